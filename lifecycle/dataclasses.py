@@ -2,14 +2,18 @@
 
 Owns: `dataclass`, the decorator of this package's types; all else is the standard library's. Its
 own takes 0.4 ms a class to write and compile six methods, and several hundred classes are imported
-by a process that calls few of them. Imports nothing of the package.
+by a process that calls few of them; and as long as all else to see which annotations are fields,
+which here all are that say nothing special. Imports nothing of the package.
 """
 
 from __future__ import annotations
 
 import contextlib
+import copy
 import dataclasses
+import sys
 import threading
+import types
 from collections.abc import Callable, Iterator
 from dataclasses import FrozenInstanceError, field, fields, is_dataclass, replace
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -33,10 +37,14 @@ _classes: list[type] = []
 class _Method:
     """A method of one class that is made when it is looked up, and then takes this one's place."""
 
-    def __init__(self, cls: type, name: str, *, frozen: bool) -> None:
-        self._cls = cls
+    __slots__ = ("_cls", "_frozen", "_name")
+
+    def __init__(self, name: str, *, frozen: bool) -> None:
         self._name = name
         self._frozen = frozen
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._cls = owner
 
     def __get__(self, instance: object, owner: type | None = None) -> Any:
         is_init = self._name == "__init__"
@@ -149,29 +157,94 @@ def _as_if_not_frozen(bases: tuple[type, ...]) -> Iterator[None]:
                 each.frozen = True
 
 
-def _decorate(cls: type, *, frozen: bool, kw_only: bool, eq: bool) -> type:
-    own = set(vars(cls))
-    if "__eq__" in own and vars(cls)["__hash__"] is None:
-        own.remove("__hash__")  # which Python has set, not its author
-    if cls.__doc__ is None:
-        cls.__doc__ = cls.__name__  # else it is made of the signature
-    with _as_if_not_frozen(cls.__bases__):
-        made: Any = dataclasses.dataclass(
-            init=False, repr=False, eq=False, slots=True, kw_only=kw_only
-        )(cls)
-    parameters = made.__dataclass_params__
-    parameters.init = parameters.repr = True
+@dataclasses.dataclass(init=False, repr=False, eq=False, slots=True)
+class _Plain:
+    """What the standard library makes of a class with one field, before it makes methods."""
+
+    of: int
+
+
+_OWN = {
+    name: vars(_Plain)[name]
+    for name in ("__replace__",)  # Python 3.13
+    if name in vars(_Plain)
+}
+_PARAMETERS = _Plain.__dataclass_params__  # type: ignore[attr-defined]
+_PARAMETERS.init = _PARAMETERS.repr = True
+_FIELD_TYPE = fields(_Plain)[0]._field_type  # type: ignore[attr-defined]  # noqa: SLF001
+_SPECIAL = ("ClassVar", "InitVar", "KW_ONLY")
+
+
+def _fields_of(cls: Any, *, kw_only: bool) -> dict[str, Any] | None:
+    """Return the fields of a class as the standard library has them, with those of its bases.
+
+    It looks up what each annotation may mean, and none of ours means anything but a field; None
+    where that is not so, or something is wrong that it has a message for.
+    """
+    own = vars(cls).get("__annotations__", {} if sys.version_info < (3, 14) else None)
+    if own is None or not all(type(each) is str for each in own.values()):
+        return None
+    text = " ".join(own.values())
+    if any(each in text for each in _SPECIAL):
+        return None
+    every: dict[str, Any] = {}
+    for base in cls.__mro__[-2:0:-1]:
+        every.update(getattr(base, "__dataclass_fields__", ()))
+    for name, annotation in own.items():
+        found = vars(cls).get(name, _ABSENT)
+        if not isinstance(found, dataclasses.Field):
+            if found is _ABSENT and name in every:
+                found = getattr(cls, name, _ABSENT)  # a base's default, unless it is its slot
+                found = _ABSENT if isinstance(found, types.MemberDescriptorType) else found
+            found = field(default=found, kw_only=kw_only)
+        elif found.kw_only is _ABSENT:
+            found.kw_only = kw_only
+        if found.default.__class__.__hash__ is None:
+            return None
+        found.name, found.type, found._field_type = name, annotation, _FIELD_TYPE  # noqa: SLF001
+        every[name] = found
+    if any(isinstance(each, dataclasses.Field) and n not in own for n, each in vars(cls).items()):
+        return None
+    return every
+
+
+def _decorate(cls: Any, *, frozen: bool, kw_only: bool, eq: bool) -> type:
+    own = dict(vars(cls))
+    if "__slots__" in own:
+        raise TypeError(f"{cls.__name__} already specifies __slots__")
+    if own["__doc__"] is None:
+        cls.__doc__ = own["__doc__"] = cls.__name__  # else it is made of the signature
+    if "__eq__" in own and own["__hash__"] is None:
+        del own["__hash__"]  # which Python has set, not its author
+    every = _fields_of(cls, kw_only=kw_only)
+    if every is None:
+        with _as_if_not_frozen(cls.__bases__):
+            plain: Any = dataclasses.dataclass(init=False, repr=False, eq=False, kw_only=kw_only)
+            every = plain(cls).__dataclass_fields__
+    taken: set[str] = set()
+    for base in cls.__mro__[1:-1]:
+        slots = vars(base).get("__slots__", ())
+        taken.update((slots,) if isinstance(slots, str) else slots)
+    parameters: Any = copy.copy(_PARAMETERS)
     parameters.eq, parameters.frozen = eq, frozen
+    known = {name: each for name, each in every.items() if each._field_type is _FIELD_TYPE}  # noqa: SLF001
+    shown = [name for name, each in known.items() if each.init and not each.kw_only]
     names = ["__init__", "__repr__", *["__eq__"] * eq, *["__hash__"] * (eq and frozen)]
-    for name in names:
-        if name not in own:
-            setattr(made, name, _Method(made, name, frozen=frozen))
-    if eq and not frozen and "__hash__" not in own:
-        made.__hash__ = None
-    if frozen:
-        for name, method in _FROZEN.items():
-            if name not in own:
-                setattr(made, name, method)
+    namespace = {
+        **_OWN,
+        "__match_args__": tuple(shown),
+        **{name: _Method(name, frozen=frozen) for name in names},
+        **({"__hash__": None} if eq and not frozen else {}),
+        **(_FROZEN if frozen else {}),
+        **own,
+        "__qualname__": cls.__qualname__,
+        "__dataclass_fields__": every,
+        "__dataclass_params__": parameters,
+        "__slots__": tuple(name for name in known if name not in taken),
+    }
+    for name in (*known, "__dict__", "__weakref__"):
+        namespace.pop(name, None)
+    made = type(cls)(cls.__name__, cls.__bases__, namespace)
     _classes.append(made)
     return made  # type: ignore[no-any-return]
 

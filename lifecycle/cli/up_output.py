@@ -166,7 +166,7 @@ class Timings:
     ) -> None:
         self._inner = inner
         self._until = until
-        self._clock = clock or _since_start_s
+        self._clock = clock or _since_start()
         self._over: dict[str, tuple[float, str]] = {}
         self._come: dict[str, int] = {}
         self._reached: set[str] = set()
@@ -239,11 +239,11 @@ _COME_BY_NODES = {
 _COME = {reach: number for number, reach in enumerate(_COME_BY_NODES, start=1)}
 
 
-def _since_start_s() -> float:
-    """Return for how long this process has been running, in seconds: starttime of proc(5)."""
+def _since_start() -> Callable[[], float]:
+    """Return what returns for how many seconds this process has run: starttime of proc(5)."""
     fields = Path("/proc/self/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
     began_s = int(fields[19]) / os.sysconf("SC_CLK_TCK")
-    return time.clock_gettime(time.CLOCK_BOOTTIME) - began_s
+    return lambda: time.clock_gettime(time.CLOCK_BOOTTIME) - began_s
 
 
 class Rollback:

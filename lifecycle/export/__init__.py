@@ -1,5 +1,5 @@
 """Plans and what runs as files: pictures, captured manifests, SROS2 documents. Pure."""
 
-import lazy_loader
+from lifecycle.doors import open_door
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = open_door(__name__, __file__)

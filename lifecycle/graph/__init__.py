@@ -6,6 +6,6 @@ not use ctypes or private rclpy names; those live in middleware/. Names that nee
 first use.
 """
 
-import lazy_loader
+from lifecycle.doors import open_door
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = open_door(__name__, __file__)

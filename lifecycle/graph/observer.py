@@ -265,6 +265,7 @@ class Observer:
         self._diagnostics = DiagnosticReadings(clients, self._wake)
         self._changed = asyncio.Event()
         self._changed.set()  # nothing was looked at yet
+        self._to_note = False
         self._loop: asyncio.AbstractEventLoop | None = None
         self._due: Remove | None = None
         self._closed = False
@@ -362,7 +363,9 @@ class Observer:
         end = loop.time() + self._burst_s
         while (left_s := end - loop.time()) > 0:
             self._changed.clear()
-            if not await set_within(self._changed, min(self._quiet_s, left_s)):
+            # Not at each change: while nodes come there is one for each of their endpoints.
+            await asyncio.sleep(min(self._quiet_s, left_s))
+            if not self._changed.is_set():
                 break
         self._changed.clear()
 
@@ -459,14 +462,17 @@ class Observer:
             self.state.reread(name)
 
     def _wake(self) -> None:
-        # Before the first use there is no loop, and no waiter.
-        if self._loop is not None:
+        # Before the first use there is no loop, and no waiter. What is to be noted is noted later
+        # than this, so that it is noted once.
+        if self._loop is not None and not self._to_note:
+            self._to_note = True
             with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
                 self._loop.call_soon_threadsafe(self._note)
 
     # -- what happens in the scheduler
 
     def _note(self) -> None:
+        self._to_note = False
         self.changes += 1
         self._changed.set()
 

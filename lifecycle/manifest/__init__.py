@@ -5,6 +5,6 @@ Other packages use the types of `model`, `qos` and `diagnostics`; nothing outsid
 YAML and JSON Schema are imported when `load` is asked for.
 """
 
-import lazy_loader
+from lifecycle.doors import open_door
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = open_door(__name__, __file__)

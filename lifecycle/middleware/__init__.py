@@ -4,6 +4,6 @@ Owns: every use of ctypes and of private rclpy names. Names load on first use, s
 only needs the /dev/shm sweep or process control does not pay for importing rclpy.
 """
 
-import lazy_loader
+from lifecycle.doors import open_door
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = open_door(__name__, __file__)

@@ -5,6 +5,7 @@ from .discovery.liveliness import AlivePublisher as AlivePublisher
 from .discovery.liveliness import AliveSubscription as AliveSubscription
 from .discovery.liveliness import PlanNotices as PlanNotices
 from .discovery.liveliness import node_topic as node_topic
+from .discovery.probe import EarlyProbe as EarlyProbe
 from .discovery.probe import discovery_peers as discovery_peers
 from .discovery.probe import peers_environment as peers_environment
 from .discovery.rediscovery import call_out as call_out

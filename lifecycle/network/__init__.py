@@ -3,6 +3,6 @@
 Pure: imports nothing of the package but `lifecycle.codec`, no ROS, opens no socket.
 """
 
-import lazy_loader
+from lifecycle.doors import open_door
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = open_door(__name__, __file__)

@@ -4,6 +4,6 @@ Owns: the node's side of everything. Names load on first use, so that the contro
 can be imported where there is no ROS.
 """
 
-import lazy_loader
+from lifecycle.doors import open_door
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = open_door(__name__, __file__)

@@ -16,6 +16,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import os
+import threading
 import traceback
 import weakref
 from collections.abc import Callable, Iterable
@@ -471,6 +472,8 @@ class ConfigurationChanges:
         self._collect = collect
         self._failed = failed
         self._listeners: list[Listener] = []
+        self._lock = threading.Lock()
+        self._behind: list[Listener] = []
         self._scheduled = False
 
     def listen(self, listener: Listener) -> None:
@@ -480,20 +483,38 @@ class ConfigurationChanges:
     def close(self) -> None:
         """Notify of nothing any more: the node's process leaves DDS."""
         self._listeners.clear()
+        with self._lock:
+            self._behind = []
 
     def touch(self) -> None:
-        """Something of the configuration has changed, match counts included."""
+        """Something of the configuration has changed, match counts included; from any thread."""
+        with self._lock:
+            self._behind = list(self._listeners)
         if self._listeners and not self._scheduled:
             self._scheduled = bool(self._later(self._notify))
 
+    def give(self, listener: Listener) -> tuple[NodeConfiguration, bool]:
+        """Return the configuration as it is now to who gives it to `listener`.
+
+        Returns:
+            And whether that takes the place of its notification: it is not notified any more of
+            what changed before.
+        """
+        with self._lock:
+            behind = listener in self._behind
+            self._behind = [each for each in self._behind if each != listener]
+        return self._collect(), behind
+
     def _notify(self) -> None:
         self._scheduled = False
-        if not self._listeners:
+        with self._lock:
+            behind, self._behind = self._behind, []
+        if not behind:
             return
         configuration = self.collect()
         if configuration is None:
             return
-        for listener in tuple(self._listeners):
+        for listener in behind:
             listener(configuration)
 
     def collect(self) -> NodeConfiguration | None:

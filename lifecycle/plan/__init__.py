@@ -1,5 +1,5 @@
 """Manifest → Plan: the computational and the data layer graph of a system, ready to run. Pure."""
 
-import lazy_loader
+from lifecycle.doors import open_door
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = open_door(__name__, __file__)

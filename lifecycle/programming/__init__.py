@@ -4,6 +4,6 @@
 ledger of what is ours in each, and HTTP. Must not import rclpy.
 """
 
-import lazy_loader
+from lifecycle.doors import open_door
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = open_door(__name__, __file__)

@@ -5,6 +5,6 @@ Owns: everything between a plan and a running system. Public: `up` and what it t
 load on first use: the fork server, which is of this room, must start without the rest of it.
 """
 
-import lazy_loader
+from lifecycle.doors import open_door
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = open_door(__name__, __file__)

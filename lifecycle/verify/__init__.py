@@ -1,5 +1,5 @@
 """Verifies Plan × Observation → Verdict, and reports it. Pure: no ROS, no files, no clock."""
 
-import lazy_loader
+from lifecycle.doors import open_door
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = open_door(__name__, __file__)

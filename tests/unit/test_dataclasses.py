@@ -6,6 +6,7 @@ import copy
 import dataclasses as standard
 import inspect
 import pickle
+import typing
 from typing import Any
 
 import pytest
@@ -116,3 +117,50 @@ def test_what_a_class_does_itself_stays() -> None:
     with pytest.raises(ValueError, match="-1"):
         Point(x=-1)
     assert hash(Point(x=1, seen=[1])) == hash(Point(x=1))
+
+
+def _variants(module: Any) -> list[Any]:
+    """Return classes whose annotations or defaults are not plain fields, and what extends them."""
+    made: list[Any] = []
+    for annotated, defaults in (
+        ({"x": "int", "shared": f"{typing.__name__}.ClassVar[int]"}, {"shared": 4}),
+        ({"x": int, "y": "str"}, {"y": "text"}),
+        ({"x": "int", "_": "standard.KW_ONLY", "y": "int"}, {"y": 2}),
+        ({"x": "int", "y": "int"}, {"y": module.field(default=3, compare=False, kw_only=True)}),
+    ):
+        body = {"__annotations__": annotated, "__module__": __name__, **defaults}
+        base = module.dataclass(frozen=True, slots=True)(type("Variant", (), dict(body)))
+        again = {"__annotations__": {"x": "float", "z": "int"}, "z": 5}
+        derived = module.dataclass(frozen=True, slots=True)(type("Derived", (base,), again))
+        made += [base, derived]
+    return made
+
+
+def test_annotations_mean_what_they_mean_to_the_standard_library() -> None:
+    def looked_at(cls: Any) -> tuple[Any, ...]:
+        one = cls(x=1)
+        return (
+            [(each.name, str(each.type), each.kw_only) for each in standard.fields(cls)],
+            [str(each) for each in inspect.signature(cls).parameters.values()],
+            (cls.__slots__, cls.__match_args__, getattr(one, "shared", None)),
+            (repr(one), one == cls(x=1), hasattr(one, "__dict__")),
+        )
+
+    ours_, theirs = _variants(ours), _variants(standard)
+    assert [looked_at(each) for each in ours_] == [looked_at(each) for each in theirs]
+
+
+@pytest.mark.parametrize("name", ["default", "unannotated", "__slots__"])
+def test_what_the_standard_library_refuses_is_refused(name: str) -> None:
+    messages = []
+    for module in (ours, standard):
+        body: dict[str, Any] = {"__annotations__": {"x": "list[int]"}, "__module__": __name__}
+        body |= {
+            "default": {"x": []},
+            "unannotated": {"y": module.field(default=1)},
+            "__slots__": {"__slots__": ("z",)},
+        }[name]
+        with pytest.raises((TypeError, ValueError)) as refused:
+            module.dataclass(frozen=True, slots=True)(type("Wrong", (), body))
+        messages.append(str(refused.value))
+    assert messages[0] == messages[1]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import graphlib
+import importlib
 import re
 import subprocess
 import sys
@@ -25,6 +26,7 @@ PURE_ROOMS = (
     "programming.rules.registry",
     "codec",
     "dataclasses",
+    "doors",
     "errors",
 )
 
@@ -82,6 +84,18 @@ def test_a_name_that_a_room_offers_is_in_the_module_that_its_stub_names(room: st
         if each.name not in _bound(_file(folder.joinpath(*node.module.split("."))))
     ]
     assert missing == []
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_a_door_has_what_python_reads_in_its_stub(room: str) -> None:
+    opened = importlib.import_module(f"lifecycle.{room}")
+    stub = ast.parse((ROOT / "lifecycle" / room / "__init__.pyi").read_text())
+    names = [
+        each.asname for node in stub.body if isinstance(node, ast.ImportFrom) for each in node.names
+    ]
+    assert opened.__all__ == sorted(filter(None, names))
+    with pytest.raises(AttributeError, match="nowhere"):
+        opened.nowhere  # noqa: B018 - looking it up is the point
 
 
 def test_the_api_page_lists_what_the_graph_offers() -> None:

@@ -31,8 +31,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from lifecycle.cli.up_output import RunOutput
+    from lifecycle.middleware import EarlyProbe
     from lifecycle.programming import TargetOptions, Treatment
-    from lifecycle.supervisor import SystemStatus, UpResult
+    from lifecycle.supervisor import Forerunner, SystemStatus, UpResult
 
 
 @click.command("up", cls=NetworkCommand)
@@ -160,25 +161,29 @@ def command(
             Ending() as ending,
             ReportFile(report, strict=strict) as written,
         ):
-            from lifecycle.supervisor import Forerunner
-
-            # What it alone imports, and what we alone do and reading the manifest, take as long as
-            # each other: side by side.
             program = _networks(targets, **rest)
-            forerunner = Forerunner(
-                without=_tokens(program), programs=bool(program), forks=are_own()
-            )
+            # A Python of its own imports while we do and read the manifest. A fork of ours follows
+            # once that is read: who is there already is asked meanwhile.
+            forks = are_own() and not program
+            forerunner = None if forks else _forerunner(program)
+            early: EarlyProbe | None = None
             try:
                 _import_asyncio()
-                from lifecycle.cli.up_output import output
                 from lifecycle.plan import build_plan, started_by_others
-                from lifecycle.supervisor import Until, UpOptions, ended_early, up
 
                 loaded = load_manifest(manifest, assignments, machine=machine)
                 plan = build_plan(loaded.manifest, domain_id=domain)
                 if without:
                     plan = started_by_others(plan, without)
                 written.begin(plan)
+                if forerunner is None:
+                    from lifecycle.supervisor import ask_early
+
+                    early = ask_early(plan, machine)
+                    forerunner = _forerunner(program, forks=True)
+                from lifecycle.cli.up_output import output
+                from lifecycle.supervisor import Until, UpOptions, ended_early, up
+
                 options = UpOptions(
                     until=Until(until),
                     stop_after_s=stop_after,
@@ -207,6 +212,7 @@ def command(
                             options,
                             [listener],
                             forerunner=forerunner,
+                            early=early,
                             ending=ending,
                             on_start=on_start,
                             conclude=conclude,
@@ -214,10 +220,19 @@ def command(
                     except Ended as ended:
                         return conclude(ended_early(ended.reason, ended.exit_code))
             finally:
-                forerunner.close()
+                if early is not None:
+                    early.close()
+                if forerunner is not None:
+                    forerunner.close()
     except Ended as ended:
         click.echo(f"ended before anything was started: {ended.reason}", err=True)
         return ended.exit_code
+
+
+def _forerunner(program: tuple[TargetOptions, ...], *, forks: bool = False) -> Forerunner:
+    from lifecycle.supervisor import Forerunner
+
+    return Forerunner(without=_tokens(program), programs=bool(program), forks=forks)
 
 
 def _import_asyncio() -> None:

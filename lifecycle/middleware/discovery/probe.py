@@ -114,6 +114,11 @@ class Probe:
         if not self.counts:
             self.close()
 
+    @property
+    def asks(self) -> tuple[object, ...]:
+        """To where it is sent, and the addresses at which it is to be answered."""
+        return self._targets, self._addresses
+
     def ask_again(self, *, to_count: bool) -> None:
         """Send one more announcement, of another participant that does not exist.
 
@@ -171,6 +176,47 @@ class Probe:
         if self._socket is not None:
             self._socket.close()
             self._socket = None
+
+
+ANSWER_S = 0.15
+"""A participant that a probe reaches, on this host or the next one, answers within so long."""
+
+
+class EarlyProbe:
+    """A probe for a participant that is not made yet: whether there is anybody already.
+
+    Making a participant, and all that comes before it, takes longer than to be answered. Who
+    answers this one is not discovered by that; if nobody does, there was nobody.
+
+    Args:
+        domain_id: 0–232.
+        urls: as for `probes_for`, of the participant to be.
+        environment: likewise.
+    """
+
+    def __init__(
+        self, domain_id: int, urls: Sequence[ConnectionUrl], environment: Mapping[str, str]
+    ) -> None:
+        self._sent_s = time.monotonic()
+        self._probes = probes_for(domain_id, urls, environment)
+
+    def silent_until_s(self, asked: Sequence[Probe]) -> float | None:
+        """Return when it is certain that nobody was there, on the monotonic clock.
+
+        None if somebody was, or if this did not ask all that are to be asked.
+
+        Args:
+            asked: the probes of the participant once that is made.
+        """
+        own = [each.asks for each in self._probes if each.counts]
+        if own != [each.asks for each in asked] or any(map(Probe.answered, self._probes)):
+            return None
+        return self._sent_s + ANSWER_S
+
+    def close(self) -> None:
+        """Receive no more answers; again is harmless."""
+        for each in self._probes:
+            each.close()
 
 
 def send(sender: socket.socket, message: bytes, targets: Iterable[ProbeTarget]) -> None:

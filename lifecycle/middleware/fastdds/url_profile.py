@@ -467,7 +467,9 @@ def _add_user_traffic(rtps: ET.Element, found: Sequence[UrlTransport], domain_id
             if family.udp:
                 _locator(unicast, family.kind, url.address, url.port)
             elif family.kind.is_tcp:
-                logical = participant_ports(domain_id, 0).user_unicast
+                # As discovery: one request for a port inside a connection, which Fast DDS may lose.
+                # Who was discovered over TCP is then reached by data, too.
+                logical = participant_ports(domain_id, 0).discovery_unicast
                 _tcp_locator(unicast, family.kind, url.address, url.port, logical)
         if family.udp and not family.unicast:
             # Readers of a group also need an address of their own: one that is alone is sent to

@@ -30,7 +30,12 @@ from lifecycle.middleware.discovery.dead_peers import (
     is_used,
     remove_participants,
 )
-from lifecycle.middleware.discovery.probe import answered_at, probes_for
+from lifecycle.middleware.discovery.probe import (
+    ANSWER_S,
+    EarlyProbe,
+    answered_at,
+    probes_for,
+)
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.middleware.fastdds.settings import stop_listening
 from lifecycle.middleware.process.process_table import programs_of
@@ -142,9 +147,6 @@ _Listed = tuple[tuple[EndpointKind, tuple[tuple[str, str], ...]], ...]
 """Name and type of what rcl lists of a node, by kind."""
 
 
-ANSWER_S = 0.15
-"""A participant that a probe reaches, on this host or the next one, answers within so long."""
-
 PATIENCE_S = 3.5
 """What Fast DDS lost on the way it sends again every 3 s."""
 
@@ -188,6 +190,7 @@ class GraphObserver:
         connections: how it is connected; as a client of a discovery server it is a super client,
             to which everything is announced.
         node: looked through instead of a hidden one, see `on`.
+        early: sent before; where nobody answers it, nobody is waited for. Closed with this.
 
     Attributes:
         urls: of its connections; none where the RMW chooses.
@@ -204,8 +207,10 @@ class GraphObserver:
         connections: ParticipantConnections | None = None,
         *,
         node: Node | None = None,
+        early: EarlyProbe | None = None,
     ) -> None:
         self.domain_id = domain_id
+        self._early = early
         settings = ParticipantSettings.of(
             connections or ParticipantConnections(), super_client=True
         )
@@ -335,8 +340,10 @@ class GraphObserver:
             return max(0.0, self._limit_s - age_s)
         if not all(probe.counts for probe in self._probes):
             return max(0.0, _UNCOUNTED_S - age_s)
-        if age_s < ANSWER_S:
-            return ANSWER_S - age_s
+        silent_until_s = None if self._early is None else self._early.silent_until_s(self._probes)
+        known_s = self._made_s + ANSWER_S if silent_until_s is None else silent_until_s
+        if (left_s := known_s - time.monotonic()) > 0:
+            return left_s
         unknown = frozenset().union(*(each.answered() for each in self._probes)) - self._known
         if not unknown:
             return 0.0
@@ -468,6 +475,8 @@ class GraphObserver:
         self._destroyed = True
         for probe in self._probes:
             probe.close()
+        if self._early is not None:
+            self._early.close()
         self._unwatch()
         if self._context is not None:
             give_up_dead_connections()

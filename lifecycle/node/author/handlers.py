@@ -8,7 +8,7 @@ an endpoint. Pure: knows no rclpy.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, TypeVar
 
 from lifecycle import dataclasses
@@ -206,11 +206,27 @@ def _marks(node_class: type) -> list[tuple[str, _Mark]]:
     """Return (method name, mark) of a class; an override inherits what it overrides."""
     found: dict[str, tuple[_Mark, ...]] = {}
     for base in node_class.__mro__:
-        for name, value in vars(base).items():
-            marks = getattr(value, _ATTRIBUTE, None) if callable(value) else None
-            if marks and name not in found:
-                found[name] = marks
+        for name, marks in _own_marks(base):
+            found.setdefault(name, marks)
     return [(name, mark) for name, marks in found.items() for mark in marks]
+
+
+_UNMARKED: set[type] = set()
+"""Classes of this package and of rclpy: what they have is looked through once, and forked."""
+
+
+def note_unmarked(node_class: type) -> None:
+    """Note that neither a class nor any of its bases has decorated methods."""
+    _UNMARKED.update(each for each in node_class.__mro__ if not tuple(_own_marks(each)))
+
+
+def _own_marks(node_class: type) -> Iterator[tuple[str, tuple[_Mark, ...]]]:
+    if node_class in _UNMARKED:
+        return
+    for name, value in vars(node_class).items():
+        marks = getattr(value, _ATTRIBUTE, None) if callable(value) else None
+        if marks:
+            yield name, marks
 
 
 def needs_handler(kind: EndpointKind) -> bool:
@@ -235,7 +251,8 @@ def match(node_class: type, endpoints: Iterable[PlannedEndpoint], *, node: str) 
     deciders: dict[tuple[EndpointKind, str], str] = {}
     timers: list[TimerHandler] = []
     problems: list[str] = []
-    for method, mark in _marks(node_class):
+    marked = _marks(node_class)
+    for method, mark in marked:
         if mark.kind is None:
             timers.append(TimerHandler(method=method, period_s=mark.period_s))
             continue
@@ -255,7 +272,7 @@ def match(node_class: type, endpoints: Iterable[PlannedEndpoint], *, node: str) 
             taken[key] = method
     unused = [
         (mark.kind, mark.name)
-        for _, mark in _marks(node_class)
+        for _, mark in marked
         if mark.kind and not mark.decides and (mark.kind, mark.name) not in wanted
     ]
     for (kind, name), endpoint in wanted.items():

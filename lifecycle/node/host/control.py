@@ -122,6 +122,7 @@ class Event:
         error: the reason, with the exception's last line; the traceback is in the log.
         configuration: for "configuration", and replies that carry it (all but ACTIVATE,
             DEACTIVATE, CLEANUP, SHUTDOWN and SERVE_INTERFACE).
+        reports: of a reply: it stands for a "configuration" that would follow, too.
     """
 
     kind: str
@@ -132,6 +133,7 @@ class Event:
     connected: bool = False
     error: str = ""
     configuration: NodeConfiguration | None = None
+    reports: bool = False
 
 
 _AT_ONCE_BYTES = 1 << 16

@@ -12,12 +12,15 @@ import argparse
 import contextlib
 import importlib
 import os
+import re
 import socket
+import sys
 from collections.abc import Iterable
+from pathlib import Path
 from typing import NoReturn
 
 from lifecycle import codec, dataclasses, middleware
-from lifecycle.manifest import DiscoveryRange, Health, Run
+from lifecycle.manifest import DiscoveryRange, Health, Run, RunKind
 from lifecycle.node.host.control import Command, Event, HostChannel, HostSpec, Operation, give_up
 from lifecycle.plan import PlannedNode
 
@@ -82,8 +85,8 @@ def preload(names: Iterable[str] = ()) -> None:
 
     Args:
         names: what only some nodes need, see `needed_by`; numpy alone, which most messages with
-            arrays import, takes 60 ms. What cannot be imported is left to the host that needs it,
-            which reports it.
+            arrays import, takes 60 ms, and not all need it. What cannot be imported is left to the
+            host that needs it, which reports it.
     """
     for name in _PRELOADED:
         importlib.import_module(name)
@@ -121,6 +124,8 @@ def _rehearse() -> None:
     import hashlib
 
     from lifecycle.middleware import ParticipantSettings
+    from lifecycle.node.author.handlers import note_unmarked
+    from lifecycle.node.author.node import LifecycleNode
     from lifecycle.node.author.spec import default_name, plan_without_manifest
     from lifecycle.node.lifecycle.machine import (
         CallbackOutcome,
@@ -130,6 +135,7 @@ def _rehearse() -> None:
 
     codecs.lookup("ascii")  # in which the machine's id is read
     hashlib.sha256()
+    note_unmarked(LifecycleNode)
     node = plan_without_manifest(HostSpec, name=default_name(HostSpec), namespace="/")
     spec = HostSpec(
         system="",
@@ -178,6 +184,8 @@ def needed_by(nodes: Iterable[PlannedNode]) -> tuple[str, ...]:
     """Return what `preload` is to import for some nodes: modules and interface types."""
     names: dict[str, None] = {}
     for node in nodes:
+        if node.run.kind is RunKind.PYTHON and _calculates(node):
+            names["numpy"] = None
         if node.events or node.membership:
             names["lifecycle.graph.transport"] = names["lifecycle.graph.reporter"] = None
         for endpoint in node.endpoints:
@@ -185,6 +193,26 @@ def needed_by(nodes: Iterable[PlannedNode]) -> tuple[str, ...]:
                 names["rclpy.action"] = None
             names[endpoint.type] = None
     return tuple(names)
+
+
+_WITH_NUMPY = re.compile(
+    rb"^\s*(?:import|from)\s+(?:numpy|cv2|cv_bridge|scipy|sensor_msgs_py|torch)\b", re.MULTILINE
+)
+
+
+def _calculates(node: PlannedNode) -> bool:
+    """Whether the file of a node's class imports numpy, as far as that is seen without Python.
+
+    It takes 60 ms: once if it is preloaded, else in each process whose code imports it.
+    """
+    parts = node.run.python.partition(":")[0].split(".")
+    beside = [str(Path(node.at.file).parent)] if node.at.file else []
+    for folder in (node.run.working_directory or ".", *beside, *sys.path):
+        place = Path(folder, *parts)
+        for file in (place / "__init__.py", place.with_name(f"{place.name}.py")):
+            with contextlib.suppress(OSError):
+                return _WITH_NUMPY.search(file.read_bytes()) is not None
+    return False
 
 
 __all__ = ["main", "needed_by", "preload", "serve"]

@@ -129,15 +129,18 @@ class HostCommands:
 
     Args:
         nodes: by full name, as they are at any time.
+        report: listens to their configurations, to send them where the answers go.
         of_process: what the operations of the whole process do.
     """
 
     def __init__(
         self,
         nodes: Mapping[str, Hosted],
+        report: Callable[[NodeConfiguration], None],
         of_process: Mapping[Operation, Callable[[], object]],
     ) -> None:
         self._nodes = nodes
+        self._report = report
         self._of_process = of_process
 
     async def execute(self, command: Command) -> Event:
@@ -184,6 +187,9 @@ class HostCommands:
             # No event reports its sockets: what its callback did to them is read when it has ended.
             or (command.operation is Operation.ACTIVATE and node.is_marked)
         )
+        configuration, reports = None, False
+        if carries:
+            configuration, reports = node.configuration_changes.give(self._report)
         return Event(
             kind="reply",
             node=command.node,
@@ -192,7 +198,8 @@ class HostCommands:
             state=state.label,
             connected=state.connected,
             error=error,
-            configuration=node.get_configuration() if carries else None,
+            configuration=configuration,
+            reports=reports,
         )
 
 
@@ -247,6 +254,7 @@ class Host:
         )
         self._commands = HostCommands(
             self._nodes,
+            self._report_configuration,
             {
                 Operation.SEND_AGAIN_SOON: send_again_soon,
                 Operation.REPUBLISH_NAMES: self._loop.republish_names,

@@ -174,11 +174,12 @@ class RosInterface:
         self._rules: set[str] = set()
         self._published: SystemStatus | None = None
         self._hurries = False
+        self._moved_s = 0.0
 
     def begin(self) -> None:
         """Wait from now on for the system to be active, or to be held up."""
         if self._opens:
-            self._open_in(HELD_UP_S)
+            self._goes_on()
 
     def on_event(self, event: Event) -> None:
         """Publish what changed; a listener of the run."""
@@ -196,7 +197,10 @@ class RosInterface:
             self._opens = False
         elif not self._was_active and isinstance(event, _ON_ITS_WAY):
             self._was_active = isinstance(event, SystemReached) and event.reached == ACTIVE
-            self._open_in(AFTER_ACTIVE_S if self._was_active else HELD_UP_S)
+            if self._was_active:
+                self._open_in(AFTER_ACTIVE_S)
+            else:
+                self._goes_on()
 
     def close(self) -> None:
         """Publish a last time, and offer nothing any more; again is harmless."""
@@ -213,6 +217,20 @@ class RosInterface:
 
     def _open_in(self, wait_s: float) -> None:
         self._wait(asyncio.get_running_loop().call_later(wait_s, self._open))
+
+    def _goes_on(self) -> None:
+        """Open once nothing has happened for `HELD_UP_S`; events only note when they came."""
+        loop = asyncio.get_running_loop()
+        self._moved_s = loop.time()
+        if self._due is None:
+            self._due = loop.call_later(HELD_UP_S, self._look)
+
+    def _look(self) -> None:
+        loop = asyncio.get_running_loop()
+        if loop.time() < (due_s := self._moved_s + HELD_UP_S):
+            self._due = loop.call_at(due_s, self._look)
+        else:
+            self._open()
 
     def _wait(self, due: asyncio.TimerHandle | None) -> None:
         if self._due is not None:

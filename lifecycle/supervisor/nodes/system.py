@@ -176,7 +176,9 @@ class InterfaceOnDemand:
             await self._changes.beyond(count, None)
             end_s = loop.time() + _BURST_S
             while (left_s := end_s - loop.time()) > 0:
-                if not await self._changes.beyond(self._changes.count, min(_QUIET_S, left_s)):
+                count = self._changes.count
+                await asyncio.sleep(min(_QUIET_S, left_s))
+                if self._changes.count == count:
                     break
 
     async def _look(self) -> None:
@@ -255,7 +257,7 @@ _CONDITIONS = {
 }
 
 _QUIET_S = 0.05
-"""Without a change for so long a burst is over: a client's endpoints come together."""
+"""So often is looked whether a burst is over: a client's endpoints come together."""
 
 _BURST_S = 0.5
 """While a system comes up the graph changes all the time: then it is looked at so often."""
@@ -735,7 +737,8 @@ class System:
     def on_host_event(self, event: HostEvent) -> None:
         """Take a host's event about one of its nodes, in the order in which it comes.
 
-        Of a reply this is the configuration; the rest is for who asked.
+        Of a reply this is the configuration, if any, which may have changed; the rest is for who
+        asked.
         """
         node = self._by_name.get(event.node)
         if node is None:
@@ -743,10 +746,13 @@ class System:
         if event.configuration is not None:
             before = node.configuration
             node.configuration = event.configuration
-            node.reports_changes = node.reports_changes or event.kind == "configuration"
+            reports = event.kind == "configuration" or event.reports
+            node.reports_changes = node.reports_changes or reports
             if before is not None and before.health != event.configuration.health:
                 node.wake()
         if event.kind == "reply":
+            if event.reports:
+                self.touched.set()
             return
         if event.state:
             node.report(event.state, connected=event.connected)

@@ -190,7 +190,9 @@ _OF_SERVICE_MANAGER = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
 
 
 class Forerunner:
-    """A fork server that is started before the manifest is read, to import while we do.
+    """A fork server that is started early: before the manifest is read, to import while we do.
+
+    A fork is made after that, and has the manifest in its memory as we have.
 
     Args:
         preload: see ForkServerProcess.
@@ -198,7 +200,7 @@ class Forerunner:
         programs: see ForkServerProcess.
         forks: it is a fork of this process, once that has imported what both need: half of the
             processor time of a start. Only for a program of ours, which has no thread and holds
-            nothing yet that nodes shall not have. Without effect if there are variables to hide.
+            nothing that nodes shall not have. Without effect if there are variables to hide.
 
     Attributes:
         run_id: of the run that it is for.

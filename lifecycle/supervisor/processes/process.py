@@ -442,8 +442,9 @@ class ManagedProcess:
             self._emit(LogLine(process=self.name, stream=stream, line=line))
 
 
-PROMPT_S = 0.1
-"""What is done within this, or a tenth of its limit, is not worth looking: most steps are."""
+PROMPT_S = 1.0
+"""What is done within this, or a tenth of its limit, is not worth looking, which takes a file of
+each thread: most steps are, of many nodes at once, too."""
 
 SLICE_S = 1.0
 """How often is looked whether a process could run, while it is waited for."""

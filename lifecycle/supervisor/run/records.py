@@ -12,7 +12,6 @@ import os
 import time
 from collections.abc import Iterator
 
-from lifecycle.graph import set_within
 from lifecycle.middleware import Creations, segments_by_holder, segments_of, still_there
 from lifecycle.run_directory import FORK_SERVER, ChildRecord, RunDirectory, start_ticks
 from lifecycle.supervisor.nodes.system import System
@@ -175,7 +174,8 @@ class Records:
             until_s = loop.time() + _BURST_S
             while created.is_set() and loop.time() < until_s:
                 created.clear()
-                await set_within(created, _QUIET_S)
+                # Not at each of them: there are a hundred for each process.
+                await asyncio.sleep(_QUIET_S)
             living = (each.pid for each in self._system.living)
             ours = frozenset((os.getpid(), self._fork_server.pid, *living))
             self._add(*await self._worker.run(self._locked, ours))

@@ -19,6 +19,7 @@ from lifecycle import dataclasses
 from lifecycle.errors import ExitCode, LifecycleError
 from lifecycle.manifest import Authority, DataLayerSource, EndpointPolicy, RunKind
 from lifecycle.middleware import (
+    EarlyProbe,
     adopt_orphans,
     check_room,
     check_threads,
@@ -86,6 +87,7 @@ def up(
     listeners: Iterable[Listener] = (),
     *,
     forerunner: Forerunner | None = None,
+    early: EarlyProbe | None = None,
     ending: Ending | None = None,
     on_start: Callable[[Callable[[], SystemStatus]], None] | None = None,
     conclude: Conclude | None = None,
@@ -101,6 +103,7 @@ def up(
         listeners: get every event, in this thread. One that raises gets nothing more; the run
             goes on to its end, and then what it raised is raised.
         forerunner: used and ended.
+        early: what `ask_early` returned for this plan; closed.
         ending: has noted signals since before this call; entered by the caller.
         on_start: given the way to ask for the status, once there is a system.
         conclude: given how the run ended, once nothing of the system runs any more; returns the
@@ -121,17 +124,19 @@ def up(
                 options,
                 listeners,
                 forerunner=forerunner,
+                early=early,
                 ending=ours,
                 on_start=on_start,
                 conclude=conclude,
             )
     guarded = tuple(_Guarded(each) for each in listeners)
-    with ending.noted():
+    with ending.noted(), contextlib.closing(early) if early else contextlib.nullcontext():
         result = _up(
             plan,
             options,
             guarded,
             forerunner=forerunner,
+            early=early,
             ending=ending,
             on_start=on_start,
             conclude=conclude,
@@ -164,6 +169,7 @@ def _up(
     listeners: Iterable[Listener],
     *,
     forerunner: Forerunner | None,
+    early: EarlyProbe | None,
     ending: Ending,
     on_start: Callable[[Callable[[], SystemStatus]], None] | None,
     conclude: Conclude | None,
@@ -206,7 +212,9 @@ def _up(
                 # Before any participant: who asks a server that is not there waits to ask again.
                 with ending.raised():
                     await discovery_server.begin(system, fork_server, ours=_serves(plan, options))
-                observer_participant = await _observer_participant(plan, options, emit, ending)
+                observer_participant = await _observer_participant(
+                    plan, options, emit, ending, early
+                )
                 leaving.callback(_succeed(directory, observer_participant).destroy)
                 await records.note_segments()
                 emit(_started(system, observer_participant, str(logs)))
@@ -358,7 +366,7 @@ def _serves(plan: Plan, options: UpOptions) -> bool:
 
 
 async def _observer_participant(
-    plan: Plan, options: UpOptions, emit: Emitter, ending: Ending
+    plan: Plan, options: UpOptions, emit: Emitter, ending: Ending, early: EarlyProbe | None
 ) -> ObserverParticipant:
     """Make the supervisor's participant; on another port if a discovery server is not reached.
 
@@ -377,6 +385,7 @@ async def _observer_participant(
                 connections,
                 unplanned=wires and dynamic and plan.policy.undeclared_nodes is EndpointPolicy.OPEN,
                 events=wires and (dynamic or layer.events),
+                early=early,
             )
         if number + 1 == OBSERVER_TRIES or observer_participant.reaches_servers():
             break

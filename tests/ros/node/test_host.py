@@ -21,6 +21,7 @@ from std_msgs.msg import String
 from lifecycle import codec
 from lifecycle.manifest.model import DiscoveryRange, Executor, Run, RunKind, Timeouts
 from lifecycle.node.host.control import Command, Event, HostSpec, Operation
+from lifecycle.node.host.host import needed_by
 
 HERE = Path(__file__).parent
 CONFIGURE, CONNECT, ACTIVATE = Operation.CONFIGURE, Operation.CONNECT, Operation.ACTIVATE
@@ -314,11 +315,34 @@ def test_what_hosts_are_forked_from_imports_only_what_every_node_needs() -> None
     modules, also = subprocess.check_output(
         [sys.executable, "-c", code], text=True, timeout=30
     ).splitlines()
-    unused = {"asyncio", "click", "jsonschema", "lifecycle.graph", "lifecycle.plan.build"}
+    unused = {"asyncio", "click", "jsonschema", "lifecycle.graph", "lifecycle.plan.build", "numpy"}
     assert unused.union({"lifecycle.verify.judge", "rclpy.action", "sensor_msgs"}).isdisjoint(
         modules.split()
     )
     assert also == "True"
+
+
+@pytest.mark.parametrize(
+    ("source", "needs"),
+    [
+        ("import numpy as np", True),
+        ("from numpy.linalg import norm", True),
+        ("    import cv2  # late", True),
+        ("import numpydoc", False),
+        ("# import numpy", False),
+    ],
+)
+def test_numpy_is_preloaded_for_nodes_whose_file_imports_it(
+    tmp_path: Path, source: str, needs: bool
+) -> None:
+    (tmp_path / "vision").mkdir()
+    (tmp_path / "vision" / "camera.py").write_text(f"import math\n{source}\n")
+    node = hosted("one", "Good")
+    run = dataclasses.replace(node.run, python="vision.camera:Camera")
+    at = dataclasses.replace(node.at, file=str(tmp_path / "robot.lifecycle.yaml"))
+    assert ("numpy" in needed_by([dataclasses.replace(node, run=run, at=at)])) is needs
+    gone = dataclasses.replace(run, python="vision.gone:Camera")
+    assert "numpy" not in needed_by([dataclasses.replace(node, run=gone, at=at)])
 
 
 @pytest.mark.parametrize(

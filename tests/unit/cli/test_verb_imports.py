@@ -39,6 +39,7 @@ TO_ASK = {
     "lifecycle.codec",
     "lifecycle.dataclasses",
     "lifecycle.errors",
+    "lifecycle.doors",
     "lifecycle.printable",
     "lifecycle.run_directory",
     "lifecycle.supervisor",

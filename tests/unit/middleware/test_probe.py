@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import socket
 import struct
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from lifecycle.middleware.discovery.probe import (
+    ANSWER_S,
+    EarlyProbe,
     Probe,
     announcement,
     answered_at,
@@ -180,3 +183,43 @@ def test_a_profile_of_the_users_is_read_for_where_others_are_looked_for(
 @pytest.mark.parametrize("transports", ["", "DEFAULT", "UDPv4?max_msg_size=1400B"])
 def test_transports_with_multicast_leave_everybody_to_be_asked(transports: str) -> None:
     assert not chosen_otherwise({"FASTDDS_BUILTIN_TRANSPORTS": transports})
+
+
+def test_before_there_is_a_participant_others_are_asked_to_answer_only_us(
+    peer: socket.socket,
+) -> None:
+    url, address = url_for(peer)
+    before_s = time.monotonic()
+    early = EarlyProbe(25, (parse(url),), {})
+    after_s = time.monotonic()
+    asked = probes_for(25, (parse(url),), {})
+    try:
+        message, (_, asked_from, *_) = peer.recvfrom(65536)
+        assert asked_from in locators(message, address)
+        silent_until_s = early.silent_until_s(asked)
+        assert silent_until_s is not None
+        assert before_s + ANSWER_S <= silent_until_s <= after_s + ANSWER_S
+        # One that is not asked now, or was not, may be there.
+        assert early.silent_until_s(()) is None
+        assert early.silent_until_s((*asked, *asked)) is None
+        peer.sendto(_ANSWER, (address, asked_from))
+        assert early.silent_until_s(asked) is None
+    finally:
+        for each in (early, *asked):
+            each.close()
+
+
+def test_where_all_leaves_by_one_port_nobody_can_be_asked_before_there_is_a_participant(
+    peer: socket.socket,
+) -> None:
+    url, _ = url_for(peer)
+    early = EarlyProbe(25, (parse(f"{url}&output_port=7999"),), {})
+    asked = probes_for(25, (parse(url),), {})
+    assert early.silent_until_s(asked) is None
+    for each in (early, *asked):
+        each.close()
+    peer.setblocking(False)
+    messages = [peer.recvfrom(65536)[0]]
+    with pytest.raises(BlockingIOError):
+        peer.recvfrom(65536)
+    assert len(messages) == 1

@@ -211,7 +211,7 @@ def test_what_others_let_go_of_a_moment_later_is_removed_then(directory: Path) -
 def test_the_creation_of_fast_ddss_files_is_noticed_and_of_nothing_else(directory: Path) -> None:
     creations = Creations()
     try:
-        make(directory, "other_el")
+        make(directory, "other_el", f"{PORT}x", f"{PORT}_el.part", f"my{PORT}", f"sem.x{SEGMENT}")
         assert creations.take() == frozenset()
         make(directory, f"{PORT}_sl", SEGMENT, f"sem.{PORT}_mutex")
         assert select.select([creations.descriptor], [], [], 5)[0]

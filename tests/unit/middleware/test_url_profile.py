@@ -105,3 +105,12 @@ def test_over_tcp_the_thread_that_finishes_a_connection_overtakes_nobody() -> No
         for tag in ("accept_thread", "default_reception_threads")
     ]
     assert policies == [str(os.SCHED_BATCH), str(os.SCHED_OTHER)]
+
+
+def test_over_tcp_data_arrive_at_the_port_inside_a_connection_that_discovery_has() -> None:
+    """Fast DDS may lose the request for one: who is discovered is then reached by data, too."""
+    root = made("tcpv4://10.77.0.1:5100")
+    lists = ("metatrafficUnicastLocatorList", "defaultUnicastLocatorList")
+    (discovery,), (data,) = (locators(root, each) for each in lists)
+    assert data == discovery
+    assert data["physical_port"] == "5100"

@@ -6,7 +6,14 @@ import pytest
 
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.node.author.handlers import match, on_action, on_message, on_service, on_timer
+from lifecycle.node.author.handlers import (
+    match,
+    note_unmarked,
+    on_action,
+    on_message,
+    on_service,
+    on_timer,
+)
 from tests.builders import planned_endpoint
 
 SCAN = planned_endpoint(EndpointKind.SUBSCRIPTION, "scan")
@@ -40,6 +47,24 @@ def test_an_override_without_the_decorator_still_handles() -> None:
         def see(self, message: object) -> None: ...
 
     assert match(Special, [SCAN, RESET, DOCK], node="/base").method(SCAN) == "see"
+
+
+def test_a_class_that_derives_from_one_without_methods_has_its_own() -> None:
+    class Plain:
+        def heard(self, message: object) -> None:
+            """Of no endpoint."""
+
+    note_unmarked(Plain)
+
+    class Handling(Plain):
+        @on_message("in")
+        def heard(self, message: object) -> None:
+            """Of one."""
+
+    note_unmarked(Handling)  # which it is not
+    endpoint = planned_endpoint(EndpointKind.SUBSCRIPTION, "in")
+    handlers = match(Handling, [endpoint], node="/node")
+    assert [method for _, _, method in handlers.methods] == ["heard"]
 
 
 def test_one_method_may_handle_two_subscriptions() -> None:

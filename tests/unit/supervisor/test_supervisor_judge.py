@@ -290,6 +290,23 @@ def test_a_reply_does_not_undo_what_was_told_after_it(tmp_path: Path) -> None:
     _run(tmp_path, test, OK)
 
 
+def test_a_reply_in_the_place_of_a_report_has_the_system_judged_again(tmp_path: Path) -> None:
+    async def test(bench: _Bench) -> None:
+        system = bench.world.system
+        node = system.nodes["camera"]
+        node.reports_changes = False
+        await asyncio.sleep(0)
+        system.touched.clear()
+        told = interface_of("/camera", "service_clients/ask")
+        reply = Event(kind="reply", node="/camera", state="inactive", configuration=told)
+        system.on_host_event(reply)
+        assert (node.reports_changes, system.touched.is_set()) == (False, False)
+        system.on_host_event(dataclasses.replace(reply, reports=True))
+        assert (node.reports_changes, system.touched.is_set()) == (True, True)
+
+    _run(tmp_path, test, OK)
+
+
 @pytest.mark.parametrize(("client", "server"), [("/viewer", "/camera"), ("/camera", "/viewer")])
 def test_of_a_server_that_is_matched_only_its_client_tells(
     tmp_path: Path, client: str, server: str
