@@ -17,8 +17,9 @@ from pathlib import Path
 
 from lifecycle import dataclasses
 
-STUCK_S = 3.0
-"""A thread that did not run once for so long, with something to read, will not."""
+STUCK_S = 20.0
+"""A thread that did not run once for so long, with something to read, will not. With 3 s two nodes
+in 45 rounds of the soak were taken for deadlocked that may only have been blocked for a while."""
 
 _SOCKET = "socket:["
 

@@ -16,7 +16,7 @@ from lifecycle.supervisor.health.liveliness import Cause
 from lifecycle.supervisor.nodes.system import System
 
 EACH_S = 2.0
-"""With two looks and what `Reception` waits, a deadlocked participant is known 4 to 9 s after
+"""With two looks and what `Reception` waits, a deadlocked participant is known 22 to 27 s after
 something came that it does not read; participants announce themselves each 3 s."""
 
 

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from lifecycle.middleware import Reception
+from lifecycle.middleware.process import reception as module
 
 _PLAYS = """
 import ctypes, socket, sys, threading
@@ -37,6 +38,11 @@ locked.acquire()
 """
 
 Play = Callable[..., tuple[subprocess.Popen[str], int]]
+
+
+@pytest.fixture(autouse=True)
+def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "STUCK_S", 3.0)
 
 
 @pytest.fixture
