@@ -178,8 +178,8 @@ def republish_names(nodes: Iterable[Node]) -> None:
 
     rmw_fastrtps does so whenever a node or an endpoint is made or destroyed. Here it is a hidden
     node without endpoints, for a moment: when an endpoint ends, a discovery server of Fast DDS 2.14
-    drops whatever it has not told others yet of that participant's other endpoints, and never tells
-    it again (remove_related_alive_from_history_nts in PDPServer::process_disposals). What was made
+    drops whatever it has not relayed yet of that participant's other endpoints, and never sends it
+    again (remove_related_alive_from_history_nts in PDPServer::process_disposals). What was made
     while a link was cut arrives there together with what is said once it is back (measured: of 16
     publishers 8 were never seen by the other host). Take one node of each participant.
     """

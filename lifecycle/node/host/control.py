@@ -122,7 +122,7 @@ class Event:
         error: the reason, with the exception's last line; the traceback is in the log.
         configuration: for "configuration", and replies that carry it (all but ACTIVATE,
             DEACTIVATE, CLEANUP, SHUTDOWN and SERVE_INTERFACE).
-        reports: of a reply: it stands for a "configuration" that would follow, too.
+        reports: of a reply: it replaces a "configuration" that would follow.
     """
 
     kind: str
