@@ -33,12 +33,11 @@ from lifecycle.middleware.discovery.probe import (
     RANGE_VARIABLE,
     ProbeTarget,
     addresses_of,
-    announcement,
+    ask,
     chosen_otherwise,
     discovery_ports,
     group_targets,
     probe_targets,
-    send,
     well_known_targets,
 )
 from lifecycle.middleware.fastdds.dscp import own_udp_socket, socket_descriptors
@@ -95,15 +94,14 @@ def _call_around(domain_id: int, kind: Medium, peers: Sequence[str]) -> None:
     group_port = participant_ports(domain_id, 0).discovery_multicast
     ports = discovery_ports(domain_id, kind)
     ours = [(a, port) for port in ports for found in interfaces.values() for a in found]
-    # Two that do not exist: an answer goes to only one kind of address.
-    calls = (announcement(ours), announcement([(DISCOVERY_GROUP[kind], group_port)]))
+    group = tuple(group_targets(domain_id, kind, interfaces))
     targets = [
         target for peer in peers for target in well_known_targets(domain_id, peer, _PARTICIPANTS)
     ]
     with socket.socket(kind.socket_family, socket.SOCK_DGRAM) as sender:
-        for call in calls:
-            send(sender, call, group_targets(domain_id, kind, interfaces))
-        send(sender, calls[0], targets)
+        # Two that do not exist: an answer goes to only one kind of address.
+        ask(sender, ours, (*group, *targets))
+        ask(sender, [(DISCOVERY_GROUP[kind], group_port)], group)
 
 
 def _call_listed(domain_id: int, family: UrlTransport) -> None:
@@ -130,7 +128,7 @@ def _call_listed(domain_id: int, family: UrlTransport) -> None:
     if own is None:
         return
     with own as sender:
-        send(sender, announcement(answered_at[:_ANSWERED_AT]), targets)
+        ask(sender, answered_at[:_ANSWERED_AT], targets, output)
 
 
 def introduce(
@@ -170,7 +168,7 @@ def introduce(
         if not answered_at or not targets:
             continue
         with contextlib.suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as sender:
-            send(sender, announcement(answered_at[:_ANSWERED_AT]), targets)
+            ask(sender, answered_at[:_ANSWERED_AT], targets)
 
 
 def republish_names(nodes: Iterable[Node]) -> None:
