@@ -141,6 +141,14 @@ def _until_ok(fleet: Fleet, name: str) -> None:
         time.sleep(0.02)
 
 
+def _until_runs(fleet: Fleet, name: str) -> None:
+    """Wait until a host's supervisor has its run directory: it may be said to be started before."""
+    deadline = time.monotonic() + BOUND_S
+    while not fleet.runs(name):
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
 def test_three_hosts_come_up_and_are_ended_from_one_place(three: Fleet) -> None:
     up = three.up(three.manifest())
     assert up.until("hosts")["destinations"] == {
@@ -277,7 +285,10 @@ def test_a_host_that_is_cut_off_runs_on_and_is_followed_once_it_is_back(
         time.sleep(1)  # a connection that is being made is not said to be cut
     else:
         up.until("host", host="b", state="cut")
-        assert three.runs("b") is (name != "asking")
+        if name == "asking":
+            assert not three.runs("b")
+        else:
+            _until_runs(three, "b")  # on a busy machine it is cut off before it has a directory
     if name == "active":
         shown = three.verb("status", stage.manifest)
         assert shown.returncode == ExitCode.VIOLATED

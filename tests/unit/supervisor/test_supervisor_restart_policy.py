@@ -450,6 +450,36 @@ def test_a_restarted_node_waits_at_a_gate_that_stays_closed_and_passes_once_it_o
     run(main())
 
 
+def test_what_is_away_while_a_restarted_node_is_let_through_keeps_orders_waiting_for_a_moment_only(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        plan = plan_of(planned_node("camera", supervision=ON_FAILURE), planned_node("viewer"))
+        world = SessionWorld(plan, tmp_path)
+
+        def hide() -> None:
+            world.graph.unseen = {"/viewer"}
+            world.graph.note()
+
+        async def die() -> None:
+            await world.story.until("[system] active")
+            world.story.in_the_moment["networks programmed"] = hide
+            world.kill("camera")
+            await world.story.until("[notice] cannot activate: the system changed")
+            await asyncio.sleep(7.0)
+            world.graph.unseen.clear()
+            world.graph.note()
+            await world.story.until("[restarted] camera")
+            assert await world.order(ControlRequest.DOWN) == "0"
+
+        await world.run(die())
+        assert [
+            each for each in world.since("networks programmed", 2) if each.startswith(("[n", "[s"))
+        ][:-1] == []
+
+    run(main())
+
+
 def test_orders_in_backoff_are_carried_out_at_once(tmp_path: Path) -> None:
     async def main() -> None:
         world = SessionWorld(_chain(), tmp_path)

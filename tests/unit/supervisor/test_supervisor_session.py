@@ -322,7 +322,8 @@ def test_a_node_that_does_not_appear_is_waited_for_as_long_as_there_is_time_and_
         await world.run()
         assert world.since("[system] connected")[1:] == [
             "[verdict] connected violated graph.missing-node /viewer",
-            "[stopping] at 8.0 s: the verdict keeps the gate closed",
+            "[stopping] at 8.0 s: the verdict keeps the gate closed, and the 8 s of the bring-up "
+            "are over (--timeout)",
             *BACK,
             *over(4),
         ]
@@ -535,6 +536,70 @@ def test_the_time_for_which_a_change_is_judged_is_not_that_of_the_node_that_wait
     run(main())
 
 
+def hiding(world: SessionWorld) -> Callable[[], None]:
+    """Return what hides `camera` from the graph, as behind a link that is cut."""
+
+    def hide() -> None:
+        world.graph.unseen = {"/camera"}
+        world.graph.note()
+
+    return hide
+
+
+HIDDEN = "[verdict] connected violated graph.missing-node /camera"
+LATE = f"{CHANGED}, and the 32 s of the bring-up are over (--timeout)"
+
+
+@pytest.mark.parametrize("moment", ["networks programmed", "/camera activate"])
+def test_what_is_away_behind_an_open_gate_may_come_back_for_as_long_as_before_it(
+    tmp_path: Path, moment: str
+) -> None:
+    """A host that is cut off once it was verified ends no bring-up that is within its time."""
+
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path, stop_after_s=0.0)
+
+        async def show() -> None:
+            await world.story.until(HIDDEN)
+            await asyncio.sleep(25.0)
+            world.graph.unseen.clear()
+            world.graph.note()
+
+        world.story.in_the_moment[moment] = hiding(world)
+        await world.run(show())
+        before = [OPENED, "/camera activate"]
+        if moment == "networks programmed":
+            heals = ["networks programmed (ok)", HIDDEN, "[verdict] connected ok", *before]
+        else:
+            heals = ["networks programmed (ok)", *before, HIDDEN, "[verdict] connected ok"]
+        assert world.since("networks programmed")[: len(heals) + 2] == [
+            *heals,
+            "/viewer activate",
+            "[system] active at 25.0 s",
+        ]
+
+    run(main())
+
+
+@pytest.mark.parametrize("moment", ["networks programmed", "/camera activate"])
+def test_what_stays_away_behind_an_open_gate_is_named_with_the_time_that_is_over(
+    tmp_path: Path, moment: str
+) -> None:
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path, timeout_s=32.0)
+        world.story.in_the_moment[moment] = hiding(world)
+        await world.run()
+        assert world.since(HIDDEN)[:2] == [HIDDEN, f"[stopping] at 32.0 s: {LATE}"]
+        assert world.outline[-1] == "[stopped] 4"
+        assert "/viewer activate" not in world.outline
+        assert world.report == (
+            f"ended when verified, before it was active, exit code 4: {LATE}; "
+            "missing: /camera (node)"
+        )
+
+    run(main())
+
+
 def test_what_changes_before_a_request_to_a_foreign_node_leaves_keeps_it_back(
     tmp_path: Path,
 ) -> None:
@@ -644,7 +709,8 @@ def test_a_node_that_is_never_discovered_is_started_three_times_and_then_waited_
         again = [line for attempt in (1, 2, 3) for line in started_again(attempt)]
         assert world.since("[verdict]")[1:] == [
             *again,
-            "[stopping] at 30.0 s: the verdict keeps the gate closed",
+            "[stopping] at 30.0 s: the verdict keeps the gate closed, and the 30 s of the bring-up "
+            "are over (--timeout)",
             *BACK,
             *over(4),
         ]
