@@ -98,6 +98,7 @@ def _soak(options: argparse.Namespace, rounds: list, *, private: bool) -> int:
                 else:
                     soaking.round(done)
             except Exception as error:  # noqa: BLE001 - whatever it is, it is reported
+                soaking.keep_stacks()
                 if excused < EXCUSED and (locked_up := soaking.locked_up()):
                     excused += 1
                     print(f"  once more, because {locked_up} ({error})", flush=True)

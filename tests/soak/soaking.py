@@ -49,6 +49,7 @@ from tests.soak.running import (
     assert_activated_on_request,
     assert_gate_held,
 )
+from tests.soak.stacks import keep_stacks
 from tests.soak.system import ISSUED, NAME, PUBLISHES, SUBSCRIBES, TINTED, manifest
 from tests.stalls import Stalls
 from tests.wall_clock import LACKS, WallClock
@@ -199,6 +200,12 @@ class Soaking:
         self.state = State()
         if run is not None:
             run.close()
+
+    def keep_stacks(self) -> None:
+        """Write what each process is doing into `stacks/`, beside manifest and logs."""
+        shutil.rmtree(self.directory / "stacks", ignore_errors=True)
+        if self._watched is not None:
+            keep_stacks(self._watched.process.pid, self.directory / "stacks")
 
     def locked_up(self) -> str:
         """Say whose participant receives nothing any more, if that is why a round failed.

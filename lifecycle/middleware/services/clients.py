@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import asyncio
 import importlib
-from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from lifecycle_msgs.msg import TransitionEvent
 from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
@@ -41,6 +41,8 @@ if TYPE_CHECKING:
 
 TIMEOUT_S = 5.0
 """For services that answer at once; a transition takes as long as the node's callback does."""
+
+_Reply = TypeVar("_Reply")
 
 _REREAD_S = 1.0
 _LEAST_S = 0.001
@@ -140,25 +142,20 @@ class NodeClients:
         request = ChangeState.Request()
         request.transition.label = transition
         left_s = max(deadline - loop.time(), _LEAST_S)
-        reply = asyncio.ensure_future(
-            self._calls.call(
+
+        async def ask() -> bool:
+            reply = await self._calls.call(
                 service, ChangeState, request, timeout_s=left_s, repeat=False, before=before
             )
-        )
+            return bool(reply.success)
+
+        async def reached() -> bool | None:
+            return await self._reached(node, transition) or None
+
         try:
-            while not reply.done():
-                await asyncio.wait((reply,), timeout=_REREAD_S)
-                if not reply.done() and await self._reached(node, transition):
-                    # A reply that is under way arrives before the next state would be read.
-                    await asyncio.wait((reply,), timeout=_REREAD_S)
-                    return bool(reply.result().success) if reply.done() else True
-            return bool(reply.result().success)
+            return await _reply(ask(), reached)
         except ServiceUnansweredError as error:
-            if await self._reached(node, transition):
-                return True
             raise ServiceUnansweredError(service, found=error.found, timeout_s=timeout_s) from error
-        finally:
-            reply.cancel()
 
     async def get_configuration(
         self, node: str, *, timeout_s: float = TIMEOUT_S, expected: bool = False
@@ -210,6 +207,9 @@ class NodeClients:
     ) -> Callable[[], Awaitable[None]]:
         """Have a component container load a node (composition_interfaces/srv/LoadNode).
 
+        The request is sent once. While the reply is missing the container is asked now and then
+        what it has loaded: this node counts as the reply. So it is with what unloads.
+
         Args:
             node: whose run names the component.
             container: full name of the container's node.
@@ -240,21 +240,30 @@ class NodeClients:
             parameters=_messages(_given_values(node).items()),
             extra_arguments=_messages(node.run.extra_arguments),
         )
-        response = await self._calls.call(
-            f"{container}/_container/load_node",
-            services.LoadNode,
-            request,
-            timeout_s=timeout_s,
-            repeat=False,
-        )
-        if not response.success:
-            raise MiddlewareError(
-                f"cannot load {node.run.component!r} into {container!r}: "
-                f"it says {response.error_message!r}"
-            )
-        number = response.unique_id
 
-        async def unload() -> None:
+        async def load() -> int:
+            response = await self._calls.call(
+                f"{container}/_container/load_node",
+                services.LoadNode,
+                request,
+                timeout_s=timeout_s,
+                repeat=False,
+            )
+            if not response.success:
+                raise MiddlewareError(
+                    f"cannot load {node.run.component!r} into {container!r}: "
+                    f"it says {response.error_message!r}"
+                )
+            return int(response.unique_id)
+
+        async def loaded() -> int | None:
+            there = await self._loaded(container, services) or {}
+            named = (number for number, name in there.items() if name == node.full_name)
+            return max(named, default=None)
+
+        number = await _reply(load(), loaded)
+
+        async def ask_to_unload() -> bool:
             answer = await self._calls.call(
                 f"{container}/_container/unload_node",
                 services.UnloadNode,
@@ -267,6 +276,14 @@ class NodeClients:
                     f"cannot unload {node.full_name!r} from {container!r}: "
                     f"it says {answer.error_message!r}"
                 )
+            return True
+
+        async def unloaded() -> bool | None:
+            there = await self._loaded(container, services)
+            return None if there is None or number in there else True
+
+        async def unload() -> None:
+            await _reply(ask_to_unload(), unloaded)
 
         return unload
 
@@ -500,6 +517,20 @@ class NodeClients:
             self._observer.node.destroy_subscription(self._parameter_events)
             self._parameter_events = None
 
+    async def _loaded(self, container: str, services: Any) -> dict[int, str] | None:
+        """Return what a container has loaded, full names by number; None if it does not answer."""
+        try:
+            there = await self._calls.call(
+                f"{container}/_container/list_nodes",
+                services.ListNodes,
+                services.ListNodes.Request(),
+                timeout_s=_REREAD_S,
+                repeat=True,
+            )
+        except ServiceUnansweredError:
+            return None
+        return dict(zip(there.unique_ids, there.full_node_names, strict=True))
+
     async def _reached(self, node: str, transition: str) -> bool:
         goal = _GOALS.get(transition)
         if goal is None:
@@ -508,6 +539,27 @@ class NodeClients:
             return await self.get_state(node, timeout_s=_REREAD_S) == goal
         except ServiceUnansweredError:
             return False
+
+
+async def _reply(
+    reply: Coroutine[Any, Any, _Reply], look: Callable[[], Awaitable[_Reply | None]]
+) -> _Reply:
+    """Wait for a reply that the server may have dropped; what `look` finds counts as one."""
+    pending = asyncio.ensure_future(reply)
+    try:
+        while not pending.done():
+            await asyncio.wait((pending,), timeout=_REREAD_S)
+            if not pending.done() and (found := await look()) is not None:
+                # A reply that is under way arrives before one would look again.
+                await asyncio.wait((pending,), timeout=_REREAD_S)
+                return pending.result() if pending.done() else found
+        return pending.result()
+    except ServiceUnansweredError:
+        if (found := await look()) is None:
+            raise
+        return found
+    finally:
+        pending.cancel()
 
 
 _PARAMETER_TYPES = {

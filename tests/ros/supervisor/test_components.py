@@ -120,6 +120,26 @@ def test_components_in_a_container_of_others_come_and_go(
         run.close()
 
 
+def test_what_a_container_did_counts_where_its_reply_is_lost(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    nodes = talker_and_hearer("container", tmp_path / "values.yaml")
+    ours = {"run": {"command": [*CONTAINER, "mute"]}, **OPEN}
+    manifest = system(tmp_path, fresh_domain, container=ours, **nodes)
+    run = Up(manifest, runtime=tmp_path, variables=VARIABLES)
+    try:
+        run.until("system", reached="active")
+        again = verb("restart", str(manifest), "talker", runtime=tmp_path)
+        assert again.returncode == ExitCode.OK, again.stderr
+        (log,) = tmp_path.glob("log/2*/container.log")
+        talked = [line for line in log.read_text().splitlines() if "talker" in line]
+        assert talked == [f"{did} /robot/talker" for did in ("loaded", "unloaded", "loaded")]
+        run.signal(signal.SIGTERM)
+        assert run.finish() == ExitCode.OK, run.said()
+    finally:
+        run.close()
+
+
 @pytest.mark.thorough
 def test_a_container_of_ours_takes_its_components_along(tmp_path: Path, fresh_domain: int) -> None:
     nodes = talker_and_hearer("container", tmp_path / "values.yaml")

@@ -1,7 +1,8 @@
-"""A component container as rclcpp_components has it, of rclpy nodes: `container.py [NAME]`.
+"""A component container as rclcpp_components has it, of rclpy nodes: `container.py [NAME] [mute]`.
 
-Prints `loaded NAME [EXTRA:=VALUE]…` and `unloaded NAME`, and ends where it is asked to load
-`demo/Fatal`.
+A mute one does not answer requests to load and unload, like a server that does not know its
+client's reader yet. Prints `loaded NAME [EXTRA:=VALUE]…` and `unloaded NAME`, and ends where it is
+asked to load `demo/Fatal`.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import sys
 from typing import Any
 
 import rclpy
-from composition_interfaces.srv import LoadNode, UnloadNode, fields_of, respond
+from composition_interfaces.srv import ListNodes, LoadNode, UnloadNode, fields_of, respond
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.node import Node
@@ -37,12 +38,18 @@ PLUGINS = {"Talker": Talker, "Hearer": Hearer}
 
 
 class Container(Node):
-    def __init__(self, name: str, executor: SingleThreadedExecutor) -> None:
+    def __init__(self, name: str, executor: SingleThreadedExecutor, *, mute: bool) -> None:
         super().__init__(name)
         self._runs = executor
         self._nodes: dict[int, Node] = {}
-        self.create_service(LoadNode, "~/_container/load_node", self._load)
-        self.create_service(UnloadNode, "~/_container/unload_node", self._unload)
+        self.create_service(ListNodes, "~/_container/list_nodes", self._list)
+        changing = (
+            self.create_service(LoadNode, "~/_container/load_node", self._load),
+            self.create_service(UnloadNode, "~/_container/unload_node", self._unload),
+        )
+        if mute:
+            for each in changing:
+                each.send_response = lambda *_: None
 
     def _load(self, request: Any, response: Any) -> Any:
         asked = fields_of(request)
@@ -65,6 +72,10 @@ class Container(Node):
         print(" ".join(["loaded", node.get_fully_qualified_name(), *extra]), flush=True)
         return respond(response, success=True, error_message="", unique_id=number)
 
+    def _list(self, request: Any, response: Any) -> Any:
+        names = [each.get_fully_qualified_name() for each in self._nodes.values()]
+        return respond(response, full_node_names=names, unique_ids=[*self._nodes])
+
     def _unload(self, request: Any, response: Any) -> Any:
         node = self._nodes.pop(fields_of(request)["unique_id"])
         name = node.get_fully_qualified_name()
@@ -77,8 +88,9 @@ class Container(Node):
 def main() -> None:
     rclpy.init(args=sys.argv)
     executor = SingleThreadedExecutor()
-    name = rclpy.utilities.remove_ros_args(sys.argv)[1:] or ["container"]
-    executor.add_node(Container(*name, executor))
+    words = rclpy.utilities.remove_ros_args(sys.argv)[1:]
+    names = [each for each in words if each != "mute"] or ["container"]
+    executor.add_node(Container(*names, executor, mute="mute" in words))
     print("ready", flush=True)
     try:
         executor.spin()

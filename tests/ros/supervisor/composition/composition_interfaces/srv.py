@@ -56,7 +56,9 @@ def _field(name: str) -> property:
     return property(lambda response: json.loads(response.result.reason)[name])
 
 
-for _name in ("success", "error_message", "full_node_name", "unique_id"):
+_LISTS = ("full_node_names", "unique_ids")
+
+for _name in ("success", "error_message", "full_node_name", "unique_id", *_LISTS):
     setattr(SetParametersAtomically.Response, _name, _field(_name))
 
 
@@ -68,5 +70,11 @@ class LoadNode(SetParametersAtomically):
 
 class UnloadNode(SetParametersAtomically):
     """Unload the node of a number."""
+
+    Request = _request(SetParametersAtomically.Request)
+
+
+class ListNodes(SetParametersAtomically):
+    """List the nodes that were loaded."""
 
     Request = _request(SetParametersAtomically.Request)
