@@ -144,7 +144,9 @@ class _Time:
 
     def __str__(self) -> str:
         """Say that it is over."""
-        return f"the {round(self.deadline - self._began, 1):g} s of the bring-up are over (--timeout)"
+        return (
+            f"the {round(self.deadline - self._began, 1):g} s of the bring-up are over (--timeout)"
+        )
 
 
 class SessionParticipant(

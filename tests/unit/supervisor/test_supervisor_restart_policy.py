@@ -38,6 +38,7 @@ from tests.unit.supervisor.fakes import run
 from tests.unit.supervisor.session_world import (
     ACTIVATED,
     CAMERA_DOWN,
+    CHANGED,
     CONNECTED,
     DOWN,
     INTRUDED,
@@ -450,7 +451,7 @@ def test_a_restarted_node_waits_at_a_gate_that_stays_closed_and_passes_once_it_o
     run(main())
 
 
-def test_what_is_away_while_a_restarted_node_is_let_through_keeps_orders_waiting_for_a_moment_only(
+def test_a_restarted_node_is_not_let_through_beside_one_that_is_away_and_orders_wait_5_s_for_that(
     tmp_path: Path,
 ) -> None:
     async def main() -> None:
@@ -465,17 +466,27 @@ def test_what_is_away_while_a_restarted_node_is_let_through_keeps_orders_waiting
             await world.story.until("[system] active")
             world.story.in_the_moment["networks programmed"] = hide
             world.kill("camera")
-            await world.story.until("[notice] cannot activate: the system changed")
-            await asyncio.sleep(7.0)
+            await world.story.until("networks programmed", 2)
+            began_s = asyncio.get_running_loop().time()
+            assert await world.order(ControlRequest.PAUSE) == "0"
+            waited_s = asyncio.get_running_loop().time() - began_s
+            assert waited_s == pytest.approx(5.0, abs=0.2)
             world.graph.unseen.clear()
             world.graph.note()
-            await world.story.until("[restarted] camera")
+            assert await world.order(ControlRequest.RESUME) == "0"
             assert await world.order(ControlRequest.DOWN) == "0"
 
         await world.run(die())
-        assert [
-            each for each in world.since("networks programmed", 2) if each.startswith(("[n", "[s"))
-        ][:-1] == []
+        away = "graph.missing-node: cannot find node /viewer in domain 30"
+        assert world.since("networks programmed", 2)[1:8] == [
+            "[verdict] connected violated graph.missing-node /viewer",
+            f"[notice] cannot activate: {CHANGED}, and its verdict now is violated\n  {away}",
+            "/viewer deactivate",
+            "[system] paused at 6.0 s",
+            "[restarted] camera (1)",
+            "[verdict] connected ok",
+            "[system] verified at 6.0 s",
+        ]
 
     run(main())
 
