@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.manifest.model import Condition, Timeouts
+from lifecycle.manifest.model import Condition, RunKind, Timeouts
 from lifecycle.supervisor.control.protocol import ControlRequest
 from lifecycle.supervisor.run.options import Until
 from tests.builders import plan_of, planned_node
@@ -625,6 +625,25 @@ def test_what_changes_before_a_request_to_a_foreign_node_leaves_keeps_it_back(
             *CAMERA_DOWN,
             *over(4),
         ]
+
+    run(main())
+
+
+def test_a_foreign_node_is_not_blamed_for_the_time_in_which_its_request_is_kept_back(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        limits = Timeouts(activate_s=3.0)
+        base = planned_node("base", kind=RunKind.ATTACH, timeouts=limits)
+        world = SessionWorld(plan_of(planned_node("camera"), base), tmp_path)
+        world.graph.services.matched_after_s["/base activate"] = 1.0
+        world.story.in_the_moment["[request] /base activate"] = hiding(world)
+        await world.run()
+        assert world.since("[gate]")[:2] == ["[gate] ok: /camera, /base", "/camera activate"]
+        assert [each for each in world.outline if "stopping" in each or "failure" in each] == [
+            f"[stopping] at 3.5 s: {CHANGED}"
+        ]
+        assert "/base activate" not in world.outline
 
     run(main())
 
