@@ -288,7 +288,7 @@ def test_who_waits_too_long_for_a_verdict_is_given_the_one_that_keeps_the_gate_c
         permit.expire()
         waits = asyncio.ensure_future(permit.use("/camera"))
         await system.begun.wait()
-        with pytest.raises(VerificationError, match="run.silent-node") as caught:
+        with pytest.raises(VerificationError, match=r"run\.silent-node") as caught:
             permit.expire()
         assert caught.value.again
         await waits

@@ -42,6 +42,12 @@ from tests.unit.supervisor.session_world import (
 ENDING = 1 + len(DOWN) + len(over(0))
 """Lines of an outline from "[stopping]" on, of what was active."""
 
+
+def time_over(timeout_s: int) -> str:
+    """Return what names the time of a bring-up that is over."""
+    return f"the {timeout_s} s of the bring-up are over (--timeout)"
+
+
 # Bring-up
 
 
@@ -322,8 +328,7 @@ def test_a_node_that_does_not_appear_is_waited_for_as_long_as_there_is_time_and_
         await world.run()
         assert world.since("[system] connected")[1:] == [
             "[verdict] connected violated graph.missing-node /viewer",
-            "[stopping] at 8.0 s: the verdict keeps the gate closed, and the 8 s of the bring-up "
-            "are over (--timeout)",
+            f"[stopping] at 8.0 s: the verdict keeps the gate closed, and {time_over(8)}",
             *BACK,
             *over(4),
         ]
@@ -547,7 +552,7 @@ def hiding(world: SessionWorld) -> Callable[[], None]:
 
 
 HIDDEN = "[verdict] connected violated graph.missing-node /camera"
-LATE = f"{CHANGED}, and the 32 s of the bring-up are over (--timeout)"
+LATE = f"{CHANGED}, and {time_over(32)}"
 
 
 @pytest.mark.parametrize("moment", ["networks programmed", "/camera activate"])
@@ -728,8 +733,7 @@ def test_a_node_that_is_never_discovered_is_started_three_times_and_then_waited_
         again = [line for attempt in (1, 2, 3) for line in started_again(attempt)]
         assert world.since("[verdict]")[1:] == [
             *again,
-            "[stopping] at 30.0 s: the verdict keeps the gate closed, and the 30 s of the bring-up "
-            "are over (--timeout)",
+            f"[stopping] at 30.0 s: the verdict keeps the gate closed, and {time_over(30)}",
             *BACK,
             *over(4),
         ]
