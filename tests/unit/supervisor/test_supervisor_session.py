@@ -645,9 +645,9 @@ def test_a_foreign_node_is_not_blamed_for_the_time_in_which_its_request_is_kept_
         world.story.in_the_moment["[request] /base activate"] = hiding(world)
         await world.run()
         assert world.since("[gate]")[:2] == ["[gate] ok: /camera, /base", "/camera activate"]
-        assert [each for each in world.outline if "stopping" in each or "failure" in each] == [
-            f"[stopping] at 3.5 s: {CHANGED}"
-        ]
+        # When is a matter of the load of this machine, see `wait_under_load`.
+        ends = [each for each in world.outline if each.startswith(("[stopping]", "[failure]"))]
+        assert [each.partition(" s: ")[2] for each in ends] == [CHANGED]
         assert "/base activate" not in world.outline
 
     run(main())
