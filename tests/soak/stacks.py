@@ -1,4 +1,4 @@
-"""What every process of a run is doing, at the moment when a round failed."""
+"""What every process of a run is doing and has open, at the moment when a round failed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _WITH = (
 
 
 def keep_stacks(pid: int, directory: Path) -> None:
-    """Write the stacks of a process, of all that descend from it, and of our own.
+    """Write stacks and shared memory of a process, of all that descend from it, and of our own.
 
     Args:
         pid: process; one that ended leaves nothing.
@@ -28,8 +28,19 @@ def keep_stacks(pid: int, directory: Path) -> None:
         family = [top, *top.children(recursive=True)]
     except psutil.Error:
         family = []
-    for each in (*(one.pid for one in family), os.getpid()):
-        (directory / f"{each}.txt").write_text(_stacks(each))
+    pids = (*(one.pid for one in family), os.getpid())
+    shared = {pid: _shared(pid) for pid in pids}
+    for pid in pids:
+        (directory / f"{pid}.txt").write_text(f"{shared[pid]}\n\n{_stacks(pid)}")
+
+
+def _shared(pid: int) -> str:
+    """Return which shared memory of Fast DDS a process has; what has no name any more, too."""
+    try:
+        maps = Path(f"/proc/{pid}/maps").read_text().splitlines()
+    except OSError:
+        return "ended"
+    return "\n".join(dict.fromkeys(each.split(None, 5)[-1] for each in maps if "fastrtps_" in each))
 
 
 def _stacks(pid: int) -> str:

@@ -15,6 +15,11 @@ host's IPC do). So it never proves that a file is unused; what the kernel grants
   can open it until the lease is given back. A port needs that too, a sender may be about to look
   for it; a segment that has a lock file does not: its readers keep a dead owner's mapping for a
   while, which removing the name does not touch.
+
+Who opens a file that has such a lease waits until it is given back, at most 45 s
+(/proc/sys/fs/lease-break-time). A thread of the own process that waits so in Fast DDS holds the
+GIL, and so keeps the lease from being given back: `sweep`, `disown_ports` and `leftovers` belong
+into processes without participants over shared memory.
 """
 
 from __future__ import annotations

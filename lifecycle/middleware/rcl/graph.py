@@ -423,6 +423,7 @@ class GraphObserver:
         if self._destroyed:
             return frozenset()
         homes, own = self._stale_node_filter.homes(), self.prefix
+        reported = frozenset(reported)
         claimed = {*reported, *(prefix for name in nodes for prefix in homes.get(name, ()))}
         if not claimed and is_alone(pid):
             named = {prefix for name, home in homes.items() if name for prefix in home}
@@ -431,6 +432,9 @@ class GraphObserver:
             each[:PROCESS_DIGITS] for each in claimed if own and is_of_process(each, pid, own)
         }
         processes.discard(own[:PROCESS_DIGITS])
+        # It may have come and gone between two looks.
+        was_on = (each for each in reported if each[:PROCESS_DIGITS] in processes)
+        self._stale_node_filter.was_on(nodes, frozenset(was_on))
         return frozenset(
             each for each in self._stale_node_filter.shown() if each[:PROCESS_DIGITS] in processes
         )

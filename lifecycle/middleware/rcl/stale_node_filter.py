@@ -55,6 +55,16 @@ class StaleNodeFilter:
         """
         self._dead |= frozenset(prefixes)
 
+    def was_on(self, names: Iterable[str], prefixes: frozenset[str]) -> None:
+        """Take note of the participants that nodes were on, which may have been seen too briefly.
+
+        Args:
+            names: fully qualified.
+            prefixes: of GUIDs, 24 hex digits each.
+        """
+        for name in names:
+            self._homes[name] = self._homes.get(name, frozenset()) | prefixes
+
     def ignores(self, gid: str) -> bool:
         """Whether an endpoint or participant is one of a dead process.
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Coroutine, Iterable, Sequence
+from collections.abc import Callable, Coroutine, Iterable, Sequence
 from typing import Any, Protocol
 
 from lifecycle.errors import BringUpError
@@ -144,9 +144,6 @@ class ParticipantRegistry(Protocol):
     def remove_participants(self, prefixes: Iterable[str], pids: Iterable[int]) -> None:
         """Have all others forget participants whose process is dead."""
 
-    def disown_ports(self) -> None:
-        """Have all others send no more to ports in shared memory whose process is dead."""
-
     def introduce(self, newcomers: Iterable[int], pids: Iterable[int]) -> None:
         """Have new participants discovered by, and discover, those that were there before."""
 
@@ -167,11 +164,15 @@ class StaleNodes:
     Args:
         system: whose processes; `on_event` must be given its events.
         graph: see above.
+        disown_ports: has all others send no more to ports in shared memory whose process is dead.
     """
 
-    def __init__(self, system: System, graph: ParticipantRegistry) -> None:
+    def __init__(
+        self, system: System, graph: ParticipantRegistry, *, disown_ports: Callable[[], None]
+    ) -> None:
         self._system = system
         self._graph = graph
+        self._disown_ports = disown_ports
         self._later: set[asyncio.TimerHandle] = set()
         self._publishing: set[asyncio.Future[None]] = set()
         self._closed = False
@@ -265,7 +266,7 @@ class StaleNodes:
         """
         if self._closed:
             return
-        self._graph.disown_ports()
+        self._disown_ports()
         names = [node.name for node in nodes]
         reported = frozenset(prefix for node in nodes for prefix in _reported(node))
         prefixes = self._graph.participants_of(pid, nodes=names, reported=reported)

@@ -31,7 +31,7 @@ from lifecycle.supervisor.processes.control_channel import (
 )
 from lifecycle.supervisor.processes.process import ManagedProcess, Spawner, wait_under_load
 from lifecycle.supervisor.run.events import Notice
-from lifecycle.supervisor.run.failure import StepFailedError, ended, together
+from lifecycle.supervisor.run.failure import StepFailedError, ended, together, within
 from lifecycle.verify import (
     DEADLINE,
     NOT_WIRED,
@@ -193,7 +193,7 @@ class BringUp:
             StepFailedError: the steps that failed, or what was missing after `timeout_s`.
         """
         try:
-            await asyncio.wait_for(self._connect_all(self._some(nodes)), timeout_s)
+            await within(timeout_s, self._connect_all(self._some(nodes)))
         except asyncio.TimeoutError:
             raise self._failure() or self._late(timeout_s) from None
 
@@ -209,8 +209,8 @@ class BringUp:
         """
         held = [node for node in self._some(nodes) if node.is_to_be_active]
         try:
-            await asyncio.wait_for(
-                self._side_by_side(self._activate(node, permit) for node in held), timeout_s
+            await within(
+                timeout_s, self._side_by_side(self._activate(node, permit) for node in held)
             )
         except asyncio.TimeoutError:
             if (failure := self._failure()) is not None:
@@ -280,13 +280,14 @@ class BringUp:
         try:
             await self._side_by_side(self._walk(node) for node in nodes)
         finally:
-            if self._gathering is not None:
-                await self._gathering.close()
-            for start in self._starts.values():
-                start.cancel()
-            await asyncio.gather(*self._starts.values(), return_exceptions=True)
             # A process that is started again later is another one.
-            self._starts.clear()
+            gathering, self._gathering = self._gathering, None
+            starts, self._starts = tuple(self._starts.values()), {}
+            for start in starts:
+                start.cancel()
+            if gathering is not None:
+                await gathering.close()
+            await ended(*starts)
 
     async def _side_by_side(self, walks: Iterable[Coroutine[Any, Any, None]]) -> None:
         """Run all of them to their end, or until one fails; then none of them goes on.

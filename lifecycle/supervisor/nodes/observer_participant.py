@@ -205,12 +205,6 @@ class ObserverParticipant:
         """Have all participants forget those whose process is dead."""
         self._graph.discovery.remove_participants(prefixes, pids)
 
-    def disown_ports(self) -> None:
-        """Have all participants of this host send no more to ports whose process is dead."""
-        from lifecycle.middleware import disown_ports
-
-        disown_ports()
-
     @property
     def prefix(self) -> str:
         """GUID prefix of our participant, 24 hex digits; empty where that is not known."""

@@ -20,11 +20,13 @@ from lifecycle.errors import BringUpError
 from lifecycle.graph import set_within
 from lifecycle.supervisor.processes.forerunner import CLOSE_S, ForkServerProcess
 from lifecycle.supervisor.processes.fork_server_main import (
+    DISOWN,
     KEEP,
     LARGEST_MESSAGE,
     MSG_CMSG_CLOEXEC,
     RELEASE,
     SERVES,
+    SWEEP,
     ChildReport,
     ForkRequest,
 )
@@ -42,6 +44,9 @@ _SOON_S = 2.0
 """One that dies sooner after its start is started again only when it is needed."""
 
 _TRIES = 3
+
+_SWEPT_S = 5.0
+"""A sweep takes milliseconds, on a loaded machine longer; what is left is swept at the end."""
 
 _STOPS = os.WSTOPPED | os.WCONTINUED | os.WNOHANG
 
@@ -164,6 +169,7 @@ class ForkServer:
         self._emit = emit or Emitter()
         self._pending: dict[int, tuple[asyncio.Future[ForkServerChild], SpawnRequest]] = {}
         self._children: dict[int, ForkServerChild] = {}
+        self._sweeping: dict[int, asyncio.Future[tuple[str, ...]]] = {}
         self._next = 0
         self._loop = asyncio.get_running_loop()
         # Of a shell that became this process by exec: no part of the run.
@@ -263,6 +269,26 @@ class ForkServer:
             raise
         return await born
 
+    def disown_ports(self) -> None:
+        """Have all participants of this host send no more to ports whose process was killed."""
+        self._send(DISOWN, ())
+
+    async def sweep(self, names: Collection[str]) -> tuple[str, ...]:
+        """Have files of shared memory removed that are unused, see `lifecycle.middleware.sweep`.
+
+        Returns:
+            The names removed; none if the fork server is gone, or does not answer.
+        """
+        if not names or not self._alive:
+            return ()
+        self._next += 1
+        number, swept = self._next, self._loop.create_future()
+        self._sweeping[number] = swept
+        self._send("\n".join((SWEEP, str(number), *names)), ())
+        done, _ = await asyncio.wait((swept,), timeout=_SWEPT_S)
+        self._sweeping.pop(number, None)
+        return swept.result() if done else ()
+
     def _send(self, message: str, descriptors: Collection[int]) -> None:
         """Send what is not answered; one that has died is noticed elsewhere."""
         if self._alive:
@@ -301,6 +327,9 @@ class ForkServer:
         report = from_json(data, ChildReport)
         if report.id == SERVES.id:
             self._serves.set()
+        elif report.swept is not None:
+            if report.id in self._sweeping:
+                self._sweeping.pop(report.id).set_result(report.swept)
         elif report.stopped is not None:
             if report.id in self._children:
                 self._children[report.id].on_stop(report.stopped)
@@ -351,6 +380,9 @@ class ForkServer:
             if not born.done():
                 born.set_exception(BringUpError(f"the fork server {self._how}"))
         self._pending.clear()
+        for swept in self._sweeping.values():
+            swept.set_result(())
+        self._sweeping.clear()
         self._renew()
 
     def _renew(self) -> None:

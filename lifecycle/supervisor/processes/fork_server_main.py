@@ -4,11 +4,12 @@ Owns: what runs in `python -m lifecycle.supervisor.processes.fork_server_main SO
 [--programs] [--again]`, or in a fork of the supervisor that is made to be the same (`become`), so
 that what both need is imported once. It stays single-threaded and never calls rclpy.init, so that
 forking is safe and every child is a participant of its own; with `--preload` a forked host skips
-~130 ms of imports. Each child leads a session of its own. It adopts what its children leave behind
-(PR_SET_CHILD_SUBREAPER), so as long as it lives, what descends from it is what the run started. If
-the supervisor vanishes it ends what is left of its children, bounded, and of those of a fork server
-before it that was killed; those that are to be kept it reads, so that none of them writes to a pipe
-without a reader.
+~130 ms of imports. For the same reason it is who handles shared memory that processes have left
+(lifecycle.middleware.process.shared_memory). Each child leads a session of its own. It adopts what
+its children leave behind (PR_SET_CHILD_SUBREAPER), so as long as it lives, what descends from it is
+what the run started. If the supervisor vanishes it ends what is left of its children, bounded, and
+of those of a fork server before it that was killed; those that are to be kept it reads, so that
+none of them writes to a pipe without a reader.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ import sys
 import time
 import traceback
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -33,11 +34,13 @@ from lifecycle.codec import from_json, to_json
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware import (
     adopt_orphans,
+    disown_ports,
     drop_network_administration,
     fill_heap,
     limit_resources,
     refuse_new_privileges,
     rename_process,
+    sweep,
 )
 from lifecycle.supervisor.processes.forerunner import PRELOAD
 
@@ -84,6 +87,7 @@ class ChildReport:
         status: waitpid(2) status; None while it runs.
         error: why it could not be forked.
         stopped: a signal stopped it (True) or made it continue (False); None reports neither.
+        swept: names of the files removed, where `SWEEP` asked with this id.
     """
 
     id: int
@@ -91,6 +95,7 @@ class ChildReport:
     status: int | None = None
     error: str = ""
     stopped: bool | None = None
+    swept: tuple[str, ...] | None = None
 
 
 KEEP = "keep"
@@ -99,6 +104,12 @@ to this file; one a line, with our ends of its output."""
 
 RELEASE = "release"
 """Begins a message: should the supervisor vanish, end the child of this pid, as all others."""
+
+DISOWN = "disown"
+"""A message: have all let go of ports in shared memory whose process was killed; not answered."""
+
+SWEEP = "sweep"
+"""Begins a message: remove unused files of shared memory; an id and their names, one a line."""
 
 
 GRACE_S = 4.0
@@ -194,16 +205,29 @@ class _ForkServer:
             return False
         if not data:
             return False
-        if data.startswith(PRELOAD.encode()):
-            _preload(data.decode().split("\n")[1:])
-            return True
-        if data.startswith((KEEP.encode(), RELEASE.encode())):
-            self._keep(data.decode(), descriptors)
-            return True
-        request = from_json(data, ForkRequest)
+        if data.startswith(b"{"):
+            self._fork(from_json(data, ForkRequest), descriptors)
+        else:
+            self._obey(data.decode(), descriptors)
+        return True
+
+    def _obey(self, message: str, descriptors: Collection[int]) -> None:
+        """Do what one of the words above says."""
+        word, *lines = message.split("\n")
+        if word == DISOWN:
+            disown_ports()
+        elif word == SWEEP:
+            number, *names = lines
+            self._tell(ChildReport(id=int(number), swept=sweep(names)))
+        elif word in (KEEP, RELEASE):
+            self._keep(message, descriptors)
+        elif word == PRELOAD:
+            _preload(lines)
+
+    def _fork(self, request: ForkRequest, descriptors: list[int]) -> None:
         if request == SERVES:
             self._tell(ChildReport(id=request.id))
-            return True
+            return
         try:
             with warnings.catch_warnings():
                 # Python 3.12 warns of any other thread. Those here belong to the libraries that
@@ -219,7 +243,6 @@ class _ForkServer:
             os.close(descriptor)
         if pid > 0:
             self._born(request.id, pid)
-        return True
 
     def _keep(self, message: str, outputs: Iterable[int]) -> None:
         """Spare a child should the supervisor vanish, or not any more."""

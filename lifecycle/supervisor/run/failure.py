@@ -120,21 +120,45 @@ def with_failure(verdict: Verdict, failure: StepFailedError) -> Verdict:
 
 T = TypeVar("T")
 
-_AGAIN_S = 1.0
-"""Far longer than any task takes to notice that it was cancelled."""
+_AGAIN_S = 5.0
+"""Far longer than any task takes to notice that it was cancelled, also on a loaded machine."""
 
 
 async def ended(*tasks: asyncio.Future[Any]) -> None:
-    """Cancel tasks and wait until each has ended, however it did.
+    """Cancel tasks and wait until each has ended, however it did, also if this is cancelled.
 
     They are cancelled again and again: asyncio.wait_for of Python 3.10 and 3.11 may take a
     cancellation for the end of its wait (python/cpython#86296).
     """
+    cancelled: asyncio.CancelledError | None = None
     while left := [each for each in tasks if not each.done()]:
         for each in left:
             each.cancel()
-        await asyncio.wait(left, timeout=_AGAIN_S)
+        try:
+            await asyncio.wait(left, timeout=_AGAIN_S)
+        except asyncio.CancelledError as error:
+            cancelled = error
     await asyncio.gather(*tasks, return_exceptions=True)
+    if cancelled is not None:
+        raise cancelled
+
+
+async def within(seconds: float, work: Coroutine[Any, Any, T]) -> T:
+    """Carry something out in a task of its own, for so long; nothing of it runs on afterwards.
+
+    asyncio.wait_for gives up what it waits for if it is cancelled a second time.
+
+    Raises:
+        asyncio.TimeoutError: it took longer.
+    """
+    task = asyncio.ensure_future(work)
+    try:
+        done, _ = await asyncio.wait((task,), timeout=seconds)
+    finally:
+        await ended(task)
+    if not done and task.cancelled():
+        raise asyncio.TimeoutError
+    return task.result()
 
 
 async def failure_of(step: Coroutine[Any, Any, None]) -> StepFailedError | None:

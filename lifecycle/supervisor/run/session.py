@@ -207,6 +207,9 @@ class SessionForkServer(Spawner, ProcessFamily, Protocol):
     def note_stops(self) -> None:
         """Look, after SIGCHLD, which children were stopped or continue."""
 
+    def disown_ports(self) -> None:
+        """Have all participants of this host send no more to ports whose process was killed."""
+
 
 class Session:
     """A supervisor of one system.
@@ -275,7 +278,9 @@ class Session:
         )
         self._gate = Gate(strict=options.strict, judging=self._judge)
         sightings = Sightings(system, observer_participant, self._changes)
-        self._stale = StaleNodes(system, observer_participant)
+        self._stale = StaleNodes(
+            system, observer_participant, disown_ports=fork_server.disown_ports
+        )
         emit.listen(self._stale.on_event)
         self._records = records
         self._process_monitor = ProcessMonitor(system)

@@ -243,13 +243,12 @@ def _up(
                 return UpResult(exit_code=failure.exit_code, verdict=verdict)
             finally:
                 await discovery_server.end(system, asyncio.Event())
-                await fork_server.close()
-                _sweep(records, emit)
+                await _close(fork_server, records, emit)
 
         return asyncio.run(_leaving_last(run, conclude))
     finally:
         forerunner.close()
-        _sweep(records, within_s=_LET_GO_S)
+        _sweep(records)
         directory.release()
 
 
@@ -326,11 +325,17 @@ within milliseconds, one that sends nothing perhaps never. Then the port stays f
 """
 
 
-def _sweep(records: Records | None, emit: Emitter | None = None, *, within_s: float = 0.0) -> None:
-    """Remove the shared memory that processes of the run have left."""
-    swept = sweep(records.left(), within_s=within_s) if records else ()
-    if swept and emit:
+async def _close(fork_server: ForkServer, records: Records, emit: Emitter) -> None:
+    """Have the fork server remove the shared memory that processes have left, and end it."""
+    if swept := await fork_server.sweep(records.left()):
         emit(Notice(message=f"removed shared memory left in /dev/shm: {', '.join(swept)}"))
+    await fork_server.close()
+
+
+def _sweep(records: Records | None) -> None:
+    """Remove what is still left once our own participant is gone, too."""
+    if records:
+        sweep(records.left(), within_s=_LET_GO_S)
 
 
 @contextlib.contextmanager

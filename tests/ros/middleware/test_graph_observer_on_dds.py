@@ -188,6 +188,34 @@ def test_a_ghost_is_not_counted_beside_participants_of_connections(
             claims.terminate()
 
 
+def test_a_ghost_of_a_node_that_was_never_seen_is_nobody_once_its_process_has_ended(
+    observer: GraphObserver, domain_id: int, wait_until: WaitUntil
+) -> None:
+    """What came and left between two looks is known by what it said of itself."""
+    wait_until(lambda: observer.prefix)
+    with subprocess.Popen([sys.executable, "-c", ""]) as process:
+        pass
+    pid_digits = (process.pid & 0xFFFF).to_bytes(2, "little").hex()
+    gone = observer.prefix[:8] + pid_digits + "00000001" + "0000"
+    assert len(gone) == 24
+    ghost = [
+        *(sys.executable, BARE_DDS, "--write", "rt/said:std_msgs::msg::dds_::String_"),
+        *("--node", "/", "bare", "--ghost", gone, "/", "brief"),
+    ]
+    with subprocess.Popen(
+        ghost, cwd=ROOT, env={**os.environ, "ROS_DOMAIN_ID": str(domain_id)}
+    ) as claims:
+        try:
+            wait_until(lambda: "/brief" in node_names(observer.node))
+            wait_until(lambda: {"/bare", "/brief"} <= nodes(observer).keys())
+            found = observer.participants_of(process.pid, nodes=["/brief"], reported=[gone])
+            assert found == frozenset()
+            wait_until(lambda: "/bare" in nodes(observer) and "/brief" not in nodes(observer))
+            assert "/brief" in node_names(observer.node)
+        finally:
+            claims.terminate()
+
+
 def test_a_node_that_comes_again_beside_a_ghost_of_its_name_has_its_own_services(
     observer: GraphObserver, context: rclpy.Context, domain_id: int, wait_until: WaitUntil
 ) -> None:

@@ -162,6 +162,42 @@ def test_shared_memory_of_a_process_killed_as_soon_as_it_has_made_it_is_removed(
     assert set(leftovers()) <= before
 
 
+_NOTES_LEASES = """
+import fcntl, os, pathlib, sys
+
+def note(event, arguments):
+    if event == "fcntl.fcntl" and arguments[1] == fcntl.F_SETLEASE:
+        threads = [each.read_text() for each in pathlib.Path("/proc/self/task").glob("*/comm")]
+        has_participant = any(each.startswith("dds.ev") for each in threads)
+        with open(os.environ["LEASES"], "a") as file:
+            file.write(f"{os.getpid()} {has_participant}\\n")
+
+sys.addaudithook(note)
+"""
+
+
+def test_no_process_that_has_a_participant_keeps_others_from_opening_shared_memory(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    """Its own threads would wait for that in Fast DDS, with the GIL: it would hang for 45 s."""
+    (tmp_path / "sitecustomize.py").write_text(_NOTES_LEASES)
+    noted = tmp_path / "leases"
+    variables = {"PYTHONPATH": str(tmp_path), "LEASES": str(noted)}
+    manifest = pair(tmp_path, fresh_domain, edit={"restart": "on-failure"})
+    run = Up(manifest, runtime=tmp_path, variables=variables)
+    try:
+        run.until("system", reached="active")
+        kill(run, "talker")
+        run.until("restarted")
+        run.signal(signal.SIGTERM)
+        assert run.finish() == ExitCode.OK
+    finally:
+        run.close()
+    leases = [line.split() for line in noted.read_text().splitlines()]
+    assert str(run.process.pid) != leases[0][0], "the fork server has not looked"
+    assert {has_participant for _, has_participant in leases} == {"False"}
+
+
 @pytest.mark.parametrize("mode", ["static", "server"])
 def test_where_ports_are_fixed_a_killed_node_is_gone_and_comes_back_at_once(
     mode: str, tmp_path: Path, fresh_domain: int

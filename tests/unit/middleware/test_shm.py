@@ -8,7 +8,6 @@ import fcntl
 import mmap
 import os
 import select
-import struct
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,6 +24,7 @@ from lifecycle.middleware import (
 )
 from lifecycle.middleware.process import shared_memory
 from lifecycle.middleware.process.shared_memory import Creations
+from tests.builders import port_node
 
 SEGMENT = "fastrtps_0123456789abcdef"
 PORT = "fastrtps_port7411"
@@ -239,12 +239,6 @@ def test_the_kernels_list_of_locks_names_the_owner_of_a_group(directory: Path) -
 
 def test_a_process_that_has_ended_owns_nothing() -> None:
     assert segments_of([2**22 + 1]) == frozenset()
-
-
-def port_node(*, number: int = 7411, wait_ms: int = 333, flags: int = 7) -> bytes:
-    """A port's memory, as far as it is looked at, as Fast DDS 2.14.5 was seen to write it."""
-    node = struct.pack("=7I", number, 1, 1000, wait_ms, 512, 1, flags)
-    return struct.pack("=I", 7411) + bytes(272) + node + bytes(1024)
 
 
 @pytest.mark.parametrize(

@@ -107,6 +107,9 @@ class FakeForkServer(FakeSpawner):
     def note_stops(self) -> None:
         """No child is of the kernel's."""
 
+    def disown_ports(self) -> None:
+        """There is no shared memory."""
+
     async def ready(self) -> None:
         if self.cannot_start:
             raise StepFailedError(self.cannot_start, rule=rule("run.start-failed"), subject="robot")
@@ -294,9 +297,6 @@ class FakeParticipant:
 
     def remove_participants(self, prefixes: Iterable[str], pids: Iterable[int]) -> None:
         raise AssertionError(f"nothing is left in this graph: {prefixes} {pids}")
-
-    def disown_ports(self) -> None:
-        """There is no shared memory."""
 
     def introduce(self, newcomers: Iterable[int], pids: Iterable[int]) -> None:
         """Everybody is discovered at once."""

@@ -17,7 +17,7 @@ from lifecycle.supervisor.gate.verification_loop import ChangeCounter, Verificat
 from lifecycle.supervisor.health.process_monitor import ProcessMonitor
 from lifecycle.supervisor.nodes.bring_up import ALSO_S, Gathering
 from lifecycle.supervisor.processes.control_channel import ControlChannel
-from lifecycle.supervisor.processes.process import ProcessExit
+from lifecycle.supervisor.processes.process import ProcessExit, SpawnRequest
 from lifecycle.supervisor.run.events import Notice, ProcessChanged, RequestSent
 from lifecycle.supervisor.run.failure import StepFailedError, with_failure
 from lifecycle.supervisor.run.shutdown import TakeDown
@@ -26,7 +26,7 @@ from lifecycle.verify.observation import Observation, ObservedNode
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import NOT_JUDGED, Stage, Verdict
 from tests.builders import plan_of, planned_node
-from tests.unit.supervisor.fakes import FakeGraph, World, run, verdict_of
+from tests.unit.supervisor.fakes import FakeGraph, FakeProcess, World, run, verdict_of
 
 LIMIT_S = 30.0
 
@@ -48,6 +48,41 @@ def test_nodes_without_an_order_come_up_side_by_side(tmp_path: Path) -> None:
         began = asyncio.get_running_loop().time()
         await world.bring_up.connect(LIMIT_S)
         assert asyncio.get_running_loop().time() - began == pytest.approx(6.0, abs=0.1)
+        await _down(world)
+
+    run(main())
+
+
+def test_a_bring_up_that_was_cancelled_twice_starts_everything_anew_the_next_time(
+    tmp_path: Path,
+) -> None:
+    """Who is slow to end is cancelled again (run/failure.py), perhaps while it cleans up."""
+
+    async def main() -> None:
+        world = _world(tmp_path, planned_node("a"), planned_node("b"))
+        spawn, asked = world.spawner.spawn, []
+
+        async def slow(request: SpawnRequest) -> FakeProcess:
+            asked.append(request.name)
+            if len(asked) > 2:
+                return await spawn(request)
+            try:
+                return await asyncio.get_running_loop().create_future()
+            except asyncio.CancelledError:
+                await asyncio.sleep(5.0)  # what was begun is undone
+                raise
+
+        world.spawner.spawn = slow  # type: ignore[method-assign]
+        connecting = asyncio.ensure_future(world.bring_up.connect(LIMIT_S))
+        await asyncio.sleep(0.1)
+        for _ in range(2):
+            connecting.cancel()
+            await asyncio.sleep(0.1)
+        with pytest.raises(asyncio.CancelledError):
+            await connecting
+        await world.bring_up.connect(LIMIT_S)
+        assert sorted(asked) == ["a", "a", "b", "b"]
+        assert {each.reach for each in world.system.nodes.values()} == {Reach.CONNECTED}
         await _down(world)
 
     run(main())

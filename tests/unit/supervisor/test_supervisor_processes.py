@@ -45,7 +45,7 @@ from lifecycle.supervisor.processes.process import (
     change,
 )
 from lifecycle.supervisor.run.events import Emitter, LogLine
-from tests.builders import teleop
+from tests.builders import port_node, teleop
 
 PYTHON = sys.executable
 BOUND_S = 20.0
@@ -302,6 +302,37 @@ def test_a_fork_of_the_supervisor_is_a_fork_server_as_a_program_of_its_own_is(re
     assert (seen["caught"], seen["blocked"], seen["mask"]) == (0, 0, 0)
     assert seen["leads"]
     assert exit_code == "0"
+
+
+def test_shared_memory_that_was_left_is_the_fork_servers_matter(tmp_path: Path) -> None:
+    # A process that has participants would wait for itself, see shared_memory.py.
+    port = f"fastrtps_port{60000 + os.getpid() % 5000}"
+    names = tuple(sorted((port, f"{port}_el", f"sem.{port}_mutex")))
+    files = [Path("/dev/shm", name) for name in names]
+
+    async def test() -> None:
+        async with _bench(tmp_path) as bench:
+            server = bench.fork_server
+            with next(each for each in files if each.name == port).open("rb") as held:
+                server.disown_ports()
+                assert await server.sweep(names) == ()
+                assert held.read() == port_node(number, flags=6)
+            assert await server.sweep(names) == names
+            assert not any(each.exists() for each in files)
+            os.kill(server.pid, signal.SIGSTOP)
+            asked = asyncio.ensure_future(server.sweep(names))
+            await asyncio.sleep(0)
+            os.kill(server.pid, signal.SIGKILL)
+            assert await asked == ()
+
+    number = int(port.removeprefix("fastrtps_port"))
+    try:
+        for each in files:
+            each.write_bytes(port_node(number) if each.name == port else b"")
+        _run(test())
+    finally:
+        for each in files:
+            each.unlink(missing_ok=True)
 
 
 def test_without_any_fork_server_nothing_can_be_started(

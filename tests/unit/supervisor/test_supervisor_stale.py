@@ -24,6 +24,7 @@ class Graph:
         self.asked: list[tuple[int, frozenset[str]]] = []
         self.removed: list[tuple[frozenset[str], tuple[int, ...]]] = []
         self.introduced: list[tuple[tuple[int, ...], tuple[int, ...]]] = []
+        self.disowned = 0
         self._removals = removals
 
     def participants_of(
@@ -39,7 +40,7 @@ class Graph:
         self.introduced.append((tuple(newcomers), tuple(pids)))
 
     def disown_ports(self) -> None:
-        """There is no shared memory."""
+        self.disowned += 1
 
 
 def system() -> System:
@@ -58,7 +59,7 @@ def system() -> System:
 
 def after(graph: Graph, *events: ProcessChanged, seconds: float = 0.0) -> None:
     async def run() -> None:
-        stale = StaleNodes(system(), graph)
+        stale = StaleNodes(system(), graph, disown_ports=graph.disown_ports)
         for event in events:
             stale.on_event(event)
         await asyncio.sleep(seconds)
@@ -88,7 +89,7 @@ def test_nobody_is_removed_whom_discovery_does_not_show_or_who_lives() -> None:
     server = dataclasses.replace(ENDED, process="discovery_server")
     after(graph, ENDED, running, another, server)
     assert graph.removed == []
-    assert len(graph.asked) == 1
+    assert (len(graph.asked), graph.disowned) == (1, 1)
 
 
 def test_what_a_process_made_just_before_its_end_is_removed_once_it_is_discovered() -> None:
@@ -111,7 +112,7 @@ def test_a_command_that_is_started_again_is_introduced_until_its_node_has_starte
         node, process = cast("Any", of.nodes["camera"]), cast("Any", of.processes["camera"])
         node.process, node.reach = process, Reach.WAITING
         process.__dict__.update(is_restarted=True, joins=False, is_gone=False, channel=None, pid=0)
-        stale = StaleNodes(of, graph)
+        stale = StaleNodes(of, graph, disown_ports=lambda: None)
         stale.on_event(dataclasses.replace(ENDED, state=ProcessState.STARTING, pid=0))
         await asyncio.sleep(0)
         assert graph.introduced == []
