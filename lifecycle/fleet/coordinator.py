@@ -236,6 +236,7 @@ class _Host:
         until: how far it is to come.
         is_up: it has come so far, at least once.
         is_cut: its link is.
+        tries: how often it was tried to reach it since.
         starts: how often we asked for a supervisor.
         asked_s: since when an answer is due to START or ATTACH.
         was_killed: its supervisor was, and may have left what it ran.
@@ -255,6 +256,7 @@ class _Host:
         self.reached = ""
         self.last_received_s = 0.0
         self.cut_s = 0.0
+        self.tries = 0
         self.starts = 0
         self.asked_s: float | None = None
         self.pings: dict[int, tuple[float, float]] = {}
@@ -576,7 +578,6 @@ class Coordinator:
 
     async def _attend(self, host: _Host) -> None:
         """Keep a connection to a host for as long as there is something to follow."""
-        tries = 0
         while not host.is_over:
             failure = await self._connected(host)
             host.channel = None
@@ -585,16 +586,20 @@ class Coordinator:
             if not host.is_ready:
                 self._fail(host, *failure)
                 return
-            if not host.is_cut:
-                tries = 0
-                host.is_cut, host.cut_s = True, self._now_s
-                message = f"the link is cut: {failure[0]}"
-                if host.is_begun:
-                    message += "; its supervisor runs on"
-                self._emit(HostChanged(state=LinkState.CUT, message=message), host)
-                self._notify()
-            await asyncio.sleep(AGAIN_S[min(tries, len(AGAIN_S) - 1)])
-            tries += 1
+            self._note_cut(host, failure[0])
+            await asyncio.sleep(AGAIN_S[min(host.tries, len(AGAIN_S) - 1)])
+            host.tries += 1
+
+    def _note_cut(self, host: _Host, why: str) -> None:
+        """Say that a link is cut, once."""
+        if host.is_cut:
+            return
+        host.is_cut, host.cut_s, host.tries = True, self._now_s, 0
+        message = f"the link is cut: {why}"
+        if host.is_begun:
+            message += "; its supervisor runs on"
+        self._emit(HostChanged(state=LinkState.CUT, message=message), host)
+        self._notify()
 
     async def _connected(self, host: _Host) -> tuple[str, str]:
         """Connect, and follow the host until the end; return why that came, and a hint."""
@@ -606,6 +611,10 @@ class Coordinator:
         noise: list[str] = []
         try:
             why = await self._speak(host, channel, noise)
+            if why and host.is_ready and not host.is_over:
+                # An ssh without a link takes seconds to end.
+                host.channel = None
+                self._note_cut(host, why)
         finally:
             # Also where this task is cancelled: the process at the other end is waited for.
             closed = await asyncio.shield(asyncio.ensure_future(channel.close()))
@@ -641,11 +650,12 @@ class Coordinator:
         try:
             while not reading.done():
                 self._ping(host)
-                await asyncio.wait({reading}, timeout=HEARTBEAT_S)
+                left_s = host.last_received_s + CUT_S - self._now_s
+                await asyncio.wait({reading}, timeout=max(0.0, min(HEARTBEAT_S, left_s)))
                 if host.is_over:
                     return "over"
                 now_s = self._now_s
-                if now_s - host.last_received_s > CUT_S:
+                if now_s - host.last_received_s >= CUT_S:
                     return f"nothing came for {now_s - host.last_received_s:.1f} s"
                 if host.asked_s is not None and now_s - host.asked_s > ANSWER_S:
                     return f"no answer within {ANSWER_S:g} s"

@@ -3,7 +3,7 @@
 N1 and N2 are the example of *Unique Network Flows*: N1 publishes video and battery state, N2 takes
 both. `LateListener` stands in for one of the nine systems'. The environment of a process may ask
 for more: HOLD_CONFIGURE_FILE holds configure until that file is there, HOLD_START_FILE and its like
-another stage, and FAIL_CONFIGURE makes configure fail.
+another stage, all for HOLD_S seconds at most, and FAIL_CONFIGURE makes configure fail.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _HOLD_S = 20.0
 
 def hold(stage: str) -> None:
     file = os.environ.get(f"HOLD_{stage}_FILE", "")
-    end = time.monotonic() + _HOLD_S
+    end = time.monotonic() + float(os.environ.get("HOLD_S", _HOLD_S))
     while file and not Path(file).exists() and time.monotonic() < end:
         time.sleep(0.01)
 

@@ -59,27 +59,45 @@ def closes(verdict: Verdict, *, strict: bool) -> bool:
 
 
 class Judging(Protocol):
-    """What a permit asks about the verdict that it came from, see VerificationLoop."""
+    """What a permit asks about the verdict that it came from, see VerificationLoop.
+
+    Attributes:
+        latest: the verdict that holds; None before the first.
+    """
+
+    latest: Verdict | None
 
     def is_current(self, verdict: Verdict) -> bool:
         """Whether nothing changed since the look that `verdict` came from."""
 
-    async def again(self, ahead: frozenset[str]) -> Verdict:
-        """Judge the system as it is now, in which the nodes `ahead` may be active; bounded."""
+    async def again(self, ahead: frozenset[str], deadline: float | None) -> Verdict:
+        """Judge the system as it is now, in which the nodes `ahead` may be active.
+
+        Args:
+            ahead: full names.
+            deadline: by the running loop's clock, until which what heals with time may do so, see
+                `behind_s`; None for a moment only.
+        """
 
 
 class Permit:
     """The right to send activate requests. Only `Gate.judge` makes one.
+
+    Args:
+        gate: open.
+        verdict: that it rests on.
+        deadline: of what it is for, see `Judging.again`.
 
     Attributes:
         verdict: the one that it rests on; a newer one, once it was renewed.
         sent: names of the nodes that were sent their requests.
     """
 
-    def __init__(self, gate: Gate, verdict: Verdict) -> None:
+    def __init__(self, gate: Gate, verdict: Verdict, deadline: float | None = None) -> None:
         if gate.permit is not None or gate.closes(verdict):
             raise BringUpError("cannot make a permit without an open gate; ask Gate.judge for one")
         self._gate = gate
+        self._deadline = deadline
         self.sent: set[str] = set()
         self._refused: Verdict | None = None
         self._renewal: asyncio.Future[None] | None = None
@@ -127,8 +145,21 @@ class Permit:
             self.check()
             renewal.result()
 
+    def expire(self) -> None:
+        """Say why, if nodes were not sent their requests in time because of what changed.
+
+        Raises:
+            VerificationError: as for `check`; or somebody waits for a verdict that opens the gate
+                again, and the latest does not.
+        """
+        refused = self._refused
+        if refused is None and self._renewal is not None and not self._renewal.done():
+            refused = self._gate.latest
+        if refused is not None and self._gate.closes(refused):
+            raise VerificationError(refused, again=True)
+
     async def _renew(self) -> None:
-        verdict = await self._gate.judged_again(frozenset(self.sent))
+        verdict = await self._gate.judged_again(frozenset(self.sent), self._deadline)
         if self._gate.permit is not self:
             return
         if self._gate.closes(verdict):
@@ -165,8 +196,17 @@ class Gate:
         """Whether a verdict keeps this gate closed."""
         return closes(verdict, strict=self.strict)
 
-    def judge(self, verdict: Verdict) -> Permit:
+    @property
+    def latest(self) -> Verdict | None:
+        """The verdict that holds now."""
+        return None if self._judging is None else self._judging.latest
+
+    def judge(self, verdict: Verdict, *, deadline: float | None = None) -> Permit:
         """Open on a verdict that allows it.
+
+        Args:
+            verdict: of the moment.
+            deadline: until which what changes behind the open gate may heal, see `Judging.again`.
 
         Raises:
             VerificationError: the verdict does not allow it; the gate is closed.
@@ -174,7 +214,7 @@ class Gate:
         self.permit = None
         if self.closes(verdict):
             raise VerificationError(verdict)
-        self.permit = Permit(self, verdict)
+        self.permit = Permit(self, verdict, deadline)
         return self.permit
 
     def close(self) -> None:
@@ -187,7 +227,7 @@ class Gate:
         """Whether nothing changed since the look that `verdict` came from."""
         return self._judging is None or self._judging.is_current(verdict)
 
-    async def judged_again(self, ahead: frozenset[str]) -> Verdict:
-        """Judge the system as it is now, in which the nodes `ahead` may be active."""
+    async def judged_again(self, ahead: frozenset[str], deadline: float | None) -> Verdict:
+        """Judge the system as it is now, see `Judging.again`."""
         assert self._judging is not None
-        return await self._judging.again(ahead)
+        return await self._judging.again(ahead, deadline)

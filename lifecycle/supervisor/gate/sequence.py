@@ -504,7 +504,9 @@ class GateSequence:
             return
         deadline = asyncio.get_running_loop().time() + self._timeout_s
         try:
-            permit = await self._unless_outrun(self.verify(self._timeout_s), self._outrun())
+            # Who is not let through now is later: orders are not kept waiting for it.
+            judging = self.verify(self._timeout_s, waits=False)
+            permit = await self._unless_outrun(judging, self._outrun())
             waiting = tuple(each for each in self.inactive() if each.name in names)
             await self.activate(permit, deadline, waiting)
         except VerificationError as error:
@@ -743,11 +745,13 @@ class GateSequence:
         system.replan(plan)
         self._replanned(each.name for each in nodes)
 
-    async def verify(self, timeout_s: float) -> Permit:
+    async def verify(self, timeout_s: float, *, waits: bool = True) -> Permit:
         """Judge the system as it is until its gate opens; activate nothing.
 
         Args:
             timeout_s: seconds, for all of it.
+            waits: what changes behind the open gate may heal for as long, too, and not only for
+                AGAIN_S.
 
         Raises:
             StepFailedError: as for `until_clear`.
@@ -756,9 +760,10 @@ class GateSequence:
         self._gate.close()
         self.phase = "verifying"
         self._judge.ahead = self.active()
+        deadline = asyncio.get_running_loop().time() + timeout_s
         await self.until_clear(timeout_s)
         assert self._judge.latest is not None
-        permit = self._gate.judge(self._judge.latest)
+        permit = self._gate.judge(self._judge.latest, deadline=deadline if waits else None)
         self.trusted = taken_on_trust(permit.verdict)
         self._emit(SystemReached(reached="verified", elapsed_s=self._emit.elapsed_s))
         return permit

@@ -21,7 +21,7 @@ from lifecycle.manifest import EndpointKind
 from lifecycle.plan import Plan
 from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.gate.activation_guard import ActivationGuard
-from lifecycle.supervisor.gate.gate import closes
+from lifecycle.supervisor.gate.gate import behind_s, closes
 from lifecycle.supervisor.health.agreement import Agreement
 from lifecycle.supervisor.health.liveliness import NodeArrivals
 from lifecycle.supervisor.nodes.system import ObservedGraph, System
@@ -174,7 +174,8 @@ UNVERIFIABLE_S = 3.5
 """What cannot be verified may be unseen yet; Fast DDS announces a late participant every 3 s."""
 
 AGAIN_S = 5.0
-"""For what changed behind an open gate to be judged clear; Fast DDS announces every 3 s."""
+"""For what changed behind an open gate to be judged clear where nobody is kept waiting for longer:
+nodes that came again by policy are let through later. Fast DDS announces every 3 s."""
 
 ASK_AGAIN_S = 0.02
 """Two other participants match without our graph changing, so while only that is missing the nodes
@@ -328,17 +329,24 @@ class VerificationLoop:
         """Whether nothing changed since the look that `verdict`, the latest one, came from."""
         return verdict is self.latest and self._mark == self._changes.mark
 
-    async def again(self, ahead: frozenset[str]) -> Verdict:
+    async def again(self, ahead: frozenset[str], deadline: float | None) -> Verdict:
         """Judge a system behind an open gate again because it changed.
+
+        What heals with time has as long for it as before the gate: a host that is cut off in
+        between, or a node of another host that takes long to activate, ends no bring-up that is
+        within its time.
 
         Args:
             ahead: names of the nodes that were asked to activate since the gate opened.
+            deadline: of what the gate was opened for, by the running loop's clock; None for
+                AGAIN_S from now.
 
         Returns:
             The latest verdict; whether it keeps the gate open is the gate's to say.
         """
         self.ahead |= ahead
-        await self.until_clear(Stage.CONNECTED, AGAIN_S)
+        timeout_s = AGAIN_S if deadline is None else behind_s(deadline)
+        await self.until_clear(Stage.CONNECTED, timeout_s)
         assert self.latest is not None
         return self.latest
 

@@ -213,7 +213,10 @@ class BringUp:
                 timeout_s, self._side_by_side(self._activate(node, permit) for node in held)
             )
         except asyncio.TimeoutError:
-            raise self._failure() or self._late(timeout_s) from None
+            if (failure := self._failure()) is not None:
+                raise failure from None
+            permit.expire()
+            raise self._late(timeout_s) from None
 
     async def deactivate(self, nodes: Iterable[NodeRun] | None = None) -> None:
         """Deactivate every active node, those first that depend on others.
@@ -526,9 +529,14 @@ class BringUp:
         # Noted before it is sent: a request without an answer may have been carried out.
         if operation is not Operation.DEACTIVATE:
             node.undo.append(operation)
-        standing = await self._step(
-            node, node.perform(operation, permit), limit_s, rule=TRANSITION_FAILED
-        )
+        try:
+            standing = await self._step(
+                node, node.perform(operation, permit), limit_s, rule=TRANSITION_FAILED
+            )
+        except StepFailedError:
+            if permit is not None and node.name not in permit.sent:
+                permit.expire()  # it was not the node that took so long
+            raise
         node.doing = ""
         if standing.already and node.process is None and operation in _TO_UNDO:
             node.undo.remove(operation)

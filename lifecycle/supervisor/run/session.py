@@ -113,6 +113,42 @@ class _RunEnd:
     verdict: Verdict | None = None
 
 
+class _Time:
+    """The time of a bring-up.
+
+    Args:
+        timeout_s: seconds from now, > 0.
+
+    Attributes:
+        deadline: by the running loop's clock.
+    """
+
+    def __init__(self, timeout_s: float) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._began = self._loop.time()
+        self.deadline = self._began + timeout_s
+
+    @property
+    def left_s(self) -> float:
+        """Seconds that are left; negative once it is over."""
+        return self.deadline - self._loop.time()
+
+    @property
+    def is_over(self) -> bool:
+        """Whether nothing is left of it."""
+        return self.left_s <= 0
+
+    def shorten(self, left_s: float) -> None:
+        """Have it over in so many seconds."""
+        self.deadline = self._loop.time() + left_s
+
+    def __str__(self) -> str:
+        """Say that it is over."""
+        return (
+            f"the {round(self.deadline - self._began, 1):g} s of the bring-up are over (--timeout)"
+        )
+
+
 class SessionParticipant(
     ObservedGraph,
     peer_supervisors.AliveExchange,
@@ -217,6 +253,7 @@ class Session:
         self._emit = emit
         self._ending = ending
         self._furthest: str | None = None
+        self._time: _Time | None = None  # of the bring-up, while it lasts
         self._held = False
         self._keeps = False
         self._ends = ""
@@ -420,6 +457,8 @@ class Session:
                 stopping = "the system changed before every node was activated"
             elif self._gate_sequence.phase == "activating":
                 stopping = "what became active is not what was verified"
+            if self._time is not None and self._time.is_over:
+                stopping = f"{stopping}, and {self._time}"
             reason = f"{stopping}; {not_ok(error.verdict) or error.verdict.verdict.value}"
         if end.why:
             reason = f"{reason}, but {end.why}" if reason == "done" else f"{reason}; {end.why}"
@@ -503,9 +542,8 @@ class Session:
         return self._bring_up.unfinished() or (missing(latest) if verifies and latest else "")
 
     async def _phases(self) -> _RunEnd:
-        loop = asyncio.get_running_loop()
         timeout_s = self._options.bring_up_s(len(self._system.processes))
-        deadline = loop.time() + timeout_s
+        self._time = time = _Time(timeout_s)
         if self._options.adopt:
             await self._adopt()
         async with self._following():
@@ -517,18 +555,19 @@ class Session:
             await self._process_monitor.during(self._judge.until_clear(Stage.CONNECTED, _GLANCE_S))
             return await self._hold(Stage.CONNECTED)
         while True:
-            deadline = loop.time() + self._options.gate_s(deadline - loop.time())
+            time.shorten(self._options.gate_s(time.left_s))
             try:
-                permit = await self._gate_sequence.verify(deadline - loop.time())
+                permit = await self._gate_sequence.verify(time.left_s)
                 self._furthest = "verified"
                 if self._options.until is Until.VERIFIED:
                     break
-                await self._gate_sequence.activate(permit, deadline)
+                await self._gate_sequence.activate(permit, time.deadline)
                 self._furthest = "active"
                 break
             except StepFailedError as failure:
                 await self._gate_sequence.recover(failure, timeout_s)
-                deadline = loop.time() + timeout_s
+                self._time = time = _Time(timeout_s)
+        self._time = None
         return await self._hold(
             Stage.CONNECTED if self._options.until is Until.VERIFIED else Stage.ACTIVE
         )

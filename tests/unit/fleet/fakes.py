@@ -82,6 +82,8 @@ class FakeChannel:
 
     async def close(self) -> Closed:
         self.is_closed = True
+        if self._host.is_cut:
+            await asyncio.sleep(self._host.closes_s)
         return Closed(exit_code=self._host.exit_code, text=self._host.stderr)
 
 
@@ -97,6 +99,7 @@ class FakeTransport:
         ahead_s: its clock.
         cut_at: the order upon which the link is cut, as it comes.
         heals_s: how long after.
+        closes_s: until a connection over a cut link is closed.
         junk: lines that its supervisor writes besides.
         stderr: of a connection that brings no agent; empty for one that does.
     """
@@ -113,6 +116,7 @@ class FakeTransport:
     ahead_s: float = 0.0
     cut_at: Do | None = None
     heals_s: float | None = 10.0
+    closes_s: float = 0.0
     stderr: str = ""
     exit_code: int | None = 0
     refuses: str = ""

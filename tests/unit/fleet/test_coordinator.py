@@ -281,6 +281,24 @@ def test_a_cut_link_ends_no_supervisor_and_starts_none_twice(
         assert healed["lost_s"] > 2
 
 
+def test_a_cut_is_said_in_time_and_not_once_its_connection_is_closed() -> None:
+    world = World()
+    world.host("a", closes_s=5.0)
+    world.host("b")
+    found: list[str] = []
+
+    async def main() -> ExitCode:
+        loop = asyncio.get_running_loop()
+        loop.call_later(5.0, world.hosts["a"].cut)
+        # What came last came up to a heartbeat before.
+        loop.call_later(5.0 + CUT_S, lambda: found.extend(world.states("a")))
+        return await world.run(at=(40.0, _stop))
+
+    assert run(main()) is ExitCode.OK
+    assert found == ["connected", "started", "cut"]
+    assert world.states("a") == ["connected", "started", "cut", "healed", "ended"]
+
+
 def test_a_host_that_is_cut_off_for_good_is_named_in_the_end_and_runs_on() -> None:
     world = World()
     world.host("a", heals_s=None)

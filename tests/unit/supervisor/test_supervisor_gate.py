@@ -155,6 +155,7 @@ class Changing:
         self.changed = False
         self.begun = asyncio.Event()
         self.asked: list[frozenset[str]] = []
+        self.deadline: float | None = None
         self.error: Exception | None = None
         self.given_up = False
         self._later = list(later)
@@ -162,8 +163,9 @@ class Changing:
     def is_current(self, verdict: Verdict) -> bool:
         return verdict is self.latest and not self.changed
 
-    async def again(self, ahead: frozenset[str]) -> Verdict:
+    async def again(self, ahead: frozenset[str], deadline: float | None) -> Verdict:
         self.asked.append(ahead)
+        self.deadline = deadline
         self.begun.set()
         try:
             await asyncio.sleep(0.01)
@@ -259,6 +261,38 @@ def test_a_change_that_is_not_allowed_closes_the_gate_for_all_that_were_not_sent
             )
         assert gate.permit is None
         assert len(system.asked) == 1
+
+    run_quietly(main)
+
+
+@pytest.mark.parametrize("deadline", [None, 31.0])
+def test_a_change_is_judged_until_the_deadline_of_what_the_gate_was_opened_for(
+    deadline: float | None,
+) -> None:
+    async def main() -> None:
+        system = Changing(verdict_of(Outcome.OK), verdict_of(Outcome.OK))
+        permit = system.gate().judge(system.latest, deadline=deadline)
+        system.changed = True
+        await permit.use("/camera")
+        assert system.deadline == deadline
+
+    asyncio.run(main())
+
+
+def test_who_waits_too_long_for_a_verdict_is_given_the_one_that_keeps_the_gate_closed() -> None:
+    async def main() -> None:
+        system = Changing(verdict_of(Outcome.OK), verdict_of(Outcome.OK))
+        permit = system.gate().judge(system.latest)
+        permit.expire()  # nobody waits
+        system.latest, system.changed = verdict_of(Outcome.VIOLATED, "run.silent-node"), True
+        permit.expire()
+        waits = asyncio.ensure_future(permit.use("/camera"))
+        await system.begun.wait()
+        with pytest.raises(VerificationError, match=r"run\.silent-node") as caught:
+            permit.expire()
+        assert caught.value.again
+        await waits
+        permit.expire()  # it is judged
 
     run_quietly(main)
 

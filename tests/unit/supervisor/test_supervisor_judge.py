@@ -605,14 +605,17 @@ def test_a_verdict_is_current_until_something_is_noticed_after_its_look_began(
     _run(tmp_path, test, OK)
 
 
-def test_behind_an_open_gate_it_is_judged_for_5_s_who_was_let_through_being_ahead(
-    tmp_path: Path,
+@pytest.mark.parametrize(("left_s", "judged_s"), [(None, 5.0), (12.0, 12.0), (0.5, 2.0)])
+def test_behind_an_open_gate_it_is_judged_in_time_who_was_let_through_being_ahead(
+    tmp_path: Path, left_s: float | None, judged_s: float
 ) -> None:
     async def test(bench: _Bench) -> None:
         bench.judge.ahead = frozenset({"/radar"})
-        assert await bench.judge.again(frozenset({"/camera"})) is bench.judge.latest
-        assert bench.judge.latest == MISSING
-        assert bench.now == pytest.approx(5.0, abs=0.1)
+        deadline = None if left_s is None else bench.now + left_s
+        found = await bench.judge.again(frozenset({"/camera"}), deadline)
+        assert found is bench.judge.latest
+        assert found == MISSING
+        assert bench.now == pytest.approx(judged_s, abs=0.1)
         assert {each["stage"] for each in bench.judged} == {Stage.CONNECTED}
         assert {each["ahead"] for each in bench.judged} == {frozenset({"/radar", "/camera"})}
 

@@ -38,6 +38,7 @@ from tests.unit.supervisor.fakes import run
 from tests.unit.supervisor.session_world import (
     ACTIVATED,
     CAMERA_DOWN,
+    CHANGED,
     CONNECTED,
     DOWN,
     INTRUDED,
@@ -446,6 +447,46 @@ def test_a_restarted_node_waits_at_a_gate_that_stays_closed_and_passes_once_it_o
             "[system] active at 5.0 s",
         ]
         assert f"[verdict] connected violated {INTRUDED}" in world.outline
+
+    run(main())
+
+
+def test_a_restarted_node_is_not_let_through_beside_one_that_is_away_and_orders_wait_5_s_for_that(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        plan = plan_of(planned_node("camera", supervision=ON_FAILURE), planned_node("viewer"))
+        world = SessionWorld(plan, tmp_path)
+
+        def hide() -> None:
+            world.graph.unseen = {"/viewer"}
+            world.graph.note()
+
+        async def die() -> None:
+            await world.story.until("[system] active")
+            world.story.in_the_moment["networks programmed"] = hide
+            world.kill("camera")
+            await world.story.until("networks programmed", 2)
+            began_s = asyncio.get_running_loop().time()
+            assert await world.order(ControlRequest.PAUSE) == "0"
+            waited_s = asyncio.get_running_loop().time() - began_s
+            assert waited_s == pytest.approx(5.0, abs=0.2)
+            world.graph.unseen.clear()
+            world.graph.note()
+            assert await world.order(ControlRequest.RESUME) == "0"
+            assert await world.order(ControlRequest.DOWN) == "0"
+
+        await world.run(die())
+        away = "graph.missing-node: cannot find node /viewer in domain 30"
+        assert world.since("networks programmed", 2)[1:8] == [
+            "[verdict] connected violated graph.missing-node /viewer",
+            f"[notice] cannot activate: {CHANGED}, and its verdict now is violated\n  {away}",
+            "/viewer deactivate",
+            "[system] paused at 6.0 s",
+            "[restarted] camera (1)",
+            "[verdict] connected ok",
+            "[system] verified at 6.0 s",
+        ]
 
     run(main())
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.manifest.model import Condition, Timeouts
+from lifecycle.manifest.model import Condition, RunKind, Timeouts
 from lifecycle.supervisor.control.protocol import ControlRequest
 from lifecycle.supervisor.run.options import Until
 from tests.builders import plan_of, planned_node
@@ -41,6 +41,12 @@ from tests.unit.supervisor.session_world import (
 
 ENDING = 1 + len(DOWN) + len(over(0))
 """Lines of an outline from "[stopping]" on, of what was active."""
+
+
+def time_over(timeout_s: int) -> str:
+    """Return what names the time of a bring-up that is over."""
+    return f"the {timeout_s} s of the bring-up are over (--timeout)"
+
 
 # Bring-up
 
@@ -322,7 +328,7 @@ def test_a_node_that_does_not_appear_is_waited_for_as_long_as_there_is_time_and_
         await world.run()
         assert world.since("[system] connected")[1:] == [
             "[verdict] connected violated graph.missing-node /viewer",
-            "[stopping] at 8.0 s: the verdict keeps the gate closed",
+            f"[stopping] at 8.0 s: the verdict keeps the gate closed, and {time_over(8)}",
             *BACK,
             *over(4),
         ]
@@ -535,6 +541,70 @@ def test_the_time_for_which_a_change_is_judged_is_not_that_of_the_node_that_wait
     run(main())
 
 
+def hiding(world: SessionWorld) -> Callable[[], None]:
+    """Return what hides `camera` from the graph, as behind a link that is cut."""
+
+    def hide() -> None:
+        world.graph.unseen = {"/camera"}
+        world.graph.note()
+
+    return hide
+
+
+HIDDEN = "[verdict] connected violated graph.missing-node /camera"
+LATE = f"{CHANGED}, and {time_over(32)}"
+
+
+@pytest.mark.parametrize("moment", ["networks programmed", "/camera activate"])
+def test_what_is_away_behind_an_open_gate_may_come_back_for_as_long_as_before_it(
+    tmp_path: Path, moment: str
+) -> None:
+    """A host that is cut off once it was verified ends no bring-up that is within its time."""
+
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path, stop_after_s=0.0)
+
+        async def show() -> None:
+            await world.story.until(HIDDEN)
+            await asyncio.sleep(25.0)
+            world.graph.unseen.clear()
+            world.graph.note()
+
+        world.story.in_the_moment[moment] = hiding(world)
+        await world.run(show())
+        before = [OPENED, "/camera activate"]
+        if moment == "networks programmed":
+            heals = ["networks programmed (ok)", HIDDEN, "[verdict] connected ok", *before]
+        else:
+            heals = ["networks programmed (ok)", *before, HIDDEN, "[verdict] connected ok"]
+        assert world.since("networks programmed")[: len(heals) + 2] == [
+            *heals,
+            "/viewer activate",
+            "[system] active at 25.0 s",
+        ]
+
+    run(main())
+
+
+@pytest.mark.parametrize("moment", ["networks programmed", "/camera activate"])
+def test_what_stays_away_behind_an_open_gate_is_named_with_the_time_that_is_over(
+    tmp_path: Path, moment: str
+) -> None:
+    async def main() -> None:
+        world = SessionWorld(CHAIN, tmp_path, timeout_s=32.0)
+        world.story.in_the_moment[moment] = hiding(world)
+        await world.run()
+        assert world.since(HIDDEN)[:2] == [HIDDEN, f"[stopping] at 32.0 s: {LATE}"]
+        assert world.outline[-1] == "[stopped] 4"
+        assert "/viewer activate" not in world.outline
+        assert world.report == (
+            f"ended when verified, before it was active, exit code 4: {LATE}; "
+            "missing: /camera (node)"
+        )
+
+    run(main())
+
+
 def test_what_changes_before_a_request_to_a_foreign_node_leaves_keeps_it_back(
     tmp_path: Path,
 ) -> None:
@@ -560,6 +630,25 @@ def test_what_changes_before_a_request_to_a_foreign_node_leaves_keeps_it_back(
             *CAMERA_DOWN,
             *over(4),
         ]
+
+    run(main())
+
+
+def test_a_foreign_node_is_not_blamed_for_the_time_in_which_its_request_is_kept_back(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        limits = Timeouts(activate_s=3.0)
+        base = planned_node("base", kind=RunKind.ATTACH, timeouts=limits)
+        world = SessionWorld(plan_of(planned_node("camera"), base), tmp_path)
+        world.graph.services.matched_after_s["/base activate"] = 1.0
+        world.story.in_the_moment["[request] /base activate"] = hiding(world)
+        await world.run()
+        assert world.since("[gate]")[:2] == ["[gate] ok: /camera, /base", "/camera activate"]
+        # When is a matter of the load of this machine, see `wait_under_load`.
+        ends = [each for each in world.outline if each.startswith(("[stopping]", "[failure]"))]
+        assert [each.partition(" s: ")[2] for each in ends] == [CHANGED]
+        assert "/base activate" not in world.outline
 
     run(main())
 
@@ -644,7 +733,7 @@ def test_a_node_that_is_never_discovered_is_started_three_times_and_then_waited_
         again = [line for attempt in (1, 2, 3) for line in started_again(attempt)]
         assert world.since("[verdict]")[1:] == [
             *again,
-            "[stopping] at 30.0 s: the verdict keeps the gate closed",
+            f"[stopping] at 30.0 s: the verdict keeps the gate closed, and {time_over(30)}",
             *BACK,
             *over(4),
         ]
