@@ -29,6 +29,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 from lifecycle.middleware.discovery.dead_peers import listening
+from lifecycle.middleware.discovery.messages import disposal
 from lifecycle.middleware.discovery.probe import (
     RANGE_VARIABLE,
     ProbeTarget,
@@ -38,6 +39,7 @@ from lifecycle.middleware.discovery.probe import (
     discovery_ports,
     group_targets,
     probe_targets,
+    send,
     well_known_targets,
 )
 from lifecycle.middleware.fastdds.dscp import own_udp_socket, socket_descriptors
@@ -137,6 +139,8 @@ def introduce(
     urls: Sequence[ConnectionUrl],
     environment: Mapping[str, str],
     pids: Iterable[int],
+    *,
+    anew: str = "",
 ) -> None:
     """Make participants that have been there for long announce themselves to new ones at once.
 
@@ -153,6 +157,8 @@ def introduce(
         environment: see `probe.probe_targets`.
         pids: of this host's processes whose participants are to answer, besides all that the
             observer could find.
+        anew: GUID prefix of the observer, where the new ones are to forget it and discover it
+            again; empty otherwise. Then they send it what they had sent before, too.
     """
     asked = dict(probe_targets(domain_id, urls, environment))
     if not asked or (urls and not leaves_discovery_open(urls)):
@@ -168,6 +174,8 @@ def introduce(
         if not answered_at or not targets:
             continue
         with contextlib.suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as sender:
+            if anew:
+                send(sender, disposal(anew), (each for each, pid in found.items() if pid in new))
             ask(sender, answered_at[:_ANSWERED_AT], targets)
 
 
