@@ -1,9 +1,8 @@
 """Dead TCP connections of Fast DDS, and removing the DDS participants of a killed process at once.
 
 Owns: which TCP connections of this process count as dead (not answered any more) and which as
-unused, read from the kernel (TCP_INFO of tcp(7)); and the RTPS message by which a participant
-leaves (DDSI-RTPS 2.3 §8.5.3.3.2, §9.6.3.4, §9.6.3.9), written for one whose process was killed and
-cannot write it, and where it is sent. Must not import rclpy.
+unused, read from the kernel (TCP_INFO of tcp(7)); and where the message is sent by which a
+participant leaves, for one whose process was killed and cannot say it. Must not import rclpy.
 
 Fast DDS 2.14 never returns from the destruction of a participant whose connection is cut: it waits
 for the thread that reads from it, which waits for the other end
@@ -28,11 +27,11 @@ import ipaddress
 import os
 import socket
 import struct
-import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
-from lifecycle.middleware.discovery.probe import HEADER, ProbeTarget, probe_targets, send
+from lifecycle.middleware.discovery.messages import disposal
+from lifecycle.middleware.discovery.probe import ProbeTarget, probe_targets, send
 from lifecycle.middleware.fastdds.dscp import own_udp_socket, socket_descriptors
 from lifecycle.middleware.fastdds.url_check import sockets_of
 from lifecycle.network import UDP_UNICAST, ConnectionUrl, Medium
@@ -108,14 +107,6 @@ def _is_dead(each: socket.socket) -> bool:
     return info[_STATE] == _ESTABLISHED and max(info[_RETRANSMITS], info[_PROBES]) >= _UNANSWERED
 
 
-_SEQUENCE = 1 << 30
-"""Sequence number of the message: above all that the participant itself has written."""
-
-_SPDP_READER, _SPDP_WRITER = b"\x00\x01\x00\xc7", b"\x00\x01\x00\xc2"
-_PARTICIPANT = b"\x00\x00\x01\xc1"
-_DISPOSED_UNREGISTERED = b"\x00\x00\x00\x03"
-_PID_SENTINEL = struct.pack("<HH", 0x0001, 0)
-
 _HOST_DIGITS = slice(4, 8)
 _PID_DIGITS = slice(8, 12)
 PROCESS_DIGITS = 16
@@ -144,29 +135,6 @@ def is_alone(pid: int) -> bool:
     most = int(Path("/proc/sys/kernel/pid_max").read_text(encoding="ascii"))
     others = (each for each in range(pid & 0xFFFF, most + 1, 0x10000) if each != pid)
     return not any(Path(f"/proc/{each}").exists() for each in others)
-
-
-def disposal(prefix: str) -> bytes:
-    """Return the RTPS message by which a participant leaves the graph.
-
-    Args:
-        prefix: its GUID prefix, 24 hex digits.
-    """
-    octets = bytes.fromhex(prefix)
-    guid = octets + _PARTICIPANT
-    inline_qos = (
-        struct.pack("<HH", 0x0070, len(guid))  # PID_KEY_HASH
-        + guid
-        + struct.pack("<HH", 0x0071, 4)  # PID_STATUS_INFO
-        + _DISPOSED_UNREGISTERED
-        + _PID_SENTINEL
-    )
-    key = b"\x00\x03\x00\x00" + struct.pack("<HH", 0x0050, len(guid)) + guid + _PID_SENTINEL
-    body = struct.pack("<HH", 0, 16) + _SPDP_READER + _SPDP_WRITER
-    body += struct.pack("<iI", 0, _SEQUENCE) + inline_qos + key
-    info_timestamp = struct.pack("<BBHII", 0x09, 0x01, 8, int(time.time()), 0)
-    flags = 0x01 | 0x02 | 0x08  # little endian, inline QoS, key
-    return HEADER + octets + info_timestamp + struct.pack("<BBH", 0x15, flags, len(body)) + body
 
 
 def remove_participants(

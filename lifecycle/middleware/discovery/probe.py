@@ -1,10 +1,9 @@
 """Discovery probe: an announcement that makes every reachable DDS participant answer at once.
 
-Owns: the announcement of a participant that does not exist, as DDSI-RTPS 2.3 writes it (§8.3.5,
-§9.4, §9.6.2.2); the participants that answered; and which participants' discovery ports it is sent
-to, for the discovery settings in the environment and for connection URLs. Shared memory, TCP and a
-discovery server cannot be probed, and nothing is sent where the system's own discovery would send
-nothing. Must not import rclpy.
+Owns: announcing a participant that does not exist, and having it forgotten; the participants that
+answered; and which participants' discovery ports it is sent to, for the discovery settings in the
+environment and for connection URLs. Shared memory, TCP and a discovery server cannot be probed, and
+nothing is sent where the system's own discovery would send nothing. Must not import rclpy.
 
 Why: Fast DDS 2.14 sends a new participant's first announcement before it listens, so an answer on
 the same host arrives too early and is lost; the participant that answered stays quiet for its next
@@ -15,9 +14,9 @@ our participant's port, and to a socket of ours that counts the participants.
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import ipaddress
-import os
 import socket
 import struct
 import time
@@ -25,6 +24,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError
+from lifecycle.middleware.discovery.messages import announcement, disposal, nobody, speaker
 from lifecycle.middleware.fastdds.dscp import own_udp_socket
 from lifecycle.middleware.fastdds.participant_profile import default_profile
 from lifecycle.middleware.fastdds.profiles import PROFILE_NAME
@@ -49,13 +49,18 @@ from lifecycle.network import (
 
 RANGE_VARIABLE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 
-_LEASE_S = 0.5
-"""Peers that answered drop the participant that does not exist after so long."""
+_FORGOTTEN_S = 2.0
+"""Peers drop the participant that does not exist after so long, because they are told to. On a
+loaded machine they answer later than within ANSWER_S, and not once it is gone.
 
-_PREFIX_BYTES = 12
-HEADER = b"RTPS\x02\x03\x01\x0f"  # protocol 2.3, vendor eProsima: would others be answered?
-_UDPV4, _UDPV6 = 1, 2
-"""LOCATOR_KIND_UDPv4 and LOCATOR_KIND_UDPv6 (DDSI-RTPS 9.3.1)."""
+They do not by its lease if that can be helped: Fast DDS 2.14 looks at it in a thread of its own,
+and deadlocks if another one just unmatches a writer (its issue 6502, docs/liveliness.md). With a
+lease of 0.5 s each node that was started again made all participants look seven times.
+"""
+_UNHEARD_LEASE_S = 20.0
+"""For who does not hear that it is gone."""
+_LEASE_S = 0.5
+"""Where there is no event loop that could tell them so."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -97,6 +102,7 @@ class Probe:
         output_port: int | None = None,
     ) -> None:
         self.counts = output_port is None
+        self._output_port = output_port
         self._answers: dict[str, str] = {}
         self._targets, self._addresses = tuple(targets), tuple(addresses)
         self._ipv6 = any(":" in target.address for target in self._targets)
@@ -145,16 +151,13 @@ class Probe:
         if self._socket is not None:
             own = "::1" if self._ipv6 else "127.0.0.1"
             targets = (ProbeTarget(address=own, port=port) for port in self._receivers)
-            send(self._socket, announcement(everybody), targets)
+            ask(self._socket, everybody, targets, self._output_port)
 
     def _send(self, ports: Iterable[int]) -> None:
         if self._socket is None:
             return
-        send(
-            self._socket,
-            announcement([(a, p) for p in ports for a in self._addresses]),
-            self._targets,
-        )
+        answered_at = [(a, p) for p in ports for a in self._addresses]
+        ask(self._socket, answered_at, self._targets, self._output_port)
 
     def answered(self) -> frozenset[str]:
         """Return the GUID prefixes (24 hex digits) of all participants that answered so far."""
@@ -166,9 +169,8 @@ class Probe:
             while self._socket is not None:
                 data, source = self._socket.recvfrom(65536, socket.MSG_DONTWAIT)
                 # What calls all sockets of this process, `introduce` say, calls this one, too.
-                is_answer = data.startswith(b"RTPS") and _NOBODY not in data
-                if is_answer and len(data) > len(HEADER) + _PREFIX_BYTES:
-                    self._answers[data[8 : 8 + _PREFIX_BYTES].hex()] = source[0]
+                if prefix := speaker(data):
+                    self._answers[prefix] = source[0]
         return dict(self._answers)
 
     def close(self) -> None:
@@ -219,6 +221,43 @@ class EarlyProbe:
             each.close()
 
 
+def ask(
+    sender: socket.socket,
+    answered_at: Iterable[tuple[str, int]],
+    targets: Iterable[ProbeTarget],
+    output_port: int | None = None,
+) -> None:
+    """Announce a participant that does not exist, so that all who hear of it answer.
+
+    Args:
+        sender: UDP, of the targets' family.
+        answered_at: IP addresses and UDP ports to which they answer.
+        targets: where to send it.
+        output_port: the source port by which it must be told, too, that it is gone; None for any.
+    """
+    prefix, targets = nobody(), tuple(targets)
+    try:
+        loop = asyncio.get_running_loop()
+    except RuntimeError:
+        send(sender, announcement(prefix, answered_at, _LEASE_S), targets)
+        return
+    send(sender, announcement(prefix, answered_at, _UNHEARD_LEASE_S), targets)
+    loop.call_later(_FORGOTTEN_S, _forget, prefix, sender.family, targets, output_port)
+
+
+def _forget(
+    prefix: str, family: int, targets: Iterable[ProbeTarget], output_port: int | None
+) -> None:
+    with contextlib.suppress(OSError):
+        if output_port is None:
+            sender: socket.socket | None = socket.socket(family, socket.SOCK_DGRAM)
+        else:
+            sender = own_udp_socket(family, output_port)
+        if sender is not None:
+            with sender:
+                send(sender, disposal(prefix), targets)
+
+
 def send(sender: socket.socket, message: bytes, targets: Iterable[ProbeTarget]) -> None:
     """Send a datagram to each destination, without waiting.
 
@@ -238,47 +277,6 @@ def _send_by(sender: socket.socket, interface: str) -> None:
         return
     chosen = struct.pack("=4s4si", bytes(4), bytes(4), index)  # struct ip_mreqn of ip(7)
     sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, chosen)
-
-
-def _parameters(parameters: Iterable[tuple[int, bytes]]) -> bytes:
-    return b"".join(struct.pack("<HH", pid, len(value)) + value for pid, value in parameters)
-
-
-_NOBODY = _parameters(
-    (
-        (0x0002, struct.pack("<iI", 0, int(_LEASE_S * 2**32))),  # PID_PARTICIPANT_LEASE_DURATION
-        (0x0058, struct.pack("<I", 0x3)),  # PID_BUILTIN_ENDPOINT_SET: announcer and detector only
-    )
-)
-"""By which announcements of participants that do not exist are known, also those of others."""
-
-
-def announcement(locators: Iterable[tuple[str, int]]) -> bytes:
-    """Return a DATA(p) of a new, random participant that can be answered at `locators`.
-
-    Args:
-        locators: (IP address, UDP port).
-    """
-    prefix = b"\x01\x0f" + os.urandom(_PREFIX_BYTES - 2)
-    parameters = [
-        (0x0015, b"\x02\x03\x00\x00"),  # PID_PROTOCOL_VERSION
-        (0x0016, b"\x01\x0f\x00\x00"),  # PID_VENDORID
-        (0x0050, prefix + b"\x00\x00\x01\xc1"),  # PID_PARTICIPANT_GUID
-    ]
-    located = []
-    for address, port in locators:
-        packed = ipaddress.ip_address(address).packed
-        kind = _UDPV6 if len(packed) == 16 else _UDPV4
-        locator = struct.pack("<iI", kind, port) + packed.rjust(16, b"\0")
-        located.append((0x0032, locator))  # PID_METATRAFFIC_UNICAST_LOCATOR
-        located.append((0x0031, locator))  # PID_DEFAULT_UNICAST_LOCATOR
-    payload = b"\x00\x03\x00\x00"  # PL_CDR_LE
-    payload += _parameters(parameters) + _NOBODY + _parameters(located)
-    payload += struct.pack("<HH", 0x0001, 0)  # PID_SENTINEL
-    reader, writer = b"\x00\x01\x00\xc7", b"\x00\x01\x00\xc2"  # SPDP builtin endpoints
-    body = struct.pack("<HH", 0, 16) + reader + writer + struct.pack("<iI", 0, 1) + payload
-    info_timestamp = struct.pack("<BBHII", 0x09, 0x01, 8, int(time.time()), 0)
-    return HEADER + prefix + info_timestamp + struct.pack("<BBH", 0x15, 0x05, len(body)) + body
 
 
 def discovery_ports(domain_id: int, kind: Medium = RMW_DISCOVERY) -> tuple[int, ...]:

@@ -29,11 +29,12 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 from lifecycle.middleware.discovery.dead_peers import listening
+from lifecycle.middleware.discovery.messages import disposal
 from lifecycle.middleware.discovery.probe import (
     RANGE_VARIABLE,
     ProbeTarget,
     addresses_of,
-    announcement,
+    ask,
     chosen_otherwise,
     discovery_ports,
     group_targets,
@@ -95,15 +96,14 @@ def _call_around(domain_id: int, kind: Medium, peers: Sequence[str]) -> None:
     group_port = participant_ports(domain_id, 0).discovery_multicast
     ports = discovery_ports(domain_id, kind)
     ours = [(a, port) for port in ports for found in interfaces.values() for a in found]
-    # Two that do not exist: an answer goes to only one kind of address.
-    calls = (announcement(ours), announcement([(DISCOVERY_GROUP[kind], group_port)]))
+    group = tuple(group_targets(domain_id, kind, interfaces))
     targets = [
         target for peer in peers for target in well_known_targets(domain_id, peer, _PARTICIPANTS)
     ]
     with socket.socket(kind.socket_family, socket.SOCK_DGRAM) as sender:
-        for call in calls:
-            send(sender, call, group_targets(domain_id, kind, interfaces))
-        send(sender, calls[0], targets)
+        # Two that do not exist: an answer goes to only one kind of address.
+        ask(sender, ours, (*group, *targets))
+        ask(sender, [(DISCOVERY_GROUP[kind], group_port)], group)
 
 
 def _call_listed(domain_id: int, family: UrlTransport) -> None:
@@ -130,7 +130,7 @@ def _call_listed(domain_id: int, family: UrlTransport) -> None:
     if own is None:
         return
     with own as sender:
-        send(sender, announcement(answered_at[:_ANSWERED_AT]), targets)
+        ask(sender, answered_at[:_ANSWERED_AT], targets, output)
 
 
 def introduce(
@@ -139,6 +139,8 @@ def introduce(
     urls: Sequence[ConnectionUrl],
     environment: Mapping[str, str],
     pids: Iterable[int],
+    *,
+    anew: str = "",
 ) -> None:
     """Make participants that have been there for long announce themselves to new ones at once.
 
@@ -155,6 +157,8 @@ def introduce(
         environment: see `probe.probe_targets`.
         pids: of this host's processes whose participants are to answer, besides all that the
             observer could find.
+        anew: GUID prefix of the observer, where the new ones are to forget it and discover it
+            again; empty otherwise. Then they send it what they had sent before, too.
     """
     asked = dict(probe_targets(domain_id, urls, environment))
     if not asked or (urls and not leaves_discovery_open(urls)):
@@ -170,7 +174,9 @@ def introduce(
         if not answered_at or not targets:
             continue
         with contextlib.suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as sender:
-            send(sender, announcement(answered_at[:_ANSWERED_AT]), targets)
+            if anew:
+                send(sender, disposal(anew), (each for each, pid in found.items() if pid in new))
+            ask(sender, answered_at[:_ANSWERED_AT], targets)
 
 
 def republish_names(nodes: Iterable[Node]) -> None:

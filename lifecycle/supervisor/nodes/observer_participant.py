@@ -268,12 +268,15 @@ class ObserverParticipant:
         """Have our participant announce itself to those that it knows, as far as that goes."""
         self._graph.discovery.announce_ourselves()
 
-    def introduce(self, newcomers: Iterable[int], pids: Iterable[int]) -> None:
+    def introduce(
+        self, newcomers: Iterable[int], pids: Iterable[int], *, anew: bool = False
+    ) -> None:
         """Have new participants discovered by, and discover, those that were there before."""
         from lifecycle.middleware import introduce
 
         discovery = self._graph.discovery
-        introduce(newcomers, discovery.domain_id, discovery.urls, os.environ, pids)
+        ours = discovery.prefix if anew else ""
+        introduce(newcomers, discovery.domain_id, discovery.urls, os.environ, pids, anew=ours)
 
     def send_again_soon(self) -> None:
         """Have what waits for a link to come back be sent soon when it does."""

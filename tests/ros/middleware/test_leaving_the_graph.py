@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import re
 import subprocess
 import sys
@@ -14,7 +15,15 @@ import rclpy
 from fast_dds_words import without_fast_dds
 from std_msgs.msg import String
 
-from lifecycle.middleware import GraphObserver, leftovers, segments_of, stop_listening, sweep
+from lifecycle.middleware import (
+    GraphObserver,
+    introduce,
+    leftovers,
+    segments_of,
+    stop_listening,
+    sweep,
+)
+from lifecycle.middleware.discovery.goodbye import say_goodbye
 
 WaitUntil = Callable[..., None]
 
@@ -84,6 +93,60 @@ def test_leaving_tells_the_graph_and_leaves_no_shared_memory(
     # Of two that leave at once neither may take itself for the last: then it is unused, and swept.
     left = {name for name in domains_own(ours) if Path("/dev/shm", name).exists()}
     assert set(sweep(left, within_s=1.0)) == left, users_of(left)
+
+
+def test_a_participant_that_says_goodbye_is_gone_with_all_its_nodes_before_they_are_destroyed(
+    observer: GraphObserver, fresh_domain: int, wait_until: WaitUntil
+) -> None:
+    context = rclpy.Context()
+    context.init(domain_id=fresh_domain)
+    try:
+        nodes = [rclpy.create_node(name, context=context) for name in ("one", "other")]
+        publisher = nodes[0].create_publisher(String, "/said", 10)
+        wait_until(lambda: names(observer) == ["/one", "/other"])
+        wait_until(lambda: observer.node.count_publishers("/said") == 1)
+        say_goodbye(nodes)
+        wait_until(lambda: names(observer) == [])
+        assert observer.node.count_publishers("/said") == 0
+        publisher.publish(String(data="to nobody"))
+        for node in nodes:
+            node.destroy_node()
+        assert names(observer) == []
+    finally:
+        context.try_shutdown()
+        context.destroy()
+
+
+_COUNTS = """
+import time, rclpy
+from std_msgs.msg import String
+
+rclpy.init()
+publisher = rclpy.create_node("counts").create_publisher(String, "/counted", 10)
+shown = 0
+while True:
+    if (count := publisher.get_subscription_count()) != shown:
+        shown = count
+        print(count, flush=True)
+    time.sleep(0.002)
+"""
+
+
+def test_one_that_is_to_meet_the_observer_anew_forgets_it_and_matches_it_again(
+    observer: GraphObserver, wait_until: WaitUntil
+) -> None:
+    observer.node.create_subscription(String, "/counted", lambda _: None, 10)
+    with subprocess.Popen([sys.executable, "-c", _COUNTS], stdout=subprocess.PIPE) as process:
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline() == b"1\n"
+            wait_until(lambda: observer.prefix)
+            pid, domain_id = process.pid, observer.domain_id
+            introduce([pid], domain_id, (), os.environ, [], anew=observer.prefix)
+            assert process.stdout.readline() == b"0\n"
+            assert process.stdout.readline() == b"1\n"
+        finally:
+            process.kill()
 
 
 def users_of(names: Iterable[str]) -> list[str]:

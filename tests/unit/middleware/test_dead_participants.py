@@ -5,11 +5,8 @@ from __future__ import annotations
 import socket
 import struct
 
-from lifecycle.middleware.discovery.dead_peers import (
-    disposal,
-    is_of_process,
-    remove_participants,
-)
+from lifecycle.middleware.discovery.dead_peers import is_of_process, remove_participants
+from lifecycle.middleware.discovery.messages import disposal
 from lifecycle.network.connection_url import parse
 
 OURS = "010f7f013c5d59590000" + "0000"

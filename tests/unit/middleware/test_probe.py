@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import socket
 import struct
 import time
@@ -10,11 +11,12 @@ from pathlib import Path
 
 import pytest
 
+from lifecycle.middleware.discovery import probe as probing
+from lifecycle.middleware.discovery.messages import announcement, disposal, nobody
 from lifecycle.middleware.discovery.probe import (
     ANSWER_S,
     EarlyProbe,
     Probe,
-    announcement,
     answered_at,
     chosen_otherwise,
     probes_for,
@@ -78,11 +80,41 @@ def test_what_introduces_others_to_each_other_is_no_participant_that_answers(
     (probe,) = probes_for(25, (parse(url),), {})
     try:
         called, (_, asked_from, *_) = peer.recvfrom(65536)
-        for message in (called, announcement([(address, 7910)]), announcement(()), _ANSWER):
+        another = (announcement(nobody(), at, 0.5) for at in ([(address, 7910)], ()))
+        left = disposal(called[8:20].hex())
+        for message in (called, *another, left, _ANSWER):
             peer.sendto(message, (address, asked_from))
         assert probe.answered() == {_PREFIX.hex()}
     finally:
         probe.close()
+
+
+def test_who_was_announced_and_does_not_exist_is_soon_said_to_have_left(
+    peer: socket.socket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not by its lease: each look at one is an occasion for Fast DDS's deadlock."""
+    monkeypatch.setattr(probing, "_FORGOTTEN_S", 0.05)
+    url, _ = url_for(peer)
+
+    async def main() -> None:
+        for each in probes_for(25, (parse(url),), {}):
+            each.close()
+        await asyncio.sleep(0.1)
+
+    asyncio.run(main())
+    came, left = peer.recv(65536), peer.recv(65536)
+    assert lease_s(came) == 20.0
+    expected = disposal(came[8:20].hex())
+    assert (left[:24], left[32:]) == (expected[:24], expected[32:])  # but for the time between
+    for each in probes_for(25, (parse(url),), {}):  # nobody could say it
+        each.close()
+    assert lease_s(peer.recv(65536)) == 0.5
+
+
+def lease_s(message: bytes) -> float:
+    at = message.index(struct.pack("<HH", 0x0002, 8)) + 4
+    seconds, rest = struct.unpack_from("<iI", message, at)
+    return float(seconds + rest / 2**32)
 
 
 @pytest.mark.parametrize(

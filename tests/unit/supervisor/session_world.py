@@ -298,7 +298,9 @@ class FakeParticipant:
     def remove_participants(self, prefixes: Iterable[str], pids: Iterable[int]) -> None:
         raise AssertionError(f"nothing is left in this graph: {prefixes} {pids}")
 
-    def introduce(self, newcomers: Iterable[int], pids: Iterable[int]) -> None:
+    def introduce(
+        self, newcomers: Iterable[int], pids: Iterable[int], *, anew: bool = False
+    ) -> None:
         """Everybody is discovered at once."""
 
     def announce_ourselves(self) -> None:

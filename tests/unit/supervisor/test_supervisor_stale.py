@@ -8,10 +8,13 @@ from collections.abc import Iterable
 from types import SimpleNamespace
 from typing import Any, cast
 
+import pytest
+
 from lifecycle.supervisor.control.protocol import ProcessState, Reach
+from lifecycle.supervisor.health import process_monitor
 from lifecycle.supervisor.health.process_monitor import STARTING_S, StaleNodes
 from lifecycle.supervisor.nodes.system import System
-from lifecycle.supervisor.run.events import ProcessChanged
+from lifecycle.supervisor.run.events import NodeChanged, ProcessChanged
 
 PREFIX = "010f7f015d3c1b4c00000000"
 ENDED = ProcessChanged(process="camera", state=ProcessState.EXITED, pid=7)
@@ -24,6 +27,7 @@ class Graph:
         self.asked: list[tuple[int, frozenset[str]]] = []
         self.removed: list[tuple[frozenset[str], tuple[int, ...]]] = []
         self.introduced: list[tuple[tuple[int, ...], tuple[int, ...]]] = []
+        self.anew: list[bool] = []
         self.disowned = 0
         self._removals = removals
 
@@ -36,8 +40,11 @@ class Graph:
     def remove_participants(self, prefixes: Iterable[str], pids: Iterable[int]) -> None:
         self.removed.append((frozenset(prefixes), tuple(pids)))
 
-    def introduce(self, newcomers: Iterable[int], pids: Iterable[int]) -> None:
+    def introduce(
+        self, newcomers: Iterable[int], pids: Iterable[int], *, anew: bool = False
+    ) -> None:
         self.introduced.append((tuple(newcomers), tuple(pids)))
+        self.anew.append(anew)
 
     def disown_ports(self) -> None:
         self.disowned += 1
@@ -125,3 +132,39 @@ def test_a_command_that_is_started_again_is_introduced_until_its_node_has_starte
         stale.close()
 
     asyncio.run(run())
+
+
+def test_who_stays_unknown_is_made_to_discover_the_supervisor_anew(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(process_monitor, "INTRODUCED_AGAIN_S", (0.01, 0.01))
+    monkeypatch.setattr(process_monitor, "MET_ANEW_S", 0.05)
+
+    async def run() -> None:
+        graph = Graph(removals=0)
+        of = system()
+        node, process = cast("Any", of.nodes["camera"]), cast("Any", of.processes["camera"])
+        process.__dict__.update(is_restarted=True, joins=False, is_gone=False, channel=None)
+        node.process, node.reach = process, Reach.CONNECTED
+        node.planned = SimpleNamespace(key="camera", run=SimpleNamespace(container=""))
+        part = SimpleNamespace(
+            reach=Reach.CONNECTED,
+            planned=SimpleNamespace(key="part", run=SimpleNamespace(container="camera")),
+        )
+        cast("Any", of).__dict__.update(present=frozenset(), node_named={"/camera": node}.get)
+        cast("Any", of.nodes)["part"] = part
+        stale = StaleNodes(of, graph, disown_ports=graph.disown_ports)
+        stale.on_event(NodeChanged(node="/camera", reach=Reach.CONNECTED))
+        await asyncio.sleep(0.3)
+        assert graph.anew[:5] == [False, False, False, True, True]
+        cast("Any", of).present = frozenset(("/camera",))
+        asked = len(graph.anew)
+        await asyncio.sleep(0.3)
+        assert len(graph.anew) == asked
+        part.reach = Reach.WAITING  # to be loaded by /camera, which does not answer
+        stale.on_event(NodeChanged(node="/camera", reach=Reach.CONNECTED))
+        await asyncio.sleep(0.3)
+        assert graph.anew[asked:][3:5] == [True, True]
+        stale.close()
+
+    asyncio.run(asyncio.wait_for(run(), 10))

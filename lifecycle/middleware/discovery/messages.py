@@ -1,0 +1,107 @@
+"""RTPS messages about participants that are written here, in the name of another.
+
+Owns: the announcement of a participant that does not exist, as DDSI-RTPS 2.3 writes it (§8.3.5,
+§9.4, §9.6.2.2), and the message by which a participant leaves (§8.5.3.3.2, §9.6.3.4, §9.6.3.9).
+Must not import rclpy.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import os
+import struct
+import time
+from collections.abc import Iterable
+
+HEADER = b"RTPS\x02\x03\x01\x0f"  # protocol 2.3, vendor eProsima: would others be answered?
+PREFIX_BYTES = 12
+_UDPV4, _UDPV6 = 1, 2
+"""LOCATOR_KIND_UDPv4 and LOCATOR_KIND_UDPv6 (DDSI-RTPS 9.3.1)."""
+
+_SEQUENCE = 1 << 30
+"""Sequence number of the message: above all that the participant itself has written."""
+
+_SPDP_READER, _SPDP_WRITER = b"\x00\x01\x00\xc7", b"\x00\x01\x00\xc2"
+_PARTICIPANT = b"\x00\x00\x01\xc1"
+_STATUS = struct.pack("<HH", 0x0071, 4) + b"\x00\x00\x00\x03"
+"""PID_STATUS_INFO: disposed and unregistered."""
+_PID_SENTINEL = struct.pack("<HH", 0x0001, 0)
+
+
+def _parameters(parameters: Iterable[tuple[int, bytes]]) -> bytes:
+    return b"".join(struct.pack("<HH", pid, len(value)) + value for pid, value in parameters)
+
+
+NOBODY = _parameters(
+    [(0x0058, struct.pack("<I", 0x3))]  # PID_BUILTIN_ENDPOINT_SET: announcer and detector only
+)
+"""By which announcements of participants that do not exist are known, also those of others."""
+
+
+def speaker(data: bytes) -> str:
+    """Return the GUID prefix of the participant that announced itself; empty if none did."""
+    if len(data) <= len(HEADER) + PREFIX_BYTES or not data.startswith(b"RTPS"):
+        return ""
+    if NOBODY in data or _STATUS in data:
+        return ""
+    return data[len(HEADER) : len(HEADER) + PREFIX_BYTES].hex()
+
+
+def nobody() -> str:
+    """Return the GUID prefix of a new, random participant, 24 hex digits."""
+    return (b"\x01\x0f" + os.urandom(PREFIX_BYTES - 2)).hex()
+
+
+def announcement(prefix: str, locators: Iterable[tuple[str, int]], lease_s: float) -> bytes:
+    """Return a DATA(p) of a participant that can be answered at `locators`.
+
+    Args:
+        prefix: its GUID prefix, see `nobody`.
+        locators: (IP address, UDP port).
+        lease_s: seconds, > 0, after which it is forgotten by itself.
+    """
+    octets = bytes.fromhex(prefix)
+    seconds, rest = divmod(lease_s, 1)
+    parameters = [
+        (0x0015, b"\x02\x03\x00\x00"),  # PID_PROTOCOL_VERSION
+        (0x0016, b"\x01\x0f\x00\x00"),  # PID_VENDORID
+        (0x0050, octets + b"\x00\x00\x01\xc1"),  # PID_PARTICIPANT_GUID
+        # PID_PARTICIPANT_LEASE_DURATION
+        (0x0002, struct.pack("<iI", int(seconds), int(rest * 2**32))),
+    ]
+    located = []
+    for address, port in locators:
+        packed = ipaddress.ip_address(address).packed
+        kind = _UDPV6 if len(packed) == 16 else _UDPV4
+        locator = struct.pack("<iI", kind, port) + packed.rjust(16, b"\0")
+        located.append((0x0032, locator))  # PID_METATRAFFIC_UNICAST_LOCATOR
+        located.append((0x0031, locator))  # PID_DEFAULT_UNICAST_LOCATOR
+    payload = b"\x00\x03\x00\x00"  # PL_CDR_LE
+    payload += _parameters(parameters) + NOBODY + _parameters(located)
+    payload += struct.pack("<HH", 0x0001, 0)  # PID_SENTINEL
+    reader, writer = b"\x00\x01\x00\xc7", b"\x00\x01\x00\xc2"  # SPDP builtin endpoints
+    body = struct.pack("<HH", 0, 16) + reader + writer + struct.pack("<iI", 0, 1) + payload
+    info_timestamp = struct.pack("<BBHII", 0x09, 0x01, 8, int(time.time()), 0)
+    return HEADER + octets + info_timestamp + struct.pack("<BBH", 0x15, 0x05, len(body)) + body
+
+
+def disposal(prefix: str) -> bytes:
+    """Return the RTPS message by which a participant leaves the graph.
+
+    Args:
+        prefix: its GUID prefix, 24 hex digits.
+    """
+    octets = bytes.fromhex(prefix)
+    guid = octets + _PARTICIPANT
+    inline_qos = (
+        struct.pack("<HH", 0x0070, len(guid))  # PID_KEY_HASH
+        + guid
+        + _STATUS
+        + _PID_SENTINEL
+    )
+    key = b"\x00\x03\x00\x00" + struct.pack("<HH", 0x0050, len(guid)) + guid + _PID_SENTINEL
+    body = struct.pack("<HH", 0, 16) + _SPDP_READER + _SPDP_WRITER
+    body += struct.pack("<iI", 0, _SEQUENCE) + inline_qos + key
+    info_timestamp = struct.pack("<BBHII", 0x09, 0x01, 8, int(time.time()), 0)
+    flags = 0x01 | 0x02 | 0x08  # little endian, inline QoS, key
+    return HEADER + octets + info_timestamp + struct.pack("<BBH", 0x15, flags, len(body)) + body
