@@ -14,13 +14,14 @@ our participant's port, and to a socket of ours that counts the participants.
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import ipaddress
 import socket
 import struct
+import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError
@@ -46,6 +47,9 @@ from lifecycle.network import (
     Medium,
     participant_ports,
 )
+
+if TYPE_CHECKING:
+    import asyncio
 
 RANGE_VARIABLE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 
@@ -236,13 +240,21 @@ def ask(
         output_port: the source port by which it must be told, too, that it is gone; None for any.
     """
     prefix, targets = nobody(), tuple(targets)
-    try:
-        loop = asyncio.get_running_loop()
-    except RuntimeError:
+    loop = _running_loop()
+    if loop is None:
         send(sender, announcement(prefix, answered_at, _LEASE_S), targets)
         return
     send(sender, announcement(prefix, answered_at, _UNHEARD_LEASE_S), targets)
     loop.call_later(_FORGOTTEN_S, _forget, prefix, sender.family, targets, output_port)
+
+
+def _running_loop() -> asyncio.AbstractEventLoop | None:
+    # A host has none, and is forked without the module.
+    loaded = sys.modules.get("asyncio")
+    try:
+        return None if loaded is None else loaded.get_running_loop()
+    except RuntimeError:
+        return None
 
 
 def _forget(

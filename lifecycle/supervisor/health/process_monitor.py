@@ -130,6 +130,7 @@ where the machine's clock was set back by a day and forth while ten nodes were s
 8 of 33 such starts)."""
 
 _MET_ANEW = 10
+"""Times."""
 
 STARTING_S = 0.2
 """Seconds between looks whether a command that is started again has a participant yet: nothing says
