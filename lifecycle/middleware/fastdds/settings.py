@@ -141,8 +141,6 @@ _SET_LISTENER = (
     "NSt6chrono8durationIlSt5ratioILl1ELl1EEEE"
 )
 _PARTICIPANT_OF = "_ZN16rmw_fastrtps_cpp22get_domain_participantEP10rmw_node_s"
-_GUID_OF = f"_ZNK{_DDS}17DomainParticipant4guidEv"
-_PREFIX_BYTES = 12
 _LISTENS_S = 1
 
 
@@ -155,45 +153,30 @@ def stop_listening(node: rclpy.node.Node) -> None:
     ever lets go of the lock that the callback needs to end. One of about 1,000 hosts hung so, where
     twenty left at once. What has no listener has no callback to wait for.
     """
-    functions = _participant_functions()
+    functions = _listener_functions()
     if functions is None:
         return
-    rmw_handle, participant_of, set_listener, _ = functions
+    rmw_handle, participant_of, set_listener = functions
     with contextlib.suppress(InvalidHandle), node.handle:
         participant = participant_of(rmw_handle(node.handle.pointer))
         if participant:
             set_listener(participant, None, _LISTENS_S)
 
 
-def prefix_of(node: rclpy.node.Node) -> str:
-    """Return the GUID prefix of a node's participant, 24 hex digits; empty if it is not known."""
-    functions = _participant_functions()
-    if functions is None:
-        return ""
-    rmw_handle, participant_of, _, guid_of = functions
-    with contextlib.suppress(InvalidHandle), node.handle:
-        if participant := participant_of(rmw_handle(node.handle.pointer)):
-            return ctypes.string_at(guid_of(participant), _PREFIX_BYTES).hex()
-    return ""
-
-
 @functools.lru_cache(maxsize=1)
-def _participant_functions() -> tuple[Any, Any, Any, Any] | None:
-    """Return rcl_node_get_rmw_handle and the three functions above; None where they are others."""
+def _listener_functions() -> tuple[Any, Any, Any] | None:
+    """Return rcl_node_get_rmw_handle and the two functions above; None where they are others."""
     if not abi.is_known() or get_rmw_implementation_identifier() != _RMW:
         return None
     pointer = ctypes.c_void_p
     try:
-        library = ctypes.CDLL(_LIBRARY)
-        set_listener, guid_of = library[_SET_LISTENER], library[_GUID_OF]
+        set_listener = ctypes.CDLL(_LIBRARY)[_SET_LISTENER]
         set_listener.restype = ctypes.c_uint32
         set_listener.argtypes = (pointer, pointer, ctypes.c_int64)
-        guid_of.restype, guid_of.argtypes = pointer, (pointer,)
         return (
             abi.bind("rcl", "rcl_node_get_rmw_handle", pointer, (pointer,)),
             abi.bind(_RMW, _PARTICIPANT_OF, pointer, (pointer,)),
             set_listener,
-            guid_of,
         )
     except (OSError, AttributeError, MiddlewareError):
         return None

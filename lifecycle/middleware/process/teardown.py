@@ -67,11 +67,8 @@ def leave_and_exit(
             _attempt(participant.destroy)
         nodes = tuple(nodes)
         if nodes:
-            # They need rclpy.
-            from lifecycle.middleware.discovery.goodbye import say_goodbye
-            from lifecycle.middleware.fastdds.settings import stop_listening
+            from lifecycle.middleware.fastdds.settings import stop_listening  # it needs rclpy
 
-            _attempt(functools.partial(say_goodbye, nodes))
             for node in nodes:
                 _attempt(functools.partial(stop_listening, node))
         for node in nodes:

@@ -23,7 +23,6 @@ from lifecycle.middleware import (
     stop_listening,
     sweep,
 )
-from lifecycle.middleware.discovery.goodbye import say_goodbye
 
 WaitUntil = Callable[..., None]
 
@@ -93,28 +92,6 @@ def test_leaving_tells_the_graph_and_leaves_no_shared_memory(
     # Of two that leave at once neither may take itself for the last: then it is unused, and swept.
     left = {name for name in domains_own(ours) if Path("/dev/shm", name).exists()}
     assert set(sweep(left, within_s=1.0)) == left, users_of(left)
-
-
-def test_a_participant_that_says_goodbye_is_gone_with_all_its_nodes_before_they_are_destroyed(
-    observer: GraphObserver, fresh_domain: int, wait_until: WaitUntil
-) -> None:
-    context = rclpy.Context()
-    context.init(domain_id=fresh_domain)
-    try:
-        nodes = [rclpy.create_node(name, context=context) for name in ("one", "other")]
-        publisher = nodes[0].create_publisher(String, "/said", 10)
-        wait_until(lambda: names(observer) == ["/one", "/other"])
-        wait_until(lambda: observer.node.count_publishers("/said") == 1)
-        say_goodbye(nodes)
-        wait_until(lambda: names(observer) == [])
-        assert observer.node.count_publishers("/said") == 0
-        publisher.publish(String(data="to nobody"))
-        for node in nodes:
-            node.destroy_node()
-        assert names(observer) == []
-    finally:
-        context.try_shutdown()
-        context.destroy()
 
 
 _COUNTS = """
