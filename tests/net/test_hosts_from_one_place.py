@@ -356,36 +356,6 @@ def test_a_coordinator_that_is_killed_leaves_all_running_to_be_followed_and_ende
     _nothing_left(two, first)
 
 
-def test_a_node_that_takes_long_to_activate_does_not_end_the_other_host_s_bring_up(
-    two: Fleet,
-) -> None:
-    """What is known of it changes while it does, behind a gate of host A that is open already."""
-    go = two.directory / "go"
-    never = str(two.directory / "never")
-    subscriptions = [
-        {"name": topic, "type": _STRING, "qos": "sensor_data"} for topic in ("video", "battery")
-    ]
-    edit = {
-        "nodes/n1/after": {"n_a": "active"},
-        "nodes/n_a": {
-            "run": {
-                "python": "tests.net.systems:Sink",
-                "environment": {"HOLD_ACTIVATE_FILE": str(go)},
-            },
-            "machine": "a",
-            "interface": {"subscriptions": subscriptions},
-        },
-    }
-    up = two.up(two.manifest(edit, HOLD_ACTIVATE_FILE=never, HOLD_S="8"))
-    up.met("request", host="a", node="/n_a", operation="activate")
-    up.met("request", host="b", node="/n2", operation="activate")
-    go.touch()
-    assert up.met("active", host="")["elapsed_s"] > 8
-    up.signal(signal.SIGTERM)
-    assert up.finish() == ExitCode.OK, (up.events[-1], up.said())
-    _nothing_left(two, up)
-
-
 def test_what_is_wrong_with_a_host_is_one_error_with_the_next_step(two: Fleet) -> None:
     manifest = two.manifest()
 
