@@ -19,35 +19,37 @@ _UDPV4, _UDPV6 = 1, 2
 """LOCATOR_KIND_UDPv4 and LOCATOR_KIND_UDPv6 (DDSI-RTPS 9.3.1)."""
 
 _SEQUENCE = 1 << 30
-"""Sequence number of the message: above all that the participant itself has written."""
+"""Sequence number of a disposal: above all that the participant itself has written."""
 
 _SPDP_READER, _SPDP_WRITER = b"\x00\x01\x00\xc7", b"\x00\x01\x00\xc2"
 _PARTICIPANT = b"\x00\x00\x01\xc1"
-_STATUS = struct.pack("<HH", 0x0071, 4) + b"\x00\x00\x00\x03"
-"""PID_STATUS_INFO: disposed and unregistered."""
-_PID_SENTINEL = struct.pack("<HH", 0x0001, 0)
+_PL_CDR_LE = b"\x00\x03\x00\x00"
+_INLINE_QOS, _DATA, _KEY = 0x02, 0x04, 0x08  # flags of DATA; 0x01 is little endian
 
 
 def _parameters(parameters: Iterable[tuple[int, bytes]]) -> bytes:
     return b"".join(struct.pack("<HH", pid, len(value)) + value for pid, value in parameters)
 
 
-NOBODY = _parameters(
+_PID_SENTINEL = _parameters([(0x0001, b"")])
+_STATUS = _parameters([(0x0071, b"\x00\x00\x00\x03")])
+"""PID_STATUS_INFO: disposed and unregistered."""
+PROBE_ENDPOINTS = _parameters(
     [(0x0058, struct.pack("<I", 0x3))]  # PID_BUILTIN_ENDPOINT_SET: announcer and detector only
 )
 """By which announcements of participants that do not exist are known, also those of others."""
 
 
-def speaker(data: bytes) -> str:
+def announced_prefix(data: bytes) -> str:
     """Return the GUID prefix of the participant that announced itself; empty if none did."""
     if len(data) <= len(HEADER) + PREFIX_BYTES or not data.startswith(b"RTPS"):
         return ""
-    if NOBODY in data or _STATUS in data:
+    if PROBE_ENDPOINTS in data or _STATUS in data:
         return ""
     return data[len(HEADER) : len(HEADER) + PREFIX_BYTES].hex()
 
 
-def nobody() -> str:
+def new_prefix() -> str:
     """Return the GUID prefix of a new, random participant, 24 hex digits."""
     return (b"\x01\x0f" + os.urandom(PREFIX_BYTES - 2)).hex()
 
@@ -56,16 +58,15 @@ def announcement(prefix: str, locators: Iterable[tuple[str, int]], lease_s: floa
     """Return a DATA(p) of a participant that can be answered at `locators`.
 
     Args:
-        prefix: its GUID prefix, see `nobody`.
+        prefix: its GUID prefix, see `new_prefix`.
         locators: (IP address, UDP port).
         lease_s: seconds, > 0, after which it is forgotten by itself.
     """
-    octets = bytes.fromhex(prefix)
     seconds, rest = divmod(lease_s, 1)
     parameters = [
         (0x0015, b"\x02\x03\x00\x00"),  # PID_PROTOCOL_VERSION
         (0x0016, b"\x01\x0f\x00\x00"),  # PID_VENDORID
-        (0x0050, octets + b"\x00\x00\x01\xc1"),  # PID_PARTICIPANT_GUID
+        (0x0050, bytes.fromhex(prefix) + _PARTICIPANT),  # PID_PARTICIPANT_GUID
         # PID_PARTICIPANT_LEASE_DURATION
         (0x0002, struct.pack("<iI", int(seconds), int(rest * 2**32))),
     ]
@@ -76,13 +77,8 @@ def announcement(prefix: str, locators: Iterable[tuple[str, int]], lease_s: floa
         locator = struct.pack("<iI", kind, port) + packed.rjust(16, b"\0")
         located.append((0x0032, locator))  # PID_METATRAFFIC_UNICAST_LOCATOR
         located.append((0x0031, locator))  # PID_DEFAULT_UNICAST_LOCATOR
-    payload = b"\x00\x03\x00\x00"  # PL_CDR_LE
-    payload += _parameters(parameters) + NOBODY + _parameters(located)
-    payload += struct.pack("<HH", 0x0001, 0)  # PID_SENTINEL
-    reader, writer = b"\x00\x01\x00\xc7", b"\x00\x01\x00\xc2"  # SPDP builtin endpoints
-    body = struct.pack("<HH", 0, 16) + reader + writer + struct.pack("<iI", 0, 1) + payload
-    info_timestamp = struct.pack("<BBHII", 0x09, 0x01, 8, int(time.time()), 0)
-    return HEADER + octets + info_timestamp + struct.pack("<BBH", 0x15, 0x05, len(body)) + body
+    content = _parameters(parameters) + PROBE_ENDPOINTS + _parameters(located) + _PID_SENTINEL
+    return _message(prefix, 1, _DATA, _PL_CDR_LE + content)
 
 
 def disposal(prefix: str) -> bytes:
@@ -91,17 +87,16 @@ def disposal(prefix: str) -> bytes:
     Args:
         prefix: its GUID prefix, 24 hex digits.
     """
-    octets = bytes.fromhex(prefix)
-    guid = octets + _PARTICIPANT
-    inline_qos = (
-        struct.pack("<HH", 0x0070, len(guid))  # PID_KEY_HASH
-        + guid
-        + _STATUS
-        + _PID_SENTINEL
-    )
-    key = b"\x00\x03\x00\x00" + struct.pack("<HH", 0x0050, len(guid)) + guid + _PID_SENTINEL
-    body = struct.pack("<HH", 0, 16) + _SPDP_READER + _SPDP_WRITER
-    body += struct.pack("<iI", 0, _SEQUENCE) + inline_qos + key
+    guid = bytes.fromhex(prefix) + _PARTICIPANT
+    inline_qos = _parameters([(0x0070, guid)]) + _STATUS + _PID_SENTINEL  # PID_KEY_HASH
+    key = _PL_CDR_LE + _parameters([(0x0050, guid)]) + _PID_SENTINEL
+    return _message(prefix, _SEQUENCE, _INLINE_QOS | _KEY, inline_qos + key)
+
+
+def _message(prefix: str, sequence: int, flags: int, content: bytes) -> bytes:
+    """Return one DATA of a participant's announcer, with its time."""
     info_timestamp = struct.pack("<BBHII", 0x09, 0x01, 8, int(time.time()), 0)
-    flags = 0x01 | 0x02 | 0x08  # little endian, inline QoS, key
-    return HEADER + octets + info_timestamp + struct.pack("<BBH", 0x15, flags, len(body)) + body
+    body = struct.pack("<HH", 0, 16) + _SPDP_READER + _SPDP_WRITER
+    body += struct.pack("<iI", 0, sequence) + content
+    data = struct.pack("<BBH", 0x15, 0x01 | flags, len(body)) + body
+    return HEADER + bytes.fromhex(prefix) + info_timestamp + data

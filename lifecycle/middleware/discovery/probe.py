@@ -25,7 +25,12 @@ from typing import TYPE_CHECKING
 
 from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.discovery.messages import announcement, disposal, nobody, speaker
+from lifecycle.middleware.discovery.messages import (
+    announced_prefix,
+    announcement,
+    disposal,
+    new_prefix,
+)
 from lifecycle.middleware.fastdds.dscp import own_udp_socket
 from lifecycle.middleware.fastdds.participant_profile import default_profile
 from lifecycle.middleware.fastdds.profiles import PROFILE_NAME
@@ -53,18 +58,18 @@ if TYPE_CHECKING:
 
 RANGE_VARIABLE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 
-_FORGOTTEN_S = 2.0
-"""Peers drop the participant that does not exist after so long, because they are told to. On a
+_DISPOSED_S = 2.0
+"""After so long the participant that does not exist is disposed of, so that peers drop it. On a
 loaded machine they answer later than within ANSWER_S, and not once it is gone.
 
 They do not by its lease if that can be helped: Fast DDS 2.14 looks at it in a thread of its own,
 and deadlocks if another one just unmatches a writer (its issue 6502, docs/liveliness.md). With a
 lease of 0.5 s each node that was started again made all participants look seven times.
 """
-_UNHEARD_LEASE_S = 20.0
-"""For who does not hear that it is gone."""
+_FALLBACK_LEASE_S = 20.0
+"""For peers that do not receive the disposal."""
 _LEASE_S = 0.5
-"""Where there is no event loop that could tell them so."""
+"""Where there is no event loop that could send one."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -173,7 +178,7 @@ class Probe:
             while self._socket is not None:
                 data, source = self._socket.recvfrom(65536, socket.MSG_DONTWAIT)
                 # What calls all sockets of this process, `introduce` say, calls this one, too.
-                if prefix := speaker(data):
+                if prefix := announced_prefix(data):
                     self._answers[prefix] = source[0]
         return dict(self._answers)
 
@@ -231,21 +236,21 @@ def ask(
     targets: Iterable[ProbeTarget],
     output_port: int | None = None,
 ) -> None:
-    """Announce a participant that does not exist, so that all who hear of it answer.
+    """Announce a participant that does not exist, so that all who receive it answer.
 
     Args:
         sender: UDP, of the targets' family.
         answered_at: IP addresses and UDP ports to which they answer.
         targets: where to send it.
-        output_port: the source port by which it must be told, too, that it is gone; None for any.
+        output_port: source port, also of the disposal; None for any.
     """
-    prefix, targets = nobody(), tuple(targets)
+    prefix, targets = new_prefix(), tuple(targets)
     loop = _running_loop()
     if loop is None:
         send(sender, announcement(prefix, answered_at, _LEASE_S), targets)
         return
-    send(sender, announcement(prefix, answered_at, _UNHEARD_LEASE_S), targets)
-    loop.call_later(_FORGOTTEN_S, _forget, prefix, sender.family, targets, output_port)
+    send(sender, announcement(prefix, answered_at, _FALLBACK_LEASE_S), targets)
+    loop.call_later(_DISPOSED_S, _dispose, prefix, sender.family, targets, output_port)
 
 
 def _running_loop() -> asyncio.AbstractEventLoop | None:
@@ -257,17 +262,23 @@ def _running_loop() -> asyncio.AbstractEventLoop | None:
         return None
 
 
-def _forget(
+def _dispose(
     prefix: str, family: int, targets: Iterable[ProbeTarget], output_port: int | None
 ) -> None:
     with contextlib.suppress(OSError):
-        if output_port is None:
-            sender: socket.socket | None = socket.socket(family, socket.SOCK_DGRAM)
-        else:
-            sender = own_udp_socket(family, output_port)
-        if sender is not None:
+        if (sender := sender_by(family, output_port)) is not None:
             with sender:
                 send(sender, disposal(prefix), targets)
+
+
+def sender_by(family: int, output_port: int | None) -> socket.socket | None:
+    """Return a UDP socket with this source port, the participant's own; None if that is closed.
+
+    Where the plan says by which port a participant sends, nothing may come from another.
+    """
+    if output_port is None:
+        return socket.socket(family, socket.SOCK_DGRAM)
+    return own_udp_socket(family, output_port)
 
 
 def send(sender: socket.socket, message: bytes, targets: Iterable[ProbeTarget]) -> None:

@@ -40,9 +40,10 @@ from lifecycle.middleware.discovery.probe import (
     group_targets,
     probe_targets,
     send,
+    sender_by,
     well_known_targets,
 )
-from lifecycle.middleware.fastdds.dscp import own_udp_socket, socket_descriptors
+from lifecycle.middleware.fastdds.dscp import socket_descriptors
 from lifecycle.middleware.fastdds.url_profile import (
     DISCOVERY_GROUP,
     UrlTransport,
@@ -124,10 +125,7 @@ def _call_listed(domain_id: int, family: UrlTransport) -> None:
     if not answered_at or not targets:
         return
     output = next((url.output_port for url in family.urls if url.output_port), None)
-    kind = family.kind.socket_family
-    # Where the plan says by which port this participant sends, nothing may come from another.
-    own = own_udp_socket(kind, output) if output else socket.socket(kind, socket.SOCK_DGRAM)
-    if own is None:
+    if (own := sender_by(family.kind.socket_family, output)) is None:
         return
     with own as sender:
         ask(sender, answered_at[:_ANSWERED_AT], targets, output)
@@ -140,7 +138,7 @@ def introduce(
     environment: Mapping[str, str],
     pids: Iterable[int],
     *,
-    anew: str = "",
+    rediscover: str = "",
 ) -> None:
     """Make participants that have been there for long announce themselves to new ones at once.
 
@@ -157,7 +155,7 @@ def introduce(
         environment: see `probe.probe_targets`.
         pids: of this host's processes whose participants are to answer, besides all that the
             observer could find.
-        anew: GUID prefix of the observer, where the new ones are to forget it and discover it
+        rediscover: GUID prefix of the observer, where the new ones are to drop it and discover it
             again; empty otherwise. Then they send it what they had sent before, too.
     """
     asked = dict(probe_targets(domain_id, urls, environment))
@@ -174,8 +172,12 @@ def introduce(
         if not answered_at or not targets:
             continue
         with contextlib.suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as sender:
-            if anew:
-                send(sender, disposal(anew), (each for each, pid in found.items() if pid in new))
+            if rediscover:
+                send(
+                    sender,
+                    disposal(rediscover),
+                    (each for each, pid in found.items() if pid in new),
+                )
             ask(sender, answered_at[:_ANSWERED_AT], targets)
 
 

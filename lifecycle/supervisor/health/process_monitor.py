@@ -123,14 +123,14 @@ datagram may be lost. After the first two only while discovery still shows a par
 INTRODUCED_AGAIN_S = (0.1, 0.1, 0.1, 0.2, 0.4, 0.8)
 """Seconds between repetitions: a datagram may be lost, and be answered before it is listened."""
 
-MET_ANEW_S = 3.0
+REDISCOVERED_S = 3.0
 """Seconds after which one whose name is still not known, or that has not loaded its components, is
 made to discover us anew, and again: now and then Fast DDS 2.14 does not repeat what is owed (seen
 where the machine's clock was set back by a day and forth while ten nodes were started; measured: in
 8 of 33 such starts)."""
 
-_MET_ANEW = 10
-"""Times."""
+_REDISCOVERIES = 10
+"""Times at most."""
 
 STARTING_S = 0.2
 """Seconds between looks whether a command that is started again has a participant yet: nothing says
@@ -154,14 +154,14 @@ class ParticipantRegistry(Protocol):
         """Have all others forget participants whose process is dead."""
 
     def introduce(
-        self, newcomers: Iterable[int], pids: Iterable[int], *, anew: bool = False
+        self, newcomers: Iterable[int], pids: Iterable[int], *, rediscover: bool = False
     ) -> None:
         """Have new participants discovered by, and discover, those that were there before.
 
         Args:
             newcomers: pids of the new ones.
             pids: of the others.
-            anew: the new ones forget us first.
+            rediscover: the new ones drop us first, and discover us again.
         """
 
 
@@ -216,18 +216,18 @@ class StaleNodes:
         if self._closed or node.reach is not reach or process.is_gone:
             return
         known = self._is_known(node)
-        anew = repetition > len(INTRODUCED_AGAIN_S)
-        if anew and known:
+        rediscover = repetition > len(INTRODUCED_AGAIN_S)
+        if rediscover and known:
             return
         pids = [each.pid for each in self._system.living if each is not process]
-        self._graph.introduce([process.pid], pids, anew=anew)
+        self._graph.introduce([process.pid], pids, rediscover=rediscover)
         if repetition and process.channel is not None and not known:
             # Its endpoints may be matched and its name not be known: what it published before the
             # match is only repeated with the next heartbeat, 3 s later.
             publishing = asyncio.ensure_future(_republish(process.channel, name))
             self._publishing.add(publishing)
             publishing.add_done_callback(self._publishing.discard)
-        pauses = (*INTRODUCED_AGAIN_S, *[MET_ANEW_S] * _MET_ANEW)
+        pauses = (*INTRODUCED_AGAIN_S, *[REDISCOVERED_S] * _REDISCOVERIES)
         if repetition == len(pauses):
             return
 
@@ -269,8 +269,8 @@ class StaleNodes:
             return
         if process.pid:
             pids = [each.pid for each in self._system.living if each is not process]
-            anew = looks % round(MET_ANEW_S / STARTING_S) == 0
-            self._graph.introduce([process.pid], pids, anew=anew)
+            rediscover = looks % round(REDISCOVERED_S / STARTING_S) == 0
+            self._graph.introduce([process.pid], pids, rediscover=rediscover)
 
         def again() -> None:
             self._later.discard(handle)

@@ -269,14 +269,14 @@ class ObserverParticipant:
         self._graph.discovery.announce_ourselves()
 
     def introduce(
-        self, newcomers: Iterable[int], pids: Iterable[int], *, anew: bool = False
+        self, newcomers: Iterable[int], pids: Iterable[int], *, rediscover: bool = False
     ) -> None:
         """Have new participants discovered by, and discover, those that were there before."""
         from lifecycle.middleware import introduce
 
         discovery = self._graph.discovery
-        ours = discovery.prefix if anew else ""
-        introduce(newcomers, discovery.domain_id, discovery.urls, os.environ, pids, anew=ours)
+        ours = discovery.prefix if rediscover else ""
+        introduce(newcomers, discovery.domain_id, discovery.urls, os.environ, pids, rediscover=ours)
 
     def send_again_soon(self) -> None:
         """Have what waits for a link to come back be sent soon when it does."""

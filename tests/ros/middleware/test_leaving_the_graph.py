@@ -109,7 +109,7 @@ while True:
 """
 
 
-def test_one_that_is_to_meet_the_observer_anew_forgets_it_and_matches_it_again(
+def test_one_that_is_to_rediscover_the_observer_drops_it_and_matches_it_again(
     observer: GraphObserver, wait_until: WaitUntil
 ) -> None:
     observer.node.create_subscription(String, "/counted", lambda _: None, 10)
@@ -119,7 +119,7 @@ def test_one_that_is_to_meet_the_observer_anew_forgets_it_and_matches_it_again(
             assert process.stdout.readline() == b"1\n"
             wait_until(lambda: observer.prefix)
             pid, domain_id = process.pid, observer.domain_id
-            introduce([pid], domain_id, (), os.environ, [], anew=observer.prefix)
+            introduce([pid], domain_id, (), os.environ, [], rediscover=observer.prefix)
             assert process.stdout.readline() == b"0\n"
             assert process.stdout.readline() == b"1\n"
         finally:

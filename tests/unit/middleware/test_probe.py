@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from lifecycle.middleware.discovery import probe as probing
-from lifecycle.middleware.discovery.messages import announcement, disposal, nobody
+from lifecycle.middleware.discovery.messages import announcement, disposal, new_prefix
 from lifecycle.middleware.discovery.probe import (
     ANSWER_S,
     EarlyProbe,
@@ -80,7 +80,7 @@ def test_what_introduces_others_to_each_other_is_no_participant_that_answers(
     (probe,) = probes_for(25, (parse(url),), {})
     try:
         called, (_, asked_from, *_) = peer.recvfrom(65536)
-        another = (announcement(nobody(), at, 0.5) for at in ([(address, 7910)], ()))
+        another = (announcement(new_prefix(), at, 0.5) for at in ([(address, 7910)], ()))
         left = disposal(called[8:20].hex())
         for message in (called, *another, left, _ANSWER):
             peer.sendto(message, (address, asked_from))
@@ -93,7 +93,7 @@ def test_who_was_announced_and_does_not_exist_is_soon_said_to_have_left(
     peer: socket.socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Not by its lease: each look at one is an occasion for Fast DDS's deadlock."""
-    monkeypatch.setattr(probing, "_FORGOTTEN_S", 0.05)
+    monkeypatch.setattr(probing, "_DISPOSED_S", 0.05)
     url, _ = url_for(peer)
 
     async def main() -> None:

@@ -299,7 +299,7 @@ class FakeParticipant:
         raise AssertionError(f"nothing is left in this graph: {prefixes} {pids}")
 
     def introduce(
-        self, newcomers: Iterable[int], pids: Iterable[int], *, anew: bool = False
+        self, newcomers: Iterable[int], pids: Iterable[int], *, rediscover: bool = False
     ) -> None:
         """Everybody is discovered at once."""
 

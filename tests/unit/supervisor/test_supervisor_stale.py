@@ -27,7 +27,7 @@ class Graph:
         self.asked: list[tuple[int, frozenset[str]]] = []
         self.removed: list[tuple[frozenset[str], tuple[int, ...]]] = []
         self.introduced: list[tuple[tuple[int, ...], tuple[int, ...]]] = []
-        self.anew: list[bool] = []
+        self.rediscovers: list[bool] = []
         self.disowned = 0
         self._removals = removals
 
@@ -41,10 +41,10 @@ class Graph:
         self.removed.append((frozenset(prefixes), tuple(pids)))
 
     def introduce(
-        self, newcomers: Iterable[int], pids: Iterable[int], *, anew: bool = False
+        self, newcomers: Iterable[int], pids: Iterable[int], *, rediscover: bool = False
     ) -> None:
         self.introduced.append((tuple(newcomers), tuple(pids)))
-        self.anew.append(anew)
+        self.rediscovers.append(rediscover)
 
     def disown_ports(self) -> None:
         self.disowned += 1
@@ -138,7 +138,7 @@ def test_who_stays_unknown_is_made_to_discover_the_supervisor_anew(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(process_monitor, "INTRODUCED_AGAIN_S", (0.01, 0.01))
-    monkeypatch.setattr(process_monitor, "MET_ANEW_S", 0.05)
+    monkeypatch.setattr(process_monitor, "REDISCOVERED_S", 0.05)
 
     async def run() -> None:
         graph = Graph(removals=0)
@@ -156,15 +156,15 @@ def test_who_stays_unknown_is_made_to_discover_the_supervisor_anew(
         stale = StaleNodes(of, graph, disown_ports=graph.disown_ports)
         stale.on_event(NodeChanged(node="/camera", reach=Reach.CONNECTED))
         await asyncio.sleep(0.3)
-        assert graph.anew[:5] == [False, False, False, True, True]
+        assert graph.rediscovers[:5] == [False, False, False, True, True]
         cast("Any", of).present = frozenset(("/camera",))
-        asked = len(graph.anew)
+        asked = len(graph.rediscovers)
         await asyncio.sleep(0.3)
-        assert len(graph.anew) == asked
+        assert len(graph.rediscovers) == asked
         part.reach = Reach.WAITING  # to be loaded by /camera, which does not answer
         stale.on_event(NodeChanged(node="/camera", reach=Reach.CONNECTED))
         await asyncio.sleep(0.3)
-        assert graph.anew[asked:][3:5] == [True, True]
+        assert graph.rediscovers[asked:][3:5] == [True, True]
         stale.close()
 
     asyncio.run(asyncio.wait_for(run(), 10))
