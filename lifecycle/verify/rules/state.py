@@ -40,7 +40,7 @@ ACTIVATED_AT_CLOSED_GATE = Rule(
 )
 RULES = (WRONG_STATE, STATE_UNVERIFIABLE, ACTIVATED_AT_CLOSED_GATE)
 
-_INACTIVE, _ACTIVE = TargetState.INACTIVE.value, TargetState.ACTIVE.value
+_INACTIVE = TargetState.INACTIVE.value
 
 
 def _wanted(stage: Stage, node: PlannedNode) -> str:
@@ -61,10 +61,8 @@ def _judge(facts: NodeFacts) -> Iterator[Finding]:
         return
     wanted = _wanted(frame.stage, node)
     allowed = {wanted}
-    let_through = frame.stage is Stage.CONNECTED and (
-        name in frame.ahead or not frame.brings_up(node)
-    )
-    if let_through:
+    ahead = frame.stage is Stage.CONNECTED and name in frame.ahead
+    if ahead or (frame.stage is Stage.CONNECTED and not frame.brings_up(node)):
         # Another supervisor brings it up, and its gate opens on the same proof, maybe before ours;
         # or an earlier gate let it through, and only others have to pass again.
         allowed.add(node.state.value)
@@ -76,7 +74,7 @@ def _judge(facts: NodeFacts) -> Iterator[Finding]:
         if state
     )
     # On the way to what is allowed; `activating` is never the goal, so no message names it.
-    passing = {"activating"} if let_through and _ACTIVE in allowed else set()
+    passing = {"activating"} if ahead else set()
     wrong = [state for state in states if state not in allowed | passing]
     expected = wanted
     if frame.stage is Stage.CONNECTED and frame.ours(node) and wanted == _INACTIVE:
