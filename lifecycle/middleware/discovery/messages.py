@@ -60,7 +60,7 @@ def announcement(prefix: str, locators: Iterable[tuple[str, int]], lease_s: floa
     Args:
         prefix: its GUID prefix, see `new_prefix`.
         locators: (IP address, UDP port).
-        lease_s: seconds, > 0, after which it is forgotten by itself.
+        lease_s: seconds, > 0, after which peers drop it if they receive no disposal.
     """
     seconds, rest = divmod(lease_s, 1)
     parameters = [

@@ -167,17 +167,14 @@ def introduce(
     # The observer itself is no target of its own probes, and is to answer as well.
     for kind, found in listening((*new, *pids, os.getpid())).items():
         family = kind.socket_family
-        answered_at = [(each.address, each.port) for each, pid in found.items() if pid in new]
+        theirs = [each for each, pid in found.items() if pid in new]
+        answered_at = [(each.address, each.port) for each in theirs]
         targets = dict.fromkeys((*asked.get(kind, ()), *found))
         if not answered_at or not targets:
             continue
         with contextlib.suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as sender:
             if rediscover:
-                send(
-                    sender,
-                    disposal(rediscover),
-                    (each for each, pid in found.items() if pid in new),
-                )
+                send(sender, disposal(rediscover), theirs)
             ask(sender, answered_at[:_ANSWERED_AT], targets)
 
 
