@@ -335,10 +335,13 @@ def test_a_coordinator_that_is_killed_leaves_all_running_to_be_followed_and_ende
     assert two.runs("b") or name == "beginning"
     stage.release()
     if name != "ending":
-        pids = {each: first.met("host", host=each, state="started")["pid"] for each in "ab"}
+        # All were asked at once; it may be killed before it has said of host A that it started.
+        started = (each for each in first.of_kind("host") if each["state"] == "started")
+        pids = {each["host"]: each["pid"] for each in started}
+        assert "b" in pids
         second = two.up(stage.manifest)
         attached = {each: second.until("host", state="attached") for each in "ab"}.values()
-        assert {each["host"]: each["pid"] for each in attached} == pids
+        assert pids.items() <= {each["host"]: each["pid"] for each in attached}.items()
         _active(second)
         if name == "active":
             second.signal(signal.SIGHUP)

@@ -7,10 +7,10 @@ process. `LIFECYCLE_TEST_DOMAINS=10-19` narrows the pool.
 
 from __future__ import annotations
 
-import re
+import contextlib
 import time
 import warnings
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -63,36 +63,46 @@ def shared_domain() -> Iterator[int]:
         yield domain
 
 
-@pytest.fixture(scope="session", autouse=True)
-def _shared_memory() -> Iterator[dict[str, str]]:
-    """Fail the run if a segment that it made is left and unused at its end, and say since when.
+_Seen = dict[tuple[str, int], str]
+"""By name and inode of a file: the test after which it was first left; empty while it was not.
 
-    By name of the file: the test after which it was first left; empty while it was not.
-    """
-    seen: dict[str, str] = {}
+A port has the same name whoever makes it: one of another test, or of a process that no supervisor
+of ours has started, is another file.
+"""
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _shared_memory() -> Iterator[_Seen]:
+    """Fail the run if a segment that it made is left and unused at its end, and say since when."""
+    seen: _Seen = {}
     yield seen
-    left = {name: seen.get(name, "") for name in _left(seen)}
+    left = {file[0]: seen[file] for file in _left(seen)}
     assert left == {}, "shared memory files were left behind"
 
 
-def _left(seen: Collection[str]) -> list[str]:
-    # Unique ports (7000–7399) are the same in every domain: another run may have one by now.
-    return [each for each in leftovers(only=seen) if not re.search(r"port7[0-3]\d\d(?!\d)", each)]
+def _files(names: Iterable[str]) -> Iterator[tuple[str, int]]:
+    """Yield files of these names as they are now."""
+    for name in names:
+        with contextlib.suppress(FileNotFoundError):
+            yield name, Path("/dev/shm", name).stat().st_ino
+
+
+def _left(seen: _Seen) -> list[tuple[str, int]]:
+    return [each for each in _files(leftovers(only=[name for name, _ in seen])) if each in seen]
 
 
 @pytest.fixture(autouse=True)
-def _note_shared_memory(
-    _shared_memory: dict[str, str], request: pytest.FixtureRequest
-) -> Iterator[None]:
+def _note_shared_memory(_shared_memory: _Seen, request: pytest.FixtureRequest) -> Iterator[None]:
     """Note what is used, and fail the test whose participants would haunt those that follow."""
     me = psutil.Process()
     before = segments_of([me.pid])
     yield
     after = segments_of([me.pid])
-    for name in after | segments_of([child.pid for child in me.children(recursive=True)]):
-        _shared_memory.setdefault(name, "")
-    for name in _left(_shared_memory):
-        _shared_memory[name] = _shared_memory.get(name) or request.node.nodeid
+    used = after | segments_of([child.pid for child in me.children(recursive=True)])
+    for file in _files(used):
+        _shared_memory.setdefault(file, "")
+    for file in _left(_shared_memory):
+        _shared_memory[file] = _shared_memory[file] or request.node.nodeid
     assert after - before == set(), (
         "a participant of this test is still there: destroy all that belongs to it"
     )
