@@ -1,7 +1,8 @@
 """Nodes of rclpy's own classes: their construction, their endpoints and their state machine.
 
 Owns: hooks into rclpy.node.Node, by which a process that hosts nodes gives them their planned names
-and knows each publisher, subscription, service, client and action that they make; and the state
+and knows each publisher, subscription, service, client and action that they make; a service of
+rclpy's that is made later than rclpy makes it; and the state
 machine of rclpy.lifecycle's nodes, driven in this process: rclpy 7 swallows what its callbacks
 raise, and an invalid request by service ends the process (rclpy/lifecycle/node.py).
 """
@@ -12,13 +13,14 @@ import contextlib
 import functools
 import sys
 import traceback
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Any, Protocol
 
 from lifecycle_msgs.msg import Transition
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.lifecycle import LifecycleNodeMixin, TransitionCallbackReturn
 from rclpy.node import Node
+from rclpy.type_description_service import TypeDescriptionService
 
 from lifecycle.manifest import EndpointKind
 
@@ -106,6 +108,29 @@ def follow_nodes(hooks: NodeHooks) -> Callable[[], None]:
             setattr(Node, name, method)
 
     return undo
+
+
+@contextlib.contextmanager
+def without_type_descriptions(node: Node) -> Iterator[None]:
+    """Have rclpy construct `node` without `~/get_type_description`, inside the block."""
+    start = TypeDescriptionService._start_service  # noqa: SLF001 - rclpy has no option for it
+
+    def start_of_others(service: Any) -> None:
+        if service._get_node() is not node:  # noqa: SLF001
+            start(service)
+
+    TypeDescriptionService._start_service = start_of_others  # noqa: SLF001
+    try:
+        yield
+    finally:
+        TypeDescriptionService._start_service = start  # noqa: SLF001
+
+
+def serve_type_descriptions(node: Node) -> None:
+    """Make `~/get_type_description` where its parameter does not forbid it; again is harmless."""
+    service = node._type_description_service  # noqa: SLF001
+    if service.enabled and service._type_description_srv is None:  # noqa: SLF001
+        service._start_service()  # noqa: SLF001
 
 
 def _noting(make: Callable[..., Any], kind: EndpointKind, hooks: NodeHooks) -> Callable[..., Any]:

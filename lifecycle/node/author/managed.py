@@ -22,6 +22,7 @@ from rclpy.timer import Timer
 from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest import EndpointKind, Health
+from lifecycle.middleware import serve_type_descriptions
 from lifecycle.node import configuration
 from lifecycle.node.author import parameters
 from lifecycle.node.author.declaring import DeclaredInCode
@@ -35,7 +36,7 @@ from lifecycle.node.connections.connection_status import (
 )
 from lifecycle.node.connections.data_layer import NodeDataLayer, NodeInterface, RemoteInterface
 from lifecycle.node.endpoints.making import wire_name
-from lifecycle.node.host.control import INTERFACE_ON_DEMAND
+from lifecycle.node.host.control import INTERFACE_ON_DEMAND, Operation
 from lifecycle.node.lifecycle.controller import Controller
 from lifecycle.node.lifecycle.execution import SUCCESS, Result
 from lifecycle.node.lifecycle.gate import NodeGate
@@ -217,10 +218,12 @@ class Managed:
         supervisor: str = "",
         *,
         served: bool = True,
+        serves_parameters: bool = True,
         health: Callable[[], Any] | None = None,
     ) -> None:
         self._node = node
         self._supervisor = supervisor
+        self._serves_parameters = serves_parameters
         # By its supervisor, through the gate; a node without one needs no permission.
         self._let_through = not supervisor
         self.mode = mode
@@ -367,9 +370,21 @@ class Managed:
 
         timer = self._turns.timer(0.0, once)
 
-    def serve_interface(self) -> None:
-        """Offer all services of the node interface: a client asks for one."""
-        self._remote.serve()
+    def serve(self, operation: Operation) -> None:
+        """Offer the services of `SERVED_ON_DEMAND`: a client asks for one; again is harmless."""
+        if operation is Operation.SERVE_INTERFACE:
+            self._remote.serve()
+        elif operation is Operation.SERVE_PARAMETERS:
+            self.serve_parameters()
+        elif operation is Operation.SERVE_TYPE_DESCRIPTIONS:
+            serve_type_descriptions(self._node)
+
+    def serve_parameters(self) -> None:
+        """Offer the parameter services, if they are not there yet."""
+        if not self._serves_parameters:
+            self._serves_parameters = True
+            for each in parameters.serve(self._node):
+                self.undeclared.remove(each)  # rclpy's
 
     def sleep(self, seconds: float) -> Future:
         """Return what is done in `seconds`, in every state."""

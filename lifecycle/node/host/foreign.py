@@ -54,7 +54,7 @@ from lifecycle.node.configuration import ConfigurationChanges
 from lifecycle.node.connections.connections import Connection, Connections
 from lifecycle.node.connections.data_layer import RemoteInterface
 from lifecycle.node.endpoints.mapping import MatchWatch
-from lifecycle.node.host.control import INTERFACE_ON_DEMAND
+from lifecycle.node.host.control import INTERFACE_ON_DEMAND, Operation
 from lifecycle.node.lifecycle.execution import SUCCESS, Result
 from lifecycle.node.lifecycle.gate import GatedPublisher, NodeGate
 from lifecycle.node.lifecycle.machine import CallbackOutcome, RefusedError
@@ -459,8 +459,8 @@ class ForeignNode:
         if self._machine is not None:
             self._machine.destroy()
 
-    def serve_interface(self) -> None:
-        """Do nothing: it has no node interface."""
+    def serve(self, operation: Operation) -> None:
+        """Do nothing: it has no node interface, and all else from the start."""
 
     @property
     def interface(self) -> Any:

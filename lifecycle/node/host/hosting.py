@@ -40,6 +40,7 @@ from lifecycle.middleware import (
 from lifecycle.node.author.spec import load_nodes
 from lifecycle.node.connections.data_layer import NodeInterface
 from lifecycle.node.host.control import (
+    SERVED_ON_DEMAND,
     Command,
     Event,
     HostChannel,
@@ -119,7 +120,7 @@ _ANSWERED_WITHOUT_CONFIGURATION = frozenset(
         Operation.DEACTIVATE,
         Operation.CLEANUP,
         Operation.SHUTDOWN,
-        Operation.SERVE_INTERFACE,
+        *SERVED_ON_DEMAND,
     }
 )
 
@@ -164,8 +165,8 @@ class HostCommands:
         if command.operation in self._of_process:
             self._of_process[command.operation]()
             return self._reply(command, ok=True)
-        if command.operation is Operation.SERVE_INTERFACE:
-            node.serve_interface()
+        if command.operation in SERVED_ON_DEMAND:
+            node.serve(command.operation)
             return self._reply(command, ok=True)
         if command.operation in _NODE_INTERFACE:
             await _NODE_INTERFACE[command.operation](node.interface, command)
@@ -432,6 +433,7 @@ class Host:
 
     def _outlive(self) -> None:
         """Go on without the supervisor, which was killed: as before, or with inactive nodes."""
+        self._loop.call_soon(self._serve_all)  # nobody is left to see who asks
         if self._spec.nodes[0].supervision.on_supervisor_lost is OnSupervisorLost.KEEP:
             _say("nodes go on (on_supervisor_lost: keep)")
             return
@@ -441,6 +443,11 @@ class Host:
         guard.daemon = True
         guard.start()
         self._loop.call_soon(self._deactivate, guard)
+
+    async def _serve_all(self) -> None:
+        for hosted in self._nodes.values():
+            for operation in SERVED_ON_DEMAND:
+                hosted.serve(operation)
 
     async def _deactivate(self, guard: threading.Timer) -> None:
         """Deactivate what is active, and end this process if that fails: it must not go on."""

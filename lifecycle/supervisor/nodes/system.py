@@ -17,7 +17,7 @@ from typing import Protocol
 from lifecycle import dataclasses
 from lifecycle.errors import BringUpError
 from lifecycle.manifest import Condition, OnSupervisorLost, RunKind, TargetState
-from lifecycle.node import INTERFACE_ON_DEMAND, Operation
+from lifecycle.node import SERVED_ON_DEMAND, Operation
 from lifecycle.node import Event as HostEvent
 from lifecycle.plan import Plan, PlannedNode, PlannedProcess, attached_to, in_mode
 from lifecycle.supervisor.control.protocol import ProcessState, Reach
@@ -154,10 +154,10 @@ class ServiceNames(Protocol):
         """Return the names of all services that have a server or a client."""
 
 
-class InterfaceOnDemand:
-    """Has nodes of ours offer the services of the node interface that a client waits for.
+class ServicesOnDemand:
+    """Has nodes of ours offer the services that a client waits for.
 
-    They are not there from the start, see node's INTERFACE_ON_DEMAND. Only hosts of ours leave them
+    They are not there from the start, see node's SERVED_ON_DEMAND. Only hosts of ours leave them
     out, and each has one supervisor.
     """
 
@@ -165,7 +165,7 @@ class InterfaceOnDemand:
         self._system = system
         self._graph = graph
         self._changes = changes
-        self._offered: dict[str, ControlChannel] = {}
+        self._offered: dict[tuple[str, Operation], ControlChannel] = {}
 
     async def follow(self) -> None:
         """Look once after each burst of changes, until this is cancelled."""
@@ -183,22 +183,23 @@ class InterfaceOnDemand:
 
     async def _look(self) -> None:
         quiet = {
-            node.name: channel
+            (node.name, operation): channel
             for node in self._system.nodes.values()
             if (channel := _channel_of(node)) is not None
-            and self._offered.get(node.name) is not channel
+            for operation in SERVED_ON_DEMAND
+            if self._offered.get((node.name, operation)) is not channel
         }
         if not quiet:
             return
+        # What a node offers from the start has a server: it is asked for once, which is harmless.
         names = self._graph.service_names()
-        asked = [
-            name
-            for name in quiet
-            if any(f"{name}/{service}" in names for service in INTERFACE_ON_DEMAND)
-        ]
-        for name in asked:
-            self._offered[name] = quiet[name]
-        await asyncio.gather(*(_offer(quiet[name], name) for name in asked))
+        asked = {
+            (name, operation): channel
+            for (name, operation), channel in quiet.items()
+            if any(f"{name}/{service}" in names for service in SERVED_ON_DEMAND[operation])
+        }
+        self._offered.update(asked)
+        await asyncio.gather(*(_offer(channel, *each) for each, channel in asked.items()))
 
 
 def _channel_of(node: NodeRun) -> ControlChannel | None:
@@ -209,10 +210,10 @@ def _channel_of(node: NodeRun) -> ControlChannel | None:
     return process.channel
 
 
-async def _offer(channel: ControlChannel, node: str) -> None:
+async def _offer(channel: ControlChannel, node: str, operation: Operation) -> None:
     # A host that hangs or ends is noticed elsewhere.
     with contextlib.suppress(BringUpError, asyncio.TimeoutError):
-        await asyncio.wait_for(channel.request(node, Operation.SERVE_INTERFACE), _OFFER_S)
+        await asyncio.wait_for(channel.request(node, operation), _OFFER_S)
 
 
 def _conditions(planned: PlannedNode, observation: Observation) -> Iterable[Condition]:

@@ -53,11 +53,11 @@ from lifecycle.supervisor.nodes.bring_up import BringUp
 from lifecycle.supervisor.nodes.driver import NodeDriver
 from lifecycle.supervisor.nodes.system import (
     AwaitedHealth,
-    InterfaceOnDemand,
     NodeRun,
     ObservedGraph,
     RemoteNodes,
     ServiceNames,
+    ServicesOnDemand,
     System,
 )
 from lifecycle.supervisor.policy.schedule import RestartSchedule
@@ -301,7 +301,7 @@ class Session:
             system.plan, system.awaited(), observer_participant, self._changes
         )
         self._awaited_health = AwaitedHealth(system, observer_participant, self._changes)
-        self._interfaces = InterfaceOnDemand(system, observer_participant, self._changes)
+        self._interfaces = ServicesOnDemand(system, observer_participant, self._changes)
         self._gate_sequence = GateSequence(
             system,
             bring_up=self._bring_up,

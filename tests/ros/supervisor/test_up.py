@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 import os
 import shutil
@@ -23,8 +22,7 @@ import yaml
 from rclpy.node import Node
 
 from lifecycle.errors import ExitCode
-from lifecycle.middleware import GraphObserver, NodeClients, segments_of
-from lifecycle.node import INTERFACE_ON_DEMAND
+from lifecycle.middleware import segments_of
 from lifecycle.supervisor.gate.verification_loop import SETTLED_S
 from tests.ros.middleware.free_ports import free_ports
 from tests.ros.supervisor.running import (
@@ -196,29 +194,6 @@ def test_a_violation_that_healed_while_the_system_was_held_still_counts(
         assert run.verdict["run"]["reason"].startswith("done, but violated meanwhile, ")
         assert "graph.undeclared-node" in run.verdict["run"]["reason"]
         assert run.verdict["run"]["reached"] == "active"
-
-
-def test_a_node_offers_all_of_the_node_interface_once_a_client_asks(
-    tmp_path: Path, fresh_domain: int
-) -> None:
-    on_demand = {f"/talker/{name}" for name in INTERFACE_ON_DEMAND}
-    always = {"/talker/map_to", "/talker/get_configuration", "/talker/get_state"}
-    with up(pair(tmp_path, fresh_domain), runtime=tmp_path) as run:
-        run.until("system", reached="active")
-        with GraphObserver(fresh_domain) as graph:
-            deadline_s = time.monotonic() + BOUND_S
-            while not always <= graph.services_of("/talker"):
-                assert time.monotonic() < deadline_s
-                time.sleep(0.01)
-            assert not on_demand & graph.services_of("/talker")
-            clients = NodeClients(graph)
-            asyncio.run(clients.remap("/talker", "publishers/chatter", "", timeout_s=5.0))
-            clients.destroy()
-            assert "/listener/remap" not in graph.services_of("/listener")
-        run.signal(signal.SIGTERM)
-        assert run.finish() == ExitCode.OK
-        assert run.verdict["findings"] == []
-        run.assert_nothing_left()
 
 
 def test_an_interrupt_takes_the_system_down_in_reverse_order(

@@ -15,7 +15,7 @@ import pytest
 from lifecycle.graph import set_within
 from lifecycle.manifest.model import Condition, Machine
 from lifecycle.plan.model import Plan
-from lifecycle.supervisor.nodes.system import InterfaceOnDemand, RemoteNode, RemoteNodes, System
+from lifecycle.supervisor.nodes.system import RemoteNode, RemoteNodes, ServicesOnDemand, System
 from lifecycle.supervisor.run.failure import ended
 from lifecycle.supervisor.run.options import address_that_is_down
 from lifecycle.verify.observation import Observation, ObservedNode
@@ -177,7 +177,7 @@ def test_what_clients_ask_for_is_looked_for_once_after_each_burst(
         began_s = loop.time()
         looks: list[float] = []
 
-        class Look(InterfaceOnDemand):
+        class Look(ServicesOnDemand):
             async def _look(self) -> None:
                 looks.append(round(loop.time() - began_s, 2))
 
