@@ -164,7 +164,7 @@ def capture(
     Args:
         observation: of every node in the graph, configurations of ours included.
         parameters: by full node name; None where a node did not answer, and no entry where it has
-            no parameter services.
+            no parameter services: what its configuration reports of them counts then.
         system: name to give it.
         domain_id: where it was looked.
         discovery_range: likewise.
@@ -217,8 +217,8 @@ def capture(
                 each,
                 key=keys[each.name],
                 endpoints=[one for one in endpoints[each.node.full_name] if each.has(one)],
-                configuration=configurations.get(each.node.full_name),
-                parameters=parameters.get(each.node.full_name),
+                configuration=(own := configurations.get(each.node.full_name)),
+                parameters=_parameters(parameters.get(each.node.full_name), own),
                 why_not="it did not answer"
                 if each.node.full_name in parameters
                 else "it serves none",
@@ -392,6 +392,22 @@ def _address(configuration: NodeConfiguration) -> str:
         ),
         "",
     )
+
+
+def _parameters(
+    answered: tuple[CapturedParameter, ...] | None, configuration: NodeConfiguration | None
+) -> tuple[CapturedParameter, ...] | None:
+    # A node under `lifecycle up` that declares none serves none until a client asks, and reports
+    # those that rclpy declares for each.
+    reported = configuration.parameters if configuration else None
+    if answered is not None or reported is None:
+        return answered
+    each_has = tuple(
+        CapturedParameter(name=one.name, type=one.type, value=one.value) for one in reported
+    )
+    if all(is_implicit(one.name) for one in each_has):
+        return each_has
+    return None
 
 
 def _node(

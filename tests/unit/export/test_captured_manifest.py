@@ -332,6 +332,23 @@ def test_nodes_of_ours_tell_depth_uniqueness_dscp_and_their_hidden_participants(
     assert (need.unique, need.dscp) == (UniqueRequirement.OPTIONALLY_REQUIRED, 46)
 
 
+def test_a_node_that_serves_no_parameters_and_reports_only_those_that_each_has_has_no_gap() -> None:
+    def gaps(*names: str) -> tuple[str, ...]:
+        reports = tuple(
+            ParameterReport.of(name, "bool", value=True, read_only=False) for name in names
+        )
+        silent = dataclasses.replace(configuration("/silent", state="active"), parameters=reports)
+        observation = Observation(
+            nodes=(ObservedNode(full_name="/silent", managed=True, state="active"),),
+            configurations=(silent,),
+        )
+        (node,) = captured(observation, parameters={}).nodes
+        return node.gaps
+
+    assert gaps("start_type_description_service", "use_sim_time") == ()
+    assert gaps("use_sim_time", "fast") == ("its parameters are not known: it serves none",)
+
+
 def test_names_that_no_manifest_can_declare_are_left_out_and_are_gaps(tmp_path: Path) -> None:
     odd = ("/foo-bar", "/", "bad/x", "/1foo", "/x\n/y", "/a\x1b[2J")
     captured = capture(
