@@ -14,6 +14,8 @@ from .discovery.rediscovery import republish_names as republish_names
 from .discovery.rediscovery import send_again_soon as send_again_soon
 from .discovery.rediscovery import wake_participants as wake_participants
 from .fastdds.dscp import widen_discovery_buffers as widen_discovery_buffers
+from .fastdds.endpoint_discovery import ENDPOINTS_MADE_S as ENDPOINTS_MADE_S
+from .fastdds.endpoint_discovery import resend_endpoints_soon as resend_endpoints_soon
 from .fastdds.nfe import SHARED_MEMORY as SHARED_MEMORY
 from .fastdds.nfe import UniqueFlowNotFeasible as UniqueFlowNotFeasible
 from .fastdds.nfe import create_publisher as create_publisher

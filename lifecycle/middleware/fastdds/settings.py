@@ -153,33 +153,54 @@ def stop_listening(node: rclpy.node.Node) -> None:
     ever lets go of the lock that the callback needs to end. One of about 1,000 hosts hung so, where
     twenty left at once. What has no listener has no callback to wait for.
     """
-    functions = _listener_functions()
-    if functions is None:
-        return
-    rmw_handle, participant_of, set_listener = functions
+    pointer = ctypes.c_void_p
+    set_listener = fast_dds_function(
+        _SET_LISTENER, ctypes.c_uint32, pointer, pointer, ctypes.c_int64
+    )
     with contextlib.suppress(InvalidHandle), node.handle:
-        participant = participant_of(rmw_handle(node.handle.pointer))
-        if participant:
+        participant = participant_of(node.handle.pointer)
+        if set_listener is not None and participant:
             set_listener(participant, None, _LISTENS_S)
 
 
+def participant_of(rcl_node: int) -> int | None:
+    """Return the address of the DomainParticipant of a node; None where the libraries are others.
+
+    Args:
+        rcl_node: address of the rcl_node_t.
+    """
+    functions = _node_functions()
+    if functions is None:
+        return None
+    rmw_handle, domain_participant = functions
+    found: int | None = domain_participant(rmw_handle(rcl_node))
+    return found
+
+
 @functools.lru_cache(maxsize=1)
-def _listener_functions() -> tuple[Any, Any, Any] | None:
-    """Return rcl_node_get_rmw_handle and the two functions above; None where they are others."""
+def _node_functions() -> tuple[Any, Any] | None:
+    """Return rcl_node_get_rmw_handle and rmw_fastrtps_cpp's get_domain_participant, if they are."""
     if not abi.is_known() or get_rmw_implementation_identifier() != _RMW:
         return None
     pointer = ctypes.c_void_p
     try:
-        set_listener = ctypes.CDLL(_LIBRARY)[_SET_LISTENER]
-        set_listener.restype = ctypes.c_uint32
-        set_listener.argtypes = (pointer, pointer, ctypes.c_int64)
         return (
             abi.bind("rcl", "rcl_node_get_rmw_handle", pointer, (pointer,)),
             abi.bind(_RMW, _PARTICIPANT_OF, pointer, (pointer,)),
-            set_listener,
         )
-    except (OSError, AttributeError, MiddlewareError):
+    except MiddlewareError:
         return None
+
+
+@functools.cache
+def fast_dds_function(symbol: str, result: Any, *arguments: Any) -> Any:
+    """Return a function of libfastrtps 2.14 by its mangled name; None where there is none."""
+    try:
+        function = ctypes.CDLL(_LIBRARY)[symbol]
+    except (OSError, AttributeError):
+        return None
+    function.restype, function.argtypes = result, arguments
+    return function
 
 
 def unknown_versions() -> str:
@@ -431,7 +452,7 @@ def noted_shared_memory(context: Context) -> bool | None:
 
 
 @contextlib.contextmanager
-def once_participant_is_made(context: Context, call: Callable[[], None]) -> Iterator[None]:
+def once_participant_is_made(context: Context, call: Callable[[int], None]) -> Iterator[None]:
     """Call this when the next node's participant is there, and nothing of the node but its name.
 
     rclpy makes services, publishers and subscriptions of a node after rcl has made the node. Where
@@ -439,7 +460,8 @@ def once_participant_is_made(context: Context, call: Callable[[], None]) -> Iter
 
     Args:
         context: of that node.
-        call: blocks the constructor of the first node that is made in the block, in its thread.
+        call: blocks the constructor of the first node that is made in the block, in its thread;
+            given the address of its rcl_node_t.
     """
     library = rclpy.node._rclpy  # noqa: SLF001 - there is no other moment
     made = library.Node
@@ -451,7 +473,7 @@ def once_participant_is_made(context: Context, call: Callable[[], None]) -> Iter
         its = any(each is context.handle for each in args)
         if its and not before and get_rmw_implementation_identifier() == _RMW:
             _SHARED_MEMORY_OF[context] = has_shared_memory_open()
-        call()
+        call(node.pointer)
         return node
 
     library.Node = make

@@ -24,6 +24,7 @@ from rclpy.subscription import Subscription
 from rclpy.waitable import Waitable
 
 from lifecycle.errors import MiddlewareError
+from lifecycle.middleware.fastdds.endpoint_discovery import resend_endpoints_soon
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.middleware.fastdds.settings import participant_settings
 
@@ -73,6 +74,8 @@ def quiet_node(
             ),
             hint=hint,
         ) from error
+    with node.handle:
+        resend_endpoints_soon(node.handle.pointer)
     _hidden.add(node)
     return context, node
 

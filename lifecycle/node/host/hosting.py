@@ -28,12 +28,14 @@ from lifecycle import codec
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest import Executor, OnSupervisorLost
 from lifecycle.middleware import (
+    ENDPOINTS_MADE_S,
     BusySign,
     ParticipantSettings,
     follow_nodes,
     leave_and_exit,
     once_participant_is_made,
     participant_settings,
+    resend_endpoints_soon,
     send_again_soon,
     widen_discovery_buffers,
 )
@@ -291,7 +293,7 @@ class Host:
             self._loop.spin_and_exit()
         raise AssertionError("spin_and_exit returned")
 
-    def _gather(self) -> None:
+    def _gather(self, rcl_node: int) -> None:
         """Wait until the participants of the other processes are there, bounded.
 
         Participants that find each other before they have endpoints cost discovery half the
@@ -299,6 +301,7 @@ class Host:
         peer. To those found later all of it is sent again, and each such message has a heartbeat
         sent to all others (Fast DDS 2.14; 20 nodes: 33,000 of 80,000 datagrams).
         """
+        resend_endpoints_soon(rcl_node, ENDPOINTS_MADE_S)
         widen_discovery_buffers(self._spec.domain_id)
         self._channel.write(Event(kind="participant"))
         self._proceed.wait(_GATHER_S)

@@ -1,0 +1,114 @@
+"""Endpoint discovery (EDP) of Fast DDS: how soon a participant resends which endpoints it has.
+
+Owns: the nack response delay of a participant's two built-in EDP writers (DDSI-RTPS §8.5.4).
+
+A participant that is discovered after its endpoints were made is asked for them: the other one
+receives a heartbeat, requests what it lacks 10 ms later, and Fast DDS 2.14 waits 100 ms before it
+resends (`edp_nack_response_delay`, EDPSimple.cpp). No profile and no variable changes that. It was
+a quarter of the time in which a small system comes up, and is part of each restart: who comes has
+to know our endpoints before it tells us its nodes' names. The delay is Fast DDS's own setting of a
+writer, changed by its own function; where the writer is not laid out as in 2.14.5 nothing is done.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from typing import Any
+
+from lifecycle.middleware.fastdds.settings import fast_dds_function, participant_of
+
+SOON_S = 0.005
+"""Fast DDS's own delay of writers of topics."""
+
+ENDPOINTS_MADE_S = 0.02
+"""Of a participant whose endpoints are just being made: what is resended meanwhile is more in one
+message, and none of it twice."""
+
+_WRITERS = (b"\x00\x00\x03\xc2", b"\x00\x00\x04\xc2")
+"""EntityIds of the built-in writers of publications and subscriptions, DDSI-RTPS table 9.1."""
+
+_PREFIX_BYTES = 12
+_TIMES_AT = 592
+"""Where StatefulWriter has its WriterTimes in Fast DDS 2.14.5, see `_is_known`."""
+
+
+class _Duration(ctypes.Structure):
+    _fields_ = (("seconds", ctypes.c_int32), ("nanoseconds", ctypes.c_uint32))
+
+
+class _WriterTimes(ctypes.Structure):
+    # fastrtps/rtps/attributes/WriterAttributes.h; its destructor is virtual.
+    _fields_ = (
+        ("virtual", ctypes.c_void_p),
+        ("initial_heartbeat_delay", _Duration),
+        ("heartbeat_period", _Duration),
+        ("nack_response_delay", _Duration),
+        ("nack_suppression_duration", _Duration),
+    )
+
+
+def resend_endpoints_soon(rcl_node: int, delay_s: float = SOON_S) -> bool:
+    """Have the participant of a node resend soon, when asked, which endpoints it has.
+
+    Args:
+        rcl_node: address of the rcl_node_t.
+        delay_s: seconds, 0.001–0.1; requests that come within it are answered together.
+
+    Returns:
+        Whether it will; False with another RMW, another version, or static endpoint discovery.
+    """
+    functions = _functions()
+    participant = participant_of(rcl_node)
+    if functions is None or not participant:
+        return False
+    guid_of, find_writer, update_times = functions
+    prefix = ctypes.string_at(guid_of(participant), _PREFIX_BYTES)
+    changed = 0
+    for entity in _WRITERS:
+        writer = find_writer(ctypes.create_string_buffer(prefix + entity, len(prefix + entity)))
+        if not writer:
+            continue
+        times = _WriterTimes.from_buffer_copy(
+            ctypes.string_at(writer + _TIMES_AT, ctypes.sizeof(_WriterTimes))
+        )
+        if not _is_known(times):
+            continue
+        times.nack_response_delay = _Duration(0, round(delay_s * 1e9))
+        update_times(writer, ctypes.byref(times))
+        changed += 1
+    return changed == len(_WRITERS)
+
+
+def _is_known(times: _WriterTimes) -> bool:
+    """Whether these are the times of an EDP writer, also after they were changed here."""
+    heartbeats, suppression = times.heartbeat_period, times.nack_suppression_duration
+    initial, response = times.initial_heartbeat_delay, times.nack_response_delay
+    return (
+        bool(times.virtual)
+        and (initial.seconds, initial.nanoseconds) == (0, 12_000_000)
+        and (heartbeats.seconds, heartbeats.nanoseconds) == (1, 0)
+        and (suppression.seconds, suppression.nanoseconds) == (0, 10_000_000)
+        and response.seconds == 0
+        and 0 < response.nanoseconds <= 100_000_000
+    )
+
+
+@functools.lru_cache(maxsize=1)
+def _functions() -> tuple[Any, Any, Any] | None:
+    """Return what tells a participant's GUID, finds a writer by GUID and changes its times.
+
+    None where the libraries are others.
+    """
+    pointer = ctypes.c_void_p
+    rtps = "8eprosima8fastrtps4rtps"
+    found = (
+        fast_dds_function("_ZNK8eprosima7fastdds3dds17DomainParticipant4guidEv", pointer, pointer),
+        fast_dds_function(
+            f"_ZN{rtps}14RTPSDomainImpl17find_local_writerERKNS1_6GUID_tE", pointer, pointer
+        ),
+        fast_dds_function(
+            f"_ZN{rtps}14StatefulWriter11updateTimesERKNS1_11WriterTimesE", None, pointer, pointer
+        ),
+    )
+    return None if None in found else found
