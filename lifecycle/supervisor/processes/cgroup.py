@@ -56,7 +56,7 @@ _KILL_S = 5.0
 _LOOK_S = 0.01
 
 _DELEGATE = (
-    "start it where one is: `Delegate=yes` in its systemd unit, or "
+    "start it where it is: `Delegate=yes` in its systemd unit, or "
     "`systemd-run --user --scope -p Delegate=yes lifecycle up ...`"
 )
 
@@ -265,12 +265,12 @@ class RunCgroup:
                 _control(self._own, "+", missing)
             _control(self._path, "+", wanted)
         except OSError as error:
+            others = () if error.errno != errno.EBUSY else _pids(self._own)
             self._disable(missing)
             if stayed:
                 self._return_to_own()
             if not needed:
                 return
-            others = _others(self._own) if error.errno == errno.EBUSY else ()
             if others:
                 listed = ", ".join(map(str, others))
                 why = (
@@ -422,10 +422,6 @@ def _pids(path: Path) -> tuple[int, ...]:
         return tuple(map(int, (path / _PROCS).read_text(encoding="ascii").split()))
     except OSError:
         return ()
-
-
-def _others(path: Path) -> tuple[int, ...]:
-    return tuple(pid for pid in _pids(path) if pid != os.getpid())
 
 
 def _subgroups(path: Path) -> list[Path]:
