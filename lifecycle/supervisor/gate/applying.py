@@ -193,7 +193,7 @@ class Applying:
                 self._spawner.confine(plan.processes)
             except (BringUpError, UsageError) as error:
                 raise NotBegunError(
-                    f"cannot apply {plan.manifest_path}: {error.message}; everything stays as it is"
+                    f"cannot apply {plan.manifest_path}: {error}; everything stays as it is"
                 ) from error
         there = self._sequence.active()
         active = frozenset(

@@ -362,7 +362,7 @@ class GateSequence:
                 self._spawner.confine(order.plan.processes)
         except (BringUpError, UsageError) as error:
             raise NotBegunError(
-                f"cannot restart {order.node or self._system.plan.system!r}: {error.message}; "
+                f"cannot restart {order.node or self._system.plan.system!r}: {error}; "
                 "everything stays as it is"
             ) from error
         self._gate.close()
