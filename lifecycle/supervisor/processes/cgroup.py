@@ -34,6 +34,7 @@ from lifecycle.errors import UsageError
 if TYPE_CHECKING:
     from lifecycle.manifest import Resources
     from lifecycle.plan import PlannedProcess
+    from lifecycle.supervisor.processes.orphans import ProcessFamily
 
 _PREFIX = "lifecycle-"
 _SUPERVISOR = "supervisor"
@@ -54,6 +55,9 @@ _KILL_S = 5.0
 """How long the kernel may take to end what was killed, and to let go of its cgroup."""
 
 _LOOK_S = 0.01
+
+_ROUNDS = 3
+"""How often what was started while others were moved is looked for."""
 
 _DELEGATE = (
     "start it where it is: `Delegate=yes` in its systemd unit, or "
@@ -126,9 +130,9 @@ def _unescaped(octal: re.Match[str]) -> str:
 
 
 def _events(path: Path) -> dict[str, int]:
-    """Return how often what happened to the memory of a cgroup; nothing where none is counted."""
+    """Return how often what happened, by a file of a cgroup; nothing where none is counted."""
     try:
-        lines = (path / "memory.events").read_text(encoding="ascii").splitlines()
+        lines = path.read_text(encoding="ascii").splitlines()
     except OSError:
         return {}
     return {name: int(count) for name, _, count in (each.partition(" ") for each in lines)}
@@ -148,13 +152,15 @@ class ProcessCgroup:
         self._resources = resources
 
     def explain(self) -> str:
-        """Say that the kernel killed in it because memory was used up; empty if it did not."""
-        events = _events(self.path)
-        kills, most = events.get("oom_kill", 0), self._resources.memory_max_mib
-        if not kills:
-            return ""
-        of = f"memory_max_mib {most}" if most and events.get("oom") else "what the machine has"
-        return f"out of memory, {of}: the kernel killed {kills} of its processes"
+        """Say that the kernel killed in it for want of memory, or refused to fork; else empty."""
+        events = _events(self.path / "memory.events")
+        most, tasks = self._resources.memory_max_mib, self._resources.tasks_max
+        if kills := events.get("oom_kill", 0):
+            of = f"memory_max_mib {most}" if most and events.get("oom") else "what the machine has"
+            return f"out of memory, {of}: the kernel killed {kills} of its processes"
+        if tasks and _events(self.path / "pids.events").get("max"):
+            return f"its tasks_max {tasks} was reached"
+        return ""
 
     async def end(self) -> None:
         """End what is left in it, bounded, and remove it."""
@@ -193,12 +199,12 @@ class RunCgroup:
         except CgroupError as error:
             raise _refused(process, error.message) from error
 
-    def prepare(self, processes: Sequence[PlannedProcess], helpers: Collection[int]) -> None:
+    def prepare(self, processes: Sequence[PlannedProcess], family: ProcessFamily) -> None:
         """Make sure that all that these processes ask for can be had; again for further ones.
 
         Args:
             processes: all have resources.
-            helpers: pids of processes of this supervisor that go with it.
+            family: knows the fork server, and what it has started already.
 
         Raises:
             CgroupError: it cannot; says what is missing where, and what is allowed. What was done
@@ -222,7 +228,7 @@ class RunCgroup:
         try:
             self._make(processes[0])
             wanted = (available & _COUNTED) | asked.keys()
-            self._enable(wanted, needed=bool(asked), process=processes[0], helpers=helpers)
+            self._enable(wanted, needed=bool(asked), process=processes[0], family=family)
         except CgroupError:
             if fresh:
                 self.close()
@@ -245,7 +251,7 @@ class RunCgroup:
         *,
         needed: bool,
         process: PlannedProcess,
-        helpers: Collection[int],
+        family: ProcessFamily,
     ) -> None:
         """Enable controllers for the run's processes.
 
@@ -253,13 +259,13 @@ class RunCgroup:
             wanted: those that are available.
             needed: some are asked for; else all are only to count, and do without if need be.
             process: of messages.
-            helpers: see `prepare`.
+            family: see `prepare`.
         """
         missing = set(wanted) - _words(self._own / _SUBTREE)
         stayed = not self._has_moved
         try:
             if missing:
-                self._leave_own(helpers)
+                self._leave_own(family)
                 self._recorder.note_cgroup(str(self._path), sorted(self._enabled | missing))
                 self._enabled |= missing
                 _control(self._own, "+", missing)
@@ -285,16 +291,23 @@ class RunCgroup:
                 )
             raise _refused(process, why) from error
 
-    def _leave_own(self, helpers: Collection[int]) -> None:
-        """Leave our own cgroup to its subgroups, but for the root of the hierarchy."""
+    def _leave_own(self, family: ProcessFamily) -> None:
+        """Leave our own cgroup to its subgroups, but for the root of the hierarchy.
+
+        What has no cgroup of its own goes with us.
+        """
         if self._has_moved or not (self._own / "cgroup.type").exists():
             return
         group = self._path / _SUPERVISOR
         group.mkdir(exist_ok=True)
         self._has_moved = True
-        for pid in (os.getpid(), *helpers):
-            with contextlib.suppress(ProcessLookupError):
-                _write(group / _PROCS, str(pid))
+        for _ in range(_ROUNDS):
+            ours = {os.getpid(), family.pid, *family.family()}.intersection(_pids(self._own))
+            if not ours:
+                break
+            for pid in ours:
+                with contextlib.suppress(ProcessLookupError):
+                    _write(group / _PROCS, str(pid))
 
     def _disable(self, controllers: Collection[str]) -> None:
         """Disable controllers that we have enabled; another run may still use them."""

@@ -280,7 +280,7 @@ class ForkServer:
         from lifecycle.supervisor.processes.cgroup import RunCgroup
 
         made = self._cgroup or RunCgroup.below_own(self._recorder, asking[0])
-        made.prepare(asking, (self.pid,))
+        made.prepare(asking, self)
         self._cgroup = made
 
     async def spawn(self, request: SpawnRequest) -> ForkServerChild:

@@ -35,12 +35,17 @@ def process(name: str = "arm", **limits: int) -> PlannedProcess:
 
 
 class Recorder:
-    """Notes a run's cgroup."""
+    """Notes a run's cgroup; and a fork server that has started nothing."""
 
     run_id = "ab12"
 
     def __init__(self) -> None:
         self.noted: list[tuple[str, tuple[str, ...]]] = []
+
+    pid = 0
+
+    def family(self) -> frozenset[int]:
+        return frozenset()
 
     def note_cgroup(self, path: str, controllers: Sequence[str]) -> None:
         self.noted.append((path, tuple(controllers)))
@@ -123,7 +128,7 @@ def test_a_controller_that_is_not_delegated_is_named_with_what_is(tmp_path: Path
     recorder = Recorder()
     asking = [process("eye", tasks_max=20), process("arm", memory_max_mib=64, cpu_weight=50)]
     with pytest.raises(CgroupError) as raised:
-        RunCgroup(own, recorder).prepare(asking, ())
+        RunCgroup(own, recorder).prepare(asking, recorder)
     assert str(raised.value) == (
         "robot.lifecycle.yaml:7:12: cannot give process 'arm' a cgroup for its 'run.resources': "
         f"the controller 'memory' is not delegated to cgroup {str(own)!r} of this supervisor; "
@@ -136,7 +141,7 @@ def test_a_controller_that_is_not_delegated_is_named_with_what_is(tmp_path: Path
 def test_a_cgroup_in_which_none_can_be_made_is_refused(tmp_path: Path) -> None:
     own = tmp_path / "gone"
     with pytest.raises(CgroupError) as raised:
-        RunCgroup(own, Recorder()).prepare([process()], ())
+        RunCgroup(own, Recorder()).prepare([process()], Recorder())
     assert str(raised.value) == (
         "robot.lifecycle.yaml:7:12: cannot give process 'arm' a cgroup for its 'run.resources': "
         f"cgroup {str(own)!r} of this supervisor is not delegated to it: No such file or "
@@ -201,6 +206,16 @@ def test_an_end_for_want_of_memory_is_said_to_be_one(
         return
     assert said == f"out of memory, {why}: the kernel killed 1 of its processes"
     assert str(ProcessExit(signal=9, why=said)) == f"killed by SIGKILL ({said})"
+
+
+def test_an_end_once_no_more_tasks_could_be_started_says_so(tmp_path: Path) -> None:
+    group = ProcessCgroup(tmp_path, Resources(at=AT, tasks_max=5))
+    assert group.explain() == ""
+    (tmp_path / "pids.events").write_text("max 0\n")
+    assert group.explain() == ""
+    (tmp_path / "pids.events").write_text("max 2\n")
+    assert group.explain() == "its tasks_max 5 was reached"
+    assert ProcessCgroup(tmp_path, Resources(at=AT)).explain() == ""
 
 
 def test_what_a_cgroup_uses_is_what_the_kernel_counts(tmp_path: Path) -> None:
