@@ -59,11 +59,6 @@ _LOOK_S = 0.01
 _ROUNDS = 3
 """How often what was started while others were moved is looked for."""
 
-_DELEGATE = (
-    "start it where it is: `Delegate=yes` in its systemd unit, or "
-    "`systemd-run --user --scope -p Delegate=yes lifecycle up ...`"
-)
-
 
 class CgroupError(UsageError):
     """There is no cgroup to be had with what the manifest asks for; nothing was started."""
@@ -399,10 +394,12 @@ def _refused(process: PlannedProcess, why: str) -> CgroupError:
     resources = process.run.resources
     assert resources is not None
     at = resources.at
+    user = " --user" if os.geteuid() else ""
     return CgroupError(
         f"{at.file}:{at.line}:{at.column}: cannot give process {process.name!r} a cgroup for its "
         f"'run.resources': {why}",
-        hint=_DELEGATE,
+        hint="start it where it is: `Delegate=yes` in its systemd unit, or "
+        f"`systemd-run{user} --scope -p Delegate=yes lifecycle up ...`",
     )
 
 

@@ -6,6 +6,7 @@ in that of version 2, and yet groups and what they use of the processors.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -29,13 +30,18 @@ LIMITS = {
 }
 """By controller, a file and a limit that it takes."""
 
+FIX = (
+    "start it where it is: `Delegate=yes` in its systemd unit, or "
+    f"`systemd-run{' --user' if os.geteuid() else ''} --scope -p Delegate=yes lifecycle up ...`"
+)
+
 THROUGH = ("sh", "-c", 'echo $$ > "$0/cgroup.procs" && exec "$@"')
 """Begins a command line, followed by a cgroup, that is run in it."""
 
 
-@pytest.fixture
-def group() -> Iterator[Path]:
-    """A cgroup that is delegated to who is started in it."""
+@contextlib.contextmanager
+def delegated() -> Iterator[Path]:
+    """Make a cgroup that is delegated to who is started in it."""
     try:
         made = own_cgroup() / f"test-{uuid.uuid4().hex[:8]}"
         made.mkdir()
@@ -49,6 +55,13 @@ def group() -> Iterator[Path]:
             each.rmdir()
         made.rmdir()
         assert left == []
+
+
+@pytest.fixture
+def group() -> Iterator[Path]:
+    """A cgroup that is delegated to who is started in it."""
+    with delegated() as made:
+        yield made
 
 
 def below(group: Path) -> list[str]:
@@ -116,8 +129,10 @@ def test_what_a_killed_supervisor_leaves_is_removed_by_the_next(
 ) -> None:
     edit = {"nodes/talker/run/resources": {}}
     manifest = pair(tmp_path, fresh_domain, misbehave="configure:fork", edit=edit)
-    through = (*THROUGH, str(group))
-    with up(manifest, runtime=tmp_path, through=through) as run:
+    with (
+        delegated() as other,
+        up(manifest, runtime=tmp_path, through=(*THROUGH, str(group))) as run,
+    ):
         run.until("system", reached="active")
         run.signal(signal.SIGKILL)
         run.finish()
@@ -126,9 +141,12 @@ def test_what_a_killed_supervisor_leaves_is_removed_by_the_next(
             done = verb("down", "pair", runtime=tmp_path)
             assert done.returncode == ExitCode.OK, done.stderr
         else:
+            # Not in the same one: it has no processes while groups in it have controllers.
+            through = (*THROUGH, str(other))
             with up(manifest, "--until", "connected", runtime=tmp_path, through=through) as again:
                 assert again.finish() == ExitCode.OK
-        assert below(group) == []
+        assert below(group) == below(other) == []
+        assert (group / "cgroup.subtree_control").read_text().split() == []
         assert left_of(run.mark) == []
 
 
@@ -150,9 +168,7 @@ def test_a_controller_that_is_not_there_is_refused_before_anything_is_started(
         assert run.said() == (
             f"{manifest}:{line}:7: cannot give process 'talker' a cgroup for its 'run.resources': "
             f"the controller 'pids' is not delegated to cgroup {str(group)!r} of this supervisor; "
-            f"available there: {', '.join(sorted(there)) or 'none'}; start it where it is: "
-            "`Delegate=yes` in its systemd unit, or "
-            "`systemd-run --user --scope -p Delegate=yes lifecycle up ...`\n"
+            f"available there: {', '.join(sorted(there)) or 'none'}; {FIX}\n"
         )
     assert below(group) == []
 
@@ -290,8 +306,6 @@ def test_a_group_with_other_processes_can_have_no_limits_below_it(
     assert seen["error"] == (
         "a.lifecycle.yaml:5:7: cannot give process 'a' a cgroup for its 'run.resources': cgroup "
         f"{str(group)!r} of this supervisor has other processes, too (pid {other.pid}), and then "
-        "none below it can have controllers; allowed is a cgroup of its own; start it where it is: "
-        "`Delegate=yes` in its systemd unit, or "
-        "`systemd-run --user --scope -p Delegate=yes lifecycle up ...`"
+        f"none below it can have controllers; allowed is a cgroup of its own; {FIX}"
     )
     assert below(group) == []

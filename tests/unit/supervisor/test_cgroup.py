@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -25,7 +27,7 @@ from lifecycle.supervisor.processes.usage import CgroupUse, resource_use
 AT = Position(file="robot.lifecycle.yaml", line=7, column=12)
 FIX = (
     "start it where it is: `Delegate=yes` in its systemd unit, or "
-    "`systemd-run --user --scope -p Delegate=yes lifecycle up ...`"
+    f"`systemd-run{' --user' if os.geteuid() else ''} --scope -p Delegate=yes lifecycle up ...`"
 )
 
 
@@ -233,3 +235,15 @@ def test_what_a_cgroup_uses_is_what_the_kernel_counts(tmp_path: Path) -> None:
     found = resource_use(os.getpid())
     assert found is not None
     assert found.cgroup is None
+
+
+def test_nothing_of_it_is_loaded_until_a_manifest_asks_for_resources() -> None:
+    module = "lifecycle.supervisor.processes.cgroup"
+    code = (
+        "import sys, lifecycle.supervisor.run.up, lifecycle.supervisor.control.client\n"
+        f"print({module!r} in sys.modules)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert done.stdout == "False\n"
