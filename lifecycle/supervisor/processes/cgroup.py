@@ -263,8 +263,8 @@ class RunCgroup:
                 self._leave_own(family)
                 self._recorder.note_cgroup(str(self._path), sorted(self._enabled | missing))
                 self._enabled |= missing
-                _control(self._own, "+", missing)
-            _control(self._path, "+", wanted)
+                _enable(self._own, missing)
+            _enable(self._path, wanted)
         except OSError as error:
             others = () if error.errno != errno.EBUSY else _pids(self._own)
             self._disable(missing)
@@ -305,10 +305,9 @@ class RunCgroup:
                     _write(group / _PROCS, str(pid))
 
     def _disable(self, controllers: Collection[str]) -> None:
-        """Disable controllers that we have enabled; another run may still use them."""
+        """Disable controllers that we have enabled."""
         for path in (self._path, self._own):
-            with contextlib.suppress(OSError):
-                _control(path, "-", _words(path / _SUBTREE).intersection(controllers))
+            _disable(path, controllers)
         self._enabled.difference_update(controllers)
 
     def _return_to_own(self) -> None:
@@ -381,8 +380,7 @@ def remove_left(path: str, controllers: Iterable[str], run_id: str) -> None:
     """
     group = _noted(path, run_id)
     if group is not None and _cleared(group):
-        with contextlib.suppress(OSError):
-            _control(group.parent, "-", _words(group.parent / _SUBTREE).intersection(controllers))
+        _disable(group.parent, controllers)
 
 
 def _noted(path: str, run_id: str) -> Path | None:
@@ -408,15 +406,24 @@ def _write(path: Path, text: str) -> None:
     descriptor = os.open(path, os.O_WRONLY | os.O_CLOEXEC)
     try:
         os.write(descriptor, text.encode())
+    except OSError as error:
+        raise OSError(error.errno, f"{error.strerror}, writing {text!r}", str(path)) from error
     finally:
         os.close(descriptor)
 
 
-def _control(path: Path, sign: str, controllers: Iterable[str]) -> None:
-    """Enable or disable controllers below a cgroup, all or none."""
-    words = " ".join(f"{sign}{each}" for each in sorted(controllers))
+def _enable(path: Path, controllers: Iterable[str]) -> None:
+    """Enable controllers for what is below a cgroup, all or none."""
+    words = " ".join(f"+{each}" for each in sorted(controllers))
     if words:
         _write(path / _SUBTREE, words)
+
+
+def _disable(path: Path, controllers: Iterable[str]) -> None:
+    """Disable controllers for what is below a cgroup, but for those that another run uses there."""
+    for each in _words(path / _SUBTREE).intersection(controllers):
+        with contextlib.suppress(OSError):
+            _write(path / _SUBTREE, f"-{each}")
 
 
 def _words(path: Path) -> set[str]:
