@@ -81,6 +81,8 @@ class RunRecord:
         segments: names of the shared memory files that the processes were seen to use.
         domain_id: where the system is; None if it was not written down.
         participant: GUID prefix of the supervisor's own, 24 hex digits; empty before there is one.
+        cgroup: directory of the cgroup with all of its processes; empty for none.
+        controllers: of cgroups, that it has enabled in that one's parent.
     """
 
     run_id: str
@@ -91,6 +93,8 @@ class RunRecord:
     segments: tuple[str, ...] = ()
     domain_id: int | None = None
     participant: str = ""
+    cgroup: str = ""
+    controllers: tuple[str, ...] = ()
 
 
 def new_run_id() -> str:
@@ -191,6 +195,9 @@ class RunDirectory:
         self.run_id = run_id
         self.domain_id = domain_id
         self.participant = ""
+        self._cgroup = ""
+        self._controllers: tuple[str, ...] = ()
+        self._recorded: tuple[tuple[ChildRecord, ...], Iterable[str]] = (), ()
         self.began_s = time.time()
         self.previous: RunRecord | None = None
         self._lock: int | None = None
@@ -284,10 +291,22 @@ class RunDirectory:
         finally:
             os.close(made)
 
+    def note_cgroup(self, path: str, controllers: Iterable[str]) -> None:
+        """Add the run's cgroup to the record; where that cannot be written, to the next one.
+
+        Args:
+            path: its directory.
+            controllers: see RunRecord.
+        """
+        self._cgroup, self._controllers = path, tuple(controllers)
+        with contextlib.suppress(OSError):
+            self.record(*self._recorded)
+
     def record(self, children: tuple[ChildRecord, ...], segments: Iterable[str] = ()) -> None:
         """Write down what runs, in one piece."""
         from lifecycle import codec
 
+        self._recorded = children, segments
         record = RunRecord(
             run_id=self.run_id,
             boot_id=boot_id(),
@@ -299,6 +318,8 @@ class RunDirectory:
             segments=tuple(sorted(segments)),
             domain_id=self.domain_id,
             participant=self.participant,
+            cgroup=self._cgroup,
+            controllers=self._controllers,
         )
         part = self.path / _PART_NAME
         part.unlink(missing_ok=True)

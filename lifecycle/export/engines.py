@@ -5,8 +5,8 @@ machine is started with it, is ready only once its system is active and verified
 event loop hangs, and is started again where that can help: by the engine where the manifest leaves
 that to it, never by both. Pure; nothing is asked of an engine.
 
-Sources: systemd.service(5), systemd.exec(5); podman-systemd.unit(5); the Kubernetes API v1 and
-apps/v1; the Compose Specification.
+Sources: systemd.service(5), systemd.exec(5), systemd.resource-control(5); podman-systemd.unit(5);
+the Kubernetes API v1 and apps/v1; the Compose Specification.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ import yaml
 
 from lifecycle import dataclasses
 from lifecycle.errors import ExitCode, UsageError
-from lifecycle.manifest import THIS_HOST, Restart, Timeouts
-from lifecycle.plan import Plan
+from lifecycle.manifest import THIS_HOST, Resources, Restart, Timeouts
+from lifecycle.plan import Plan, PlannedProcess
 from lifecycle.printable import one_line
 from lifecycle.run_directory import run_name
 
@@ -107,6 +107,14 @@ class Deployment:
             if each.machine == machine or not machine
         )
 
+    def limited(self, machine: str) -> tuple[tuple[PlannedProcess, Resources], ...]:
+        """Return the processes of a machine for which its supervisor makes cgroups."""
+        return tuple(
+            (each, each.run.resources)
+            for each in self.plan.processes
+            if each.run.resources is not None and (each.machine == machine or not machine)
+        )
+
     def probe(self, what: str) -> tuple[str, ...]:
         """Return the command that says, in a container, whether it is "live" or "ready"."""
         return ("lifecycle", "status", run_name(self.plan).rpartition("@")[0], "--probe", what)
@@ -170,6 +178,7 @@ def _systemd_unit(deployment: Deployment, machine: str) -> str:
         ("RestrictSUIDSGID", "yes"),
         ("LockPersonality", "yes"),
         *_systemd_capabilities(deployment),
+        *_systemd_delegation(deployment, machine),
     ]
     return _sections(
         deployment,
@@ -189,6 +198,18 @@ def _systemd_capabilities(deployment: Deployment) -> Iterator[tuple[str, object]
     yield "CapabilityBoundingSet", allowed
     if allowed:
         yield "AmbientCapabilities", allowed
+
+
+_COUNTED = ("memory", "pids")
+"""What a cgroup uses is counted by its controllers, also where nothing is limited."""
+
+
+def _systemd_delegation(deployment: Deployment, machine: str) -> Iterator[tuple[str, object]]:
+    """Let the supervisor make cgroups below the unit's own, see systemd.resource-control(5)."""
+    limited = deployment.limited(machine)
+    if limited:
+        controllers = {*_COUNTED, *(name for _, each in limited for name in each.controllers())}
+        yield "Delegate", " ".join(sorted(controllers))
 
 
 def _systemd_restart(deployment: Deployment, machine: str) -> Iterator[tuple[str, object]]:
@@ -212,7 +233,31 @@ def quadlet(deployment: Deployment) -> dict[str, str]:
     }
 
 
+def _refuse_cgroups(deployment: Deployment, machine: str, engine: str, limits: str) -> None:
+    """Refuse a part whose supervisor is to make cgroups, which it cannot in a container.
+
+    Args:
+        deployment: with the part.
+        machine: of the part.
+        engine: as people call it.
+        limits: what limits a whole container there.
+
+    Raises:
+        UsageError: it is to.
+    """
+    for process, resources in deployment.limited(machine):
+        at = resources.at
+        raise UsageError(
+            f"{at.file}:{at.line}:{at.column}: cannot give process {process.name!r} its "
+            f"'run.resources' in a container of {engine}: its supervisor would make a cgroup for "
+            "it, and the cgroup file system is read-only in a container without privileges",
+            hint=f"leave 'resources' out and limit the whole container ({limits}), or write a "
+            "unit: lifecycle export systemd",
+        )
+
+
 def _quadlet_unit(deployment: Deployment, machine: str) -> str:
+    _refuse_cgroups(deployment, machine, "podman", "PodmanArgs=--memory=, --cpus=, --pids-limit=")
     return _sections(
         deployment,
         machine,
@@ -264,6 +309,7 @@ def compose(deployment: Deployment) -> dict[str, str]:
 
 
 def _compose_project(deployment: Deployment, machine: str) -> dict[str, object]:
+    _refuse_cgroups(deployment, machine, "Compose", "mem_limit, cpus, pids_limit")
     service = {
         "image": deployment.image,
         "container_name": deployment.name(machine),
@@ -339,6 +385,8 @@ def _kubernetes_object(deployment: Deployment, machine: str) -> dict[str, object
 
 
 def _pod(deployment: Deployment, machine: str) -> dict[str, object]:
+    _refuse_cgroups(deployment, machine, "Kubernetes", "resources.limits")
+
     def probe(what: str, failures: int) -> dict[str, object]:
         return {
             "exec": {"command": list(deployment.probe(what))},

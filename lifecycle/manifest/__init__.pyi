@@ -60,6 +60,7 @@ from .model import ParameterValue as ParameterValue
 from .model import Policy as Policy
 from .model import Quantity as Quantity
 from .model import Reaction as Reaction
+from .model import Resources as Resources
 from .model import Restart as Restart
 from .model import RosArguments as RosArguments
 from .model import RosInterfaceAccess as RosInterfaceAccess

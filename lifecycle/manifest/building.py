@@ -39,6 +39,7 @@ from lifecycle.manifest.model import (
     ParameterValue,
     Quantity,
     Reaction,
+    Resources,
     Run,
     RunKind,
     Supervision,
@@ -480,7 +481,21 @@ def _run(node: Cursor, base: Path, found: Findings) -> Run:
         working_directory=absolute(base, folder) if folder else "",
         prefix=_words(cursor, "prefix", found),
         limits=None if limits is None else limits.build(Limits),
+        resources=_resources(cursor, found),
     )
+
+
+def _resources(run: Cursor, found: Findings) -> Resources | None:
+    cursor = run.get("resources")
+    if cursor is None:
+        return None
+    built = cursor.build(Resources, at=cursor.key_at)
+    high, most = built.memory_high_mib, built.memory_max_mib
+    if high is not None and most is not None and high >= most:
+        at = cursor.document.key_at((*cursor.place, "memory_high_mib"))
+        message = f"cannot use memory_high_mib {high} with memory_max_mib {most}: it is not reached"
+        found.append(error("manifest.resources", at, message, "set it lower, or leave it out"))
+    return built
 
 
 def _values(run: Cursor, key: str, found: Findings) -> tuple[tuple[str, ParameterValue], ...]:
@@ -490,7 +505,7 @@ def _values(run: Cursor, key: str, found: Findings) -> tuple[tuple[str, Paramete
 
 _OF_A_PROCESS = (
     *("environment", "working_directory", "ros_args", "prefix", "output"),
-    *("no_new_privileges", "limits"),
+    *("no_new_privileges", "limits", "resources"),
 )
 
 

@@ -200,6 +200,61 @@ class Limits:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Resources:
+    """What a process and all that it starts may use together, as systemd.resource-control(5).
+
+    None sets no limit. The process has a cgroup of its own in any case, see cgroup-v2.rst.
+
+    Attributes:
+        at: of the key `resources`.
+        memory_max_mib: MiB, beyond which the kernel kills (MemoryMax=).
+        memory_high_mib: MiB, beyond which it is slowed down and memory reclaimed (MemoryHigh=).
+        cpu_quota_percent: of one CPU, 250 is two and a half (CPUQuota=).
+        cpu_weight: 1–10000, its share among siblings that want more than there is; 100 is the
+            kernel's default (CPUWeight=).
+        tasks_max: processes and threads (TasksMax=).
+    """
+
+    at: Position = dataclasses.field(compare=False)
+    memory_max_mib: Positive | None = None
+    memory_high_mib: Positive | None = None
+    cpu_quota_percent: Positive | None = None
+    cpu_weight: Positive | None = None
+    tasks_max: Positive | None = None
+
+    def settings(self) -> tuple[tuple[str, str], ...]:
+        """Return file of the cgroup and what is written there, cgroup-v2.rst, of those set."""
+        quota = self.cpu_quota_percent and f"{self.cpu_quota_percent * 1000} {_PERIOD_US}"
+        found = (
+            ("memory.max", self.memory_max_mib and self.memory_max_mib * 2**20),
+            ("memory.high", self.memory_high_mib and self.memory_high_mib * 2**20),
+            ("cpu.max", quota),
+            ("cpu.weight", self.cpu_weight),
+            ("pids.max", self.tasks_max),
+        )
+        return tuple((name, str(value)) for name, value in found if value is not None)
+
+    def controllers(self) -> frozenset[str]:
+        """Return the controllers of the kernel that its limits take: memory, cpu, pids."""
+        return frozenset(name.partition(".")[0] for name, _ in self.settings())
+
+    def properties(self) -> tuple[str, ...]:
+        """Return the limits as systemd.resource-control(5) spells them, `MemoryMax=64M`."""
+        found = (
+            ("MemoryMax", self.memory_max_mib, "M"),
+            ("MemoryHigh", self.memory_high_mib, "M"),
+            ("CPUQuota", self.cpu_quota_percent, "%"),
+            ("CPUWeight", self.cpu_weight, ""),
+            ("TasksMax", self.tasks_max, ""),
+        )
+        return tuple(f"{name}={value}{unit}" for name, value, unit in found if value is not None)
+
+
+_PERIOD_US = 100_000
+"""Of cpu.max, the kernel's default and systemd's."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Run:
     """How to start a node. Exactly one of the forms is set, as `kind` says.
 
@@ -220,6 +275,7 @@ class Run:
         no_new_privileges: the process, and what it starts, can gain none by execve(2), as
             NoNewPrivileges= of systemd.exec(5).
         limits: None for those of the supervisor.
+        resources: None for no cgroup of its own.
     """
 
     kind: RunKind
@@ -240,6 +296,7 @@ class Run:
     output: Output = Output.BOTH
     no_new_privileges: bool = False
     limits: Limits | None = None
+    resources: Resources | None = None
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -640,6 +697,7 @@ __all__ = [
     "Policy",
     "Quantity",
     "Reaction",
+    "Resources",
     "Restart",
     "RosArguments",
     "RosInterfaceAccess",

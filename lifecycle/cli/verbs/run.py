@@ -13,7 +13,7 @@ import click
 
 from lifecycle.cli.common import completing, load_manifest
 from lifecycle.errors import ExitCode, UsageError
-from lifecycle.manifest import DiscoveryRange, RunKind
+from lifecycle.manifest import DiscoveryRange, Resources, RunKind
 from lifecycle.middleware import limit_resources, peers_environment, refuse_new_privileges
 from lifecycle.plan import Plan, PlannedNode, build_plan, reached_hosts
 
@@ -54,6 +54,8 @@ def command(manifest: str, node: str, words: tuple[str, ...], *, auto: bool) -> 
         raise UsageError(
             f"cannot run {planned.full_name}: it is attached, and started outside of the manifest"
         )
+    if planned.run.resources is not None:
+        _say_unlimited(planned.full_name, planned.run.resources)
     if planned.run.limits:
         limit_resources(planned.run.limits.resources())
     if planned.run.no_new_privileges:
@@ -61,6 +63,17 @@ def command(manifest: str, node: str, words: tuple[str, ...], *, auto: bool) -> 
     if planned.run.kind is RunKind.COMMAND:
         _replace_process(plan, planned, words[split:])
     return _run_class(plan, planned, list(words[split:]), lifecycle="auto" if auto else "manual")
+
+
+def _say_unlimited(name: str, resources: Resources) -> None:
+    """Say that a node runs in the cgroup of this terminal, and how it would not."""
+    properties = "".join(f" -p {each}" for each in resources.properties())
+    hint = f": systemd-run --user --scope{properties} lifecycle run ..." if properties else ""
+    click.echo(
+        f"warning: the resources of {name} are not limited nor counted here, a supervisor makes a "
+        f"cgroup for them{hint}",
+        err=True,
+    )
 
 
 def find_node(plan: Plan, name: str) -> PlannedNode:

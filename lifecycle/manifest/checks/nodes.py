@@ -121,6 +121,7 @@ def _apart(node: Node, other: Node, at: Position) -> Iterator[Diagnostic]:
             ("ros_args", one.ros_args, two.ros_args),
             ("no_new_privileges", one.no_new_privileges, two.no_new_privileges),
             ("limits", one.limits, two.limits),
+            ("resources", one.resources, two.resources),
             ("executor", _executor(one), _executor(two)),
         )
         if mine != its

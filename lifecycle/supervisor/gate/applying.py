@@ -14,7 +14,7 @@ from collections.abc import Awaitable, Callable, Collection, Coroutine, Mapping
 from typing import Any, Protocol
 
 from lifecycle import dataclasses
-from lifecycle.errors import BringUpError, MiddlewareError
+from lifecycle.errors import BringUpError, MiddlewareError, UsageError
 from lifecycle.manifest import Condition
 from lifecycle.plan import GivenParameters, Plan, PlanChange
 from lifecycle.supervisor.control.orders import (
@@ -190,9 +190,10 @@ class Applying:
         if change.ends_or_starts:
             try:
                 await self._spawner.ready()
-            except BringUpError as error:
+                self._spawner.confine(plan.processes)
+            except (BringUpError, UsageError) as error:
                 raise NotBegunError(
-                    f"cannot apply {plan.manifest_path}: {error.message}; everything stays as it is"
+                    f"cannot apply {plan.manifest_path}: {error}; everything stays as it is"
                 ) from error
         there = self._sequence.active()
         active = frozenset(

@@ -22,7 +22,7 @@ from collections import Counter
 from collections.abc import AsyncIterator, Callable, Collection, Coroutine, Iterable, Mapping
 from typing import Any
 
-from lifecycle.errors import BringUpError
+from lifecycle.errors import BringUpError, UsageError
 from lifecycle.manifest import TargetState
 from lifecycle.node import Operation
 from lifecycle.plan import Plan, PlanError, moving_nodes, restarted
@@ -358,9 +358,11 @@ class GateSequence:
             nodes = tuple(each for each in nodes if each.planned.key in found)
         try:
             await self._spawner.ready()
-        except BringUpError as error:
+            if order.reload and order.plan is not None:
+                self._spawner.confine(order.plan.processes)
+        except (BringUpError, UsageError) as error:
             raise NotBegunError(
-                f"cannot restart {order.node or self._system.plan.system!r}: {error.message}; "
+                f"cannot restart {order.node or self._system.plan.system!r}: {error}; "
                 "everything stays as it is"
             ) from error
         self._gate.close()

@@ -720,10 +720,6 @@ class System:
         """Return how many bytes the log file of each process has."""
         return {each.name: each.log.position for each in self.processes.values()}
 
-    def pids(self) -> dict[str, int]:
-        """Return the pids of the living processes, by name."""
-        return {each.name: each.pid for each in self.living}
-
     def dead(self) -> frozenset[str]:
         """Return the names of the nodes whose process has ended.
 

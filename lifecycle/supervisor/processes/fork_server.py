@@ -13,11 +13,15 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
+from lifecycle import dataclasses
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import BringUpError
 from lifecycle.graph import set_within
+from lifecycle.manifest import RunKind
 from lifecycle.supervisor.processes.forerunner import CLOSE_S, ForkServerProcess
 from lifecycle.supervisor.processes.fork_server_main import (
     DISOWN,
@@ -33,6 +37,10 @@ from lifecycle.supervisor.processes.fork_server_main import (
 from lifecycle.supervisor.processes.orphans import Lineage, children, descendants
 from lifecycle.supervisor.processes.process import ProcessExit, SpawnRequest, run_delay_s
 from lifecycle.supervisor.run.events import Emitter, Notice
+
+if TYPE_CHECKING:
+    from lifecycle.plan import PlannedProcess
+    from lifecycle.supervisor.processes.cgroup import ProcessCgroup, RunCgroup, RunRecorder
 
 _STATUS_WAIT_S = 1.0
 """The fork server reaps within microseconds; after this long its report does not come any more."""
@@ -63,6 +71,7 @@ class ForkServerChild:
         on_stop: see SpawnRequest.
         lineage: which processes descend from it.
         send: sends the fork server a message with descriptors.
+        group: the cgroup that it joins; None for none.
     """
 
     def __init__(
@@ -72,8 +81,12 @@ class ForkServerChild:
         on_stop: Callable[[bool], None],
         lineage: Lineage,
         send: Callable[[str, Collection[int]], None],
+        *,
+        group: ProcessCgroup | None = None,
     ) -> None:
         self.pid = pid
+        self._group = group
+        self._clearing: asyncio.Future[None] | None = None
         self._send = send
         self._lineage = lineage
         self.exited: asyncio.Future[ProcessExit] = asyncio.get_running_loop().create_future()
@@ -105,6 +118,16 @@ class ForkServerChild:
     def release(self) -> None:
         """Have the fork server end it, should this process be killed."""
         self._send(f"{RELEASE}\n{self.pid}\n", ())
+
+    @property
+    def cgroup(self) -> Path | None:
+        """Directory of its own cgroup; None if it has none."""
+        return None if self._group is None else self._group.path
+
+    async def cleared(self) -> None:
+        """Wait until what it left in its cgroup has ended and that is gone, bounded."""
+        if self._clearing is not None:
+            await asyncio.shield(self._clearing)
 
     def run_delay_s(self) -> float:
         """Return how long its threads, and those of its descendants, waited for a processor."""
@@ -154,7 +177,18 @@ class ForkServerChild:
                     exit_ = ProcessExit(signal=found.si_status)
         os.close(self._pidfd)
         self._pidfd = None
+        if self._group is not None:
+            exit_ = dataclasses.replace(exit_, why=self._group.explain())
+            self._clearing = asyncio.ensure_future(self._group.end())
         self.exited.set_result(exit_)
+
+
+class _Pending(NamedTuple):
+    """A process that the fork server was asked for."""
+
+    born: asyncio.Future[ForkServerChild]
+    request: SpawnRequest
+    group: ProcessCgroup | None
 
 
 class ForkServer:
@@ -163,11 +197,19 @@ class ForkServer:
     Args:
         process: the first one.
         emit: where it is reported if one dies.
+        recorder: notes the cgroup of the run; None where no process has resources.
     """
 
-    def __init__(self, process: ForkServerProcess, emit: Emitter | None = None) -> None:
+    def __init__(
+        self,
+        process: ForkServerProcess,
+        emit: Emitter | None = None,
+        recorder: RunRecorder | None = None,
+    ) -> None:
         self._emit = emit or Emitter()
-        self._pending: dict[int, tuple[asyncio.Future[ForkServerChild], SpawnRequest]] = {}
+        self._recorder = recorder
+        self._cgroup: RunCgroup | None = None
+        self._pending: dict[int, _Pending] = {}
         self._children: dict[int, ForkServerChild] = {}
         self._sweeping: dict[int, asyncio.Future[tuple[str, ...]]] = {}
         self._next = 0
@@ -222,25 +264,50 @@ class ForkServer:
                 return
         raise BringUpError(f"the fork server {self._how}")
 
+    def confine(self, processes: Iterable[PlannedProcess]) -> None:
+        """Make the run's cgroup, where processes ask for resources, see `Spawner`.
+
+        Raises:
+            CgroupError: that cannot be, or they cannot have what they ask for.
+        """
+        asking = [
+            each
+            for each in processes
+            if each.run.resources is not None and each.run.kind is not RunKind.ATTACH
+        ]
+        if not asking or self._recorder is None:
+            return
+        from lifecycle.supervisor.processes.cgroup import RunCgroup
+
+        made = self._cgroup or RunCgroup.below_own(self._recorder, asking[0])
+        made.prepare(asking, self)
+        self._cgroup = made
+
     async def spawn(self, request: SpawnRequest) -> ForkServerChild:
         """Fork one process.
 
         Raises:
             BringUpError: the fork server is gone, or the system is out of processes.
         """
+        group: ProcessCgroup | None = None
         try:
+            if request.resources is not None:
+                assert self._cgroup is not None
+                group = self._cgroup.make(request.name, request.resources)
             if not self._alive:
                 await self.ready()
             try:
-                return await self._forked(request)
+                return await self._forked(request, group)
             except ConnectionError:  # it is dying: nothing was forked
                 await self.ready()
-                return await self._forked(request)
+                return await self._forked(request, group)
         except (BringUpError, OSError) as error:
+            if group is not None:
+                await group.end()
             message = error.message if isinstance(error, BringUpError) else str(error)
             raise BringUpError(f"cannot start process {request.name!r}: {message}") from error
 
-    async def _forked(self, request: SpawnRequest) -> ForkServerChild:
+    async def _forked(self, request: SpawnRequest, group: ProcessCgroup | None) -> ForkServerChild:
         """Have it fork; raises OSError if it cannot be asked, BringUpError otherwise."""
         self._next += 1
         descriptors = [request.stdout, request.stderr]
@@ -259,9 +326,10 @@ class ForkServer:
             control=request.control is not None,
             limits=request.limits,
             no_new_privileges=request.no_new_privileges,
+            cgroup="" if group is None else group.procs,
         )
         born: asyncio.Future[ForkServerChild] = self._loop.create_future()
-        self._pending[message.id] = born, request
+        self._pending[message.id] = _Pending(born, request, group)
         try:
             socket.send_fds(self._process.socket, [to_json(message)], descriptors)
         except OSError:
@@ -342,13 +410,13 @@ class ForkServer:
         return True
 
     def _born(self, report: ChildReport, descriptors: list[int]) -> None:
-        born, request = self._pending.pop(report.id)
+        born, request, group = self._pending.pop(report.id)
         if report.error:
             if not born.done():
                 born.set_exception(BringUpError(report.error))
             return
         child = ForkServerChild(
-            report.pid, descriptors[0], request.on_stop, self._lineage, self._send
+            report.pid, descriptors[0], request.on_stop, self._lineage, self._send, group=group
         )
         self._children[report.id] = child
         child.exited.add_done_callback(lambda _: self._children.pop(report.id, None))
@@ -376,7 +444,7 @@ class ForkServer:
         self._how = f"ended unasked ({exit_})"
         for child in tuple(self._children.values()):
             child.adopt()
-        for born, _ in self._pending.values():
+        for born, _, _ in self._pending.values():
             if not born.done():
                 born.set_exception(BringUpError(f"the fork server {self._how}"))
         self._pending.clear()
@@ -404,7 +472,12 @@ class ForkServer:
             child.note_stops()
 
     async def close(self) -> None:
-        """End the fork server; its children must have ended."""
+        """End the fork server; its children must have ended. Then the run's cgroup is removed."""
+        await self._end()
+        if self._cgroup is not None and (left := self._cgroup.close()):
+            self._emit(Notice(message=left))
+
+    async def _end(self) -> None:
         self._closed = True
         if not self._alive:
             return

@@ -62,6 +62,7 @@ class ForkRequest:
         id: ≥ 1; 0 only asks whether the fork server serves, which answers with the same id.
         limits: see SpawnRequest.
         no_new_privileges: likewise.
+        cgroup: file that it writes to join its cgroup; empty to stay in that of the fork server.
     """
 
     id: int
@@ -71,6 +72,7 @@ class ForkRequest:
     control: bool
     limits: tuple[tuple[str, int], ...] = ()
     no_new_privileges: bool = False
+    cgroup: str = ""
 
 
 SERVES = ForkRequest(id=0, argv=(), environment=(), working_directory="", control=False)
@@ -401,12 +403,25 @@ def _take_streams(stdout: int, stderr: int) -> None:
 
 
 def _confine(request: ForkRequest) -> None:
+    if request.cgroup:
+        _join(request.cgroup)
     try:
         limit_resources(request.limits)
         if request.no_new_privileges:
             refuse_new_privileges()
     except MiddlewareError as error:
         print(error, file=sys.stderr)
+        raise SystemExit(1) from error
+
+
+def _join(procs: str) -> None:
+    """Have this process, and all that it will start, in a cgroup, see cgroups(7)."""
+    try:
+        descriptor = os.open(procs, os.O_WRONLY | os.O_CLOEXEC)
+        os.write(descriptor, b"0")
+        os.close(descriptor)
+    except OSError as error:
+        print(f"cannot join cgroup {str(Path(procs).parent)!r}: {error.strerror}", file=sys.stderr)
         raise SystemExit(1) from error
 
 

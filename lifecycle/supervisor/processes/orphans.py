@@ -125,12 +125,19 @@ def end_run(record: RunRecord) -> tuple[tuple[int, ...], frozenset[str]]:
         return (), recorded
     pids = {child.pid for child in record.children if start_ticks(child.pid) == child.start_ticks}
     pids |= _carrying(record.run_id)
+    if record.cgroup:
+        from lifecycle.supervisor.processes.cgroup import pids_left, remove_left
+
+        pids |= pids_left(record.cgroup, record.run_id)
     for pid in tuple(pids):
         pids.update(descendants(pid))
     pids.discard(os.getpid())
     # What they own now may be newer than the record.
     owned = segments_of(pids)
-    return _end(pids, GRACE_S), recorded | owned
+    ended = _end(pids, GRACE_S)
+    if record.cgroup:
+        remove_left(record.cgroup, record.controllers, record.run_id)
+    return ended, recorded | owned
 
 
 def children() -> frozenset[int]:

@@ -14,12 +14,12 @@ import contextlib
 import functools
 import os
 import signal
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
 from lifecycle import dataclasses
-from lifecycle.manifest import Output
+from lifecycle.manifest import Output, Resources
 from lifecycle.plan import PlannedProcess
 from lifecycle.supervisor.control.protocol import ProcessState
 from lifecycle.supervisor.processes.control_channel import ControlChannel
@@ -65,10 +65,12 @@ class ProcessExit:
     Attributes:
         status: exit status, 0–255; None if a signal ended it or it is not known.
         signal: number of the signal that ended it; None otherwise.
+        why: what else is known of its end; empty if nothing is.
     """
 
     status: int | None = None
     signal: int | None = None
+    why: str = ""
 
     @classmethod
     def from_wait(cls, raw: int) -> ProcessExit:
@@ -77,6 +79,9 @@ class ProcessExit:
         return cls(status=code) if code >= 0 else cls(signal=-code)
 
     def __str__(self) -> str:
+        return f"{self._how()} ({self.why})" if self.why else self._how()
+
+    def _how(self) -> str:
         if self.signal is not None:
             try:
                 return f"killed by {signal.Signals(self.signal).name}"
@@ -108,6 +113,7 @@ class SpawnRequest:
             continues.
         limits: (name, value) of setrlimit(2), `RLIMIT_NOFILE`.
         no_new_privileges: see prctl(2), PR_SET_NO_NEW_PRIVS.
+        resources: of a cgroup of its own, see `Spawner.confine`; None for none.
     """
 
     name: str
@@ -121,6 +127,7 @@ class SpawnRequest:
     prefix: tuple[str, ...] = ()
     limits: tuple[tuple[str, int], ...] = ()
     no_new_privileges: bool = False
+    resources: Resources | None = None
 
 
 class Child(Protocol):
@@ -133,6 +140,10 @@ class Child(Protocol):
 
     pid: int
     exited: asyncio.Future[ProcessExit]
+
+    @property
+    def cgroup(self) -> Path | None:
+        """Directory of its own cgroup, cgroups(7); None if it has none."""
 
     def signal(self, number: int) -> None:
         """Send a signal to the process and everything in its group; harmless once it ended."""
@@ -154,6 +165,9 @@ class Child(Protocol):
         Those of all its descendants count, too; 0 where the kernel does not say.
         """
 
+    async def cleared(self) -> None:
+        """Wait, bounded, until its cgroup is gone with all that it left there; it has ended."""
+
 
 class Spawner(Protocol):
     """Starts processes."""
@@ -163,6 +177,13 @@ class Spawner(Protocol):
 
         Raises:
             BringUpError: they cannot.
+        """
+
+    def confine(self, processes: Iterable[PlannedProcess]) -> None:
+        """Make sure, before any is started, that those that ask for resources can have them.
+
+        Raises:
+            CgroupError: they cannot; nothing has changed.
         """
 
     async def spawn(self, request: SpawnRequest) -> Child:
@@ -314,6 +335,7 @@ class ManagedProcess:
                     prefix=() if channel is None else self.planned.run.prefix,
                     limits=() if limits is None else limits.resources(),
                     no_new_privileges=self.planned.run.no_new_privileges,
+                    resources=self.planned.run.resources,
                 )
             )
         finally:
@@ -327,6 +349,11 @@ class ManagedProcess:
     def run_delay_s(self) -> float:
         """Return its run delay and ours, seconds: ready to run, but without CPU."""
         return own_run_delay_s() + (0.0 if self.child is None else self.child.run_delay_s())
+
+    @property
+    def cgroup(self) -> Path | None:
+        """Directory of its own cgroup; None if it has none."""
+        return None if self.child is None else self.child.cgroup
 
     def running(self) -> None:
         """Note that the process does its work: its nodes are there."""
@@ -423,6 +450,8 @@ class ManagedProcess:
     async def _release(self) -> None:
         if self.channel is not None:
             await self.channel.close()
+        if self.child is not None and self.ended.done():
+            await self.child.cleared()
         for reader in self._readers:
             reader.close()
         for log in (self.log, *self._node_logs.values()):

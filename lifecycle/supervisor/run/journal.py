@@ -15,7 +15,7 @@ import os
 import time
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Protocol, TypeVar
 
 from lifecycle import codec, dataclasses
 from lifecycle.codec import Count, says
@@ -181,6 +181,22 @@ class JournalLine:
     output: dict[str, Count] | None = None
 
 
+class RunningProcess(Protocol):
+    """A process of which is noted what it uses, see processes/process.py."""
+
+    @property
+    def name(self) -> str:
+        """Of the planned process."""
+
+    @property
+    def pid(self) -> int:
+        """Process id."""
+
+    @property
+    def cgroup(self) -> Path | None:
+        """Directory of its own cgroup; None if it has none."""
+
+
 class Journal:
     """Writes the journal of one run.
 
@@ -245,18 +261,18 @@ class Journal:
             self._path = None
 
     @contextlib.contextmanager
-    def noting_use(self, pids: Callable[[], Mapping[str, int]]) -> Iterator[None]:
+    def noting_use(self, living: Callable[[], Iterable[RunningProcess]]) -> Iterator[None]:
         """Note what processes use every USE_S meanwhile, in the running event loop.
 
         Args:
-            pids: returns the pids of the living processes, by name.
+            living: returns the living processes.
         """
         loop = asyncio.get_running_loop()
         timers: list[asyncio.TimerHandle] = []
 
         def note() -> None:
             timers[:] = [loop.call_later(USE_S, note)]
-            self._note_use(pids())
+            self._note_use(living())
 
         timers.append(loop.call_later(USE_S, note))
         try:
@@ -331,9 +347,9 @@ class Journal:
         if seen is not None and looked is not None:
             self._add(look=_told(looked, Observation(), seen, whole=True))
 
-    def _note_use(self, pids: Mapping[str, int]) -> None:
+    def _note_use(self, living: Iterable[RunningProcess]) -> None:
         self._make_room()
-        found = {name: resource_use(pid) for name, pid in pids.items()}
+        found = {each.name: resource_use(each.pid, each.cgroup) for each in living}
         use = {name: each for name, each in found.items() if each is not None}
         if use:
             self._add(use=use, marks=True)

@@ -204,11 +204,12 @@ def _up(
                 variables=_graph_variables(os.environ),
             )
             leaving.enter_context(journal.writing(logs, positions=system.output_positions))
-            leaving.enter_context(journal.noting_use(system.pids))
-            fork_server = ForkServer(forerunner.process, emit)
+            leaving.enter_context(journal.noting_use(lambda: system.living))
+            fork_server = ForkServer(forerunner.process, emit, directory)
             worker = leaving.enter_context(contextlib.closing(Worker("lifecycle")))
             records = leaving.enter_context(noting(directory, system, fork_server, worker, emit))
             try:
+                fork_server.confine(processes)
                 # Before any participant: who asks a server that is not there waits to ask again.
                 with ending.raised():
                     await discovery_server.begin(system, fork_server, ours=_serves(plan, options))

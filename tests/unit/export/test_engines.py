@@ -167,6 +167,53 @@ def test_a_manifest_that_restarts_a_node_leaves_the_engine_its_supervisor(tmp_pa
     assert sections(text)["Service"]["Restart"] == "on-abnormal"
 
 
+LIMITED = """
+manifest_version: 1
+system: limited
+machines:
+  here: {address: 10.0.0.1}
+  there: {address: 10.0.0.2}
+nodes:
+  arm:
+    run: {command: [arm], resources: {cpu_quota_percent: 50, tasks_max: 20}}
+    machine: here
+  eye: {run: {command: [eye]}, machine: here}
+  hand: {run: {command: [hand]}, machine: there}
+"""
+
+
+def test_a_supervisor_that_makes_cgroups_has_them_delegated_to_it(tmp_path: Path) -> None:
+    manifest = tmp_path / "limited.lifecycle.yaml"
+    manifest.write_text(LIMITED)
+    files = exported(tmp_path / "out", "systemd", str(manifest))
+    assert sections(files["limited-here.service"])["Service"]["Delegate"] == "cpu memory pids"
+    assert "Delegate" not in sections(files["limited-there.service"])["Service"]
+
+
+@pytest.mark.parametrize(
+    ("engine", "called", "limits"),
+    [
+        ("quadlet", "podman", "PodmanArgs=--memory=, --cpus=, --pids-limit="),
+        ("compose", "Compose", "mem_limit, cpus, pids_limit"),
+        ("kubernetes", "Kubernetes", "resources.limits"),
+    ],
+)
+def test_a_container_in_which_no_cgroups_can_be_made_is_refused(
+    tmp_path: Path, engine: str, called: str, limits: str
+) -> None:
+    manifest = tmp_path / "limited.lifecycle.yaml"
+    manifest.write_text(LIMITED)
+    with pytest.raises(UsageError) as raised:
+        exported(tmp_path / "out", engine, str(manifest), "--image", "i")
+    assert str(raised.value) == (
+        f"{manifest}:9:27: cannot give process 'arm' its 'run.resources' in a container of "
+        f"{called}: its supervisor would make a cgroup for it, and the cgroup file system is "
+        "read-only in a container without privileges; leave 'resources' out and limit the whole "
+        f"container ({limits}), or write a unit: lifecycle export systemd"
+    )
+    assert not (tmp_path / "out").exists()
+
+
 AWKWARD = """
 manifest_version: 1
 system: The_Longest-System_Name_That_Anybody_Would_Write_In_A_Manifest_Of_Theirs

@@ -26,6 +26,7 @@ from lifecycle.manifest import (
     OnSupervisorLost,
     QosProfile,
     Reliability,
+    Resources,
     Restart,
     Run,
     RunKind,
@@ -114,6 +115,33 @@ def test_machines_with_this_host_added_for_nodes_that_name_none(every_key: Manif
     ]
 
 
+def test_resources_in_the_words_of_the_kernel_and_of_systemd(every_key: Manifest) -> None:
+    resources = _node(every_key, "talker").run.resources
+    assert resources is not None
+    assert (Path(resources.at.file).name, resources.at.line, resources.at.column) == (
+        "every_key.lifecycle.yaml",
+        36,
+        7,
+    )
+    assert resources.settings() == (
+        ("memory.max", "536870912"),
+        ("memory.high", "402653184"),
+        ("cpu.max", "150000 100000"),
+        ("cpu.weight", "200"),
+        ("pids.max", "64"),
+    )
+    assert resources.controllers() == {"cpu", "memory", "pids"}
+    assert resources.properties() == (
+        "MemoryMax=512M",
+        "MemoryHigh=384M",
+        "CPUQuota=150%",
+        "CPUWeight=200",
+        "TasksMax=64",
+    )
+    bare = Resources(at=resources.at)
+    assert (bare.settings(), bare.controllers(), bare.properties()) == ((), frozenset(), ())
+
+
 def test_ways_to_run(every_key: Manifest) -> None:
     assert _node(every_key, "talker").run == Run(
         kind=RunKind.PYTHON,
@@ -122,6 +150,14 @@ def test_ways_to_run(every_key: Manifest) -> None:
         working_directory=str(VALID),
         no_new_privileges=True,
         limits=Limits(as_mib=4096, cpu_sec=3600, nofile=1024, nproc=4096),
+        resources=Resources(
+            at=Position(file="", line=0, column=0),  # not compared
+            memory_max_mib=512,
+            memory_high_mib=384,
+            cpu_quota_percent=150,
+            cpu_weight=200,
+            tasks_max=64,
+        ),
     )
     assert _node(every_key, "orders").run == Run(
         kind=RunKind.COMMAND, command=("orders_node", "--fast", "3")

@@ -29,6 +29,7 @@ from lifecycle.supervisor.control.protocol import ProcessState
 from lifecycle.supervisor.processes import logs
 from lifecycle.supervisor.processes.control_channel import ControlChannel
 from lifecycle.supervisor.processes.fork_server import ForkServer, ForkServerProcess
+from lifecycle.supervisor.processes.fork_server_main import ForkRequest, _confine
 from lifecycle.supervisor.processes.logs import (
     LONGEST_LINE,
     LineReader,
@@ -672,6 +673,23 @@ def test_a_process_is_confined_with_all_that_it_starts_and_a_limit_too_high_fail
     assert done.stderr.endswith("; allowed: 77\n")
 
 
+def test_a_process_that_cannot_join_its_cgroup_ends_before_its_own_code_runs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    request = ForkRequest(
+        id=1,
+        argv=(),
+        environment=(),
+        working_directory="",
+        control=False,
+        cgroup=str(tmp_path / "gone" / "cgroup.procs"),
+    )
+    with pytest.raises(SystemExit, match="1"):
+        _confine(request)
+    gone = str(tmp_path / "gone")
+    assert capsys.readouterr().err == f"cannot join cgroup {gone!r}: No such file or directory\n"
+
+
 def test_what_runs_without_a_supervisor_is_confined_as_well(tmp_path: Path) -> None:
     manifest = tmp_path / "one.lifecycle.yaml"
     manifest.write_text(
@@ -682,3 +700,30 @@ def test_what_runs_without_a_supervisor_is_confined_as_well(tmp_path: Path) -> N
     words = [sys.executable, "-m", "lifecycle", "run", str(manifest), "it"]
     done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=60)
     assert (done.stdout.split(), done.stderr) == (["NoNewPrivs:", "1", "77"], "")
+
+
+@pytest.mark.parametrize(
+    ("resources", "hint"),
+    [
+        (
+            "{memory_max_mib: 64, cpu_quota_percent: 50}",
+            ": systemd-run --user --scope -p MemoryMax=64M -p CPUQuota=50% lifecycle run ...",
+        ),
+        ("{}", ""),
+    ],
+)
+def test_what_runs_without_a_supervisor_has_no_cgroup_and_says_so(
+    tmp_path: Path, resources: str, hint: str
+) -> None:
+    manifest = tmp_path / "one.lifecycle.yaml"
+    manifest.write_text(
+        "manifest_version: 1\nsystem: one\nnodes:\n  it:\n    managed: false\n"
+        f"    run: {{command: ['true'], resources: {resources}}}\n"
+    )
+    words = [sys.executable, "-m", "lifecycle", "run", str(manifest), "it"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 0
+    assert done.stderr == (
+        "warning: the resources of /it are not limited nor counted here, a supervisor makes a "
+        f"cgroup for them{hint}\n"
+    )
