@@ -139,8 +139,8 @@ def _active(up: Up) -> Event:
 def _until_ok(fleet: Fleet, name: str) -> None:
     """Wait until a host's supervisor sees nothing wrong."""
     deadline = time.monotonic() + BOUND_S
-    while status(run_directory(fleet.runtime(name), name)).verdict is not Outcome.OK:
-        assert time.monotonic() < deadline
+    while (seen := status(run_directory(fleet.runtime(name), name))).verdict is not Outcome.OK:
+        assert time.monotonic() < deadline, f"{name}: {seen.phase}: {seen.not_ok}"
         time.sleep(0.02)
 
 
