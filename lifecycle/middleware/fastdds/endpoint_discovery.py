@@ -29,8 +29,8 @@ SOON_S = 0.005
 """Fast DDS's own delay of writers of topics."""
 
 ENDPOINTS_MADE_S = 0.02
-"""Of a participant whose endpoints are just being made: what is resended meanwhile is more in one
-message, and none of it twice."""
+"""Of a participant whose endpoints are just being made: requests that come meanwhile are answered
+together."""
 
 _WRITERS = (b"\x00\x00\x03\xc2", b"\x00\x00\x04\xc2")
 """EntityIds of the built-in writers of publications and subscriptions, DDSI-RTPS table 9.1."""
@@ -38,7 +38,6 @@ _WRITERS = (b"\x00\x00\x03\xc2", b"\x00\x00\x04\xc2")
 _PREFIX_BYTES = 12
 _TIMES_AT = 592
 """Where StatefulWriter has its WriterTimes in Fast DDS 2.14.5, see `_is_known`."""
-
 
 _KEEP_DURATION_AT = 928
 _SEND_BUFFER_AT = 952
