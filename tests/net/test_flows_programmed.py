@@ -83,7 +83,8 @@ class Bench:
             yield ups
             for each in ups:
                 each.signal(signal.SIGTERM)
-            assert [each.finish() for each in ups] == [ExitCode.OK, ExitCode.OK]
+            codes = [each.finish() for each in ups]
+            assert codes == [ExitCode.OK, ExitCode.OK], [each.verdict for each in ups]
 
     def marks(self) -> tuple[set[int], set[int]]:
         """The DSCPs with which video and battery leave the host now."""
