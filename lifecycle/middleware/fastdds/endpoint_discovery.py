@@ -6,9 +6,10 @@ that they resend without a heartbeat to everybody.
 A participant that is discovered after its endpoints were made is asked for them: the other one
 receives a heartbeat, requests what it lacks 10 ms later, and Fast DDS 2.14 waits 100 ms before it
 resends (`edp_nack_response_delay`, EDPSimple.cpp). No profile and no variable changes that. It was
-a quarter of the time in which a small system comes up, and is part of each restart: who comes has
-to know our endpoints before it tells us its nodes' names. The delay is Fast DDS's own setting of a
-writer, changed by its own function; where the writer is not laid out as in 2.14.5 nothing is done.
+a quarter of the time in which a small system comes up, and is part of each restart: a participant
+sends `ros_discovery_info`, the names of its nodes, to readers that it has discovered. The delay is
+Fast DDS's own setting of a writer, changed by its own function; where the writer is not laid out as
+in 2.14.5 nothing is done.
 
 With each 106 kB that a writer has sent it sends a heartbeat to all that it knows. What it resends
 to many is counted again with each message (`last_processed` in
@@ -74,9 +75,9 @@ def resend_endpoints_soon(rcl_node: int, delay_s: float = SOON_S) -> bool:
     Returns:
         Whether it will; False with another RMW, another version, or static endpoint discovery.
     """
-    functions = _functions()
     participant = participant_of(rcl_node)
-    if functions is None or not participant:
+    functions = _functions() if participant else None
+    if functions is None:
         return False
     guid_of, find_writer, update_times = functions
     prefix = ctypes.string_at(guid_of(participant), _PREFIX_BYTES)

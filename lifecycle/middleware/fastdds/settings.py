@@ -154,12 +154,14 @@ def stop_listening(node: rclpy.node.Node) -> None:
     twenty left at once. What has no listener has no callback to wait for.
     """
     pointer = ctypes.c_void_p
-    set_listener = fast_dds_function(
-        _SET_LISTENER, ctypes.c_uint32, pointer, pointer, ctypes.c_int64
-    )
     with contextlib.suppress(InvalidHandle), node.handle:
         participant = participant_of(node.handle.pointer)
-        if set_listener is not None and participant:
+        if not participant:
+            return
+        set_listener = fast_dds_function(
+            _SET_LISTENER, ctypes.c_uint32, pointer, pointer, ctypes.c_int64
+        )
+        if set_listener is not None:
             set_listener(participant, None, _LISTENS_S)
 
 
@@ -194,7 +196,10 @@ def _node_functions() -> tuple[Any, Any] | None:
 
 @functools.cache
 def fast_dds_function(symbol: str, result: Any, *arguments: Any) -> Any:
-    """Return a function of libfastrtps 2.14 by its mangled name; None where there is none."""
+    """Return a function of libfastrtps 2.14 by its mangled name; None where there is none.
+
+    It loads the library: only for who has a participant of it, see `participant_of`.
+    """
     try:
         function = ctypes.CDLL(_LIBRARY)[symbol]
     except (OSError, AttributeError):

@@ -64,4 +64,6 @@ def test_nothing_is_changed_where_a_writer_is_laid_out_otherwise(
         monkeypatch.undo()
         assert resend_endpoints_soon(pointer)
         monkeypatch.setattr(endpoint_discovery, "participant_of", lambda _: None)
+        # With another RMW: Fast DDS is not even loaded.
+        monkeypatch.setattr(endpoint_discovery, "_functions", lambda: pytest.fail("loaded"))
         assert not resend_endpoints_soon(pointer)
