@@ -366,19 +366,41 @@ def profile(
     return ET.tostring(root, encoding="unicode", xml_declaration=True)
 
 
+def without_shared_memory(environment: Mapping[str, str]) -> ParticipantSettings:
+    """Return what a participant needs to do without shared memory where nothing chose transports.
+
+    That is what Fast DDS has by default but for shared memory. Who only looks at the graph gains
+    nothing by it, and a process that is killed while it holds the mutex of a port there stops
+    whoever sends to it for 10 s at a time (SharedMemManager::Port::regenerate_port in Fast DDS
+    2.14), with the lock of the writer that sends.
+
+    Args:
+        environment: of this process.
+
+    Raises:
+        MiddlewareError: a file of profiles cannot be read, or is no XML.
+    """
+    is_free = not (environment.get(TRANSPORTS_VARIABLE) or _chosen(default_profile(environment)))
+    return ParticipantSettings(transports=(Medium.UDPV4,) if is_free else ())
+
+
+def _chosen(base: DefaultProfile | None) -> list[str]:
+    """Return the elements by which a profile chooses transports."""
+    rtps = None if base is None else base.element.find("rtps")
+    return [] if rtps is None else [each.tag for each in rtps if each.tag in _TRANSPORT_CHOICES]
+
+
 def _refuse_second_choice(
     settings: ParticipantSettings, base: DefaultProfile | None, environment: Mapping[str, str]
 ) -> None:
     wish = " and ".join(settings.transports or map(str, settings.urls)) or "a non-blocking send"
-    rtps = None if base is None else base.element.find("rtps")
-    if base is not None and rtps is not None:
-        chosen = [each.tag for each in rtps if each.tag in _TRANSPORT_CHOICES]
-        if chosen:
-            raise MiddlewareError(
-                f"cannot give a participant {wish}: the default participant profile {base.name!r} "
-                f"of {base.file!r} already chooses its transports (<{chosen[0]}>)",
-                hint=f"take <{chosen[0]}> out of it, or what needs {wish} out of the manifest",
-            )
+    chosen = _chosen(base)
+    if base is not None and chosen:
+        raise MiddlewareError(
+            f"cannot give a participant {wish}: the default participant profile {base.name!r} "
+            f"of {base.file!r} already chooses its transports (<{chosen[0]}>)",
+            hint=f"take <{chosen[0]}> out of it, or what needs {wish} out of the manifest",
+        )
     variable = environment.get(TRANSPORTS_VARIABLE, "")
     if variable and not settings.transports and not settings.urls:
         raise MiddlewareError(

@@ -34,12 +34,14 @@ from rclpy.context import Context
 from rclpy.exceptions import InvalidHandle
 from rclpy.utilities import get_rmw_implementation_identifier
 
+from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds.participant_profile import (
     ParticipantSettings,
     default_profile,
     endpoint_profiles,
     profile,
+    without_shared_memory,
 )
 from lifecycle.middleware.fastdds.url_check import (
     check_free,
@@ -231,6 +233,28 @@ def unknown_versions() -> str:
                 "counted only"
             )
     return "; ".join(unknown)
+
+
+def observer_settings(settings: ParticipantSettings) -> ParticipantSettings:
+    """Return the settings of a participant that only looks: without shared memory where it can be.
+
+    Args:
+        settings: what it needs otherwise.
+
+    Returns:
+        `settings`, where they, a profile or the environment say what transports it has, and with
+        another RMW or an unknown version of Fast DDS.
+    """
+    if settings or get_rmw_implementation_identifier() != _RMW:
+        return settings
+    try:
+        _library()
+        return dataclasses.replace(
+            settings, transports=without_shared_memory(os.environ).transports
+        )
+    except MiddlewareError:
+        # What is wrong with a profile is said by who needs it; Fast DDS does without.
+        return settings
 
 
 def load_profile(name: str, xml: str) -> None:

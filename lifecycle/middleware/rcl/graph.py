@@ -37,7 +37,7 @@ from lifecycle.middleware.discovery.probe import (
     probes_for,
 )
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
-from lifecycle.middleware.fastdds.settings import stop_listening
+from lifecycle.middleware.fastdds.settings import observer_settings, stop_listening
 from lifecycle.middleware.process.process_table import programs_of
 from lifecycle.middleware.rcl.graph_changes import GraphGuard, on_graph_change
 from lifecycle.middleware.rcl.graph_queries import (
@@ -226,7 +226,10 @@ class GraphObserver:
         self._guard: GraphGuard | None = None
         if node is None:
             self._context, node = quiet_node(
-                f"_lifecycle_observer_{os.getpid()}", "/", domain_id, settings=settings
+                f"_lifecycle_observer_{os.getpid()}",
+                "/",
+                domain_id,
+                settings=observer_settings(settings),
             )
             self._guard = GraphGuard(node, self._changed)
             self._unwatch = self._guard.stop

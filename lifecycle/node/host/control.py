@@ -92,7 +92,8 @@ class HostSpec:
     """First line from the supervisor: what this process hosts.
 
     Attributes:
-        gathers: make the participant, report it, and make no endpoint before `PROCEED`.
+        gathers: how many hosts make their participants together, ≥ 0; unless it is 0, this one
+            makes its, reports it, and makes no endpoint before `PROCEED`.
         folders: absolute, of the manifest and what it includes: modules are looked for there.
     """
 
@@ -101,7 +102,7 @@ class HostSpec:
     domain_id: int
     discovery_range: DiscoveryRange
     nodes: tuple[PlannedNode, ...]
-    gathers: bool = False
+    gathers: int = 0
     folders: tuple[str, ...] = ()
 
 

@@ -273,7 +273,7 @@ class Host:
             follow_nodes(self._adoption)
             for index, planned in enumerate(self._spec.nodes):
                 failure: Exception | None = None
-                first = self._spec.gathers and index == 0
+                first = self._spec.gathers > 0 and index == 0
                 try:
                     if planned.key in self._adoption.made:
                         continue  # by the same call as one before it
@@ -301,7 +301,7 @@ class Host:
         peer. To those found later all of it is sent again, and each such message has a heartbeat
         sent to all others (Fast DDS 2.14; 20 nodes: 33,000 of 80,000 datagrams).
         """
-        resend_endpoints_soon(rcl_node, ENDPOINTS_MADE_S)
+        resend_endpoints_soon(rcl_node, ENDPOINTS_MADE_S, participants=self._spec.gathers)
         widen_discovery_buffers(self._spec.domain_id)
         self._channel.write(Event(kind="participant"))
         self._proceed.wait(_GATHER_S)

@@ -87,10 +87,12 @@ class Gathering:
 
     Args:
         limit_s: seconds, > 0, that any of them waits for the others at most.
+        hosts: how many there will be, > 0.
         announce: has our participant announce itself to those that it knows.
     """
 
-    def __init__(self, limit_s: float, announce: Callable[[], None]) -> None:
+    def __init__(self, limit_s: float, hosts: int, announce: Callable[[], None]) -> None:
+        self.hosts = hosts
         self._limit_s = limit_s
         self._announce = announce
         self._missing: set[ControlChannel] = set()
@@ -276,7 +278,7 @@ class BringUp:
         nodes = tuple(nodes)
         hosts = {node.planned.process for node in nodes if node.planned.run.kind is RunKind.PYTHON}
         limit_s = min((node.planned.timeouts.start_s for node in nodes), default=0.0) / 2
-        self._gathering = Gathering(limit_s, self._announce) if hosts else None
+        self._gathering = Gathering(limit_s, len(hosts), self._announce) if hosts else None
         try:
             await self._side_by_side(self._walk(node) for node in nodes)
         finally:
@@ -580,7 +582,7 @@ class BringUp:
                     domain_id=self._system.plan.domain_id,
                     discovery_range=self._system.plan.discovery_range,
                     nodes=tuple(node.planned for node in nodes),
-                    gathers=self._gathering is not None,
+                    gathers=0 if self._gathering is None else self._gathering.hosts,
                     folders=manifest_folders(node.planned for node in nodes),
                 ),
                 self._system.on_host_event,

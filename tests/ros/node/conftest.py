@@ -31,7 +31,7 @@ def start(fresh_domain: int, tmp_path: Path) -> Iterator[Callable[..., HostProce
     """Start hosts in a domain of their own."""
     hosts: list[HostProcess] = []
 
-    def start(*nodes: PlannedNode, gathers: bool = False) -> HostProcess:
+    def start(*nodes: PlannedNode, gathers: int = 0) -> HostProcess:
         log = tmp_path / f"host{len(hosts)}.log"
         hosts.append(HostProcess(fresh_domain, nodes, log, gathers=gathers))
         return hosts[-1]

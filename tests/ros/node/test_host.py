@@ -54,7 +54,7 @@ def test_two_nodes_in_one_process_are_brought_up_and_end_with_the_channel(start:
 def test_a_host_that_gathers_makes_no_endpoint_before_it_may(
     start: Start, fresh_domain: int, wait_until: Callable[..., None]
 ) -> None:
-    host = start(hosted("one", "Good"), gathers=True)
+    host = start(hosted("one", "Good"), gathers=1)
     assert host.read() == Event(kind="participant")
     with driver_in(fresh_domain) as driver:
         wait_until(lambda: "one" in driver.node.get_node_names())
@@ -65,7 +65,7 @@ def test_a_host_that_gathers_makes_no_endpoint_before_it_may(
 
 
 def test_a_host_that_is_ended_while_it_gathers_ends(start: Start) -> None:
-    host = start(hosted("one", "Good"), gathers=True)
+    host = start(hosted("one", "Good"), gathers=1)
     assert host.read() == Event(kind="participant")
     host.hang_up()
     assert host.wait(5.0) == 0

@@ -654,7 +654,7 @@ class _Host:
 
 def _proceeding(*hosts: _Host, limit_s: float = 5.0) -> list[float | None]:
     async def main() -> list[float | None]:
-        gathering = Gathering(limit_s, lambda: None)
+        gathering = Gathering(limit_s, 1, lambda: None)
         began = asyncio.get_running_loop().time()
         for host in hosts:
             gathering.expect(host)  # type: ignore[arg-type]
@@ -676,7 +676,7 @@ def test_hosts_are_told_of_us_once_they_listen_and_before_they_have_endpoints() 
     async def main() -> None:
         met: list[list[float | None]] = []
         hosts = (_Host(0.1, fails=True), _Host(0.2), _Host(0.3))
-        gathering = Gathering(5.0, lambda: met.append([each.proceeded_at for each in hosts]))
+        gathering = Gathering(5.0, 2, lambda: met.append([each.proceeded_at for each in hosts]))
         for host in hosts:
             gathering.expect(host)  # type: ignore[arg-type]
         await asyncio.sleep(1.0)
