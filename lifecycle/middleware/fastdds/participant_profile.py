@@ -381,7 +381,8 @@ def without_shared_memory(environment: Mapping[str, str]) -> ParticipantSettings
         MiddlewareError: a file of profiles cannot be read, or is no XML.
     """
     is_free = not (environment.get(TRANSPORTS_VARIABLE) or _chosen(default_profile(environment)))
-    return ParticipantSettings(transports=(Medium.UDPV4,) if is_free else ())
+    network = tuple(each for each in RMW_DEFAULT if each.is_udp)
+    return ParticipantSettings(transports=network if is_free else ())
 
 
 def _chosen(base: DefaultProfile | None) -> list[str]:
