@@ -62,7 +62,11 @@ def start() -> subprocess.Popen[str]:
 
 @pytest.fixture
 def observer(fresh_domain: int) -> GraphObserver:
-    with GraphObserver(fresh_domain) as observer:
+    """One that sends over shared memory, as nodes do; by itself an observer has none."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("FASTDDS_BUILTIN_TRANSPORTS", "DEFAULT")
+        made = GraphObserver(fresh_domain)
+    with made as observer:
         yield observer
 
 
