@@ -20,8 +20,8 @@ begun with 1 GiB here; the periodic heartbeat remains.
 While one reader has not acknowledged something, a writer sends that heartbeat to all of them, each
 second, and all of them answer. A hundred participants on one host are 40,000 datagrams a second
 then, more than two processors can do, so that nothing is acknowledged any more. The period follows
-the number of participants: of 620,000 datagrams with 75 of them 450,000 remain, with 50 it is up
-after 6.5 s and not 7.5. What is lost is sent again that much later.
+the number of participants: with 75 of them two thirds of the datagrams remain. What is lost is sent
+again that much later.
 """
 
 from __future__ import annotations

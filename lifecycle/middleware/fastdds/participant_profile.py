@@ -366,13 +366,12 @@ def profile(
     return ET.tostring(root, encoding="unicode", xml_declaration=True)
 
 
-def without_shared_memory(environment: Mapping[str, str]) -> ParticipantSettings:
-    """Return what a participant needs to do without shared memory where nothing chose transports.
+def without_shared_memory(environment: Mapping[str, str]) -> tuple[Medium, ...]:
+    """Return Fast DDS's default transports but for shared memory; none where others are chosen.
 
-    That is what Fast DDS has by default but for shared memory. Who only looks at the graph gains
-    nothing by it, and a process that is killed while it holds the mutex of a port there stops
-    whoever sends to it for 10 s at a time (SharedMemManager::Port::regenerate_port in Fast DDS
-    2.14), with the lock of the writer that sends.
+    An observer of the graph needs no shared memory, and a process that is killed while it holds the
+    mutex of a port there blocks each process that sends to it for 10 s at a time, with the lock of
+    the writer that sends (SharedMemManager::Port::regenerate_port in Fast DDS 2.14).
 
     Args:
         environment: of this process.
@@ -380,9 +379,9 @@ def without_shared_memory(environment: Mapping[str, str]) -> ParticipantSettings
     Raises:
         MiddlewareError: a file of profiles cannot be read, or is no XML.
     """
-    is_free = not (environment.get(TRANSPORTS_VARIABLE) or _chosen(default_profile(environment)))
-    network = tuple(each for each in RMW_DEFAULT if each.is_udp)
-    return ParticipantSettings(transports=network if is_free else ())
+    if environment.get(TRANSPORTS_VARIABLE) or _chosen(default_profile(environment)):
+        return ()
+    return tuple(each for each in RMW_DEFAULT if each.is_udp)
 
 
 def _chosen(base: DefaultProfile | None) -> list[str]:

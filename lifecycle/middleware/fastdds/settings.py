@@ -236,7 +236,7 @@ def unknown_versions() -> str:
 
 
 def observer_settings(settings: ParticipantSettings) -> ParticipantSettings:
-    """Return the settings of a participant that only looks: without shared memory where it can be.
+    """Return the settings of an observer's participant: no shared memory, unless it is chosen.
 
     Args:
         settings: what it needs otherwise.
@@ -249,11 +249,9 @@ def observer_settings(settings: ParticipantSettings) -> ParticipantSettings:
         return settings
     try:
         _library()
-        return dataclasses.replace(
-            settings, transports=without_shared_memory(os.environ).transports
-        )
+        return dataclasses.replace(settings, transports=without_shared_memory(os.environ))
     except MiddlewareError:
-        # What is wrong with a profile is said by who needs it; Fast DDS does without.
+        # An error of a profile is reported where the profile is needed; Fast DDS ignores it.
         return settings
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +11,7 @@ from std_msgs.msg import String
 
 from lifecycle.middleware import FlowParticipant, GraphObserver, resend_endpoints_soon
 from lifecycle.middleware.fastdds import endpoint_discovery
+from tests.ros.node.edp_heartbeats import heartbeat_periods_s
 
 _LATECOMER = Path(__file__).with_name("latecomer.py")
 _TRIES = 9
@@ -79,22 +79,7 @@ def test_heartbeats_come_the_less_often_the_more_participants_there_are(
     with FlowParticipant("_other", "/", fresh_domain) as other, other.node.handle:
         pointer = other.node.handle.pointer
         assert resend_endpoints_soon(pointer, participants=participants)
-        assert _heartbeat_periods_s(pointer) == [period_s, period_s]
+        assert heartbeat_periods_s(pointer) == [period_s, period_s]
         # Also what was changed before is known, and changed back.
         assert resend_endpoints_soon(pointer)
-        assert _heartbeat_periods_s(pointer) == [1, 1]
-
-
-def _heartbeat_periods_s(rcl_node: int) -> list[float]:
-    """What Fast DDS has, read where its own function has put it."""
-    functions = endpoint_discovery._functions()
-    assert functions is not None
-    guid_of, find_writer, _ = functions
-    prefix = ctypes.string_at(guid_of(endpoint_discovery.participant_of(rcl_node)), 12)
-    found = []
-    for entity in endpoint_discovery._WRITERS:
-        writer = find_writer(ctypes.create_string_buffer(prefix + entity, 16))
-        times = endpoint_discovery._WriterTimes.from_address(writer + endpoint_discovery._TIMES_AT)
-        period = times.heartbeat_period
-        found.append(period.seconds + period.nanoseconds / 1e9)
-    return found
+        assert heartbeat_periods_s(pointer) == [1, 1]

@@ -1,4 +1,4 @@
-"""Which transports a participant has that only looks at the graph."""
+"""Which transports the participant of an observer has."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-_LOOKS = """
-import os, sys
+_OBSERVES = """
+import sys
 from lifecycle.middleware import GraphObserver
 from lifecycle.middleware.process.shared_memory import has_shared_memory_open
 
@@ -32,7 +32,7 @@ _SHARED_MEMORY_ONLY = """
 
 def _has_shared_memory(domain_id: int) -> bool:
     done = subprocess.run(
-        [sys.executable, "-c", _LOOKS, str(domain_id)],
+        [sys.executable, "-c", _OBSERVES, str(domain_id)],
         capture_output=True,
         text=True,
         timeout=60,
@@ -42,7 +42,7 @@ def _has_shared_memory(domain_id: int) -> bool:
 
 
 @pytest.mark.parametrize("range_", ["SUBNET", "LOCALHOST"])
-def test_who_only_looks_has_no_shared_memory(
+def test_an_observer_has_no_shared_memory(
     fresh_domain: int, range_: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", range_)

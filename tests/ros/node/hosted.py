@@ -7,6 +7,7 @@ import time
 from typing import Any
 
 import rclpy
+from edp_heartbeats import heartbeat_periods_s
 from rclpy.lifecycle import LifecycleNode as RclpyLifecycleNode
 from rclpy.node import Node
 from std_msgs.msg import String
@@ -17,6 +18,15 @@ from lifecycle import LifecycleNode, on_message
 
 class Good(LifecycleNode):
     """Does everything right."""
+
+
+class Heartbeats(LifecycleNode):
+    """Logs the heartbeat periods of its participant."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        with self.handle:
+            print("heartbeats", *heartbeat_periods_s(self.handle.pointer), file=sys.stderr)
 
 
 class Echo(LifecycleNode):

@@ -64,6 +64,16 @@ def test_a_host_that_gathers_makes_no_endpoint_before_it_may(
     assert host.do("/one", CONFIGURE).ok
 
 
+@pytest.mark.parametrize(("gathers", "period_s"), [(1, 1.0), (60, 3.0)])
+def test_heartbeats_of_a_host_follow_how_many_gather(
+    start: Start, gathers: int, period_s: float
+) -> None:
+    host = start(hosted("one", "Heartbeats"), gathers=gathers)
+    host.send(Command(id=0, node="", operation=Operation.PROCEED))
+    host.until("ready")
+    assert f"heartbeats {period_s} {period_s}" in host.log.read_text()
+
+
 def test_a_host_that_is_ended_while_it_gathers_ends(start: Start) -> None:
     host = start(hosted("one", "Good"), gathers=1)
     assert host.read() == Event(kind="participant")

@@ -208,6 +208,7 @@ class FakeProcess:
         reader, writer = await asyncio.open_connection(sock=control)
         with contextlib.closing(writer):
             spec = from_json(await reader.readline(), HostSpec)
+            self._spawner.gathers.append(spec.gathers)
             if await self._cannot_host(writer):
                 return
             nodes = [node.full_name for node in spec.nodes]
@@ -306,6 +307,7 @@ class FakeSpawner:
         nodes: full names of the nodes that are in the graph, by process.
         changed: called whenever the graph looks otherwise.
         refuses: why no process can have resources; empty if all can.
+        gathers: what each host was given of it, see HostSpec.
     """
 
     def __init__(self) -> None:
@@ -323,6 +325,7 @@ class FakeSpawner:
         self.nodes: dict[str, tuple[str, ...]] = {}
         self.changed: Callable[[], None] = lambda: None
         self.refuses = ""
+        self.gathers: list[int] = []
         self._pid = _FIRST_PID
 
     def next_pid(self) -> int:

@@ -53,6 +53,16 @@ def test_nodes_without_an_order_come_up_side_by_side(tmp_path: Path) -> None:
     run(main())
 
 
+def test_hosts_are_given_how_many_of_them_make_participants_together(tmp_path: Path) -> None:
+    async def main() -> list[int]:
+        world = _world(tmp_path, *(planned_node(name) for name in "abc"))
+        await world.bring_up.connect(LIMIT_S)
+        await _down(world)
+        return world.spawner.gathers
+
+    assert run(main()) == [3, 3, 3]
+
+
 def test_a_bring_up_that_was_cancelled_twice_starts_everything_anew_the_next_time(
     tmp_path: Path,
 ) -> None:
@@ -654,7 +664,7 @@ class _Host:
 
 def _proceeding(*hosts: _Host, limit_s: float = 5.0) -> list[float | None]:
     async def main() -> list[float | None]:
-        gathering = Gathering(limit_s, 1, lambda: None)
+        gathering = Gathering(limit_s, len(hosts), lambda: None)
         began = asyncio.get_running_loop().time()
         for host in hosts:
             gathering.expect(host)  # type: ignore[arg-type]
@@ -676,7 +686,9 @@ def test_hosts_are_told_of_us_once_they_listen_and_before_they_have_endpoints() 
     async def main() -> None:
         met: list[list[float | None]] = []
         hosts = (_Host(0.1, fails=True), _Host(0.2), _Host(0.3))
-        gathering = Gathering(5.0, 2, lambda: met.append([each.proceeded_at for each in hosts]))
+        gathering = Gathering(
+            5.0, len(hosts), lambda: met.append([each.proceeded_at for each in hosts])
+        )
         for host in hosts:
             gathering.expect(host)  # type: ignore[arg-type]
         await asyncio.sleep(1.0)
