@@ -15,6 +15,7 @@ from .discovery.rediscovery import send_again_soon as send_again_soon
 from .discovery.rediscovery import wake_participants as wake_participants
 from .fastdds.dscp import widen_discovery_buffers as widen_discovery_buffers
 from .fastdds.endpoint_discovery import ENDPOINTS_MADE_S as ENDPOINTS_MADE_S
+from .fastdds.endpoint_discovery import endpoints_made_s as endpoints_made_s
 from .fastdds.endpoint_discovery import resend_endpoints_soon as resend_endpoints_soon
 from .fastdds.nfe import SHARED_MEMORY as SHARED_MEMORY
 from .fastdds.nfe import UniqueFlowNotFeasible as UniqueFlowNotFeasible
@@ -23,8 +24,11 @@ from .fastdds.nfe import create_subscription as create_subscription
 from .fastdds.nfe import get_network_flow_endpoints as get_network_flow_endpoints
 from .fastdds.nfe import has_shared_memory as has_shared_memory
 from .fastdds.participant import FlowParticipant as FlowParticipant
+from .fastdds.participant_discovery import Unannounced as Unannounced
+from .fastdds.participant_discovery import can_be_unannounced as can_be_unannounced
 from .fastdds.participant_profile import ParticipantSettings as ParticipantSettings
 from .fastdds.profiles import discovery_environment as discovery_environment
+from .fastdds.settings import host_settings as host_settings
 from .fastdds.settings import once_participant_is_made as once_participant_is_made
 from .fastdds.settings import participant_settings as participant_settings
 from .fastdds.settings import stop_listening as stop_listening

@@ -39,6 +39,11 @@ ENDPOINTS_MADE_S = 0.02
 """Of a participant whose endpoints are just being made: requests that come meanwhile are answered
 together."""
 
+_SHARE_S = 0.001
+_LONGEST_S = 0.05
+"""Two processors discover one participant in a share; the limit is for those of a large system that
+are found later."""
+
 _PARTICIPANTS_A_SECOND = 20
 _MAX_HEARTBEAT_S = 30
 """The heartbeat period is a second for so many participants, Fast DDS's own, to 30 for 600."""
@@ -73,6 +78,18 @@ class _WriterTimes(ctypes.Structure):
         ("nack_response_delay", _Duration),
         ("nack_suppression_duration", _Duration),
     )
+
+
+def endpoints_made_s(participants: int) -> float:
+    """Return how soon one that was unannounced resends: once most of the others have asked.
+
+    Args:
+        participants: how many are announced together, ≥ 0.
+
+    Returns:
+        Seconds, for `resend_endpoints_soon`.
+    """
+    return min(max(SOON_S, participants * _SHARE_S), _LONGEST_S)
 
 
 def resend_endpoints_soon(rcl_node: int, delay_s: float = SOON_S, *, participants: int = 1) -> bool:

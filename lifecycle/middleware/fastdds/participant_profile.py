@@ -24,7 +24,12 @@ from xml.etree import ElementTree as ET
 from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds import url_profile
-from lifecycle.middleware.fastdds.profiles import DEFAULT_FILE, PROFILES_FILE_VARIABLE
+from lifecycle.middleware.fastdds.profiles import (
+    DEFAULT_FILE,
+    PROFILE_NAME,
+    PROFILES_FILE_VARIABLE,
+    locator,
+)
 from lifecycle.middleware.fastdds.profiles import child as _child
 from lifecycle.middleware.fastdds.profiles import text as _text
 from lifecycle.network import RMW_DEFAULT, TRANSPORTS_VARIABLE, UDP_UNICAST, ConnectionUrl, Medium
@@ -141,6 +146,19 @@ def _check(endpoint: StaticEndpoint, participant: StaticParticipant, seen: dict[
 
 _SKIP_DEFAULT_FILE_VARIABLE = "SKIP_DEFAULT_XML"
 _TRANSPORT_CHOICES = ("userTransports", "useBuiltinTransports", "builtinTransports")
+DISCOVERY_SERVER_VARIABLE = "ROS_DISCOVERY_SERVER"
+"""Makes every participant a client of that server."""
+
+_IGNORE_ALL = ("FILTER_DIFFERENT_PROCESS", "FILTER_DIFFERENT_HOST", "FILTER_SAME_PROCESS")
+"""Not the first two alone: a participant that has those makes no transports."""
+
+_MANY = 40
+_HEARTBEAT_SHARE_S = 0.01
+"""With so many, heartbeats with each message of names are most of all messages. With fewer, what
+was lost has to be sent again sooner than in that period."""
+
+_ANNOUNCEMENTS = 4
+_ANNOUNCEMENT_PERIOD_NS = 500_000_000
 _LOCALHOST_PEERS_RANGE = url_profile.LOCALHOST_PEERS_RANGE
 _MIN_DATAGRAM_BYTES = 500
 _MAX_DATAGRAM_BYTES = 65500
@@ -164,6 +182,14 @@ class ParticipantSettings:
         super_client: as a client of a discovery server, receive everything.
         static_participants: whose endpoints are known without being announced, its own too.
         static_name: its own name among them; its context must have it as its enclave.
+        unannounced: ignores all others until `Unannounced.announce`, where a profile leaves that
+            open; see `lifecycle.middleware.fastdds.participant_discovery`.
+        names_by_udp: the names of its nodes go by UDP, where a profile and the environment leave
+            transports open. By shared memory, each opens a port of each other's; the first send
+            looks at its health, up to 1 s, with the lock of the writer.
+        names_heartbeat_s: seconds, > 0, between heartbeats of the names; None for one with each
+            message, and each that is sent again, to all: the history holds one and is full. Only
+            with `names_by_udp`.
 
     Raises:
         MiddlewareError: out of range, or URLs that one participant cannot have together.
@@ -176,6 +202,9 @@ class ParticipantSettings:
     super_client: bool = False
     static_participants: tuple[StaticParticipant, ...] = ()
     static_name: str = ""
+    unannounced: bool = False
+    names_by_udp: bool = False
+    names_heartbeat_s: float | None = None
 
     @classmethod
     def of(
@@ -255,7 +284,12 @@ class ParticipantSettings:
 
     def __bool__(self) -> bool:
         """Whether it needs anything."""
-        return self.chooses_transports or self.max_datagram_bytes is not None
+        return (
+            self.chooses_transports
+            or self.max_datagram_bytes is not None
+            or self.unannounced
+            or self.names_by_udp
+        )
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -362,8 +396,70 @@ def profile(
             _discover_as_localhost(_child(rtps, "builtin"), kinds, localhost_peers)
     if settings.max_datagram_bytes is not None:
         _set_property(rtps, "fastdds.max_message_size", str(settings.max_datagram_bytes))
+    if settings.unannounced:
+        _set_unannounced(_child(_child(rtps, "builtin"), "discovery_config"))
+    if settings.names_by_udp:
+        profiles.extend(_names_by_udp(settings.names_heartbeat_s))
     profiles.append(participant)
     return ET.tostring(root, encoding="unicode", xml_declaration=True)
+
+
+def for_a_host(
+    settings: ParticipantSettings,
+    environment: Mapping[str, str],
+    *,
+    unannounced: bool,
+    participants: int,
+) -> ParticipantSettings:
+    """Return the settings of the first participant of a host.
+
+    Args:
+        settings: what it needs otherwise.
+        environment: of this process.
+        unannounced: it is to be, if the environment leaves that open.
+        participants: how many are made together, ≥ 0.
+
+    Raises:
+        MiddlewareError: a file of profiles cannot be read, or is no XML.
+    """
+    base = default_profile(environment)
+    if settings.urls or (base is not None and base.name != PROFILE_NAME):
+        return settings
+    leaves_transports = not (settings.chooses_transports or environment.get(TRANSPORTS_VARIABLE))
+    # Profiles of a user's file may be for the names as well, and the first one counts.
+    is_ours = base is not None or not environment.get(PROFILES_FILE_VARIABLE)
+    has_many = unannounced and participants >= _MANY
+    return dataclasses.replace(
+        settings,
+        unannounced=unannounced and not environment.get(DISCOVERY_SERVER_VARIABLE),
+        names_by_udp=leaves_transports and is_ours and not Path(DEFAULT_FILE).exists(),
+        names_heartbeat_s=participants * _HEARTBEAT_SHARE_S if has_many else None,
+    )
+
+
+def _set_unannounced(config: ET.Element) -> None:
+    _text(config, "ignoreParticipantFlags", "|".join(_IGNORE_ALL))
+    # All the others listen by then, and each announcement goes to all of them.
+    announcements = _child(config, "initialAnnouncements")
+    announcements.clear()
+    _text(announcements, "count", str(_ANNOUNCEMENTS))
+    _text(_child(announcements, "period"), "nanosec", str(_ANNOUNCEMENT_PERIOD_NS))
+
+
+def _names_by_udp(heartbeat_s: float | None) -> Iterator[ET.Element]:
+    """Yield profiles of what each participant of rmw_fastrtps has for the names of nodes."""
+    for tag in ("data_writer", "data_reader"):
+        element = ET.Element(tag, profile_name=GRAPH_TOPIC)
+        if heartbeat_s is not None and tag == "data_writer":
+            _text(_child(element, "qos"), "disable_heartbeat_piggyback", "true")
+            period = _child(_child(element, "times"), "heartbeatPeriod")
+            _text(period, "sec", str(int(heartbeat_s)))
+            _text(period, "nanosec", str(round(heartbeat_s % 1 * 1e9)))
+        locators = _child(element, "unicastLocatorList")
+        for kind in RMW_DEFAULT:
+            if kind.is_udp:
+                locator(locators, kind, "", None)
+        yield element
 
 
 def without_shared_memory(environment: Mapping[str, str]) -> tuple[Medium, ...]:

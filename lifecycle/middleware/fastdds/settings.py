@@ -37,9 +37,11 @@ from rclpy.utilities import get_rmw_implementation_identifier
 from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds.participant_profile import (
+    DISCOVERY_SERVER_VARIABLE,
     ParticipantSettings,
     default_profile,
     endpoint_profiles,
+    for_a_host,
     profile,
     without_shared_memory,
 )
@@ -210,6 +212,17 @@ def fast_dds_function(symbol: str, result: Any, *arguments: Any) -> Any:
     return function
 
 
+def fast_dds_address(symbol: str) -> int | None:
+    """Return where a variable of libfastrtps 2.14 is, by its mangled name; None if there is none.
+
+    As for `fast_dds_function`.
+    """
+    try:
+        return ctypes.addressof(ctypes.c_char.in_dll(ctypes.CDLL(_LIBRARY), symbol))
+    except (OSError, ValueError):
+        return None
+
+
 def unknown_versions() -> str:
     """Return which of the libraries here are not known, and what that costs; empty if all are.
 
@@ -252,6 +265,29 @@ def observer_settings(settings: ParticipantSettings) -> ParticipantSettings:
         return dataclasses.replace(settings, transports=without_shared_memory(os.environ))
     except MiddlewareError:
         # An error of a profile is reported where the profile is needed; Fast DDS ignores it.
+        return settings
+
+
+def host_settings(
+    settings: ParticipantSettings, *, unannounced: bool, participants: int
+) -> ParticipantSettings:
+    """Return the settings of a host's first participant, see `for_a_host`.
+
+    Args:
+        settings: what it needs otherwise.
+        unannounced: it is to be, where that is possible.
+        participants: how many are made together, ≥ 0.
+
+    Returns:
+        `settings` with another RMW, and an unknown version of Fast DDS.
+    """
+    if get_rmw_implementation_identifier() != _RMW:
+        return settings
+    try:
+        _library()
+        return for_a_host(settings, os.environ, unannounced=unannounced, participants=participants)
+    except MiddlewareError:
+        # As for an observer.
         return settings
 
 
@@ -464,9 +500,9 @@ def _discovery(context: Context) -> Any:
 
 
 _RMW = "rmw_fastrtps_cpp"
-_SERVER_VARIABLE = "ROS_DISCOVERY_SERVER"
 
 
+_REFUSED_PORT = "unique_network_request cannot be set along specific locators"
 _SHARED_MEMORY_OF: weakref.WeakKeyDictionary[Context, bool] = weakref.WeakKeyDictionary()
 
 
@@ -479,7 +515,12 @@ def noted_shared_memory(context: Context) -> bool | None:
 
 
 @contextlib.contextmanager
-def once_participant_is_made(context: Context, call: Callable[[int], None]) -> Iterator[None]:
+def once_participant_is_made(
+    context: Context,
+    call: Callable[[int], None],
+    *,
+    names_by_udp: Callable[[], bool] = lambda: False,
+) -> Iterator[None]:
     """Call this when the next node's participant is there, and nothing of the node but its name.
 
     rclpy makes services, publishers and subscriptions of a node after rcl has made the node. Where
@@ -489,14 +530,19 @@ def once_participant_is_made(context: Context, call: Callable[[int], None]) -> I
         context: of that node.
         call: blocks the constructor of the first node that is made in the block, in its thread;
             given the address of its rcl_node_t.
+        names_by_udp: its participant is made so (ParticipantSettings). rmw asks for a port for them
+            alone first, which Fast DDS refuses with a message, and then without.
     """
+    from lifecycle.middleware.fastdds.log import without_message  # it needs this module
+
     library = rclpy.node._rclpy  # noqa: SLF001 - there is no other moment
     made = library.Node
 
     def make(*args: Any, **kwargs: Any) -> Any:
         library.Node = made
         before = has_shared_memory_open()
-        node = made(*args, **kwargs)
+        with without_message(_REFUSED_PORT) if names_by_udp() else contextlib.nullcontext():
+            node = made(*args, **kwargs)
         its = any(each is context.handle for each in args)
         if its and not before and get_rmw_implementation_identifier() == _RMW:
             _SHARED_MEMORY_OF[context] = has_shared_memory_open()
@@ -568,10 +614,11 @@ def participant_settings(context: Context, settings: ParticipantSettings) -> Ite
 
 
 def _check_environment(settings: ParticipantSettings) -> None:
-    server = os.environ.get(_SERVER_VARIABLE, "")
+    server = os.environ.get(DISCOVERY_SERVER_VARIABLE, "")
     if server and not any(url.server for url in settings.urls):
         raise MiddlewareError(
-            f"cannot connect by {str(settings.urls[0])!r}: {_SERVER_VARIABLE}={server!r} makes "
-            "every participant a client of that server",
-            hint=f"unset {_SERVER_VARIABLE}, or name the server in the URL, server=ADDRESS:PORT",
+            f"cannot connect by {str(settings.urls[0])!r}: {DISCOVERY_SERVER_VARIABLE}={server!r} "
+            "makes every participant a client of that server",
+            hint=f"unset {DISCOVERY_SERVER_VARIABLE}, or name the server in the URL, "
+            "server=ADDRESS:PORT",
         )

@@ -456,6 +456,8 @@ class LifecycleNode(Declarations, LocalInterface, RclpyLifecycle, GatedFactories
             health=None if type(self).health is LifecycleNode.health else self.health,
         )
         self._take_rclpy_names()
+        if construction is not None:
+            construction.constructed()
         if construction is None and mode is Mode.AUTO:
             self.lifecycle.bring_up_when_spun()
 

@@ -57,8 +57,8 @@ class Operation(enum.Enum):
     # announce to the graph anew which nodes are here.
     SEND_AGAIN_SOON = "send_again_soon"
     REPUBLISH_NAMES = "republish_names"
-    # Those that are not answered: the participants of all are there, make endpoints; and should the
-    # supervisor be killed, do what `on_supervisor_lost` says, or again end with it.
+    # Those that are not answered: all have gathered, go on; and should the supervisor be killed, do
+    # what `on_supervisor_lost` says, or again end with it.
     PROCEED = "proceed"
     KEEP = "keep"
     RELEASE = "release"
@@ -93,7 +93,9 @@ class HostSpec:
 
     Attributes:
         gathers: how many hosts make their participants together, ≥ 0; unless it is 0, this one
-            makes its, reports it, and makes no endpoint before `PROCEED`.
+            reports that it has made its, and waits for `PROCEED`: unannounced before it is
+            discovered, otherwise before it makes endpoints.
+        unannounced: its participant is made so, see `Unannounced`; only if it gathers.
         folders: absolute, of the manifest and what it includes: modules are looked for there.
     """
 
@@ -103,6 +105,7 @@ class HostSpec:
     discovery_range: DiscoveryRange
     nodes: tuple[PlannedNode, ...]
     gathers: int = 0
+    unannounced: bool = False
     folders: tuple[str, ...] = ()
 
 
@@ -130,8 +133,8 @@ class Event:
     """Host → supervisor; exactly one of the groups below is set.
 
     Attributes:
-        kind: "participant" (it is made, and waits for PROCEED), "ready" (all nodes constructed,
-            executor spinning), "failed" (construction failed; `error` says why, the process exits),
+        kind: "gathered" (it waits for PROCEED), "ready" (all nodes constructed, executor spinning),
+            "failed" (construction failed; `error` says why, the process exits),
             "state" (a node's state changed), "reply", "beat" (the executor has returned from a
             callback that took too long), "configuration" (it changed: endpoints, connections,
             mappings or matches).

@@ -567,6 +567,7 @@ class Adoption:
         host: makes the ForeignNode of an rclpy node and its plan.
         supervisor: name of the system whose gate holds the nodes; empty for none.
         use_global_arguments: nodes take remaps from the process's own --ros-args.
+        constructed: called for each node of rclpy that is made, and when one of ours is.
 
     Attributes:
         made: rclpy node by key of the plan, with its ForeignNode unless it is one of ours.
@@ -580,8 +581,10 @@ class Adoption:
         supervisor: str = "",
         mode: Mode | None = Mode.MANUAL,
         use_global_arguments: bool = False,
+        constructed: Callable[[], None] = lambda: None,
     ) -> None:
         self._carrying = carrying
+        self._constructed = constructed
         self._host = host
         self._supervisor = supervisor
         self._mode = mode
@@ -663,6 +666,7 @@ class Adoption:
             use_global_arguments=self._use_global_arguments,
             # Of a plain node no states are driven.
             supervisor=self._supervisor if planned.managed else "",
+            constructed=self._constructed,
         )
 
     @contextlib.contextmanager
@@ -685,6 +689,8 @@ class Adoption:
         if foreign is not None:
             self._foreign[id(node)] = foreign
         self.made[planned.key] = (node, foreign)
+        if not ours:
+            self._constructed()
 
     def make_endpoint(self, node: Node, kind: EndpointKind, arguments: Mapping[str, Any]) -> Any:
         """Make an endpoint that is planned otherwise than rclpy would make it; else None."""

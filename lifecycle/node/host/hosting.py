@@ -31,7 +31,10 @@ from lifecycle.middleware import (
     ENDPOINTS_MADE_S,
     BusySign,
     ParticipantSettings,
+    Unannounced,
+    endpoints_made_s,
     follow_nodes,
+    host_settings,
     leave_and_exit,
     once_participant_is_made,
     participant_settings,
@@ -72,10 +75,21 @@ class Participants:
 
     Nodes of equal transports, datagram size and connection URLs share. The first ones get the
     process's default context, which is what code that names none uses.
+
+    Args:
+        default: that context.
+        unannounced: its participant is made so, where the environment leaves that open.
+        participants: how many are made together, ≥ 0.
+
+    Attributes:
+        first: the settings of the default context's participant; none before it is made.
     """
 
-    def __init__(self, default: Context) -> None:
+    def __init__(self, default: Context, *, unannounced: bool, participants: int) -> None:
+        self.first = ParticipantSettings()
         self._default = default
+        self._unannounced = unannounced
+        self._participants = participants
         self._made: dict[ParticipantSettings, Context] = {}
 
     @contextlib.contextmanager
@@ -94,12 +108,17 @@ class Participants:
         if context is not None:
             yield context
             return
-        context = self._default
+        context, wanted = self._default, settings
         if self._made:
             context = Context()
             context.init(args=[], domain_id=self._default.get_domain_id())
+        else:
+            wanted = host_settings(
+                settings, unannounced=self._unannounced, participants=self._participants
+            )
+            self.first = wanted
         # The participant is made with the context's first node.
-        with participant_settings(context, settings):
+        with participant_settings(context, wanted):
             yield context
         self._made[settings] = context
 
@@ -252,8 +271,15 @@ class Host:
         self._is_kept = False
         self._proceed = threading.Event()
         self._nodes: dict[str, Hosted] = {}
+        self._participants = Participants(
+            context, unannounced=spec.unannounced, participants=spec.gathers
+        )
+        self._unannounced: Unannounced | None = None
         self._adoption = Adoption(
-            Participants(context).carrying, self._adopt, supervisor=spec.system
+            self._participants.carrying,
+            self._adopt,
+            supervisor=spec.system,
+            constructed=self._meet,
         )
         self._commands = HostCommands(
             self._nodes,
@@ -273,15 +299,18 @@ class Host:
             follow_nodes(self._adoption)
             for index, planned in enumerate(self._spec.nodes):
                 failure: Exception | None = None
-                first = self._spec.gathers > 0 and index == 0
                 try:
                     if planned.key in self._adoption.made:
                         continue  # by the same call as one before it
                     maker = self._import(planned)
                     with contextlib.ExitStack() as stack:
-                        if first:
+                        if index == 0:
                             stack.enter_context(
-                                once_participant_is_made(self._context, self._gather)
+                                once_participant_is_made(
+                                    self._context,
+                                    self._participant_made,
+                                    names_by_udp=lambda: self._participants.first.names_by_udp,
+                                )
                             )
                         self._construct(planned, maker)
                 except Exception as error:  # noqa: BLE001 - reported to the supervisor
@@ -293,17 +322,34 @@ class Host:
             self._loop.spin_and_exit()
         raise AssertionError("spin_and_exit returned")
 
-    def _gather(self, rcl_node: int) -> None:
-        """Wait until the participants of the other processes are there, bounded.
+    def _participant_made(self, rcl_node: int) -> None:
+        """Keep it to itself until it has its endpoints, or wait for those of the other processes.
 
-        Participants that find each other before they have endpoints cost discovery half the
-        datagrams, and a tenth of the heartbeats: what is made afterwards is sent once to each
-        peer. To those found later all of it is sent again, and each such message has a heartbeat
-        sent to all others (Fast DDS 2.14; 20 nodes: 33,000 of 80,000 datagrams).
+        Participants that are not unannounced should find each other before they have endpoints:
+        what is made afterwards is sent once to each peer, and to those found later all of it is
+        sent again.
         """
-        resend_endpoints_soon(rcl_node, ENDPOINTS_MADE_S, participants=self._spec.gathers)
+        if not self._spec.gathers:
+            return
+        unannounced = self._participants.first.unannounced
+        delay_s = endpoints_made_s(self._spec.gathers) if unannounced else ENDPOINTS_MADE_S
+        resend_endpoints_soon(rcl_node, delay_s, participants=self._spec.gathers)
         widen_discovery_buffers(self._spec.domain_id)
-        self._channel.write(Event(kind="participant"))
+        if unannounced:
+            self._unannounced = Unannounced(rcl_node)
+        else:
+            self._gather()
+
+    def _meet(self) -> None:
+        """Be discovered, once the other processes are ready to be: a node has its endpoints."""
+        unannounced, self._unannounced = self._unannounced, None
+        if unannounced is not None:
+            self._gather()
+            unannounced.announce()
+
+    def _gather(self) -> None:
+        """Wait until the other processes have come as far, bounded."""
+        self._channel.write(Event(kind="gathered"))
         self._proceed.wait(_GATHER_S)
 
     def _import(self, planned: PlannedNode) -> Callable[..., Any]:

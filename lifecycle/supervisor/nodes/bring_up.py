@@ -79,20 +79,25 @@ class Wirer(Protocol):
 
 
 _GATHERED_S = 0.5
-"""For so long no further participant has come: what is still missing imports something big."""
+"""For so long no further host has come: what is still missing imports something big."""
 
 
 class Gathering:
-    """Has hosts make their endpoints when the participants of all of them are there.
+    """Has hosts meet, or make endpoints, when all of them are ready for it (HostSpec.gathers).
 
     Args:
         limit_s: seconds, > 0, that any of them waits for the others at most.
         hosts: how many there will be, > 0.
-        announce: has our participant announce itself to those that it knows.
+        announce: has our participant announce itself to those that it knows. Unannounced ones are
+            not: they are answered.
+        unannounced: see HostSpec.
     """
 
-    def __init__(self, limit_s: float, hosts: int, announce: Callable[[], None]) -> None:
+    def __init__(
+        self, limit_s: float, hosts: int, announce: Callable[[], None], *, unannounced: bool = False
+    ) -> None:
         self.hosts = hosts
+        self.unannounced = unannounced
         self._limit_s = limit_s
         self._announce = announce
         self._missing: set[ControlChannel] = set()
@@ -102,7 +107,7 @@ class Gathering:
         self._quiet: asyncio.TimerHandle | None = None
 
     def expect(self, channel: ControlChannel) -> None:
-        """Wait for the participant of one more host, which is started now."""
+        """Wait for one more host, which is started now."""
         self._missing.add(channel)
         task = asyncio.ensure_future(self._await(channel))
         self._tasks.add(task)
@@ -128,7 +133,7 @@ class Gathering:
             if timer is not None:
                 timer.cancel()
         self._limit = self._quiet = None
-        if self._waiting:
+        if self._waiting and not self.unannounced:
             self._announce()
         for channel in self._waiting:
             channel.proceed()
@@ -155,6 +160,7 @@ class BringUp:
         loads: has the container of this full name load a node, and returns what unloads it.
         wirer: wires each node between its configure and its connect; None leaves it to the nodes.
         announce: see Gathering.
+        unannounced: whether hosts can be, see HostSpec.
     """
 
     def __init__(
@@ -170,8 +176,10 @@ class BringUp:
         alone: Callable[[NodeRun], None] | None = None,
         loads: Callable[[PlannedNode, str], Awaitable[Callable[[], Awaitable[None]]]] | None = None,
         announce: Callable[[], None] = lambda: None,
+        unannounced: Callable[[], bool] = lambda: False,
     ) -> None:
         self._announce = announce
+        self._unannounced = unannounced
         self._gives = gives
         self._alone = alone
         self._loads = loads
@@ -278,7 +286,12 @@ class BringUp:
         nodes = tuple(nodes)
         hosts = {node.planned.process for node in nodes if node.planned.run.kind is RunKind.PYTHON}
         limit_s = min((node.planned.timeouts.start_s for node in nodes), default=0.0) / 2
-        self._gathering = Gathering(limit_s, len(hosts), self._announce) if hosts else None
+        if hosts:
+            # One alone has nobody to meet.
+            unannounced = len(hosts) > 1 and self._unannounced()
+            self._gathering = Gathering(
+                limit_s, len(hosts), self._announce, unannounced=unannounced
+            )
         try:
             await self._side_by_side(self._walk(node) for node in nodes)
         finally:
@@ -583,6 +596,7 @@ class BringUp:
                     discovery_range=self._system.plan.discovery_range,
                     nodes=tuple(node.planned for node in nodes),
                     gathers=0 if self._gathering is None else self._gathering.hosts,
+                    unannounced=self._gathering is not None and self._gathering.unannounced,
                     folders=manifest_folders(node.planned for node in nodes),
                 ),
                 self._system.on_host_event,

@@ -268,6 +268,13 @@ class ObserverParticipant:
         """Have our participant announce itself to those that it knows, as far as that goes."""
         self._graph.discovery.announce_ourselves()
 
+    def can_be_unannounced(self) -> bool:
+        """Return whether participants like ours can be, see HostSpec."""
+        from lifecycle.middleware import can_be_unannounced
+
+        with self._node.handle:
+            return can_be_unannounced(self._node.handle.pointer)
+
     def introduce(
         self, newcomers: Iterable[int], pids: Iterable[int], *, rediscover: bool = False
     ) -> None:

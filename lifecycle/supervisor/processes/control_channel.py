@@ -74,7 +74,7 @@ class ControlChannel:
         self._ready: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         # The host may end before a caller waits for "ready".
         self._ready.add_done_callback(lambda done: done.cancelled() or done.exception())
-        self._participant = asyncio.Event()
+        self._gathered = asyncio.Event()
         self._writer: asyncio.StreamWriter | None = None
         self._task: asyncio.Task[None] | None = None
 
@@ -110,7 +110,7 @@ class ControlChannel:
 
     async def gathered(self) -> bool:
         """Wait until the host waits for `proceed`; False once it will not do so any more."""
-        there: asyncio.Future[Any] = asyncio.ensure_future(self._participant.wait())
+        there: asyncio.Future[Any] = asyncio.ensure_future(self._gathered.wait())
         try:
             await asyncio.wait({there, self._ready}, return_when=asyncio.FIRST_COMPLETED)
         finally:
@@ -118,7 +118,7 @@ class ControlChannel:
         return not self._ready.done()
 
     def proceed(self) -> None:
-        """Have the host make its endpoints."""
+        """Have the host go on, see HostSpec.gathers."""
         self._tell(Operation.PROCEED)
 
     def keep(self) -> None:
@@ -207,8 +207,8 @@ class ControlChannel:
             reply = self._replies.get(event.id)
             if reply is not None and not reply.done():
                 reply.set_result(event)
-        elif event.kind == "participant":
-            self._participant.set()
+        elif event.kind == "gathered":
+            self._gathered.set()
         elif event.kind == "ready":
             if not self._ready.done():
                 self._ready.set_result(None)

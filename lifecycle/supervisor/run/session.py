@@ -193,6 +193,9 @@ class SessionParticipant(
     def announce_ourselves(self) -> None:
         """Have our participant announce itself to those that it knows."""
 
+    def can_be_unannounced(self) -> bool:
+        """Return whether participants like ours can be, see HostSpec."""
+
     def prepare_to_leave(self) -> None:
         """Close connections that are not answered, so that leaving does not wait for them."""
 
@@ -296,6 +299,7 @@ class Session:
             loads=observer_participant.load,
             alone=self._alone,
             announce=observer_participant.announce_ourselves,
+            unannounced=observer_participant.can_be_unannounced,
         )
         self._remote_nodes = RemoteNodes(
             system.plan, system.awaited(), observer_participant, self._changes

@@ -31,9 +31,10 @@ def start(fresh_domain: int, tmp_path: Path) -> Iterator[Callable[..., HostProce
     """Start hosts in a domain of their own."""
     hosts: list[HostProcess] = []
 
-    def start(*nodes: PlannedNode, gathers: int = 0) -> HostProcess:
+    def start(*nodes: PlannedNode, gathers: int = 0, unannounced: bool = False) -> HostProcess:
         log = tmp_path / f"host{len(hosts)}.log"
-        hosts.append(HostProcess(fresh_domain, nodes, log, gathers=gathers))
+        host = HostProcess(fresh_domain, nodes, log, gathers=gathers, unannounced=unannounced)
+        hosts.append(host)
         return hosts[-1]
 
     yield start

@@ -37,11 +37,12 @@ class HostProcess:
         log: Path,
         *,
         gathers: int = 0,
+        unannounced: bool = False,
     ) -> None:
         ours, theirs = socket.socketpair()
         ours.settimeout(30)
         self.log = log
-        with log.open("w", encoding="utf-8") as stderr, theirs:
+        with log.open("w", encoding="utf-8") as written, theirs:
             self.process = subprocess.Popen(
                 [
                     sys.executable,
@@ -51,7 +52,8 @@ class HostProcess:
                 ],
                 pass_fds=[theirs.fileno()],
                 cwd=HERE,
-                stderr=stderr,
+                stdout=written,
+                stderr=written,
             )
         self._control = ours
         self._reader = ours.makefile("rb")
@@ -63,6 +65,7 @@ class HostProcess:
             discovery_range=DiscoveryRange.LOCALHOST,
             nodes=nodes,
             gathers=gathers,
+            unannounced=unannounced,
         )
         self.send(spec)
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import rclpy
 from edp_heartbeats import heartbeat_periods_s
+from lifecycle_msgs.srv import GetState
 from rclpy.lifecycle import LifecycleNode as RclpyLifecycleNode
 from rclpy.node import Node
 from std_msgs.msg import String
@@ -18,6 +19,16 @@ from lifecycle import LifecycleNode, on_message
 
 class Good(LifecycleNode):
     """Does everything right."""
+
+
+class Waiting(LifecycleNode):
+    """Its constructor waits for the other of the two hosts that have it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        other = {"one": "other", "other": "one"}[self.get_name()]
+        client = self.create_client(GetState, f"/{other}/get_state")
+        print("met" if client.wait_for_service(10.0) else "alone", file=sys.stderr, flush=True)
 
 
 class Heartbeats(LifecycleNode):

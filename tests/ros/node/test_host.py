@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -15,6 +16,7 @@ from pathlib import Path
 import psutil
 import pytest
 from host_process import HostProcess, driver_in, hosted
+from lifecycle_driver import Driver
 from planning import publisher, subscription
 from std_msgs.msg import String
 
@@ -55,13 +57,82 @@ def test_a_host_that_gathers_makes_no_endpoint_before_it_may(
     start: Start, fresh_domain: int, wait_until: Callable[..., None]
 ) -> None:
     host = start(hosted("one", "Good"), gathers=1)
-    assert host.read() == Event(kind="participant")
+    assert host.read() == Event(kind="gathered")
     with driver_in(fresh_domain) as driver:
         wait_until(lambda: "one" in driver.node.get_node_names())
         assert driver.node.get_service_names_and_types_by_node("one", "/") == []
         host.send(Command(id=0, node="", operation=Operation.PROCEED))
         host.until("ready")
     assert host.do("/one", CONFIGURE).ok
+
+
+@pytest.mark.parametrize("class_", ["Good", "Plain", "Theirs"])
+def test_an_unannounced_host_is_discovered_once_it_may_be_and_with_all_it_has(
+    start: Start, fresh_domain: int, wait_until: Callable[..., None], class_: str
+) -> None:
+    host = start(hosted("one", class_, managed=class_ != "Plain"), gathers=2, unannounced=True)
+    assert host.read() == Event(kind="gathered")
+    other = start(hosted("other", "Good"))
+    other.until("ready")
+    with driver_in(fresh_domain) as driver:
+        # Who came later is there with all it has: the first one would be, too.
+        wait_until(lambda: _services(driver, "other"))
+        assert "one" not in driver.node.get_node_names()
+        host.send(Command(id=0, node="", operation=Operation.PROCEED))
+        host.until("ready")
+        wait_until(lambda: _services(driver, "one"))
+    host.hang_up()
+    assert host.wait() == 0
+
+
+def _services(driver: Driver, node: str) -> list[str]:
+    """Return the services of a node; none before it is in the graph."""
+    if node not in driver.node.get_node_names():
+        return []
+    return [name for name, _ in driver.node.get_service_names_and_types_by_node(node, "/")]
+
+
+def test_unannounced_hosts_meet_before_the_users_constructors_go_on(start: Start) -> None:
+    hosts = [
+        start(hosted(name, "Waiting"), gathers=2, unannounced=True) for name in ("one", "other")
+    ]
+    for host in hosts:
+        assert host.read() == Event(kind="gathered")
+    for host in hosts:
+        host.send(Command(id=0, node="", operation=Operation.PROCEED))
+    for host in hosts:
+        host.until("ready")
+        assert "met" in host.log.read_text()
+
+
+def test_an_unannounced_host_that_is_ended_while_it_gathers_ends(start: Start) -> None:
+    host = start(hosted("one", "Good"), gathers=2, unannounced=True)
+    assert host.read() == Event(kind="gathered")
+    host.hang_up()
+    assert host.wait(5.0) == 0
+
+
+@pytest.mark.parametrize(
+    ("variables", "has"),
+    [({}, False), ({"FASTDDS_BUILTIN_TRANSPORTS": "DEFAULT"}, True)],
+)
+def test_names_have_no_port_of_shared_memory_unless_transports_are_chosen(
+    start: Start, monkeypatch: pytest.MonkeyPatch, variables: dict[str, str], has: bool
+) -> None:
+    monkeypatch.delenv("FASTDDS_BUILTIN_TRANSPORTS", raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    host = start(hosted("one", "Good"))
+    host.until("ready")
+    threads = [
+        (each / "comm").read_text() for each in Path(f"/proc/{host.process.pid}/task").iterdir()
+    ]
+    # rmw asks for ports from 7000 on for them, Fast DDS names threads by ports.
+    assert any(re.match(r"dds\.shm\.70\d\d", each) for each in threads) is has
+    assert any(each.startswith("dds.shm.") for each in threads)
+    # What Fast DDS says of it is kept from the log, and the thread that says it is ended.
+    assert host.log.read_text() == ""
+    assert not any(each.startswith("dds.log") for each in threads)
 
 
 @pytest.mark.parametrize(("gathers", "period_s"), [(1, 1.0), (60, 3.0)])
@@ -76,7 +147,7 @@ def test_heartbeats_of_a_host_follow_how_many_gather(
 
 def test_a_host_that_is_ended_while_it_gathers_ends(start: Start) -> None:
     host = start(hosted("one", "Good"), gathers=1)
-    assert host.read() == Event(kind="participant")
+    assert host.read() == Event(kind="gathered")
     host.hang_up()
     assert host.wait(5.0) == 0
 

@@ -13,9 +13,11 @@ from lifecycle.middleware.fastdds.participant_profile import (
     DefaultProfile,
     ParticipantSettings,
     default_profile,
+    for_a_host,
     profile,
 )
 from lifecycle.middleware.fastdds.profiles import discovery_profile
+from lifecycle.network import parse
 
 UDP = ParticipantSettings(transports=("udpv4",))
 USERS = """<?xml version="1.0"?>
@@ -132,6 +134,97 @@ def test_quick_discovery_is_kept(tmp_path: Path) -> None:
     path.write_text(discovery_profile())
     base = default_profile({"FASTRTPS_DEFAULT_PROFILES_FILE": str(path)})
     assert texts(made(UDP, base=base), ".//initialAnnouncements/count") == ["10"]
+
+
+def test_an_unannounced_participant_ignores_all_and_announces_itself_less(tmp_path: Path) -> None:
+    path = tmp_path / "quick.xml"
+    path.write_text(discovery_profile())
+    base = default_profile({"FASTRTPS_DEFAULT_PROFILES_FILE": str(path)})
+    root = made(ParticipantSettings(unannounced=True), base=base)
+    (flags,) = texts(root, ".//discovery_config/ignoreParticipantFlags")
+    assert set(flags.split("|")) == {
+        "FILTER_DIFFERENT_HOST",
+        "FILTER_DIFFERENT_PROCESS",
+        "FILTER_SAME_PROCESS",
+    }
+    assert texts(root, ".//initialAnnouncements/count") == ["4"]
+    assert texts(root, ".//initialAnnouncements/period/nanosec") == ["500000000"]
+
+
+def test_names_by_udp_have_a_locator_at_both_ends_and_heartbeats_as_asked() -> None:
+    root = made(ParticipantSettings(names_by_udp=True))
+    for tag in ("data_writer", "data_reader"):
+        (element,) = root.findall(f".//{tag}")
+        assert element.get("profile_name") == "ros_discovery_info"
+        assert [each.tag for each in element.findall("unicastLocatorList/locator/*")] == ["udpv4"]
+    assert texts(root, ".//disable_heartbeat_piggyback") == []
+    slower = made(ParticipantSettings(names_by_udp=True, names_heartbeat_s=1.25))
+    assert texts(slower, ".//data_writer/qos/disable_heartbeat_piggyback") == ["true"]
+    assert texts(slower, ".//data_writer/times/heartbeatPeriod/*") == ["1", "250000000"]
+    assert slower.findall(".//data_reader/times") == []
+
+
+_QUICK = object()
+
+
+@pytest.mark.parametrize(
+    ("settings", "environment", "unannounced", "names"),
+    [
+        ({}, {}, True, True),
+        ({}, {"FASTRTPS_DEFAULT_PROFILES_FILE": _QUICK}, True, True),
+        ({"max_datagram_bytes": 1400}, {}, True, True),
+        ({"transports": ("udpv4",)}, {}, True, False),
+        ({}, {"FASTDDS_BUILTIN_TRANSPORTS": "DEFAULT"}, True, False),
+        ({}, {"ROS_DISCOVERY_SERVER": "127.0.0.1:11811"}, False, True),
+        ({}, {"FASTRTPS_DEFAULT_PROFILES_FILE": "mine.xml"}, False, False),
+        ({"urls": (parse("udpv4://127.0.0.1:7400"),)}, {}, False, False),
+    ],
+)
+def test_a_host_gets_what_its_environment_leaves_open(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    settings: dict[str, Any],
+    environment: dict[str, Any],
+    unannounced: bool,
+    names: bool,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    users(tmp_path)
+    (tmp_path / "quick.xml").write_text(discovery_profile())
+    variables = {
+        name: "quick.xml" if value is _QUICK else value for name, value in environment.items()
+    }
+    before = ParticipantSettings(**settings)
+    found = for_a_host(before, variables, unannounced=True, participants=3)
+    assert (found.unannounced, found.names_by_udp) == (unannounced, names)
+    assert found.names_heartbeat_s is None
+    assert bool(found) or found == before
+    alone = for_a_host(before, variables, unannounced=False, participants=3)
+    assert not alone.unannounced
+
+
+def test_names_are_left_alone_beside_a_file_of_the_working_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It may have a profile for them without having one for participants."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "DEFAULT_FASTRTPS_PROFILES.xml").write_text("<dds/>")
+    assert not for_a_host(ParticipantSettings(), {}, unannounced=True, participants=1).names_by_udp
+
+
+@pytest.mark.parametrize(("participants", "heartbeat_s"), [(39, None), (40, 0.4), (100, 1.0)])
+def test_heartbeats_of_names_follow_how_many_are_made_together(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    participants: int,
+    heartbeat_s: float | None,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for unannounced in (True, False):
+        found = for_a_host(
+            ParticipantSettings(), {}, unannounced=unannounced, participants=participants
+        )
+        assert found.names_heartbeat_s == (heartbeat_s if unannounced else None)
 
 
 @pytest.mark.parametrize(

@@ -208,7 +208,7 @@ class FakeProcess:
         reader, writer = await asyncio.open_connection(sock=control)
         with contextlib.closing(writer):
             spec = from_json(await reader.readline(), HostSpec)
-            self._spawner.gathers.append(spec.gathers)
+            self._spawner.gathers.append((spec.gathers, spec.unannounced))
             if await self._cannot_host(writer):
                 return
             nodes = [node.full_name for node in spec.nodes]
@@ -307,7 +307,7 @@ class FakeSpawner:
         nodes: full names of the nodes that are in the graph, by process.
         changed: called whenever the graph looks otherwise.
         refuses: why no process can have resources; empty if all can.
-        gathers: what each host was given of it, see HostSpec.
+        gathers: what each host was given of it and of `unannounced`, see HostSpec.
     """
 
     def __init__(self) -> None:
@@ -325,7 +325,7 @@ class FakeSpawner:
         self.nodes: dict[str, tuple[str, ...]] = {}
         self.changed: Callable[[], None] = lambda: None
         self.refuses = ""
-        self.gathers: list[int] = []
+        self.gathers: list[tuple[int, bool]] = []
         self._pid = _FIRST_PID
 
     def next_pid(self) -> int:
@@ -445,12 +445,14 @@ class World:
         self.emit.listen(self.events.append)
         self.system = System(plan, emit=self.emit, logs=directory, processes=plan.processes)
         self.appeared: dict[str, asyncio.Event] = {}
+        self.can_be_unannounced = False
         self.bring_up = BringUp(
             self.system,
             spawner_of=lambda _: self.spawner,
             services=self._no_services,
             appears=self._appears,
             recorded=lambda: None,
+            unannounced=lambda: self.can_be_unannounced,
         )
 
     @property

@@ -306,6 +306,9 @@ class FakeParticipant:
     def announce_ourselves(self) -> None:
         """Likewise."""
 
+    def can_be_unannounced(self) -> bool:
+        return False
+
     def announce_machine(self, system: str, machine: str) -> _Connection:
         raise AssertionError(f"{system} has no other machine than {machine}")
 

@@ -53,14 +53,25 @@ def test_nodes_without_an_order_come_up_side_by_side(tmp_path: Path) -> None:
     run(main())
 
 
-def test_hosts_are_given_how_many_of_them_make_participants_together(tmp_path: Path) -> None:
-    async def main() -> list[int]:
-        world = _world(tmp_path, *(planned_node(name) for name in "abc"))
+@pytest.mark.parametrize(
+    ("names", "can_be", "gathers"),
+    [
+        ("abc", True, [(3, True)] * 3),
+        ("abc", False, [(3, False)] * 3),
+        ("a", True, [(1, False)]),  # nobody to meet
+    ],
+)
+def test_hosts_are_given_how_many_of_them_make_participants_together(
+    tmp_path: Path, names: str, can_be: bool, gathers: list[tuple[int, bool]]
+) -> None:
+    async def main() -> list[tuple[int, bool]]:
+        world = _world(tmp_path, *(planned_node(name) for name in names))
+        world.can_be_unannounced = can_be
         await world.bring_up.connect(LIMIT_S)
         await _down(world)
         return world.spawner.gathers
 
-    assert run(main()) == [3, 3, 3]
+    assert run(main()) == gathers
 
 
 def test_a_bring_up_that_was_cancelled_twice_starts_everything_anew_the_next_time(
@@ -660,6 +671,19 @@ class _Host:
 
     def proceed(self) -> None:
         self.proceeded_at = asyncio.get_running_loop().time()
+
+
+def test_unannounced_hosts_are_not_told_of_us() -> None:
+    async def main() -> list[float | None]:
+        hosts = (_Host(0.1), _Host(0.3))
+        gathering = Gathering(5.0, 2, lambda: pytest.fail("told"), unannounced=True)
+        for host in hosts:
+            gathering.expect(host)  # type: ignore[arg-type]
+        await asyncio.sleep(1.0)
+        await gathering.close()
+        return [each.proceeded_at for each in hosts]
+
+    assert None not in run(main())
 
 
 def _proceeding(*hosts: _Host, limit_s: float = 5.0) -> list[float | None]:
