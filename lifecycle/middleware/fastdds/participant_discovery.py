@@ -76,26 +76,35 @@ class _Endpoint(ctypes.Structure):
 
 
 class Unannounced:
-    """A participant that nobody knows, and that knows nobody, until it is announced.
+    """A participant that nobody knows, and that knows nobody, until it is announced; see `of`."""
 
-    Args:
-        rcl_node: address of the rcl_node_t of its first node; it was made `unannounced`.
+    def __init__(self, pdp: _Pdp) -> None:
+        self._pdp = pdp
+        _announcing("31stopRTPSParticipantAnnouncementEv")(pdp.participant)
+        _announce()(ctypes.addressof(pdp), True, True)
 
-    Raises:
-        MiddlewareError: Fast DDS is not laid out as known; the participant stays alone.
-    """
+    @classmethod
+    def of(cls, rcl_node: int) -> Unannounced | None:
+        """Take back that a participant was announced when it was made.
 
-    def __init__(self, rcl_node: int) -> None:
+        Args:
+            rcl_node: address of the rcl_node_t of its first node that was made by a profile for
+                `unannounced`.
+
+        Returns:
+            None if it knows others: another node had it made before, in a user's module perhaps.
+
+        Raises:
+            MiddlewareError: Fast DDS is not laid out as known; the participant stays alone.
+        """
         pdp = _pdp_of(rcl_node)
-        if pdp is None or pdp.ignored != _IGNORE_ALL_FLAGS:
+        if pdp is None:
             raise MiddlewareError(
                 "cannot have a participant discover others: the loaded Fast DDS is not laid out as "
                 "2.14.5, though that of the process that started this one is",
                 hint=f"start both in one environment; {abi.INSTALL}",
             )
-        self._pdp = pdp
-        _announcing("31stopRTPSParticipantAnnouncementEv")(pdp.participant)
-        _announce()(ctypes.addressof(pdp), True, True)
+        return cls(pdp) if pdp.ignored == _IGNORE_ALL_FLAGS else None
 
     def announce(self) -> None:
         """Have it discover others, and be discovered."""

@@ -313,6 +313,7 @@ class Host:
                                 )
                             )
                         self._construct(planned, maker)
+                    self._meet()  # at the latest
                 except Exception as error:  # noqa: BLE001 - reported to the supervisor
                     failure = error
                 if failure is not None:
@@ -331,13 +332,13 @@ class Host:
         """
         if not self._spec.gathers:
             return
-        unannounced = self._participants.first.unannounced
-        delay_s = endpoints_made_s(self._spec.gathers) if unannounced else ENDPOINTS_MADE_S
+        if self._participants.first.unannounced:
+            self._unannounced = Unannounced.of(rcl_node)
+        is_known = self._unannounced is None
+        delay_s = ENDPOINTS_MADE_S if is_known else endpoints_made_s(self._spec.gathers)
         resend_endpoints_soon(rcl_node, delay_s, participants=self._spec.gathers)
         widen_discovery_buffers(self._spec.domain_id)
-        if unannounced:
-            self._unannounced = Unannounced(rcl_node)
-        else:
+        if is_known:
             self._gather()
 
     def _meet(self) -> None:

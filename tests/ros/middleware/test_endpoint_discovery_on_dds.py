@@ -83,3 +83,12 @@ def test_heartbeats_come_the_less_often_the_more_participants_there_are(
         # Also what was changed before is known, and changed back.
         assert resend_endpoints_soon(pointer)
         assert heartbeat_periods_s(pointer) == [1, 1]
+
+
+@pytest.mark.parametrize(
+    ("participants", "delay_s"), [(0, 0.005), (2, 0.005), (20, 0.02), (50, 0.05), (200, 0.05)]
+)
+def test_what_was_unannounced_resends_once_the_others_had_time_to_ask(
+    participants: int, delay_s: float
+) -> None:
+    assert endpoint_discovery.endpoints_made_s(participants) == pytest.approx(delay_s)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -13,6 +14,7 @@ import rclpy
 from rclpy.node import Node
 
 from lifecycle.errors import MiddlewareError
+from lifecycle.middleware.fastdds import participant_discovery
 from lifecycle.middleware.fastdds.participant_discovery import Unannounced, can_be_unannounced
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.middleware.fastdds.settings import participant_settings
@@ -51,7 +53,9 @@ def _node(name: str, domain_id: int, *, unannounced: bool) -> Iterator[Node]:
 
 def _held(node: Node) -> Unannounced:
     with node.handle:
-        return Unannounced(node.handle.pointer)
+        found = Unannounced.of(node.handle.pointer)
+    assert found is not None
+    return found
 
 
 def test_two_that_were_unannounced_meet_each_other_and_one_that_was_there(
@@ -80,14 +84,31 @@ def test_two_that_were_unannounced_meet_each_other_and_one_that_was_there(
             wait_until(lambda node=node: set(node.get_node_names()) == {"early", "one", "other"})
 
 
-def test_one_that_was_not_made_so_is_refused_and_goes_on(
+def test_one_that_was_not_made_so_goes_on(
     fresh_domain: int, wait_until: Callable[..., None]
 ) -> None:
     with _node("one", fresh_domain, unannounced=False) as one:
-        with pytest.raises(MiddlewareError, match="cannot have a participant discover others"):
-            _held(one)
+        with one.handle:
+            assert Unannounced.of(one.handle.pointer) is None
         with _node("other", fresh_domain, unannounced=False) as other:
             wait_until(lambda: set(other.get_node_names()) == {"one", "other"})
+
+
+@pytest.mark.parametrize("field", ["protocol", "static_edp", "announcement_period", "sync_period"])
+def test_what_is_laid_out_otherwise_is_not_touched(
+    fresh_domain: int, monkeypatch: pytest.MonkeyPatch, field: str
+) -> None:
+    """Fields in another order stand for another version."""
+    fields = list(participant_discovery._Pdp._fields_)
+    index = [name for name, _ in fields].index(field)
+    fields[index], fields[index + 1] = fields[index + 1], fields[index]
+    other = type("_Pdp", (ctypes.Structure,), {"_fields_": tuple(fields)})
+    with _node("one", fresh_domain, unannounced=False) as one, one.handle:
+        assert can_be_unannounced(one.handle.pointer)
+        monkeypatch.setattr(participant_discovery, "_Pdp", other)
+        assert not can_be_unannounced(one.handle.pointer)
+        with pytest.raises(MiddlewareError, match="cannot have a participant discover others"):
+            Unannounced.of(one.handle.pointer)
 
 
 def test_one_that_is_unannounced_says_that_others_cannot_be(fresh_domain: int) -> None:

@@ -105,6 +105,21 @@ def test_unannounced_hosts_meet_before_the_users_constructors_go_on(start: Start
         assert "met" in host.log.read_text()
 
 
+def test_a_host_whose_module_has_made_its_participant_waits_for_the_others_all_the_same(
+    start: Start, fresh_domain: int, wait_until: Callable[..., None]
+) -> None:
+    late = dataclasses.replace(
+        hosted("one", "Late"), run=Run(kind=RunKind.PYTHON, python="at_import:Late")
+    )
+    host = start(late, gathers=2, unannounced=True)
+    assert host.read() == Event(kind="gathered")
+    host.send(Command(id=0, node="", operation=Operation.PROCEED))
+    host.until("ready")
+    with driver_in(fresh_domain) as driver:
+        wait_until(lambda: _services(driver, "one"))
+    assert host.do("/one", CONFIGURE).ok
+
+
 def test_an_unannounced_host_that_is_ended_while_it_gathers_ends(start: Start) -> None:
     host = start(hosted("one", "Good"), gathers=2, unannounced=True)
     assert host.read() == Event(kind="gathered")
