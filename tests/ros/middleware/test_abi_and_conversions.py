@@ -26,7 +26,6 @@ from lifecycle.middleware import (
     import_interface,
     to_rclpy,
 )
-from lifecycle.middleware.fastdds import settings
 from lifecycle.middleware.fastdds.nfe import NetworkFlowEndpointsUnsupported
 from lifecycle.middleware.rcl import abi, graph_queries
 from lifecycle.network.nfe import UniqueRequirement
@@ -80,13 +79,9 @@ def test_a_missing_symbol_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 def unknown(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """An rcl whose layouts nobody wrote down."""
     monkeypatch.setattr(abi, "rcl_version", lambda: "10.1.0")
-    # Both are kept for good, and what is asked for first in here is not there.
-    kept = (abi._loaded, settings._node_functions)
-    for each in kept:
-        each.cache_clear()
+    abi._loaded.cache_clear()
     yield
-    for each in kept:
-        each.cache_clear()
+    abi._loaded.cache_clear()
 
 
 @pytest.mark.usefixtures("unknown")

@@ -27,6 +27,7 @@ from lifecycle.middleware import (
     has_shared_memory,
     participant_settings,
 )
+from lifecycle.middleware.fastdds import settings
 from lifecycle.middleware.fastdds.settings import without_localhost
 from lifecycle.network.nfe import NetworkFlowEndpoint, TransportProtocol
 from lifecycle.verify.observation import Identity
@@ -398,6 +399,15 @@ def test_static_peers_and_the_range_are_read_and_left_as_they_were(
     context.destroy()
 
 
+@pytest.fixture
+def asked_anew() -> Iterator[None]:
+    """What the RMW can is kept for good in a process, and asked for when a participant ends."""
+    settings._node_functions.cache_clear()
+    yield
+    settings._node_functions.cache_clear()
+
+
+@pytest.mark.usefixtures("asked_anew")
 def test_another_rmw_is_refused_in_words(domain_id: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         "lifecycle.middleware.fastdds.settings.get_rmw_implementation_identifier",
