@@ -152,10 +152,8 @@ DISCOVERY_SERVER_VARIABLE = "ROS_DISCOVERY_SERVER"
 _IGNORE_ALL = ("FILTER_DIFFERENT_PROCESS", "FILTER_DIFFERENT_HOST", "FILTER_SAME_PROCESS")
 """Not the first two alone: a participant that has those makes no transports."""
 
-_MANY = 40
 _HEARTBEAT_SHARE_S = 0.01
-"""With so many, heartbeats with each message of names are most of all messages. With fewer, what
-was lost has to be sent again sooner than in that period."""
+"""With many, heartbeats with each message of names are most of all messages."""
 
 _ANNOUNCEMENTS = 4
 _ANNOUNCEMENT_PERIOD_NS = 500_000_000
@@ -409,6 +407,7 @@ def for_a_host(
     environment: Mapping[str, str],
     *,
     unannounced: bool,
+    names_by_udp: bool,
     participants: int,
 ) -> ParticipantSettings:
     """Return the settings of the first participant of a host.
@@ -417,6 +416,7 @@ def for_a_host(
         settings: what it needs otherwise.
         environment: of this process.
         unannounced: it is to be, if the environment leaves that open.
+        names_by_udp: likewise.
         participants: how many are made together, ≥ 0.
 
     Raises:
@@ -428,12 +428,14 @@ def for_a_host(
     leaves_transports = not (settings.chooses_transports or environment.get(TRANSPORTS_VARIABLE))
     # Profiles of a user's file may be for the names as well, and the first one counts.
     is_ours = base is not None or not environment.get(PROFILES_FILE_VARIABLE)
-    has_many = unannounced and participants >= _MANY
+    leaves_names = (
+        names_by_udp and leaves_transports and is_ours and not Path(DEFAULT_FILE).exists()
+    )
     return dataclasses.replace(
         settings,
         unannounced=unannounced and not environment.get(DISCOVERY_SERVER_VARIABLE),
-        names_by_udp=leaves_transports and is_ours and not Path(DEFAULT_FILE).exists(),
-        names_heartbeat_s=participants * _HEARTBEAT_SHARE_S if has_many else None,
+        names_by_udp=leaves_names,
+        names_heartbeat_s=participants * _HEARTBEAT_SHARE_S if leaves_names else None,
     )
 
 

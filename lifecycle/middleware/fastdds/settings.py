@@ -269,13 +269,14 @@ def observer_settings(settings: ParticipantSettings) -> ParticipantSettings:
 
 
 def host_settings(
-    settings: ParticipantSettings, *, unannounced: bool, participants: int
+    settings: ParticipantSettings, *, unannounced: bool, names_by_udp: bool, participants: int
 ) -> ParticipantSettings:
     """Return the settings of a host's first participant, see `for_a_host`.
 
     Args:
         settings: what it needs otherwise.
         unannounced: it is to be, where that is possible.
+        names_by_udp: likewise.
         participants: how many are made together, ≥ 0.
 
     Returns:
@@ -285,7 +286,13 @@ def host_settings(
         return settings
     try:
         _library()
-        return for_a_host(settings, os.environ, unannounced=unannounced, participants=participants)
+        return for_a_host(
+            settings,
+            os.environ,
+            unannounced=unannounced,
+            names_by_udp=names_by_udp,
+            participants=participants,
+        )
     except MiddlewareError:
         # As for an observer.
         return settings

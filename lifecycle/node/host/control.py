@@ -96,6 +96,7 @@ class HostSpec:
             reports that it has made its, and waits for `PROCEED`: unannounced before it is
             discovered, otherwise before it makes endpoints.
         unannounced: its participant is made so, see `Unannounced`; only if it gathers.
+        names_by_udp: likewise, see ParticipantSettings.
         folders: absolute, of the manifest and what it includes: modules are looked for there.
     """
 
@@ -106,6 +107,7 @@ class HostSpec:
     nodes: tuple[PlannedNode, ...]
     gathers: int = 0
     unannounced: bool = False
+    names_by_udp: bool = False
     folders: tuple[str, ...] = ()
 
 

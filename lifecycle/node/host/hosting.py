@@ -78,18 +78,16 @@ class Participants:
 
     Args:
         default: that context.
-        unannounced: its participant is made so, where the environment leaves that open.
-        participants: how many are made together, ≥ 0.
+        spec: how its participant is made, where the environment leaves that open.
 
     Attributes:
         first: the settings of the default context's participant; none before it is made.
     """
 
-    def __init__(self, default: Context, *, unannounced: bool, participants: int) -> None:
+    def __init__(self, default: Context, spec: HostSpec) -> None:
         self.first = ParticipantSettings()
         self._default = default
-        self._unannounced = unannounced
-        self._participants = participants
+        self._spec = spec
         self._made: dict[ParticipantSettings, Context] = {}
 
     @contextlib.contextmanager
@@ -114,7 +112,10 @@ class Participants:
             context.init(args=[], domain_id=self._default.get_domain_id())
         else:
             wanted = host_settings(
-                settings, unannounced=self._unannounced, participants=self._participants
+                settings,
+                unannounced=self._spec.unannounced,
+                names_by_udp=self._spec.names_by_udp,
+                participants=self._spec.gathers,
             )
             self.first = wanted
         # The participant is made with the context's first node.
@@ -271,9 +272,7 @@ class Host:
         self._is_kept = False
         self._proceed = threading.Event()
         self._nodes: dict[str, Hosted] = {}
-        self._participants = Participants(
-            context, unannounced=spec.unannounced, participants=spec.gathers
-        )
+        self._participants = Participants(context, spec)
         self._unannounced: Unannounced | None = None
         self._adoption = Adoption(
             self._participants.carrying,

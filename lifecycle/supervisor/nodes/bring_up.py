@@ -82,6 +82,10 @@ _GATHERED_S = 0.5
 """For so long no further host has come: what is still missing imports something big."""
 
 
+_MANY = 40
+"""From so many hosts on names by shared memory take longer than all else."""
+
+
 class Gathering:
     """Has hosts meet, or make endpoints, when all of them are ready for it (HostSpec.gathers).
 
@@ -281,6 +285,23 @@ class BringUp:
         for task in self._appearing:
             task.cancel()
         await asyncio.gather(*self._appearing, return_exceptions=True)
+
+    def _names_by_udp(self) -> bool:
+        """Return whether names of nodes go by UDP (ParticipantSettings), as in a large system.
+
+        They arrive at the port that a participant has by its number. It has another one where that
+        is taken, as only participants with transports of their own take it.
+        """
+        gathering = self._gathering
+        return (
+            gathering is not None
+            and gathering.unannounced
+            and gathering.hosts >= _MANY
+            and not any(
+                node.participants or node.transports or node.connections.urls
+                for node in self._system.plan.nodes
+            )
+        )
 
     async def _connect_all(self, nodes: Iterable[NodeRun]) -> None:
         nodes = tuple(nodes)
@@ -597,6 +618,7 @@ class BringUp:
                     nodes=tuple(node.planned for node in nodes),
                     gathers=0 if self._gathering is None else self._gathering.hosts,
                     unannounced=self._gathering is not None and self._gathering.unannounced,
+                    names_by_udp=self._names_by_udp(),
                     folders=manifest_folders(node.planned for node in nodes),
                 ),
                 self._system.on_host_event,

@@ -31,9 +31,9 @@ def start(fresh_domain: int, tmp_path: Path) -> Iterator[Callable[..., HostProce
     """Start hosts in a domain of their own."""
     hosts: list[HostProcess] = []
 
-    def start(*nodes: PlannedNode, gathers: int = 0, unannounced: bool = False) -> HostProcess:
+    def start(*nodes: PlannedNode, **spec: Any) -> HostProcess:
         log = tmp_path / f"host{len(hosts)}.log"
-        host = HostProcess(fresh_domain, nodes, log, gathers=gathers, unannounced=unannounced)
+        host = HostProcess(fresh_domain, nodes, log, **spec)
         hosts.append(host)
         return hosts[-1]
 

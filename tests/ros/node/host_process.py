@@ -38,6 +38,7 @@ class HostProcess:
         *,
         gathers: int = 0,
         unannounced: bool = False,
+        names_by_udp: bool = False,
     ) -> None:
         ours, theirs = socket.socketpair()
         ours.settimeout(30)
@@ -66,6 +67,7 @@ class HostProcess:
             nodes=nodes,
             gathers=gathers,
             unannounced=unannounced,
+            names_by_udp=names_by_udp,
         )
         self.send(spec)
 

@@ -137,7 +137,7 @@ def test_names_have_no_port_of_shared_memory_unless_transports_are_chosen(
     monkeypatch.delenv("FASTDDS_BUILTIN_TRANSPORTS", raising=False)
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
-    host = start(hosted("one", "Good"))
+    host = start(hosted("one", "Good"), names_by_udp=True)
     host.until("ready")
     threads = [
         (each / "comm").read_text() for each in Path(f"/proc/{host.process.pid}/task").iterdir()

@@ -195,12 +195,12 @@ def test_a_host_gets_what_its_environment_leaves_open(
         name: "quick.xml" if value is _QUICK else value for name, value in environment.items()
     }
     before = ParticipantSettings(**settings)
-    found = for_a_host(before, variables, unannounced=True, participants=3)
+    found = for_a_host(before, variables, unannounced=True, names_by_udp=True, participants=50)
     assert (found.unannounced, found.names_by_udp) == (unannounced, names)
-    assert found.names_heartbeat_s is None
+    assert found.names_heartbeat_s == (0.5 if names else None)
     assert bool(found) or found == before
-    alone = for_a_host(before, variables, unannounced=False, participants=3)
-    assert not alone.unannounced
+    alone = for_a_host(before, variables, unannounced=False, names_by_udp=False, participants=3)
+    assert alone == before
 
 
 def test_names_are_left_alone_beside_a_file_of_the_working_directory(
@@ -209,22 +209,10 @@ def test_names_are_left_alone_beside_a_file_of_the_working_directory(
     """It may have a profile for them without having one for participants."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "DEFAULT_FASTRTPS_PROFILES.xml").write_text("<dds/>")
-    assert not for_a_host(ParticipantSettings(), {}, unannounced=True, participants=1).names_by_udp
-
-
-@pytest.mark.parametrize(("participants", "heartbeat_s"), [(39, None), (40, 0.4), (100, 1.0)])
-def test_heartbeats_of_names_follow_how_many_are_made_together(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    participants: int,
-    heartbeat_s: float | None,
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    for unannounced in (True, False):
-        found = for_a_host(
-            ParticipantSettings(), {}, unannounced=unannounced, participants=participants
-        )
-        assert found.names_heartbeat_s == (heartbeat_s if unannounced else None)
+    found = for_a_host(
+        ParticipantSettings(), {}, unannounced=True, names_by_udp=True, participants=50
+    )
+    assert found == ParticipantSettings(unannounced=True)
 
 
 @pytest.mark.parametrize(

@@ -209,6 +209,7 @@ class FakeProcess:
         with contextlib.closing(writer):
             spec = from_json(await reader.readline(), HostSpec)
             self._spawner.gathers.append((spec.gathers, spec.unannounced))
+            self._spawner.names_by_udp.append(spec.names_by_udp)
             if await self._cannot_host(writer):
                 return
             nodes = [node.full_name for node in spec.nodes]
@@ -308,6 +309,7 @@ class FakeSpawner:
         changed: called whenever the graph looks otherwise.
         refuses: why no process can have resources; empty if all can.
         gathers: what each host was given of it and of `unannounced`, see HostSpec.
+        names_by_udp: likewise.
     """
 
     def __init__(self) -> None:
@@ -326,6 +328,7 @@ class FakeSpawner:
         self.changed: Callable[[], None] = lambda: None
         self.refuses = ""
         self.gathers: list[tuple[int, bool]] = []
+        self.names_by_udp: list[bool] = []
         self._pid = _FIRST_PID
 
     def next_pid(self) -> int:

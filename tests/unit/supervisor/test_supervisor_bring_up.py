@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import signal
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -72,6 +74,30 @@ def test_hosts_are_given_how_many_of_them_make_participants_together(
         return world.spawner.gathers
 
     assert run(main()) == gathers
+
+
+@pytest.mark.parametrize(
+    ("count", "can_be", "changes", "by_udp"),
+    [
+        (40, True, {}, True),
+        (39, True, {}, False),
+        (40, False, {}, False),
+        # Its port may be another's.
+        (40, True, {"transports": ("udpv6",)}, False),
+    ],
+)
+def test_names_go_by_udp_in_large_systems_in_which_no_port_is_taken(
+    tmp_path: Path, count: int, can_be: bool, changes: dict[str, Any], by_udp: bool
+) -> None:
+    async def main() -> list[bool]:
+        nodes = [planned_node(f"n{number}") for number in range(count)]
+        world = _world(tmp_path, *nodes[1:], dataclasses.replace(nodes[0], **changes))
+        world.can_be_unannounced = can_be
+        await world.bring_up.connect(LIMIT_S)
+        await _down(world)
+        return world.spawner.names_by_udp
+
+    assert run(main()) == [by_udp] * count
 
 
 def test_a_bring_up_that_was_cancelled_twice_starts_everything_anew_the_next_time(
