@@ -65,7 +65,9 @@ _LARGEST_SOCKET_BUFFER = 1 << 26
 _NEVER = 1 << 30
 
 
-class _Duration(ctypes.Structure):
+class Duration(ctypes.Structure):
+    """Duration_t of DDSI-RTPS as Fast DDS has it in memory."""
+
     _fields_ = (("seconds", ctypes.c_int32), ("nanoseconds", ctypes.c_uint32))
 
 
@@ -73,10 +75,10 @@ class _WriterTimes(ctypes.Structure):
     # fastrtps/rtps/attributes/WriterAttributes.h; its destructor is virtual.
     _fields_ = (
         ("virtual", ctypes.c_void_p),
-        ("initial_heartbeat_delay", _Duration),
-        ("heartbeat_period", _Duration),
-        ("nack_response_delay", _Duration),
-        ("nack_suppression_duration", _Duration),
+        ("initial_heartbeat_delay", Duration),
+        ("heartbeat_period", Duration),
+        ("nack_response_delay", Duration),
+        ("nack_suppression_duration", Duration),
     )
 
 
@@ -119,9 +121,9 @@ def resend_endpoints_soon(rcl_node: int, delay_s: float = SOON_S, *, participant
         )
         if not _is_known(times):
             continue
-        times.nack_response_delay = _Duration(0, round(delay_s * 1e9))
+        times.nack_response_delay = Duration(0, round(delay_s * 1e9))
         period_s = max(1, min(participants // _PARTICIPANTS_A_SECOND, _MAX_HEARTBEAT_S))
-        times.heartbeat_period = _Duration(period_s, 0)
+        times.heartbeat_period = Duration(period_s, 0)
         update_times(writer, ctypes.byref(times))
         changed += _resend_without_heartbeats(writer)
     return changed == len(_WRITERS)
@@ -129,7 +131,7 @@ def resend_endpoints_soon(rcl_node: int, delay_s: float = SOON_S, *, participant
 
 def _resend_without_heartbeats(writer: int) -> bool:
     """Have a writer count from 1 GiB until its next heartbeat to all; False if it is none known."""
-    kept = _Duration.from_address(writer + _KEEP_DURATION_AT)
+    kept = Duration.from_address(writer + _KEEP_DURATION_AT)
     size = ctypes.c_uint32.from_address(writer + _SEND_BUFFER_AT)
     left = ctypes.c_int32.from_address(writer + _SEND_BUFFER_AT + ctypes.sizeof(size))
     is_known = (

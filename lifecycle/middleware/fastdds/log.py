@@ -6,6 +6,7 @@ Owns: keeping one message that we cause from it.
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import sys
 from collections.abc import Iterator
@@ -41,6 +42,8 @@ def without_message(message: str) -> Iterator[None]:
         except (OSError, AttributeError, ValueError):
             yield
             return
+        # Threads that write to a memfd at once would write over each other's lines.
+        fcntl.fcntl(written, fcntl.F_SETFL, fcntl.fcntl(written, fcntl.F_GETFL) | os.O_APPEND)
         os.dup2(written.fileno(), _STDOUT)
         try:
             yield

@@ -7,12 +7,11 @@ of a node again with each: some 20 datagrams and 16 messages from each node to e
 when they have their endpoints send all of them in two datagrams, and the names once.
 
 A participant is made by a profile that has it ignore all others (`ignoreParticipantFlags`, see
-`ParticipantSettings.unannounced`). It
-announces itself once while it is made, which nothing changes, and takes that back here: who has
-seen it forgets it, and answers when it is announced again. Then what it ignores is set back, which
-Fast DDS 2.14 has no function for: it is one number in PDP::m_discovery. So this is done only where
-all that lies around it is as in 2.14.5, which is looked at before, in a participant of the process
-that starts the others.
+`ParticipantSettings.unannounced`). It announces itself once while it is made, which no setting
+changes, and is disposed of here: participants that discovered it remove it, and answer when it is
+announced again. Then what it ignores is set back, which Fast DDS 2.14 has no function for: it is
+one number in PDP::m_discovery. So this is done only where all that lies around it is as in 2.14.5,
+which is checked before, in a participant of the process that starts the others.
 """
 
 from __future__ import annotations
@@ -22,6 +21,7 @@ import functools
 from typing import Any
 
 from lifecycle.errors import MiddlewareError
+from lifecycle.middleware.fastdds.endpoint_discovery import Duration
 from lifecycle.middleware.fastdds.settings import (
     fast_dds_address,
     fast_dds_function,
@@ -40,10 +40,6 @@ _PREFIX_BYTES = 12
 _POINTER_BYTES = ctypes.sizeof(ctypes.c_void_p)
 
 
-class _Duration(ctypes.Structure):
-    _fields_ = (("seconds", ctypes.c_int32), ("nanoseconds", ctypes.c_uint32))
-
-
 class _Pdp(ctypes.Structure):
     # PDP.h, and DiscoverySettings of RTPSParticipantAttributes.h, which m_discovery begins with.
     _fields_ = (
@@ -54,13 +50,13 @@ class _Pdp(ctypes.Structure):
         ("protocol", ctypes.c_uint32),
         ("simple_edp", ctypes.c_uint8),
         ("static_edp", ctypes.c_uint8),
-        ("lease", _Duration),
-        ("announcement_period", _Duration),
+        ("lease", Duration),
+        ("announcement_period", Duration),
         ("announcements", ctypes.c_uint32),
-        ("initial_period", _Duration),
+        ("initial_period", Duration),
         ("simple_edp_settings", ctypes.c_uint8 * 4),
         ("factory", ctypes.c_void_p * 2),
-        ("sync_period", _Duration),
+        ("sync_period", Duration),
         ("servers", ctypes.c_void_p * 3),
         ("ignored", ctypes.c_uint32),
     )
@@ -76,7 +72,7 @@ class _Endpoint(ctypes.Structure):
 
 
 class Unannounced:
-    """A participant that nobody knows, and that knows nobody, until it is announced; see `of`."""
+    """A participant that is not discovered, and discovers none, until it is announced; see `of`."""
 
     def __init__(self, pdp: _Pdp) -> None:
         self._pdp = pdp
@@ -85,14 +81,14 @@ class Unannounced:
 
     @classmethod
     def of(cls, rcl_node: int) -> Unannounced | None:
-        """Take back that a participant was announced when it was made.
+        """Dispose of a participant in the graph that was announced when it was made.
 
         Args:
             rcl_node: address of the rcl_node_t of its first node that was made by a profile for
                 `unannounced`.
 
         Returns:
-            None if it knows others: another node had it made before, in a user's module perhaps.
+            None if it discovers others: a node of a user's module had it made before, perhaps.
 
         Raises:
             MiddlewareError: Fast DDS is not laid out as known; the participant stays alone.

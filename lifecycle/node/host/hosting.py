@@ -298,12 +298,13 @@ class Host:
             follow_nodes(self._adoption)
             for index, planned in enumerate(self._spec.nodes):
                 failure: Exception | None = None
+                first = self._spec.gathers > 0 and index == 0
                 try:
                     if planned.key in self._adoption.made:
                         continue  # by the same call as one before it
                     maker = self._import(planned)
                     with contextlib.ExitStack() as stack:
-                        if index == 0:
+                        if first:
                             stack.enter_context(
                                 once_participant_is_made(
                                     self._context,
@@ -329,8 +330,6 @@ class Host:
         what is made afterwards is sent once to each peer, and to those found later all of it is
         sent again.
         """
-        if not self._spec.gathers:
-            return
         if self._participants.first.unannounced:
             self._unannounced = Unannounced.of(rcl_node)
         is_known = self._unannounced is None

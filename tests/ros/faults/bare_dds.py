@@ -186,11 +186,8 @@ def main() -> None:
                 data, source = listener.recvfrom(65536)
             except TimeoutError:
                 break
-            if data.startswith(b"RTPS") and data[8:20] != prefix and source[1] not in asked:
-                # At once, as every DDS does: a probe waits for 0.15 s.
+            if data.startswith(b"RTPS") and data[8:20] != prefix:
                 asked.add(source[1])
-                for each in said:
-                    speaker.sendto(each, ("127.0.0.1", source[1]))
 
 
 if __name__ == "__main__":

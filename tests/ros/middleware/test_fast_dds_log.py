@@ -10,7 +10,11 @@ import os, sys
 import rclpy
 from lifecycle.middleware.fastdds.log import without_message
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
-from lifecycle.middleware.fastdds.settings import load_profile, participant_settings
+from lifecycle.middleware.fastdds.settings import (
+    fast_dds_function,
+    load_profile,
+    participant_settings,
+)
 from lifecycle.errors import MiddlewareError
 
 rclpy.init(domain_id=int(sys.argv[1]))
@@ -24,6 +28,8 @@ with without_message("unique_network_request"):
     try:
         load_profile("broken", "<dds><profiles><participant/></profiles></dds>")
     except MiddlewareError:
+        # Its thread writes a line in pieces; ours would be in the middle of one.
+        fast_dds_function("_ZN8eprosima7fastdds3dds3Log5FlushEv", None)()
         print("refused")
 print("after")
 sys.stdout.flush()

@@ -137,7 +137,8 @@ def test_names_have_no_port_of_shared_memory_unless_transports_are_chosen(
     monkeypatch.delenv("FASTDDS_BUILTIN_TRANSPORTS", raising=False)
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
-    host = start(hosted("one", "Good"), names_by_udp=True)
+    host = start(hosted("one", "Good"), gathers=1, names_by_udp=True)
+    host.send(Command(id=0, node="", operation=Operation.PROCEED))
     host.until("ready")
     threads = [
         (each / "comm").read_text() for each in Path(f"/proc/{host.process.pid}/task").iterdir()

@@ -699,10 +699,10 @@ class _Host:
         self.proceeded_at = asyncio.get_running_loop().time()
 
 
-def test_unannounced_hosts_are_not_told_of_us() -> None:
+def test_our_participant_is_not_announced_to_unannounced_hosts() -> None:
     async def main() -> list[float | None]:
         hosts = (_Host(0.1), _Host(0.3))
-        gathering = Gathering(5.0, 2, lambda: pytest.fail("told"), unannounced=True)
+        gathering = Gathering(5.0, 2, lambda: pytest.fail("announced"), unannounced=True)
         for host in hosts:
             gathering.expect(host)  # type: ignore[arg-type]
         await asyncio.sleep(1.0)
