@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ipaddress
 import os
+import re
 import struct
 import time
 from collections.abc import Iterable
@@ -40,6 +41,12 @@ PROBE_ENDPOINTS = _parameters(
 """By which announcements of participants that do not exist are known, also those of others."""
 
 
+_LOCATOR = re.compile(rb"\x32\x00\x18\x00[\x01\x02]\x00\x00\x00(.{4})", re.DOTALL)
+"""PID_METATRAFFIC_UNICAST_LOCATOR over UDP, and its port."""
+_SWAPPED = re.compile(rb"\x00\x32\x00\x18\x00\x00\x00[\x01\x02](.{4})", re.DOTALL)
+"""The same of a big-endian participant."""
+
+
 def announced_prefix(data: bytes) -> str:
     """Return the GUID prefix of the participant that announced itself; empty if none did."""
     if len(data) <= len(HEADER) + PREFIX_BYTES or not data.startswith(b"RTPS"):
@@ -47,6 +54,12 @@ def announced_prefix(data: bytes) -> str:
     if PROBE_ENDPOINTS in data or _STATUS in data:
         return ""
     return data[len(HEADER) : len(HEADER) + PREFIX_BYTES].hex()
+
+
+def announced_ports(data: bytes) -> frozenset[int]:
+    """Return the UDP ports at which a participant that announced itself receives discovery."""
+    found = {int.from_bytes(each[1], "little") for each in _LOCATOR.finditer(data)}
+    return frozenset(found | {int.from_bytes(each[1], "big") for each in _SWAPPED.finditer(data)})
 
 
 def new_prefix() -> str:

@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING
 from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.discovery.messages import (
+    announced_ports,
     announced_prefix,
     announcement,
     disposal,
@@ -34,7 +35,7 @@ from lifecycle.middleware.discovery.messages import (
 from lifecycle.middleware.fastdds.dscp import own_udp_socket
 from lifecycle.middleware.fastdds.participant_profile import default_profile
 from lifecycle.middleware.fastdds.profiles import PROFILE_NAME
-from lifecycle.middleware.fastdds.url_check import open_sockets
+from lifecycle.middleware.fastdds.url_check import OpenSocket, open_sockets, sockets_of_others
 from lifecycle.middleware.fastdds.url_profile import (
     DISCOVERY_GROUP,
     LOCALHOST_PEERS_RANGE,
@@ -113,6 +114,7 @@ class Probe:
         self.counts = output_port is None
         self._output_port = output_port
         self._answers: dict[str, str] = {}
+        self._named: set[int] = set()
         self._targets, self._addresses = tuple(targets), tuple(addresses)
         self._ipv6 = any(":" in target.address for target in self._targets)
         family = socket.AF_INET6 if self._ipv6 else socket.AF_INET
@@ -125,6 +127,7 @@ class Probe:
             self._socket = socket.socket(family, socket.SOCK_DGRAM)
             self._socket.bind(("", 0))  # answers arrive at every address we name
             own = (self._socket.getsockname()[1],)
+        self._listeners = self._listeners_here() if self.counts else frozenset()
         self._send((*own, *self._receivers))
         if not self.counts:
             self.close()
@@ -133,6 +136,45 @@ class Probe:
     def asks(self) -> tuple[object, ...]:
         """To where it is sent, and the addresses at which it is to be answered."""
         return self._targets, self._addresses
+
+    def silent(self) -> frozenset[int]:
+        """Return the asked UDP ports of other processes on this host that no answer named so far.
+
+        Only of those that were bound when this was made, and still are. Who has one is most likely
+        a participant that had no processor yet, however long that takes.
+        """
+        if not self._listeners or self._socket is None:
+            return frozenset()
+        self.addresses()
+        left = {each for each in self._listeners if each.port not in self._named}
+        if left:
+            left &= self._listeners_here()
+        self._listeners = frozenset(left)
+        return frozenset(each.port for each in left)
+
+    def ask_silent(self) -> None:
+        """Ask those on this host once more that did not answer, to be answered by them."""
+        if (ports := self.silent()) and self._socket is not None:
+            targets = (each for each in self._targets if each.port in ports)
+            answered_at = ((each, self._socket.getsockname()[1]) for each in self._addresses)
+            ask(self._socket, answered_at, targets)
+
+    def _listeners_here(self) -> frozenset[OpenSocket]:
+        """Return the sockets of other processes on this host that one of the targets is."""
+        own = frozenset(self._addresses)
+        asked: dict[int, set[str]] = {}
+        for target in self._targets:
+            if target.address in own:
+                asked.setdefault(target.port, set()).add(target.address)
+        if not asked:
+            return frozenset()
+        return frozenset(
+            each
+            for each in sockets_of_others()
+            if not each.kind.is_tcp
+            and (at := asked.get(each.port))
+            and (each.address in at or ipaddress.ip_address(each.address).is_unspecified)
+        )
 
     def ask_again(self, *, to_count: bool) -> None:
         """Send one more announcement, of another participant that does not exist.
@@ -180,6 +222,7 @@ class Probe:
                 # What calls all sockets of this process, `introduce` say, calls this one, too.
                 if prefix := announced_prefix(data):
                     self._answers[prefix] = source[0]
+                    self._named |= announced_ports(data)
         return dict(self._answers)
 
     def close(self) -> None:
@@ -197,7 +240,8 @@ class EarlyProbe:
     """A probe for a participant that is not made yet: whether there is anybody already.
 
     Making a participant, and all that comes before it, takes longer than to be answered. Who
-    answers this one is not discovered by that; if nobody does, there was nobody.
+    answers this one is not discovered by that; if nobody does, there was nobody, unless a process
+    of this host has a port at which a participant would have been asked.
 
     Args:
         domain_id: 0–232.
@@ -220,7 +264,9 @@ class EarlyProbe:
             asked: the probes of the participant once that is made.
         """
         own = [each.asks for each in self._probes if each.counts]
-        if own != [each.asks for each in asked] or any(map(Probe.answered, self._probes)):
+        if own != [each.asks for each in asked]:
+            return None
+        if any(each.answered() or each.silent() for each in self._probes):
             return None
         return self._sent_s + ANSWER_S
 

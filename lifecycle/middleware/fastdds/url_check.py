@@ -120,6 +120,12 @@ def open_sockets(pid: int | None = None) -> tuple[OpenSocket, ...]:
     return tuple(each for each in _bound_sockets() if each.inode in ours)
 
 
+def sockets_of_others() -> tuple[OpenSocket, ...]:
+    """Return the UDP and listening TCP sockets of our network namespace but for this process's."""
+    ours = set(_socket_inodes("self"))
+    return tuple(each for each in _bound_sockets() if each.inode not in ours)
+
+
 def sockets_of(pids: Iterable[int]) -> dict[int, tuple[OpenSocket, ...]]:
     """Return the same of several processes; those that are gone, or not ours, have none."""
     inodes: dict[int, int] = {}

@@ -245,6 +245,7 @@ class GraphObserver:
         self._name = self.node.get_fully_qualified_name()
         self._stale_node_filter = StaleNodeFilter(self.node)
         self._made_s = time.monotonic()
+        self._ask_silent_s = 0.0
 
     @classmethod
     def on(cls, node: Node) -> GraphObserver:
@@ -335,7 +336,8 @@ class GraphObserver:
         """Return for how many seconds a snapshot may still miss nodes; 0 once it cannot.
 
         A participant that answered our probe and whose node is not known is on its way into the
-        graph. Fast DDS needs 3 s at most for what it lost; a participant without a node by
+        graph, and so is one of this host that has a port for discovery and did not answer.
+        Fast DDS needs 3 s at most for what it lost; a participant without a node by
         then has none. Judged by the last `snapshot`. Where probing is impossible, it is a time.
         """
         age_s = time.monotonic() - self._made_s
@@ -347,6 +349,13 @@ class GraphObserver:
         known_s = self._made_s + ANSWER_S if silent_until_s is None else silent_until_s
         if (left_s := known_s - time.monotonic()) > 0:
             return left_s
+        patience_s = max(0.0, PATIENCE_S - age_s)
+        if patience_s and silent_until_s is None and any(each.silent() for each in self._probes):
+            if time.monotonic() >= self._ask_silent_s:
+                self._ask_silent_s = time.monotonic() + ANSWER_S
+                for probe in self._probes:
+                    probe.ask_silent()
+            return min(patience_s, ANSWER_S)
         unknown = frozenset().union(*(each.answered() for each in self._probes)) - self._known
         if not unknown:
             return 0.0
@@ -354,7 +363,7 @@ class GraphObserver:
             self._asked_for |= unknown
             for probe in self._probes:
                 probe.ask_again(to_count=False)
-        return max(0.0, PATIENCE_S - age_s)
+        return patience_s
 
     @property
     def prefix(self) -> str:

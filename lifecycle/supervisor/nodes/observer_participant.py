@@ -366,5 +366,5 @@ def _pending(snapshot: Snapshot, *, settling_s: float) -> Collection[str]:
         f"nobody tells whose {each.name} is" for each in endpoints if not known_node(each.node)
     )
     if settling_s > 0:
-        pending["a participant answered whose node is not known"] = None
+        pending["a participant whose node is not known"] = None
     return tuple(pending)

@@ -7,10 +7,12 @@ import contextlib
 import gc
 import json
 import os
+import signal
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -20,9 +22,12 @@ from std_msgs.msg import String
 
 from lifecycle.errors import ExitCode
 from lifecycle.middleware import GraphObserver, NodeClients
+from tests.ros.faults.system import BARE_DDS, FOREIGN
 from tests.ros.supervisor.running import BOUND_S, ROOT, Up, command, environment, pair, up, verb
 
 _ELSEWHERE = str(Path(__file__).with_name("managed_elsewhere.py"))
+_CHATTER = "/chatter:std_msgs/msg/String:RELIABLE"
+_UNATTRIBUTED = "graph.unattributed-endpoint"
 _LIMITS = {"start_s": 8, "configure_s": 8, "connect_s": 8, "activate_s": 8, "silent_s": 8}
 _BASE = {
     "nodes/base": {"run": {"command": [sys.executable, _ELSEWHERE]}, "timeouts": _LIMITS},
@@ -179,6 +184,38 @@ def test_who_appears_while_a_network_is_programmed_keeps_every_node_inactive(
         run.assert_nothing_left()
     finally:
         run.close()
+
+
+@pytest.mark.parametrize(
+    ("program", "rule"),
+    [
+        ((FOREIGN, "late", "--publish", _CHATTER), "graph.undeclared-node"),
+        ((BARE_DDS, "--write", "rt/chatter:std_msgs::msg::dds_::String_"), _UNATTRIBUTED),
+    ],
+    ids=["a node", "a plain DDS program"],
+)
+def test_who_was_there_and_had_no_processor_is_waited_for(
+    tmp_path: Path, fresh_domain: int, program: Sequence[str], rule: str
+) -> None:
+    """As on a loaded machine, or by a limit of its control group: for longer than answers take."""
+    with subprocess.Popen([sys.executable, *program], stdout=subprocess.PIPE) as intruder:
+        try:
+            assert intruder.stdout is not None
+            assert intruder.stdout.readline() == b"ready\n"
+            intruder.send_signal(signal.SIGSTOP)
+            options = ("--timeout", "8", "--stop-after", "1")
+            with up(pair(tmp_path, fresh_domain), *options, runtime=tmp_path) as run:
+                run.until("node", node="/listener", state="inactive")
+                # Until then the gate would be open: all that is declared is there.
+                go_on = threading.Timer(0.5, intruder.send_signal, [signal.SIGCONT])
+                go_on.start()
+                assert run.finish() == ExitCode.VIOLATED
+                go_on.join()
+                assert activated(run) == []
+                assert rule in {each["rule"] for each in run.verdict["findings"]}
+                run.assert_nothing_left()
+        finally:
+            intruder.kill()
 
 
 @pytest.mark.parametrize("order", ["resume", "restart"])

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import socket
 import struct
+import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +19,7 @@ from lifecycle.middleware.discovery.probe import (
     ANSWER_S,
     EarlyProbe,
     Probe,
+    ProbeTarget,
     answered_at,
     chosen_otherwise,
     probes_for,
@@ -255,3 +258,66 @@ def test_where_all_leaves_by_one_port_nobody_can_be_asked_before_there_is_a_part
     with pytest.raises(BlockingIOError):
         peer.recvfrom(65536)
     assert len(messages) == 1
+
+
+@contextlib.contextmanager
+def of_another_process(peer: socket.socket) -> Iterator[tuple[str, int]]:
+    """Give a socket to another process; return its URL and port."""
+    url, _ = url_for(peer)
+    with subprocess.Popen(["cat"], pass_fds=[peer.fileno()], stdin=subprocess.PIPE) as process:
+        port = peer.getsockname()[1]
+        peer.close()
+        try:
+            yield url, port
+        finally:
+            process.communicate()
+
+
+def announced(port: int, order: str = "<") -> bytes:
+    """Return an answer that names a port for discovery."""
+    return _ANSWER + struct.pack(f"{order}HHiI", _METATRAFFIC_UNICAST, 24, 1, port) + bytes(16)
+
+
+@pytest.mark.parametrize("byte_order", ["<", ">"])
+def test_another_process_that_listens_is_silent_until_an_answer_names_its_port(
+    peer: socket.socket, byte_order: str
+) -> None:
+    """It may have had no processor since it was asked: no time says that it is no participant."""
+    with of_another_process(peer) as (url, port):
+        early = EarlyProbe(25, (parse(url),), {})
+        (probe,) = asked = probes_for(25, (parse(url),), {})
+        family, address = (socket.AF_INET6, "::1") if "[" in url else (socket.AF_INET, "127.0.0.1")
+        with socket.socket(family, socket.SOCK_DGRAM) as answering:
+            answering.connect((address, probe._socket.getsockname()[1]))
+            assert probe.silent() == {port}
+            assert early.silent_until_s(asked) is None
+            answering.send(announced(port + 2))
+            assert probe.silent() == {port}
+            answering.send(announced(port, byte_order))
+            assert probe.silent() == frozenset()
+        for each in (early, probe):
+            each.close()
+
+
+def test_a_process_that_closed_its_port_is_silent_no_more(peer: socket.socket) -> None:
+    with of_another_process(peer) as (url, port):
+        (probe,) = probes_for(25, (parse(url),), {})
+        assert probe.silent() == {port}
+    assert probe.silent() == frozenset()
+    probe.close()
+
+
+def test_only_processes_that_did_not_answer_are_asked_again(
+    peer: socket.socket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with of_another_process(peer) as (url, port):
+        peers = f"peer={url.partition('peer=')[2].partition('&')[0]}"
+        another = url.replace(peers, f"{peers}&{peers.rpartition(':')[0]}:7913")
+        (probe,) = probes_for(25, (parse(another),), {})
+        asked: list[ProbeTarget] = []
+        monkeypatch.setattr(probing, "send", lambda *sent: asked.extend(sent[2]))
+        probe.ask_silent()
+        assert [each.port for each in asked] == [port]
+    probe.ask_silent()
+    assert len(asked) == 1
+    probe.close()
