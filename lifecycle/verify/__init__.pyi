@@ -64,6 +64,7 @@ from .tool_filter import is_noise_node as is_noise_node
 from .tool_filter import is_of_supervisor as is_of_supervisor
 from .tool_filter import known_node as known_node
 from .tool_filter import matches as matches
+from .tool_filter import our_nodes as our_nodes
 from .tool_filter import supervisor_endpoints as supervisor_endpoints
 from .tool_filter import supervisor_label as supervisor_label
 from .tool_filter import takes_diagnostics as takes_diagnostics

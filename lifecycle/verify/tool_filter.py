@@ -542,16 +542,21 @@ def our_nodes(endpoints: Iterable[ObservedEndpoint]) -> frozenset[str]:
 
 
 def without_noise(
-    endpoints: Iterable[ObservedEndpoint], *, but: DeclaredNames = NO_NAMES
+    endpoints: Iterable[ObservedEndpoint],
+    *,
+    but: DeclaredNames = NO_NAMES,
+    ours: Collection[str] | None = None,
 ) -> tuple[ObservedEndpoint, ...]:
     """Return what was written on purpose, in order; the input must be complete per node.
 
     Args:
         endpoints: to choose from.
         but: names that are looked for: endpoints of them are kept, whatever they look like.
+        ours: names of the nodes that are ours; None for `our_nodes` of these endpoints.
     """
     found = tuple(endpoints)
-    ours = our_nodes(found)
+    if ours is None:
+        ours = our_nodes(found)
     return tuple(
         each
         for each in found

@@ -58,6 +58,7 @@ from lifecycle.verify import (
     fold_actions,
     is_noise_endpoint,
     known_node,
+    our_nodes,
     without_noise,
 )
 
@@ -105,12 +106,14 @@ class _ShownNode:
 
     Attributes:
         shown: all of them.
+        ours: the services of the node interface are its own.
         meant: without what client libraries bring along.
         hashed: the same with the type hashes of services.
         endpoints: the same with the parts of actions folded, in the order of a snapshot.
     """
 
     shown: Sequence[ObservedEndpoint]
+    ours: bool
     meant: tuple[ObservedEndpoint, ...]
     hashed: Sequence[ObservedEndpoint]
     endpoints: tuple[ObservedEndpoint, ...]
@@ -543,9 +546,15 @@ class GraphObserver:
         """
         known = last.shown.get(name)
         if known is not None and _same(known.shown, shown):
-            meant = known.meant
+            ours, meant = known.ours, known.meant
         else:
-            meant = without_noise(shown, but=NO_NAMES if name in kept.declared else kept.names)
+            # One that leaves, endpoint by endpoint, stays ours.
+            ours = (known is not None and known.ours) or name in our_nodes(shown)
+            meant = without_noise(
+                shown,
+                but=NO_NAMES if name in kept.declared else kept.names,
+                ours={name} if ours else (),
+            )
         hashed: list[ObservedEndpoint] = []
         for each in meant:
             if each.kind not in (EndpointKind.SERVICE_SERVER, EndpointKind.SERVICE_CLIENT):
@@ -564,7 +573,7 @@ class GraphObserver:
         else:
             folded = fold_actions(hashed)
             endpoints = tuple(sorted(folded if name else self._located(folded), key=_order))
-        return _ShownNode(shown, meant, hashed, endpoints)
+        return _ShownNode(shown, ours, meant, hashed, endpoints)
 
     def _services_of_others(
         self, names: DeclaredNames, unreported: Collection[str]

@@ -14,6 +14,7 @@ import psutil
 import pytest
 import rclpy
 from managed_node import ManagedNode
+from rcl_interfaces.srv import SetParameters
 from rclpy.node import Node
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -30,6 +31,7 @@ from tests.ros.faults.system import BARE_DDS
 from tests.ros.supervisor.running import ROOT
 from tests.stalls import assert_in_time
 
+SET_PARAMETERS = "rcl_interfaces/srv/SetParameters"
 MakeNode = Callable[..., Node]
 WaitUntil = Callable[..., None]
 
@@ -258,6 +260,26 @@ def test_a_managed_node_is_told_by_its_services(
     node = ManagedNode("managed", context=context)
     wait_until(lambda: "/managed" in nodes(observer) and nodes(observer)["/managed"].managed)
     node.destroy_node()
+
+
+def test_of_a_node_that_leaves_the_services_of_the_node_interface_stay_its_own(
+    observer: GraphObserver, make_node: MakeNode, wait_until: WaitUntil
+) -> None:
+    """It is known as ours by two of them, which may leave first."""
+    node, another = make_node("leaving"), make_node("another")
+    known_by = node.create_service(Trigger, "~/get_configuration", lambda _, reply: reply)
+    for name in ("map_to", "alias"):
+        node.create_service(SetParameters, f"~/{name}", lambda _, reply: reply)
+    another.create_service(SetParameters, "~/alias", lambda _, reply: reply)
+    alias = (EndpointKind.SERVICE_SERVER, "/another", "/another/alias", SET_PARAMETERS)
+    wait_until(lambda: endpoints(observer) == [alias])
+
+    node.destroy_service(known_by)
+    node.create_publisher(String, "last", 10)
+    last = (EndpointKind.PUBLISHER, "/leaving", "/last", "std_msgs/msg/String")
+    wait_until(lambda: last in endpoints(observer))
+    wait_until(lambda: "/leaving/get_configuration" not in observer.service_names())
+    assert sorted(endpoints(observer), key=lambda each: each[1]) == [alias, last]
 
 
 def test_the_parts_of_an_action_server_show_as_one_endpoint(

@@ -156,6 +156,8 @@ def test_what_users_call_like_the_node_interface_is_left_in():
     assert without_noise([*libraries, *own]) == tuple(own)
     ours = [*own, server("/a/map_to", SET_PARAMETERS)]
     assert without_noise([*libraries, *ours]) == ()
+    assert without_noise([*libraries, *own], ours={"/a"}) == ()
+    assert without_noise([*libraries, *ours], ours=()) == tuple(ours)
 
 
 @pytest.mark.parametrize(
