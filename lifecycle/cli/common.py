@@ -7,7 +7,9 @@ Owns: `MANIFEST [name:=value …]`, `TARGET [name:=value …]` of the verbs abou
 from __future__ import annotations
 
 import contextlib
+import importlib
 import os
+import sys
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -24,6 +26,19 @@ if TYPE_CHECKING:
 
 F = TypeVar("F", bound=Callable[..., Any])
 Completer = Callable[[click.Context, click.Parameter, str], list[Any]]
+
+
+def import_without(module: str, absent: str) -> None:
+    """Import a module as if another one were not installed, which it does without then.
+
+    Only while this process has one thread: no other may import that meanwhile.
+    """
+    if not {module, absent} & sys.modules.keys():
+        sys.modules[absent] = None  # type: ignore[assignment]
+        try:
+            importlib.import_module(module)
+        finally:
+            del sys.modules[absent]
 
 
 def manifest_arguments(function: F) -> F:

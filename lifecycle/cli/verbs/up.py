@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import gc
-import sys
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -15,6 +14,7 @@ from lifecycle.cli.common import (
     completing,
     format_option,
     hosts_options,
+    import_without,
     load_manifest,
     machine_option,
     manifest_arguments,
@@ -168,7 +168,8 @@ def command(
             forerunner = None if forks else _forerunner(program)
             early: EarlyProbe | None = None
             try:
-                _import_asyncio()
+                # ssl takes 6 ms, and a supervisor's loop has no connections with TLS.
+                import_without("asyncio", "ssl")
                 from lifecycle.plan import build_plan, started_by_others
 
                 loaded = load_manifest(manifest, assignments, machine=machine)
@@ -233,19 +234,6 @@ def _forerunner(program: tuple[TargetOptions, ...], *, forks: bool = False) -> F
     from lifecycle.supervisor import Forerunner
 
     return Forerunner(without=_tokens(program), programs=bool(program), forks=forks)
-
-
-def _import_asyncio() -> None:
-    """Import it without ssl, which takes 6 ms, and which it does without where there is none.
-
-    A supervisor's loop has no connections with TLS. Who needs ssl imports it by itself.
-    """
-    if not {"asyncio", "ssl"} & sys.modules.keys():
-        sys.modules["ssl"] = None  # type: ignore[assignment]
-        try:
-            import asyncio  # noqa: F401
-        finally:
-            del sys.modules["ssl"]
 
 
 @contextlib.contextmanager

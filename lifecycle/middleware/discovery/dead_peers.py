@@ -185,7 +185,7 @@ def _asked(
 def listening(pids: Iterable[int]) -> dict[Medium, dict[ProbeTarget, int]]:
     """Return where processes of this host receive UDP, by medium; the values are their pids."""
     found: dict[Medium, dict[ProbeTarget, int]] = {kind: {} for kind in UDP_UNICAST}
-    for pid, sockets in sockets_of(pids).items():
+    for pid, sockets in sockets_of(pids, kinds=UDP_UNICAST).items():
         for each in sockets:
             if each.kind not in found or ipaddress.ip_address(each.address).is_multicast:
                 continue

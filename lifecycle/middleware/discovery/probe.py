@@ -35,7 +35,7 @@ from lifecycle.middleware.discovery.messages import (
 from lifecycle.middleware.fastdds.dscp import own_udp_socket
 from lifecycle.middleware.fastdds.participant_profile import default_profile
 from lifecycle.middleware.fastdds.profiles import PROFILE_NAME
-from lifecycle.middleware.fastdds.url_check import OpenSocket, open_sockets, sockets_of_others
+from lifecycle.middleware.fastdds.url_check import OpenSocket, open_sockets, udp_sockets_of_others
 from lifecycle.middleware.fastdds.url_profile import (
     DISCOVERY_GROUP,
     LOCALHOST_PEERS_RANGE,
@@ -170,9 +170,8 @@ class Probe:
             return frozenset()
         return frozenset(
             each
-            for each in sockets_of_others()
-            if not each.kind.is_tcp
-            and (at := asked.get(each.port))
+            for each in udp_sockets_of_others()
+            if (at := asked.get(each.port))
             and (each.address in at or ipaddress.ip_address(each.address).is_unspecified)
         )
 
@@ -359,7 +358,7 @@ def discovery_ports(domain_id: int, kind: Medium = RMW_DISCOVERY) -> tuple[int, 
     """
     first = participant_ports(domain_id, 0).discovery_unicast
     last = participant_ports(domain_id, 0).discovery_multicast + DG
-    ports = {each.port for each in open_sockets() if each.kind == kind}
+    ports = {each.port for each in open_sockets(kinds=(kind,))}
     return tuple(sorted(p for p in ports if first <= p < last and (p - first) % 2 == 0))
 
 

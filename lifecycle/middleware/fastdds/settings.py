@@ -51,6 +51,7 @@ from lifecycle.middleware.fastdds.url_check import (
     check_sockets,
     open_sockets,
 )
+from lifecycle.middleware.fastdds.url_profile import families
 from lifecycle.middleware.process.shared_memory import has_shared_memory_open
 from lifecycle.middleware.rcl import abi
 
@@ -615,9 +616,11 @@ def participant_settings(context: Context, settings: ParticipantSettings) -> Ite
             return
         # Under the lock of the default profile: no participant of ours is made in between.
         check_free(settings.urls)
-        before = {each.inode for each in open_sockets()}
+        kinds = [family.kind for family in families(settings.urls)]
+        before = {each.inode for each in open_sockets(kinds=kinds)}
         yield
-        check_sockets(settings.urls, [s for s in open_sockets() if s.inode not in before])
+        opened = [each for each in open_sockets(kinds=kinds) if each.inode not in before]
+        check_sockets(settings.urls, opened)
 
 
 def _check_environment(settings: ParticipantSettings) -> None:

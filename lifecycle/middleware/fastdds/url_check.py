@@ -11,14 +11,14 @@ import contextlib
 import ipaddress
 import socket
 import struct
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 
 from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds.url_profile import UrlTransport, families
 from lifecycle.middleware.process.control import interface_addresses
-from lifecycle.network import CONNECTABLE, ConnectionUrl, Medium
+from lifecycle.network import CONNECTABLE, UDP_UNICAST, ConnectionUrl, Medium
 
 _KINDS = tuple(each for each in CONNECTABLE if each.is_network and not each.is_group)
 _LISTEN = "0A"  # TCP_LISTEN of linux/tcp_states.h
@@ -107,33 +107,38 @@ def check_sockets(urls: Sequence[ConnectionUrl], opened: Sequence[OpenSocket]) -
             )
 
 
-def open_sockets(pid: int | None = None) -> tuple[OpenSocket, ...]:
+def open_sockets(
+    pid: int | None = None, *, kinds: Collection[Medium] = _KINDS
+) -> tuple[OpenSocket, ...]:
     """Return the UDP and listening TCP sockets of a process in our network namespace.
 
     Args:
         pid: of the process; None for this one.
+        kinds: only these; the kernel takes milliseconds to list the TCP sockets of a host.
 
     Raises:
         OSError: there is no such process, or it is not ours to look at.
     """
     ours = set(_socket_inodes("self" if pid is None else str(pid)))
-    return tuple(each for each in _bound_sockets() if each.inode in ours)
+    return tuple(each for each in _bound_sockets(kinds) if each.inode in ours)
 
 
-def sockets_of_others() -> tuple[OpenSocket, ...]:
-    """Return the UDP and listening TCP sockets of our network namespace but for this process's."""
+def udp_sockets_of_others() -> tuple[OpenSocket, ...]:
+    """Return the UDP sockets of our network namespace but for those of this process."""
     ours = set(_socket_inodes("self"))
-    return tuple(each for each in _bound_sockets() if each.inode not in ours)
+    return tuple(each for each in _bound_sockets(UDP_UNICAST) if each.inode not in ours)
 
 
-def sockets_of(pids: Iterable[int]) -> dict[int, tuple[OpenSocket, ...]]:
-    """Return the same of several processes; those that are gone, or not ours, have none."""
+def sockets_of(
+    pids: Iterable[int], *, kinds: Collection[Medium] = _KINDS
+) -> dict[int, tuple[OpenSocket, ...]]:
+    """Return what `open_sockets` does of several; those that are gone, or not ours, have none."""
     inodes: dict[int, int] = {}
     for pid in pids:
         with contextlib.suppress(OSError):
             inodes |= dict.fromkeys(_socket_inodes(str(pid)), pid)
     found: dict[int, list[OpenSocket]] = {}
-    for each in _bound_sockets() if inodes else ():
+    for each in _bound_sockets(kinds) if inodes else ():
         if each.inode in inodes:
             found.setdefault(inodes[each.inode], []).append(each)
     return {pid: tuple(sockets) for pid, sockets in found.items()}
@@ -176,8 +181,10 @@ def _ports(family: UrlTransport) -> Iterator[tuple[ConnectionUrl, str, int]]:
                 yield url, what, port
 
 
-def _bound_sockets() -> Iterator[OpenSocket]:
+def _bound_sockets(kinds: Collection[Medium]) -> Iterator[OpenSocket]:
     for kind in _KINDS:
+        if kind not in kinds:
+            continue
         table = f"{'tcp' if kind.is_tcp else 'udp'}{'6' if kind.ip_version == 6 else ''}"
         path = Path("/proc/thread-self/net") / table
         with contextlib.suppress(FileNotFoundError):  # a kernel without IPv6

@@ -15,7 +15,6 @@ import os
 import resource
 import signal
 import socket
-import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
@@ -60,6 +59,8 @@ _PR_CAP_AMBIENT = 47
 _PR_CAP_AMBIENT_LOWER = 3
 _CAP_NET_ADMIN = 12
 _CAPABILITY_VERSION_3 = 0x20080522
+_SEMAPHORE_BYTES = 64
+"""Room for glibc's sem_t, which has 32."""
 _SIGEV_SIGNAL = 0
 _SIGEV_THREAD = 2
 
@@ -376,22 +377,26 @@ def interface_addresses(*families: socket.AddressFamily) -> tuple[tuple[str, str
 def check_threads(count: int) -> None:
     """Make sure that so many threads can be started now.
 
+    They are none of Python's, each of which is waited for as it starts.
+
     Raises:
         MiddlewareError: they cannot; names the limits that hold.
     """
-    over = threading.Event()
-    started: list[threading.Thread] = []
+    over = ctypes.create_string_buffer(_SEMAPHORE_BYTES)
+    libc().sem_init(over, 0, 0)
+    started: list[ctypes.c_ulong] = []
     try:
         for _ in range(count):
-            thread = threading.Thread(target=over.wait, daemon=True)
-            thread.start()
+            thread = ctypes.c_ulong()
+            if libc().pthread_create(ctypes.byref(thread), None, libc().sem_wait, over):
+                raise no_room_for_threads(count)
             started.append(thread)
-    except RuntimeError as error:
-        raise no_room_for_threads(count) from error
     finally:
-        over.set()
+        for _ in started:
+            libc().sem_post(over)
         for thread in started:
-            thread.join()
+            libc().pthread_join(thread, None)
+        libc().sem_destroy(over)
 
 
 def no_room_for_threads(count: int) -> MiddlewareError:

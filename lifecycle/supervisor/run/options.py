@@ -137,11 +137,11 @@ def address_that_is_down(plan: Plan, machine: str) -> str:
         plan: the whole system.
         machine: as for `own_machines`.
     """
-    import psutil
-
     own = own_machines(plan, machine)
     if all(each.machine in own for each in plan.nodes):
         return ""
+    import psutil
+
     wanted = {each.address for each in plan.machines if each.name in own and each.address}
     states = psutil.net_if_stats()
     for name, addresses in psutil.net_if_addrs().items():
