@@ -5,6 +5,8 @@ from .discovery.liveliness import AlivePublisher as AlivePublisher
 from .discovery.liveliness import AliveSubscription as AliveSubscription
 from .discovery.liveliness import PlanNotices as PlanNotices
 from .discovery.liveliness import node_topic as node_topic
+from .discovery.names_port import check_own_pair as check_own_pair
+from .discovery.names_port import pairs_are_whole as pairs_are_whole
 from .discovery.probe import EarlyProbe as EarlyProbe
 from .discovery.probe import discovery_peers as discovery_peers
 from .discovery.probe import peers_environment as peers_environment

@@ -152,8 +152,11 @@ DISCOVERY_SERVER_VARIABLE = "ROS_DISCOVERY_SERVER"
 _IGNORE_ALL = ("FILTER_DIFFERENT_PROCESS", "FILTER_DIFFERENT_HOST", "FILTER_SAME_PROCESS")
 """Not the first two alone: a participant that has those makes no transports."""
 
+_MANY = 40
 _HEARTBEAT_SHARE_S = 0.01
-"""With many, heartbeats with each message of names are most of all messages."""
+"""From so many participants on heartbeats with each message of names are most of all messages."""
+_NAMES_ASKED_S, _NAMES_ANSWERED_S = 0.005, 0.001
+"""Of names that were sent before their writer was known Fast DDS asks after 70 ms by default."""
 
 _ANNOUNCEMENTS = 4
 _ANNOUNCEMENT_PERIOD_NS = 500_000_000
@@ -188,6 +191,7 @@ class ParticipantSettings:
         names_heartbeat_s: seconds, > 0, between heartbeats of the names; None for one with each
             message, and each that is sent again, to all: the history holds one and is full. Only
             with `names_by_udp`.
+        asks_for_names_soon: for the names of nodes that were there before, or are found late.
 
     Raises:
         MiddlewareError: out of range, or URLs that one participant cannot have together.
@@ -203,6 +207,7 @@ class ParticipantSettings:
     unannounced: bool = False
     names_by_udp: bool = False
     names_heartbeat_s: float | None = None
+    asks_for_names_soon: bool = False
 
     @classmethod
     def of(
@@ -287,6 +292,7 @@ class ParticipantSettings:
             or self.max_datagram_bytes is not None
             or self.unannounced
             or self.names_by_udp
+            or self.asks_for_names_soon
         )
 
 
@@ -398,6 +404,8 @@ def profile(
         _set_unannounced(_child(_child(rtps, "builtin"), "discovery_config"))
     if settings.names_by_udp:
         profiles.extend(_names_by_udp(settings.names_heartbeat_s))
+    elif settings.asks_for_names_soon:
+        profiles.append(_names_asked_for_soon())
     profiles.append(participant)
     return ET.tostring(root, encoding="unicode", xml_declaration=True)
 
@@ -426,17 +434,31 @@ def for_a_host(
     if settings.urls or (base is not None and base.name != PROFILE_NAME):
         return settings
     leaves_transports = not (settings.chooses_transports or environment.get(TRANSPORTS_VARIABLE))
-    # Profiles of a user's file may be for the names as well, and the first one counts.
-    is_ours = base is not None or not environment.get(PROFILES_FILE_VARIABLE)
-    leaves_names = (
-        names_by_udp and leaves_transports and is_ours and not Path(DEFAULT_FILE).exists()
-    )
+    leaves_names = names_by_udp and leaves_transports and are_names_open(environment)
     return dataclasses.replace(
         settings,
         unannounced=unannounced and not environment.get(DISCOVERY_SERVER_VARIABLE),
         names_by_udp=leaves_names,
-        names_heartbeat_s=participants * _HEARTBEAT_SHARE_S if leaves_names else None,
+        names_heartbeat_s=participants * _HEARTBEAT_SHARE_S
+        if leaves_names and participants >= _MANY
+        else None,
     )
+
+
+def are_names_open(environment: Mapping[str, str]) -> bool:
+    """Return whether profiles of ours may say how names of nodes go.
+
+    Those of a user's file may be for the names as well, and the first one counts.
+
+    Args:
+        environment: of this process.
+
+    Raises:
+        MiddlewareError: a file of profiles cannot be read, or is no XML.
+    """
+    base = default_profile(environment)
+    is_ours = base.name == PROFILE_NAME if base else not environment.get(PROFILES_FILE_VARIABLE)
+    return is_ours and not Path(DEFAULT_FILE).exists()
 
 
 def _set_unannounced(config: ET.Element) -> None:
@@ -462,6 +484,19 @@ def _names_by_udp(heartbeat_s: float | None) -> Iterator[ET.Element]:
             if kind.is_udp:
                 locator(locators, kind, "", None)
         yield element
+
+
+def _names_asked_for_soon() -> ET.Element:
+    element = ET.Element("data_reader", profile_name=GRAPH_TOPIC)
+    times = _child(element, "times")
+    for name, delay_s in (
+        ("initialAcknackDelay", _NAMES_ASKED_S),
+        ("heartbeatResponseDelay", _NAMES_ANSWERED_S),
+    ):
+        delay = _child(times, name)
+        _text(delay, "sec", "0")
+        _text(delay, "nanosec", str(round(delay_s * 1e9)))
+    return element
 
 
 def without_shared_memory(environment: Mapping[str, str]) -> tuple[Medium, ...]:

@@ -39,6 +39,7 @@ from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds.participant_profile import (
     DISCOVERY_SERVER_VARIABLE,
     ParticipantSettings,
+    are_names_open,
     default_profile,
     endpoint_profiles,
     for_a_host,
@@ -252,6 +253,8 @@ def unknown_versions() -> str:
 def observer_settings(settings: ParticipantSettings) -> ParticipantSettings:
     """Return the settings of an observer's participant: no shared memory, unless it is chosen.
 
+    It asks soon for names of nodes that it has not received, too.
+
     Args:
         settings: what it needs otherwise.
 
@@ -263,7 +266,9 @@ def observer_settings(settings: ParticipantSettings) -> ParticipantSettings:
         return settings
     try:
         _library()
-        return dataclasses.replace(settings, transports=without_shared_memory(os.environ))
+        transports = without_shared_memory(os.environ)
+        asks = bool(transports) and are_names_open(os.environ)
+        return dataclasses.replace(settings, transports=transports, asks_for_names_soon=asks)
     except MiddlewareError:
         # An error of a profile is reported where the profile is needed; Fast DDS ignores it.
         return settings

@@ -82,10 +82,6 @@ _GATHERED_S = 0.5
 """For so long no further host has come: what is still missing imports something big."""
 
 
-_MANY = 40
-"""From so many hosts on names by shared memory take longer than all else."""
-
-
 class Gathering:
     """Has hosts meet, or make endpoints, when all of them are ready for it (HostSpec.gathers).
 
@@ -95,13 +91,21 @@ class Gathering:
         announce: has our participant announce itself to those that it knows. Unannounced ones are
             not: they are answered.
         unannounced: see HostSpec.
+        names_by_udp: likewise.
     """
 
     def __init__(
-        self, limit_s: float, hosts: int, announce: Callable[[], None], *, unannounced: bool = False
+        self,
+        limit_s: float,
+        hosts: int,
+        announce: Callable[[], None],
+        *,
+        unannounced: bool = False,
+        names_by_udp: bool = False,
     ) -> None:
         self.hosts = hosts
         self.unannounced = unannounced
+        self.names_by_udp = names_by_udp
         self._limit_s = limit_s
         self._announce = announce
         self._missing: set[ControlChannel] = set()
@@ -165,6 +169,7 @@ class BringUp:
         wirer: wires each node between its configure and its connect; None leaves it to the nodes.
         announce: see Gathering.
         unannounced: whether hosts can be, see HostSpec.
+        names_by_udp: whether names that go so arrive, as far as what runs already matters.
     """
 
     def __init__(
@@ -181,9 +186,11 @@ class BringUp:
         loads: Callable[[PlannedNode, str], Awaitable[Callable[[], Awaitable[None]]]] | None = None,
         announce: Callable[[], None] = lambda: None,
         unannounced: Callable[[], bool] = lambda: False,
+        names_by_udp: Callable[[], bool] = lambda: False,
     ) -> None:
         self._announce = announce
         self._unannounced = unannounced
+        self._names_by_udp = names_by_udp
         self._gives = gives
         self._alone = alone
         self._loads = loads
@@ -286,21 +293,15 @@ class BringUp:
             task.cancel()
         await asyncio.gather(*self._appearing, return_exceptions=True)
 
-    def _names_by_udp(self) -> bool:
-        """Return whether names of nodes go by UDP (ParticipantSettings), as in a large system.
+    def _no_port_is_taken(self) -> bool:
+        """Return whether names of nodes can go by UDP (ParticipantSettings).
 
         They arrive at the port that a participant has by its number. It has another one where that
         is taken, as only participants with transports of their own take it.
         """
-        gathering = self._gathering
-        return (
-            gathering is not None
-            and gathering.unannounced
-            and gathering.hosts >= _MANY
-            and not any(
-                node.participants or node.transports or node.connections.urls
-                for node in self._system.plan.nodes
-            )
+        return self._names_by_udp() and not any(
+            node.participants or node.transports or node.connections.urls
+            for node in self._system.plan.nodes
         )
 
     async def _connect_all(self, nodes: Iterable[NodeRun]) -> None:
@@ -311,7 +312,11 @@ class BringUp:
             # One alone has nobody to meet.
             unannounced = len(hosts) > 1 and self._unannounced()
             self._gathering = Gathering(
-                limit_s, len(hosts), self._announce, unannounced=unannounced
+                limit_s,
+                len(hosts),
+                self._announce,
+                unannounced=unannounced,
+                names_by_udp=unannounced and self._no_port_is_taken(),
             )
         try:
             await self._side_by_side(self._walk(node) for node in nodes)
@@ -618,7 +623,7 @@ class BringUp:
                     nodes=tuple(node.planned for node in nodes),
                     gathers=0 if self._gathering is None else self._gathering.hosts,
                     unannounced=self._gathering is not None and self._gathering.unannounced,
-                    names_by_udp=self._names_by_udp(),
+                    names_by_udp=self._gathering is not None and self._gathering.names_by_udp,
                     folders=manifest_folders(node.planned for node in nodes),
                 ),
                 self._system.on_host_event,

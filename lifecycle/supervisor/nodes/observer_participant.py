@@ -275,6 +275,12 @@ class ObserverParticipant:
         with self._node.handle:
             return can_be_unannounced(self._node.handle.pointer)
 
+    def names_can_go_by_udp(self) -> bool:
+        """Return whether names of nodes that are started now would arrive, see HostSpec."""
+        from lifecycle.middleware import pairs_are_whole
+
+        return pairs_are_whole(self._graph.discovery.domain_id)
+
     def introduce(
         self, newcomers: Iterable[int], pids: Iterable[int], *, rediscover: bool = False
     ) -> None:

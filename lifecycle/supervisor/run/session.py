@@ -196,6 +196,9 @@ class SessionParticipant(
     def can_be_unannounced(self) -> bool:
         """Return whether participants like ours can be, see HostSpec."""
 
+    def names_can_go_by_udp(self) -> bool:
+        """Return whether names of nodes that are started now would arrive, see HostSpec."""
+
     def prepare_to_leave(self) -> None:
         """Close connections that are not answered, so that leaving does not wait for them."""
 
@@ -300,6 +303,7 @@ class Session:
             alone=self._alone,
             announce=observer_participant.announce_ourselves,
             unannounced=observer_participant.can_be_unannounced,
+            names_by_udp=observer_participant.names_can_go_by_udp,
         )
         self._remote_nodes = RemoteNodes(
             system.plan, system.awaited(), observer_participant, self._changes

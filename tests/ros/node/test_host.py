@@ -22,6 +22,7 @@ from std_msgs.msg import String
 
 from lifecycle import codec
 from lifecycle.manifest.model import DiscoveryRange, Executor, Run, RunKind, Timeouts
+from lifecycle.network import participant_ports
 from lifecycle.node.host.control import Command, Event, HostSpec, Operation
 from lifecycle.node.host.host import needed_by
 
@@ -149,6 +150,16 @@ def test_names_have_no_port_of_shared_memory_unless_transports_are_chosen(
     # What Fast DDS says of it is kept from the log, and the thread that says it is ended.
     assert host.log.read_text() == ""
     assert not any(each.startswith("dds.log") for each in threads)
+
+
+def test_a_host_to_which_no_names_would_arrive_says_so(start: Start, fresh_domain: int) -> None:
+    port = participant_ports(fresh_domain, 0).user_unicast
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("", port))
+        host = start(hosted("one", "Good"), gathers=1, names_by_udp=True)
+        failed, _ = host.until("failed")
+    assert f"UDP port {port} is another process's" in failed.error
+    assert host.wait() == 1
 
 
 @pytest.mark.parametrize(("gathers", "period_s"), [(1, 1.0), (60, 3.0)])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import socket
@@ -22,6 +23,7 @@ import yaml
 from rclpy.node import Node
 
 from lifecycle.errors import ExitCode
+from lifecycle.network import participant_ports
 from lifecycle.supervisor.gate.verification_loop import SETTLED_S
 from tests.ros.middleware.free_ports import free_ports
 from tests.ros.supervisor.running import (
@@ -100,6 +102,26 @@ def test_processes_that_start_together_are_discovered_once_they_have_their_endpo
         for name in ("talker", "listener"):
             said = verb("logs", name, runtime=tmp_path).stdout
             assert said.count("announced") == 1, said
+
+
+@pytest.mark.parametrize("taken", [False, True])
+def test_names_of_nodes_go_by_shared_memory_where_another_process_has_a_port_for_them(
+    tmp_path: Path, fresh_domain: int, *, taken: bool
+) -> None:
+    """It is no participant: the processes of a system start all at once, each with two ports."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+        if taken:
+            stranger.bind(("", participant_ports(fresh_domain, 1).user_unicast))
+        with up(pair(tmp_path, fresh_domain), runtime=tmp_path) as run:
+            run.until("system", reached="active")
+            for name in ("talker", "listener"):
+                threads = Path(f"/proc/{run.pid_of(name)}/task").iterdir()
+                named = {(each / "comm").read_text().strip() for each in threads}
+                # rmw asks for ports from 7000 on for them, Fast DDS names threads by ports.
+                assert any(re.match(r"dds\.shm\.70\d\d", each) for each in named) is taken
+            run.signal(signal.SIGINT)
+            assert run.finish() == ExitCode.INTERRUPTED
+            run.assert_nothing_left()
 
 
 OTHER_VERSIONS = """

@@ -17,7 +17,7 @@ from lifecycle.middleware.fastdds.participant_profile import (
     profile,
 )
 from lifecycle.middleware.fastdds.profiles import discovery_profile
-from lifecycle.network import parse
+from lifecycle.network import RMW_DISCOVERY, parse
 
 UDP = ParticipantSettings(transports=("udpv4",))
 USERS = """<?xml version="1.0"?>
@@ -164,6 +164,16 @@ def test_names_by_udp_have_a_locator_at_both_ends_and_heartbeats_as_asked() -> N
     assert slower.findall(".//data_reader/times") == []
 
 
+def test_an_observer_asks_soon_for_names_that_it_has_not_received() -> None:
+    root = made(ParticipantSettings(transports=(RMW_DISCOVERY,), asks_for_names_soon=True))
+    (element,) = root.findall(".//data_reader")
+    assert element.get("profile_name") == "ros_discovery_info"
+    assert texts(root, ".//data_reader/times/initialAcknackDelay/*") == ["0", "5000000"]
+    assert texts(root, ".//data_reader/times/heartbeatResponseDelay/*") == ["0", "1000000"]
+    assert root.findall(".//unicastLocatorList") == []
+    assert bool(ParticipantSettings(asks_for_names_soon=True))
+
+
 _QUICK = object()
 
 
@@ -199,6 +209,8 @@ def test_a_host_gets_what_its_environment_leaves_open(
     assert (found.unannounced, found.names_by_udp) == (unannounced, names)
     assert found.names_heartbeat_s == (0.5 if names else None)
     assert bool(found) or found == before
+    few = for_a_host(before, variables, unannounced=True, names_by_udp=True, participants=39)
+    assert (few.names_by_udp, few.names_heartbeat_s) == (names, None)
     alone = for_a_host(before, variables, unannounced=False, names_by_udp=False, participants=3)
     assert alone == before
 

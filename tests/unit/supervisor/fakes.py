@@ -449,6 +449,7 @@ class World:
         self.system = System(plan, emit=self.emit, logs=directory, processes=plan.processes)
         self.appeared: dict[str, asyncio.Event] = {}
         self.can_be_unannounced = False
+        self.names_can_go_by_udp = True
         self.bring_up = BringUp(
             self.system,
             spawner_of=lambda _: self.spawner,
@@ -456,6 +457,7 @@ class World:
             appears=self._appears,
             recorded=lambda: None,
             unannounced=lambda: self.can_be_unannounced,
+            names_by_udp=lambda: self.names_can_go_by_udp,
         )
 
     @property

@@ -77,22 +77,24 @@ def test_hosts_are_given_how_many_of_them_make_participants_together(
 
 
 @pytest.mark.parametrize(
-    ("count", "can_be", "changes", "by_udp"),
+    ("count", "can_be", "arrive", "changes", "by_udp"),
     [
-        (40, True, {}, True),
-        (39, True, {}, False),
-        (40, False, {}, False),
+        (2, True, True, {}, True),
+        (40, True, True, {}, True),
+        (1, True, True, {}, False),
+        (2, False, True, {}, False),
         # Its port may be another's.
-        (40, True, {"transports": ("udpv6",)}, False),
+        (2, True, False, {}, False),
+        (2, True, True, {"transports": ("udpv6",)}, False),
     ],
 )
-def test_names_go_by_udp_in_large_systems_in_which_no_port_is_taken(
-    tmp_path: Path, count: int, can_be: bool, changes: dict[str, Any], by_udp: bool
+def test_names_go_by_udp_where_no_port_is_taken(
+    tmp_path: Path, count: int, can_be: bool, arrive: bool, changes: dict[str, Any], by_udp: bool
 ) -> None:
     async def main() -> list[bool]:
         nodes = [planned_node(f"n{number}") for number in range(count)]
         world = _world(tmp_path, *nodes[1:], dataclasses.replace(nodes[0], **changes))
-        world.can_be_unannounced = can_be
+        world.can_be_unannounced, world.names_can_go_by_udp = can_be, arrive
         await world.bring_up.connect(LIMIT_S)
         await _down(world)
         return world.spawner.names_by_udp
