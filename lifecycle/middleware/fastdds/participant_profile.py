@@ -152,7 +152,7 @@ DISCOVERY_SERVER_VARIABLE = "ROS_DISCOVERY_SERVER"
 _IGNORE_ALL = ("FILTER_DIFFERENT_PROCESS", "FILTER_DIFFERENT_HOST", "FILTER_SAME_PROCESS")
 """Not the first two alone: a participant that has those makes no transports."""
 
-_MANY = 40
+_MANY = 24
 _HEARTBEAT_SHARE_S = 0.01
 """From so many participants on heartbeats with each message of names are most of all messages."""
 _NAMES_ASKED_S, _NAMES_ANSWERED_S = 0.005, 0.001

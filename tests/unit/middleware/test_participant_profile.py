@@ -209,7 +209,7 @@ def test_a_host_gets_what_its_environment_leaves_open(
     assert (found.unannounced, found.names_by_udp) == (unannounced, names)
     assert found.names_heartbeat_s == (0.5 if names else None)
     assert bool(found) or found == before
-    few = for_a_host(before, variables, unannounced=True, names_by_udp=True, participants=39)
+    few = for_a_host(before, variables, unannounced=True, names_by_udp=True, participants=23)
     assert (few.names_by_udp, few.names_heartbeat_s) == (names, None)
     alone = for_a_host(before, variables, unannounced=False, names_by_udp=False, participants=3)
     assert alone == before
