@@ -1,7 +1,8 @@
-"""Endpoint discovery (EDP) of Fast DDS: how soon a participant resends which endpoints it has.
+"""Endpoint discovery (EDP) of Fast DDS: how soon a participant sends, and asks for, endpoints.
 
 Owns: the nack response delay and the heartbeat period of a participant's two built-in EDP writers
-(DDSI-RTPS §8.5.4), and that they resend without a heartbeat to everybody.
+(DDSI-RTPS §8.5.4), that they resend without a heartbeat to everybody, and the times of its two
+built-in readers.
 
 A participant that is discovered after its endpoints were made is asked for them: the other one
 receives a heartbeat, requests what it lacks 10 ms later, and Fast DDS 2.14 waits 100 ms before it
@@ -10,6 +11,9 @@ a quarter of the time in which a small system comes up, and is part of each rest
 sends `ros_discovery_info`, the names of its nodes, to readers that it has discovered. The delay is
 Fast DDS's own setting of a writer, changed by its own function; where the writer is not laid out as
 in 2.14.5 nothing is done.
+
+A heartbeat that comes before its participant was discovered is lost. Then a reader asks by itself,
+after 70 ms (`initialAcknackDelay`), which no setting changes either.
 
 With each 106 kB that a writer has sent it sends a heartbeat to all that it knows. What it resends
 to many is counted again with each message (`last_processed` in
@@ -30,6 +34,7 @@ import ctypes
 import functools
 from typing import Any
 
+from lifecycle.middleware.fastdds.local_readers import RTPS, builtin_reader, virtual_functions
 from lifecycle.middleware.fastdds.settings import fast_dds_function, participant_of
 
 SOON_S = 0.005
@@ -50,6 +55,12 @@ _MAX_HEARTBEAT_S = 30
 
 _WRITERS = (b"\x00\x00\x03\xc2", b"\x00\x00\x04\xc2")
 """EntityIds of the built-in writers of publications and subscriptions, DDSI-RTPS table 9.1."""
+
+_READERS = (b"\x00\x00\x03\xc7", b"\x00\x00\x04\xc7")
+"""EntityIds of the built-in readers of the same."""
+
+_ANSWERED_S = 0.009
+"""To a heartbeat they answer after 10 ms. Fast DDS changes times only where that is another one."""
 
 _PREFIX_BYTES = 12
 _TIMES_AT = 592
@@ -79,6 +90,15 @@ class _WriterTimes(ctypes.Structure):
         ("heartbeat_period", Duration),
         ("nack_response_delay", Duration),
         ("nack_suppression_duration", Duration),
+    )
+
+
+class _ReaderTimes(ctypes.Structure):
+    # fastrtps/rtps/attributes/ReaderAttributes.h; its destructor is virtual, and never called.
+    _fields_ = (
+        ("virtual", ctypes.c_void_p),
+        ("initial_acknack_delay", Duration),
+        ("heartbeat_response_delay", Duration),
     )
 
 
@@ -129,6 +149,31 @@ def resend_endpoints_soon(rcl_node: int, delay_s: float = SOON_S, *, participant
     return changed == len(_WRITERS)
 
 
+def ask_for_endpoints_soon(rcl_node: int, delay_s: float = SOON_S) -> bool:
+    """Have the participant of a node soon ask a new one for its endpoints, by itself.
+
+    Args:
+        rcl_node: address of the rcl_node_t.
+        delay_s: seconds, 0.001–0.07, after it has discovered one that it has not heard of yet;
+            then after twice, four times as long.
+
+    Returns:
+        Whether it will; False with another RMW, another version, or static endpoint discovery.
+    """
+    update_times, virtual = _reader_functions() or (None, None)
+    if update_times is None:
+        return False
+    answer_s = min(delay_s, _ANSWERED_S)
+    times = _ReaderTimes(0, Duration(0, round(delay_s * 1e9)), Duration(0, round(answer_s * 1e9)))
+    changed = 0
+    for entity in _READERS:
+        reader = builtin_reader(rcl_node, entity)
+        if reader is not None and reader.virtual == virtual:
+            update_times(ctypes.addressof(reader), ctypes.byref(times))
+            changed += 1
+    return changed == len(_READERS)
+
+
 def _resend_without_heartbeats(writer: int) -> bool:
     """Have a writer count from 1 GiB until its next heartbeat to all; False if it is none known."""
     kept = Duration.from_address(writer + _KEEP_DURATION_AT)
@@ -160,20 +205,31 @@ def _is_known(times: _WriterTimes) -> bool:
 
 
 @functools.lru_cache(maxsize=1)
+def _reader_functions() -> tuple[Any, int] | None:
+    """Return what changes a StatefulReader's times, and its table of virtual functions."""
+    pointer = ctypes.c_void_p
+    update_times = fast_dds_function(
+        f"_ZN{RTPS}14StatefulReader11updateTimesERKNS1_11ReaderTimesE",
+        *(ctypes.c_bool, pointer, pointer),
+    )
+    virtual = virtual_functions(f"_ZTVN{RTPS}14StatefulReaderE")
+    return None if update_times is None or virtual is None else (update_times, virtual)
+
+
+@functools.lru_cache(maxsize=1)
 def _functions() -> tuple[Any, Any, Any] | None:
     """Return what tells a participant's GUID, finds a writer by GUID and changes its times.
 
     None where the libraries are others.
     """
     pointer = ctypes.c_void_p
-    rtps = "8eprosima8fastrtps4rtps"
     found = (
         fast_dds_function("_ZNK8eprosima7fastdds3dds17DomainParticipant4guidEv", pointer, pointer),
         fast_dds_function(
-            f"_ZN{rtps}14RTPSDomainImpl17find_local_writerERKNS1_6GUID_tE", pointer, pointer
+            f"_ZN{RTPS}14RTPSDomainImpl17find_local_writerERKNS1_6GUID_tE", pointer, pointer
         ),
         fast_dds_function(
-            f"_ZN{rtps}14StatefulWriter11updateTimesERKNS1_11WriterTimesE", None, pointer, pointer
+            f"_ZN{RTPS}14StatefulWriter11updateTimesERKNS1_11WriterTimesE", None, pointer, pointer
         ),
     )
     return None if None in found else found

@@ -22,11 +22,14 @@ from typing import Any
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds.endpoint_discovery import Duration
-from lifecycle.middleware.fastdds.settings import (
-    fast_dds_address,
-    fast_dds_function,
-    participant_of,
+from lifecycle.middleware.fastdds.local_readers import (
+    POINTER_BYTES,
+    RTPS,
+    builtin_reader,
+    pointer_at,
+    virtual_functions,
 )
+from lifecycle.middleware.fastdds.settings import fast_dds_function
 from lifecycle.middleware.rcl import abi
 
 _IGNORE_NONE_FLAGS, _IGNORE_ALL_FLAGS = 0, 7
@@ -34,10 +37,7 @@ _SIMPLE = 1
 _READER = b"\x00\x01\x00\xc7"
 """EntityId of the built-in reader of participants, DDSI-RTPS table 9.1."""
 
-_RTPS = "8eprosima8fastrtps4rtps"
-_IMPL = f"_ZN{_RTPS}19RTPSParticipantImpl"
-_PREFIX_BYTES = 12
-_POINTER_BYTES = ctypes.sizeof(ctypes.c_void_p)
+_IMPL = f"_ZN{RTPS}19RTPSParticipantImpl"
 
 
 class _Pdp(ctypes.Structure):
@@ -59,15 +59,6 @@ class _Pdp(ctypes.Structure):
         ("sync_period", Duration),
         ("servers", ctypes.c_void_p * 3),
         ("ignored", ctypes.c_uint32),
-    )
-
-
-class _Endpoint(ctypes.Structure):
-    # Endpoint.h: what each writer and reader begins with.
-    _fields_ = (
-        ("virtual", ctypes.c_void_p),
-        ("participant", ctypes.c_void_p),
-        ("guid", ctypes.c_uint8 * 16),
     )
 
 
@@ -125,24 +116,14 @@ def can_be_unannounced(rcl_node: int) -> bool:
 
 def _pdp_of(rcl_node: int) -> _Pdp | None:
     """Return the PDP of the participant of a node; None where anything is not as known."""
-    participant = participant_of(rcl_node)
-    functions = _functions() if participant else None
-    if functions is None:
+    functions = _functions()
+    reader = builtin_reader(rcl_node, _READER) if functions else None
+    if functions is None or reader is None:
         return None
-    guid_of, find_reader, listener_of, virtual = functions
-    guid = ctypes.string_at(guid_of(participant), _PREFIX_BYTES) + _READER
-    # std::shared_ptr<LocalReaderPointer>. It is not given back: 50 bytes, once in a process.
-    found = (ctypes.c_void_p * 2)()
-    find_reader(ctypes.byref(found), ctypes.create_string_buffer(guid, len(guid)))
-    if not found[0]:
-        return None
-    address = _pointer_at(found[0] + _POINTER_BYTES)
-    reader = _Endpoint.from_address(address) if address else None
-    if reader is None or bytes(reader.guid) != guid:
-        return None
-    listener = listener_of(address)
-    pdp_address = _pointer_at(listener + _POINTER_BYTES) if listener else None
-    if not pdp_address or _pointer_at(pdp_address) != virtual:
+    listener_of, virtual = functions
+    listener = listener_of(ctypes.addressof(reader))
+    pdp_address = pointer_at(listener + POINTER_BYTES) if listener else None
+    if not pdp_address or pointer_at(pdp_address) != virtual:
         return None
     pdp = _Pdp.from_address(pdp_address)
     is_known = (
@@ -158,42 +139,28 @@ def _pdp_of(rcl_node: int) -> _Pdp | None:
     return pdp if is_known else None
 
 
-def _pointer_at(address: int) -> int | None:
-    value: int | None = ctypes.c_void_p.from_address(address).value
-    return value
-
-
 @functools.lru_cache(maxsize=1)
-def _functions() -> tuple[Any, Any, Any, int] | None:
-    """Return what tells GUID, reader and listener, and PDPSimple's table of virtual functions.
+def _functions() -> tuple[Any, int] | None:
+    """Return what tells a reader's listener, and PDPSimple's table of virtual functions.
 
     None where the libraries are others.
     """
     pointer = ctypes.c_void_p
-    found = (
-        fast_dds_function("_ZNK8eprosima7fastdds3dds17DomainParticipant4guidEv", pointer, pointer),
-        fast_dds_function(
-            f"_ZN{_RTPS}14RTPSDomainImpl17find_local_readerE"
-            "RSt10shared_ptrINS1_18LocalReaderPointerEERKNS1_6GUID_tE",
-            *(None, pointer, pointer),
-        ),
-        fast_dds_function(f"_ZNK{_RTPS}10RTPSReader11getListenerEv", pointer, pointer),
-    )
-    table = fast_dds_address(f"_ZTVN{_RTPS}9PDPSimpleE")
+    found = fast_dds_function(f"_ZNK{RTPS}10RTPSReader11getListenerEv", pointer, pointer)
+    virtual = virtual_functions(f"_ZTVN{RTPS}9PDPSimpleE")
     others = (
         _announce(),
         _announcing("31stopRTPSParticipantAnnouncementEv"),
         _announcing("32resetRTPSParticipantAnnouncementEv"),
     )
-    if table is None or None in (*found, *others):
+    if virtual is None or None in (found, *others):
         return None
-    # What an object points at lies behind two entries of the table, see the C++ ABI for Itanium.
-    return (*found, table + 2 * _POINTER_BYTES)
+    return found, virtual
 
 
 def _announce() -> Any:
     """Return PDPSimple::announceParticipantState(new_change, dispose)."""
-    symbol = f"_ZN{_RTPS}9PDPSimple24announceParticipantStateEbb"
+    symbol = f"_ZN{RTPS}9PDPSimple24announceParticipantStateEbb"
     return fast_dds_function(symbol, None, ctypes.c_void_p, ctypes.c_bool, ctypes.c_bool)
 
 

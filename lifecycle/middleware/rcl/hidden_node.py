@@ -24,7 +24,10 @@ from rclpy.subscription import Subscription
 from rclpy.waitable import Waitable
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.fastdds.endpoint_discovery import resend_endpoints_soon
+from lifecycle.middleware.fastdds.endpoint_discovery import (
+    ask_for_endpoints_soon,
+    resend_endpoints_soon,
+)
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.middleware.fastdds.settings import participant_settings
 
@@ -76,6 +79,7 @@ def quiet_node(
         ) from error
     with node.handle:
         resend_endpoints_soon(node.handle.pointer)
+        ask_for_endpoints_soon(node.handle.pointer)
     _hidden.add(node)
     return context, node
 

@@ -1,0 +1,92 @@
+"""The built-in readers of a participant of this process, by which Fast DDS discovers others.
+
+Owns: finding one by its entity id (DDSI-RTPS table 9.1), and whether it is what it should be.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from typing import Any
+
+from lifecycle.middleware.fastdds.settings import (
+    fast_dds_address,
+    fast_dds_function,
+    participant_of,
+)
+
+RTPS = "8eprosima8fastrtps4rtps"
+POINTER_BYTES = ctypes.sizeof(ctypes.c_void_p)
+_PREFIX_BYTES = 12
+
+
+class Endpoint(ctypes.Structure):
+    """Endpoint.h: what each writer and reader begins with.
+
+    Attributes:
+        virtual: address of its table of virtual functions, see `virtual_functions`.
+        participant: address of its RTPSParticipantImpl.
+        guid: of its own.
+    """
+
+    _fields_ = (
+        ("virtual", ctypes.c_void_p),
+        ("participant", ctypes.c_void_p),
+        ("guid", ctypes.c_uint8 * 16),
+    )
+
+
+def builtin_reader(rcl_node: int, entity: bytes) -> Endpoint | None:
+    """Return a built-in reader of the participant of a node, in Fast DDS's own memory.
+
+    Args:
+        rcl_node: address of the rcl_node_t.
+        entity: its EntityId.
+
+    Returns:
+        None with another RMW or another version, and where there is no such reader.
+    """
+    participant = participant_of(rcl_node)
+    functions = _functions() if participant else None
+    if functions is None:
+        return None
+    guid_of, find_reader = functions
+    guid = ctypes.string_at(guid_of(participant), _PREFIX_BYTES) + entity
+    # std::shared_ptr<LocalReaderPointer>. It is not given back: 50 bytes, once in a process.
+    found = (ctypes.c_void_p * 2)()
+    find_reader(ctypes.byref(found), ctypes.create_string_buffer(guid, len(guid)))
+    if not found[0]:
+        return None
+    address = pointer_at(found[0] + POINTER_BYTES)
+    reader = Endpoint.from_address(address) if address else None
+    return reader if reader is not None and bytes(reader.guid) == guid else None
+
+
+def pointer_at(address: int) -> int | None:
+    """Return the pointer that is stored there."""
+    value: int | None = ctypes.c_void_p.from_address(address).value
+    return value
+
+
+def virtual_functions(symbol: str) -> int | None:
+    """Return what an object of a class points at, by its table's symbol; None if there is none.
+
+    That lies behind two entries of the table, see the C++ ABI for Itanium.
+    """
+    table = fast_dds_address(symbol)
+    return None if table is None else table + 2 * POINTER_BYTES
+
+
+@functools.lru_cache(maxsize=1)
+def _functions() -> tuple[Any, Any] | None:
+    """Return what tells a participant's GUID and finds a reader; None with other libraries."""
+    pointer = ctypes.c_void_p
+    found = (
+        fast_dds_function("_ZNK8eprosima7fastdds3dds17DomainParticipant4guidEv", pointer, pointer),
+        fast_dds_function(
+            f"_ZN{RTPS}14RTPSDomainImpl17find_local_readerE"
+            "RSt10shared_ptrINS1_18LocalReaderPointerEERKNS1_6GUID_tE",
+            *(None, pointer, pointer),
+        ),
+    )
+    return None if None in found else found
