@@ -17,6 +17,7 @@ from .discovery.rediscovery import send_again_soon as send_again_soon
 from .discovery.rediscovery import wake_participants as wake_participants
 from .fastdds.dscp import widen_discovery_buffers as widen_discovery_buffers
 from .fastdds.endpoint_discovery import ENDPOINTS_MADE_S as ENDPOINTS_MADE_S
+from .fastdds.endpoint_discovery import ask_for_endpoints_soon as ask_for_endpoints_soon
 from .fastdds.endpoint_discovery import endpoints_made_s as endpoints_made_s
 from .fastdds.endpoint_discovery import resend_endpoints_soon as resend_endpoints_soon
 from .fastdds.nfe import SHARED_MEMORY as SHARED_MEMORY

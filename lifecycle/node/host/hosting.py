@@ -32,6 +32,7 @@ from lifecycle.middleware import (
     BusySign,
     ParticipantSettings,
     Unannounced,
+    ask_for_endpoints_soon,
     check_own_pair,
     endpoints_made_s,
     follow_nodes,
@@ -336,6 +337,7 @@ class Host:
         is_known = self._unannounced is None
         delay_s = ENDPOINTS_MADE_S if is_known else endpoints_made_s(self._spec.gathers)
         resend_endpoints_soon(rcl_node, delay_s, participants=self._spec.gathers)
+        ask_for_endpoints_soon(rcl_node, endpoints_made_s(self._spec.gathers))
         widen_discovery_buffers(self._spec.domain_id)
         if self._participants.first.names_by_udp:
             check_own_pair(self._spec.domain_id)

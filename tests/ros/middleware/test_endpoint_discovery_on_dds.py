@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+import ctypes
+import struct
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from rclpy.node import Node
 from std_msgs.msg import String
 
-from lifecycle.middleware import FlowParticipant, GraphObserver, resend_endpoints_soon
+from lifecycle.middleware import (
+    FlowParticipant,
+    GraphObserver,
+    ask_for_endpoints_soon,
+    resend_endpoints_soon,
+)
 from lifecycle.middleware.fastdds import endpoint_discovery
+from lifecycle.middleware.fastdds.local_readers import builtin_reader
 from tests.ros.node.edp_heartbeats import heartbeat_periods_s
 
 _LATECOMER = Path(__file__).with_name("latecomer.py")
@@ -83,6 +93,48 @@ def test_heartbeats_come_the_less_often_the_more_participants_there_are(
         # Also what was changed before is known, and changed back.
         assert resend_endpoints_soon(pointer)
         assert heartbeat_periods_s(pointer) == [1, 1]
+
+
+_READER_BYTES = 1024
+"""More than sizeof(StatefulReader) is read nowhere; its times are among the first."""
+
+
+def times_ms_of(rcl_node: int) -> set[tuple[int, int]]:
+    """Return what the built-in readers have of these times: initial request, answer."""
+    found = set()
+    for entity in endpoint_discovery._READERS:
+        reader = builtin_reader(rcl_node, entity)
+        assert reader is not None
+        data = ctypes.string_at(ctypes.addressof(reader), _READER_BYTES)
+        for ask_ms, answer_ms in ((70, 10), (20, 9), (5, 5)):
+            times = struct.pack("<iIiI", 0, ask_ms * 10**6, 0, answer_ms * 10**6)
+            found |= {(ask_ms, answer_ms)} if times in data else set()
+    return found
+
+
+def test_a_new_participant_is_soon_asked_by_itself(
+    make_node: Callable[..., Node], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    node = make_node("asking")
+    with node.handle:
+        pointer = node.handle.pointer
+        assert times_ms_of(pointer) == {(70, 10)}
+        with monkeypatch.context() as other:
+            other.setattr(endpoint_discovery, "builtin_reader", lambda *_: None)
+            assert not ask_for_endpoints_soon(pointer)
+        with monkeypatch.context() as other:
+            other.setattr(endpoint_discovery, "_reader_functions", lambda: None)
+            assert not ask_for_endpoints_soon(pointer)
+        assert times_ms_of(pointer) == {(70, 10)}
+        assert ask_for_endpoints_soon(pointer, 0.02)
+        assert times_ms_of(pointer) == {(20, 9)}
+        assert ask_for_endpoints_soon(pointer)
+        assert times_ms_of(pointer) == {(5, 5)}
+
+
+def test_an_observer_asks_soon(fresh_domain: int) -> None:
+    with GraphObserver(fresh_domain) as observer, observer.node.handle:
+        assert times_ms_of(observer.node.handle.pointer) == {(5, 5)}
 
 
 @pytest.mark.parametrize(
