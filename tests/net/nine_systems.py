@@ -128,7 +128,9 @@ class System:
         """End all supervisors; each must end well, with its gate held and nothing left."""
         for up in self.ups.values():
             up.signal(signal.SIGTERM)
-        assert {name: up.finish() for name, up in self.ups.items()} == dict.fromkeys(self.ups, 0)
+        codes = {name: up.finish() for name, up in self.ups.items()}
+        said = {name: (up.verdict["run"], up.said()) for name, up in self.ups.items()}
+        assert codes == dict.fromkeys(self.ups, 0), (codes, said)
         for up in self.ups.values():
             up.assert_gate_held()
             up.assert_nothing_left()

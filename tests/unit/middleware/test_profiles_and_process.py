@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import socket
 import subprocess
 import sys
@@ -100,6 +101,40 @@ def test_the_deadman_ends_a_process_that_holds_the_gil() -> None:
     )
     began = time.monotonic()
     assert subprocess.run([sys.executable, "-c", hang], check=False, timeout=30).returncode == 42
+    assert time.monotonic() - began < 10
+
+
+_TERMINATES = """
+import ctypes, sys, threading
+from lifecycle.middleware import exit_after
+
+cpp = ctypes.CDLL("libstdc++.so.6")
+live_on = exit_after({seconds}, 42)
+{then}
+thread = threading.Thread(target=cpp["_ZSt9terminatev"])
+thread.start()
+{meanwhile}
+thread.join()
+"""
+
+
+@pytest.mark.parametrize(
+    ("seconds", "then", "meanwhile", "code"),
+    [
+        (20, "", "", 42),
+        # What ends it waits for who holds the GIL, if that is not too late.
+        (1, "", "ctypes.PyDLL(None).sleep(60)", 42),
+        (20, "live_on()", "", -signal.SIGABRT),
+    ],
+)
+def test_what_cpp_does_not_catch_ends_a_process_that_leaves_as_it_would_have_ended(
+    seconds: float, then: str, meanwhile: str, code: int
+) -> None:
+    """Fast DDS 2.14 throws when a socket of TCP is closed by another of its threads."""
+    program = _TERMINATES.format(seconds=seconds, then=then, meanwhile=meanwhile)
+    began = time.monotonic()
+    done = subprocess.run([sys.executable, "-c", program], check=False, timeout=30)
+    assert done.returncode == code
     assert time.monotonic() - began < 10
 
 
