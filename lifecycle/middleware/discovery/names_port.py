@@ -11,17 +11,17 @@ proc(5). Must not import rclpy.
 from __future__ import annotations
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.fastdds.url_check import open_sockets, udp_sockets_of_others
+from lifecycle.middleware.fastdds.url_check import open_sockets, udp_sockets
 from lifecycle.network import PARTICIPANTS_PER_DOMAIN, UDP_UNICAST, participant_ports
 
 
 def pairs_are_whole(domain_id: int) -> bool:
-    """Return whether no process of this host has only the second port of a participant.
+    """Return whether no process of this host, this one neither, has only the second port of a pair.
 
     Args:
         domain_id: 0–232.
     """
-    ports = {each.port for each in udp_sockets_of_others()}
+    ports = {each.port for each in udp_sockets()}
     return all(user not in ports or discovery in ports for discovery, user in _pairs(domain_id))
 
 

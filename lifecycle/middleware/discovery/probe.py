@@ -35,7 +35,7 @@ from lifecycle.middleware.discovery.messages import (
 from lifecycle.middleware.fastdds.dscp import own_udp_socket
 from lifecycle.middleware.fastdds.participant_profile import default_profile
 from lifecycle.middleware.fastdds.profiles import PROFILE_NAME
-from lifecycle.middleware.fastdds.url_check import OpenSocket, open_sockets, udp_sockets_of_others
+from lifecycle.middleware.fastdds.url_check import OpenSocket, open_sockets, udp_sockets
 from lifecycle.middleware.fastdds.url_profile import (
     DISCOVERY_GROUP,
     LOCALHOST_PEERS_RANGE,
@@ -170,7 +170,7 @@ class Probe:
             return frozenset()
         return frozenset(
             each
-            for each in udp_sockets_of_others()
+            for each in udp_sockets(of_others=True)
             if (at := asked.get(each.port))
             and (each.address in at or ipaddress.ip_address(each.address).is_unspecified)
         )

@@ -123,9 +123,9 @@ def open_sockets(
     return tuple(each for each in _bound_sockets(kinds) if each.inode in ours)
 
 
-def udp_sockets_of_others() -> tuple[OpenSocket, ...]:
-    """Return the UDP sockets of our network namespace but for those of this process."""
-    ours = set(_socket_inodes("self"))
+def udp_sockets(*, of_others: bool = False) -> tuple[OpenSocket, ...]:
+    """Return the UDP sockets of our network namespace, or only those that others have."""
+    ours = set(_socket_inodes("self")) if of_others else set[int]()
     return tuple(each for each in _bound_sockets(UDP_UNICAST) if each.inode not in ours)
 
 

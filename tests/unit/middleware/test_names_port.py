@@ -52,6 +52,8 @@ def test_one_that_has_only_the_second_port_of_a_pair_is_in_the_way(
     with of_another_process(bound(ports.user_unicast, family)):
         assert not pairs_are_whole(domain)
         assert pairs_are_whole(domain - 1)
+    with bound(ports.user_unicast, family):
+        assert not pairs_are_whole(domain)
     assert pairs_are_whole(domain)
 
 
