@@ -25,6 +25,7 @@ import functools
 import hashlib
 import os
 import threading
+import time
 import weakref
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -533,6 +534,7 @@ def once_participant_is_made(
     call: Callable[[int], None],
     *,
     names_by_udp: Callable[[], bool] = lambda: False,
+    check_names: Callable[[], None] = lambda: None,
 ) -> Iterator[None]:
     """Call this when the next node's participant is there, and nothing of the node but its name.
 
@@ -545,6 +547,8 @@ def once_participant_is_made(
             given the address of its rcl_node_t.
         names_by_udp: its participant is made so (ParticipantSettings). rmw asks for a port for them
             alone first, which Fast DDS refuses with a message, and then without.
+        check_names: raises MiddlewareError where they do not arrive. Then it is made again, for as
+            long as a participant takes that just left to close its ports.
     """
     from lifecycle.middleware.fastdds.log import without_message  # it needs this module
 
@@ -554,7 +558,10 @@ def once_participant_is_made(
     def make(*args: Any, **kwargs: Any) -> Any:
         library.Node = made
         before = has_shared_memory_open()
-        with without_message(_REFUSED_PORT) if names_by_udp() else contextlib.nullcontext():
+        if names_by_udp():
+            with without_message(_REFUSED_PORT):
+                node = _made_with_names(lambda: made(*args, **kwargs), check_names)
+        else:
             node = made(*args, **kwargs)
         its = any(each is context.handle for each in args)
         if its and not before and get_rmw_implementation_identifier() == _RMW:
@@ -567,6 +574,26 @@ def once_participant_is_made(
         yield
     finally:
         library.Node = made
+
+
+_NAMES_TRIES = 10
+_NAMES_AGAIN_S = 0.02
+
+
+def _made_with_names(make: Callable[[], Any], check_names: Callable[[], None]) -> Any:
+    """Make a node, and again if what others call theirs would not arrive at its participant."""
+    for left in reversed(range(_NAMES_TRIES)):
+        node = make()
+        try:
+            check_names()
+        except MiddlewareError:
+            node.destroy_when_not_in_use()
+            if not left:
+                raise
+            time.sleep(_NAMES_AGAIN_S)  # the kernel gives no event
+        else:
+            break
+    return node
 
 
 @contextlib.contextmanager

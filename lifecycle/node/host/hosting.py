@@ -312,6 +312,7 @@ class Host:
                                     self._context,
                                     self._participant_made,
                                     names_by_udp=lambda: self._participants.first.names_by_udp,
+                                    check_names=lambda: check_own_pair(self._spec.domain_id),
                                 )
                             )
                         self._construct(planned, maker)
@@ -339,8 +340,6 @@ class Host:
         resend_endpoints_soon(rcl_node, delay_s, participants=self._spec.gathers)
         ask_for_endpoints_soon(rcl_node, endpoints_made_s(self._spec.gathers))
         widen_discovery_buffers(self._spec.domain_id)
-        if self._participants.first.names_by_udp:
-            check_own_pair(self._spec.domain_id)
         if is_known:
             self._gather()
 

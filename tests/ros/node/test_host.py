@@ -22,6 +22,7 @@ from std_msgs.msg import String
 
 from lifecycle import codec
 from lifecycle.manifest.model import DiscoveryRange, Executor, Run, RunKind, Timeouts
+from lifecycle.middleware.fastdds.url_check import open_sockets, udp_sockets
 from lifecycle.network import participant_ports
 from lifecycle.node.host.control import Command, Event, HostSpec, Operation
 from lifecycle.node.host.host import needed_by
@@ -150,6 +151,22 @@ def test_names_have_no_port_of_shared_memory_unless_transports_are_chosen(
     # What Fast DDS says of it is kept from the log, and the thread that says it is ended.
     assert host.log.read_text() == ""
     assert not any(each.startswith("dds.log") for each in threads)
+
+
+def test_a_host_waits_for_a_port_of_a_participant_that_leaves(
+    start: Start, fresh_domain: int, wait_until: Callable[..., None]
+) -> None:
+    """One that leaves closes its ports one after the other."""
+    ports = participant_ports(fresh_domain, 0)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as leaving:
+        leaving.bind(("", ports.user_unicast))
+        host = start(hosted("one", "Good"), gathers=1, names_by_udp=True)
+        wait_until(lambda: ports.discovery_unicast in {each.port for each in udp_sockets()})
+    host.send(Command(id=0, node="", operation=Operation.PROCEED))
+    host.until("ready")
+    own = {each.port for each in open_sockets(host.process.pid)}
+    assert {ports.discovery_unicast, ports.user_unicast} <= own
+    assert host.do("/one", CONFIGURE).ok
 
 
 def test_a_host_to_which_no_names_would_arrive_says_so(start: Start, fresh_domain: int) -> None:
