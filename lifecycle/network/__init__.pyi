@@ -86,6 +86,7 @@ from .ports import overflows as overflows
 from .ports import overlaps as overlaps
 from .ports import owner_of as owner_of
 from .ports import participant_ports as participant_ports
+from .ports import ports_of_participants as ports_of_participants
 from .ports import read_ephemeral_range as read_ephemeral_range
 from .ports import safe_domains as safe_domains
 from .ports import unique_flow_ports as unique_flow_ports

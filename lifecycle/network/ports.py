@@ -10,8 +10,9 @@ ports of a running system are read from it, never inferred from here.
 
 from __future__ import annotations
 
+import contextlib
 import enum
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 from lifecycle import dataclasses
 
@@ -169,6 +170,13 @@ def participant_ports(domain_id: int, participant_id: int) -> ParticipantPorts:
             f"use 0 to {(MAX_PORT - base - D3) // PG}"
         )
     return ports
+
+
+def ports_of_participants(domain_id: int, participants: int) -> Iterator[ParticipantPorts]:
+    """Yield the ports of the first participants of a domain on one host, as far as they exist."""
+    with contextlib.suppress(ValueError):  # the domain has no such port
+        for participant in range(participants):
+            yield participant_ports(domain_id, participant)
 
 
 def owner_of(port: int) -> PortUse | None:

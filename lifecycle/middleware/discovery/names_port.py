@@ -1,18 +1,17 @@
-"""Ports at which names of nodes arrive by UDP (`ParticipantSettings.names_by_udp`).
+"""Ports at which the names of nodes arrive by UDP (`ParticipantSettings.names_by_udp`).
 
-Owns: whether each participant that is made here has the port that goes with its own. rmw_fastrtps'
-`ros_discovery_info` is received at the participant's port for user data, the one after that of its
-discovery (DDSI-RTPS 9.6.2.3). Fast DDS 2.14 takes the next two that are free, each by itself: a
-participant with ports of its own choice may have the second of a pair whose first is free, and what
-is sent to that by name of the participant then made is lost, for good. Sockets are read from
-proc(5). Must not import rclpy.
+Owns: whether each participant of a host has the pair of ports that goes with its number (DDSI-RTPS
+9.6.2.3): `ros_discovery_info` is received at the one for user data, the next after that for
+discovery. Fast DDS 2.14 takes the next free port for each by itself. Where another participant has
+only the second port of a pair, messages to the participant that gets the first are lost. Sockets
+are read from proc(5). Must not import rclpy.
 """
 
 from __future__ import annotations
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds.url_check import open_sockets, udp_sockets
-from lifecycle.network import PARTICIPANTS_PER_DOMAIN, UDP_UNICAST, participant_ports
+from lifecycle.network import PARTICIPANTS_PER_DOMAIN, UDP_UNICAST, ports_of_participants
 
 
 def pairs_are_whole(domain_id: int) -> bool:
@@ -45,11 +44,5 @@ def check_own_pair(domain_id: int) -> None:
 
 def _pairs(domain_id: int) -> list[tuple[int, int]]:
     """Return the ports for discovery and user data of all participants that a host can have."""
-    found = []
-    for participant in range(PARTICIPANTS_PER_DOMAIN):
-        try:
-            ports = participant_ports(domain_id, participant)
-        except ValueError:  # the domain has no such port
-            break
-        found.append((ports.discovery_unicast, ports.user_unicast))
-    return found
+    every = ports_of_participants(domain_id, PARTICIPANTS_PER_DOMAIN)
+    return [(each.discovery_unicast, each.user_unicast) for each in every]

@@ -52,6 +52,7 @@ from lifecycle.network import (
     ConnectionUrl,
     Medium,
     participant_ports,
+    ports_of_participants,
 )
 
 if TYPE_CHECKING:
@@ -140,8 +141,8 @@ class Probe:
     def silent(self) -> frozenset[int]:
         """Return the asked UDP ports of other processes on this host that no answer named so far.
 
-        Only of those that were bound when this was made, and still are. Who has one is most likely
-        a participant that had no processor yet, however long that takes.
+        Only of those that were bound when this was made, and still are. Most likely a participant
+        has it that got no CPU time yet, however long that takes.
         """
         if not self._listeners or self._socket is None:
             return frozenset()
@@ -599,12 +600,8 @@ def _probe_peers(domain_id: int, family: UrlTransport) -> Probe:
 
 def well_known_targets(domain_id: int, address: str, participants: int) -> Iterator[ProbeTarget]:
     """Yield the discovery ports of a host's first participants (DDSI-RTPS 9.6.2.3)."""
-    for participant in range(participants):
-        try:
-            port = participant_ports(domain_id, participant).discovery_unicast
-        except ValueError:  # the domain has no such port
-            return
-        yield ProbeTarget(address=address, port=port)
+    for ports in ports_of_participants(domain_id, participants):
+        yield ProbeTarget(address=address, port=ports.discovery_unicast)
 
 
 def group_targets(domain_id: int, kind: Medium, interfaces: Iterable[str]) -> Iterator[ProbeTarget]:

@@ -34,7 +34,12 @@ import ctypes
 import functools
 from typing import Any
 
-from lifecycle.middleware.fastdds.local_readers import RTPS, builtin_reader, virtual_functions
+from lifecycle.middleware.fastdds.local_readers import (
+    RTPS,
+    builtin_reader,
+    guid_prefix,
+    virtual_functions,
+)
 from lifecycle.middleware.fastdds.settings import fast_dds_function, participant_of
 
 SOON_S = 0.005
@@ -62,7 +67,6 @@ _READERS = (b"\x00\x00\x03\xc7", b"\x00\x00\x04\xc7")
 _ANSWERED_S = 0.009
 """To a heartbeat they answer after 10 ms. Fast DDS changes times only where that is another one."""
 
-_PREFIX_BYTES = 12
 _TIMES_AT = 592
 """Where StatefulWriter has its WriterTimes in Fast DDS 2.14.5, see `_is_known`."""
 
@@ -127,10 +131,11 @@ def resend_endpoints_soon(rcl_node: int, delay_s: float = SOON_S, *, participant
     """
     participant = participant_of(rcl_node)
     functions = _functions() if participant else None
-    if functions is None:
+    if participant is None or functions is None:
         return False
-    guid_of, find_writer, update_times = functions
-    prefix = ctypes.string_at(guid_of(participant), _PREFIX_BYTES)
+    find_writer, update_times = functions
+    if not (prefix := guid_prefix(participant)):
+        return False
     changed = 0
     for entity in _WRITERS:
         writer = find_writer(ctypes.create_string_buffer(prefix + entity, len(prefix + entity)))
@@ -154,8 +159,8 @@ def ask_for_endpoints_soon(rcl_node: int, delay_s: float = SOON_S) -> bool:
 
     Args:
         rcl_node: address of the rcl_node_t.
-        delay_s: seconds, 0.001–0.07, after it has discovered one that it has not heard of yet;
-            then after twice, four times as long.
+        delay_s: seconds, 0.001–0.07, after it has discovered one of which it has received no
+            heartbeat; then after twice, four times as long.
 
     Returns:
         Whether it will; False with another RMW, another version, or static endpoint discovery.
@@ -217,14 +222,13 @@ def _reader_functions() -> tuple[Any, int] | None:
 
 
 @functools.lru_cache(maxsize=1)
-def _functions() -> tuple[Any, Any, Any] | None:
-    """Return what tells a participant's GUID, finds a writer by GUID and changes its times.
+def _functions() -> tuple[Any, Any] | None:
+    """Return what finds a writer by GUID and changes its times.
 
     None where the libraries are others.
     """
     pointer = ctypes.c_void_p
     found = (
-        fast_dds_function("_ZNK8eprosima7fastdds3dds17DomainParticipant4guidEv", pointer, pointer),
         fast_dds_function(
             f"_ZN{RTPS}14RTPSDomainImpl17find_local_writerERKNS1_6GUID_tE", pointer, pointer
         ),

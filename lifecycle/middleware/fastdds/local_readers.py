@@ -1,6 +1,7 @@
 """The built-in readers of a participant of this process, by which Fast DDS discovers others.
 
-Owns: finding one by its entity id (DDSI-RTPS table 9.1), and whether it is what it should be.
+Owns: a participant's GUID prefix, finding a reader by its entity id (DDSI-RTPS table 9.1), and
+whether it is what it should be.
 """
 
 from __future__ import annotations
@@ -47,11 +48,11 @@ def builtin_reader(rcl_node: int, entity: bytes) -> Endpoint | None:
         None with another RMW or another version, and where there is no such reader.
     """
     participant = participant_of(rcl_node)
-    functions = _functions() if participant else None
-    if functions is None:
+    find_reader = _find_reader() if participant else None
+    prefix = guid_prefix(participant) if participant else b""
+    if find_reader is None or not prefix:
         return None
-    guid_of, find_reader = functions
-    guid = ctypes.string_at(guid_of(participant), _PREFIX_BYTES) + entity
+    guid = prefix + entity
     # std::shared_ptr<LocalReaderPointer>. It is not given back: 50 bytes, once in a process.
     found = (ctypes.c_void_p * 2)()
     find_reader(ctypes.byref(found), ctypes.create_string_buffer(guid, len(guid)))
@@ -60,6 +61,12 @@ def builtin_reader(rcl_node: int, entity: bytes) -> Endpoint | None:
     address = pointer_at(found[0] + POINTER_BYTES)
     reader = Endpoint.from_address(address) if address else None
     return reader if reader is not None and bytes(reader.guid) == guid else None
+
+
+def guid_prefix(participant: int) -> bytes:
+    """Return the GUID prefix of a DomainParticipant by its address; empty with other libraries."""
+    guid_of = _guid_of()
+    return b"" if guid_of is None else ctypes.string_at(guid_of(participant), _PREFIX_BYTES)
 
 
 def pointer_at(address: int) -> int | None:
@@ -78,15 +85,17 @@ def virtual_functions(symbol: str) -> int | None:
 
 
 @functools.lru_cache(maxsize=1)
-def _functions() -> tuple[Any, Any] | None:
-    """Return what tells a participant's GUID and finds a reader; None with other libraries."""
+def _guid_of() -> Any:
     pointer = ctypes.c_void_p
-    found = (
-        fast_dds_function("_ZNK8eprosima7fastdds3dds17DomainParticipant4guidEv", pointer, pointer),
-        fast_dds_function(
-            f"_ZN{RTPS}14RTPSDomainImpl17find_local_readerE"
-            "RSt10shared_ptrINS1_18LocalReaderPointerEERKNS1_6GUID_tE",
-            *(None, pointer, pointer),
-        ),
+    symbol = "_ZNK8eprosima7fastdds3dds17DomainParticipant4guidEv"
+    return fast_dds_function(symbol, pointer, pointer)
+
+
+@functools.lru_cache(maxsize=1)
+def _find_reader() -> Any:
+    pointer = ctypes.c_void_p
+    return fast_dds_function(
+        f"_ZN{RTPS}14RTPSDomainImpl17find_local_readerE"
+        "RSt10shared_ptrINS1_18LocalReaderPointerEERKNS1_6GUID_tE",
+        *(None, pointer, pointer),
     )
-    return None if None in found else found

@@ -333,7 +333,13 @@ def _exit_where_cpp_terminates(code: int) -> Callable[[], None]:
     except (OSError, AttributeError):
         return lambda: None
     set_terminate.restype, set_terminate.argtypes = ctypes.c_void_p, (ctypes.c_void_p,)
-    handler = ctypes.CFUNCTYPE(None)(lambda: os._exit(code))
+
+    def terminate() -> None:
+        with contextlib.suppress(OSError):
+            os.write(2, b"the process ends at once: an exception was not caught in C++\n")
+        os._exit(code)
+
+    handler = ctypes.CFUNCTYPE(None)(terminate)
     _TERMINATED.append(handler)
     before = set_terminate(ctypes.cast(handler, ctypes.c_void_p))
     return lambda: set_terminate(before)

@@ -164,7 +164,7 @@ def test_a_killed_node_falls_silent_and_its_next_instance_takes_its_place(
         )
         with process("mortal", "/mortal/t") as first:
             until(graph, publishers("/mortal/t", "/mortal"))
-            # Discovery may show it sooner than it was heard, and who was never heard is not silent.
+            # Discovery may show it before its first graph message, without which none is missed.
             until(graph, lambda state: (seen := state.node("/mortal")) and seen.incarnation)
             born = graph.state.node("/mortal")
             assert born is not None

@@ -11,8 +11,8 @@ def heartbeat_periods_s(rcl_node: int) -> list[float]:
     """What Fast DDS has, read where its own function has put it."""
     functions = endpoint_discovery._functions()
     assert functions is not None
-    guid_of, find_writer, _ = functions
-    prefix = ctypes.string_at(guid_of(endpoint_discovery.participant_of(rcl_node)), 12)
+    find_writer, _ = functions
+    prefix = endpoint_discovery.guid_prefix(endpoint_discovery.participant_of(rcl_node))
     found = []
     for entity in endpoint_discovery._WRITERS:
         writer = find_writer(ctypes.create_string_buffer(prefix + entity, 16))

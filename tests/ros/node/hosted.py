@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import socket
 import sys
 import time
 from typing import Any
@@ -29,6 +31,15 @@ class Waiting(LifecycleNode):
         other = {"one": "other", "other": "one"}[self.get_name()]
         client = self.create_client(GetState, f"/{other}/get_state")
         print("met" if client.wait_for_service(10.0) else "alone", file=sys.stderr, flush=True)
+
+
+class WithSocket(LifecycleNode):
+    """Has a UDP socket of its own by then, at a port that a participant might have."""
+
+    def __init__(self) -> None:
+        self.own = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.own.bind(("", int(os.environ["TAKES_UDP_PORT"])))
+        super().__init__()
 
 
 class Heartbeats(LifecycleNode):

@@ -171,6 +171,21 @@ def test_a_host_waits_for_a_port_of_a_participant_that_leaves(
     assert host.do("/one", CONFIGURE).ok
 
 
+def test_a_socket_of_a_node_s_own_is_not_taken_for_a_participant_s(
+    start: Start, fresh_domain: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In domains above 101 the kernel itself may give it such a port."""
+    port = participant_ports(fresh_domain, 9).discovery_unicast
+    monkeypatch.setenv("TAKES_UDP_PORT", str(port))
+    host = start(hosted("one", "WithSocket"), gathers=1, names_by_udp=True)
+    host.send(Command(id=0, node="", operation=Operation.PROCEED))
+    host.until("ready")
+    own = {each.port for each in open_sockets(host.process.pid)}
+    assert port in own
+    assert participant_ports(fresh_domain, 0).user_unicast in own
+    assert host.do("/one", CONFIGURE).ok
+
+
 def test_a_host_to_which_no_names_would_arrive_says_so(start: Start, fresh_domain: int) -> None:
     port = participant_ports(fresh_domain, 0).user_unicast
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:

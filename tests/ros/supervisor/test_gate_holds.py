@@ -194,7 +194,7 @@ def test_who_appears_while_a_network_is_programmed_keeps_every_node_inactive(
     ],
     ids=["a node", "a plain DDS program"],
 )
-def test_who_was_there_and_had_no_processor_is_waited_for(
+def test_a_participant_that_gets_no_cpu_time_is_waited_for(
     tmp_path: Path, fresh_domain: int, program: Sequence[str], rule: str
 ) -> None:
     """As on a loaded machine, or by a limit of its control group: for longer than answers take."""

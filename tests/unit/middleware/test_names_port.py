@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import socket
-import subprocess
 from collections.abc import Iterator
 
 import pytest
@@ -13,6 +11,7 @@ from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.discovery.names_port import check_own_pair, pairs_are_whole
 from lifecycle.network import participant_ports
 from lifecycle.pytest_plugin import claimed_domain
+from tests.unit.middleware.other_process import of_another_process
 
 _LAST = 119
 """The last participant of a host."""
@@ -28,18 +27,6 @@ def bound(port: int, family: int = socket.AF_INET) -> socket.socket:
     each = socket.socket(family, socket.SOCK_DGRAM)
     each.bind(("", port))
     return each
-
-
-@contextlib.contextmanager
-def of_another_process(*sockets: socket.socket) -> Iterator[None]:
-    numbers = [each.fileno() for each in sockets]
-    with subprocess.Popen(["cat"], pass_fds=numbers, stdin=subprocess.PIPE) as process:
-        for each in sockets:
-            each.close()
-        try:
-            yield
-        finally:
-            process.communicate()
 
 
 @pytest.mark.parametrize("family", [socket.AF_INET, socket.AF_INET6])

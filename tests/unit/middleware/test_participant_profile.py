@@ -215,6 +215,25 @@ def test_a_host_gets_what_its_environment_leaves_open(
     assert alone == before
 
 
+@pytest.mark.parametrize(("participants", "heartbeat_s"), [(23, None), (24, 0.24), (100, 1.0)])
+def test_heartbeats_of_names_follow_how_many_are_made_together(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    participants: int,
+    heartbeat_s: float | None,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for by_udp in (True, False):
+        found = for_a_host(
+            ParticipantSettings(),
+            {},
+            unannounced=True,
+            names_by_udp=by_udp,
+            participants=participants,
+        )
+        assert found.names_heartbeat_s == (heartbeat_s if by_udp else None)
+
+
 def test_names_are_left_alone_beside_a_file_of_the_working_directory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

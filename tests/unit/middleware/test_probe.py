@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import socket
 import struct
-import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,6 +24,7 @@ from lifecycle.middleware.discovery.probe import (
     probes_for,
 )
 from lifecycle.network.connection_url import parse
+from tests.unit.middleware.other_process import of_another_process
 
 _WAIT_S = 5.0
 _PREFIX = bytes(range(12))
@@ -261,16 +261,11 @@ def test_where_all_leaves_by_one_port_nobody_can_be_asked_before_there_is_a_part
 
 
 @contextlib.contextmanager
-def of_another_process(peer: socket.socket) -> Iterator[tuple[str, int]]:
+def listening_elsewhere(peer: socket.socket) -> Iterator[tuple[str, int]]:
     """Give a socket to another process; return its URL and port."""
-    url, _ = url_for(peer)
-    with subprocess.Popen(["cat"], pass_fds=[peer.fileno()], stdin=subprocess.PIPE) as process:
-        port = peer.getsockname()[1]
-        peer.close()
-        try:
-            yield url, port
-        finally:
-            process.communicate()
+    (url, _), port = url_for(peer), peer.getsockname()[1]
+    with of_another_process(peer):
+        yield url, port
 
 
 def announced(port: int, order: str = "<") -> bytes:
@@ -283,7 +278,7 @@ def test_another_process_that_listens_is_silent_until_an_answer_names_its_port(
     peer: socket.socket, byte_order: str
 ) -> None:
     """It may have had no processor since it was asked: no time says that it is no participant."""
-    with of_another_process(peer) as (url, port):
+    with listening_elsewhere(peer) as (url, port):
         early = EarlyProbe(25, (parse(url),), {})
         (probe,) = asked = probes_for(25, (parse(url),), {})
         family, address = (socket.AF_INET6, "::1") if "[" in url else (socket.AF_INET, "127.0.0.1")
@@ -300,7 +295,7 @@ def test_another_process_that_listens_is_silent_until_an_answer_names_its_port(
 
 
 def test_a_process_that_closed_its_port_is_silent_no_more(peer: socket.socket) -> None:
-    with of_another_process(peer) as (url, port):
+    with listening_elsewhere(peer) as (url, port):
         (probe,) = probes_for(25, (parse(url),), {})
         assert probe.silent() == {port}
     assert probe.silent() == frozenset()
@@ -310,7 +305,7 @@ def test_a_process_that_closed_its_port_is_silent_no_more(peer: socket.socket) -
 def test_only_processes_that_did_not_answer_are_asked_again(
     peer: socket.socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with of_another_process(peer) as (url, port):
+    with listening_elsewhere(peer) as (url, port):
         peers = f"peer={url.partition('peer=')[2].partition('&')[0]}"
         another = url.replace(peers, f"{peers}&{peers.rpartition(':')[0]}:7913")
         (probe,) = probes_for(25, (parse(another),), {})

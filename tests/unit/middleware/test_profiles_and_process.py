@@ -133,9 +133,13 @@ def test_what_cpp_does_not_catch_ends_a_process_that_leaves_as_it_would_have_end
     """Fast DDS 2.14 throws when a socket of TCP is closed by another of its threads."""
     program = _TERMINATES.format(seconds=seconds, then=then, meanwhile=meanwhile)
     began = time.monotonic()
-    done = subprocess.run([sys.executable, "-c", program], check=False, timeout=30)
+    done = subprocess.run(
+        [sys.executable, "-c", program], check=False, timeout=30, capture_output=True, text=True
+    )
     assert done.returncode == code
     assert time.monotonic() - began < 10
+    if not then and not meanwhile:
+        assert done.stderr == "the process ends at once: an exception was not caught in C++\n"
 
 
 def test_an_orphan_is_adopted_by_the_subreaper() -> None:
