@@ -12,6 +12,7 @@ from collections.abc import Iterable
 
 from lifecycle import dataclasses
 from lifecycle.errors import BringUpError
+from lifecycle.manifest import RunKind
 from lifecycle.node import Operation
 from lifecycle.plan import Plan
 from lifecycle.supervisor.control.protocol import Reach
@@ -112,6 +113,8 @@ def _foreign(plan: Plan, nodes: Iterable[NodeRun]) -> Plan | None:
     found = tuple(
         each.planned
         for each in nodes
-        if each.planned.managed and (each.process is None or each.process.channel is None)
+        if each.planned.managed
+        # Of a process of ours that is not started yet, too, which has no channel.
+        and (each.process is None or each.process.planned.run.kind is not RunKind.PYTHON)
     )
     return dataclasses.replace(plan, nodes=found) if found else None

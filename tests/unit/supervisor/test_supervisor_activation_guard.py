@@ -8,10 +8,11 @@ from typing import cast
 
 from lifecycle.manifest.model import RunKind
 from lifecycle.node.host.control import Operation
+from lifecycle.plan import Plan
 from lifecycle.supervisor.control.protocol import Reach
 from lifecycle.supervisor.gate.activation_guard import TRIES, ActivationGuard
 from lifecycle.supervisor.nodes.driver import LifecycleClients, ServiceDriver
-from lifecycle.supervisor.nodes.system import NodeRun
+from lifecycle.supervisor.nodes.system import ChangeSource, NodeRun
 from lifecycle.supervisor.run.events import Notice
 from lifecycle.verify.observation import Observation, ObservedNode
 from tests.builders import plan_of, planned_node
@@ -88,3 +89,40 @@ def test_what_the_gate_let_through_is_left_alone_and_so_is_what_was_not_brought_
         assert bench.services.requests == []
 
     run(main())
+
+
+class _Graph:
+    """An observer and its changes: notes the nodes that it is asked about."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.asked: list[list[str]] = []
+
+    async def observe(self, plan: Plan) -> Observation:
+        self.asked.append([each.full_name for each in plan.nodes])
+        return Observation()
+
+    async def beyond(self, _count: int, _timeout_s: float | None) -> bool:
+        await asyncio.get_running_loop().create_future()
+        return True
+
+
+def _followed(tmp_path: Path, *kinds: RunKind) -> list[list[str]]:
+    """Which nodes are asked about, of a system none of whose processes was started yet."""
+
+    async def main() -> list[list[str]]:
+        nodes = (planned_node(f"node_{each.value}", kind=each) for each in kinds)
+        world = World(plan_of(*nodes), tmp_path)
+        graph = _Graph()
+        guard = ActivationGuard(world.system)
+        following = asyncio.ensure_future(guard.follow(graph, cast("ChangeSource", graph)))
+        await asyncio.sleep(0)
+        following.cancel()
+        return graph.asked
+
+    return run(main())
+
+
+def test_a_node_of_a_host_of_ours_that_is_not_started_yet_is_not_asked(tmp_path: Path) -> None:
+    assert _followed(tmp_path, RunKind.PYTHON) == []
+    assert _followed(tmp_path, RunKind.PYTHON, RunKind.ATTACH) == [["/node_attach"]]
