@@ -16,7 +16,7 @@ import threading
 import types
 from collections.abc import Callable, Iterator
 from dataclasses import FrozenInstanceError, field, fields, is_dataclass, replace
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
 
 __all__ = [
     "FrozenInstanceError",
@@ -162,6 +162,7 @@ class _Plain:
     """What the standard library makes of a class with one field, before it makes methods."""
 
     of: int
+    shared: ClassVar[int] = 0
 
 
 _OWN = {
@@ -172,26 +173,39 @@ _OWN = {
 _PARAMETERS = _Plain.__dataclass_params__  # type: ignore[attr-defined]
 _PARAMETERS.init = _PARAMETERS.repr = True
 _FIELD_TYPE = fields(_Plain)[0]._field_type  # type: ignore[attr-defined]  # noqa: SLF001
+_SHARED_TYPE = _Plain.__dataclass_fields__["shared"]._field_type  # type: ignore[attr-defined]  # noqa: SLF001
 _SPECIAL = ("ClassVar", "InitVar", "KW_ONLY")
+
+
+def _are_class_variables(cls: Any, names: set[str]) -> bool:
+    """Return whether names that are annotated so are nothing but that, where there are any."""
+    module = sys.modules.get(cls.__module__)
+    imported = not names or getattr(module, "ClassVar", None) is ClassVar
+    return imported and not any(isinstance(vars(cls).get(n), dataclasses.Field) for n in names)
 
 
 def _fields_of(cls: Any, *, kw_only: bool) -> dict[str, Any] | None:
     """Return the fields of a class as the standard library has them, with those of its bases.
 
-    It looks up what each annotation may mean, and none of ours means anything but a field; None
-    where that is not so, or something is wrong that it has a message for.
+    It looks up what each annotation may mean, and those of ours mean a field, or begin with
+    ClassVar; None where that is not so, or something is wrong that it has a message for.
     """
     own = vars(cls).get("__annotations__", {} if sys.version_info < (3, 14) else None)
     if own is None or not all(type(each) is str for each in own.values()):
         return None
-    text = " ".join(own.values())
-    if any(each in text for each in _SPECIAL):
+    shared = {name for name, each in own.items() if each.startswith("ClassVar[")}
+    text = " ".join(each for name, each in own.items() if name not in shared)
+    if any(each in text for each in _SPECIAL) or not _are_class_variables(cls, shared):
         return None
     every: dict[str, Any] = {}
     for base in cls.__mro__[-2:0:-1]:
         every.update(getattr(base, "__dataclass_fields__", ()))
     for name, annotation in own.items():
         found = vars(cls).get(name, _ABSENT)
+        if name in shared:
+            found = every[name] = field(default=found)
+            found.name, found.type, found._field_type = name, annotation, _SHARED_TYPE  # noqa: SLF001
+            continue
         if not isinstance(found, dataclasses.Field):
             if found is _ABSENT and name in every:
                 found = getattr(cls, name, _ABSENT)  # a base's default, unless it is its slot

@@ -331,7 +331,7 @@ def _describe(event: Event) -> str | None:
     return None
 
 
-@_describe.register
+@_describe.register(RunStarted)
 def _(event: RunStarted) -> str:
     return (
         f"{event.system}: {_count(len(event.nodes), 'node')} in "
@@ -340,7 +340,7 @@ def _(event: RunStarted) -> str:
     )
 
 
-@_describe.register
+@_describe.register(ProcessChanged)
 def _(event: ProcessChanged) -> str:
     pid = f" (pid {event.pid})" if event.pid else ""
     return f"process {event.process}: {event.state.value}{pid}" + (
@@ -348,13 +348,13 @@ def _(event: ProcessChanged) -> str:
     )
 
 
-@_describe.register
+@_describe.register(NodeChanged)
 def _(event: NodeChanged) -> str:
     same = not event.state or event.reach is not Reach.ACTIVE or event.state == "active"
     return f"{event.node}: {event.reach.value}" + ("" if same else f", but {event.state}")
 
 
-@_describe.register
+@_describe.register(WiringChanged)
 def _(event: WiringChanged) -> str:
     again = f" (try {event.attempt})" if event.attempt > 1 else ""
     if event.error:
@@ -367,25 +367,25 @@ def _(event: WiringChanged) -> str:
     return f"{event.node}: disconnected from {event.connection}"
 
 
-@_describe.register
+@_describe.register(WiringLost)
 def _(event: WiringLost) -> str:
     what = f"{event.endpoint} on " if event.endpoint else ""
     return f"{event.node}: lost {what}{event.connection or 'its own participant'}"
 
 
-@_describe.register
+@_describe.register(NodeSilent)
 def _(event: NodeSilent) -> str:
     return f"{event.node}: silent; {event.message}"
 
 
-@_describe.register
+@_describe.register(NodeAlive)
 def _(event: NodeAlive) -> str:
     if not event.there:
         return f"{event.node}: not silent any more after {event.silent_s:.1f} s, but not there yet"
     return f"{event.node}: alive again after {event.silent_s:.1f} s"
 
 
-@_describe.register
+@_describe.register(MachineConnection)
 def _(event: MachineConnection) -> str:
     if not event.established:
         what = "was shut down by its supervisor" if event.left else "connection lost"
@@ -394,12 +394,12 @@ def _(event: MachineConnection) -> str:
     return f"machine {event.machine}: connected{again}"
 
 
-@_describe.register
+@_describe.register(LogLine)
 def _(event: LogLine) -> str:
     return f"[{event.process}] {event.line}"
 
 
-@_describe.register
+@_describe.register(VerdictChanged)
 def _(event: VerdictChanged) -> str:
     waits = missing(event.verdict)
     if waits and event.stage is Stage.CONNECTED:
@@ -407,32 +407,32 @@ def _(event: VerdictChanged) -> str:
     return f"{event.stage.value}: {verdict_line(event.verdict)}"
 
 
-@_describe.register
+@_describe.register(GateOpened)
 def _(event: GateOpened) -> str:
     trusted = f"; taken on trust: {event.trusted}" if event.trusted else ""
     activating = f"activating {_count(len(event.nodes), 'node')}"
     return f"gate open on verdict {event.outcome}: {activating}{trusted}"
 
 
-@_describe.register
+@_describe.register(SystemReached)
 def _(event: SystemReached) -> str:
     return f"system {event.reached} after {event.elapsed_s:.2f} s"
 
 
-@_describe.register
+@_describe.register(StageTimed)
 def _(event: StageTimed) -> str:
     last = f"  last {event.last}" if event.last else ""
     return f"stage {event.stage:<10}  {event.took_s:7.3f} s  at {event.elapsed_s:7.3f} s{last}"
 
 
-@_describe.register
+@_describe.register(Failure)
 def _(event: Failure) -> str:
     # What ends the run comes first in the last verdict; once is enough.
     named = f"failed: {event.subject} ({event.rule})"
     return named if event.ends_run else f"{named}: {event.message}"
 
 
-@_describe.register
+@_describe.register(RestartScheduled)
 def _(event: RestartScheduled) -> str:
     last = f"; its last line: {event.stderr}" if event.stderr else ""
     others = len(event.nodes) - 1
@@ -440,7 +440,7 @@ def _(event: RestartScheduled) -> str:
     return f"{event.process} is started again in {event.in_s:.1f} s{with_it}{last}"
 
 
-@_describe.register
+@_describe.register(Restarted)
 def _(event: Restarted) -> str:
     return (
         f"{event.process} is back {event.took_s:.2f} s after its failure; "
@@ -448,25 +448,25 @@ def _(event: Restarted) -> str:
     )
 
 
-@_describe.register
+@_describe.register(GaveUp)
 def _(event: GaveUp) -> str:
     return f"gave up {event.process} after {_count(len(event.history), 'failure')}"
 
 
-@_describe.register
+@_describe.register(ConsequenceTaken)
 def _(event: ConsequenceTaken) -> str:
     whom = f" {', '.join(event.nodes)}" if event.nodes else ""
     return f"on_violation: {event.action}{whom} for {event.rule} of {event.subject}"
 
 
-@_describe.register
+@_describe.register(ModeEntered)
 def _(event: ModeEntered) -> str:
     without = f", without {', '.join(event.inactive)}" if event.inactive else ""
     others = f", other parameters of {', '.join(event.parameters)}" if event.parameters else ""
     return f"mode {event.mode}{without}{others}"
 
 
-@_describe.register
+@_describe.register(ManifestApplied)
 def _(event: ManifestApplied) -> str:
     what = {
         "added": event.added,
@@ -484,17 +484,17 @@ def _(event: ManifestApplied) -> str:
     return said[event.stage]
 
 
-@_describe.register
+@_describe.register(Notice)
 def _(event: Notice) -> str:
     return event.message
 
 
-@_describe.register
+@_describe.register(Stopping)
 def _(event: Stopping) -> str:
     return f"stopping: {event.reason}"
 
 
-@_describe.register
+@_describe.register(Stopped)
 def _(event: Stopped) -> str:
     return f"stopped after {event.elapsed_s:.2f} s"
 

@@ -7,7 +7,7 @@ import dataclasses as standard
 import inspect
 import pickle
 import typing
-from typing import Any
+from typing import Any, ClassVar  # noqa: F401 - annotations name it
 
 import pytest
 
@@ -124,6 +124,10 @@ def _variants(module: Any) -> list[Any]:
     made: list[Any] = []
     for annotated, defaults in (
         ({"x": "int", "shared": f"{typing.__name__}.ClassVar[int]"}, {"shared": 4}),
+        ({"x": "int", "shared": "ClassVar[int]"}, {"shared": 4}),
+        ({"x": "int", "shared": "ClassVar[int]", "other": "ClassVar[str]"}, {"shared": [4]}),
+        ({"x": "int", "shared": "ClassVar[int]", "_": "standard.KW_ONLY", "y": "int"}, {"y": 2}),
+        ({"x": "int", "y": "ClassVarious"}, {"y": 3}),
         ({"x": int, "y": "str"}, {"y": "text"}),
         ({"x": "int", "_": "standard.KW_ONLY", "y": "int"}, {"y": 2}),
         ({"x": "int", "y": "int"}, {"y": module.field(default=3, compare=False, kw_only=True)}),
@@ -141,6 +145,7 @@ def test_annotations_mean_what_they_mean_to_the_standard_library() -> None:
         one = cls(x=1)
         return (
             [(each.name, str(each.type), each.kw_only) for each in standard.fields(cls)],
+            [(name, str(each._field_type)) for name, each in cls.__dataclass_fields__.items()],
             [str(each) for each in inspect.signature(cls).parameters.values()],
             (cls.__slots__, cls.__match_args__, getattr(one, "shared", None)),
             (repr(one), one == cls(x=1), hasattr(one, "__dict__")),
