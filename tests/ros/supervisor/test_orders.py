@@ -253,7 +253,8 @@ def test_without_being_asked_it_only_says_how_it_is_and_nobody_says_it_in_its_pl
             lambda: (
                 [
                     each.name
-                    for each in panel.diagnostics[-1].status
+                    for latest in panel.diagnostics[-1:]
+                    for each in latest.status
                     if each.level == DiagnosticStatus.ERROR and "rqt_panel" in each.message
                 ]
                 == ["pair: graph.undeclared-publisher"]
