@@ -69,12 +69,15 @@ from .rcl.graph_changes import is_server_matched as is_server_matched
 from .rcl.graph_queries import EndpointInfo as EndpointInfo
 from .rcl.graph_queries import endpoints_of as endpoints_of
 from .rcl.hidden_node import hidden_nodes as hidden_nodes
+from .rcl.library_loading import await_loading as await_loading
+from .rcl.library_loading import begin_loading as begin_loading
+from .rcl.library_loading import load_libraries as load_libraries
 from .rcl.matched_peers import guid_of as guid_of
-from .rcl.matched_peers import load_libraries as load_libraries
 from .rcl.matched_peers import matched_with as matched_with
 from .rcl.qos import UnknownInterfaceError as UnknownInterfaceError
 from .rcl.qos import from_rclpy as from_rclpy
 from .rcl.qos import import_interface as import_interface
+from .rcl.qos import import_service_events as import_service_events
 from .rcl.qos import load_type_support as load_type_support
 from .rcl.qos import to_rclpy as to_rclpy
 from .rcl.rclpy_nodes import RCLError as RCLError

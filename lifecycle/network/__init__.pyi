@@ -89,6 +89,7 @@ from .ports import participant_ports as participant_ports
 from .ports import ports_of_participants as ports_of_participants
 from .ports import read_ephemeral_range as read_ephemeral_range
 from .ports import safe_domains as safe_domains
+from .ports import unicast_pairs as unicast_pairs
 from .ports import unique_flow_ports as unique_flow_ports
 from .rmw_capabilities import DEFAULT_RMW as DEFAULT_RMW
 from .rmw_capabilities import Capability as Capability

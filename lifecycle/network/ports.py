@@ -179,6 +179,18 @@ def ports_of_participants(domain_id: int, participants: int) -> Iterator[Partici
             yield participant_ports(domain_id, participant)
 
 
+def unicast_pairs(domain_id: int) -> list[tuple[int, int]]:
+    """Return the ports for discovery and user data of all participants that a host can have.
+
+    Args:
+        domain_id: 0–232.
+    """
+    first = participant_ports(domain_id, 0)
+    between = first.user_unicast - first.discovery_unicast
+    end = min(first.discovery_unicast + PG * PARTICIPANTS_PER_DOMAIN, MAX_PORT + 1 - between)
+    return [(port, port + between) for port in range(first.discovery_unicast, end, PG)]
+
+
 def owner_of(port: int) -> PortUse | None:
     """Return the domain and role that the formula gives a port; None where it gives none."""
     domain_id, offset = divmod(port - PB, DG)

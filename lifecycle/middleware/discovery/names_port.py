@@ -10,8 +10,9 @@ are read from proc(5). Must not import rclpy.
 from __future__ import annotations
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.fastdds.url_check import open_sockets, udp_sockets
-from lifecycle.network import PARTICIPANTS_PER_DOMAIN, UDP_UNICAST, ports_of_participants
+from lifecycle.middleware.fastdds.dscp import own_udp_ports
+from lifecycle.middleware.fastdds.url_check import udp_sockets
+from lifecycle.network import unicast_pairs
 
 
 def pairs_are_whole(domain_id: int) -> bool:
@@ -21,7 +22,9 @@ def pairs_are_whole(domain_id: int) -> bool:
         domain_id: 0–232.
     """
     ports = {each.port for each in udp_sockets()}
-    return all(user not in ports or discovery in ports for discovery, user in _pairs(domain_id))
+    return all(
+        user not in ports or discovery in ports for discovery, user in unicast_pairs(domain_id)
+    )
 
 
 def check_own_pair(domain_id: int) -> None:
@@ -33,16 +36,10 @@ def check_own_pair(domain_id: int) -> None:
     Raises:
         MiddlewareError: it has only the first port of a pair.
     """
-    ports = {each.port for each in open_sockets(kinds=UDP_UNICAST)}
-    for discovery, user in _pairs(domain_id):
+    ports = own_udp_ports()
+    for discovery, user in unicast_pairs(domain_id):
         if discovery in ports and user not in ports:
             raise MiddlewareError(
                 f"cannot receive the names of other nodes: UDP port {user} is another process's",
                 hint="a participant took it just now; start again",
             )
-
-
-def _pairs(domain_id: int) -> list[tuple[int, int]]:
-    """Return the ports for discovery and user data of all participants that a host can have."""
-    every = ports_of_participants(domain_id, PARTICIPANTS_PER_DOMAIN)
-    return [(each.discovery_unicast, each.user_unicast) for each in every]

@@ -93,14 +93,30 @@ def own_udp_socket(family: int, port: int) -> socket.socket | None:
 
     What is set on it is set on the original. Close it.
     """
+    for each in _own_udp_sockets():
+        if each.family == family and each.getsockname()[1] == port:
+            return each.dup()
+    return None
+
+
+def own_udp_ports() -> frozenset[int]:
+    """Return the ports of this process's UDP sockets."""
+    return frozenset(each.getsockname()[1] for each in _own_udp_sockets())
+
+
+def _own_udp_sockets() -> Iterator[socket.socket]:
+    """Yield duplicates of this process's UDP sockets; each is closed when the next one is asked."""
     for number in socket_descriptors():
         with contextlib.suppress(OSError):  # closed since, or no socket any more
-            duplicate = socket.socket(fileno=os.dup(number))
-            same = (duplicate.family, duplicate.type) == (family, socket.SOCK_DGRAM)
-            if same and duplicate.getsockname()[1] == port:
-                return duplicate
-            duplicate.close()
-    return None
+            duplicate = os.dup(number)
+            try:
+                each = socket.socket(fileno=duplicate)
+            except OSError:
+                os.close(duplicate)
+                continue
+            with each:
+                if each.type == socket.SOCK_DGRAM and each.family in _FAMILY.values():
+                    yield each
 
 
 def socket_descriptors() -> list[int]:
@@ -128,15 +144,11 @@ def widen_discovery_buffers(domain_id: int) -> int:
     first = participant_ports(domain_id, 0).discovery_multicast
     ports = range(first, first + DG, 2)
     count = 0
-    for number in socket_descriptors():
-        # Closed since, or no socket any more.
-        with contextlib.suppress(OSError), socket.socket(fileno=os.dup(number)) as each:
-            if each.type != socket.SOCK_DGRAM or each.family not in _FAMILY.values():
-                continue
-            before = each.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
-            if before < _DISCOVERY_BYTES and each.getsockname()[1] in ports:
-                each.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _DISCOVERY_BYTES)
-                count += each.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) > before
+    for each in _own_udp_sockets():
+        before = each.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
+        if before < _DISCOVERY_BYTES and each.getsockname()[1] in ports:
+            each.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _DISCOVERY_BYTES)
+            count += each.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) > before
     return count
 
 

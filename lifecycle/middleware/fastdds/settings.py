@@ -79,12 +79,17 @@ class _String(ctypes.Structure):
     )
 
 
+@functools.lru_cache(maxsize=1)
+def _loaded() -> ctypes.CDLL:
+    return ctypes.CDLL(_LIBRARY)
+
+
 class _FastDds:
     """The loaded library; get it from `_library`."""
 
     def __init__(self) -> None:
         try:
-            library = ctypes.CDLL(_LIBRARY)
+            library = _loaded()
         except OSError as error:
             raise MiddlewareError(
                 f"cannot use Fast DDS, only {_KNOWN} is known: {error}", hint=abi.INSTALL
@@ -136,6 +141,16 @@ class _FastDds:
             yield address
         finally:
             self.destroy_qos(address)
+
+
+def load_functions() -> None:
+    """Load what participants are made and found through, for a process that forks others.
+
+    Raises:
+        MiddlewareError: no Fast DDS, or another version than is known.
+    """
+    _library()
+    _node_functions()
 
 
 @functools.lru_cache(maxsize=1)
@@ -208,7 +223,7 @@ def fast_dds_function(symbol: str, result: Any, *arguments: Any) -> Any:
     It loads the library: only for who has a participant of it, see `participant_of`.
     """
     try:
-        function = ctypes.CDLL(_LIBRARY)[symbol]
+        function = _loaded()[symbol]
     except (OSError, AttributeError):
         return None
     function.restype, function.argtypes = result, arguments
@@ -221,7 +236,7 @@ def fast_dds_address(symbol: str) -> int | None:
     As for `fast_dds_function`.
     """
     try:
-        return ctypes.addressof(ctypes.c_char.in_dll(ctypes.CDLL(_LIBRARY), symbol))
+        return ctypes.addressof(ctypes.c_char.in_dll(_loaded(), symbol))
     except (OSError, ValueError):
         return None
 
@@ -600,6 +615,9 @@ def _made_with_names(make: Callable[[], Any], check_names: Callable[[], None]) -
     return node
 
 
+_DRAFT = "lifecycle_draft_of_a_profile"
+
+
 @contextlib.contextmanager
 def participant_settings(context: Context, settings: ParticipantSettings) -> Iterator[None]:
     """Give the participant of `context` these settings: construct its first node in the block.
@@ -642,10 +660,9 @@ def participant_settings(context: Context, settings: ParticipantSettings) -> Ite
             stack.enter_context(with_endpoint_profiles(own))
         base = default_profile()
         # The name says what is in it: equal profiles are loaded once.
-        draft = profile("draft", settings, base=base, localhost_peers=peers, domain_id=domain_id)
+        draft = profile(_DRAFT, settings, base=base, localhost_peers=peers, domain_id=domain_id)
         name = f"lifecycle_{hashlib.sha256(draft.encode()).hexdigest()[:16]}"
-        xml = profile(name, settings, base=base, localhost_peers=peers, domain_id=domain_id)
-        load_profile(name, xml)
+        load_profile(name, draft.replace(_DRAFT, name))
         stack.enter_context(default_participant(name))
         if not settings.urls:
             yield

@@ -17,7 +17,7 @@ from typing import Any
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 
-from lifecycle.middleware.rcl import abi, graph_queries
+from lifecycle.middleware.rcl import abi
 
 _FASTDDS = "libfastrtps.so.2.14"
 _RTPS = "8eprosima8fastrtps4rtps"
@@ -174,10 +174,9 @@ class _MatchLibrary:
         return tuple(sorted(each for each in candidates if method(endpoint, bytes.fromhex(each))))
 
 
-def load_libraries() -> None:
-    """Load what every node asks rcl and Fast DDS through, for a process that forks hosts."""
+def load_library() -> None:
+    """Load what is asked through, for a process that forks others."""
     _library()
-    graph_queries.load_library()
 
 
 @functools.lru_cache(maxsize=1)

@@ -141,7 +141,7 @@ def load_type_support(name: str) -> None:
     if "/msg/" in name:
         check_is_valid_msg_type(found)
     elif "/srv/" in name:
-        _import_service_events()
+        import_service_events()
         check_is_valid_srv_type(found)
 
 
@@ -154,7 +154,7 @@ class _LateNumpy(types.ModuleType):
         return getattr(importlib.import_module("numpy"), name)
 
 
-def _import_service_events() -> None:
+def import_service_events() -> None:
     """Import what each service type needs without the numpy that this needs: 40 ms, 10 MiB.
 
     It has one array, the GID of who called, which is made where calls are introspected.

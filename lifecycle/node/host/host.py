@@ -106,6 +106,7 @@ def preload_shared() -> None:
 
     What `preload` says of threads, participants and sockets holds here, too.
     """
+    middleware.await_loading()
     for name in _SHARED:
         importlib.import_module(name)
     for name in _SHARED_NAMES:

@@ -74,8 +74,9 @@ class ObserverParticipant:
             MiddlewareError: it cannot be made.
         """
         from lifecycle.graph import Graph
-        from lifecycle.middleware import widen_discovery_buffers
+        from lifecycle.middleware import import_service_events, widen_discovery_buffers
 
+        import_service_events()  # else the first service that is asked imports numpy for them
         graph = Graph.in_loop(
             domain_id,
             connections,

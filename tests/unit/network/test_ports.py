@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from lifecycle.network.ports import (
     EPHEMERAL_RANGE_FILE,
+    PARTICIPANTS_PER_DOMAIN,
     Capacity,
     EphemeralRange,
     ParticipantPorts,
@@ -20,8 +21,10 @@ from lifecycle.network.ports import (
     overlaps,
     owner_of,
     participant_ports,
+    ports_of_participants,
     read_ephemeral_range,
     safe_domains,
+    unicast_pairs,
     unique_flow_ports,
 )
 
@@ -303,6 +306,13 @@ def test_participants_of_the_highest_domain_end_with_the_last_port() -> None:
         domain_id=232, role="discovery_multicast", participant_id=None
     )
     assert owner_of(65535) == PortUse(domain_id=232, role="user_unicast", participant_id=62)
+
+
+@pytest.mark.parametrize("domain", [0, 77, 101, 231, 232])
+def test_the_pairs_of_a_host_are_those_of_its_participants(domain: int) -> None:
+    every = ports_of_participants(domain, PARTICIPANTS_PER_DOMAIN)
+    expected = [(each.discovery_unicast, each.user_unicast) for each in every]
+    assert unicast_pairs(domain) == expected
 
 
 @pytest.mark.parametrize("offset", [0, 1])
