@@ -17,7 +17,6 @@ the file system.
 
 from __future__ import annotations
 
-import difflib
 import enum
 import functools
 import json
@@ -94,6 +93,8 @@ def look_up(type_: str, prefixes: Sequence[Path]) -> TypeLookup:
     package, _, name = type_.partition("/")
     found = find_resource(_RESOURCE, package, prefixes)
     if found is None:
+        import difflib  # only a mistake needs it
+
         # Packages share endings (`_msgs`, `_interfaces`), so only a near miss is a hint.
         known = list_resources(_RESOURCE, prefixes)
         similar = next(iter(difflib.get_close_matches(package, known, n=1, cutoff=0.85)), "")

@@ -9,7 +9,6 @@ which a document that fits needs no jsonschema. Pure but for reading the shipped
 
 from __future__ import annotations
 
-import difflib
 import functools
 import itertools
 import json
@@ -133,6 +132,8 @@ def nearest(word: str, known: Collection[str]) -> str:
     if len(known) > MAX_WORDS:
         return ""
     spelled = {each.lower(): each for each in known}
+    import difflib  # only a mistake needs it
+
     close = difflib.get_close_matches(word.lower(), spelled, n=1, cutoff=0.6)
     return spelled[close[0]] if close else ""
 

@@ -16,7 +16,6 @@ becomes is decided in middleware/. Pure.
 from __future__ import annotations
 
 import contextlib
-import difflib
 import functools
 import ipaddress
 import re
@@ -52,6 +51,8 @@ class Peer:
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """Return a hint with the known name that is nearest; empty if none is near."""
+    import difflib  # only a mistake needs it
+
     close = difflib.get_close_matches(word.lower(), list(known), n=1, cutoff=0.6)
     return f"did you mean {close[0]!r}?" if close else ""
 

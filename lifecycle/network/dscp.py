@@ -11,7 +11,6 @@ are always shown side by side.
 
 from __future__ import annotations
 
-import difflib
 import functools
 import re
 from typing import Annotated
@@ -105,6 +104,8 @@ def _named(text: str) -> int:
     name = text.strip().upper().replace("_", "-")
     if (found := _by_name().get(name)) is not None:
         return found.dscp
+    import difflib  # only a mistake needs it
+
     close = difflib.get_close_matches(name, _by_name(), n=len(_by_name()))
     # Many names are equally near (AF14: AF13, AF41); people mistype the last digit, not the first.
     nearest = max(close, key=lambda each: each[:-1] == name[:-1], default="")

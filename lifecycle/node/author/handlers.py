@@ -7,7 +7,6 @@ an endpoint. Pure: knows no rclpy.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, TypeVar
 
@@ -321,6 +320,8 @@ def _without_handler(
 
 def nearest(name: str, candidates: Iterable[str]) -> str:
     """Return the candidate spelt most like `name`, or "" if none is near."""
+    import difflib  # only a mistake needs it
+
     found = difflib.get_close_matches(name, list(candidates), n=1, cutoff=0.6)
     return found[0] if found else ""
 

@@ -8,7 +8,6 @@ before `serve`.
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import importlib
 import os
@@ -76,17 +75,12 @@ _SERVICES = (
 """What every node of ours has; their type supports are libraries that load on first use."""
 
 
-def preload(names: Iterable[str] = ()) -> None:
+def preload() -> None:
     """Import everything a host needs, for a process that will fork hosts.
 
     Makes no participant and opens no socket, so a fork afterwards is safe. The only threads are
     those of libraries that a child can do without: LTTng's two listeners, numpy's OpenBLAS pool.
     Call `gc.freeze()` after it to keep the imported pages shared.
-
-    Args:
-        names: what only some nodes need, see `needed_by`; numpy alone, which most messages with
-            arrays import, takes 60 ms, and not all need it. What cannot be imported is left to the
-            host that needs it, which reports it.
     """
     for name in _PRELOADED:
         importlib.import_module(name)
@@ -94,11 +88,21 @@ def preload(names: Iterable[str] = ()) -> None:
 
     for interface in (*_MESSAGES, *_SERVICES):
         _load(interface)
+    load_libraries()
+    _rehearse()
+
+
+def preload_for_some(names: Iterable[str]) -> None:
+    """Import what only some nodes need, after `preload`, of which the rest holds here, too.
+
+    Args:
+        names: see `needed_by`; numpy alone, which most messages with arrays import, takes 60 ms,
+            and not all need it. What cannot be imported is left to the host that needs it, which
+            reports it.
+    """
     for name in names:
         with contextlib.suppress(Exception):
             _load(name)
-    load_libraries()
-    _rehearse()
 
 
 def preload_shared() -> None:
@@ -182,7 +186,7 @@ def _load(name: str) -> None:
 
 
 def needed_by(nodes: Iterable[PlannedNode]) -> tuple[str, ...]:
-    """Return what `preload` is to import for some nodes: modules and interface types."""
+    """Return what `preload_for_some` is to import: modules and interface types."""
     names: dict[str, None] = {}
     for node in nodes:
         if node.run.kind is RunKind.PYTHON and _calculates(node):
@@ -216,7 +220,7 @@ def _calculates(node: PlannedNode) -> bool:
     return False
 
 
-__all__ = ["main", "needed_by", "preload", "serve"]
+__all__ = ["main", "needed_by", "preload", "preload_for_some", "serve"]
 
 
 def main(control_socket_fd: int) -> NoReturn:
@@ -248,6 +252,8 @@ def serve(control: socket.socket) -> NoReturn:
 
 
 def _main() -> NoReturn:
+    import argparse
+
     parser = argparse.ArgumentParser(prog="python -m lifecycle.node.host.host", description=__doc__)
     parser.add_argument("--control-fd", type=int, required=True, help="inherited AF_UNIX socket")
     main(parser.parse_args().control_fd)

@@ -14,7 +14,6 @@ none of them writes to a pipe without a reader.
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import gc
 import os
@@ -224,7 +223,7 @@ class _ForkServer:
         elif word in (KEEP, RELEASE):
             self._keep(message, descriptors)
         elif word == PRELOAD:
-            _preload(lines)
+            _preload_for_some(lines)
 
     def _fork(self, request: ForkRequest, descriptors: list[int]) -> None:
         if request == SERVES:
@@ -477,16 +476,29 @@ def _idle_blas() -> Iterator[None]:
             del os.environ[_BLAS_TIMEOUT]
 
 
-def _preload(names: Iterable[str]) -> None:
-    """Import what hosts need, and keep its pages shared: a first collection would touch them.
+def _preload() -> None:
+    from lifecycle.node import preload
+
+    with _pages_shared():
+        preload()
+
+
+def _preload_for_some(names: Iterable[str]) -> None:
+    from lifecycle.node import preload_for_some
+
+    with _pages_shared():
+        preload_for_some(names)
+
+
+@contextlib.contextmanager
+def _pages_shared() -> Iterator[None]:
+    """Keep the pages of what is imported inside shared: a first collection would touch them.
 
     None takes place meanwhile: importing makes next to no garbage, and a lot to look through.
     """
-    from lifecycle.node import preload
-
     gc.disable()
     with _idle_blas():
-        preload(names)
+        yield
     fill_heap()
     gc.freeze()
     gc.enable()
@@ -551,28 +563,23 @@ def become(
 
 
 def main(mask: Iterable[int] | None = None) -> NoReturn:
-    """Run the fork server.
+    """Run the fork server: the arguments of this program are what a ForkServerProcess gives it.
 
     Args:
         mask: of signals, once they are handled; None leaves it.
     """
-    parser = argparse.ArgumentParser(prog=f"python -m {__spec__.name}")
-    parser.add_argument("socket_fd", type=int)
-    parser.add_argument("--preload", action="store_true")
-    parser.add_argument("--programs", action="store_true", help="its supervisor programs networks")
-    parser.add_argument("--again", action="store_true", help="another one before it was killed")
-    options = parser.parse_args()
+    descriptor, *options = sys.argv[1:]
     # Ctrl-C is the supervisor's to handle, and its end is what ends us.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     if mask is not None:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
     adopt_orphans()
-    if options.programs and os.geteuid() != 0:
+    if "--programs" in options and os.geteuid() != 0:
         drop_network_administration()
-    if options.preload:
-        _preload(())
-    _ForkServer(socket.socket(fileno=options.socket_fd), again=options.again).serve()
+    if "--preload" in options:
+        _preload()
+    _ForkServer(socket.socket(fileno=int(descriptor)), again="--again" in options).serve()
     os._exit(0)
 
 

@@ -450,8 +450,8 @@ os._exit(os.waitstatus_to_exitcode(os.wait()[1]))
 
 def test_what_hosts_are_forked_from_imports_only_what_every_node_needs() -> None:
     code = (
-        "import sys; from lifecycle.node import preload; preload(); "
-        "print(*sys.modules); preload(['example_interfaces/msg/No', 'rclpy.action']); "
+        "import sys; from lifecycle.node import preload, preload_for_some; preload(); "
+        "print(*sys.modules); preload_for_some(['example_interfaces/msg/No', 'rclpy.action']); "
         "print('rclpy.action' in sys.modules)"
     )
     modules, also = subprocess.check_output(
