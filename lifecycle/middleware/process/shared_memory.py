@@ -58,6 +58,7 @@ _LOCK_FIELDS = 8
 _AGAIN_S = 0.02
 """So often it is tried again to remove what others still use: no event says that they let go."""
 
+_PORT = "fastrtps_port"
 _Inode = tuple[int, int]
 """(device, inode number)."""
 
@@ -109,7 +110,7 @@ class _SharedFile:
 
     @property
     def is_port(self) -> bool:
-        return self.group.startswith("fastrtps_port")
+        return self.group.startswith(_PORT)
 
 
 def segments_of(pids: Iterable[int]) -> frozenset[str]:
@@ -135,19 +136,26 @@ def segments_by_holder() -> dict[int, frozenset[str]]:
     files = _files()
     locks = {file.inode: file.group for file in files if file.is_lock}
     held: dict[int, set[str]] = {}
-    if locks:
-        for line in Path("/proc/locks").read_text(encoding="ascii").splitlines():
-            fields = line.split()
-            if len(fields) < _LOCK_FIELDS or fields[1] != "FLOCK":
-                continue
-            major, minor, inode = fields[5].split(":")
-            device = os.makedev(int(major, 16), int(minor, 16))
-            if group := locks.get((device, int(inode))):
-                held.setdefault(int(fields[4]), set()).add(group)
+    for pid, inode in _locks() if locks else ():
+        if group := locks.get(inode):
+            held.setdefault(pid, set()).add(group)
     return {
         pid: frozenset(file.path.name for file in files if file.group in groups)
         for pid, groups in held.items()
     }
+
+
+def _locks() -> Iterator[tuple[int, _Inode]]:
+    """Yield who holds a lock on a whole file, and on which, of this PID namespace.
+
+    Raises:
+        OSError: see `segments_by_holder`.
+    """
+    for line in Path("/proc/locks").read_text(encoding="ascii").splitlines():
+        fields = line.split()
+        if len(fields) >= _LOCK_FIELDS and fields[1] == "FLOCK":
+            major, minor, inode = fields[5].split(":")
+            yield int(fields[4]), (os.makedev(int(major, 16), int(minor, 16)), int(inode))
 
 
 def still_there(groups: Collection[str]) -> frozenset[str]:
@@ -247,10 +255,19 @@ def disown_ports() -> tuple[str, ...]:
         Their names, sorted.
     """
     groups: dict[str, list[_SharedFile]] = {}
-    for file in _files():
-        if file.is_port and file.uid == os.getuid():
+    for file in _files(of_ports=True):
+        if file.uid == os.getuid():
             groups.setdefault(file.group, []).append(file)
-    return tuple(sorted(group for group, files in groups.items() if _disowned(group, files)))
+    used: set[_Inode] = set()
+    with contextlib.suppress(OSError):  # each is tried then
+        used = {inode for _, inode in _locks()} if groups else used
+    return tuple(
+        sorted(
+            group
+            for group, files in groups.items()
+            if used.isdisjoint(file.inode for file in files) and _disowned(group, files)
+        )
+    )
 
 
 def _disowned(group: str, files: Collection[_SharedFile]) -> bool:
@@ -273,7 +290,6 @@ def _disowned(group: str, files: Collection[_SharedFile]) -> bool:
     return False
 
 
-_PORT = "fastrtps_port"
 _PORT_NODE = struct.Struct("=7I")
 """From port_id to the flags of SharedMemGlobal::PortNode in Fast DDS 2.14."""
 _OK, _READ_AND_OK = 1, 5
@@ -360,12 +376,12 @@ def _claim(file: _SharedFile) -> Iterator[None]:
         os.close(descriptor)
 
 
-def _files(group: str = "") -> list[_SharedFile]:
-    """Return the files of one group, or of all."""
+def _files(group: str = "", *, of_ports: bool = False) -> list[_SharedFile]:
+    """Return the files of one group, or of all, or of all ports."""
     found = []
     for entry in _listing(_DIRECTORY):
         of = _group(entry.name)
-        if not of or (group and of != group):
+        if not of or (group and of != group) or (of_ports and not of.startswith(_PORT)):
             continue
         with contextlib.suppress(FileNotFoundError):
             status = entry.stat(follow_symlinks=False)

@@ -264,12 +264,41 @@ def test_senders_let_go_of_the_port_of_a_dead_process_where_its_memory_is_as_kno
     assert disown_ports() == ()
 
 
-def test_the_port_of_a_living_process_stays_as_it_is(directory: Path) -> None:
+@pytest.mark.parametrize("are_listed", [True, False])
+def test_the_port_of_a_living_process_stays_as_it_is(
+    directory: Path, monkeypatch: pytest.MonkeyPatch, are_listed: bool
+) -> None:
+    if not are_listed:  # those of another PID namespace, or where proc(5) has none
+        monkeypatch.setattr(shared_memory, "_locks", lambda: iter(()))
     make(directory, *GROUP)
     (directory / PORT).write_bytes(port_node())
     with (directory / f"{PORT}_el").open("rb") as owner:
         fcntl.flock(owner, fcntl.LOCK_EX)
         assert disown_ports() == ()
+    assert disown_ports() == (PORT,)
+
+
+def test_a_port_that_is_locked_is_not_opened(
+    directory: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make(directory, *GROUP)
+    (directory / PORT).write_bytes(port_node())
+    monkeypatch.setattr(shared_memory, "_port_flags", lambda *_: pytest.fail("it is opened"))
+    with (directory / f"{PORT}_el").open("rb") as owner:
+        fcntl.flock(owner, fcntl.LOCK_EX)
+        assert disown_ports() == ()
+
+
+def test_ports_are_let_go_of_where_the_kernel_lists_no_locks(
+    directory: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused() -> Iterator[tuple[int, tuple[int, int]]]:
+        raise PermissionError
+        yield
+
+    monkeypatch.setattr(shared_memory, "_locks", refused)
+    make(directory, *GROUP)
+    (directory / PORT).write_bytes(port_node())
     assert disown_ports() == (PORT,)
 
 
