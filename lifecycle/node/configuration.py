@@ -20,7 +20,6 @@ import threading
 import traceback
 import weakref
 from collections.abc import Callable, Iterable
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rclpy.exceptions import InvalidHandle
@@ -71,8 +70,8 @@ if TYPE_CHECKING:
 __all__ = ["PARADIGMS", "SERIALIZATIONS", "transports"]
 
 _CONFIGURABLE_RMW = "rmw_fastrtps_cpp"
-_SHARED_MEMORY = Path("/dev/shm")  # noqa: S108 - what Fast DDS uses
-_IPV6_ADDRESSES = Path("/proc/net/if_inet6")
+_SHARED_MEMORY = "/dev/shm"  # noqa: S108 - what Fast DDS uses
+_IPV6_ADDRESSES = "/proc/net/if_inet6"
 
 
 @functools.lru_cache(maxsize=1)
@@ -94,7 +93,8 @@ def _is_here(medium: Medium) -> bool:
     if medium.ip_version != 6:
         return True
     try:
-        return bool(_IPV6_ADDRESSES.read_text(encoding="ascii").strip())
+        with open(_IPV6_ADDRESSES, encoding="ascii") as file:  # noqa: PTH123 - see default_profile
+            return bool(file.read().strip())
     except OSError:  # a kernel without IPv6
         return False
 

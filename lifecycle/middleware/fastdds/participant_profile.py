@@ -18,7 +18,6 @@ import copy
 import ipaddress
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 from xml.etree import ElementTree as ET
 
 from lifecycle import dataclasses
@@ -324,17 +323,22 @@ def default_profile(environment: Mapping[str, str] | None = None) -> DefaultProf
         MiddlewareError: a file cannot be read, or is no XML.
     """
     current = os.environ if environment is None else environment
-    paths = []
+    files = []
     if current.get(PROFILES_FILE_VARIABLE):
-        paths.append(Path(current[PROFILES_FILE_VARIABLE]))
-    if current.get(_SKIP_DEFAULT_FILE_VARIABLE, "")[:1] != "1" and Path(DEFAULT_FILE).exists():
-        paths.append(Path(DEFAULT_FILE))
+        files.append(current[PROFILES_FILE_VARIABLE])
+    if current.get(_SKIP_DEFAULT_FILE_VARIABLE, "")[:1] != "1" and _has_default_file():
+        files.append(DEFAULT_FILE)
     found = None
-    for path in paths:
-        for element in _default_participants(path):
+    for file in files:
+        for element in _default_participants(file):
             name = element.get("profile_name", "")
-            found = DefaultProfile(file=str(path), name=name, element=element)
+            found = DefaultProfile(file=file, name=name, element=element)
     return found
+
+
+def _has_default_file() -> bool:
+    # Not by pathlib: each host looks, and has what that is of in memory of its own then.
+    return os.path.exists(DEFAULT_FILE)  # noqa: PTH110
 
 
 def profile(
@@ -458,7 +462,7 @@ def are_names_open(environment: Mapping[str, str]) -> bool:
     """
     base = default_profile(environment)
     is_ours = base.name == PROFILE_NAME if base else not environment.get(PROFILES_FILE_VARIABLE)
-    return is_ours and not Path(DEFAULT_FILE).exists()
+    return is_ours and not _has_default_file()
 
 
 def _set_unannounced(config: ET.Element) -> None:
@@ -592,13 +596,14 @@ def _set_property(rtps: ET.Element, name: str, value: str) -> None:
     _text(element, "value", value)
 
 
-def _default_participants(path: Path) -> Iterator[ET.Element]:
+def _default_participants(file: str) -> Iterator[ET.Element]:
     try:
-        root = ET.fromstring(path.read_bytes())  # noqa: S314 - Fast DDS itself trusts this file
+        with open(file, "rb") as opened:  # noqa: PTH123
+            root = ET.fromstring(opened.read())  # noqa: S314 - Fast DDS itself trusts this file
     except OSError as error:
-        raise MiddlewareError(f"cannot read profiles {str(path)!r}: {error.strerror}") from error
+        raise MiddlewareError(f"cannot read profiles {file!r}: {error.strerror}") from error
     except ET.ParseError as error:
-        raise MiddlewareError(f"cannot read profiles {str(path)!r}: {error}") from error
+        raise MiddlewareError(f"cannot read profiles {file!r}: {error}") from error
     for element in root.iter():
         # Fast DDS does not look at namespaces; with them, no name would be found here.
         if isinstance(element.tag, str):

@@ -68,6 +68,8 @@ def families(urls: Sequence[ConnectionUrl]) -> tuple[UrlTransport, ...]:
     Raises:
         MiddlewareError: URLs that one participant cannot have together.
     """
+    if not urls:
+        return ()
     by_kind: dict[Medium, list[ConnectionUrl]] = {}
     for url in urls:
         by_kind.setdefault(transport_of(url), []).append(url)

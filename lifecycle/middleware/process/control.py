@@ -476,15 +476,17 @@ def _failed(call: str) -> MiddlewareError:
     return MiddlewareError(f"cannot use {call}: {os.strerror(ctypes.get_errno())}")
 
 
-@functools.lru_cache(maxsize=1)
 def machine_id() -> str:
     """Return what distinguishes this machine from others.
 
     It is $LIFECYCLE_MACHINE_ID where that is set, else /etc/machine-id (machine-id(5)), else the
     kernel's boot id. Nodes of one id are taken to share memory and loopback.
     """
-    if given := os.environ.get(MACHINE_ID_VARIABLE):
-        return given
+    return os.environ.get(MACHINE_ID_VARIABLE) or _own_machine_id()
+
+
+@functools.lru_cache(maxsize=1)
+def _own_machine_id() -> str:
     for path in ("/etc/machine-id", "/proc/sys/kernel/random/boot_id"):
         try:
             found = Path(path).read_text(encoding="ascii").strip()

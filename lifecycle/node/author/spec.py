@@ -18,7 +18,6 @@ import os
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from lifecycle import dataclasses
@@ -203,8 +202,9 @@ def _look_in(folders: Iterable[str]) -> tuple[str, ...]:
     """Have modules looked for in more places, and return these."""
     # PYTHONPATH of the manifest's own `environment:` came after this interpreter started.
     given = [each for each in os.environ.get("PYTHONPATH", "").split(os.pathsep) if each]
-    here = [] if "" in sys.path else [str(Path.cwd())]
+    current = os.getcwd()  # noqa: PTH109 - it is a text
+    here = [] if "" in sys.path else [current]
     for each in reversed([*here, *folders, *given]):
         if each not in sys.path:
             sys.path.insert(0, each)
-    return tuple(dict.fromkeys([str(Path.cwd()), *folders, *given]))
+    return tuple(dict.fromkeys([current, *folders, *given]))

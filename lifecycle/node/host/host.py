@@ -125,10 +125,9 @@ _OFTEN = 8
 
 def _rehearse() -> None:
     """Do what every host does before it has a node: what is written meanwhile is shared after."""
-    import codecs
     import hashlib
 
-    from lifecycle.middleware import ParticipantSettings
+    from lifecycle.middleware import ParticipantSettings, machine_id
     from lifecycle.node.author.handlers import note_unmarked
     from lifecycle.node.author.node import LifecycleNode
     from lifecycle.node.author.spec import default_name, plan_without_manifest
@@ -138,7 +137,7 @@ def _rehearse() -> None:
         TransitionRequest,
     )
 
-    codecs.lookup("ascii")  # in which the machine's id is read
+    machine_id()
     hashlib.sha256()
     note_unmarked(LifecycleNode)
     node = plan_without_manifest(HostSpec, name=default_name(HostSpec), namespace="/")
