@@ -12,6 +12,8 @@ import importlib
 import os
 import signal
 import sys
+from types import FrameType
+from typing import NoReturn
 
 import click
 from click.shell_completion import CompletionItem
@@ -192,6 +194,8 @@ def program() -> int:
     verb = sys.argv[1:2]
     if verb == ["run"]:  # whose streams are the user's node's
         return main()
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _interrupt)
     code = own_streams(waits=verb != ["up"]).settled(main())
     if verb == ["up"]:
         # The interpreter takes a moment to end, and the reported result of the run is final.
@@ -211,6 +215,15 @@ def program() -> int:
     os._exit(code)
 
 
+_interrupts: list[int] = []
+
+
+def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
+    """Do what Python does by default, and note it."""
+    _interrupts.append(number)
+    signal.default_int_handler(number, frame)
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; the one place where exceptions become exit codes.
 
@@ -219,24 +232,30 @@ def main(arguments: list[str] | None = None) -> int:
     """
     try:
         result = cli.main(args=arguments, prog_name="lifecycle", standalone_mode=False)
-    except click.ClickException as error:
-        error.show()
-        return ExitCode.USAGE
     except (click.Abort, KeyboardInterrupt):
         return ExitCode.INTERRUPTED
-    except LifecycleError as error:
+    except Exception as error:  # noqa: BLE001 - the boundary: report our bug, whatever it is
+        # An import, or a class that is being made, raises an error of its own for an interrupt.
+        return ExitCode.INTERRUPTED if _interrupts else _report(error)
+    return int(result or 0)
+
+
+def _report(error: Exception) -> int:
+    """Say on standard error why a command failed; return its exit code."""
+    if isinstance(error, click.ClickException):
+        error.show()
+        return ExitCode.USAGE
+    if isinstance(error, LifecycleError):
         click.echo(lines(str(error)), err=True)
         return error.exit_code
-    except Exception as error:  # noqa: BLE001 - the boundary: report our bug, whatever it is
-        if isinstance(error, ImportError) and "rclpy" in f"{error.name} {error}":
-            # Of another Python, most often: ROS 2 has its C extensions for one version only.
-            version = sys.version.split()[0]
-            message = f"cannot import rclpy with Python {version}: {error}; {_NEEDS_ROS}"
-            click.echo(lines(" ".join(message.split())), err=True)
-            return ExitCode.USAGE
-        import traceback
+    if isinstance(error, ImportError) and "rclpy" in f"{error.name} {error}":
+        # Of another Python, most often: ROS 2 has its C extensions for one version only.
+        version = sys.version.split()[0]
+        message = f"cannot import rclpy with Python {version}: {error}; {_NEEDS_ROS}"
+        click.echo(lines(" ".join(message.split())), err=True)
+        return ExitCode.USAGE
+    import traceback
 
-        traceback.print_exc()
-        click.echo("this is a bug in lifecycle: please report it with the trace above", err=True)
-        return ExitCode.INTERNAL
-    return int(result or 0)
+    traceback.print_exception(error)
+    click.echo("this is a bug in lifecycle: please report it with the trace above", err=True)
+    return ExitCode.INTERNAL

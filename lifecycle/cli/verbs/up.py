@@ -161,6 +161,7 @@ def command(
             _collecting_later() as collect,
             Ending() as ending,
             ReportFile(report, strict=strict) as written,
+            ending.unmasked(),
         ):
             program = _networks(targets, **rest)
             # A Python of its own imports while we do and read the manifest. A fork of ours follows

@@ -35,7 +35,11 @@ def command(  # noqa: PLR0917 - click passes options by name
     from lifecycle.supervisor import Ended, Ending
 
     try:
-        with Ending() as ending, ReportFile(report, strict=strict) as written:
+        with (
+            Ending() as ending,
+            ReportFile(report, strict=strict) as written,
+            ending.unmasked(),
+        ):
             from lifecycle.plan import build_plan
             from lifecycle.supervisor import judge_running
 

@@ -21,16 +21,12 @@ import re
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, NoReturn
 
-import lazy_loader
-
 from lifecycle import dataclasses
 from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position
 from lifecycle.manifest.yaml.document import Document, Place, Scalar, Value, error, spell_place
 
 if TYPE_CHECKING:
     import yaml
-else:  # others need no more of this module than how a value is spelled
-    yaml = lazy_loader.load("yaml")
 
 INT64_MIN = -(2**63)
 INT64_MAX = 2**63 - 1
@@ -181,6 +177,8 @@ class _Composer:
         self._root: Value | None = None
 
     def run(self, text: str) -> tuple[Document, tuple[Diagnostic, ...]]:
+        import yaml  # others need no more of this module than how a value is spelled
+
         for event in self._events(text):
             start = event.start_mark
             mark = (start.line + 1, start.column + 1) if start else (1, 1)
@@ -191,7 +189,7 @@ class _Composer:
             elif isinstance(event, yaml.AliasEvent):
                 self._alias(event.anchor, mark)
             elif isinstance(event, (yaml.MappingStartEvent, yaml.SequenceStartEvent)):
-                self._open(event, mark)
+                self._open(event, mark, mapping=isinstance(event, yaml.MappingStartEvent))
             elif isinstance(event, (yaml.MappingEndEvent, yaml.SequenceEndEvent)):
                 self._close()
             elif isinstance(event, yaml.ScalarEvent):
@@ -201,6 +199,8 @@ class _Composer:
         return Document(file=self._file, root=self._root), tuple(self._found)
 
     def _events(self, text: str) -> Iterator[yaml.Event]:
+        import yaml
+
         try:
             yield from yaml.parse(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
         except yaml.YAMLError as problem:
@@ -211,9 +211,10 @@ class _Composer:
 
     # -- events
 
-    def _open(self, event: yaml.CollectionStartEvent, mark: tuple[int, int]) -> None:
+    def _open(
+        self, event: yaml.CollectionStartEvent, mark: tuple[int, int], *, mapping: bool
+    ) -> None:
         self._refuse_tag(event.tag, mark)
-        mapping = isinstance(event, yaml.MappingStartEvent)
         if self._wants_key():
             self._stop(
                 mark, f"cannot use a {'mapping' if mapping else 'list'} as a key", "use a string"

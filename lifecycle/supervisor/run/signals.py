@@ -58,6 +58,7 @@ class Ending:
     def __init__(self) -> None:
         self.number: int | None = None
         self._raises = True
+        self._raised = False
         self._found: dict[int, Callable[[int, FrameType | None], object] | int | None] = {}
 
     def __enter__(self) -> Ending:  # noqa: PYI034 - typing.Self is not in Python 3.10
@@ -86,6 +87,23 @@ class Ending:
         """
         if self.number is not None:
             raise Ended(self.number)
+
+    @contextlib.contextmanager
+    def unmasked(self) -> Iterator[None]:
+        """Within, what came of a signal's exception on its way out is that exception again.
+
+        Python raises one of its own instead where a class or an extension module is being made, and
+        where a hash is asked for, even without naming what it was.
+
+        Raises:
+            Ended: a signal was raised.
+        """
+        try:
+            yield
+        except Exception as error:
+            if not self._raised or self.number is None:
+                raise
+            raise Ended(self.number) from error
 
     @contextlib.contextmanager
     def noted(self) -> Iterator[None]:
@@ -120,4 +138,5 @@ class Ending:
         if self.number is None:
             self.number = number
         if self._raises:
+            self._raised = True
             raise Ended(number)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
 import types
 from collections.abc import Callable
@@ -86,3 +87,55 @@ def test_a_process_without_ros_ends_at_once_and_loads_none_of_it(
     with pytest.raises(_EndedAtOnce) as ended:
         end(holds=True)
     assert ended.value.args == (ExitCode.VIOLATED,)
+
+
+_INTERRUPTED_WHILE = """
+import os, signal, sys
+from lifecycle import cli
+
+class Named:
+    def __set_name__(self, owner, name):
+        os.kill(os.getpid(), signal.SIGINT)
+
+def interrupted(**_):
+    {}
+
+if sys.argv.pop() == "interrupted":
+    cli.cli.main = interrupted
+else:
+    cli.cli.main = lambda **_: 1 / 0
+sys.exit(cli.program())
+"""
+_MAKES_A_CLASS = 'type("Made", (), {"named": Named()})'
+_IMPORTS = """
+    try:
+        os.kill(os.getpid(), signal.SIGINT)
+    except KeyboardInterrupt:
+        pass
+    raise ImportError("rclpy: initialization failed", name="rclpy")
+"""
+
+
+@pytest.mark.parametrize("code", [_MAKES_A_CLASS, _IMPORTS], ids=["a class", "an import"])
+def test_an_interrupt_that_python_raises_something_else_for_is_no_bug(code: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", _INTERRUPTED_WHILE.format(code), "graph", "interrupted"],
+        capture_output=True,
+        text=True,
+        timeout=30,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (ExitCode.INTERRUPTED, "")
+
+
+def test_an_error_that_nobody_interrupted_is_one() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", _INTERRUPTED_WHILE.format("pass"), "graph", "fails"],
+        capture_output=True,
+        text=True,
+        timeout=30,
+        check=False,
+    )
+    assert done.returncode == ExitCode.INTERNAL
+    assert "ZeroDivisionError" in done.stderr
+    assert "this is a bug in lifecycle" in done.stderr

@@ -476,6 +476,18 @@ def test_a_process_that_only_needs_the_types_imports_neither_yaml_nor_json_schem
     assert done.stdout == "set()\n"
 
 
+def test_no_module_takes_the_place_of_yaml_until_that_is_loaded() -> None:
+    # Python forgets an error, an interrupt too, that loads such a one when others import it.
+    program = (
+        "import sys, lifecycle.manifest.yaml.yaml_parser as parser; "
+        "print('yaml' in sys.modules, parser.resolve('0x10'))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True
+    )
+    assert done.stdout == "False 16\n"
+
+
 def test_what_is_done_when_a_process_fails_is_its_nodes_or_nearest_to_it_or_any_of_its_nodes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
