@@ -8,18 +8,24 @@ from pathlib import Path
 import pytest
 
 from lifecycle.middleware import machine_id
+from lifecycle.middleware.process import control
 
 
 @pytest.fixture(autouse=True)
 def _forgotten() -> Iterator[None]:
-    machine_id.cache_clear()
+    control._own_machine_id.cache_clear()
     yield
-    machine_id.cache_clear()
+    control._own_machine_id.cache_clear()
 
 
 def test_a_machine_id_that_is_given_stands_for_the_files(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("LIFECYCLE_MACHINE_ID", "container-1")
     assert machine_id() == "container-1"
+    # A host is forked from a process that had looked, and may be given another one.
+    monkeypatch.delenv("LIFECYCLE_MACHINE_ID")
+    files = machine_id()
+    monkeypatch.setenv("LIFECYCLE_MACHINE_ID", "container-2")
+    assert (machine_id(), files != "container-1") == ("container-2", True)
 
 
 @pytest.mark.parametrize("given", [None, ""])
