@@ -95,7 +95,8 @@ def own_udp_socket(family: int, port: int) -> socket.socket | None:
     """
     for each in _own_udp_sockets():
         if each.family == family and each.getsockname()[1] == port:
-            return each.dup()
+            # Not by its own dup(), which would make the original wait where it must not.
+            return socket.socket(fileno=os.dup(each.fileno()))
     return None
 
 
