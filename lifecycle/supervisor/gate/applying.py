@@ -318,6 +318,12 @@ class Applying:
             if key in self._system.nodes and self._system.nodes[key].name not in self._schedule.down
         }
         self._schedule.again(waiting)
+        # Who was brought up again and waits at the gate goes through it with who comes again.
+        self._schedule.wait_at_gate(
+            each.planned.key
+            for each in self._sequence.inactive()
+            if each.planned.key in before.active
+        )
         return self._in_force(
             before, f"and what failed meanwhile is started again as its policy says: {failure}"
         )

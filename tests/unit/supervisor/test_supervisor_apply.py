@@ -353,6 +353,31 @@ def test_the_death_of_another_rolls_back_and_then_counts_as_ever(
     assert world.story[-1] == f"[stopped] {6 if ends else 0}"
 
 
+def test_who_waits_at_the_gate_again_as_another_dies_goes_through_it_with_that_one(
+    tmp_path: Path,
+) -> None:
+    camera = dataclasses.replace(CAMERA, supervision=AGAIN)
+    plan, other = plan_of(camera, VIEWER), plan_of(camera, LOUD, ARM)
+
+    async def acts(world: SessionWorld) -> None:
+        world.hosts.takes_s["/arm configure"] = 4.0
+        applying = asyncio.ensure_future(world.apply(other, timeout_s=2.0))
+        await world.story.until("/arm configure")
+        world.intrude()  # the gate stays closed
+        await world.story.until("[apply] rolling_back")
+        await world.story.until("/viewer connect", 3)
+        await asyncio.sleep(0.1)
+        world.kill("camera")
+        assert "and what failed meanwhile is started again" in (await applying).error
+        world.retreat()
+        await world.story.until("[restarted] camera")
+        status = world.status()
+        assert [each.state for each in status.nodes] == ["active", "active"]
+        assert (status.phase, status.not_ok, status.revision) == ("active", "", 1)
+
+    _session(tmp_path, plan, acts)
+
+
 def test_a_node_of_the_manifest_before_that_does_not_come_back_ends_the_run(
     tmp_path: Path,
 ) -> None:
