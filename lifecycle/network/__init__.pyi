@@ -86,7 +86,6 @@ from .ports import overflows as overflows
 from .ports import overlaps as overlaps
 from .ports import owner_of as owner_of
 from .ports import participant_ports as participant_ports
-from .ports import ports_of_participants as ports_of_participants
 from .ports import read_ephemeral_range as read_ephemeral_range
 from .ports import safe_domains as safe_domains
 from .ports import unicast_pairs as unicast_pairs

@@ -10,9 +10,8 @@ ports of a running system are read from it, never inferred from here.
 
 from __future__ import annotations
 
-import contextlib
 import enum
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 from lifecycle import dataclasses
 
@@ -172,22 +171,20 @@ def participant_ports(domain_id: int, participant_id: int) -> ParticipantPorts:
     return ports
 
 
-def ports_of_participants(domain_id: int, participants: int) -> Iterator[ParticipantPorts]:
-    """Yield the ports of the first participants of a domain on one host, as far as they exist."""
-    with contextlib.suppress(ValueError):  # the domain has no such port
-        for participant in range(participants):
-            yield participant_ports(domain_id, participant)
+def unicast_pairs(
+    domain_id: int, participants: int = PARTICIPANTS_PER_DOMAIN
+) -> list[tuple[int, int]]:
+    """Return the ports for discovery and user data of the first participants of one host.
 
-
-def unicast_pairs(domain_id: int) -> list[tuple[int, int]]:
-    """Return the ports for discovery and user data of all participants that a host can have.
+    As many as exist: the highest domain has fewer.
 
     Args:
         domain_id: 0–232.
+        participants: ≥ 0; by default all that a host can have.
     """
     first = participant_ports(domain_id, 0)
     between = first.user_unicast - first.discovery_unicast
-    end = min(first.discovery_unicast + PG * PARTICIPANTS_PER_DOMAIN, MAX_PORT + 1 - between)
+    end = min(first.discovery_unicast + PG * participants, MAX_PORT + 1 - between)
     return [(port, port + between) for port in range(first.discovery_unicast, end, PG)]
 
 

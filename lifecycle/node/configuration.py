@@ -93,7 +93,7 @@ def _is_here(medium: Medium) -> bool:
     if medium.ip_version != 6:
         return True
     try:
-        with open(_IPV6_ADDRESSES, encoding="ascii") as file:  # noqa: PTH123 - see default_profile
+        with open(_IPV6_ADDRESSES, encoding="ascii") as file:  # noqa: PTH123 - in each host
             return bool(file.read().strip())
     except OSError:  # a kernel without IPv6
         return False

@@ -52,7 +52,7 @@ from lifecycle.network import (
     ConnectionUrl,
     Medium,
     participant_ports,
-    ports_of_participants,
+    unicast_pairs,
 )
 
 if TYPE_CHECKING:
@@ -600,8 +600,8 @@ def _probe_peers(domain_id: int, family: UrlTransport) -> Probe:
 
 def well_known_targets(domain_id: int, address: str, participants: int) -> Iterator[ProbeTarget]:
     """Yield the discovery ports of a host's first participants (DDSI-RTPS 9.6.2.3)."""
-    for ports in ports_of_participants(domain_id, participants):
-        yield ProbeTarget(address=address, port=ports.discovery_unicast)
+    for port, _ in unicast_pairs(domain_id, participants):
+        yield ProbeTarget(address=address, port=port)
 
 
 def group_targets(domain_id: int, kind: Medium, interfaces: Iterable[str]) -> Iterator[ProbeTarget]:

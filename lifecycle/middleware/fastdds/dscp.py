@@ -106,7 +106,7 @@ def own_udp_ports() -> frozenset[int]:
 
 
 def _own_udp_sockets() -> Iterator[socket.socket]:
-    """Yield duplicates of this process's UDP sockets; each is closed when the next one is asked."""
+    """Yield duplicates of this process's UDP sockets; each is closed when the next is asked for."""
     for number in socket_descriptors():
         with contextlib.suppress(OSError):  # closed since, or no socket any more
             duplicate = os.dup(number)

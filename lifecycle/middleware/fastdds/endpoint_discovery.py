@@ -209,12 +209,6 @@ def _is_known(times: _WriterTimes) -> bool:
     )
 
 
-def load_functions() -> None:
-    """Load what times are changed through, for a process that forks others."""
-    _functions()
-    _reader_functions()
-
-
 @functools.lru_cache(maxsize=1)
 def _reader_functions() -> tuple[Any, int] | None:
     """Return what changes a StatefulReader's times, and its table of virtual functions."""

@@ -84,12 +84,6 @@ def virtual_functions(symbol: str) -> int | None:
     return None if table is None else table + 2 * POINTER_BYTES
 
 
-def load_functions() -> None:
-    """Load what readers are found through, for a process that forks others."""
-    _guid_of()
-    _find_reader()
-
-
 @functools.lru_cache(maxsize=1)
 def _guid_of() -> Any:
     pointer = ctypes.c_void_p

@@ -10,24 +10,11 @@ import fcntl
 import os
 import sys
 from collections.abc import Iterator
-from typing import Any
 
 from lifecycle.middleware.fastdds.settings import fast_dds_function
 
 _LOG = "_ZN8eprosima7fastdds3dds3Log"
 _STDOUT = 1
-
-
-def load_functions() -> None:
-    """Load what the log is changed through, for a process that forks others."""
-    _functions()
-
-
-def _functions() -> tuple[Any, Any]:
-    return (
-        fast_dds_function(f"{_LOG}5FlushEv", None),
-        fast_dds_function(f"{_LOG}10KillThreadEv", None),
-    )
 
 
 @contextlib.contextmanager
@@ -41,7 +28,8 @@ def without_message(message: str) -> Iterator[None]:
     Args:
         message: a part of one line, as Fast DDS writes it.
     """
-    flush, end_thread = _functions()
+    flush = fast_dds_function(f"{_LOG}5FlushEv", None)
+    end_thread = fast_dds_function(f"{_LOG}10KillThreadEv", None)
     with contextlib.ExitStack() as stack:
         if flush is None or end_thread is None:
             yield

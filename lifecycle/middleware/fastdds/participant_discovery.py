@@ -139,11 +139,6 @@ def _pdp_of(rcl_node: int) -> _Pdp | None:
     return pdp if is_known else None
 
 
-def load_functions() -> None:
-    """Load what participants are announced through, for a process that forks others."""
-    _functions()
-
-
 @functools.lru_cache(maxsize=1)
 def _functions() -> tuple[Any, int] | None:
     """Return what tells a reader's listener, and PDPSimple's table of virtual functions.

@@ -80,7 +80,7 @@ class _String(ctypes.Structure):
 
 
 @functools.lru_cache(maxsize=1)
-def _loaded() -> ctypes.CDLL:
+def _shared_library() -> ctypes.CDLL:
     return ctypes.CDLL(_LIBRARY)
 
 
@@ -89,7 +89,7 @@ class _FastDds:
 
     def __init__(self) -> None:
         try:
-            library = _loaded()
+            library = _shared_library()
         except OSError as error:
             raise MiddlewareError(
                 f"cannot use Fast DDS, only {_KNOWN} is known: {error}", hint=abi.INSTALL
@@ -143,14 +143,12 @@ class _FastDds:
             self.destroy_qos(address)
 
 
-def load_functions() -> None:
-    """Load what participants are made and found through, for a process that forks others.
-
-    Raises:
-        MiddlewareError: no Fast DDS, or another version than is known.
-    """
-    _library()
-    _node_functions()
+def load_library() -> None:
+    """Load what participants are made and found through, for a process that forks others."""
+    if get_rmw_implementation_identifier() == _RMW:
+        with contextlib.suppress(MiddlewareError):  # of another version, which hosts do without
+            _library()
+        _node_functions()
 
 
 @functools.lru_cache(maxsize=1)
@@ -223,7 +221,7 @@ def fast_dds_function(symbol: str, result: Any, *arguments: Any) -> Any:
     It loads the library: only for who has a participant of it, see `participant_of`.
     """
     try:
-        function = _loaded()[symbol]
+        function = _shared_library()[symbol]
     except (OSError, AttributeError):
         return None
     function.restype, function.argtypes = result, arguments
@@ -236,7 +234,7 @@ def fast_dds_address(symbol: str) -> int | None:
     As for `fast_dds_function`.
     """
     try:
-        return ctypes.addressof(ctypes.c_char.in_dll(_loaded(), symbol))
+        return ctypes.addressof(ctypes.c_char.in_dll(_shared_library(), symbol))
     except (OSError, ValueError):
         return None
 

@@ -259,8 +259,9 @@ def disown_ports() -> tuple[str, ...]:
         if file.uid == os.getuid():
             groups.setdefault(file.group, []).append(file)
     used: set[_Inode] = set()
-    with contextlib.suppress(OSError):  # each is tried then
-        used = {inode for _, inode in _locks()} if groups else used
+    if groups:
+        with contextlib.suppress(OSError):  # each is tried then
+            used.update(inode for _, inode in _locks())
     return tuple(
         sorted(
             group

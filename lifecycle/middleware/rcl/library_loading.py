@@ -14,7 +14,6 @@ import threading
 from importlib.machinery import EXTENSION_SUFFIXES
 from importlib.util import find_spec
 
-from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.process.control import libc
 
 _threads: list[threading.Thread] = []
@@ -50,23 +49,9 @@ def _load(file: bytes) -> None:
 
 def load_libraries() -> None:
     """Load what every node asks rcl and Fast DDS through, for a process that forks hosts."""
-    from rclpy.utilities import get_rmw_implementation_identifier
-
+    from lifecycle.middleware.fastdds import log, settings
     from lifecycle.middleware.rcl import graph_queries, matched_peers
 
-    matched_peers.load_library()
-    graph_queries.load_library()
-    if get_rmw_implementation_identifier() != "rmw_fastrtps_cpp":
-        return
-    from lifecycle.middleware.fastdds import (
-        endpoint_discovery,
-        local_readers,
-        log,
-        participant_discovery,
-        settings,
-    )
-
-    with contextlib.suppress(MiddlewareError):  # of another version, which hosts do without
-        settings.load_functions()
-        for each in (endpoint_discovery, local_readers, log, participant_discovery):
-            each.load_functions()
+    del log  # which a host imports where it makes its participant
+    for module in (matched_peers, graph_queries, settings):
+        module.load_library()

@@ -776,7 +776,7 @@ def _needs(what: Callable[..., Any], name: str) -> bool:
         and not says_otherwise
         and not hasattr(function, "__wrapped__")
     ):
-        # Most nodes' are: what inspect does for any, each process would have in memory of its own.
+        # As of most nodes: what each host calls of inspect is copied into its own memory.
         code, optional = function.__code__, function.__kwdefaults__ or {}
         positional = code.co_varnames[: code.co_argcount - len(function.__defaults__ or ())]
         by_name = code.co_varnames[code.co_argcount :][: code.co_kwonlyargcount]

@@ -114,7 +114,7 @@ def _foreign(plan: Plan, nodes: Iterable[NodeRun]) -> Plan | None:
         each.planned
         for each in nodes
         if each.planned.managed
-        # Of a process of ours that is not started yet, too, which has no channel.
+        # Not by its control channel: a process of ours has none before it is started.
         and (each.process is None or each.process.planned.run.kind is not RunKind.PYTHON)
     )
     return dataclasses.replace(plan, nodes=found) if found else None

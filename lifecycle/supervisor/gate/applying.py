@@ -318,7 +318,7 @@ class Applying:
             if key in self._system.nodes and self._system.nodes[key].name not in self._schedule.down
         }
         self._schedule.again(waiting)
-        # Who was brought up again and waits at the gate goes through it with who comes again.
+        # Nodes that are up again and wait at the gate are activated with those that restart.
         self._schedule.wait_at_gate(
             each.planned.key
             for each in self._sequence.inactive()

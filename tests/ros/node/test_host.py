@@ -10,6 +10,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -23,9 +24,10 @@ from std_msgs.msg import String
 from lifecycle import codec
 from lifecycle.manifest.model import DiscoveryRange, Executor, Run, RunKind, Timeouts
 from lifecycle.middleware.fastdds.url_check import open_sockets, udp_sockets
+from lifecycle.middleware.rcl import library_loading
 from lifecycle.network import participant_ports
 from lifecycle.node.host.control import Command, Event, HostSpec, Operation
-from lifecycle.node.host.host import needed_by
+from lifecycle.node.host.host import needed_by, preload_shared
 
 HERE = Path(__file__).parent
 CONFIGURE, CONNECT, ACTIVATE = Operation.CONFIGURE, Operation.CONNECT, Operation.ACTIVATE
@@ -446,6 +448,18 @@ os._exit(os.waitstatus_to_exitcode(os.wait()[1]))
         assert len(children) == 1
         ours.shutdown(socket.SHUT_RDWR)
     assert process.wait(30) == 0
+
+
+def test_a_process_that_will_fork_waits_for_the_thread_that_loads_libraries(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    ends = threading.Event()
+    loading = threading.Thread(target=ends.wait)
+    loading.start()
+    monkeypatch.setattr(library_loading, "_threads", [loading])
+    threading.Timer(0.2, ends.set).start()
+    preload_shared()
+    assert not loading.is_alive()
 
 
 def test_what_hosts_are_forked_from_imports_only_what_every_node_needs() -> None:

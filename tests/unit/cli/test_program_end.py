@@ -128,7 +128,7 @@ def test_an_interrupt_that_python_raises_something_else_for_is_no_bug(code: str)
     assert (done.returncode, done.stderr) == (ExitCode.INTERRUPTED, "")
 
 
-def test_an_error_that_nobody_interrupted_is_one() -> None:
+def test_an_error_without_an_interrupt_is_reported_as_a_bug() -> None:
     done = subprocess.run(
         [sys.executable, "-c", _INTERRUPTED_WHILE.format("pass"), "graph", "fails"],
         capture_output=True,

@@ -353,7 +353,7 @@ def test_the_death_of_another_rolls_back_and_then_counts_as_ever(
     assert world.story[-1] == f"[stopped] {6 if ends else 0}"
 
 
-def test_who_waits_at_the_gate_again_as_another_dies_goes_through_it_with_that_one(
+def test_a_node_at_the_gate_again_as_another_dies_is_activated_with_that_one(
     tmp_path: Path,
 ) -> None:
     camera = dataclasses.replace(CAMERA, supervision=AGAIN)
