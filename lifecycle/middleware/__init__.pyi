@@ -26,6 +26,7 @@ from .fastdds.nfe import create_publisher as create_publisher
 from .fastdds.nfe import create_subscription as create_subscription
 from .fastdds.nfe import get_network_flow_endpoints as get_network_flow_endpoints
 from .fastdds.nfe import has_shared_memory as has_shared_memory
+from .fastdds.nfe import note_senders as note_senders
 from .fastdds.participant import FlowParticipant as FlowParticipant
 from .fastdds.participant_discovery import Unannounced as Unannounced
 from .fastdds.participant_discovery import can_be_unannounced as can_be_unannounced

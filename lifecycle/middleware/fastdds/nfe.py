@@ -35,6 +35,7 @@ from lifecycle.manifest import QosProfile
 from lifecycle.middleware.fastdds.settings import noted_shared_memory
 from lifecycle.middleware.rcl import abi
 from lifecycle.middleware.rcl.hidden_node import is_moved
+from lifecycle.middleware.rcl.matched_peers import guid_of
 from lifecycle.middleware.rcl.qos import to_rclpy
 from lifecycle.network import (
     InternetProtocol,
@@ -68,6 +69,13 @@ class NetworkFlowEndpointsUnsupported(MiddlewareError):  # noqa: N818 - states a
         self.reason = reason
 
 
+_PREFIX_DIGITS = 24
+"""Of a GUID in hex, 32 digits, those of its participant (DDSI-RTPS §9.3.1)."""
+
+_SENDERS: dict[str, tuple[NetworkFlowEndpoint, ...]] = {}
+"""Of publishers, by the GUID prefix of their participant."""
+
+
 def get_network_flow_endpoints(
     entity: Publisher | Subscription,
 ) -> tuple[NetworkFlowEndpoint, ...]:
@@ -78,14 +86,44 @@ def get_network_flow_endpoints(
     only among a subscription's: ask `has_shared_memory` for a publisher. An empty tuple means that
     the endpoint cannot be reached over any network.
 
+    Sender sockets are asked for once in a participant's life, and do not change (see
+    `lifecycle.middleware.fastdds.dscp`). Fast DDS 2.14 keeps them in a list with its senders by
+    shared memory and TCP, which a thread of discovery extends when the first peer that has these is
+    matched, and lists them without the lock (RTPSParticipantImpl::get_sending_locators): who asked
+    meanwhile read what was freed, one of 4,500 hosts. So ask before the participant has peers,
+    `note_senders`.
+
     Raises:
         NetworkFlowEndpointsUnsupported: this RMW has no such function.
         MiddlewareError: the call failed, or the installed rcl is not known.
         rclpy.exceptions.InvalidHandle: the entity was destroyed.
     """
-    return read_handle(
-        entity.handle, "publisher" if isinstance(entity, Publisher) else "subscription"
-    )
+    if not isinstance(entity, Publisher):
+        return read_handle(entity.handle, "subscription")
+    prefix = guid_of(entity)[:_PREFIX_DIGITS]
+    known = _SENDERS.get(prefix)
+    if known is None:
+        known = read_handle(entity.handle, "publisher")
+        if prefix:
+            _SENDERS[prefix] = known
+    return known
+
+
+def note_senders(node: Node) -> None:
+    """Ask for the sender sockets of a node's participant, as soon as the node is made.
+
+    Later it may have peers, see `get_network_flow_endpoints`. Without effect where they cannot be
+    had, or the node has no publisher.
+    """
+    publisher = next(iter(node.publishers), None)
+    if publisher is not None:
+        with contextlib.suppress(MiddlewareError):
+            get_network_flow_endpoints(publisher)
+
+
+def forget_senders(guid: str) -> None:
+    """Forget those of a participant that is destroyed, by the GUID of a publisher it had."""
+    _SENDERS.pop(guid[:_PREFIX_DIGITS], None)
 
 
 def has_shared_memory(node: Node) -> bool:
@@ -116,7 +154,10 @@ def has_shared_memory(node: Node) -> bool:
 
 
 def read_handle(handle: Any, kind: str) -> tuple[NetworkFlowEndpoint, ...]:
-    """As `get_network_flow_endpoints`, for rclpy's bare handle of a `kind`."""
+    """Ask rmw for the NFEs of rclpy's bare handle of a `kind`.
+
+    Of a publisher only before its participant has peers, see `get_network_flow_endpoints`.
+    """
     rcl = abi.load()
     array = abi.NfeArray()
     with handle:

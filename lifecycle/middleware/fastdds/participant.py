@@ -33,7 +33,11 @@ from lifecycle.manifest import QosProfile
 from lifecycle.middleware.fastdds import dscp as marks
 from lifecycle.middleware.fastdds import nfe
 from lifecycle.middleware.fastdds.dscp import never_wait
-from lifecycle.middleware.fastdds.nfe import get_network_flow_endpoints, has_shared_memory
+from lifecycle.middleware.fastdds.nfe import (
+    forget_senders,
+    get_network_flow_endpoints,
+    has_shared_memory,
+)
 from lifecycle.middleware.fastdds.participant_profile import (
     ParticipantSettings,
     endpoint_profiles,
@@ -44,6 +48,7 @@ from lifecycle.middleware.fastdds.url_check import open_sockets
 from lifecycle.middleware.rcl import hidden_node
 from lifecycle.middleware.rcl.abi import is_known
 from lifecycle.middleware.rcl.hidden_node import forget_hidden, hidden_nodes, quiet_node
+from lifecycle.middleware.rcl.matched_peers import guid_of
 from lifecycle.middleware.rcl.qos import to_rclpy
 from lifecycle.network import ConnectionUrl, Medium, NetworkFlowEndpoint, UniqueRequirement
 from lifecycle.plan import ParticipantConnections
@@ -167,6 +172,7 @@ class FlowParticipant:
         self._dscp = dscp
         self._context: rclpy.Context | None
         self._nfes: tuple[NetworkFlowEndpoint, ...] = ()
+        self._probe_guid = ""
         before = fixed_sockets(settings)
         self._context, self.node = quiet_node(
             name, namespace, domain_id, settings=settings, arguments=arguments
@@ -179,6 +185,7 @@ class FlowParticipant:
             self.has_shared_memory: bool | None = None
             if dscp is not None or is_known():
                 self._nfes = get_network_flow_endpoints(probe)
+                self._probe_guid = guid_of(probe)
             if dscp is not None:
                 marks.set_dscp(self._nfes, dscp)
             # It would share the sockets that are to be unique.
@@ -346,19 +353,18 @@ class FlowParticipant:
             self._moved.remove(entity)
 
     def ensure_dscp(self) -> None:
-        """Mark sender sockets that were opened, or lost their mark, since the participant was made.
+        """Mark sender sockets that lost their mark since the participant was made.
 
-        Half a millisecond. It is called before a publisher or subscription is handed out, and by
-        no reading: what reads and marks at once finds every mark in place. No socket of Fast DDS
-        2.14 is known to open later (see `lifecycle.middleware.fastdds.dscp`).
+        It is called before a publisher or subscription is handed out, and by no reading: what reads
+        and marks at once finds every mark in place. No socket of Fast DDS 2.14 opens later (see
+        `lifecycle.middleware.fastdds.dscp`).
 
         Raises:
             MiddlewareError: the mark cannot be set.
         """
-        if self._context is None:
-            return  # nothing of the user's can be sent
-        changed = self._look_at_sockets()
-        if self._dscp is not None and (changed or marks.get_dscps(self._nfes) != {self._dscp}):
+        if self._context is None or self._dscp is None:
+            return
+        if marks.get_dscps(self._nfes) != {self._dscp}:
             marks.set_dscp(self._nfes, self._dscp)
 
     def read_dscp(self) -> int:
@@ -370,21 +376,10 @@ class FlowParticipant:
         Raises:
             MiddlewareError: it has no socket, or its sockets differ and none was to be marked.
         """
-        self._look_at_sockets()
         if self._dscp is None:
             return marks.get_dscp(self._nfes)
         others = marks.get_dscps(self._nfes) - {self._dscp}
         return min(others, default=self._dscp)
-
-    def _look_at_sockets(self) -> bool:
-        """List the sender sockets anew, as far as a publisher lists them; whether they changed."""
-        publisher = next(iter(self.node.publishers), None)
-        if self._context is None or publisher is None or not is_known():
-            return False  # those that were there when it was made
-        nfes = get_network_flow_endpoints(publisher)
-        changed = nfes != self._nfes
-        self._nfes = nfes
-        return changed
 
     def never_waits(self) -> bool:
         """Return whether its sockets drop what finds their buffer full, asked of the kernel.
@@ -401,6 +396,7 @@ class FlowParticipant:
         for its endpoints.
         """
         self._nfes = ()  # its ports may belong to another process from now on
+        forget_senders(self._probe_guid)
         for entity in tuple(self._moved):
             self.destroy_endpoint(entity)
         forget_hidden(self.node)

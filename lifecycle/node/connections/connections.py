@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError, MiddlewareError
-from lifecycle.middleware import FlowParticipant, has_shared_memory
+from lifecycle.middleware import FlowParticipant, has_shared_memory, note_senders
 from lifecycle.network import ConnectionUrl
 from lifecycle.node.author.handlers import nearest
 from lifecycle.plan import ParticipantConnections, PlannedParticipant
@@ -69,6 +69,7 @@ class Connections:
         self.own = Connection(name="")
         self._made: dict[str, Connection] = {}  # by name of the hidden node
         self._failed: dict[str, Connection] = {}  # by name
+        note_senders(node)
 
     @property
     def named(self) -> tuple[Connection, ...]:

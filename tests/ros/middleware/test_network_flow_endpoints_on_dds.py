@@ -234,6 +234,28 @@ def test_a_publisher_on_its_own_participant_shares_no_port_with_the_node(
     assert got == [String(data="frame")]
 
 
+def test_sender_sockets_are_asked_for_once_in_the_life_of_a_participant(
+    make_node: MakeNode, domain_id: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    node = make_node("camera")
+    one, other = (node.create_publisher(String, f"/{each}", 10) for each in ("a", "b"))
+    first = get_network_flow_endpoints(one)
+    participants = len(nfe._SENDERS)
+    with FlowParticipant("_camera_flow_0", "/", domain_id, dscp=46) as participant:
+        flow = participant.create_publisher(String, "/flow", QOS)
+        assert len(nfe._SENDERS) == participants + 1
+
+        def ask(*arguments: object) -> None:
+            raise AssertionError(arguments)
+
+        monkeypatch.setattr(nfe, "read_handle", ask)
+        assert get_network_flow_endpoints(other) == first
+        assert get_network_flow_endpoints(flow) == participant.network_flow_endpoints != first
+        participant.ensure_dscp()
+        assert participant.read_dscp() == 46
+    assert len(nfe._SENDERS) == participants
+
+
 def test_the_dscp_of_a_participant_is_read_back_from_every_sender_socket(
     make_node: MakeNode, domain_id: int
 ) -> None:

@@ -355,22 +355,6 @@ def test_a_mark_that_was_lost_is_set_again_before_a_subscription_is_handed_out(
         assert participant.read_dscp() == 46
 
 
-def test_sockets_that_came_later_are_marked_before_a_publisher_is_handed_out(
-    domain_id: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with FlowParticipant("_flow", "/", domain_id, dscp=46) as participant:
-        # As if the participant had been made before one of its sockets was there.
-        later = participant.network_flow_endpoints
-        from lifecycle.middleware.fastdds.dscp import get_dscps, set_dscp
-
-        set_dscp(later[-1:], 0)
-        participant._nfes = later[:-1]
-        assert get_dscps(later) == {0, 46} if len(later) > 1 else {0}
-        participant.create_publisher(String, "/flow", QOS)
-        assert get_dscps(later) == {46}
-        assert participant.network_flow_endpoints == later
-
-
 def test_shared_memory_is_found_without_leaving_a_subscription(make_node: MakeNode) -> None:
     node = make_node("node", start_parameter_services=False)
     assert list(node.subscriptions) == []

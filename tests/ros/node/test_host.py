@@ -96,6 +96,35 @@ def _services(driver: Driver, node: str) -> list[str]:
     return [name for name, _ in driver.node.get_service_names_and_types_by_node(node, "/")]
 
 
+@pytest.mark.parametrize("class_", ["Good", "Plain", "Theirs"])
+def test_a_host_asks_for_its_sender_sockets_before_it_can_have_a_peer_and_never_again(
+    start: Start, class_: str
+) -> None:
+    """Fast DDS lists them without a lock, and extends the list when the first peer is matched."""
+    run = Run(kind=RunKind.PYTHON, python=f"senders_asked:{class_}")
+    out = publisher("out")
+    host = start(
+        hosted("one", class_, out, run=run, managed=class_ != "Plain"),
+        hosted("two", "Good", out),
+        gathers=1,
+        unannounced=True,
+        names_by_udp=True,
+    )
+    assert host.read() == Event(kind="gathered")
+    host.send(Command(id=0, node="", operation=Operation.PROCEED))
+    host.until("ready")
+    for node in ("/two",) if class_ == "Plain" else ("/one", "/two"):
+        assert host.do(node, CONFIGURE).ok
+        assert host.do(node, CONNECT).ok
+    told = host.do("/two", Operation.GET_CONFIGURATION).configuration
+    assert told is not None
+    assert told.endpoints[0].nfes
+    host.hang_up()
+    assert host.wait() == 0
+    said = [each for each in host.log.read_text().split("\n") if each in {"asked", "announced"}]
+    assert said == ["asked", "announced"]
+
+
 def test_unannounced_hosts_meet_before_the_users_constructors_go_on(start: Start) -> None:
     hosts = [
         start(hosted(name, "Waiting"), gathers=2, unannounced=True) for name in ("one", "other")

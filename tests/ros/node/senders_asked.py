@@ -1,0 +1,28 @@
+"""Node classes whose process says when it asks for sender sockets, and when it is announced."""
+
+from __future__ import annotations
+
+import functools
+import sys
+from typing import Any
+
+from hosted import Good, Plain, Theirs
+
+from lifecycle.middleware.fastdds import nfe
+from lifecycle.middleware.fastdds.participant_discovery import Unannounced
+
+__all__ = ["Good", "Plain", "Theirs"]
+
+
+def _saying(what: str, function: Any) -> Any:
+    @functools.wraps(function)
+    def call(*arguments: Any) -> Any:
+        if what != "asked" or "publisher" in arguments:
+            print(what, file=sys.stderr, flush=True)
+        return function(*arguments)
+
+    return call
+
+
+nfe.read_handle = _saying("asked", nfe.read_handle)
+Unannounced.announce = _saying("announced", Unannounced.announce)  # type: ignore[method-assign]
