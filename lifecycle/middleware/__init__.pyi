@@ -33,6 +33,7 @@ from .fastdds.participant_discovery import can_be_unannounced as can_be_unannoun
 from .fastdds.participant_profile import ParticipantSettings as ParticipantSettings
 from .fastdds.profiles import discovery_environment as discovery_environment
 from .fastdds.settings import host_settings as host_settings
+from .fastdds.settings import noting_shared_memory as noting_shared_memory
 from .fastdds.settings import once_participant_is_made as once_participant_is_made
 from .fastdds.settings import participant_settings as participant_settings
 from .fastdds.settings import stop_listening as stop_listening

@@ -87,10 +87,15 @@ def open_files() -> list[tuple[int, str]]:
     return found
 
 
-def has_shared_memory_open() -> bool:
-    """Return whether a participant of this process has a shared memory transport."""
-    own = f"{_DIRECTORY}/fastrtps_"
-    return any(to.startswith(own) for _, to in open_files())
+def own_segments() -> frozenset[str]:
+    """Return the lock files of what this process sends by shared memory from.
+
+    A participant of it that has the transport has one from when it is made until it ends.
+    """
+    own, ports = f"{_DIRECTORY}/fastrtps_", f"{_DIRECTORY}/{_PORT}"
+    return frozenset(
+        to for _, to in open_files() if to.startswith(own) and not to.startswith(ports)
+    )
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

@@ -29,7 +29,7 @@ from lifecycle.middleware.fastdds.endpoint_discovery import (
     resend_endpoints_soon,
 )
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
-from lifecycle.middleware.fastdds.settings import participant_settings
+from lifecycle.middleware.fastdds.settings import noting_shared_memory, participant_settings
 
 _hidden: weakref.WeakSet[Node] = weakref.WeakSet()
 
@@ -53,7 +53,8 @@ def quiet_node(
     node: Node | None = None
     try:
         context.init(args=[*arguments, *enclave], domain_id=domain_id, initialize_logging=False)
-        with participant_settings(context, settings):
+        shared_memory = noting_shared_memory(context, is_new=True)
+        with participant_settings(context, settings), shared_memory:
             node = Node(
                 name,
                 namespace=namespace,

@@ -38,6 +38,7 @@ from lifecycle.middleware import (
     follow_nodes,
     host_settings,
     leave_and_exit,
+    noting_shared_memory,
     once_participant_is_made,
     participant_settings,
     resend_endpoints_soon,
@@ -109,7 +110,8 @@ class Participants:
             yield context
             return
         context, wanted = self._default, settings
-        if self._made:
+        is_new = bool(self._made)  # a user's module may have made the default context's
+        if is_new:
             context = Context()
             context.init(args=[], domain_id=self._default.get_domain_id())
         else:
@@ -121,7 +123,8 @@ class Participants:
             )
             self.first = wanted
         # The participant is made with the context's first node.
-        with participant_settings(context, wanted):
+        shared_memory = noting_shared_memory(context, is_new=is_new)
+        with participant_settings(context, wanted), shared_memory:
             yield context
         self._made[settings] = context
 

@@ -35,6 +35,8 @@ from lifecycle.middleware import (
     ParticipantSettings,
     follow_nodes,
     node_topic,
+    noting_shared_memory,
+    once_participant_is_made,
     participant_settings,
 )
 from lifecycle.node.author.node import LifecycleNode
@@ -168,7 +170,11 @@ def run(
         construction = Construction(
             spec=spec, mode=mode, context=context, use_global_arguments=True
         )
-        with constructing(construction), participant_settings(context, _settings(spec)):
+        with (
+            constructing(construction),
+            participant_settings(context, _settings(spec)),
+            once_participant_is_made(context, lambda _: None),  # which notes its shared memory
+        ):
             node: LifecycleNode = node_class(**({} if spec is None else keywords(spec, node_class)))
         loop.add(node, node.lifecycle)
         liveliness.open(node, loop.republish_names)
@@ -197,7 +203,8 @@ def _adopt(
 
     @contextlib.contextmanager
     def carrying(planned: PlannedNode) -> Iterator[Context]:
-        with participant_settings(context, _settings(planned)):
+        shared_memory = noting_shared_memory(context, is_new=False)
+        with participant_settings(context, _settings(planned)), shared_memory:
             yield context
 
     def host(node: Node, planned: PlannedNode) -> ForeignNode:

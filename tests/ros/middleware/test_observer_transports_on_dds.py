@@ -11,10 +11,10 @@ import pytest
 _OBSERVES = """
 import sys
 from lifecycle.middleware import GraphObserver
-from lifecycle.middleware.process.shared_memory import has_shared_memory_open
+from lifecycle.middleware.process.shared_memory import own_segments
 
 with GraphObserver(int(sys.argv[1])):
-    print(has_shared_memory_open())
+    print(bool(own_segments()))
 """
 
 _SHARED_MEMORY_ONLY = """

@@ -27,7 +27,7 @@ from lifecycle.middleware import (
     has_shared_memory,
     participant_settings,
 )
-from lifecycle.middleware.fastdds import settings
+from lifecycle.middleware.fastdds import nfe, settings
 from lifecycle.middleware.fastdds.settings import without_localhost
 from lifecycle.network.nfe import NetworkFlowEndpoint, TransportProtocol
 from lifecycle.verify.observation import Identity
@@ -353,6 +353,27 @@ def test_a_mark_that_was_lost_is_set_again_before_a_subscription_is_handed_out(
         set_dscp(participant.network_flow_endpoints, 0)
         participant.create_subscription(String, "/flow", print, QOS)
         assert participant.read_dscp() == 46
+
+
+def test_whether_a_participant_has_shared_memory_is_seen_by_what_it_opens(
+    domain_id: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A subscription that is made and removed while others discover it keeps later ones from some.
+
+    Inside a process, that is, where Fast DDS 2.14 delivers endpoints by function calls.
+    """
+
+    def probe(*_: object) -> bool:
+        raise AssertionError("asked")
+
+    monkeypatch.setattr(nfe, "_listens_on_shared_memory", probe)
+    with (
+        FlowParticipant("_plain", "/", domain_id) as plain,
+        FlowParticipant("_chosen", "/", domain_id, transports=UDP) as chosen,
+        FlowParticipant("_other", "/", domain_id) as other,
+    ):
+        found = [each.has_shared_memory for each in (plain, chosen, other)]
+    assert found == [True, False, True]
 
 
 def test_shared_memory_is_found_without_leaving_a_subscription(make_node: MakeNode) -> None:

@@ -1,4 +1,7 @@
-"""Node classes whose process says when it asks for sender sockets, and when it is announced."""
+"""Node classes whose process says when it asks for sender sockets, and when it is announced.
+
+It also says when it makes a subscription to learn whether it has shared memory.
+"""
 
 from __future__ import annotations
 
@@ -24,5 +27,6 @@ def _saying(what: str, function: Any) -> Any:
     return call
 
 
+nfe._listens_on_shared_memory = _saying("probed", nfe._listens_on_shared_memory)
 nfe.read_handle = _saying("asked", nfe.read_handle)
 Unannounced.announce = _saying("announced", Unannounced.announce)  # type: ignore[method-assign]

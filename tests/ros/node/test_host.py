@@ -119,9 +119,11 @@ def test_a_host_asks_for_its_sender_sockets_before_it_can_have_a_peer_and_never_
     told = host.do("/two", Operation.GET_CONFIGURATION).configuration
     assert told is not None
     assert told.endpoints[0].nfes
+    assert told.endpoints[0].nfes[-1].medium == "shm"
     host.hang_up()
     assert host.wait() == 0
-    said = [each for each in host.log.read_text().split("\n") if each in {"asked", "announced"}]
+    words = {"asked", "announced", "probed"}
+    said = [each for each in host.log.read_text().split("\n") if each in words]
     assert said == ["asked", "announced"]
 
 
@@ -142,7 +144,8 @@ def test_a_host_whose_module_has_made_its_participant_waits_for_the_others_all_t
     start: Start, fresh_domain: int, wait_until: Callable[..., None]
 ) -> None:
     late = dataclasses.replace(
-        hosted("one", "Late"), run=Run(kind=RunKind.PYTHON, python="at_import:Late")
+        hosted("one", "Late", publisher("out")),
+        run=Run(kind=RunKind.PYTHON, python="at_import:Late"),
     )
     host = start(late, gathers=2, unannounced=True)
     assert host.read() == Event(kind="gathered")
@@ -151,6 +154,11 @@ def test_a_host_whose_module_has_made_its_participant_waits_for_the_others_all_t
     with driver_in(fresh_domain) as driver:
         wait_until(lambda: _services(driver, "one"))
     assert host.do("/one", CONFIGURE).ok
+    connected = host.do("/one", CONNECT)
+    assert connected.configuration is not None
+    nfes = connected.configuration.endpoints[0].nfes
+    assert nfes is not None
+    assert [each.medium for each in nfes].count("shm") == 1
 
 
 def test_an_unannounced_host_that_is_ended_while_it_gathers_ends(start: Start) -> None:
