@@ -43,6 +43,7 @@ def _known_after_s(observer: GraphObserver) -> float:
         return float(process.stdout.readline())
 
 
+@pytest.mark.alone  # beside others two of nine tries are slow by themselves
 @pytest.mark.thorough
 def test_who_comes_late_knows_our_endpoints_sooner_than_fast_dds_would_have_it(
     fresh_domain: int,
