@@ -18,7 +18,7 @@ from lifecycle.middleware.fastdds.settings import (
 
 RTPS = "8eprosima8fastrtps4rtps"
 POINTER_BYTES = ctypes.sizeof(ctypes.c_void_p)
-_PREFIX_BYTES = 12
+PREFIX_BYTES = 12
 
 
 class Endpoint(ctypes.Structure):
@@ -66,7 +66,7 @@ def builtin_reader(rcl_node: int, entity: bytes) -> Endpoint | None:
 def guid_prefix(participant: int) -> bytes:
     """Return the GUID prefix of a DomainParticipant by its address; empty with other libraries."""
     guid_of = _guid_of()
-    return b"" if guid_of is None else ctypes.string_at(guid_of(participant), _PREFIX_BYTES)
+    return b"" if guid_of is None else ctypes.string_at(guid_of(participant), PREFIX_BYTES)
 
 
 def pointer_at(address: int) -> int | None:

@@ -21,6 +21,7 @@ from typing import Any
 from rcl_interfaces.msg import ParameterEvent
 from rclpy.callback_groups import CallbackGroup
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.exceptions import InvalidHandle
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -32,7 +33,8 @@ from rclpy.validate_topic_name import validate_topic_name
 from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest import QosProfile
-from lifecycle.middleware.fastdds.settings import noted_shared_memory
+from lifecycle.middleware.fastdds.local_readers import PREFIX_BYTES, guid_prefix
+from lifecycle.middleware.fastdds.settings import noted_shared_memory, participant_of
 from lifecycle.middleware.rcl import abi
 from lifecycle.middleware.rcl.hidden_node import is_moved
 from lifecycle.middleware.rcl.matched_peers import guid_of
@@ -69,11 +71,8 @@ class NetworkFlowEndpointsUnsupported(MiddlewareError):  # noqa: N818 - states a
         self.reason = reason
 
 
-_PREFIX_DIGITS = 24
-"""Of a GUID in hex, 32 digits, those of its participant (DDSI-RTPS §9.3.1)."""
-
 _SENDERS: dict[str, tuple[NetworkFlowEndpoint, ...]] = {}
-"""Of publishers, by the GUID prefix of their participant."""
+"""NFEs of publishers, by the GUID prefix of their participant in hex."""
 
 
 def get_network_flow_endpoints(
@@ -100,7 +99,7 @@ def get_network_flow_endpoints(
     """
     if not isinstance(entity, Publisher):
         return read_handle(entity.handle, "subscription")
-    prefix = guid_of(entity)[:_PREFIX_DIGITS]
+    prefix = guid_of(entity)[: 2 * PREFIX_BYTES]
     known = _SENDERS.get(prefix)
     if known is None:
         known = read_handle(entity.handle, "publisher")
@@ -121,9 +120,12 @@ def note_senders(node: Node) -> None:
             get_network_flow_endpoints(publisher)
 
 
-def forget_senders(guid: str) -> None:
-    """Forget those of a participant that is destroyed, by the GUID of a publisher it had."""
-    _SENDERS.pop(guid[:_PREFIX_DIGITS], None)
+def forget_senders(node: Node) -> None:
+    """Forget the sender sockets of a node's participant, which is about to be destroyed."""
+    with contextlib.suppress(InvalidHandle), node.handle:
+        participant = participant_of(node.handle.pointer)
+        if participant:
+            _SENDERS.pop(guid_prefix(participant).hex(), None)
 
 
 def has_shared_memory(node: Node) -> bool:

@@ -48,7 +48,6 @@ from lifecycle.middleware.fastdds.url_check import open_sockets
 from lifecycle.middleware.rcl import hidden_node
 from lifecycle.middleware.rcl.abi import is_known
 from lifecycle.middleware.rcl.hidden_node import forget_hidden, hidden_nodes, quiet_node
-from lifecycle.middleware.rcl.matched_peers import guid_of
 from lifecycle.middleware.rcl.qos import to_rclpy
 from lifecycle.network import ConnectionUrl, Medium, NetworkFlowEndpoint, UniqueRequirement
 from lifecycle.plan import ParticipantConnections
@@ -172,7 +171,6 @@ class FlowParticipant:
         self._dscp = dscp
         self._context: rclpy.Context | None
         self._nfes: tuple[NetworkFlowEndpoint, ...] = ()
-        self._probe_guid = ""
         before = fixed_sockets(settings)
         self._context, self.node = quiet_node(
             name, namespace, domain_id, settings=settings, arguments=arguments
@@ -185,7 +183,6 @@ class FlowParticipant:
             self.has_shared_memory: bool | None = None
             if dscp is not None or is_known():
                 self._nfes = get_network_flow_endpoints(probe)
-                self._probe_guid = guid_of(probe)
             if dscp is not None:
                 marks.set_dscp(self._nfes, dscp)
             # It would share the sockets that are to be unique.
@@ -396,7 +393,7 @@ class FlowParticipant:
         for its endpoints.
         """
         self._nfes = ()  # its ports may belong to another process from now on
-        forget_senders(self._probe_guid)
+        forget_senders(self.node)
         for entity in tuple(self._moved):
             self.destroy_endpoint(entity)
         forget_hidden(self.node)

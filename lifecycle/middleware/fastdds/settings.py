@@ -549,7 +549,7 @@ def noting_shared_memory(context: Context, *, is_new: bool) -> Iterator[None]:
         context: of the next node.
         is_new: it has no participant yet.
 
-    To ask it costs a subscription, which is announced and taken back while others discover the
+    To ask for it costs a subscription, which is announced and taken back while others discover the
     participant. Of one in the same process another then lacks all its subscriptions for good, at
     times: Fast DDS 2.14 delivers endpoints by function calls there, and never again. It was 1 of
     560 processes with three participants that were made one after the other, and none of 8,000.
@@ -564,7 +564,6 @@ def noting_shared_memory(context: Context, *, is_new: bool) -> Iterator[None]:
 
 @contextlib.contextmanager
 def once_participant_is_made(
-    context: Context,
     call: Callable[[int], None],
     *,
     names_by_udp: Callable[[], bool] = lambda: False,
@@ -573,10 +572,8 @@ def once_participant_is_made(
     """Call this when the next node's participant is there, and nothing of the node but its name.
 
     rclpy makes services, publishers and subscriptions of a node after rcl has made the node.
-    Whether its participant has shared memory is noted.
 
     Args:
-        context: of that node.
         call: blocks the constructor of the first node that is made in the block, in its thread;
             given the address of its rcl_node_t.
         names_by_udp: its participant is made so (ParticipantSettings). rmw asks for a port for them
@@ -591,13 +588,11 @@ def once_participant_is_made(
 
     def make(*args: Any, **kwargs: Any) -> Any:
         library.Node = made
-        its = any(each is context.handle for each in args)
-        with noting_shared_memory(context, is_new=False) if its else contextlib.nullcontext():
-            if names_by_udp():
-                with without_message(_REFUSED_PORT):
-                    node = _made_with_names(lambda: made(*args, **kwargs), check_names)
-            else:
-                node = made(*args, **kwargs)
+        if names_by_udp():
+            with without_message(_REFUSED_PORT):
+                node = _made_with_names(lambda: made(*args, **kwargs), check_names)
+        else:
+            node = made(*args, **kwargs)
         call(node.pointer)
         return node
 

@@ -312,7 +312,6 @@ class Host:
                         if first:
                             stack.enter_context(
                                 once_participant_is_made(
-                                    self._context,
                                     self._participant_made,
                                     names_by_udp=lambda: self._participants.first.names_by_udp,
                                     check_names=lambda: check_own_pair(self._spec.domain_id),

@@ -36,7 +36,6 @@ from lifecycle.middleware import (
     follow_nodes,
     node_topic,
     noting_shared_memory,
-    once_participant_is_made,
     participant_settings,
 )
 from lifecycle.node.author.node import LifecycleNode
@@ -167,14 +166,16 @@ def run(
         if spec is not None and not _is_ours(node_class):
             _adopt(node_class, spec, loop, context=context, report=report, mode=mode)
             loop.spin_and_exit()
+        noting = contextlib.ExitStack()
         construction = Construction(
-            spec=spec, mode=mode, context=context, use_global_arguments=True
+            spec=spec,
+            mode=mode,
+            context=context,
+            use_global_arguments=True,
+            constructed=noting.close,  # the class may make more participants after that
         )
-        with (
-            constructing(construction),
-            participant_settings(context, _settings(spec)),
-            once_participant_is_made(context, lambda _: None),  # which notes its shared memory
-        ):
+        with constructing(construction), participant_settings(context, _settings(spec)), noting:
+            noting.enter_context(noting_shared_memory(context, is_new=False))
             node: LifecycleNode = node_class(**({} if spec is None else keywords(spec, node_class)))
         loop.add(node, node.lifecycle)
         liveliness.open(node, loop.republish_names)

@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -353,6 +354,28 @@ def test_a_mark_that_was_lost_is_set_again_before_a_subscription_is_handed_out(
         set_dscp(participant.network_flow_endpoints, 0)
         participant.create_subscription(String, "/flow", print, QOS)
         assert participant.read_dscp() == 46
+
+
+def test_a_node_is_made_again_for_as_long_as_another_process_has_half_a_pair_of_ports() -> None:
+    """That takes longer than 0.2 s where the processor is busy."""
+    until_s = time.monotonic() + 0.5
+    made: list[bool] = []
+
+    class Made:
+        def __init__(self) -> None:
+            made.append(True)
+
+        def destroy_when_not_in_use(self) -> None:
+            made[-1] = False
+
+    def check() -> None:
+        if made[-1] and time.monotonic() < until_s:
+            raise MiddlewareError("port 7411 is another process's")
+
+    assert isinstance(settings._made_with_names(Made, check), Made)
+    assert time.monotonic() >= until_s
+    assert made.count(True) == 1
+    assert made[-1]
 
 
 def test_whether_a_participant_has_shared_memory_is_seen_by_what_it_opens(

@@ -77,6 +77,21 @@ def read_until(process: subprocess.Popen[str], last: str) -> list[str]:
     return lines
 
 
+def test_a_node_alone_makes_no_subscription_to_learn_whether_it_has_shared_memory(
+    start: Start,
+) -> None:
+    code = (
+        f"import sys; sys.path.insert(0, {str(HERE)!r}); import lifecycle, senders_asked; "
+        "from alone import Counter; lifecycle.run(Counter)"
+    )
+    process = start("-c", code)
+    read_until(process, "/counter: active")
+    process.send_signal(signal.SIGINT)
+    _, reported = process.communicate(timeout=30)
+    assert process.returncode == 0
+    assert reported.split() == ["asked"]
+
+
 def test_a_node_of_a_manifest_comes_up_talks_and_ends_with_ctrl_c(
     start: Start, neighbour: Driver
 ) -> None:
