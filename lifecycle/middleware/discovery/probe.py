@@ -32,7 +32,7 @@ from lifecycle.middleware.discovery.messages import (
     disposal,
     new_prefix,
 )
-from lifecycle.middleware.fastdds.dscp import own_udp_socket
+from lifecycle.middleware.fastdds.dscp import own_udp_ports, own_udp_socket
 from lifecycle.middleware.fastdds.participant_profile import default_profile
 from lifecycle.middleware.fastdds.profiles import PROFILE_NAME
 from lifecycle.middleware.fastdds.url_check import OpenSocket, open_sockets, udp_sockets
@@ -374,6 +374,11 @@ _CHOICES = frozenset(
         "metatrafficMulticastLocatorList",
         "metatrafficUnicastLocatorList",
         "avoid_builtin_multicast",
+        "portBase",
+        "domainIDGain",
+        "participantIDGain",
+        "offsetd0",
+        "offsetd1",
     }
 )
 """Elements of a participant profile that say where others are looked for, or by what."""
@@ -456,6 +461,31 @@ def answered_at(
         return ((DISCOVERY_GROUP[kind], participant_ports(domain_id, 0).discovery_multicast),)
     found = well_known_targets(domain_id, kind.loopback, LOCALHOST_PEERS_RANGE)
     return tuple((each.address, each.port) for each in found)
+
+
+def missing_port(
+    domain_id: int, urls: Sequence[ConnectionUrl], environment: Mapping[str, str]
+) -> int | None:
+    """Return the UDP port of the multicast by which participants find each other, if it is missing.
+
+    Fast DDS shares that port with other participants. If another kind of socket has it, no
+    participant of this host receives announcements, and none of them finds another; Fast DDS 2.14
+    says nothing.
+
+    Args:
+        domain_id: of a participant of this process.
+        urls: its own.
+        environment: as for `probes_for`.
+
+    Returns:
+        None if this process has it, or participants look for each other elsewhere, too.
+    """
+    if static_peers(environment):
+        return None
+    for address, port in answered_at(domain_id, urls, environment):
+        if ipaddress.ip_address(address).is_multicast and port not in own_udp_ports():
+            return port if any(each.port == port for each in udp_sockets()) else None
+    return None
 
 
 def _range(environment: Mapping[str, str]) -> str:

@@ -33,7 +33,7 @@ import re
 import signal
 import struct
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 
 from lifecycle import dataclasses
@@ -59,6 +59,7 @@ _AGAIN_S = 0.02
 """So often it is tried again to remove what others still use: no event says that they let go."""
 
 _PORT = "fastrtps_port"
+_LOCKS = ("_el", "_sl")
 _Inode = tuple[int, int]
 """(device, inode number)."""
 
@@ -107,7 +108,7 @@ class _SharedFile:
 
     @property
     def is_lock(self) -> bool:
-        return self.path.name.endswith(("_el", "_sl"))
+        return self.path.name.endswith(_LOCKS)
 
     @property
     def is_mutex(self) -> bool:
@@ -124,9 +125,10 @@ def segments_of(pids: Iterable[int]) -> frozenset[str]:
     Remember them while a process lives; `sweep` then removes what it left behind.
     """
     held = {inode for pid in pids for inode in _peek(_open_inodes, pid)}
-    files = _files() if held else []
-    owned = {file.group for file in files if file.is_lock and file.inode in held}
-    return frozenset(file.path.name for file in files if file.group in owned)
+    names = _names() if held else {}
+    locks = _lock_files(names)
+    owned = frozenset(locks[inode] for inode in held & locks.keys())
+    return frozenset(name for name, (group, _) in names.items() if group in owned)
 
 
 def segments_by_holder() -> dict[int, frozenset[str]]:
@@ -138,14 +140,14 @@ def segments_by_holder() -> dict[int, frozenset[str]]:
     Raises:
         OSError: /proc/locks cannot be read, see proc_locks(5).
     """
-    files = _files()
-    locks = {file.inode: file.group for file in files if file.is_lock}
+    names = _names()
+    locks = _lock_files(names)
     held: dict[int, set[str]] = {}
     for pid, inode in _locks() if locks else ():
         if group := locks.get(inode):
             held.setdefault(pid, set()).add(group)
     return {
-        pid: frozenset(file.path.name for file in files if file.group in groups)
+        pid: frozenset(name for name, (group, _) in names.items() if group in groups)
         for pid, groups in held.items()
     }
 
@@ -165,7 +167,7 @@ def _locks() -> Iterator[tuple[int, _Inode]]:
 
 def still_there(groups: Collection[str]) -> frozenset[str]:
     """Return those of some groups, see `Creations.take`, that still have a file."""
-    return frozenset(groups) & {file.group for file in _files()} if groups else frozenset()
+    return frozenset(groups) & {group for group, _ in _names().values()} if groups else frozenset()
 
 
 class Creations:
@@ -260,7 +262,7 @@ def disown_ports() -> tuple[str, ...]:
         Their names, sorted.
     """
     groups: dict[str, list[_SharedFile]] = {}
-    for file in _files(of_ports=True):
+    for file in _files(lambda group: group.startswith(_PORT)):
         if file.uid == os.getuid():
             groups.setdefault(file.group, []).append(file)
     used: set[_Inode] = set()
@@ -322,12 +324,12 @@ def leftovers(*, only: Collection[str] | None = None) -> tuple[str, ...]:
 
 
 def _unused(only: Collection[str] | None, *, remove: bool) -> tuple[str, ...]:
+    wanted = None if only is None else {_group(name) for name in only}
     groups: dict[str, list[_SharedFile]] = {}
-    for file in _files():
+    for file in _files(lambda group: wanted is None or group in wanted):
         groups.setdefault(file.group, []).append(file)
-    wanted = groups if only is None else {_group(name) for name in only} & set(groups)
     found = []
-    for group in sorted(wanted):
+    for group in sorted(groups):
         with _claimed(groups[group]) as claimed:
             for file in groups[group] if claimed else ():
                 if remove:
@@ -354,7 +356,7 @@ def _claimed(files: Collection[_SharedFile]) -> Iterator[bool]:
                 if file.is_lock or file.is_port or not locked:
                     claims.enter_context(_claim(file))
             # What was made meanwhile belongs to a process that just opens it.
-            same = set(_files(next(iter(files)).group)) == set(files)
+            same = set(_files(next(iter(files)).group.__eq__)) == set(files)
         except OSError:
             same = False
         yield same
@@ -382,12 +384,27 @@ def _claim(file: _SharedFile) -> Iterator[None]:
         os.close(descriptor)
 
 
-def _files(group: str = "", *, of_ports: bool = False) -> list[_SharedFile]:
-    """Return the files of one group, or of all, or of all ports."""
+def _names() -> dict[str, tuple[str, _Inode]]:
+    """Return the names of all files, each with its group and inode; nothing is looked at but names.
+
+    Processes that were killed may have left tens of thousands.
+    """
+    device = _DIRECTORY.stat().st_dev if _DIRECTORY.is_dir() else 0
+    found = ((entry.name, _group(entry.name), entry.inode()) for entry in _listing(_DIRECTORY))
+    return {name: (group, (device, inode)) for name, group, inode in found if group}
+
+
+def _lock_files(names: Mapping[str, tuple[str, _Inode]]) -> dict[_Inode, str]:
+    """Return the group of each lock file."""
+    return {inode: group for name, (group, inode) in names.items() if name.endswith(_LOCKS)}
+
+
+def _files(is_wanted: Callable[[str], bool]) -> list[_SharedFile]:
+    """Return the files of some groups."""
     found = []
     for entry in _listing(_DIRECTORY):
         of = _group(entry.name)
-        if not of or (group and of != group) or (of_ports and not of.startswith(_PORT)):
+        if not of or not is_wanted(of):
             continue
         with contextlib.suppress(FileNotFoundError):
             status = entry.stat(follow_symlinks=False)

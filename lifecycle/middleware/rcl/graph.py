@@ -34,6 +34,7 @@ from lifecycle.middleware.discovery.probe import (
     ANSWER_S,
     EarlyProbe,
     answered_at,
+    missing_port,
     probes_for,
 )
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
@@ -400,6 +401,10 @@ class GraphObserver:
             if kind is EndpointKind.SERVICE_SERVER
             for name, _ in listed
         )
+
+    def missing_port(self) -> int | None:
+        """Return the UDP port that another process keeps from all participants of this host."""
+        return missing_port(self.domain_id, self.urls, os.environ)
 
     def reaches_servers(self) -> bool:
         """Wait, bounded, until the TCP discovery servers of its URLs can be asked; False if not.

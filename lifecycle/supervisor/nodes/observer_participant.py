@@ -103,6 +103,10 @@ class ObserverParticipant:
 
         return unknown_versions()
 
+    def missing_port(self) -> int | None:
+        """Return the UDP port that another process keeps from all participants of this host."""
+        return self._graph.discovery.missing_port()
+
     def reaches_servers(self) -> bool:
         """Wait, bounded, until a TCP discovery server can be asked; False if it never will be."""
         return self._graph.discovery.reaches_servers()

@@ -14,9 +14,10 @@ import re
 import time
 import traceback
 from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
+from pathlib import Path
 
 from lifecycle import dataclasses
-from lifecycle.errors import ExitCode, LifecycleError
+from lifecycle.errors import ExitCode, LifecycleError, MiddlewareError
 from lifecycle.manifest import Authority, DataLayerSource, EndpointPolicy, RunKind
 from lifecycle.middleware import (
     EarlyProbe,
@@ -47,12 +48,27 @@ from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.forerunner import Forerunner
 from lifecycle.supervisor.processes.fork_server import ForkServer
-from lifecycle.supervisor.processes.logs import begin_logs, check_log_root, log_directory
+from lifecycle.supervisor.processes.logs import (
+    begin_logs,
+    check_log_root,
+    forget_runs,
+    log_directory,
+)
 from lifecycle.supervisor.processes.orphans import end_run
-from lifecycle.supervisor.run.events import Emitter, Event, Listener, Notice, RunStarted
+from lifecycle.supervisor.run.events import (
+    Emitter,
+    Event,
+    Failure,
+    Listener,
+    Notice,
+    RunStarted,
+    Stopping,
+    SystemReached,
+)
 from lifecycle.supervisor.run.failure import StepFailedError, Worker, never_connected, with_failure
 from lifecycle.supervisor.run.journal import Journal
 from lifecycle.supervisor.run.options import (
+    Until,
     UpOptions,
     UpResult,
     address_that_is_down,
@@ -195,7 +211,7 @@ def _up(
         async def run(leaving: contextlib.AsyncExitStack) -> UpResult:
             nonlocal records
             leaving.callback(service.watch())
-            logs = begin_logs(log_directory(os.environ, plan.system), plan.system, os.environ)
+            logs = begin_logs(log_directory(os.environ, plan.system))
             system = System(
                 plan,
                 emit=emit,
@@ -207,6 +223,7 @@ def _up(
             leaving.enter_context(journal.noting_use(lambda: system.living))
             fork_server = ForkServer(forerunner.process, emit, directory)
             worker = leaving.enter_context(contextlib.closing(Worker("lifecycle")))
+            emit.listen(_forgetting_logs(worker, logs.parent, plan.system))
             records = leaving.enter_context(noting(directory, system, fork_server, worker, emit))
             try:
                 fork_server.confine(processes)
@@ -272,6 +289,19 @@ def _journal(plan: Plan, directory: RunDirectory, emit: Emitter) -> Journal:
     )
     emit.listen(journal.on_event)
     return journal
+
+
+def _forgetting_logs(worker: Worker, root: Path, system: str) -> Listener:
+    """Return what has old logs removed once bring-up is over, which must not wait for that."""
+    begun: list[asyncio.Future[None]] = []
+
+    def on_event(event: Event) -> None:
+        is_up = isinstance(event, SystemReached) and event.reached == Until.ACTIVE.value
+        if not begun and (is_up or isinstance(event, (Failure, Stopping))):
+            work = worker.run(forget_runs, root, system, os.environ)
+            begun.append(asyncio.ensure_future(work))
+
+    return on_event
 
 
 def _emitter(listeners: Iterable[Listener]) -> Emitter:
@@ -404,6 +434,17 @@ async def _observer_participant(
                 "discovery server did not take its connection; "
                 f"try {number + 1} of {OBSERVER_TRIES - 1}"
             )
+        )
+    # Nodes elsewhere would be found: they answer to ports of ours.
+    port = observer_participant.missing_port() if local_processes(plan, options.machine) else None
+    if port is not None:
+        observer_participant.prepare_to_leave()
+        observer_participant.destroy()
+        raise MiddlewareError(
+            f"cannot discover nodes of this host in domain {plan.domain_id}: UDP port {port}, by "
+            "which all participants find each other, is taken by something else",
+            hint=f"`ss -lunp 'sport = :{port}'` says by what; end it, or choose another domain: "
+            "`lifecycle ports` says which are safe",
         )
     if limits := observer_participant.unknown_versions:
         emit(Notice(message=limits))

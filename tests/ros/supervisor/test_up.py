@@ -474,6 +474,37 @@ def test_a_second_interrupt_kills_what_does_not_end(tmp_path: Path, fresh_domain
         run.assert_nothing_left()
 
 
+def _logs_of_a_run_before(tmp_path: Path, system: str) -> Path:
+    dead = 2**22 + 1  # more than any pid
+    folder = tmp_path / "log" / f"2020-01-01-00-00-00-000000-host-{dead}-{system}"
+    folder.mkdir(parents=True)
+    (folder / "talker.log").write_text("of a run before\n")
+    return folder
+
+
+def test_logs_of_old_runs_go_once_the_system_is_active_or_is_not_going_to_be(
+    tmp_path: Path, fresh_domain: int, wait_until: Callable[..., None]
+) -> None:
+    keeping = {"LIFECYCLE_KEEP_LOGS": "1"}
+    old = _logs_of_a_run_before(tmp_path, "pair")
+    other = _logs_of_a_run_before(tmp_path, "other")
+    manifest = pair(tmp_path, fresh_domain, misbehave="activate:hang")
+    with up(manifest, runtime=tmp_path, variables=keeping) as run:
+        run.until("log", line="about to hang in activate")
+        assert old.is_dir()
+        run.signal(signal.SIGINT)
+        assert run.finish() == ExitCode.INTERRUPTED
+        assert not old.exists()
+        run.assert_nothing_left()
+    old = _logs_of_a_run_before(tmp_path, "pair")
+    with up(pair(tmp_path, fresh_domain), runtime=tmp_path, variables=keeping) as run:
+        run.until("system", reached="active")
+        wait_until(lambda: not old.exists())
+        run.signal(signal.SIGINT)
+        assert run.finish() == ExitCode.INTERRUPTED
+    assert other.is_dir()
+
+
 def test_a_process_that_dies_in_a_step_ends_the_run_and_is_named_with_its_last_words(
     tmp_path: Path, fresh_domain: int
 ) -> None:
@@ -697,6 +728,59 @@ def test_a_run_that_hangs_on_leaving_the_graph_ends_with_its_verdict_and_report(
     assert json.loads(done.stdout.splitlines()[-1])["verdict"] == "ok"
     assert json.loads(report.read_text())["verdict"] == "ok"
     assert left_of(mark) == []
+
+
+_SUBNET = {"discovery/range": "subnet"}
+
+
+@pytest.mark.parametrize("range_", ["subnet", "localhost"])
+def test_where_something_else_has_the_port_of_discovery_a_system_is_not_begun_and_says_so(
+    tmp_path: Path, fresh_domain: int, range_: str
+) -> None:
+    report = tmp_path / "verdict.json"
+    manifest = pair(tmp_path, fresh_domain, edit={"discovery/range": range_})
+    port = participant_ports(fresh_domain, 0).discovery_multicast
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", port))
+        options = ("--until", "verified", "--report", str(report))
+        done = verb("up", str(manifest), *options, runtime=tmp_path)
+    if range_ == "localhost":  # where nobody needs it
+        assert done.returncode == ExitCode.OK, done.stdout
+        return
+    assert done.returncode == ExitCode.BRING_UP_FAILED, done.stdout
+    assert f"cannot discover nodes of this host in domain {fresh_domain}: UDP port {port}" in (
+        done.stderr
+    )
+    assert "process talker" not in done.stdout
+    assert json.loads(report.read_text())["verdict"] == "unverifiable"
+    again = verb("up", str(manifest), "--until", "verified", runtime=tmp_path)
+    assert again.returncode == ExitCode.OK, again.stdout
+
+
+_OTHER_PORTS = """<?xml version="1.0" encoding="UTF-8" ?>
+<profiles xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
+  <participant profile_name="theirs" is_default_profile="true">
+    <rtps><port><portBase>7600</portBase></port></rtps>
+  </participant>
+</profiles>
+"""
+
+
+def test_a_system_whose_profile_chooses_other_ports_needs_no_port_of_others(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    manifest = pair(tmp_path, fresh_domain, edit=_SUBNET)
+    profile = tmp_path / "ports.xml"
+    profile.write_text(_OTHER_PORTS)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", participant_ports(fresh_domain, 0).discovery_multicast))
+        done = verb(
+            "up",
+            *(str(manifest), "--until", "verified"),
+            runtime=tmp_path,
+            variables={"FASTRTPS_DEFAULT_PROFILES_FILE": str(profile)},
+        )
+    assert done.returncode == ExitCode.OK, done.stdout
 
 
 _NOBODY = "54321"

@@ -21,8 +21,10 @@ from lifecycle.middleware.discovery.probe import (
     ProbeTarget,
     answered_at,
     chosen_otherwise,
+    missing_port,
     probes_for,
 )
+from lifecycle.network import participant_ports
 from lifecycle.network.connection_url import parse
 from tests.unit.middleware.other_process import of_another_process
 
@@ -156,6 +158,38 @@ def test_where_participants_are_told_whom_to_look_for_ours_announces_itself_by_i
     assert answered_at(25, (parse(url),) if url else (), environment) == ()
 
 
+_SUBNET = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}
+
+
+@pytest.mark.parametrize(
+    ("url", "environment", "misses"),
+    [
+        ("", _SUBNET, True),
+        ("", {}, True),
+        ("", {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}, False),
+        ("", {"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF"}, False),
+        ("", {**_SUBNET, "ROS_STATIC_PEERS": "127.0.0.1"}, False),
+        ("", {**_SUBNET, "ROS_DISCOVERY_SERVER": "127.0.0.1"}, False),
+        ("udpv4://127.0.0.1:7911?metatraffic_port=7910", _SUBNET, False),
+    ],
+)
+def test_the_port_of_multicast_is_missing_where_only_another_process_has_it(
+    url: str, environment: dict[str, str], *, misses: bool
+) -> None:
+    domain, urls = 217, (parse(url),) if url else ()  # no other test has it
+    port = participant_ports(domain, 0).discovery_multicast
+    assert missing_port(domain, urls, environment) is None
+    shared = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    shared.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    shared.bind(("", port))
+    with of_another_process(shared):
+        assert missing_port(domain, urls, environment) == (port if misses else None)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as own:
+            own.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            own.bind(("", port))
+            assert missing_port(domain, urls, environment) is None
+
+
 def test_who_is_not_listed_is_not_asked(peer: socket.socket) -> None:
     url, _ = url_for(peer)
     without = url.partition("&peer=")[0] + "&multicast=off"
@@ -201,6 +235,9 @@ def test_where_the_user_chose_how_others_are_found_nobody_is_asked(
     [
         ("<builtin><avoid_builtin_multicast>true</avoid_builtin_multicast></builtin>", True),
         ("<useBuiltinTransports>false</useBuiltinTransports><userTransports/>", True),
+        ("<port><domainIDGain>200</domainIDGain></port>", True),
+        ("<port><portBase>7600</portBase></port>", True),
+        ("<port><offsetd0>4</offsetd0></port>", True),
         ("<sendSocketBufferSize>65536</sendSocketBufferSize>", False),
     ],
 )
