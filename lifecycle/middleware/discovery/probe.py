@@ -413,6 +413,22 @@ def probes_for(
     )
 
 
+def answers_unasked(urls: Sequence[ConnectionUrl], environment: Mapping[str, str]) -> bool:
+    """Return whether nobody can be asked, but all answer who is announced to them once it listens.
+
+    So it is over shared memory, and where the user's settings of Fast DDS say how others are found.
+
+    Args:
+        urls: the observer's.
+        environment: as for `probes_for`.
+    """
+    if environment.get("ROS_DISCOVERY_SERVER"):
+        return False
+    if urls:
+        return all(each.kind is Medium.SHM for each in families(urls))
+    return chosen_otherwise(environment)
+
+
 def probe_targets(
     domain_id: int, urls: Sequence[ConnectionUrl], environment: Mapping[str, str]
 ) -> tuple[tuple[Medium, tuple[ProbeTarget, ...]], ...]:

@@ -405,7 +405,10 @@ def profile(
     if settings.max_datagram_bytes is not None:
         _set_property(rtps, "fastdds.max_message_size", str(settings.max_datagram_bytes))
     if settings.unannounced:
-        _set_unannounced(_child(_child(rtps, "builtin"), "discovery_config"))
+        config = _child(_child(rtps, "builtin"), "discovery_config")
+        _text(config, "ignoreParticipantFlags", "|".join(_IGNORE_ALL))
+        if base is None or base.name == PROFILE_NAME:
+            _announce_seldom(config)
     if settings.names_by_udp:
         profiles.extend(_names_by_udp(settings.names_heartbeat_s))
     elif settings.asks_for_names_soon:
@@ -465,8 +468,7 @@ def are_names_open(environment: Mapping[str, str]) -> bool:
     return is_ours and not _has_default_file()
 
 
-def _set_unannounced(config: ET.Element) -> None:
-    _text(config, "ignoreParticipantFlags", "|".join(_IGNORE_ALL))
+def _announce_seldom(config: ET.Element) -> None:
     # All the others listen by then, and each announcement goes to all of them.
     announcements = _child(config, "initialAnnouncements")
     announcements.clear()

@@ -264,22 +264,27 @@ def unknown_versions() -> str:
     return "; ".join(unknown)
 
 
-def observer_settings(settings: ParticipantSettings) -> ParticipantSettings:
+def observer_settings(
+    settings: ParticipantSettings, *, unannounced: bool
+) -> ParticipantSettings:
     """Return the settings of an observer's participant: no shared memory, unless it is chosen.
 
     It asks soon for names of nodes that it has not received, too.
 
     Args:
         settings: what it needs otherwise.
+        unannounced: it is to be, see ParticipantSettings.
 
     Returns:
         `settings`, where they, a profile or the environment say what transports it has, and with
         another RMW or an unknown version of Fast DDS.
     """
-    if settings or get_rmw_implementation_identifier() != _RMW:
+    if get_rmw_implementation_identifier() != _RMW:
         return settings
     try:
         _library()
+        if settings or unannounced:
+            return dataclasses.replace(settings, unannounced=unannounced)
         transports = without_shared_memory(os.environ)
         asks = bool(transports) and are_names_open(os.environ)
         return dataclasses.replace(settings, transports=transports, asks_for_names_soon=asks)
