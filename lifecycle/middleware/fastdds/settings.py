@@ -264,9 +264,7 @@ def unknown_versions() -> str:
     return "; ".join(unknown)
 
 
-def observer_settings(
-    settings: ParticipantSettings, *, unannounced: bool
-) -> ParticipantSettings:
+def observer_settings(settings: ParticipantSettings, *, unannounced: bool) -> ParticipantSettings:
     """Return the settings of an observer's participant: no shared memory, unless it is chosen.
 
     It asks soon for names of nodes that it has not received, too.

@@ -8,6 +8,7 @@ rmw_cyclonedds announce hashes since Iron.
 
 from __future__ import annotations
 
+import contextlib
 import operator
 import os
 import re
@@ -40,7 +41,10 @@ from lifecycle.middleware.discovery.probe import (
     probes_for,
 )
 from lifecycle.middleware.fastdds.participant_discovery import Unannounced
-from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
+from lifecycle.middleware.fastdds.participant_profile import (
+    DISCOVERY_SERVER_VARIABLE,
+    ParticipantSettings,
+)
 from lifecycle.middleware.fastdds.settings import observer_settings, stop_listening
 from lifecycle.middleware.process.process_table import programs_of
 from lifecycle.middleware.rcl.graph_changes import GraphGuard, on_graph_change
@@ -238,9 +242,10 @@ class GraphObserver:
             if unannounced is not None:
                 unannounced.announce()
             self._probes = probes_for(domain_id, settings.urls, os.environ)
-            self._limit_s = (
-                _ANNOUNCED_BY_SERVER_S if any(url.server for url in settings.urls) else _UNPROBED_S
+            served = any(url.server for url in settings.urls) or bool(
+                os.environ.get(DISCOVERY_SERVER_VARIABLE)
             )
+            self._limit_s = _ANNOUNCED_BY_SERVER_S if served else _UNPROBED_S
         else:
             self._unwatch = on_graph_change(node, self._changed)
             self._probes = ()
@@ -710,7 +715,8 @@ def _observing_node(
     name = f"_lifecycle_observer_{os.getpid()}"
     unasked = answers_unasked(settings.urls, os.environ)
     chosen = observer_settings(settings, unannounced=unasked)
-    context, node = quiet_node(name, "/", domain_id, settings=chosen)
+    with _as_super_client():
+        context, node = quiet_node(name, "/", domain_id, settings=chosen)
     if not chosen.unannounced:
         return context, node, None
     try:
@@ -723,6 +729,26 @@ def _observing_node(
         context.destroy()
     known = observer_settings(settings, unannounced=False)
     return *quiet_node(name, "/", domain_id, settings=known), None
+
+
+_SUPER_CLIENT_VARIABLE = "ROS_SUPER_CLIENT"
+
+
+@contextlib.contextmanager
+def _as_super_client() -> Iterator[None]:
+    """Have a participant that is a client of the user's discovery server receive everything.
+
+    A client is announced what matches its own endpoints, and nothing else. Fast DDS 2.14 looks at
+    the variable when a participant is made.
+    """
+    if not os.environ.get(DISCOVERY_SERVER_VARIABLE) or _SUPER_CLIENT_VARIABLE in os.environ:
+        yield
+        return
+    os.environ[_SUPER_CLIENT_VARIABLE] = "TRUE"
+    try:
+        yield
+    finally:
+        del os.environ[_SUPER_CLIENT_VARIABLE]
 
 
 def _topic_endpoint(

@@ -222,8 +222,7 @@ def _up(
             leaving.enter_context(journal.writing(logs, positions=system.output_positions))
             leaving.enter_context(journal.noting_use(lambda: system.living))
             fork_server = ForkServer(forerunner.process, emit, directory)
-            worker = leaving.enter_context(contextlib.closing(Worker("lifecycle")))
-            emit.listen(_forgetting_logs(worker, logs.parent, plan.system))
+            worker = leaving.enter_context(_working(emit, logs, plan.system))
             records = leaving.enter_context(noting(directory, system, fork_server, worker, emit))
             try:
                 fork_server.confine(processes)
@@ -291,17 +290,20 @@ def _journal(plan: Plan, directory: RunDirectory, emit: Emitter) -> Journal:
     return journal
 
 
-def _forgetting_logs(worker: Worker, root: Path, system: str) -> Listener:
-    """Return what has old logs removed once bring-up is over, which must not wait for that."""
+@contextlib.contextmanager
+def _working(emit: Emitter, logs: Path, system: str) -> Iterator[Worker]:
+    """Yield a worker, which removes old logs once bring-up is over: that must not wait for them."""
     begun: list[asyncio.Future[None]] = []
 
     def on_event(event: Event) -> None:
         is_up = isinstance(event, SystemReached) and event.reached == Until.ACTIVE.value
         if not begun and (is_up or isinstance(event, (Failure, Stopping))):
-            work = worker.run(forget_runs, root, system, os.environ)
+            work = worker.run(forget_runs, logs.parent, system, os.environ)
             begun.append(asyncio.ensure_future(work))
 
-    return on_event
+    with contextlib.closing(Worker("lifecycle")) as worker:
+        emit.listen(on_event)
+        yield worker
 
 
 def _emitter(listeners: Iterable[Listener]) -> Emitter:
