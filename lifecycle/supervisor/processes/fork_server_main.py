@@ -579,7 +579,8 @@ def main(mask: Iterable[int] | None = None) -> NoReturn:
         drop_network_administration()
     if "--preload" in options:
         _preload()
-    _ForkServer(socket.socket(fileno=int(descriptor)), again="--again" in options).serve()
+    with socket.socket(fileno=int(descriptor)) as control:
+        _ForkServer(control, again="--again" in options).serve()
     os._exit(0)
 
 

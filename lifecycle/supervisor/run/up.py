@@ -381,6 +381,7 @@ def _ends_within(seconds: float, code: int) -> Iterator[None]:
         live_on()
 
 
+_SERVER_VARIABLE = "ROS_DISCOVERY_SERVER"
 _INTERFACE_S = 0.05
 
 
@@ -450,6 +451,9 @@ async def _observer_participant(
         )
     if limits := observer_participant.unknown_versions:
         emit(Notice(message=limits))
+    if server := os.environ.get(_SERVER_VARIABLE):
+        message = f"nodes are found by the discovery server of {_SERVER_VARIABLE}={server}"
+        emit(Notice(message=f"{message}; none is while it does not run"))
     return observer_participant
 
 

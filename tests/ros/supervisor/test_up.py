@@ -455,6 +455,24 @@ def test_every_import_that_fails_is_named_once_and_whoever_still_imports_is_not_
         assert log.read_text() == "importing\n"
 
 
+def test_with_all_warnings_on_a_run_gives_none(tmp_path: Path, fresh_domain: int) -> None:
+    warnings = {"PYTHONWARNINGS": "always"}
+    manifest = str(pair(tmp_path, fresh_domain))
+    done = verb("up", manifest, "--stop-after", "0", runtime=tmp_path, variables=warnings)
+    assert (done.returncode, done.stderr) == (ExitCode.OK, "")
+    assert "Warning" not in done.stdout
+
+
+def test_that_nodes_are_found_by_a_server_of_the_user_s_is_said(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    there_is_none = {"ROS_DISCOVERY_SERVER": "127.0.0.1:9"}
+    options = (str(pair(tmp_path, fresh_domain)), "--timeout", "2")
+    done = verb("up", *options, runtime=tmp_path, variables=there_is_none)
+    assert done.returncode == ExitCode.VIOLATED
+    assert "found by the discovery server of ROS_DISCOVERY_SERVER=127.0.0.1:9" in done.stdout
+
+
 def test_a_second_interrupt_kills_what_does_not_end(tmp_path: Path, fresh_domain: int) -> None:
     manifest = pair(
         tmp_path,
