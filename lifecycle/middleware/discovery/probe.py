@@ -425,7 +425,7 @@ def answers_unasked(urls: Sequence[ConnectionUrl], environment: Mapping[str, str
     if environment.get("ROS_DISCOVERY_SERVER"):
         return False
     if urls:
-        return all(each.kind is Medium.SHM for each in families(urls))
+        return not any(each.kind.is_network for each in families(urls))
     return chosen_otherwise(environment)
 
 
