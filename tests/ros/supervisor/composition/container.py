@@ -42,6 +42,7 @@ class Container(Node):
         super().__init__(name)
         self._runs = executor
         self._nodes: dict[int, Node] = {}
+        self._loaded = 0
         self.create_service(ListNodes, "~/_container/list_nodes", self._list)
         changing = (
             self.create_service(LoadNode, "~/_container/load_node", self._load),
@@ -65,12 +66,12 @@ class Container(Node):
             cli_args=["--ros-args", *rules] if rules else None,
             parameter_overrides=[Parameter.from_parameter_msg(e) for e in asked["parameters"]],
         )
-        number = len(self._nodes) + 1
-        self._nodes[number] = node
+        self._loaded += 1  # an id is of one component for good
+        self._nodes[self._loaded] = node
         self._runs.add_node(node)
         extra = [f"{name}:={value}" for name, value in asked["extra_arguments"].items()]
         print(" ".join(["loaded", node.get_fully_qualified_name(), *extra]), flush=True)
-        return respond(response, success=True, error_message="", unique_id=number)
+        return respond(response, success=True, error_message="", unique_id=self._loaded)
 
     def _list(self, request: Any, response: Any) -> Any:
         names = [each.get_fully_qualified_name() for each in self._nodes.values()]
