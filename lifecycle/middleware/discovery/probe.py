@@ -364,6 +364,7 @@ def discovery_ports(domain_id: int, kind: Medium = RMW_DISCOVERY) -> tuple[int, 
 
 
 PEERS_VARIABLE = "ROS_STATIC_PEERS"
+_WITHOUT_SERVER = ("", "SIMPLE", "NONE")
 _WITH_UDP = ("", "DEFAULT", "UDPV4", "LARGE_DATA")
 _CHOICES = frozenset(
     {
@@ -422,11 +423,22 @@ def answers_unasked(urls: Sequence[ConnectionUrl], environment: Mapping[str, str
         urls: the observer's.
         environment: as for `probes_for`.
     """
-    if environment.get("ROS_DISCOVERY_SERVER"):
+    if is_served(urls, environment):
         return False
     if urls:
         return not any(each.kind.is_network for each in families(urls))
     return chosen_otherwise(environment)
+
+
+def is_served(urls: Sequence[ConnectionUrl], environment: Mapping[str, str]) -> bool:
+    """Return whether a participant of these URLs finds others by a discovery server."""
+    if any(url.server for url in urls) or environment.get("ROS_DISCOVERY_SERVER"):
+        return True
+    with contextlib.suppress(MiddlewareError):  # as for `chosen_otherwise`
+        profile = default_profile(environment)
+        protocols = () if profile is None or urls else profile.element.iter("discoveryProtocol")
+        return any((each.text or "").strip() not in _WITHOUT_SERVER for each in protocols)
+    return False
 
 
 def probe_targets(

@@ -191,6 +191,7 @@ class ParticipantSettings:
             message, and each that is sent again, to all: the history holds one and is full. Only
             with `names_by_udp`.
         asks_for_names_soon: for the names of nodes that were there before, or are found late.
+        sees_all: as a client of a discovery server that a profile names it receives everything.
 
     Raises:
         MiddlewareError: out of range, or URLs that one participant cannot have together.
@@ -207,6 +208,7 @@ class ParticipantSettings:
     names_by_udp: bool = False
     names_heartbeat_s: float | None = None
     asks_for_names_soon: bool = False
+    sees_all: bool = False
 
     @classmethod
     def of(
@@ -292,6 +294,7 @@ class ParticipantSettings:
             or self.unannounced
             or self.names_by_udp
             or self.asks_for_names_soon
+            or self.sees_all
         )
 
 
@@ -404,11 +407,7 @@ def profile(
             _discover_as_localhost(_child(rtps, "builtin"), kinds, localhost_peers)
     if settings.max_datagram_bytes is not None:
         _set_property(rtps, "fastdds.max_message_size", str(settings.max_datagram_bytes))
-    if settings.unannounced:
-        config = _child(_child(rtps, "builtin"), "discovery_config")
-        _text(config, "ignoreParticipantFlags", "|".join(_IGNORE_ALL))
-        if base is None or base.name == PROFILE_NAME:
-            _announce_seldom(config)
+    _set_discovery(rtps, settings, is_users=base is not None and base.name != PROFILE_NAME)
     if settings.names_by_udp:
         profiles.extend(_names_by_udp(settings.names_heartbeat_s))
     elif settings.asks_for_names_soon:
@@ -468,7 +467,15 @@ def are_names_open(environment: Mapping[str, str]) -> bool:
     return is_ours and not _has_default_file()
 
 
-def _announce_seldom(config: ET.Element) -> None:
+def _set_discovery(rtps: ET.Element, settings: ParticipantSettings, *, is_users: bool) -> None:
+    for each in rtps.iter("discoveryProtocol") if settings.sees_all else ():
+        each.text = "SUPER_CLIENT"
+    if not settings.unannounced:
+        return
+    config = _child(_child(rtps, "builtin"), "discovery_config")
+    _text(config, "ignoreParticipantFlags", "|".join(_IGNORE_ALL))
+    if is_users:
+        return
     # All the others listen by then, and each announcement goes to all of them.
     announcements = _child(config, "initialAnnouncements")
     announcements.clear()

@@ -264,7 +264,9 @@ def unknown_versions() -> str:
     return "; ".join(unknown)
 
 
-def observer_settings(settings: ParticipantSettings, *, unannounced: bool) -> ParticipantSettings:
+def observer_settings(
+    settings: ParticipantSettings, *, unannounced: bool, sees_all: bool
+) -> ParticipantSettings:
     """Return the settings of an observer's participant: no shared memory, unless it is chosen.
 
     It asks soon for names of nodes that it has not received, too.
@@ -272,6 +274,7 @@ def observer_settings(settings: ParticipantSettings, *, unannounced: bool) -> Pa
     Args:
         settings: what it needs otherwise.
         unannounced: it is to be, see ParticipantSettings.
+        sees_all: likewise.
 
     Returns:
         `settings`, where they, a profile or the environment say what transports it has, and with
@@ -281,8 +284,8 @@ def observer_settings(settings: ParticipantSettings, *, unannounced: bool) -> Pa
         return settings
     try:
         _library()
-        if settings or unannounced:
-            return dataclasses.replace(settings, unannounced=unannounced)
+        if settings or unannounced or sees_all:
+            return dataclasses.replace(settings, unannounced=unannounced, sees_all=sees_all)
         transports = without_shared_memory(os.environ)
         asks = bool(transports) and are_names_open(os.environ)
         return dataclasses.replace(settings, transports=transports, asks_for_names_soon=asks)

@@ -37,6 +37,7 @@ from lifecycle.middleware.discovery.probe import (
     EarlyProbe,
     answered_at,
     answers_unasked,
+    is_served,
     missing_port,
     probes_for,
 )
@@ -242,9 +243,7 @@ class GraphObserver:
             if unannounced is not None:
                 unannounced.announce()
             self._probes = probes_for(domain_id, settings.urls, os.environ)
-            served = any(url.server for url in settings.urls) or bool(
-                os.environ.get(DISCOVERY_SERVER_VARIABLE)
-            )
+            served = is_served(settings.urls, os.environ)
             self._limit_s = _ANNOUNCED_BY_SERVER_S if served else _UNPROBED_S
         else:
             self._unwatch = on_graph_change(node, self._changed)
@@ -714,7 +713,8 @@ def _observing_node(
     """
     name = f"_lifecycle_observer_{os.getpid()}"
     unasked = answers_unasked(settings.urls, os.environ)
-    chosen = observer_settings(settings, unannounced=unasked)
+    sees_all = is_served(settings.urls, os.environ) and not settings.urls
+    chosen = observer_settings(settings, unannounced=unasked, sees_all=sees_all)
     with _as_super_client():
         context, node = quiet_node(name, "/", domain_id, settings=chosen)
     if not chosen.unannounced:
@@ -727,7 +727,7 @@ def _observing_node(
         node.destroy_node()
         context.try_shutdown()
         context.destroy()
-    known = observer_settings(settings, unannounced=False)
+    known = observer_settings(settings, unannounced=False, sees_all=False)
     return *quiet_node(name, "/", domain_id, settings=known), None
 
 

@@ -22,9 +22,11 @@ _OBSERVERS = 3
 _STRANGER = """
 import sys
 import rclpy
+from std_msgs.msg import String
 
 rclpy.init(domain_id=int(sys.argv[1]))
 node = rclpy.create_node("stranger")
+publisher = node.create_publisher(String, "words", 1)
 print("there", flush=True)
 sys.stdin.read()
 """
@@ -38,13 +40,12 @@ from lifecycle.middleware import GraphObserver
 found = []
 for _ in range(int(sys.argv[2])):
     with GraphObserver(int(sys.argv[1])) as observer:
-        names = set()
         while True:
-            names = {each.full_name for each in observer.snapshot()[0]}
+            endpoints = {(each.node, each.name) for each in observer.snapshot()[1]}
             if (left_s := observer.settling_s()) <= 0:
                 break
             time.sleep(min(left_s, 0.01))
-        found.append("/stranger" in names)
+        found.append(("/stranger", "/words") in endpoints)
 print(json.dumps(found))
 """
 
@@ -93,6 +94,14 @@ def a_stranger(domain_id: int) -> Iterator[None]:
             process.kill()
 
 
+def use_profile(profile: str, directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have all participants that are made from now on have this default profile."""
+    file = directory / "mine.xml"
+    namespace = "http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles"
+    file.write_text(f'<dds xmlns="{namespace}"><profiles>{profile}</profiles></dds>')
+    monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", str(file))
+
+
 def seen(domain_id: int) -> list[bool]:
     """Return whether each of several observers saw the stranger before it said that it sees all."""
     done = subprocess.run(
@@ -109,11 +118,8 @@ def seen(domain_id: int) -> list[bool]:
 def test_with_a_profile_that_says_how_others_are_found(
     fresh_domain: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, profile: str
 ) -> None:
-    file = tmp_path / "mine.xml"
-    namespace = "http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles"
-    file.write_text(f'<dds xmlns="{namespace}"><profiles>{_PROFILES[profile]}</profiles></dds>')
+    use_profile(_PROFILES[profile], tmp_path, monkeypatch)
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", str(file))
     assert chosen_otherwise(os.environ)
     with a_stranger(fresh_domain):
         assert seen(fresh_domain) == [True] * _OBSERVERS
@@ -148,12 +154,33 @@ def a_discovery_server(port: int) -> Iterator[None]:
             process.kill()
 
 
-def test_with_a_discovery_server_of_the_users(
+def test_with_a_discovery_server_that_the_environment_names(
     fresh_domain: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (port,) = free_ports(1)
     with a_discovery_server(port):
         monkeypatch.setenv("ROS_DISCOVERY_SERVER", f"127.0.0.1:{port}")
         monkeypatch.delenv("ROS_SUPER_CLIENT", raising=False)
+        with a_stranger(fresh_domain):
+            assert seen(fresh_domain) == [True] * _OBSERVERS
+
+
+_CLIENT = """
+    <participant profile_name="mine" is_default_profile="true"><rtps><builtin><discovery_config>
+      <discoveryProtocol>CLIENT</discoveryProtocol>
+      <discoveryServersList><RemoteServer prefix="44.53.00.5f.45.50.52.4f.53.49.4d.41">
+        <metatrafficUnicastLocatorList><locator><udpv4>
+          <address>127.0.0.1</address><port>{port}</port>
+        </udpv4></locator></metatrafficUnicastLocatorList>
+      </RemoteServer></discoveryServersList>
+    </discovery_config></builtin></rtps></participant>"""
+
+
+def test_with_a_discovery_server_that_a_profile_names(
+    fresh_domain: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (port,) = free_ports(1)
+    with a_discovery_server(port):
+        use_profile(_CLIENT.format(port=port), tmp_path, monkeypatch)
         with a_stranger(fresh_domain):
             assert seen(fresh_domain) == [True] * _OBSERVERS
