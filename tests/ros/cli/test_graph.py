@@ -58,7 +58,7 @@ def active(tmp_path_factory: pytest.TempPathFactory, shared_domain: int) -> Iter
         run.until("system", reached="active")
         yield run
         run.signal(signal.SIGTERM)
-        assert run.finish() == ExitCode.OK
+        assert run.finish() == ExitCode.OK, run.of_kind("verdict")
 
 
 def test_a_supervised_system_is_drawn_with_its_processes_and_flows(active: Up) -> None:
