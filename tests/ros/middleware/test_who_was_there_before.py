@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -29,6 +30,8 @@ node = rclpy.create_node("stranger")
 publisher = node.create_publisher(String, "words", 1)
 print("there", flush=True)
 sys.stdin.read()
+node.destroy_node()
+rclpy.shutdown()
 """
 
 _OBSERVES = """
@@ -91,7 +94,7 @@ def a_stranger(domain_id: int) -> Iterator[None]:
             assert process.stdout.readline() == "there\n"
             yield
         finally:
-            process.kill()
+            process.communicate(timeout=_LIMIT_S)  # one that is killed leaves its shared memory
 
 
 def use_profile(profile: str, directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -151,7 +154,8 @@ def a_discovery_server(port: int) -> Iterator[None]:
             assert "Server is running" in process.stdout.readline()
             yield
         finally:
-            process.kill()
+            process.send_signal(signal.SIGINT)
+            process.communicate(timeout=_LIMIT_S)
 
 
 def test_with_a_discovery_server_that_the_environment_names(
