@@ -128,11 +128,12 @@ def test_with_a_profile_that_says_how_others_are_found(
         assert seen(fresh_domain) == [True] * _OBSERVERS
 
 
+@pytest.mark.parametrize("transports", ["SHM", "LARGE_DATA"])
 def test_with_transports_that_the_environment_chooses(
-    fresh_domain: int, monkeypatch: pytest.MonkeyPatch
+    fresh_domain: int, monkeypatch: pytest.MonkeyPatch, transports: str
 ) -> None:
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
-    monkeypatch.setenv("FASTDDS_BUILTIN_TRANSPORTS", "SHM")
+    monkeypatch.setenv("FASTDDS_BUILTIN_TRANSPORTS", transports)
     with a_stranger(fresh_domain):
         assert seen(fresh_domain) == [True] * _OBSERVERS
 

@@ -22,6 +22,7 @@ from lifecycle.middleware.discovery.probe import (
     answered_at,
     answers_unasked,
     chosen_otherwise,
+    connects_first,
     is_served,
     missing_port,
     probes_for,
@@ -166,6 +167,7 @@ def test_where_participants_are_told_whom_to_look_for_ours_announces_itself_by_i
         ("", {}, False),
         ("", {"FASTDDS_BUILTIN_TRANSPORTS": "SHM"}, True),
         ("", {"FASTDDS_BUILTIN_TRANSPORTS": "SHM", "ROS_DISCOVERY_SERVER": "127.0.0.1"}, False),
+        ("", {"FASTDDS_BUILTIN_TRANSPORTS": "LARGE_DATA?max_msg_size=1MB"}, True),
         ("shm://", {}, True),
         ("tcpv4://127.0.0.1:7911", {}, False),
         ("udpv4://127.0.0.1:7911?metatraffic_port=7910", {}, False),
@@ -287,6 +289,28 @@ def test_a_profile_of_the_users_is_read_for_a_discovery_server(
     assert is_served((), environment) is served
     assert answers_unasked((), environment) is not served
     assert not is_served((parse("shm://"),), environment)
+
+
+@pytest.mark.parametrize(
+    ("element", "connects"),
+    [
+        ("<builtinTransports>LARGE_DATA</builtinTransports>", True),
+        ("<builtinTransports>DEFAULT</builtinTransports>", False),
+    ],
+)
+def test_where_participants_connect_first_an_answer_is_not_enough(
+    tmp_path: Path, element: str, *, connects: bool
+) -> None:
+    file = tmp_path / "profile.xml"
+    file.write_text(
+        f"""<dds><profiles><participant profile_name="mine" is_default_profile="true">
+        <rtps>{element}</rtps></participant></profiles></dds>"""
+    )
+    assert connects_first((), {"FASTRTPS_DEFAULT_PROFILES_FILE": str(file)}) is connects
+    large = {"FASTDDS_BUILTIN_TRANSPORTS": "LARGE_DATA"}
+    assert connects_first((), large)
+    assert not connects_first((parse("shm://"),), large)
+    assert not connects_first((), {**large, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"})
 
 
 @pytest.mark.parametrize("transports", ["", "DEFAULT", "UDPv4?max_msg_size=1400B"])
