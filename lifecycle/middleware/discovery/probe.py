@@ -34,7 +34,10 @@ from lifecycle.middleware.discovery.messages import (
     new_prefix,
 )
 from lifecycle.middleware.fastdds.dscp import own_udp_ports, own_udp_socket
-from lifecycle.middleware.fastdds.participant_profile import default_profile
+from lifecycle.middleware.fastdds.participant_profile import (
+    DISCOVERY_SERVER_VARIABLE,
+    default_profile,
+)
 from lifecycle.middleware.fastdds.profiles import PROFILE_NAME
 from lifecycle.middleware.fastdds.url_check import OpenSocket, open_sockets, udp_sockets
 from lifecycle.middleware.fastdds.url_profile import (
@@ -457,7 +460,7 @@ def connects_first(urls: Sequence[ConnectionUrl], environment: Mapping[str, str]
 
 def is_served(urls: Sequence[ConnectionUrl], environment: Mapping[str, str]) -> bool:
     """Return whether a participant of these URLs finds others by a discovery server."""
-    if any(url.server for url in urls) or environment.get("ROS_DISCOVERY_SERVER"):
+    if any(url.server for url in urls) or environment.get(DISCOVERY_SERVER_VARIABLE):
         return True
     with contextlib.suppress(MiddlewareError):  # as for `chosen_otherwise`
         profile = default_profile(environment)
@@ -551,7 +554,7 @@ def chosen_otherwise(environment: Mapping[str, str]) -> bool:
     A discovery server, transports, or where to look for others: then nothing may be probed over
     UDP, which those settings may have ruled out.
     """
-    if environment.get("ROS_DISCOVERY_SERVER") or not _has_udpv4(environment):
+    if environment.get(DISCOVERY_SERVER_VARIABLE) or not _has_udpv4(environment):
         return True
     try:
         profile = default_profile(environment)
@@ -587,7 +590,7 @@ def peers_environment(hosts: Iterable[str], environment: Mapping[str, str]) -> M
         hosts: IPv4 addresses.
         environment: what it is now.
     """
-    if environment.get("ROS_DISCOVERY_SERVER") or not _has_udpv4(environment):
+    if environment.get(DISCOVERY_SERVER_VARIABLE) or not _has_udpv4(environment):
         return {}
     given = [each.strip() for each in environment.get(PEERS_VARIABLE, "").split(";")]
     every = dict.fromkeys([*filter(None, given), *hosts])

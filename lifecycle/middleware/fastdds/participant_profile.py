@@ -191,7 +191,6 @@ class ParticipantSettings:
             message, and each that is sent again, to all: the history holds one and is full. Only
             with `names_by_udp`.
         asks_for_names_soon: for the names of nodes that were there before, or are found late.
-        sees_all: as a client of a discovery server that a profile names it receives everything.
 
     Raises:
         MiddlewareError: out of range, or URLs that one participant cannot have together.
@@ -208,7 +207,6 @@ class ParticipantSettings:
     names_by_udp: bool = False
     names_heartbeat_s: float | None = None
     asks_for_names_soon: bool = False
-    sees_all: bool = False
 
     @classmethod
     def of(
@@ -294,7 +292,7 @@ class ParticipantSettings:
             or self.unannounced
             or self.names_by_udp
             or self.asks_for_names_soon
-            or self.sees_all
+            or self.super_client
         )
 
 
@@ -468,8 +466,9 @@ def are_names_open(environment: Mapping[str, str]) -> bool:
 
 
 def _set_discovery(rtps: ET.Element, settings: ParticipantSettings, *, is_users: bool) -> None:
-    for each in rtps.iter("discoveryProtocol") if settings.sees_all else ():
-        each.text = "SUPER_CLIENT"
+    for each in rtps.iter("discoveryProtocol") if settings.super_client else ():
+        if (each.text or "").strip() == "CLIENT":
+            each.text = "SUPER_CLIENT"
     if not settings.unannounced:
         return
     config = _child(_child(rtps, "builtin"), "discovery_config")

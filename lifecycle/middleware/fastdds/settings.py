@@ -265,7 +265,7 @@ def unknown_versions() -> str:
 
 
 def observer_settings(
-    settings: ParticipantSettings, *, unannounced: bool, sees_all: bool
+    settings: ParticipantSettings, *, unannounced: bool, super_client: bool
 ) -> ParticipantSettings:
     """Return the settings of an observer's participant: no shared memory, unless it is chosen.
 
@@ -274,7 +274,7 @@ def observer_settings(
     Args:
         settings: what it needs otherwise.
         unannounced: it is to be, see ParticipantSettings.
-        sees_all: likewise.
+        super_client: likewise.
 
     Returns:
         `settings`, where they, a profile or the environment say what transports it has, and with
@@ -284,8 +284,8 @@ def observer_settings(
         return settings
     try:
         _library()
-        if settings or unannounced or sees_all:
-            return dataclasses.replace(settings, unannounced=unannounced, sees_all=sees_all)
+        if settings or unannounced or super_client:
+            return dataclasses.replace(settings, unannounced=unannounced, super_client=super_client)
         transports = without_shared_memory(os.environ)
         asks = bool(transports) and are_names_open(os.environ)
         return dataclasses.replace(settings, transports=transports, asks_for_names_soon=asks)

@@ -228,9 +228,7 @@ class GraphObserver:
     ) -> None:
         self.domain_id = domain_id
         self._early = early
-        settings = ParticipantSettings.of(
-            connections or ParticipantConnections(), super_client=True
-        )
+        settings = ParticipantSettings.of(connections or ParticipantConnections())
         self.urls = settings.urls
         self.owns_node = node is None
         self._lock = threading.Lock()
@@ -720,8 +718,8 @@ def _observing_node(
     """
     name = f"_lifecycle_observer_{os.getpid()}"
     unasked = answers_unasked(settings.urls, os.environ)
-    sees_all = is_served(settings.urls, os.environ) and not settings.urls
-    chosen = observer_settings(settings, unannounced=unasked, sees_all=sees_all)
+    served = is_served(settings.urls, os.environ)
+    chosen = observer_settings(settings, unannounced=unasked, super_client=served)
     with _as_super_client():
         context, node = quiet_node(name, "/", domain_id, settings=chosen)
     if not chosen.unannounced:
@@ -734,7 +732,7 @@ def _observing_node(
         node.destroy_node()
         context.try_shutdown()
         context.destroy()
-    known = observer_settings(settings, unannounced=False, sees_all=False)
+    known = observer_settings(settings, unannounced=False, super_client=served)
     return *quiet_node(name, "/", domain_id, settings=known), None
 
 

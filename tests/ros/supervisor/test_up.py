@@ -748,9 +748,6 @@ def test_a_run_that_hangs_on_leaving_the_graph_ends_with_its_verdict_and_report(
     assert left_of(mark) == []
 
 
-_SUBNET = {"discovery/range": "subnet"}
-
-
 @pytest.mark.parametrize("range_", ["subnet", "localhost"])
 def test_where_something_else_has_the_port_of_discovery_a_system_is_not_begun_and_says_so(
     tmp_path: Path, fresh_domain: int, range_: str
@@ -787,7 +784,7 @@ _OTHER_PORTS = """<?xml version="1.0" encoding="UTF-8" ?>
 def test_a_system_whose_profile_chooses_other_ports_needs_no_port_of_others(
     tmp_path: Path, fresh_domain: int
 ) -> None:
-    manifest = pair(tmp_path, fresh_domain, edit=_SUBNET)
+    manifest = pair(tmp_path, fresh_domain, edit={"discovery/range": "subnet"})
     profile = tmp_path / "ports.xml"
     profile.write_text(_OTHER_PORTS)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:

@@ -151,6 +151,24 @@ def test_an_unannounced_participant_ignores_all_and_announces_itself_less(tmp_pa
     assert texts(root, ".//initialAnnouncements/period/nanosec") == ["500000000"]
 
 
+@pytest.mark.parametrize(
+    ("protocol", "made_so"),
+    [("CLIENT", "SUPER_CLIENT"), ("SIMPLE", "SIMPLE"), ("SERVER", "SERVER")],
+)
+def test_of_a_server_that_a_profile_names_only_a_client_becomes_a_super_client(
+    tmp_path: Path, protocol: str, made_so: str
+) -> None:
+    path = tmp_path / "theirs.xml"
+    path.write_text(
+        f"""<dds><profiles><participant profile_name="theirs" is_default_profile="true"><rtps>
+        <builtin><discovery_config><discoveryProtocol>{protocol}</discoveryProtocol>
+        </discovery_config></builtin></rtps></participant></profiles></dds>"""
+    )
+    base = default_profile({"FASTRTPS_DEFAULT_PROFILES_FILE": str(path)})
+    root = made(ParticipantSettings(super_client=True), base=base)
+    assert texts(root, ".//discoveryProtocol") == [made_so]
+
+
 def test_names_by_udp_have_a_locator_at_both_ends_and_heartbeats_as_asked() -> None:
     root = made(ParticipantSettings(names_by_udp=True))
     for tag in ("data_writer", "data_reader"):

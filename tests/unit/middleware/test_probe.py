@@ -29,6 +29,7 @@ from lifecycle.middleware.discovery.probe import (
 )
 from lifecycle.network import participant_ports
 from lifecycle.network.connection_url import parse
+from lifecycle.pytest_plugin import claimed_domain
 from tests.unit.middleware.other_process import of_another_process
 
 _WAIT_S = 5.0
@@ -197,18 +198,22 @@ _SUBNET = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}
 def test_the_port_of_multicast_is_missing_where_only_another_process_has_it(
     url: str, environment: dict[str, str], *, misses: bool
 ) -> None:
-    domain, urls = 217, (parse(url),) if url else ()  # no other test has it
-    port = participant_ports(domain, 0).discovery_multicast
-    assert missing_port(domain, urls, environment) is None
+    urls = (parse(url),) if url else ()
+    with claimed_domain() as domain, contextlib.ExitStack() as stack:
+        port = participant_ports(domain, 0).discovery_multicast
+        assert missing_port(domain, urls, environment) is None
+        stack.enter_context(of_another_process(_sharing(port)))
+        assert missing_port(domain, urls, environment) == (port if misses else None)
+        stack.enter_context(_sharing(port))
+        assert missing_port(domain, urls, environment) is None
+
+
+def _sharing(port: int) -> socket.socket:
+    """Return a socket at a port that others may have, too, as Fast DDS has it for multicast."""
     shared = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     shared.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     shared.bind(("", port))
-    with of_another_process(shared):
-        assert missing_port(domain, urls, environment) == (port if misses else None)
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as own:
-            own.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            own.bind(("", port))
-            assert missing_port(domain, urls, environment) is None
+    return shared
 
 
 def test_who_is_not_listed_is_not_asked(peer: socket.socket) -> None:

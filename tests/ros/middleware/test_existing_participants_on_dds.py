@@ -1,4 +1,4 @@
-"""An observer sees who was there before in time, also where nobody can be asked to answer."""
+"""An observer discovers existing participants in time, also where none can be probed."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ _LIMIT_S = 60.0
 _OBSERVERS = 3
 """Before, each missed it in two of five tries."""
 
-_STRANGER = """
+_EXISTING = """
 import sys
 import rclpy
 from std_msgs.msg import String
 
 rclpy.init(domain_id=int(sys.argv[1]))
-node = rclpy.create_node("stranger")
+node = rclpy.create_node("existing")
 publisher = node.create_publisher(String, "words", 1)
 print("there", flush=True)
 sys.stdin.read()
@@ -48,28 +48,27 @@ for _ in range(int(sys.argv[2])):
             if (left_s := observer.settling_s()) <= 0:
                 break
             time.sleep(min(left_s, 0.01))
-        found.append(("/stranger", "/words") in endpoints)
+        found.append(("/existing", "/words") in endpoints)
 print(json.dumps(found))
 """
 
+
+def _one_transport(description: str) -> str:
+    return f"""
+        <transport_descriptors><transport_descriptor>
+          <transport_id>mine</transport_id>{description}
+        </transport_descriptor></transport_descriptors>
+        <participant profile_name="mine" is_default_profile="true"><rtps>
+          <userTransports><transport_id>mine</transport_id></userTransports>
+          <useBuiltinTransports>false</useBuiltinTransports>
+        </rtps></participant>"""
+
+
 _PROFILES = {
-    "shared memory": """
-        <transport_descriptors><transport_descriptor>
-          <transport_id>mine</transport_id><type>SHM</type>
-        </transport_descriptor></transport_descriptors>
-        <participant profile_name="mine" is_default_profile="true"><rtps>
-          <userTransports><transport_id>mine</transport_id></userTransports>
-          <useBuiltinTransports>false</useBuiltinTransports>
-        </rtps></participant>""",
-    "one interface": """
-        <transport_descriptors><transport_descriptor>
-          <transport_id>mine</transport_id><type>UDPv4</type>
-          <interfaceWhiteList><address>127.0.0.1</address></interfaceWhiteList>
-        </transport_descriptor></transport_descriptors>
-        <participant profile_name="mine" is_default_profile="true"><rtps>
-          <userTransports><transport_id>mine</transport_id></userTransports>
-          <useBuiltinTransports>false</useBuiltinTransports>
-        </rtps></participant>""",
+    "shared memory": _one_transport("<type>SHM</type>"),
+    "one interface": _one_transport(
+        "<type>UDPv4</type><interfaceWhiteList><address>127.0.0.1</address></interfaceWhiteList>"
+    ),
     "no multicast": """
         <participant profile_name="mine" is_default_profile="true"><rtps><builtin>
           <avoid_builtin_multicast>true</avoid_builtin_multicast>
@@ -82,9 +81,9 @@ _PROFILES = {
 
 
 @contextlib.contextmanager
-def a_stranger(domain_id: int) -> Iterator[None]:
+def an_existing_node(domain_id: int) -> Iterator[None]:
     with subprocess.Popen(
-        [sys.executable, "-c", _STRANGER, str(domain_id)],
+        [sys.executable, "-c", _EXISTING, str(domain_id)],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
@@ -106,7 +105,7 @@ def use_profile(profile: str, directory: Path, monkeypatch: pytest.MonkeyPatch) 
 
 
 def seen(domain_id: int) -> list[bool]:
-    """Return whether each of several observers saw the stranger before it said that it sees all."""
+    """Return whether each of several observers saw that node before it said that it sees all."""
     done = subprocess.run(
         [sys.executable, "-c", _OBSERVES, str(domain_id), str(_OBSERVERS)],
         capture_output=True,
@@ -124,7 +123,7 @@ def test_with_a_profile_that_says_how_others_are_found(
     use_profile(_PROFILES[profile], tmp_path, monkeypatch)
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     assert chosen_otherwise(os.environ)
-    with a_stranger(fresh_domain):
+    with an_existing_node(fresh_domain):
         assert seen(fresh_domain) == [True] * _OBSERVERS
 
 
@@ -134,7 +133,7 @@ def test_with_transports_that_the_environment_chooses(
 ) -> None:
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
     monkeypatch.setenv("FASTDDS_BUILTIN_TRANSPORTS", transports)
-    with a_stranger(fresh_domain):
+    with an_existing_node(fresh_domain):
         assert seen(fresh_domain) == [True] * _OBSERVERS
 
 
@@ -166,7 +165,7 @@ def test_with_a_discovery_server_that_the_environment_names(
     with a_discovery_server(port):
         monkeypatch.setenv("ROS_DISCOVERY_SERVER", f"127.0.0.1:{port}")
         monkeypatch.delenv("ROS_SUPER_CLIENT", raising=False)
-        with a_stranger(fresh_domain):
+        with an_existing_node(fresh_domain):
             assert seen(fresh_domain) == [True] * _OBSERVERS
 
 
@@ -187,5 +186,5 @@ def test_with_a_discovery_server_that_a_profile_names(
     (port,) = free_ports(1)
     with a_discovery_server(port):
         use_profile(_CLIENT.format(port=port), tmp_path, monkeypatch)
-        with a_stranger(fresh_domain):
+        with an_existing_node(fresh_domain):
             assert seen(fresh_domain) == [True] * _OBSERVERS
