@@ -31,6 +31,7 @@ from lifecycle.manifest import (
     Link,
     Manifest,
     ManifestError,
+    Mode,
     Node,
     NodeDeclaration,
     ParticipantGroup,
@@ -61,7 +62,7 @@ from lifecycle.plan.model import (
     in_mode,
 )
 from lifecycle.plan.negotiation.parties import ANY, LinksByPair
-from lifecycle.plan.parameters import ParameterFiles
+from lifecycle.plan.parameters import ParameterFiles, portable
 from lifecycle.plan.participants import command_line, place_flows
 
 
@@ -256,7 +257,7 @@ def build_plan(
     rmw = variables.get("RMW_IMPLEMENTATION", "") or DEFAULT_RMW
     wired = _wired(manifest, variables, domain_id=domain_id, rmw=rmw)
     plan = Plan(
-        **declared(SystemDeclaration, manifest),
+        **{**declared(SystemDeclaration, manifest), "modes": tuple(map(_portable, manifest.modes))},
         manifest_path=manifest.path,
         domain_id=domain_id,
         discovery_range=discovery_range,
@@ -466,12 +467,18 @@ def _planned_node(
     endpoints, connected, groups = place_declared(node.name, endpoints, node.connections, groups)
     endpoints, participants = place_flows(node.name, endpoints, groups)
     expected = files.expected(node)
+    given = tuple((name, portable(value)) for name, value in node.parameters)
     return PlannedNode(
-        **declared(NodeDeclaration, node),
+        **{**declared(NodeDeclaration, node), "parameters": given},
         process=process_name(node),
         held_by=_held_by(node),
         endpoints=endpoints,
-        declared_parameters=node.interface.parameters,
+        declared_parameters=tuple(
+            each
+            if each.default is None
+            else dataclasses.replace(each, default=portable(each.default))
+            for each in node.interface.parameters
+        ),
         expected_parameters=expected,
         mode_parameters=files.in_modes(node, expected),
         has_all_parameters=node.interface.has_all_parameters
@@ -484,6 +491,13 @@ def _planned_node(
             _planned_file(node.parameter_files, place, text) for place, text in node.written_paths
         ),
     )
+
+
+def _portable(mode: Mode) -> Mode:
+    parameters = tuple(
+        dataclasses.replace(each, value=portable(each.value)) for each in mode.parameters
+    )
+    return dataclasses.replace(mode, parameters=parameters)
 
 
 def _held_by(node: Node) -> HeldBy:

@@ -216,14 +216,16 @@ class ExpectedParameter:
     @property
     def raw(self) -> Any:
         """The value, also where JSON has no number for it."""
-        if isinstance(self.value, tuple):
-            return tuple(_raw(each, self.type) for each in self.value)
-        return _raw(self.value, self.type)
+        return raw_value(self.value, self.type)
 
 
-def _raw(value: Any, type_: str) -> Any:
-    is_text = isinstance(value, str) and type_.startswith("double")
-    return float(value.replace(".", "")) if is_text else value
+def raw_value(value: Any, type_: str) -> Any:
+    """Return a value of a plan as it is; doubles that JSON has no numbers for are text there."""
+    if not type_.startswith("double"):
+        return value
+    if isinstance(value, tuple):
+        return tuple(raw_value(each, type_) for each in value)
+    return float(value.replace(".", "")) if isinstance(value, str) else value
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -438,7 +440,7 @@ def _with_parameters(node: PlannedNode, given: tuple[ExpectedParameter, ...]) ->
         ),
         parameters=(
             *(each for each in node.parameters if each[0] not in values),
-            *((each.name, each.raw) for each in given if each.value is not None),
+            *((each.name, each.value) for each in given if each.value is not None),
         ),
     )
 

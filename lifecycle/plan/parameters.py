@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -234,6 +235,8 @@ def _scalar(text: str) -> ParameterValue | None:
 
     if len(text) > 1 and text[0] == text[-1] in "'\"" and not {text[0], "\\"} & set(text[1:-1]):
         return read_scalar(text[1:-1], quoted=True)
+    if re.fullmatch(r"\[\s*\]", text.strip()):
+        return ()
     if not text or text[0] in "[{'\"!&*|>%@`,#?" or ": " in text or " #" in text:
         return None
     return read_scalar(text, quoted=False)

@@ -178,6 +178,8 @@ def _ros_arguments(node: Node, *, alone: bool) -> Iterator[str]:
     # rcl 9.2 knows a value for one node by the name alone, and so has none for a namespace; the
     # supervisor sets these.
     for name, value in node.parameters if alone or node.namespace == "/" else ():
+        if value == ():
+            continue  # rcl has no empty array: `[]` takes the node's default from it
         yield from ("-p", f"{own}{name}:={parameter_text(value)}")
 
 

@@ -12,9 +12,12 @@ An interface that declares no parameters leaves them open, so nothing is checked
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import math
 import os
 import re
+import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
@@ -26,7 +29,7 @@ from lifecycle.manifest.nodl import nearest_file
 from lifecycle.manifest.schema import did_you_mean
 from lifecycle.manifest.yaml.document import Document, Place, Value, error, warning
 from lifecycle.manifest.yaml.source import is_outside, read_document
-from lifecycle.manifest.yaml.yaml_parser import INT64_MAX, INT64_MIN, quote
+from lifecycle.manifest.yaml.yaml_parser import INT64_MAX, INT64_MIN, not_finite, quote
 
 _SCALARS = {bool: "bool", int: "int", float: "double", str: "string"}
 _IMPLICIT = ("use_sim_time", "start_type_description_service")
@@ -41,8 +44,11 @@ _TRUE = frozenset(("Y", "y", *_spellings("yes"), *_spellings("true"), *_spelling
 _FALSE = frozenset(("N", "n", *_spellings("no"), *_spellings("false"), *_spellings("off")))
 _INTEGER = re.compile(r"\s*([-+]?)(0[xX][0-9a-fA-F]+|0[0-7]*|[1-9][0-9]*)\Z", re.ASCII)
 _DOUBLE = re.compile(
-    r"\s*[-+]?(\.?(inf|nan)|infinity|([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?)\Z",
+    r"\s*[-+]?(inf(inity)?|(nan)(\([0-9a-z_]*\))?|([0-9]+\.?[0-9]*|\.[0-9]+)(e[-+]?[0-9]+)?)\Z",
     re.ASCII | re.IGNORECASE,
+)
+_HEXADECIMAL = re.compile(
+    r"\s*[-+]?0x([0-9a-f]+\.?[0-9a-f]*|\.[0-9a-f]+)(p[-+]?[0-9]+)?\Z", re.ASCII | re.IGNORECASE
 )
 _LONGEST_INTEGER = 80
 
@@ -106,9 +112,29 @@ def read_scalar(text: str, *, quoted: bool) -> bool | int | float | str:
         number = int(f"{match[1]}{digits}", 8 if octal else 0)
         if INT64_MIN <= number <= INT64_MAX:
             return number
-    if _DOUBLE.match(text):
-        return float(text.strip().replace(".inf", "inf").replace(".nan", "nan").lower())
-    return text
+    number = _double(text)
+    return text if number is None else number
+
+
+def _double(text: str) -> float | None:
+    """Return what rcl reads as a double: YAML's words, else strtod() unless it sets ERANGE."""
+    if (found := not_finite(text)) is not None:
+        return found
+    if _HEXADECIMAL.match(text):
+        with contextlib.suppress(OverflowError):
+            return float.fromhex(text.strip())
+        return None
+    match = _DOUBLE.match(text)
+    if match is None:
+        return None
+    if match[1].lower().startswith("inf"):
+        return float(text)
+    if match[3]:
+        return math.nan
+    number = float(text)
+    digits = match[1].lower().partition("e")[0].strip("0.")
+    is_out_of_range = math.isinf(number) or (digits and abs(number) < sys.float_info.min)
+    return None if is_out_of_range else number
 
 
 def _show(value: ParameterValue) -> str:

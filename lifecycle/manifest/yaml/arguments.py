@@ -26,7 +26,7 @@ from lifecycle.manifest.yaml.substitutions import (
     parse_text,
     truth,
 )
-from lifecycle.manifest.yaml.yaml_parser import MAX_FINDINGS, quote, resolve
+from lifecycle.manifest.yaml.yaml_parser import MAX_FINDINGS, check_finite, quote, resolve
 
 MAX_TEXT = 1 << 20
 """Characters that the substitutions of one document may produce."""
@@ -271,6 +271,7 @@ class _Substitution:
             whole = len(parts) == 1 and isinstance(parts[0], Substitution)
             if whole and not value.quoted and text:
                 data = resolve(text)
+                check_finite(data, place)
         except LifecycleError as problem:
             if problem.message:
                 self._report("manifest.substitution", place, problem.message, problem.hint)

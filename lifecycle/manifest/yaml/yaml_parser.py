@@ -47,16 +47,19 @@ _LEADING_ZERO = re.compile(r"[-+]?0[0-9]+\Z")
 _OCTAL = re.compile(r"0o[0-7]+\Z")
 _HEXADECIMAL = re.compile(r"0x[0-9a-fA-F]+\Z")
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?\Z")
-_NOT_FINITE = re.compile(r"([-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN))\Z")
+_INFINITE = re.compile(r"[-+]?\.(inf|Inf|INF)\Z")
+_NOT_A_NUMBER = frozenset({".nan", ".NaN", ".NAN"})
 _LONGEST_INT = 80  # digits; int() is quadratic in them and refuses 4300, INT64_MIN has 19
 
 
 def resolve(text: str) -> Scalar:
     """Return what the unquoted scalar `text` means.
 
+    `.inf` and `.nan` are doubles; where they may be written is `may_be_any_double`'s.
+
     Raises:
-        ValueError: a number that is not finite or does not fit into 64 bits; the message is a
-            phrase that follows "cannot use '…': ".
+        ValueError: a number that is too large for a double or does not fit into 64 bits; the
+            message is a phrase that follows "cannot use '…': ".
     """
     if text in _NULL:
         return None
@@ -71,10 +74,38 @@ def resolve(text: str) -> Scalar:
         number = float(text)
         if math.isfinite(number):
             return number
-        raise ValueError("a number must be finite")
-    if _NOT_FINITE.match(text):
-        raise ValueError("a number must be finite")
-    return text
+        raise ValueError(_FINITE)
+    special = not_finite(text)
+    return text if special is None else special
+
+
+_FINITE = "a number must be finite"
+
+
+def not_finite(text: str) -> float | None:
+    """Return the double that YAML's `.inf`, `-.INF`, `.NaN` … spell; None of anything else."""
+    if text in _NOT_A_NUMBER:
+        return math.nan
+    return float(text.replace(".", "")) if _INFINITE.match(text) else None
+
+
+_NAMED = frozenset({"nodes", "groups", "modes", "machines", "arguments"})
+"""Sections whose keys users choose: one that is called `parameters` is none."""
+
+
+def may_be_any_double(place: Place) -> bool:
+    """Whether a number there may be infinite or none: values of parameters, and only those."""
+    return any(
+        each == "extra_arguments"
+        or (each == "parameters" and (index == 0 or place[index - 1] not in _NAMED))
+        for index, each in enumerate(place)
+    )
+
+
+def check_finite(number: object, place: Place) -> None:
+    """Raise the ValueError of `resolve` for a number that must be finite at this place."""
+    if isinstance(number, float) and not math.isfinite(number) and not may_be_any_double(place):
+        raise ValueError(_FINITE)
 
 
 def has_leading_zero(text: str) -> bool:
@@ -253,6 +284,7 @@ class _Composer:
         if not quoted:
             try:
                 data = resolve(event.value)
+                check_finite(data, self._next_place())
             except ValueError as problem:
                 self._note("yaml.number", mark, f"cannot use {_cut(event.value)}: {problem}")
         if self._wants_key():

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import importlib
-from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Collection, Coroutine, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from lifecycle_msgs.msg import TransitionEvent
@@ -25,7 +25,12 @@ from std_srvs.srv import Trigger
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.rcl.graph import GraphObserver
-from lifecycle.middleware.services.parameters import read_parameters, report_parameters
+from lifecycle.middleware.services.parameters import (
+    parameter_value,
+    read_parameters,
+    report_parameters,
+    type_word,
+)
 from lifecycle.middleware.services.service_calls import ServiceCalls, ServiceUnansweredError
 from lifecycle.plan import COMMAND, DEFAULT, PlannedNode
 from lifecycle.verify import (
@@ -237,8 +242,11 @@ class NodeClients:
             node_name=node.name,
             node_namespace=node.namespace,
             remap_rules=[f"{source}:={target}" for source, target in node.remap],
-            parameters=_messages(_given_values(node).items()),
-            extra_arguments=_messages(node.run.extra_arguments),
+            parameters=[each.to_parameter_msg() for each in _given_values(node).values()],
+            extra_arguments=[
+                RclpyParameter(name, value=value).to_parameter_msg()
+                for name, value in node.run.extra_arguments
+            ],
         )
 
         async def load() -> int:
@@ -294,18 +302,20 @@ class NodeClients:
             ServiceUnansweredError: the node serves no parameters, or did not answer.
             MiddlewareError: it refuses a value, with its reason.
         """
-        values = _given_values(planned)
-        if not values:
-            return
         node = planned.full_name
-        has = {each.name: each.value for each in await self.get_parameters(node)}
-        wanted = {name: value for name, value in values.items() if has.get(name, value) != value}
+        if not any(each.value is not None for each in planned.expected_parameters):
+            return
+        has = {each.name: each for each in await self.report_parameters(node, None)}
+        values = _given_values(planned, {name: each.type for name, each in has.items()})
+        wanted = {
+            name: each for name, each in values.items() if name in has and _differs(has[name], each)
+        }
         if not wanted:
             return
         response = await self._calls.call(
             f"{node}/set_parameters",
             SetParameters,
-            SetParameters.Request(parameters=_messages(wanted.items())),
+            SetParameters.Request(parameters=[each.to_parameter_msg() for each in wanted.values()]),
             timeout_s=timeout_s,
             repeat=True,
         )
@@ -571,17 +581,43 @@ _PARAMETER_TYPES = {
     "int_array": RclpyParameter.Type.INTEGER_ARRAY,
     "double_array": RclpyParameter.Type.DOUBLE_ARRAY,
     "string_array": RclpyParameter.Type.STRING_ARRAY,
+    "byte_array": RclpyParameter.Type.BYTE_ARRAY,
 }
 
 
-def _given_values(node: PlannedNode) -> dict[str, Any]:
-    """Return what a plan gives a node's parameters, as rclpy has it, but by its command line."""
-    return {
-        each.name: [bytes((one,)) for one in each.raw] if each.type == "byte_array" else each.raw
-        for each in node.expected_parameters
-        if each.value is not None and each.source not in (DEFAULT, COMMAND)
-    }
+def _given_values(node: PlannedNode, has: Mapping[str, str] | None = None) -> dict[str, Any]:
+    """Return what a plan gives a node's parameters, by name, but by its command line.
+
+    Empty arrays are among them, too: rcl reads none from a command line. One whose type is declared
+    nowhere is given by the type that the node has for it, and not at all where that is unknown.
+
+    Args:
+        node: as it is planned.
+        has: types of what the node has, by name; None while it is not made.
+    """
+    given = {}
+    for each in node.expected_parameters:
+        word = (has or {}).get(each.name, "") if each.type == "array" else each.type
+        known = _PARAMETER_TYPES.get(word)
+        if each.value is None or known is None or each.source == DEFAULT:
+            continue
+        if each.source == COMMAND and each.value != ():
+            continue
+        if each.type == "array" and not word.endswith("_array"):
+            continue
+        value = each.raw
+        if isinstance(value, tuple):
+            value = [bytes((one,)) for one in value] if word == "byte_array" else list(value)
+        given[each.name] = RclpyParameter(each.name, known, value)
+    return given
 
 
-def _messages(values: Iterable[tuple[str, Any]]) -> list[Any]:
-    return [RclpyParameter(name, value=value).to_parameter_msg() for name, value in values]
+def _differs(has: ParameterReport, given: RclpyParameter) -> bool:
+    """Whether a node has another value than it is given; what is not a number equals itself."""
+    wanted = ParameterReport.of(
+        has.name,
+        type_word(given.type_.value),
+        parameter_value(given.value),
+        read_only=has.read_only,
+    )
+    return has != wanted

@@ -427,6 +427,7 @@ class LifecycleNode(Declarations, LocalInterface, RclpyLifecycle, GatedFactories
             options["cli_args"] = [*ros_arguments(planned), *(options.get("cli_args") or ())]
             given = options.get("parameter_overrides") or ()
             options["parameter_overrides"] = [*given, *parameters.overrides(planned)]
+            parameters.give_empty_arrays(self, planned)
         if construction is not None:
             context = construction.context or context
             options.setdefault("use_global_arguments", construction.use_global_arguments)

@@ -8,6 +8,8 @@ the next configure.
 
 from __future__ import annotations
 
+import copy
+import functools
 from typing import TYPE_CHECKING, Any
 
 from rcl_interfaces.msg import ParameterDescriptor
@@ -19,12 +21,13 @@ from rclpy.parameter import Parameter
 from rclpy.parameter_service import ParameterService
 
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest import ParameterDeclaration, ParameterValue
+from lifecycle.manifest import ParameterDeclaration, ParameterValue, type_of
 from lifecycle.middleware import parameter_value, type_word
+from lifecycle.plan import DEFAULT, raw_value
 from lifecycle.verify import ParameterReport
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from rclpy.node import Node
     from rclpy.service import Service
@@ -42,15 +45,94 @@ _TYPES = {
     "string_array": Parameter.Type.STRING_ARRAY,
     "byte_array": Parameter.Type.BYTE_ARRAY,
 }
+_ARRAYS = frozenset(each for name, each in _TYPES.items() if name.endswith("_array"))
 
 
 def overrides(spec: PlannedNode) -> list[Parameter]:
     """Return the plan's values as rclpy overrides; they win over parameter files."""
     types = {declared.name: declared.type for declared in spec.declared_parameters}
-    return [
-        Parameter(name, value=to_rclpy(value, types.get(name, "")))
-        for name, value in spec.parameters
+    given = [
+        (name, to_rclpy(value, types.get(name, "") or type_of(value)))
+        for name, value in without_text(spec)
     ]
+    return [Parameter(name, value=value) for name, value in given if value != []]
+
+
+def give_empty_arrays(node: Node, spec: PlannedNode) -> None:
+    """Have a node that is about to be constructed declare its empty arrays with their type.
+
+    Neither rcl's parameter files nor rclpy's overrides and defaults have an empty array of another
+    type than byte_array: each is declared without it, and set to it before anything can read it.
+    """
+    empty = {
+        each.name: "" if each.type == "array" else each.type
+        for each in spec.expected_parameters
+        if each.value == () and each.source != DEFAULT
+    }
+    if not empty:
+        return
+    declare_all = node.declare_parameters
+
+    @functools.wraps(declare_all)
+    def declare_parameters(
+        namespace: str, parameters: Iterable[tuple[Any, ...]], ignore_override: bool = False
+    ) -> list[Parameter]:
+        found: list[Parameter] = []
+        for each in parameters:
+            name = f"{namespace}.{each[0]}" if namespace else each[0]
+            type_ = None if ignore_override else _array_type(each, empty.get(name))
+            if type_ is None:
+                found += declare_all(namespace, [each], ignore_override)
+            else:
+                descriptor = each[2] if len(each) > 2 else ParameterDescriptor()
+                found.append(_declare_empty(node, declare_all, name, type_, descriptor))
+        return found
+
+    node.declare_parameters = declare_parameters
+
+
+def _array_type(declared: tuple[Any, ...], wanted: str | None) -> Parameter.Type | None:
+    """Return the type of an empty array that a declaration is to get; None if it is to get none.
+
+    Args:
+        declared: name, value or type, and descriptor, as rclpy's declare_parameters() has them.
+        wanted: our name of the type; empty: that of the declaration; None: no array is given.
+    """
+    if wanted is None:
+        return None
+    by_code = declared[1] if len(declared) > 1 else None
+    if by_code is not None and not isinstance(by_code, Parameter.Type):
+        by_code = Parameter.Type.from_parameter_value(by_code)
+    # Where types differ, rclpy refuses the value, as any of another type.
+    found = _TYPES[wanted] if wanted else by_code
+    return found if found in _ARRAYS else None
+
+
+def _declare_empty(
+    node: Node,
+    declare_all: Callable[..., list[Parameter]],
+    name: str,
+    type_: Parameter.Type,
+    descriptor: ParameterDescriptor,
+) -> Parameter:
+    """Declare a parameter as an empty array of a type, read-only or not.
+
+    Raises:
+        InvalidParameterValueException: a callback of the node refuses it.
+    """
+    writable = copy.copy(descriptor)
+    writable.read_only = False
+    second = None if descriptor.dynamic_typing else type_
+    declare_all("", [(name, second, writable)], ignore_override=True)
+    value = Parameter(name, type_, [])
+    (result,) = node.set_parameters([value])
+    if not result.successful:
+        node.undeclare_parameter(name)
+        raise InvalidParameterValueException(name, [], result.reason)
+    if descriptor.read_only:
+        writable.read_only = True
+        node.set_descriptor(name, writable)
+    return value
 
 
 _MAKES_MORE = (
@@ -84,6 +166,7 @@ def declare(node: Node, spec: PlannedNode) -> None:
         LifecycleError: every value that does not fit its declaration.
     """
     problems: list[str] = []
+    given = {each.name for each in spec.expected_parameters if each.source not in ("", DEFAULT)}
     for declared in spec.declared_parameters:
         if node.has_parameter(declared.name):
             continue
@@ -92,9 +175,14 @@ def declare(node: Node, spec: PlannedNode) -> None:
         )
         value: Any = _TYPES[declared.type]
         if declared.default is not None:
-            value = to_rclpy(declared.default, declared.type)
+            value = to_rclpy(raw_value(declared.default, declared.type), declared.type)
         try:
-            node.declare_parameter(declared.name, value, descriptor)
+            if value == [] and declared.name not in given:
+                type_ = _TYPES[declared.type]
+                _declare_empty(node, node.declare_parameters, declared.name, type_, descriptor)
+            else:
+                value = _TYPES[declared.type] if value == [] else value
+                node.declare_parameter(declared.name, value, descriptor)
         except (InvalidParameterTypeException, InvalidParameterValueException) as error:
             problems.append(_problem(declared, error))
     if problems:
@@ -130,6 +218,13 @@ def to_rclpy(value: ParameterValue, type_: str) -> Any:
     if type_ == "double" and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     return value
+
+
+def without_text(spec: PlannedNode) -> Iterator[tuple[str, ParameterValue]]:
+    """Yield the values under `parameters:`; doubles that JSON cannot carry are doubles again."""
+    types = {each.name: each.type for each in spec.expected_parameters}
+    for name, value in spec.parameters:
+        yield name, raw_value(value, types.get(name, ""))
 
 
 def _problem(declared: ParameterDeclaration, error: Exception) -> str:

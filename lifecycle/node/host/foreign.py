@@ -684,6 +684,7 @@ class Adoption:
         refuse_unmanaged(planned, type(node))
         if not ours:
             name, options = planned.name, self._options(planned, options)
+            parameters.give_empty_arrays(node, planned)
         with self._carrying(planned) as context:
             yield name, {**options, "context": context}
         foreign = None if ours and planned.managed else self._host(node, planned)

@@ -19,7 +19,7 @@ from lifecycle import dataclasses
 from lifecycle.errors import BringUpError, MiddlewareError
 from lifecycle.manifest import Condition, RosArguments, RunKind, TargetState
 from lifecycle.node import HostSpec, Operation
-from lifecycle.plan import GIVEN, PlannedNode
+from lifecycle.plan import DEFAULT, GIVEN, PlannedNode
 from lifecycle.supervisor.control.protocol import ProcessState, Reach
 from lifecycle.supervisor.gate.gate import Permit
 from lifecycle.supervisor.nodes.driver import ACTIVE, ControlDriver, NodeCondition, NodeDriver
@@ -474,12 +474,15 @@ class BringUp:
     def _is_to_be_given(node: NodeRun) -> bool:
         """Whether its command line cannot give it all of its parameters, see `command_line`."""
         planned, process = node.planned, node.process
+        empty = [each for each in planned.expected_parameters if each.value == ()]
+        if planned.run.component and any(each.type == "array" for each in empty):
+            return True
         if process is None or planned.run.kind is not RunKind.COMMAND:
             return False
         if planned.run.ros_args is RosArguments.NONE:
             return bool(planned.parameters or planned.parameter_files)
-        if planned.mode_parameters:
-            return True  # it may come again in another mode
+        if planned.mode_parameters or any(each.source != DEFAULT for each in empty):
+            return True  # it may come again in another mode; rcl reads no empty array
         shared = len(process.planned.nodes) > 1
         return shared and planned.namespace != "/" and bool(planned.parameters)
 
