@@ -1,4 +1,7 @@
+from .checks.parameters import CommandParameter as CommandParameter
 from .checks.parameters import Section as Section
+from .checks.parameters import command_line_parameters as command_line_parameters
+from .checks.parameters import given_value as given_value
 from .checks.parameters import is_implicit as is_implicit
 from .checks.parameters import misfit as misfit
 from .checks.parameters import read_scalar as read_scalar

@@ -57,7 +57,7 @@ from lifecycle.manifest.qos import (
     not_written,
     problems,
 )
-from lifecycle.manifest.yaml.document import Cursor, Scalar, error, warning
+from lifecycle.manifest.yaml.document import Cursor, Scalar, error, note
 from lifecycle.manifest.yaml.yaml_parser import YAML_1_1_BOOLEANS, has_leading_zero, quote
 from lifecycle.network import ConnectionUrl, ConnectionUrlError, parse, parse_dscp
 
@@ -603,11 +603,11 @@ def _parameter(name: str, cursor: Cursor, found: Findings) -> ParameterValue | N
     if not cursor.value.quoted and len(text) > 1 and text in YAML_1_1_BOOLEANS:
         message = f"cannot tell whether {text} is meant as a boolean; it is read as a string"
         hint = f'write {name}: true or false, or {name}: "{text}"'
-        found.append(warning("manifest.yaml-1.1-boolean", cursor.at, message, hint))
+        found.append(note("manifest.yaml-1.1-boolean", cursor.at, message, hint))
     if not cursor.value.quoted and has_leading_zero(text):
         message = f"cannot tell which number {text} is meant as; it is read as a string"
         hint = f'write {name}: {text.lstrip("+0") or "0"}, or {name}: "{text}"'
-        found.append(warning("manifest.leading-zero", cursor.at, message, hint))
+        found.append(note("manifest.leading-zero", cursor.at, message, hint))
     return cursor.scalar
 
 

@@ -19,7 +19,12 @@ class Severity(enum.Enum):
     """How bad a diagnostic is; only ERROR stops a manifest from loading."""
 
     ERROR = "error"
-    WARNING = "warning"
+    WARNING = "warning"  # something declared is not proven, or not in force: `--strict` refuses it
+    NOTE = "note"  # advice: nothing that is declared is in doubt
+
+
+BY_POLICY = frozenset({"check.unheard", "check.unpublished", "check.no-server"})
+"""Rules whose severity `policy:` decides: a warning of them is what was asked for."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,10 +60,15 @@ class Diagnostic:
     message: str
     hint: str = ""
 
+    @property
+    def is_unproven(self) -> bool:
+        """Whether `--strict` refuses it: it is a warning, and none that the policy asks for."""
+        return self.severity is Severity.WARNING and self.rule not in BY_POLICY
+
     def __str__(self) -> str:
         place = f"{self.at.file}:{self.at.line}:{self.at.column}: "
         path = f"{self.at.path}: " if self.at.path else ""
-        word = "warning: " if self.severity is Severity.WARNING else ""
+        word = "" if self.severity is Severity.ERROR else f"{self.severity.value}: "
         return f"{place}{word}{path}{self.message}" + (f"; {self.hint}" if self.hint else "")
 
 

@@ -43,7 +43,7 @@ from lifecycle.manifest.schema import MANIFEST, nearest, read_schema, validate
 from lifecycle.manifest.shared import Shared, settle
 from lifecycle.manifest.yaml import include
 from lifecycle.manifest.yaml.arguments import CONDITIONS, Substituted, substitute
-from lifecycle.manifest.yaml.document import Cursor, Document, Place, Value, error, warning
+from lifecycle.manifest.yaml.document import Cursor, Document, Place, Value, error, note
 from lifecycle.manifest.yaml.source import is_outside, note_file, read_document
 from lifecycle.manifest.yaml.substitutions import Programs, Surroundings, folder_of
 from lifecycle.manifest.yaml.yaml_parser import quote
@@ -219,7 +219,7 @@ class Loaded:
     """A manifest without errors.
 
     Attributes:
-        warnings: what may be wrong with it, by position.
+        warnings: what may be wrong with it, and notes, by position.
     """
 
     manifest: Manifest
@@ -255,7 +255,7 @@ def load(
 
     if manifest is None:
         raise ManifestError(every())
-    manifest = settle(_without_left_out(manifest))
+    manifest = settle(_without_left_out(manifest), found)
     if not manifest.nodes and manifest.left_out:
         at = Position(file=manifest.path, line=1, column=1)
         message = "cannot run a system without nodes: conditions leave out all of them"
@@ -274,7 +274,9 @@ def load(
     found += check(manifest, environment=variables)
     if any(each.severity is Severity.ERROR for each in found):
         raise ManifestError(every())
-    return Loaded(manifest=manifest, warnings=every())
+    warnings = every()
+    unproven = tuple(each for each in warnings if each.is_unproven)
+    return Loaded(manifest=dataclasses.replace(manifest, unproven=unproven), warnings=warnings)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -734,7 +736,7 @@ class _Loading:
             message = f"cannot tell by its name {name!r} that this is a manifest"
             stem = name.removesuffix(".yaml").removesuffix(".yml")
             hint = f"rename it to {stem}{SUFFIX}"
-            self.found.append(warning("manifest.suffix", at, message, hint))
+            self.found.append(note("manifest.suffix", at, message, hint))
 
     def _check_outermost(self, root: Cursor, manifest: Manifest) -> None:
         """Warn where a system-wide section of an included manifest has no effect."""
@@ -749,7 +751,7 @@ class _Loading:
             if key in root and mine != holds:
                 message = f"cannot use the {key} of an included manifest; the including one's holds"
                 at = root.document.key_at((key,))
-                self.found.append(warning("manifest.include-ignored", at, message))
+                self.found.append(note("manifest.include-ignored", at, message))
 
 
 def _union(

@@ -12,7 +12,7 @@ from typing import Annotated
 
 from lifecycle import dataclasses
 from lifecycle.codec import DomainId, Positive, says
-from lifecycle.manifest.diagnostics import Position, Severity
+from lifecycle.manifest.diagnostics import Diagnostic, Position, Severity
 from lifecycle.manifest.qos import POLICIES, QosProfile
 from lifecycle.network import (
     ConnectionUrl,
@@ -879,9 +879,11 @@ class SystemDeclaration:
     Attributes:
         on_violation: what is done about violations for which nothing nearer says it.
         modes: the first is entered at the start; none: every node is as it is declared.
+        unproven: warnings about what is declared and not proven, or in force for nothing.
     """
 
     system: str
+    unproven: tuple[Diagnostic, ...] = ()
     machines: tuple[Machine, ...] = ()
     discovery: Discovery = Discovery()
     network: Network = Network()

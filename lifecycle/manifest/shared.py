@@ -9,13 +9,13 @@ done when a process fails (`restart:` …) all nodes of the process share, which
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 
 from lifecycle import dataclasses
 from lifecycle.manifest.building import Findings, build_parameters
 from lifecycle.manifest.checks.parameters import is_implicit, read_sections, shown_path
 from lifecycle.manifest.checks.system import full_name
-from lifecycle.manifest.diagnostics import Position
+from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.model import (
     SUPERVISION_KEYS,
     Manifest,
@@ -24,7 +24,7 @@ from lifecycle.manifest.model import (
     RunKind,
     Supervision,
 )
-from lifecycle.manifest.yaml.document import Cursor, error
+from lifecycle.manifest.yaml.document import Cursor, error, warning
 
 SIM_TIME = "use_sim_time"
 
@@ -117,14 +117,16 @@ class Shared:
         )
 
 
-def settle(manifest: Manifest) -> Manifest:
+def settle(manifest: Manifest, found: Findings) -> Manifest:
     """Take from nodes the shared parameters that their files set, and those they do not declare.
 
     Nodes of one process get what any of them says of its supervision.
 
     Args:
         manifest: with all that it includes, so that each node has its full name.
+        found: findings are appended here: shared parameters that no node declares.
     """
+    found.extend(_for_no_node(manifest.nodes))
     own: dict[str, dict[str, object]] = {}
     for node in manifest.nodes:
         if node.process:
@@ -135,6 +137,24 @@ def settle(manifest: Manifest) -> Manifest:
         for node in manifest.nodes
     )
     return dataclasses.replace(manifest, nodes=nodes)
+
+
+def _for_no_node(nodes: Iterable[Node]) -> Iterator[Diagnostic]:
+    """Warn of each shared parameter that none of the nodes declares which it is for."""
+    taken: set[Position] = set()
+    unknown: dict[Position, str] = {}
+    for node in nodes:
+        declared = {each.name for each in node.interface.parameters}
+        for name, _ in node.parameters:
+            place = f"parameters.{name}"
+            if place in node.shared and (not declared or name in declared or is_implicit(name)):
+                taken.add(node.where(place))
+            elif place in node.shared:
+                unknown[node.where(place)] = name
+    for at, name in unknown.items():
+        if at not in taken:
+            message = f"cannot set parameter {name!r}: no node that it is for declares it"
+            yield warning("check.parameter-undeclared", at, message)
 
 
 def _own_supervision(node: Node) -> dict[str, object]:

@@ -13,9 +13,6 @@ and of those that match a node the later wins. `-p` goes into the section `/**`.
 from __future__ import annotations
 
 import math
-import os
-import re
-from collections.abc import Iterator
 from typing import TYPE_CHECKING, NamedTuple
 
 from lifecycle import dataclasses
@@ -111,21 +108,24 @@ class ParameterFiles:
 
     def unread(self, node: Node) -> tuple[str, ...]:
         """Return the files of a node whose values are not known here."""
-        named = [path for path, *_ in _command_line(node) if path]
+        from lifecycle.manifest import command_line_parameters
+
+        named = [each.file for each in command_line_parameters(node) if each.file]
         files = [self._file(path) for path in (*named, *node.parameter_files)]
         return tuple(each.shown for each in files if not each.is_read)
 
     def _given(self, node: Node) -> dict[str, _Given]:
+        from lifecycle.manifest import CommandParameter, command_line_parameters, given_value
+
         name_of_node = f"{node.namespace.rstrip('/')}/{node.name}"
         sections: dict[str, dict[str, _Given]] = {}
-        for path, name, text, is_own in (
-            *_command_line(node),
-            *((p, "", "", False) for p in node.parameter_files),
-        ):
+        own = [each for each in command_line_parameters(node) if each.node in ("", node.name)]
+        files = [CommandParameter(file=each) for each in node.parameter_files]
+        for path, base, name, text in (*own, *files):
             if not path:
-                value = _scalar(text)
+                value = given_value(text)
                 # What all nodes of a process are given only some of them need have.
-                optional = bool(node.process) and not is_own
+                optional = bool(node.process) and not base
                 given = _Given(value, COMMAND, optional=optional, at=node.at)
                 sections.setdefault("/**", {})[name] = given
                 continue
@@ -202,44 +202,6 @@ def _undeclared(name: str, given: _Given) -> ExpectedParameter | None:
         optional=given.optional,
         at=given.at,
     )
-
-
-def _command_line(node: Node) -> Iterator[tuple[str, str, str, bool]]:
-    """Yield what a node's own command line sets of parameters.
-
-    Each is (file, "", "", False) or ("", name, text, whether it is for this node alone). As rcl's
-    parser reads it: between `--ros-args` and `--`, `-p name:=value`, which may begin with the name
-    of a node, and `--params-file`.
-    """
-    words = iter(node.run.command)
-    for word in words:
-        if word != "--ros-args":
-            continue
-        for option in words:
-            if option == "--":
-                break
-            if option in ("-p", "--param"):
-                name, separator, text = next(words, "").partition(":=")
-                base, _, alone = name.rpartition(":")
-                if separator and base in ("", node.name):
-                    yield "", alone, text, bool(base)
-            elif option == "--params-file":
-                folder = node.run.working_directory or os.curdir
-                path = os.path.abspath(os.path.join(folder, next(words, "")))  # noqa: PTH100, PTH118
-                yield path, "", "", False
-
-
-def _scalar(text: str) -> ParameterValue | None:
-    """Return what rcl makes of a value on a command line; None of anything but a plain scalar."""
-    from lifecycle.manifest import read_scalar
-
-    if len(text) > 1 and text[0] == text[-1] in "'\"" and not {text[0], "\\"} & set(text[1:-1]):
-        return read_scalar(text[1:-1], quoted=True)
-    if re.fullmatch(r"\[\s*\]", text.strip()):
-        return ()
-    if not text or text[0] in "[{'\"!&*|>%@`,#?" or ": " in text or " #" in text:
-        return None
-    return read_scalar(text, quoted=False)
 
 
 def as_type(value: ParameterValue, type_: str) -> ParameterValue:

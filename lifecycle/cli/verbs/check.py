@@ -83,7 +83,7 @@ class CheckReport:
         if self.ok:
             return ExitCode.OK
         errors = any(each.severity is Severity.ERROR for each in self.diagnostics)
-        alone = strict and not errors and not self.diagnostics
+        alone = strict and not errors and bool(self.system)
         return ExitCode.UNVERIFIABLE if alone else ExitCode.MANIFEST_INVALID
 
 
@@ -93,7 +93,7 @@ def write_check(report: CheckReport, format_: str, *, strict: bool) -> str:
     Args:
         report: what was found.
         format_: see above.
-        strict: warnings and what could not be resolved count as failures.
+        strict: what is unproven and what could not be resolved count as failures.
     """
     if format_ == "json":
         return to_json(report).decode()
@@ -105,7 +105,7 @@ def write_check(report: CheckReport, format_: str, *, strict: bool) -> str:
     if format_ == "github":
         lines += [
             annotation(
-                "error" if strict else each.severity.value,
+                "error" if strict and each.is_unproven else _LEVELS[each.severity],
                 each.rule,
                 f"{each.message}; {each.hint}" if each.hint else each.message,
                 at=f"{each.at.file}:{each.at.line}:{each.at.column}",
@@ -119,9 +119,8 @@ def summary(report: CheckReport) -> str:
     """Return one line, `teleop: 6 nodes, 14 endpoints, 3 links: ok`."""
     severities = [each.severity for each in report.diagnostics]
     errors, warnings = severities.count(Severity.ERROR), severities.count(Severity.WARNING)
-    found = [_count(errors, "error")] * bool(errors) + [_count(warnings, "warning")] * bool(
-        warnings
-    )
+    by_word = [(errors, "error"), (warnings, "warning"), (severities.count(Severity.NOTE), "note")]
+    found = [_count(number, word) for number, word in by_word if number]
     found += [f"{len(report.unresolved)} not resolved"] * bool(report.unresolved)
     outcome = "ok" if report.ok else "not ok"
     verdict = f"{outcome} ({', '.join(found)})" if found else outcome
@@ -135,6 +134,10 @@ def summary(report: CheckReport) -> str:
     return f"{report.system}: {', '.join(counts)}: {verdict}"
 
 
+_LEVELS = {Severity.ERROR: "error", Severity.WARNING: "warning", Severity.NOTE: "notice"}
+"""As annotations of GitHub call them."""
+
+
 def _count(number: int, word: str) -> str:
     return f"{number} {word}{'' if number == 1 else 's'}"
 
@@ -146,7 +149,11 @@ def _junit(report: CheckReport, *, strict: bool) -> str:
     for name in TESTS:
         case = ET.SubElement(suite, "testcase", classname="check", name=name)
         found = [each for each in report.diagnostics if _test(each.rule) == name]
-        bad = [each for each in found if strict or each.severity is Severity.ERROR]
+        bad = [
+            each
+            for each in found
+            if each.severity is Severity.ERROR or (strict and each.is_unproven)
+        ]
         notes = list(map(str, report.unresolved)) if name == "programs" else []
         said = [str(each) for each in found if each not in bad]
         if bad or (strict and notes):
@@ -244,7 +251,9 @@ def _legal(text: str) -> str:
 @manifest_arguments
 @format_option("text", "json", "sarif", "junit", "github")
 @click.option(
-    "--strict", is_flag=True, help="Let warnings and what could not be resolved fail it, too."
+    "--strict",
+    is_flag=True,
+    help="Let what is not proven (warnings, what could not be resolved) fail it, too.",
 )
 @machine_option("The machine that this host is; default: all whose address is this host's.")
 @click.option(
@@ -265,7 +274,8 @@ def command(
 
     Programs, packages, Python classes and their handlers are looked for without running them, as
     `lifecycle up` would find them here. Needs no ROS. Exits with 0 if it can be used, with 3 if
-    not; under --strict with 5 if all that is missing is something that could not be resolved.
+    not; under --strict with 5 if it can, but a warning or something that could not be resolved
+    remains. Notes, and warnings that `policy:` asks for, never fail it.
     """
     if lists:
         return _list(manifest, format_, others=bool(assignments or strict or machine or report))
@@ -341,14 +351,17 @@ def check(
             *check_plan(result.manifest),
             *resolution.diagnostics,
         )
-        if all(each.severity is Severity.WARNING for each in diagnostics):
+        if all(each.severity is not Severity.ERROR for each in diagnostics):
             loaded = result.manifest
     except ManifestError as error:
         diagnostics = error.diagnostics
     nodes = loaded.nodes if loaded else ()
     return CheckReport(
         manifest=path,
-        ok=loaded is not None and not (strict and (diagnostics or resolution.unresolved)),
+        ok=loaded is not None
+        and not (
+            strict and (any(each.is_unproven for each in diagnostics) or resolution.unresolved)
+        ),
         system=loaded.system if loaded else "",
         nodes=len(nodes),
         endpoints=sum(len(node.interface.endpoints) for node in nodes),

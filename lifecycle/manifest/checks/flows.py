@@ -26,7 +26,7 @@ from lifecycle.manifest.model import (
 from lifecycle.manifest.names import full_name_problem
 from lifecycle.manifest.qos import Reliability
 from lifecycle.manifest.schema import did_you_mean
-from lifecycle.manifest.yaml.document import error, warning
+from lifecycle.manifest.yaml.document import error, note, warning
 from lifecycle.network import MAX_DSCP, UniqueRequirement, describe, five_qi_of
 
 ASKS_UNIQUE = (*OWN_FLOW, UniqueRequirement.SYSTEM_DEFAULT)
@@ -89,7 +89,7 @@ def _marking(node: Node, each: ResolvedNeed) -> Iterator[Diagnostic]:
             f"BEST_EFFORT and acknowledges nothing"
         )
         hint = "make it RELIABLE, or mark the publishers of the topic"
-        yield warning("check.flow-dscp", need.at, message, hint)
+        yield note("check.flow-dscp", need.at, message, hint)
     if len(given) > 1:
         message = (
             f"cannot give {need.kind.noun} {need.name!r} both dscp and transport_priority: each is "
@@ -103,10 +103,10 @@ def _marking(node: Node, each: ResolvedNeed) -> Iterator[Diagnostic]:
     message, hint = each.marking.problem
     if message and need.transport_priority is not None:
         yield error("check.flow-dscp", need.at, message, hint)
-    for note in each.marking.notes:
+    for advice in each.marking.notes:
         rule = "check.five-qi-class" if need.transport_priority is None else ""
-        message, _, hint = note.partition("; ")
-        yield warning(rule or "check.transport-priority", need.at, message, hint)
+        message, _, hint = advice.partition("; ")
+        yield note(rule or "check.transport-priority", need.at, message, hint)
 
 
 def _is_best_effort(node: Node, need: FlowNeed) -> bool:
@@ -139,7 +139,7 @@ def _class(each: ResolvedNeed) -> Iterator[Diagnostic]:
         yield error("check.flow-five-qi", need.at, message, hint)
         return
     for issue in class_.issues:
-        make = error if issue.field in _KEPT_BY_CLASS else warning
+        make = error if issue.field in _KEPT_BY_CLASS else note
         hint = "choose another class, or write 'five_qi: auto'"
         yield make("check.five-qi-class", need.at, issue.message, hint)
     if need.five_qi is None or class_.five_qi is None:
@@ -152,13 +152,11 @@ def _class(each: ResolvedNeed) -> Iterator[Diagnostic]:
             f"an operator's own"
         )
         if each.max_delay_ms is not None or need.loss is not None:
-            yield warning("check.five-qi-class", need.at, message, "ask that operator")
+            yield note("check.five-qi-class", need.at, message, "ask that operator")
         return
     if known.flagged:
         message = f"cannot be sure of {', '.join(known.flagged)} of {known}: {known.note}"
-        yield warning(
-            "check.five-qi-class", need.at, message, "choose another, or ask the operator"
-        )
+        yield note("check.five-qi-class", need.at, message, "choose another, or ask the operator")
 
 
 def _foreign(node: Node, each: ResolvedNeed) -> Iterator[Diagnostic]:
@@ -180,7 +178,7 @@ def _foreign(node: Node, each: ResolvedNeed) -> Iterator[Diagnostic]:
         yield warning("check.flow-foreign", need.at, message, hint)
     if need.non_blocking_send:
         message = f"cannot make {what} send without waiting: its participant is not ours"
-        yield warning("check.flow-foreign", need.at, message, hint)
+        yield warning("check.flow-blocks", need.at, message, hint)
 
 
 _DSCP_VALUES = MAX_DSCP + 1
@@ -253,7 +251,7 @@ def _repurposed(system: DeclaredSystem, needs: FlowNeeds) -> Iterator[Diagnostic
             "tell those who run the network and configure each router on the way, or use "
             "'flow_identification: participant'"
         )
-        yield warning("check.dscp-repurposed", at, message, hint)
+        yield note("check.dscp-repurposed", at, message, hint)
 
 
 def _relied_on(system: DeclaredSystem, needs: FlowNeeds) -> Iterator[Diagnostic]:

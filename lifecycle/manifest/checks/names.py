@@ -31,7 +31,7 @@ from lifecycle.manifest.names import (
     parse_rule,
 )
 from lifecycle.manifest.schema import did_you_mean
-from lifecycle.manifest.yaml.document import error, warning
+from lifecycle.manifest.yaml.document import error, note, warning
 
 _ANSWERING = (EndpointKind.SERVICE_SERVER, EndpointKind.ACTION_SERVER)
 
@@ -99,7 +99,7 @@ def _duplicate_endpoints(group: tuple[Resolved, ...]) -> Iterator[Diagnostic]:
                 f"{servers[0]} offers it as well"
             )
             hint = "move one of them with 'namespace:' or 'remap:'"
-            yield warning("check.several-servers", each.at, message, hint)
+            yield note("check.several-servers", each.at, message, hint)
 
 
 def _remapped(each: Resolved) -> bool:

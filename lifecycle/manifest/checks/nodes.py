@@ -37,7 +37,7 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.manifest.names import full_name_problem
 from lifecycle.manifest.schema import did_you_mean
-from lifecycle.manifest.yaml.document import error, warning
+from lifecycle.manifest.yaml.document import error, note, warning
 from lifecycle.network import (
     LOCALHOST_PARTICIPANTS,
     LOCALHOST_PEERS_RANGE,
@@ -288,7 +288,7 @@ def _delays(node: Node, places: Mapping[str, Position]) -> Iterator[Diagnostic]:
         )
         at = places.get("start_limit_interval_sec", places.get("restart_sec", node.at))
         hint = f"set start_limit_interval_sec > {least_s:g}, or to 0 if that is meant"
-        yield warning("check.start-limit", at, message, hint)
+        yield note("check.start-limit", at, message, hint)
 
 
 def _program(run: Run) -> str:
@@ -383,7 +383,7 @@ def check_ports(
             f"cannot be sure of the ports of domain {domain}: Linux gives them to other sockets, "
             f"by default"
         )
-        yield warning("check.domain", at, message, f"use domain {domains}")
+        yield note("check.domain", at, message, f"use domain {domains}")
     for host in _hosts(system):
         yield from _crowded(system, needs, host, domain, discovery.at or host[0].at)
         yield from _beyond_localhost(system, needs, host, environment)
@@ -420,7 +420,7 @@ def _crowded(
     if not refused and max_participants(domain, Platform.LINUX).participants:
         for each in over(ephemeral=Platform.LINUX):
             message, _, hint = each.partition("; ")
-            yield warning("check.ports", at, message, hint)
+            yield note("check.ports", at, message, hint)
 
 
 def _nodes_on(system: DeclaredSystem, host: list[Machine]) -> list[Node]:

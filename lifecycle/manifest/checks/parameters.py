@@ -18,8 +18,9 @@ import math
 import os
 import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 from lifecycle import dataclasses
 from lifecycle.manifest.checks.system import DeclaredSystem, full_name
@@ -27,7 +28,7 @@ from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position, 
 from lifecycle.manifest.model import ModeParameter, Node, ParameterValue, RunKind
 from lifecycle.manifest.nodl import nearest_file
 from lifecycle.manifest.schema import did_you_mean
-from lifecycle.manifest.yaml.document import Document, Place, Value, error, warning
+from lifecycle.manifest.yaml.document import Document, Place, Value, error, note, warning
 from lifecycle.manifest.yaml.source import is_outside, read_document
 from lifecycle.manifest.yaml.yaml_parser import INT64_MAX, INT64_MIN, not_finite, quote
 
@@ -112,8 +113,8 @@ def read_scalar(text: str, *, quoted: bool) -> bool | int | float | str:
         number = int(f"{match[1]}{digits}", 8 if octal else 0)
         if INT64_MIN <= number <= INT64_MAX:
             return number
-    number = _double(text)
-    return text if number is None else number
+    double = _double(text)
+    return text if double is None else double
 
 
 def _double(text: str) -> float | None:
@@ -123,18 +124,15 @@ def _double(text: str) -> float | None:
     if _HEXADECIMAL.match(text):
         with contextlib.suppress(OverflowError):
             return float.fromhex(text.strip())
-        return None
     match = _DOUBLE.match(text)
     if match is None:
         return None
-    if match[1].lower().startswith("inf"):
-        return float(text)
     if match[3]:
         return math.nan
-    number = float(text)
-    digits = match[1].lower().partition("e")[0].strip("0.")
-    is_out_of_range = math.isinf(number) or (digits and abs(number) < sys.float_info.min)
-    return None if is_out_of_range else number
+    number, digits = float(text), match[1].lower().partition("e")[0].strip("0.")
+    overflows = math.isinf(number) and "inf" not in digits
+    underflows = bool(digits) and abs(number) < sys.float_info.min
+    return None if overflows or underflows else number
 
 
 def _show(value: ParameterValue) -> str:
@@ -145,9 +143,14 @@ def _show(value: ParameterValue) -> str:
 
 def check_parameters(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about the parameters of every node."""
+    names: dict[str, set[str]] = {}
+    for node in system.manifest.nodes:
+        names.setdefault(node.process or node.key, set()).add(node.name)
     for node in system.manifest.nodes:
         yield from _given(node)
         yield from _no_effect(node)
+        yield from _for_no_node(node, names[node.process or node.key])
+        yield from _empty_arrays(node)
 
 
 def _given(node: Node) -> Iterator[Diagnostic]:
@@ -165,6 +168,47 @@ def _given(node: Node) -> Iterator[Diagnostic]:
             message = f"cannot set parameter {name!r}: the interface declares no such parameter"
             hint = did_you_mean(name, declared) or "declare it under 'interface.parameters'"
             yield error("check.parameter-undeclared", at, message, hint)
+
+
+def _for_no_node(node: Node, names: Collection[str]) -> Iterator[Diagnostic]:
+    """Warn of values on a command line for a node that its process is not declared to have."""
+    at = node.where("run.command")
+    for each in command_line_parameters(node):
+        if each.node and each.node not in names:
+            message = (
+                f"cannot tell what takes '-p {each.node}:{each.name}': no node {each.node!r} is "
+                f"declared in the process of {node.key!r}"
+            )
+            listed = ", ".join(map(repr, sorted(names)))
+            hint = did_you_mean(each.node, names) or f"declared there: {listed}"
+            yield warning("check.parameter-for-no-node", at, message, hint)
+
+
+def _empty_arrays(node: Node) -> Iterator[Diagnostic]:
+    """Warn of empty arrays whose type nothing declares: rcl reads none from `[]`."""
+    if node.interface.parameters:
+        return  # one that those do not declare is reported as such
+    given: list[tuple[str, ParameterValue | None, Position]] = [
+        (name, value, node.where(f"parameters.{name}")) for name, value in node.parameters
+    ]
+    given += [
+        (each.name, given_value(each.text), node.where("run.command"))
+        for each in command_line_parameters(node)
+        if each.name and each.node in ("", node.name)
+    ]
+    given += [
+        each
+        for path in node.parameter_files
+        if os.path.lexists(path)
+        for section in read_sections(path, shown=shown_path(path, node.at.file))[0]
+        if section.matches(full_name(node))
+        for each in section.parameters
+    ]
+    for name, value, at in given:
+        if value == ():
+            message = f"cannot tell the type of {name!r} of {node.key!r}: [] has none in ROS"
+            hint = f"declare it: 'interface: {{parameters: {{{name}: {{type: string_array}}}}}}'"
+            yield warning("check.parameter-empty-array", at, message, hint)
 
 
 def check_mode_parameters(system: DeclaredSystem) -> Iterator[Diagnostic]:
@@ -239,7 +283,60 @@ def _no_effect(node: Node) -> Iterator[Diagnostic]:
     for place, what in places[:1]:
         message = f"cannot give {what} to {node.key!r}, which is attached: they are only verified"
         hint = "give them where it is started"
-        yield warning("check.parameter-unused", node.where(place), message, hint)
+        yield note("check.parameter-unused", node.where(place), message, hint)
+
+
+class CommandParameter(NamedTuple):
+    """What a command line sets of parameters: a file, or one parameter.
+
+    Attributes:
+        file: absolute path; else empty.
+        node: the base name of the only node that takes it; empty for all of the process.
+        name: of the parameter, and `text` its value as written.
+    """
+
+    file: str = ""
+    node: str = ""
+    name: str = ""
+    text: str = ""
+
+
+def command_line_parameters(node: Node) -> Iterator[CommandParameter]:
+    """Yield what a node's own `command:` sets of parameters, as rcl's parser reads it.
+
+    That is between `--ros-args` and `--`: `-p name:=value`, which may begin with the name of a
+    node, and `--params-file`.
+    """
+    words = iter(node.run.command)
+    for word in words:
+        if word != "--ros-args":
+            continue
+        for option in words:
+            if option == "--":
+                break
+            if option in ("-p", "--param"):
+                name, separator, text = next(words, "").partition(":=")
+                base, _, alone = name.rpartition(":")
+                if separator:
+                    yield CommandParameter(node=base, name=alone, text=text)
+            elif option == "--params-file":
+                folder = node.run.working_directory or os.curdir
+                path = os.path.abspath(os.path.join(folder, next(words, "")))  # noqa: PTH100, PTH118
+                yield CommandParameter(file=path)
+
+
+def given_value(text: str) -> ParameterValue | None:
+    """Return what rcl makes of a value on a command line; None of anything but plain scalars.
+
+    `[]` is an empty array, although rcl itself takes nothing from it.
+    """
+    if len(text) > 1 and text[0] == text[-1] in "'\"" and not {text[0], "\\"} & set(text[1:-1]):
+        return read_scalar(text[1:-1], quoted=True)
+    if re.fullmatch(r"\s*\[\s*\]\s*", text):
+        return ()
+    if not text or text[0] in "[{'\"!&*|>%@`,#?" or ": " in text or " #" in text:
+        return None
+    return read_scalar(text, quoted=False)
 
 
 PARAMETERS_KEY = "ros__parameters"
@@ -403,6 +500,8 @@ def check_parameter_files(system: DeclaredSystem) -> Iterator[Diagnostic]:
                 files[path] = _ParameterFile(shown=shown_path(path, system.manifest.path))
                 yield from _read(path, files[path], node, index)
             files[path].readers.append(node)
+    for node in system.manifest.nodes:
+        yield from _unmatched_file_of_command(node, system)
     for path, file in files.items():
         for node in file.readers:
             if file.readable:
@@ -445,6 +544,29 @@ def _unmatched_node(
     message = f"cannot find node {name!r} in {file.shown!r}: it is for {listed}"
     hint = f"name the section {name}, or /** for every node"
     yield warning("check.parameter-file-unmatched", at, message, hint)
+
+
+def _unmatched_file_of_command(node: Node, system: DeclaredSystem) -> Iterator[Diagnostic]:
+    """Warn of sections of a command's `--params-file` that are for no node, or not for its own."""
+    process = node.process or node.key
+    every = [full_name(each) for each in system.manifest.nodes]
+    names = [full_name(e) for e in system.manifest.nodes if process == (e.process or e.key)]
+    for path in (each.file for each in command_line_parameters(node)):
+        if not path or not os.path.lexists(path):
+            continue
+        shown = shown_path(path, system.manifest.path)
+        at = node.where("run.command")
+        sections = read_sections(path, shown=shown)[0]
+        mine = [each for each in sections if any(map(each.matches, names))]
+        # One file for many processes has sections for the nodes of others.
+        for section in sections:
+            if not mine or not any(map(section.matches, every)):
+                message = (
+                    f"cannot use the parameters of {section.pattern!r} in {shown!r}: no node of "
+                    f"the process of {node.key!r} has that name"
+                )
+                hint = did_you_mean(section.pattern, names)
+                yield warning("check.parameter-file-unmatched", at, message, hint)
 
 
 def _unmatched_sections(file: _ParameterFile, system: DeclaredSystem) -> Iterator[Diagnostic]:

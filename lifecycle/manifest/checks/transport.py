@@ -29,7 +29,7 @@ from lifecycle.manifest.model import (
     RunKind,
 )
 from lifecycle.manifest.schema import did_you_mean
-from lifecycle.manifest.yaml.document import error, warning
+from lifecycle.manifest.yaml.document import error, note, warning
 from lifecycle.network import (
     DEFAULT_TCP,
     RMW_DISCOVERY,
@@ -494,7 +494,7 @@ def _fragments(system: DeclaredSystem, node: Node, each: ResolvedNeed) -> Iterat
         hint = (
             f"start it with {TRANSPORTS_VARIABLE}='UDPv4?max_msg_size={each.max_datagram_bytes}B'"
         )
-    yield warning("check.flow-fragments", each.need.at, message, hint)
+    yield note("check.flow-fragments", each.need.at, message, hint)
 
 
 def _ipv6(system: DeclaredSystem, environment: Mapping[str, str]) -> Iterator[Diagnostic]:

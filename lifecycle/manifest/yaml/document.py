@@ -131,8 +131,13 @@ def error(rule: str, at: Position, message: str, hint: str = "") -> Diagnostic:
 
 
 def warning(rule: str, at: Position, message: str, hint: str = "") -> Diagnostic:
-    """Make a warning; `message` starts with "cannot"."""
+    """Make a warning: something that is declared is in doubt; `message` starts with "cannot"."""
     return Diagnostic(rule=rule, severity=Severity.WARNING, at=at, message=message, hint=hint)
+
+
+def note(rule: str, at: Position, message: str, hint: str = "") -> Diagnostic:
+    """Make a note: advice, with nothing in doubt that is declared; `message` as of a warning."""
+    return Diagnostic(rule=rule, severity=Severity.NOTE, at=at, message=message, hint=hint)
 
 
 E = TypeVar("E", bound=enum.Enum)

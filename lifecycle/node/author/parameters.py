@@ -130,8 +130,9 @@ def _declare_empty(
         node.undeclare_parameter(name)
         raise InvalidParameterValueException(name, [], result.reason)
     if descriptor.read_only:
-        writable.read_only = True
-        node.set_descriptor(name, writable)
+        last = copy.copy(writable)
+        last.read_only = True
+        node.set_descriptor(name, last)
     return value
 
 

@@ -475,7 +475,7 @@ class BringUp:
         """Whether its command line cannot give it all of its parameters, see `command_line`."""
         planned, process = node.planned, node.process
         empty = [each for each in planned.expected_parameters if each.value == ()]
-        if planned.run.component and any(each.type == "array" for each in empty):
+        if planned.run.component and empty:
             return True
         if process is None or planned.run.kind is not RunKind.COMMAND:
             return False

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 
 from lifecycle.verify.rules import (
     connections,
+    declaration,
     endpoints,
     flows,
     health,
@@ -34,6 +35,7 @@ _FAMILIES: tuple[tuple[tuple[Rule, ...], Callable[[View], Iterator[Finding]]], .
     (health.RULES, health.check),
     (state.REPORT_RULES, state.check_reports),
     (parameters.RULES, parameters.check),
+    (declaration.RULES, declaration.check),
     (connections.RULES, connections.check),
     (flows.RULES, flows.check),
     (flows.TRANSPORT_RULES, flows.check_transport),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 
-from lifecycle.manifest import ParameterValue, is_implicit
+from lifecycle.manifest import ParameterValue, Position, is_implicit
 from lifecycle.plan import COMMAND, DEFAULT, GIVEN, NOT_FINITE, ExpectedParameter, PlannedNode
 from lifecycle.verify.observation import SERVES_NONE, ParameterReport, digest_of
 from lifecycle.verify.outcome import Outcome
@@ -49,7 +49,22 @@ UNVERIFIABLE = Rule(
     outcomes=(Outcome.UNVERIFIABLE,),
     fix="see whether `ros2 param list` shows the node's parameters; look at its log",
 )
-RULES = (MISSING, UNDECLARED, TYPE_DIFFERS, VALUE_DIFFERS, READ_ONLY_DIFFERS, UNVERIFIABLE)
+REACHED_NOBODY = Rule(
+    id="param.reached-nobody",
+    meaning="a value that is given for nodes by a name or a pattern is a parameter of none",
+    outcomes=(Outcome.UNVERIFIABLE,),
+    fix="correct the name of the node or of the parameter, or remove the value",
+    heals=Heals.WITH_TIME,
+)
+RULES = (
+    MISSING,
+    UNDECLARED,
+    TYPE_DIFFERS,
+    VALUE_DIFFERS,
+    READ_ONLY_DIFFERS,
+    UNVERIFIABLE,
+    REACHED_NOBODY,
+)
 
 _NAMED = 8
 _SHOWN_ITEMS = 8
@@ -59,6 +74,7 @@ _SHOWN_TEXT = 60
 def check(view: View) -> Iterator[Finding]:
     """Judge the parameters of every node that is there."""
     yield from view.by_node.each(_judge_node)
+    yield from _reached_nobody(view)
 
 
 def _judge_node(facts: NodeFacts) -> Iterator[Finding]:
@@ -80,6 +96,32 @@ def _judge_node(facts: NodeFacts) -> Iterator[Finding]:
     elif known or facts.configuration is not None or not facts.frame.ours(node):
         # Of a node of ours without a report config.missing-report says it all.
         yield _unknown(node, known or "they were not read")
+
+
+def _reached_nobody(view: View) -> Iterator[Finding]:
+    """Find values for several nodes, as below `/**`, that none of those has as a parameter."""
+    settled = {each.at for each in view.plan.unproven}
+    found: dict[Position, tuple[ExpectedParameter, list[str]]] = {}
+    for facts in view.nodes.values():
+        known = _known(facts)
+        for each in facts.node.expected_parameters:
+            if not each.optional or each.at in settled:
+                continue
+            if facts.absent or isinstance(known, str) or each.name in known:
+                settled.add(each.at)  # it did, or it is not known, which has its own finding
+                found.pop(each.at, None)
+            else:
+                found.setdefault(each.at, (each, []))[1].append(facts.name)
+    for at, (each, nodes) in found.items():
+        yield REACHED_NOBODY.finding(
+            Outcome.UNVERIFIABLE,
+            subject=each.name,
+            expected=_wanted(each),
+            observed="no such parameter",
+            message=f"cannot find parameter {each.name}, which is {_origin(each)}, in any node "
+            f"that it is for: {', '.join(nodes[:_NAMED])}",
+            at=at,
+        )
 
 
 def _known(facts: NodeFacts) -> dict[str, ParameterReport] | str:
