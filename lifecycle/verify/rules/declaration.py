@@ -17,7 +17,7 @@ from lifecycle.verify.verdict import Finding
 from lifecycle.verify.view import Frame, View, once
 
 UNPROVEN = Rule(
-    id="manifest.unproven",
+    id="declaration.unproven",
     meaning="`lifecycle check` warns of something that is declared and that nothing can prove",
     outcomes=(Outcome.UNVERIFIABLE,),
     fix="see what `lifecycle check` says of it",

@@ -52,15 +52,29 @@ def test_every_finding_of_a_bad_manifest_comes_before_the_summary(
 
 
 @pytest.mark.usefixtures("corpus")
-def test_warnings_fail_only_when_strict(capsys: pytest.CaptureFixture[str]) -> None:
-    path = "valid/include_only.lifecycle.yaml"
+def test_what_is_unproven_fails_only_when_strict(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    (tmp_path / "p.yaml").write_text("/other: {ros__parameters: {gain: 1.0}}\n")
+    path = str(tmp_path / "one.lifecycle.yaml")
+    Path(path).write_text(
+        "manifest_version: 1\nsystem: one\nnodes:\n"
+        "  arm: {run: {command: [python3]}, managed: false, parameter_files: [p.yaml]}\n"
+    )
     assert main(["check", path]) == 0
     relaxed = capsys.readouterr().out.splitlines()
-    assert main(["check", path, "--strict"]) == 3
+    assert main(["check", path, "--strict"]) == 5
     strict = capsys.readouterr().out.splitlines()
-    assert relaxed[-1] == "include_only: 2 nodes, 2 endpoints, 0 links: ok (2 warnings)"
-    assert strict[-1] == "include_only: 2 nodes, 2 endpoints, 0 links: not ok (2 warnings)"
+    assert relaxed[-1] == "one: 1 node, 0 endpoints, 0 links: ok (1 warning)"
+    assert strict[-1] == "one: 1 node, 0 endpoints, 0 links: not ok (1 warning)"
     assert relaxed[:-1] == strict[:-1]
+
+
+@pytest.mark.usefixtures("corpus")
+def test_notes_fail_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", "valid/include_only.lifecycle.yaml", "--strict"]) == 0
+    found = capsys.readouterr().out.splitlines()
+    assert found[-1] == "include_only: 2 nodes, 2 endpoints, 0 links: ok (2 notes)"
 
 
 @pytest.mark.usefixtures("corpus")

@@ -362,7 +362,7 @@ def test_an_included_manifest_does_not_bring_its_network(findings):
     found = findings("include: [{manifest: part.yaml}]\n", part_yaml=part)
     assert [each for each in found if each.startswith("manifest.include-ignored")] == [
         (
-            "manifest.include-ignored part.yaml:3:1: warning: network: cannot use the "
+            "manifest.include-ignored part.yaml:3:1: note: network: cannot use the "
             "network of an included manifest; the including one's holds"
         )
     ]

@@ -180,9 +180,9 @@ def test_a_reliable_subscription_can_be_marked_as_it_acknowledges() -> None:
 
 def test_a_best_effort_subscription_is_told_that_it_sends_nothing_to_mark() -> None:
     (found,) = check(acknowledging(Reliability.BEST_EFFORT))
-    assert found.severity.value == "warning"
+    assert found.severity.value == "note"
     assert str(found) == (
-        f"{FILE}:1:1: warning: cannot mark anything that subscription 's0' sends with a DSCP: it "
+        f"{FILE}:1:1: note: cannot mark anything that subscription 's0' sends with a DSCP: it "
         "is BEST_EFFORT and acknowledges nothing; make it RELIABLE, or mark the publishers of the "
         "topic"
     )

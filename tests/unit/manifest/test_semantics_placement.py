@@ -115,7 +115,7 @@ def test_machines_of_one_address_are_one_host(findings: Findings) -> None:
     )
     assert found == [
         (
-            "check.ports 3:1: warning: discovery: cannot run 55 participants in domain 101 on "
+            "check.ports 3:1: note: discovery: cannot run 55 participants in domain 101 on "
             "machines 'a', 'b': 54 fit before the ephemeral ports 32768–60999; use another domain, "
             "run fewer processes, or give fewer publishers a flow of their own (safe domains: "
             "0–101, 215–232)"
@@ -132,7 +132,7 @@ def test_domains_in_the_ephemeral_range_are_doubtful(
         nodes: {{n: {{run: {{python: "demo:N"}}}}}}
     """)
     warning = (
-        f"check.domain 3:1: warning: discovery: cannot be sure of the ports of domain {domain}: "
+        f"check.domain 3:1: note: discovery: cannot be sure of the ports of domain {domain}: "
         "Linux gives them to other sockets, by default; use domain 0–101, 215–232"
     )
     assert found == ([] if sure else [warning])

@@ -6,6 +6,7 @@ import dataclasses
 
 import pytest
 
+from lifecycle.manifest import Diagnostic, Position, Severity
 from lifecycle.manifest.model import ParameterValue, Run, RunKind
 from lifecycle.plan import Plan
 from lifecycle.plan.model import ExpectedParameter
@@ -62,11 +63,6 @@ CASES: dict[str, tuple[ExpectedParameter, ParameterReport | None, list[str]]] = 
     ),
     "one is not true": (expected(True, "bool"), has(1, "int"), ["param.type-differs"]),
     "it is not there": (expected(), ABSENT, ["param.missing"]),
-    "it is not there, and only a section for many gives it": (
-        expected(optional=True),
-        ABSENT,
-        [],
-    ),
     "only a section for many gives it, and it is otherwise": (
         expected(optional=True),
         has(2.0),
@@ -130,9 +126,28 @@ def test_a_parameter_is_judged(case: str):
     assert {each.at for each in found} <= {"robot.lifecycle.yaml:60:7"}
 
 
+def test_a_value_for_many_nodes_that_none_has_reached_nobody():
+    plan = plan_of(expected(optional=True))
+    (found,) = judged(plan, served(plan))
+    assert (found.rule, found.outcome) == ("param.reached-nobody", Outcome.UNVERIFIABLE)
+    assert (found.subject, found.at) == ("gain", "robot.lifecycle.yaml:60:7")
+
+
+def test_a_warning_of_check_is_a_finding_unless_the_graph_settles_it():
+    at = Position(file="p.yaml", line=2, column=3, path="/**")
+    warnings = [
+        Diagnostic(rule=rule, severity=Severity.WARNING, at=at, message="cannot")
+        for rule in ("check.parameter-file-unmatched", "check.remap-unused", "check.qos-doubtful")
+    ]
+    plan = dataclasses.replace(plan_of(), unproven=tuple(warnings))
+    found = judged(plan, served(plan))
+    assert [each.rule for each in found] == ["param.reached-nobody", "declaration.unproven"]
+    assert {(each.outcome, each.at) for each in found} == {(Outcome.UNVERIFIABLE, "p.yaml:2:3")}
+
+
 def test_every_rule_of_parameters_has_a_case_in_which_it_fires():
     fired = {rule for _, _, rules in CASES.values() for rule in rules} | {"param.unverifiable"}
-    fired.add("param.undeclared")  # test_nodl_conform.py
+    fired |= {"param.undeclared", "param.reached-nobody"}  # test_nodl_conform.py, above
     assert fired == {each.id for each in RULES if each.id.startswith("param.")}
 
 
