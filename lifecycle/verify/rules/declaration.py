@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from lifecycle.manifest import Diagnostic
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import Rule
-from lifecycle.verify.rules.parameters import REACHED_NOBODY
+from lifecycle.verify.rules.parameters import REACHED_NONE
 from lifecycle.verify.verdict import Finding
 from lifecycle.verify.view import Frame, View, once
 
@@ -53,7 +53,7 @@ def _warned(frame: Frame) -> Iterator[Finding]:
 
 
 def _finding(warning: Diagnostic) -> Finding:
-    rule = REACHED_NOBODY if warning.rule in _NO_NODE else UNPROVEN
+    rule = REACHED_NONE if warning.rule in _NO_NODE else UNPROVEN
     return rule.finding(
         Outcome.UNVERIFIABLE,
         subject=warning.at.path or warning.at.file,

@@ -49,8 +49,8 @@ UNVERIFIABLE = Rule(
     outcomes=(Outcome.UNVERIFIABLE,),
     fix="see whether `ros2 param list` shows the node's parameters; look at its log",
 )
-REACHED_NOBODY = Rule(
-    id="param.reached-nobody",
+REACHED_NONE = Rule(
+    id="param.reached-none",
     meaning="a value that is given for nodes by a name or a pattern is a parameter of none",
     outcomes=(Outcome.UNVERIFIABLE,),
     fix="correct the name of the node or of the parameter, or remove the value",
@@ -63,7 +63,7 @@ RULES = (
     VALUE_DIFFERS,
     READ_ONLY_DIFFERS,
     UNVERIFIABLE,
-    REACHED_NOBODY,
+    REACHED_NONE,
 )
 
 _NAMED = 8
@@ -74,7 +74,7 @@ _SHOWN_TEXT = 60
 def check(view: View) -> Iterator[Finding]:
     """Judge the parameters of every node that is there."""
     yield from view.by_node.each(_judge_node)
-    yield from _reached_nobody(view)
+    yield from _reached_none(view)
 
 
 def _judge_node(facts: NodeFacts) -> Iterator[Finding]:
@@ -98,7 +98,7 @@ def _judge_node(facts: NodeFacts) -> Iterator[Finding]:
         yield _unknown(node, known or "they were not read")
 
 
-def _reached_nobody(view: View) -> Iterator[Finding]:
+def _reached_none(view: View) -> Iterator[Finding]:
     """Find values for several nodes, as below `/**`, that none of those has as a parameter."""
     settled = {each.at for each in view.plan.unproven}
     found: dict[Position, tuple[ExpectedParameter, list[str]]] = {}
@@ -113,7 +113,7 @@ def _reached_nobody(view: View) -> Iterator[Finding]:
             else:
                 found.setdefault(each.at, (each, []))[1].append(facts.name)
     for at, (each, nodes) in found.items():
-        yield REACHED_NOBODY.finding(
+        yield REACHED_NONE.finding(
             Outcome.UNVERIFIABLE,
             subject=each.name,
             expected=_wanted(each),

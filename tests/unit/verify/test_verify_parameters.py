@@ -126,10 +126,10 @@ def test_a_parameter_is_judged(case: str):
     assert {each.at for each in found} <= {"robot.lifecycle.yaml:60:7"}
 
 
-def test_a_value_for_many_nodes_that_none_has_reached_nobody():
+def test_a_value_for_many_nodes_that_none_has_reached_none():
     plan = plan_of(expected(optional=True))
     (found,) = judged(plan, served(plan))
-    assert (found.rule, found.outcome) == ("param.reached-nobody", Outcome.UNVERIFIABLE)
+    assert (found.rule, found.outcome) == ("param.reached-none", Outcome.UNVERIFIABLE)
     assert (found.subject, found.at) == ("gain", "robot.lifecycle.yaml:60:7")
 
 
@@ -141,13 +141,13 @@ def test_a_warning_of_check_is_a_finding_unless_the_graph_settles_it():
     ]
     plan = dataclasses.replace(plan_of(), unproven=tuple(warnings))
     found = judged(plan, served(plan))
-    assert [each.rule for each in found] == ["param.reached-nobody", "declaration.unproven"]
+    assert [each.rule for each in found] == ["param.reached-none", "declaration.unproven"]
     assert {(each.outcome, each.at) for each in found} == {(Outcome.UNVERIFIABLE, "p.yaml:2:3")}
 
 
 def test_every_rule_of_parameters_has_a_case_in_which_it_fires():
     fired = {rule for _, _, rules in CASES.values() for rule in rules} | {"param.unverifiable"}
-    fired |= {"param.undeclared", "param.reached-nobody"}  # test_nodl_conform.py, above
+    fired |= {"param.undeclared", "param.reached-none"}  # test_nodl_conform.py, above
     assert fired == {each.id for each in RULES if each.id.startswith("param.")}
 
 
