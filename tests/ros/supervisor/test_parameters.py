@@ -94,7 +94,7 @@ def test_every_change_of_a_parameter_is_judged_until_it_is_set_back(
     tmp_path: Path, fresh_domain: int, set_parameter: Set
 ) -> None:
     values = tmp_path / "arm.yaml"
-    values.write_text("/**/*: {ros__parameters: {joints: [c], elsewhere: 5, offset: .nan}}\n")
+    values.write_text("/**/*: {ros__parameters: {joints: [c], offset: .nan}}\n")
     foreign = arm(
         namespace="/robot", name="left", parameters={"gain": 2.5}, parameter_files=[str(values)]
     )
