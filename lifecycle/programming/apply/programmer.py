@@ -142,6 +142,8 @@ class Programmer:
         self._made_by = made_by
         self._deadline = made_by.deadline if made_by is not None else Deadline()
         self._applied: tuple[FlowRule, ...] | None = None
+        # What targets have, as far as is known: all of it once every target was brought up to date.
+        self._programmed: dict[str, FlowRule] = {}
         self.left_out: tuple[LeftOut, ...] = ()
 
     def replan(self, plan: Plan) -> None:
@@ -193,15 +195,28 @@ class Programmer:
         """
         reports = tuple(flows)
         rules = self._take(reports)
-        if hold and self._applied is not None:
-            rules = _with_held(rules, self._applied, reports)
+        if hold:
+            rules = _with_held(rules, self._programmed.values(), reports)
         if rules == self._applied:
             return ()
-        # Forgotten first: if a target fails, the next call must not take it for done.
+        # Forgotten first: if a target fails, the next call must not take it for done. What was
+        # programmed is not: it is held whether or not the last call succeeded.
         self._applied = None
+        by_key = {each.key: each for each in rules}
+
+        def apply(target: Target) -> TargetChanges:
+            changes = target.apply(rules)
+            self._programmed |= by_key
+            return changes
+
         with self._deadline.within(within_s), self._ledger.locked():
-            done = _each(self._targets, lambda target: target.apply(rules))
-        self._applied = rules
+            try:
+                done = _each(self._targets, apply)
+            except LifecycleError:
+                made = {entry.key for each in self._ledger.read().targets for entry in each.entries}
+                self._programmed |= {key: each for key, each in by_key.items() if key in made}
+                raise
+        self._applied, self._programmed = rules, by_key
         return done
 
     def renew(self, *, within_s: float | None = None) -> float | None:
@@ -234,7 +249,7 @@ class Programmer:
 
     def release(self) -> None:
         """Close connections and leave in the networks what was made."""
-        self._applied = None
+        self._applied, self._programmed = None, {}
         if self._made_by is not None:
             self._made_by.close()
 
@@ -406,7 +421,7 @@ def _system(directory: Path) -> str:
 
 
 def _with_held(
-    rules: tuple[FlowRule, ...], applied: tuple[FlowRule, ...], reports: Sequence[FlowReport]
+    rules: tuple[FlowRule, ...], programmed: Iterable[FlowRule], reports: Sequence[FlowReport]
 ) -> tuple[FlowRule, ...]:
     unsure = {
         (each.topic, each.publisher, each.subscription)
@@ -416,7 +431,7 @@ def _with_held(
     keys = {each.key for each in rules}
     held = tuple(
         each
-        for each in applied
+        for each in programmed
         if each.key not in keys and all(map(unsure.__contains__, each.names))
     )
     return tuple(sorted((*rules, *held), key=lambda each: each.key))

@@ -225,3 +225,17 @@ def test_the_site_is_built_without_a_warning_and_loads_nothing_from_elsewhere(
     api = read(tmp_path / "docs/api.html")
     for name in ("LifecycleNode.on_configure", "on_service", "graph.Graph.wait_for"):
         assert f'id="lifecycle.{name}"' in api
+
+
+@each_document
+def test_a_table_has_all_its_cells_and_a_page_its_end(document: Path) -> None:
+    """What a merge left behind: a row that lost its start, a page that lost its last lines."""
+    text = read(document)
+    assert text.endswith("\n")
+    assert not re.findall(r"^([^\s\w])\1{6}(?:\s|$)|^(\w)\2{5}", text, flags=re.MULTILINE)
+    columns = 0
+    for number, line in enumerate(prose(document).splitlines(), 1):
+        cells = line.replace(r"\|", "").count("|") if line.lstrip(" ").startswith("|") else 0
+        assert not (columns and line and not cells), f"{document.name}:{number}: no row: {line}"
+        assert columns in (0, cells) or not cells, f"{document.name}:{number}: {line}"
+        columns = cells

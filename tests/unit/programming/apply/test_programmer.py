@@ -116,6 +116,47 @@ def test_while_a_node_restarts_its_rule_is_held_and_then_moved(tmp_path: Path) -
     assert target.rules == ()
 
 
+@pytest.mark.parametrize("first_fails", [False, True])
+def test_a_rule_is_held_although_a_target_failed_meanwhile(
+    tmp_path: Path, *, first_fails: bool
+) -> None:
+    operator, other = FakeTarget("operator"), FakeTarget("other")
+    programs = programmer(tmp_path, operator, other)
+    unsure = report(outcome=Outcome.VIOLATED, source=())
+    if first_fails:
+        other.fails = "out of reach"
+        with pytest.raises(PartlyError):
+            programs.update([report()], hold=True)
+    else:
+        programs.update([report()], hold=True)
+        programs.update([unsure], hold=True)
+        operator.fails = other.fails = "out of reach"
+        with pytest.raises(PartlyError):
+            programs.update([report(source=(nfe("0.0.0.0", 46000),))], hold=True)
+        operator.fails = ""
+        with pytest.raises(PartlyError):
+            programs.update([unsure], hold=True)
+    held = operator.rules
+    other.fails = ""
+    programs.update([unsure], hold=True)
+
+    assert [each.source_port for each in held] == [45000]
+    assert operator.rules == other.rules == held
+    programs.update([], hold=True)
+    assert operator.rules == other.rules == ()
+
+
+def test_what_no_target_took_is_not_held(tmp_path: Path) -> None:
+    target = FakeTarget()
+    target.fails = "out of reach"
+    programs = programmer(tmp_path, target)
+    with pytest.raises(ProgrammingError):
+        programs.update([report()], hold=True)
+    target.fails = ""
+    programs.update([report(outcome=Outcome.VIOLATED)], hold=True)
+    assert target.rules == ()
+
+
 def test_without_hold_an_unverified_flow_loses_its_rule(tmp_path: Path) -> None:
     target = FakeTarget()
     programs = programmer(tmp_path, target)
