@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
+import functools
 import os
 import re
 import socket
@@ -156,9 +157,35 @@ def boot_id() -> str:
 
 
 def start_ticks(pid: int) -> int | None:
-    """Return when a process started, in clock ticks since boot; None if it does not live."""
+    """Return when a process started, in clock ticks since boot; None if it does not live.
+
+    It is the same in every time namespace, but for a tick: the kernel adds the reader's offset
+    (time_namespaces(7)), and rounds down after that.
+    """
     fields = _status(pid)
-    return None if fields is None or fields[0] in b"ZX" else int(fields[19])
+    if fields is None or fields[0] in b"ZX":
+        return None
+    return int(fields[19]) - _offset_ticks()
+
+
+def is_process(pid: int, started_ticks: int) -> bool:
+    """Return whether a process lives that has this pid and, by `start_ticks`, began then."""
+    now = start_ticks(pid)
+    return now is not None and abs(now - started_ticks) <= 1
+
+
+@functools.cache
+def _offset_ticks() -> int:
+    """Return what the kernel adds to the start of every process that this one reads."""
+    try:
+        text = Path("/proc/self/timens_offsets").read_text(encoding="ascii")
+    except OSError:  # a kernel without time namespaces
+        return 0
+    # Lines of clock, seconds and nanoseconds.
+    offsets = {each[0]: (int(each[1]), int(each[2])) for each in map(str.split, text.splitlines())}
+    seconds, nanoseconds = offsets.get("boottime", (0, 0))
+    ticks = os.sysconf("SC_CLK_TCK")
+    return seconds * ticks + nanoseconds * ticks // 10**9
 
 
 def parent_of(pid: int) -> int | None:
@@ -440,7 +467,7 @@ def lost(path: Path) -> UsageError:
         left = [
             f"{each.name} (pid {each.pid})"
             for each in sorted(record.children, key=lambda child: child.name)
-            if here and each.name != FORK_SERVER and start_ticks(each.pid) == each.start_ticks
+            if here and each.name != FORK_SERVER and is_process(each.pid, each.start_ticks)
         ]
     count = "1 process still runs" if len(left) == 1 else f"{len(left)} processes still run"
     still = f"{count}: {', '.join(left)}" if left else "none of its processes runs any more"

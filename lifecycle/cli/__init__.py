@@ -19,7 +19,7 @@ import click
 from click.shell_completion import CompletionItem
 
 from lifecycle.cli.standard_streams import own_streams
-from lifecycle.errors import ExitCode, LifecycleError, UsageError
+from lifecycle.errors import ExitCode, LifecycleError, UsageError, exhausted
 from lifecycle.printable import lines
 
 VERBS: dict[str, str] = {
@@ -93,6 +93,7 @@ def _check_ros(verb: str) -> None:
 
     Raises:
         UsageError: there is no ROS 2 here, or not the RMW that the environment names.
+        MiddlewareError: loading it would end this process: /dev/shm is full.
     """
     from importlib.util import find_spec
 
@@ -105,8 +106,9 @@ def _check_ros(verb: str) -> None:
 
     if sys.version_info >= (3, 11):  # from which on typing has what msgspec takes of it
         import_without("msgspec", "typing_extensions")
-    from lifecycle.middleware import check_rmw
+    from lifecycle.middleware import check_rmw, check_room_to_load
 
+    check_room_to_load()
     check_rmw(os.environ)
     if not os.environ.get("HOME"):
         from lifecycle.run_directory import home_directory
@@ -202,8 +204,9 @@ def program() -> int:
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, signal.SIG_IGN)
     if "rclpy" in sys.modules:
-        from lifecycle.middleware import holds_shared_memory
+        from lifecycle.middleware import dispose_of_announced, holds_shared_memory
 
+        dispose_of_announced()
         if code not in _ORDERLY and not (verb == ["up"] and code == ExitCode.INTERRUPTED):
             gc.collect()  # what an error may have kept of a participant leaves the graph with it
         if holds_shared_memory():
@@ -248,6 +251,9 @@ def _report(error: Exception) -> int:
     if isinstance(error, LifecycleError):
         click.echo(lines(str(error)), err=True)
         return error.exit_code
+    if (used_up := exhausted(error)) is not None:
+        click.echo(lines(str(used_up)), err=True)
+        return used_up.exit_code
     if isinstance(error, ImportError) and "rclpy" in f"{error.name} {error}":
         # Of another Python, most often: ROS 2 has its C extensions for one version only.
         version = sys.version.split()[0]

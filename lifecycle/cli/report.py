@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from lifecycle import dataclasses
-from lifecycle.errors import ExitCode, LifecycleError, UsageError
+from lifecycle.errors import ExitCode, LifecycleError, UsageError, exhausted
 from lifecycle.printable import json_text, lines, one_line
 
 if TYPE_CHECKING:
@@ -293,7 +293,9 @@ def exit_code_of(error: BaseException) -> ExitCode:
         return error.exit_code
     if isinstance(error, KeyboardInterrupt | click.Abort):
         return ExitCode.INTERRUPTED
-    return ExitCode.USAGE if isinstance(error, click.ClickException) else ExitCode.INTERNAL
+    if isinstance(error, click.ClickException):
+        return ExitCode.USAGE
+    return ExitCode.INTERNAL if (used_up := exhausted(error)) is None else used_up.exit_code
 
 
 def _verdict_of(error: BaseException) -> Verdict:

@@ -39,6 +39,7 @@ from lifecycle.fleet.protocol import (
 from lifecycle.run_directory import (
     SENT_PREFIX,
     is_held,
+    is_process,
     lost,
     private_directory,
     read_record,
@@ -82,7 +83,7 @@ class _Process:
 
     @property
     def lives(self) -> bool:
-        return start_ticks(self.pid) == self.start_ticks
+        return is_process(self.pid, self.start_ticks)
 
 
 class _Pipe:

@@ -20,7 +20,7 @@ from lifecycle.graph.observer import BURST_S, QUIET_S, Observer
 from lifecycle.graph.scheduler import LoopScheduler, ThreadScheduler
 from lifecycle.graph.state import GraphState
 from lifecycle.graph.transport import DdsTransport, GraphTransport
-from lifecycle.middleware import EarlyProbe, GraphObserver, NodeClients
+from lifecycle.middleware import GraphObserver, NodeClients
 from lifecycle.plan import ParticipantConnections, Plan
 from lifecycle.verify import Observation, Stage, Verdict, verify
 
@@ -121,7 +121,6 @@ class Graph:
         unplanned: bool = False,
         quiet_s: float = QUIET_S,
         burst_s: float = BURST_S,
-        early: EarlyProbe | None = None,
     ) -> Graph:
         """Look at the graph of a domain with a participant of its own, as a supervisor does.
 
@@ -135,13 +134,12 @@ class Graph:
             unplanned: also ask nodes that are not planned, as far as they have our node interface.
             quiet_s: a burst of changes is over when nothing changed for so long, ≥ 0.
             burst_s: a burst is cut off after so long, ≥ quiet_s.
-            early: see GraphObserver.
 
         Raises:
             MiddlewareError: no participant could be made.
         """
         return cls(
-            GraphObserver(domain_id, connections, early=early),
+            GraphObserver(domain_id, connections),
             LoopScheduler(),
             messages=messages,
             quiet_s=quiet_s,

@@ -7,8 +7,8 @@ from .discovery.liveliness import PlanNotices as PlanNotices
 from .discovery.liveliness import node_topic as node_topic
 from .discovery.names_port import check_own_pair as check_own_pair
 from .discovery.names_port import pairs_are_whole as pairs_are_whole
-from .discovery.probe import EarlyProbe as EarlyProbe
 from .discovery.probe import discovery_peers as discovery_peers
+from .discovery.probe import dispose_of_announced as dispose_of_announced
 from .discovery.probe import peers_environment as peers_environment
 from .discovery.rediscovery import call_out as call_out
 from .discovery.rediscovery import introduce as introduce
@@ -42,6 +42,8 @@ from .process.busy_timer import BusySign as BusySign
 from .process.busy_timer import Overdue as Overdue
 from .process.clock import ClockTimer as ClockTimer
 from .process.control import adopt_orphans as adopt_orphans
+from .process.control import check_descriptors as check_descriptors
+from .process.control import check_memory as check_memory
 from .process.control import check_threads as check_threads
 from .process.control import drop_network_administration as drop_network_administration
 from .process.control import exit_after as exit_after
@@ -56,6 +58,7 @@ from .process.process_table import note_ended as note_ended
 from .process.reception import Reception as Reception
 from .process.shared_memory import Creations as Creations
 from .process.shared_memory import check_room as check_room
+from .process.shared_memory import check_room_to_load as check_room_to_load
 from .process.shared_memory import disown_ports as disown_ports
 from .process.shared_memory import holds_shared_memory as holds_shared_memory
 from .process.shared_memory import leftovers as leftovers

@@ -70,7 +70,6 @@ from .run.options import TIMEOUT_S as TIMEOUT_S
 from .run.options import Until as Until
 from .run.options import UpOptions as UpOptions
 from .run.options import UpResult as UpResult
-from .run.options import ask_early as ask_early
 from .run.options import own_machines as own_machines
 from .run.signals import Ended as Ended
 from .run.signals import Ending as Ending

@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from lifecycle.cli.up_output import RunOutput
-    from lifecycle.middleware import EarlyProbe
     from lifecycle.programming import TargetOptions, Treatment
     from lifecycle.supervisor import Forerunner, SystemStatus, UpResult
 
@@ -165,10 +164,9 @@ def command(
         ):
             program = _networks(targets, **rest)
             # A Python of its own imports while we do and read the manifest. A fork of ours follows
-            # once that is read: who is there already is asked meanwhile.
+            # once that is read.
             forks = are_own() and not program
             forerunner = None if forks else _forerunner(program)
-            early: EarlyProbe | None = None
             try:
                 # ssl takes 6 ms, and a supervisor's loop has no connections with TLS.
                 import_without("asyncio", "ssl")
@@ -181,9 +179,6 @@ def command(
                     plan = started_by_others(plan, without)
                 written.begin(plan)
                 if forerunner is None:
-                    from lifecycle.supervisor import ask_early
-
-                    early = ask_early(plan, machine)
                     forerunner = _forerunner(program, forks=True)
                 from lifecycle.cli.up_output import output
                 from lifecycle.supervisor import Until, UpOptions, ended_early, up
@@ -216,7 +211,6 @@ def command(
                             options,
                             [listener],
                             forerunner=forerunner,
-                            early=early,
                             ending=ending,
                             on_start=on_start,
                             conclude=conclude,
@@ -224,8 +218,6 @@ def command(
                     except Ended as ended:
                         return conclude(ended_early(ended.reason, ended.exit_code))
             finally:
-                if early is not None:
-                    early.close()
                 if forerunner is not None:
                     forerunner.close()
     except Ended as ended:

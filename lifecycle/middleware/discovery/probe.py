@@ -14,15 +14,15 @@ our participant's port, and to a socket of ours that counts the participants.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import ipaddress
 import socket
 import struct
-import sys
-import time
+import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import NamedTuple
 
 from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError
@@ -59,23 +59,17 @@ from lifecycle.network import (
     unicast_pairs,
 )
 
-if TYPE_CHECKING:
-    import asyncio
-
 RANGE_VARIABLE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 
 _DISPOSED_S = 2.0
-"""After so long the participant that does not exist is disposed of, so that peers drop it. On a
-loaded machine they answer later than within ANSWER_S, and not once it is gone.
+"""After so long an announced participant that does not exist is disposed of, or before, when its
+process leaves the graph. Peers answer it late on a loaded machine, and not once it is gone.
 
-They do not by its lease if that can be helped: Fast DDS 2.14 looks at it in a thread of its own,
-and deadlocks if another one just unmatches a writer (its issue 6502, docs/liveliness.md). With a
-lease of 0.5 s each node that was started again made all participants look seven times.
+They are not to look at its lease if that can be helped: Fast DDS 2.14 does so in a thread of its
+own, and deadlocks if another one just unmatches a writer (its issue 6502, docs/liveliness.md).
 """
-_FALLBACK_LEASE_S = 20.0
-"""For peers that do not receive the disposal."""
-_LEASE_S = 0.5
-"""Where there is no event loop that could send one."""
+_LEASE_S = 10.0
+"""For peers that receive no disposal: this process was killed, or the link was cut."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -240,44 +234,17 @@ ANSWER_S = 0.15
 """A participant that a probe reaches, on this host or the next one, answers within so long."""
 
 
-class EarlyProbe:
-    """A probe for a participant that is not made yet: whether there is anybody already.
+class _Announced(NamedTuple):
+    """A participant that does not exist, and by whom and to whom it was announced."""
 
-    Making a participant, and all that comes before it, takes longer than to be answered. Who
-    answers this one is not discovered by that; if nobody does, there was nobody, unless a process
-    of this host has a port at which a participant would have been asked.
+    family: int
+    targets: tuple[ProbeTarget, ...]
+    output_port: int | None
+    timer: threading.Timer
 
-    Args:
-        domain_id: 0–232.
-        urls: as for `probes_for`, of the participant to be.
-        environment: likewise.
-    """
 
-    def __init__(
-        self, domain_id: int, urls: Sequence[ConnectionUrl], environment: Mapping[str, str]
-    ) -> None:
-        self._sent_s = time.monotonic()
-        self._probes = probes_for(domain_id, urls, environment)
-
-    def silent_until_s(self, asked: Sequence[Probe]) -> float | None:
-        """Return when it is certain that nobody was there, on the monotonic clock.
-
-        None if somebody was, or if this did not ask all that are to be asked.
-
-        Args:
-            asked: the probes of the participant once that is made.
-        """
-        own = [each.asks for each in self._probes if each.counts]
-        if own != [each.asks for each in asked]:
-            return None
-        if any(each.answered() or each.silent() for each in self._probes):
-            return None
-        return self._sent_s + ANSWER_S
-
-    def close(self) -> None:
-        """Receive no more answers; again is harmless."""
-        for each in self._probes:
-            each.close()
+_announced: dict[str, _Announced] = {}
+"""By GUID prefix, what this process announced and did not dispose of yet."""
 
 
 def ask(
@@ -288,6 +255,8 @@ def ask(
 ) -> None:
     """Announce a participant that does not exist, so that all who receive it answer.
 
+    It is disposed of soon, and by `dispose_of_announced`.
+
     Args:
         sender: UDP, of the targets' family.
         answered_at: IP addresses and UDP ports to which they answer.
@@ -295,30 +264,33 @@ def ask(
         output_port: source port, also of the disposal; None for any.
     """
     prefix, targets = new_prefix(), tuple(targets)
-    loop = _running_loop()
-    if loop is None:
-        send(sender, announcement(prefix, answered_at, _LEASE_S), targets)
+    if not targets:
         return
-    send(sender, announcement(prefix, answered_at, _FALLBACK_LEASE_S), targets)
-    loop.call_later(_DISPOSED_S, _dispose, prefix, sender.family, targets, output_port)
+    timer = threading.Timer(_DISPOSED_S, _dispose, [prefix])
+    timer.daemon = True
+    _announced[prefix] = _Announced(sender.family, targets, output_port, timer)
+    send(sender, announcement(prefix, answered_at, _LEASE_S), targets)
+    with contextlib.suppress(RuntimeError):  # no thread is left: it is disposed of in the end
+        timer.start()
 
 
-def _running_loop() -> asyncio.AbstractEventLoop | None:
-    # A host has none, and is forked without the module.
-    loaded = sys.modules.get("asyncio")
-    try:
-        return None if loaded is None else loaded.get_running_loop()
-    except RuntimeError:
-        return None
+def dispose_of_announced() -> None:
+    """Say that no participant that this process announced by `ask` is there any more."""
+    for each in tuple(_announced):
+        _dispose(each)
 
 
-def _dispose(
-    prefix: str, family: int, targets: Iterable[ProbeTarget], output_port: int | None
-) -> None:
+atexit.register(dispose_of_announced)
+
+
+def _dispose(prefix: str) -> None:
+    if (announced := _announced.pop(prefix, None)) is None:
+        return
+    announced.timer.cancel()
     with contextlib.suppress(OSError):
-        if (sender := sender_by(family, output_port)) is not None:
+        if (sender := sender_by(announced.family, announced.output_port)) is not None:
             with sender:
-                send(sender, disposal(prefix), targets)
+                send(sender, disposal(prefix), announced.targets)
 
 
 def sender_by(family: int, output_port: int | None) -> socket.socket | None:

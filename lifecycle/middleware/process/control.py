@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import functools
+import mmap
 import os
 import resource
 import signal
@@ -433,13 +434,61 @@ def check_threads(count: int) -> None:
         libc().sem_destroy(over)
 
 
+_OWN_DESCRIPTORS, _DESCRIPTORS_EACH = 36, 8
+"""What a supervisor has open at the very least, and besides for each process that it runs."""
+
+
+def check_descriptors(processes: int) -> None:
+    """Make sure that a supervisor of so many processes may open what it needs.
+
+    Raises:
+        MiddlewareError: it may not; names the limit.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    needed = _OWN_DESCRIPTORS + _DESCRIPTORS_EACH * processes
+    if soft != resource.RLIM_INFINITY and soft < needed:
+        most = "unlimited" if hard == resource.RLIM_INFINITY else hard
+        raise MiddlewareError(
+            f"cannot run {processes} processes with {soft} file descriptors: it takes {needed} "
+            f"at the very least, and the hard limit is {most}",
+            hint=f"raise it (ulimit -n {needed}, LimitNOFILE=)",
+        )
+
+
+_ADDRESS_BYTES = 512 * 2**20
+"""What a participant and its threads map, each with a stack and a heap of its own."""
+_LEAST_ADDRESSES_KIB = 1_000_000
+"""With it the libraries, whose own heaps take less where there is less."""
+
+
+def check_memory() -> None:
+    """Make sure that this process may map what a participant takes.
+
+    With less the C library ends a process whose thread it has no memory for, in the middle of all.
+
+    Raises:
+        MiddlewareError: it may not; names the limit.
+    """
+    try:
+        mmap.mmap(-1, _ADDRESS_BYTES, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS, prot=0).close()
+    except OSError as error:
+        used = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+        needed = max(_LEAST_ADDRESSES_KIB, (used * mmap.PAGESIZE + _ADDRESS_BYTES) // 1024)
+        soft, _ = resource.getrlimit(resource.RLIMIT_AS)
+        has = "so little memory" if soft == resource.RLIM_INFINITY else f"{soft // 1024} KiB"
+        raise MiddlewareError(
+            f"cannot run with {has}: it takes {needed} KiB of addresses (RLIMIT_AS)",
+            hint=f"raise it (ulimit -v {needed}, LimitAS=)",
+        ) from error
+
+
 def no_room_for_threads(count: int) -> MiddlewareError:
     """Return the error of a process that can have no more threads; names the limits that hold."""
     threads = "the thread" if count == 1 else f"the {count} threads"
     return MiddlewareError(
-        f"cannot start {threads} that this needs: the limit of processes and threads is "
+        f"cannot start {threads} that this needs: a limit of processes, threads or memory is "
         f"reached{_limits()}",
-        hint="raise it (ulimit -u, TasksMax= or pids.max), or end other processes",
+        hint="raise it (ulimit -u, TasksMax= or pids.max; ulimit -v), or end other processes",
     )
 
 
@@ -449,6 +498,11 @@ def _limits() -> str:
     soft, _ = resource.getrlimit(resource.RLIMIT_NPROC)
     if soft != resource.RLIM_INFINITY:
         found.append(f"{soft} for this user")
+    # Each thread has a stack; what it may have of memory ends it as well.
+    for kind, name in ((resource.RLIMIT_AS, "ulimit -v"), (resource.RLIMIT_DATA, "ulimit -d")):
+        soft, _ = resource.getrlimit(kind)
+        if soft != resource.RLIM_INFINITY:
+            found.append(f"{name} allows {soft // 1024} KiB of memory")
     with contextlib.suppress(OSError, StopIteration):
         groups = Path("/proc/self/cgroup").read_text(encoding="utf-8").splitlines()
         own = next(each for each in groups if each.startswith("0::"))[3:]

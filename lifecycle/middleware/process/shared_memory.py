@@ -216,15 +216,42 @@ def check_room() -> None:
         MiddlewareError: there is so little that the kernel would end its users with SIGBUS.
     """
     with contextlib.suppress(OSError):
-        there = os.statvfs(_DIRECTORY)
-        free = there.f_bavail * there.f_frsize
-        if free < _LEAST_ROOM_BYTES:
-            raise MiddlewareError(
-                f"cannot share memory: {str(_DIRECTORY)!r} has {free} bytes left, and Fast DDS "
-                f"needs {_LEAST_ROOM_BYTES} at the very least",
-                hint="make room there, or give it more (mount -o remount,size=64m; in a container "
-                "--shm-size=64m)",
-            )
+        if (free := _free_bytes()) < _LEAST_ROOM_BYTES:
+            raise _no_room(free, "Fast DDS")
+
+
+_TRACING_BYTES = 8192
+_TRACING_FILES = "lttng-ust-wait-*"
+"""Two pages that LTTng, which ROS 2 links to, maps and writes to as it is loaded; they stay."""
+
+
+def check_room_to_load() -> None:
+    """Make sure that libraries of ROS 2 can be loaded, before any of them is.
+
+    Raises:
+        MiddlewareError: /dev/shm is so full that the kernel would end this process with SIGBUS.
+    """
+    with contextlib.suppress(OSError):
+        free = _free_bytes()
+        # st_blocks of stat(3type): in units of 512 bytes, whatever the file system has.
+        kept = sum(each.stat().st_blocks * 512 for each in _DIRECTORY.glob(_TRACING_FILES))
+        if free + kept < _TRACING_BYTES:
+            raise _no_room(free, "what ROS 2 loads and Fast DDS together")
+
+
+def _free_bytes() -> int:
+    there = os.statvfs(_DIRECTORY)
+    return there.f_bavail * there.f_frsize
+
+
+def _no_room(free: int, who: str) -> MiddlewareError:
+    verb = "need" if " and " in who else "needs"
+    return MiddlewareError(
+        f"cannot share memory: {str(_DIRECTORY)!r} has {free} bytes left, and {who} "
+        f"{verb} {_LEAST_ROOM_BYTES} at the very least",
+        hint="make room there, or give it more (mount -o remount,size=64m; in a container "
+        "--shm-size=64m)",
+    )
 
 
 def sweep(only: Collection[str], *, within_s: float = 0.0) -> tuple[str, ...]:

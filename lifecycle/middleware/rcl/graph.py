@@ -34,10 +34,10 @@ from lifecycle.middleware.discovery.dead_peers import (
 )
 from lifecycle.middleware.discovery.probe import (
     ANSWER_S,
-    EarlyProbe,
     answered_at,
     answers_unasked,
     connects_first,
+    dispose_of_announced,
     is_served,
     missing_port,
     probes_for,
@@ -183,6 +183,9 @@ _ANNOUNCED_BY_SERVER_S = 2.5
 _AGREED_S = 5.0
 """A server that listens agrees within 0.1 s, on a machine with both processors busy within 1 s."""
 
+_NAMED_S = 0.2
+"""Of a new participant endpoints are known first, and within so long of which nodes they are."""
+
 _LOOK_S = 0.005
 _PREFIX_DIGITS = 24
 
@@ -207,7 +210,6 @@ class GraphObserver:
         connections: how it is connected; as a client of a discovery server it is a super client,
             to which everything is announced.
         node: looked through instead of a hidden one, see `on`.
-        early: sent before; where nobody answers it, nobody is waited for. Closed with this.
 
     Attributes:
         urls: of its connections; none where the RMW chooses.
@@ -224,10 +226,8 @@ class GraphObserver:
         connections: ParticipantConnections | None = None,
         *,
         node: Node | None = None,
-        early: EarlyProbe | None = None,
     ) -> None:
         self.domain_id = domain_id
-        self._early = early
         settings = ParticipantSettings.of(connections or ParticipantConnections())
         self.urls = settings.urls
         self.owns_node = node is None
@@ -237,6 +237,7 @@ class GraphObserver:
         self._known: frozenset[str] = frozenset()
         self._last: _Kept | None = None
         self._asked_for: set[str] = set()
+        self._nameless_since_s: dict[str, float] = {}
         self._context: rclpy.Context | None = None
         self._guard: GraphGuard | None = None
         if node is None:
@@ -358,14 +359,12 @@ class GraphObserver:
             return max(0.0, self._limit_s - age_s)
         if not all(probe.counts for probe in self._probes):
             return max(0.0, _UNCOUNTED_S - age_s)
-        silent_until_s = None if self._early is None else self._early.silent_until_s(self._probes)
-        known_s = self._made_s + ANSWER_S if silent_until_s is None else silent_until_s
-        if (left_s := known_s - time.monotonic()) > 0:
-            return left_s
+        if age_s < ANSWER_S:
+            return ANSWER_S - age_s
         patience_s = max(0.0, PATIENCE_S - age_s)
-        if patience_s and silent_until_s is None and any(each.silent() for each in self._probes):
-            if time.monotonic() >= self._ask_silent_s:
-                self._ask_silent_s = time.monotonic() + ANSWER_S
+        if patience_s and any(each.silent() for each in self._probes):
+            if age_s >= self._ask_silent_s:
+                self._ask_silent_s = 2 * age_s
                 for probe in self._probes:
                     probe.ask_silent()
             return min(patience_s, ANSWER_S)
@@ -508,8 +507,7 @@ class GraphObserver:
         self._destroyed = True
         for probe in self._probes:
             probe.close()
-        if self._early is not None:
-            self._early.close()
+        dispose_of_announced()
         self._unwatch()
         if self._context is not None:
             give_up_dead_connections()
@@ -640,7 +638,9 @@ class GraphObserver:
             if not prefix:
                 yield endpoint
                 continue
-            if prefix not in known and prefix not in self._asked_for:
+            since_s = self._nameless_since_s.setdefault(prefix, time.monotonic())
+            is_coming = time.monotonic() - since_s < _NAMED_S
+            if prefix not in known and prefix not in self._asked_for and not is_coming:
                 self._asked_for.add(prefix)
                 for probe in self._probes:
                     probe.ask_again(to_count=True)

@@ -26,6 +26,7 @@ from lifecycle.run_directory import (
     LEDGER_NAME,
     ChildRecord,
     boot_id,
+    is_process,
     start_ticks,
 )
 
@@ -230,7 +231,7 @@ def owner_is_dead(file: LedgerFile) -> bool:
     """Whether the supervisor that made all this is gone; False if applied manually."""
     if file.owner is None:
         return False
-    return file.boot_id != boot_id() or start_ticks(file.owner.pid) != file.owner.start_ticks
+    return file.boot_id != boot_id() or not is_process(file.owner.pid, file.owner.start_ticks)
 
 
 def digest_of(*parts: str) -> str:

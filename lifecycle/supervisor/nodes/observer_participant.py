@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from lifecycle.middleware import (
         AlivePublisher,
         AliveSubscription,
-        EarlyProbe,
         GraphObserver,
         PlanNotices,
     )
@@ -59,7 +58,6 @@ class ObserverParticipant:
         *,
         unplanned: bool = False,
         events: bool = False,
-        early: EarlyProbe | None = None,
     ) -> ObserverParticipant:
         """Make the participant; before any process, so that each is discovered at once.
 
@@ -68,7 +66,6 @@ class ObserverParticipant:
             connections: how it is connected; by default as the RMW likes.
             unplanned: also read the configurations of nodes that are not planned.
             events: receive graph messages, and look again at nodes that changed.
-            early: see GraphObserver.
 
         Raises:
             MiddlewareError: it cannot be made.
@@ -84,7 +81,6 @@ class ObserverParticipant:
             unplanned=unplanned,
             quiet_s=_QUIET_S,
             burst_s=_BURST_S,
-            early=early,
         )
         widen_discovery_buffers(domain_id)
         return cls(graph)

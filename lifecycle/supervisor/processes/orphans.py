@@ -24,8 +24,8 @@ from lifecycle.run_directory import (
     RUN_VARIABLE,
     RunRecord,
     boot_id,
+    is_process,
     parent_of,
-    start_ticks,
 )
 
 GRACE_S = 3.0
@@ -123,7 +123,7 @@ def end_run(record: RunRecord) -> tuple[tuple[int, ...], frozenset[str]]:
     recorded = frozenset(record.segments)
     if record.boot_id != boot_id():
         return (), recorded
-    pids = {child.pid for child in record.children if start_ticks(child.pid) == child.start_ticks}
+    pids = {child.pid for child in record.children if is_process(child.pid, child.start_ticks)}
     pids |= _carrying(record.run_id)
     if record.cgroup:
         from lifecycle.supervisor.processes.cgroup import pids_left, remove_left

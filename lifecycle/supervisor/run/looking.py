@@ -30,7 +30,7 @@ from lifecycle.export import (
 )
 from lifecycle.graph import Look
 from lifecycle.manifest import DiscoveryRange, EndpointPolicy
-from lifecycle.middleware import note_ended, peers_environment
+from lifecycle.middleware import check_memory, note_ended, peers_environment
 from lifecycle.plan import Plan, reached_hosts
 from lifecycle.run_directory import is_held, run_name, running, runtime_root
 from lifecycle.supervisor.connections.negotiation import Expectation, is_negotiated
@@ -185,6 +185,7 @@ def _looking(plan: Plan) -> ObserverParticipant:
     hosts = reached_hosts(plan, own_machines(plan, ""))
     os.environ.update(peers_environment(hosts, os.environ))
     is_open = plan.policy.undeclared_nodes is EndpointPolicy.OPEN
+    check_memory()
     return ObserverParticipant.open(
         plan.domain_id,
         onlooker_connections(plan, _reported_to_supervisors(plan)),
@@ -386,6 +387,7 @@ def capture_running(
 
     os.environ["ROS_DOMAIN_ID"] = str(domain_id)
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = discovery_range.name
+    check_memory()
     with Graph.in_loop(domain_id) as graph:
         observation, parameters, unsettled, programs = asyncio.run(
             _look(graph, wait_s, None if attach else environment)

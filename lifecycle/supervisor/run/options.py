@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import enum
 import ipaddress
-import os
 import socket
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
@@ -21,13 +20,11 @@ from lifecycle.plan import (
     ParticipantConnections,
     Plan,
     PlannedProcess,
-    reached_hosts,
     urls_of,
 )
 from lifecycle.verify import NodeConfiguration, Verdict, only_shared_memory
 
 if TYPE_CHECKING:
-    from lifecycle.middleware import EarlyProbe
     from lifecycle.programming import TargetOptions, Treatment
 
 
@@ -189,25 +186,6 @@ def observer_connections(plan: Plan, machine: str = "") -> ParticipantConnection
         return found
     shared = tuple(each for each in found.urls if only_shared_memory(_connected_to(each)))
     return dataclasses.replace(found, urls=shared or found.urls)
-
-
-def ask_early(plan: Plan, machine: str = "") -> EarlyProbe | None:
-    """Ask who is there, for a supervisor whose participant is not made yet; close what is returned.
-
-    None where nodes of other machines are waited for, whose link may only come up.
-
-    Raises:
-        UsageError: the plan has no such machine.
-    """
-    from lifecycle.middleware import EarlyProbe, peers_environment
-
-    own = own_machines(plan, machine)
-    if any(each.machine not in own for each in plan.nodes):
-        return None
-    urls = tuple(map(parse, observer_connections(plan, machine).urls))
-    environment = {**os.environ, "ROS_AUTOMATIC_DISCOVERY_RANGE": plan.discovery_range.name}
-    environment |= peers_environment(reached_hosts(plan, own), environment)
-    return EarlyProbe(plan.domain_id, urls, environment)
 
 
 def _connected_to(url: str) -> ParticipantConnections:

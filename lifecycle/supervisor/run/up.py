@@ -20,8 +20,9 @@ from lifecycle import dataclasses
 from lifecycle.errors import ExitCode, LifecycleError, MiddlewareError
 from lifecycle.manifest import Authority, DataLayerSource, EndpointPolicy, RunKind
 from lifecycle.middleware import (
-    EarlyProbe,
     adopt_orphans,
+    check_descriptors,
+    check_memory,
     check_room,
     check_threads,
     discovery_environment,
@@ -103,7 +104,6 @@ def up(
     listeners: Iterable[Listener] = (),
     *,
     forerunner: Forerunner | None = None,
-    early: EarlyProbe | None = None,
     ending: Ending | None = None,
     on_start: Callable[[Callable[[], SystemStatus]], None] | None = None,
     conclude: Conclude | None = None,
@@ -119,7 +119,6 @@ def up(
         listeners: get every event, in this thread. One that raises gets nothing more; the run
             goes on to its end, and then what it raised is raised.
         forerunner: used and ended.
-        early: what `ask_early` returned for this plan; closed.
         ending: has noted signals since before this call; entered by the caller.
         on_start: given the way to ask for the status, once there is a system.
         conclude: given how the run ended, once nothing of the system runs any more; returns the
@@ -140,19 +139,17 @@ def up(
                 options,
                 listeners,
                 forerunner=forerunner,
-                early=early,
                 ending=ours,
                 on_start=on_start,
                 conclude=conclude,
             )
     guarded = tuple(_Guarded(each) for each in listeners)
-    with ending.noted(), contextlib.closing(early) if early else contextlib.nullcontext():
+    with ending.noted():
         result = _up(
             plan,
             options,
             guarded,
             forerunner=forerunner,
-            early=early,
             ending=ending,
             on_start=on_start,
             conclude=conclude,
@@ -185,7 +182,6 @@ def _up(
     listeners: Iterable[Listener],
     *,
     forerunner: Forerunner | None,
-    early: EarlyProbe | None,
     ending: Ending,
     on_start: Callable[[Callable[[], SystemStatus]], None] | None,
     conclude: Conclude | None,
@@ -229,9 +225,7 @@ def _up(
                 # Before any participant: who asks a server that is not there waits to ask again.
                 with ending.raised():
                     await discovery_server.begin(system, fork_server, ours=_serves(plan, options))
-                observer_participant = await _observer_participant(
-                    plan, options, emit, ending, early
-                )
+                observer_participant = await _observer_participant(plan, options, emit, ending)
                 leaving.callback(_succeed(directory, observer_participant).destroy)
                 await records.note_segments()
                 emit(_started(system, observer_participant, str(logs)))
@@ -405,7 +399,7 @@ def _serves(plan: Plan, options: UpOptions) -> bool:
 
 
 async def _observer_participant(
-    plan: Plan, options: UpOptions, emit: Emitter, ending: Ending, early: EarlyProbe | None
+    plan: Plan, options: UpOptions, emit: Emitter, ending: Ending
 ) -> ObserverParticipant:
     """Make the supervisor's participant; on another port if a discovery server is not reached.
 
@@ -424,7 +418,6 @@ async def _observer_participant(
                 connections,
                 unplanned=wires and dynamic and plan.policy.undeclared_nodes is EndpointPolicy.OPEN,
                 events=wires and (dynamic or layer.events),
-                early=early,
             )
         if number + 1 == OBSERVER_TRIES or observer_participant.reaches_servers():
             break
@@ -488,11 +481,16 @@ def _enter_graph(plan: Plan, options: UpOptions, directory: RunDirectory) -> Non
     # and once more at the very end, when who asked for the end waits for nothing else.
     gc.freeze()
     adopt_orphans()
+    own = own_machines(plan, options.machine)
+    check_descriptors(
+        sum(each.machine in own and each.run.kind is not RunKind.ATTACH for each in plan.processes)
+    )
+    check_memory()
     check_threads(THREADS)
     check_room()
     os.environ["ROS_DOMAIN_ID"] = str(plan.domain_id)
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = plan.discovery_range.name
-    hosts = reached_hosts(plan, own_machines(plan, options.machine))
+    hosts = reached_hosts(plan, own)
     os.environ.update(peers_environment(hosts, os.environ))
     peers = discovery_peers(plan.domain_id, hosts, os.environ)
     os.environ.update(discovery_environment(directory.path, peers=peers))

@@ -22,7 +22,7 @@ from std_srvs.srv import Trigger
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import Durability, History, QosProfile, Reliability
-from lifecycle.middleware import EarlyProbe, FlowParticipant, GraphObserver, to_rclpy
+from lifecycle.middleware import FlowParticipant, GraphObserver, to_rclpy
 from lifecycle.middleware.discovery.probe import ANSWER_S
 from lifecycle.middleware.rcl.graph_queries import endpoints_of, node_names
 from lifecycle.middleware.rcl.hidden_node import quiet_node
@@ -449,30 +449,9 @@ def _settled_after_s(observer: GraphObserver, began_s: float) -> float:
         time.sleep(min(left_s, 0.005))
 
 
-def test_who_was_there_before_is_not_waited_for_where_nobody_answered_earlier(
-    fresh_domain: int,
-) -> None:
-    early = EarlyProbe(fresh_domain, (), os.environ)
-    time.sleep(ANSWER_S)
-    with GraphObserver(fresh_domain, early=early) as observer:
-        observer.snapshot()
-        assert observer.settling_s() == 0.0
-
-
-def test_who_was_there_before_is_waited_for_where_it_answered_earlier(fresh_domain: int) -> None:
+def test_who_was_there_before_is_waited_for(fresh_domain: int) -> None:
     with a_node(fresh_domain, "before"):
-        early = EarlyProbe(fresh_domain, (), os.environ)
-        time.sleep(ANSWER_S)
         began_s = time.monotonic()
-        with GraphObserver(fresh_domain, early=early) as observer:
+        with GraphObserver(fresh_domain) as observer:
             assert _settled_after_s(observer, began_s) >= ANSWER_S
             assert "/before" in nodes(observer)
-
-
-def test_what_one_asked_for_early_does_not_speak_for_another_range(fresh_domain: int) -> None:
-    off = {**os.environ, "ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF"}
-    early = EarlyProbe(fresh_domain, (), off)
-    time.sleep(ANSWER_S)
-    with GraphObserver(fresh_domain, early=early) as observer:
-        observer.snapshot()
-        assert observer.settling_s() > 0

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import socket
 import struct
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,14 +13,13 @@ import pytest
 from lifecycle.middleware.discovery import probe as probing
 from lifecycle.middleware.discovery.messages import announcement, disposal, new_prefix
 from lifecycle.middleware.discovery.probe import (
-    ANSWER_S,
-    EarlyProbe,
     Probe,
     ProbeTarget,
     answered_at,
     answers_unasked,
     chosen_otherwise,
     connects_first,
+    dispose_of_announced,
     is_served,
     missing_port,
     probes_for,
@@ -98,26 +95,25 @@ def test_what_introduces_others_to_each_other_is_no_participant_that_answers(
         probe.close()
 
 
+@pytest.mark.parametrize("at_the_end", [False, True])
 def test_who_was_announced_and_does_not_exist_is_soon_said_to_have_left(
-    peer: socket.socket, monkeypatch: pytest.MonkeyPatch
+    peer: socket.socket, monkeypatch: pytest.MonkeyPatch, *, at_the_end: bool
 ) -> None:
     """Not by its lease: each look at one is an occasion for Fast DDS's deadlock."""
-    monkeypatch.setattr(probing, "_DISPOSED_S", 0.05)
+    monkeypatch.setattr(probing, "_DISPOSED_S", 60.0 if at_the_end else 0.05)
     url, _ = url_for(peer)
-
-    async def main() -> None:
-        for each in probes_for(25, (parse(url),), {}):
-            each.close()
-        await asyncio.sleep(0.1)
-
-    asyncio.run(main())
+    for each in probes_for(25, (parse(url),), {}):
+        each.close()
+    if at_the_end:
+        dispose_of_announced()
     came, left = peer.recv(65536), peer.recv(65536)
-    assert lease_s(came) == 20.0
+    assert lease_s(came) == 10.0
     expected = disposal(came[8:20].hex())
     assert (left[:24], left[32:]) == (expected[:24], expected[32:])  # but for the time between
-    for each in probes_for(25, (parse(url),), {}):  # nobody could say it
-        each.close()
-    assert lease_s(peer.recv(65536)) == 0.5
+    dispose_of_announced()
+    peer.setblocking(False)
+    with pytest.raises(BlockingIOError):
+        peer.recv(65536)
 
 
 def lease_s(message: bytes) -> float:
@@ -323,46 +319,6 @@ def test_transports_with_multicast_leave_everybody_to_be_asked(transports: str) 
     assert not chosen_otherwise({"FASTDDS_BUILTIN_TRANSPORTS": transports})
 
 
-def test_before_there_is_a_participant_others_are_asked_to_answer_only_us(
-    peer: socket.socket,
-) -> None:
-    url, address = url_for(peer)
-    before_s = time.monotonic()
-    early = EarlyProbe(25, (parse(url),), {})
-    after_s = time.monotonic()
-    asked = probes_for(25, (parse(url),), {})
-    try:
-        message, (_, asked_from, *_) = peer.recvfrom(65536)
-        assert asked_from in locators(message, address)
-        silent_until_s = early.silent_until_s(asked)
-        assert silent_until_s is not None
-        assert before_s + ANSWER_S <= silent_until_s <= after_s + ANSWER_S
-        # One that is not asked now, or was not, may be there.
-        assert early.silent_until_s(()) is None
-        assert early.silent_until_s((*asked, *asked)) is None
-        peer.sendto(_ANSWER, (address, asked_from))
-        assert early.silent_until_s(asked) is None
-    finally:
-        for each in (early, *asked):
-            each.close()
-
-
-def test_where_all_leaves_by_one_port_nobody_can_be_asked_before_there_is_a_participant(
-    peer: socket.socket,
-) -> None:
-    url, _ = url_for(peer)
-    early = EarlyProbe(25, (parse(f"{url}&output_port=7999"),), {})
-    asked = probes_for(25, (parse(url),), {})
-    assert early.silent_until_s(asked) is None
-    for each in (early, *asked):
-        each.close()
-    peer.setblocking(False)
-    messages = [peer.recvfrom(65536)[0]]
-    with pytest.raises(BlockingIOError):
-        peer.recvfrom(65536)
-    assert len(messages) == 1
-
-
 @contextlib.contextmanager
 def listening_elsewhere(peer: socket.socket) -> Iterator[tuple[str, int]]:
     """Give a socket to another process; return its URL and port."""
@@ -382,19 +338,16 @@ def test_another_process_that_listens_is_silent_until_an_answer_names_its_port(
 ) -> None:
     """It may have had no processor since it was asked: no time says that it is no participant."""
     with listening_elsewhere(peer) as (url, port):
-        early = EarlyProbe(25, (parse(url),), {})
-        (probe,) = asked = probes_for(25, (parse(url),), {})
+        (probe,) = probes_for(25, (parse(url),), {})
         family, address = (socket.AF_INET6, "::1") if "[" in url else (socket.AF_INET, "127.0.0.1")
         with socket.socket(family, socket.SOCK_DGRAM) as answering:
             answering.connect((address, probe._socket.getsockname()[1]))
             assert probe.silent() == {port}
-            assert early.silent_until_s(asked) is None
             answering.send(announced(port + 2))
             assert probe.silent() == {port}
             answering.send(announced(port, byte_order))
             assert probe.silent() == frozenset()
-        for each in (early, probe):
-            each.close()
+        probe.close()
 
 
 def test_a_process_that_closed_its_port_is_silent_no_more(peer: socket.socket) -> None:
