@@ -159,8 +159,8 @@ def boot_id() -> str:
 def start_ticks(pid: int) -> int | None:
     """Return when a process started, in clock ticks since boot; None if it does not live.
 
-    It is the same in every time namespace, but for a tick: the kernel adds the reader's offset
-    (time_namespaces(7)), and rounds down after that.
+    It is the same in every time namespace whose offset is in whole ticks: the kernel adds the
+    reader's (time_namespaces(7)), and rounds down after that.
     """
     fields = _status(pid)
     if fields is None or fields[0] in b"ZX":
@@ -170,8 +170,7 @@ def start_ticks(pid: int) -> int | None:
 
 def is_process(pid: int, started_ticks: int) -> bool:
     """Return whether a process lives that has this pid and, by `start_ticks`, began then."""
-    now = start_ticks(pid)
-    return now is not None and abs(now - started_ticks) <= 1
+    return start_ticks(pid) == started_ticks
 
 
 @functools.cache
