@@ -83,7 +83,8 @@ _EXHAUSTED = (
     (errno.EDQUOT, "room on a disk: its quota is reached", "", "make room there (quota)"),
     (errno.EFBIG, "room in a file", "RLIMIT_FSIZE", "raise it (ulimit -f, LimitFSIZE=)"),
 )
-_OF_MEMORY = ("can't start new thread", "failed to map segment", "bad_alloc")
+_OF_MEMORY = ("failed to map segment", "bad_alloc")
+_OF_THREADS = "can't start new thread"
 
 
 def exhausted(error: BaseException) -> ExhaustedError | None:
@@ -96,6 +97,11 @@ def exhausted(error: BaseException) -> ExhaustedError | None:
     number = error.errno if isinstance(error, OSError) else None
     if isinstance(error, MemoryError) or any(each in text for each in _OF_MEMORY):
         number = errno.ENOMEM
+    if _OF_THREADS in text:
+        return ExhaustedError(
+            f"cannot go on without more threads, or memory for them{_limit('RLIMIT_AS')}: {text}",
+            hint="raise the limit (ulimit -u, TasksMax= or pids.max; ulimit -v)",
+        )
     for known, what, limit, hint in _EXHAUSTED:
         if number != known and os.strerror(known) not in text:
             continue
