@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 RUN_VARIABLE = "LIFECYCLE_RUN"
 """Set in every process of a run, with the run's id: what proves that a process is ours."""
 
+PROCESS_VARIABLE = "LIFECYCLE_PROCESS"
+"""Set in every process of a run, with the name of the planned process that it descends from."""
+
 _OURS = os.O_CLOEXEC | os.O_NOFOLLOW
 
 _LONGEST_RECORD = 16 * 2**20
@@ -191,6 +194,12 @@ def parent_of(pid: int) -> int | None:
     """Return the pid of a process's parent; None if there is no such process."""
     fields = _status(pid)
     return None if fields is None else int(fields[1])
+
+
+def groups_of(pid: int) -> tuple[int, int]:
+    """Return the process group and the session of a process; zeros if there is no such process."""
+    fields = _status(pid)
+    return (0, 0) if fields is None else (int(fields[2]), int(fields[3]))
 
 
 def _status(pid: int) -> list[bytes] | None:

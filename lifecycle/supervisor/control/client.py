@@ -5,12 +5,23 @@ Owns: `status`, `look`, `differences`, `order`, `down`. Must not import rclpy.
 
 from __future__ import annotations
 
+import contextlib
+import os
+import signal
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lifecycle.errors import ExitCode
-from lifecycle.run_directory import RunDirectory, is_held, lost, new_run_id
+from lifecycle.run_directory import (
+    RunDirectory,
+    boot_id,
+    is_held,
+    lost,
+    new_run_id,
+    read_record,
+    start_ticks,
+)
 from lifecycle.supervisor.control.protocol import (
     A,
     Answer,
@@ -120,6 +131,17 @@ def down(path: Path, timeout_s: float) -> ExitCode:
     """
     deadline = time.monotonic() + timeout_s
     answer = _asked(path, Question(ask=ControlRequest.DOWN), timeout_s, Answer)
+    patience = time.monotonic() + _STARTS_S
+    while answer is None and is_held(path):
+        # It is just starting, and will listen; or ending, and does so no more.
+        if time.monotonic() > deadline:
+            raise TimeoutError
+        if time.monotonic() > patience:
+            _terminate(path)
+            patience = deadline
+        time.sleep(_ASKED_AGAIN_S)
+        left_s = max(_ASKED_AGAIN_S, deadline - time.monotonic())
+        answer = _asked(path, Question(ask=ControlRequest.DOWN), left_s, Answer)
     if answer is not None and answer.exit_code is None:
         raise strange(path / _SOCKET, "it has no exit code")
     if answer is not None and _released(path, deadline):
@@ -147,6 +169,26 @@ def _released(path: Path, deadline: float) -> bool:
         time.sleep(_LOCK_CHECK_S)
     return True
 
+
+def _terminate(path: Path) -> None:
+    """Have a supervisor end that does not listen (yet), as by SIGTERM: it may wait for long."""
+    record = read_record(path)
+    if record is None or record.boot_id != boot_id():
+        return
+    of = record.supervisor
+    with contextlib.suppress(ProcessLookupError, PermissionError):
+        pidfd = os.pidfd_open(of.pid)
+        try:
+            if start_ticks(of.pid) == of.start_ticks:
+                signal.pidfd_send_signal(pidfd, signal.SIGTERM)
+        finally:
+            os.close(pidfd)
+
+
+_ASKED_AGAIN_S = 0.1
+
+_STARTS_S = 2.0
+"""A supervisor listens sooner, unless it waits for a network interface or a discovery server."""
 
 _LOCK_CHECK_S = 0.01
 """A lock cannot be waited for with a deadline; it is released within milliseconds."""

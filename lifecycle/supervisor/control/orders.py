@@ -327,9 +327,9 @@ class Revisions:
         """Return the keys of all nodes that an order restarts."""
         if not order.node:
             return tuple(self._system.nodes)
-        process = node_of(order, self._system).process
-        assert process is not None
-        return process.planned.nodes
+        node = node_of(order, self._system)
+        # A component has none of its own: its container loads it anew.
+        return (node.planned.key,) if node.process is None else node.process.planned.nodes
 
     def _refused(self, order: Order, found: Iterable[PlanDifference]) -> UsageError:
         system = self._system.plan.system

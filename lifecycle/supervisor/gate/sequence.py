@@ -120,7 +120,8 @@ class GateSequence:
         alive: see above.
         leaves: called with the names of processes that end because we want it, and `comes_back`
             once they are started again.
-        forget: drops what a node reported before it was restarted.
+        forget: drops what nodes reported before they were taken down, and has all others forget
+            the participants of processes that theirs had left, by pid.
         vanishes: waits, bounded, until the graph shows no node of this name.
         replanned: called with the names of nodes that the plan connects otherwise from now on.
         program: programs networks with the flows of a verdict within seconds, done when it returns.
@@ -148,7 +149,7 @@ class GateSequence:
         alive: Alive,
         leaves: Callable[[Iterable[str]], None],
         comes_back: Callable[[Iterable[str]], None],
-        forget: Callable[[str], None],
+        forget: Callable[[Collection[NodeRun], Collection[int]], None],
         vanishes: Callable[[str], Coroutine[Any, Any, None]],
         replanned: Callable[[Iterable[str]], None],
         program: Callable[[Verdict, float], Coroutine[Any, Any, None]],
@@ -687,8 +688,26 @@ class GateSequence:
                 # Nobody answers for a component whose container is gone.
                 node.stuck = node.stuck or container.process.is_gone
         await TakeDown(self._system, self._emit, self._hurry, nodes=nodes).run()
-        for node in nodes:
-            self._forget(node.name)
+        await self.end_left(nodes)
+
+    def nodes_of(self, failure: StepFailedError) -> tuple[NodeRun, ...]:
+        """Return the nodes of the process that a failure is of."""
+        every = self._system.nodes.values()
+        return tuple(each for each in every if each.planned.process == failure.process)
+
+    async def end_left(self, nodes: Collection[NodeRun]) -> None:
+        """End what processes left that have ended: nothing of it runs beside a successor."""
+        ended = {
+            each.process.pid: each.process.name
+            for each in nodes
+            if each.process is not None and each.process.pid and each.process.is_gone
+        }
+        left = await self._spawner.end_left(ended) if ended else ()
+        if left:
+            names = ", ".join(map(repr, dict.fromkeys(ended.values())))
+            pids = ", ".join(map(str, left))
+            self._emit(Notice(message=f"ended what {names} left behind: {pids}"))
+        self._forget(nodes, left)
 
     async def begin_again(
         self,

@@ -744,14 +744,17 @@ def died(process: ManagedProcess, node: NodeRun | None = None) -> StepFailedErro
     subject = node.name if node is not None else process.name
     what = f"process {process.name!r}" if node is None else repr(node.name)
     holds = "" if node is None or (len(names) == 1) else f" with its process {process.name!r}"
-    return StepFailedError(
+    words = f": {process.last_words}" if process.last_words else ""
+    failure = StepFailedError(
         f"cannot keep {what} running{holds}: pid {process.pid} died{doing}: "
-        f"{process.ended.result()}{_not_run(process)}",
+        f"{process.ended.result()}{_not_run(process)}{words}",
         rule=PROCESS_DIED,
         subject=subject,
         process=process.name,
         log=process.log.shown,
     )
+    failure.gone = process.carries
+    return failure
 
 
 def _not_run(process: ManagedProcess) -> str:

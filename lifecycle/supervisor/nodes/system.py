@@ -559,6 +559,12 @@ class System:
             variables=self._variables,
             nodes={each.full_name: each.key for each in nodes},
             may_end=self._may_end(planned),
+            carries=[
+                each.full_name
+                for each in self.plan.nodes
+                if each.key in planned.nodes
+                or (each.run.component and each.run.container in planned.nodes)
+            ],
             # A host of ours deactivates its nodes itself.
             outlives=planned.run.kind is RunKind.PYTHON
             or all(each.supervision.on_supervisor_lost is _KEEP for each in nodes),

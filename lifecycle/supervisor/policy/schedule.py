@@ -375,9 +375,11 @@ class RestartSchedule:
         self._emit(
             GaveUp(process=name, restarts=record.policy.restarts, history=tuple(record.history))
         )
-        return GaveUpError(
+        error = GaveUpError(
             message, rule=GAVE_UP, subject=last.subject, process=name, log=failure.log
         )
+        error.gone = failure.gone
+        return error
 
     def _add(self, entry: _Entry) -> None:
         self._entries.append(entry)

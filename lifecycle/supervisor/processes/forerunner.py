@@ -163,6 +163,11 @@ class ForkServerProcess:
         another.preload(self._names)
         return another
 
+    @property
+    def run_id(self) -> str:
+        """Of the run whose processes it starts; empty for none."""
+        return self._environment.get(RUN_VARIABLE, "")
+
     def preload(self, names: Collection[str]) -> None:
         """Have it import what the nodes of this manifest need besides, before it forks any.
 

@@ -13,7 +13,7 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -22,6 +22,7 @@ from lifecycle.codec import from_json, to_json
 from lifecycle.errors import BringUpError
 from lifecycle.graph import set_within
 from lifecycle.manifest import RunKind
+from lifecycle.run_directory import PROCESS_VARIABLE
 from lifecycle.supervisor.processes.forerunner import CLOSE_S, ForkServerProcess
 from lifecycle.supervisor.processes.fork_server_main import (
     DISOWN,
@@ -34,7 +35,7 @@ from lifecycle.supervisor.processes.fork_server_main import (
     ChildReport,
     ForkRequest,
 )
-from lifecycle.supervisor.processes.orphans import Lineage, children, descendants
+from lifecycle.supervisor.processes.orphans import Lineage, children, descendants, end_left
 from lifecycle.supervisor.processes.process import ProcessExit, SpawnRequest, run_delay_s
 from lifecycle.supervisor.run.events import Emitter, Notice
 
@@ -321,7 +322,7 @@ class ForkServer:
         message = ForkRequest(
             id=self._next,
             argv=argv,
-            environment=request.environment,
+            environment=(*request.environment, (PROCESS_VARIABLE, request.name)),
             working_directory=request.working_directory,
             control=request.control is not None,
             limits=request.limits,
@@ -336,6 +337,15 @@ class ForkServer:
             del self._pending[message.id]
             raise
         return await born
+
+    async def end_left(self, ended: Mapping[int, str]) -> tuple[int, ...]:
+        """End, bounded, what processes have left that have ended; return the pids.
+
+        Args:
+            ended: their names by pid.
+        """
+        living = [each.pid for each in self._children.values() if not each.exited.done()]
+        return await end_left(self._process.run_id, self, ended, living)
 
     def disown_ports(self) -> None:
         """Have all participants of this host send no more to ports whose process was killed."""

@@ -197,20 +197,28 @@ class LineReader:
         """The pipe; nothing once it is closed."""
         return (self._descriptor,) if self._open else ()
 
-    def _read(self) -> None:
+    def drain(self) -> None:
+        """Read what is there: of a process that has ended, its last words."""
+        for _ in range(_LARGEST_PIPE // LONGEST_LINE):
+            if not self._open or not self._read():
+                return
+
+    def _read(self) -> bool:
+        """Read once; whether there may be more."""
         try:
             data = os.read(self._descriptor, LONGEST_LINE)
         except BlockingIOError:
-            return
+            return False
         if not data:
             self.close()
-            return
+            return False
         *lines, self._rest = (self._rest + data).split(b"\n")
         for line in lines:
             self._line(line)
         while len(self._rest) >= LONGEST_LINE:
             self._line(self._rest[:LONGEST_LINE])
             self._rest = self._rest[LONGEST_LINE:]
+        return True
 
     def _line(self, line: bytes) -> None:
         self._on_line(line.rstrip(b"\r").decode("utf-8", errors="replace"))
@@ -234,6 +242,38 @@ class LineReader:
         self._rest = b""
         if not self.ended.done():
             self.ended.set_result(None)
+
+
+class Traceback:
+    """Finds Python's last traceback among the lines of a process.
+
+    Attributes:
+        last: its exception, and the place in the user's code that it came by; empty before one.
+    """
+
+    def __init__(self) -> None:
+        self.last = ""
+        self._place = ""
+        self._is_users = False
+        self._inside = False
+
+    def add(self, line: str) -> None:
+        """Take the next line of standard error."""
+        if line.startswith("Traceback (most recent call last):"):
+            self._inside, self._place, self._is_users = True, "", False
+        elif not self._inside:
+            return
+        elif found := _FRAME.match(line):
+            is_users = not _LIBRARY.search(found[1])
+            if is_users or not self._is_users:
+                self._place, self._is_users = f"{found[1]}:{found[2]}", is_users
+        elif line.strip() and not line.startswith(" "):
+            self._inside = False
+            self.last = f"{line} ({self._place})" if self._place else line
+
+
+_FRAME = re.compile(r'  File "([^"]+)", line (\d+)')
+_LIBRARY = re.compile(r"^<|/(?:site|dist)-packages/|/lib/python3")
 
 
 class LogDirectory:

@@ -9,22 +9,25 @@ rclpy.
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import os
 import select
 import signal
 import time
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Protocol
 
 from lifecycle.middleware import segments_of
 from lifecycle.run_directory import (
     OWN_CHILD,
+    PROCESS_VARIABLE,
     RUN_VARIABLE,
     RunRecord,
     boot_id,
     is_process,
+    groups_of,
     parent_of,
 )
 
@@ -35,6 +38,11 @@ KILL_S = 5.0
 """How long the kernel may take to end a killed process, before it is reported."""
 
 _TASKS = Path("/proc/self/task")
+
+_LEFT_S = 0.5
+"""Between asking what a process left to end and killing it: another waits to start in its place."""
+
+_LOOK_S = 0.02
 
 _ROUNDS = 3
 """How often what was started while others were ended is looked for."""
@@ -96,6 +104,67 @@ def end_strays(
     if fork_server is not None:
         reap_adopted((fork_server.pid,))
     return tuple(sorted(ended))
+
+
+async def end_left(
+    run_id: str, family: ProcessFamily, ended: Mapping[int, str], living: Collection[int]
+) -> tuple[int, ...]:
+    """End what some processes of a run have left that have ended, and nothing of any other.
+
+    A process was left by another if it is in its session or group, if its environment carries that
+    one's name, or if it descends from one of these.
+
+    Args:
+        run_id: of the run.
+        family: all that the run has started.
+        ended: names of the planned processes that have ended, by pid.
+        living: pids of those that were started and live.
+
+    Returns:
+        The pids that had to be ended.
+    """
+    found: list[int] = []
+    for _ in range(_ROUNDS):
+        left = _left_by(run_id, family, ended, living)
+        orphans = _held(left)
+        try:
+            left_over = _living(orphans, 0.0)
+            found += [each.pid for each in left_over]
+            for number, wait_s in ((signal.SIGTERM, _LEFT_S), (signal.SIGKILL, KILL_S)):
+                for each in left_over:
+                    each.signal(number)
+                    each.signal(signal.SIGCONT)
+                deadline = time.monotonic() + wait_s
+                while (  # noqa: ASYNC110 - pidfds are polled
+                    left_over := _living(left_over, 0.0)
+                ) and time.monotonic() < deadline:
+                    await asyncio.sleep(_LOOK_S)
+        finally:
+            for each in orphans:
+                os.close(each.pidfd)
+        if not orphans:
+            break
+    return tuple(sorted(set(found)))
+
+
+def _left_by(
+    run_id: str, family: ProcessFamily, ended: Mapping[int, str], living: Collection[int]
+) -> set[int]:
+    """Return the pids of what `ended` left, see `end_left`."""
+    lineage = Lineage()
+    every = family.family()
+    others = {each for pid in living for each in lineage.of(pid)}
+    names = set(ended.values())
+    carrying = {pid: name for pid, name in _marked(run_id).items() if name}
+    left = {pid for pid, name in carrying.items() if name in names}
+    for pid in every:
+        groups = groups_of(pid)
+        # One that carries another's name has left the group on its way.
+        if not ended.keys().isdisjoint(groups) and others.isdisjoint(groups):
+            left.add(pid)
+    for pid in tuple(left - others):
+        left |= lineage.of(pid)
+    return left - others - {os.getpid(), family.pid}
 
 
 def reap_adopted(spare: Iterable[int]) -> None:
@@ -191,22 +260,36 @@ class Lineage:
 
 def _carrying(run_id: str) -> set[int]:
     """Pids of every process of ours whose environment carries the run's id."""
+    return set(_marked(run_id))
+
+
+def _marked(run_id: str) -> dict[int, str]:
+    """Return the planned process whose name each process carries that carries the run's id."""
     mark = f"{RUN_VARIABLE}={run_id}".encode()
-    found = set()
+    prefix = f"{PROCESS_VARIABLE}=".encode()
+    found = {}
     for entry in Path("/proc").iterdir():
         if not entry.name.isdigit() or int(entry.name) == os.getpid():
             continue
         with contextlib.suppress(OSError):
-            if mark in (entry / "environ").read_bytes().split(b"\0"):
-                found.add(int(entry.name))
+            words = (entry / "environ").read_bytes().split(b"\0")
+            if mark in words:
+                names = [each.removeprefix(prefix) for each in words if each.startswith(prefix)]
+                found[int(entry.name)] = os.fsdecode(names[-1]) if names else ""
     return found
 
 
-def _end(pids: Iterable[int], grace_s: float) -> tuple[int, ...]:
+def _held(pids: Iterable[int]) -> list[_Orphan]:
+    """Hold processes by their pidfds; the caller closes them."""
     orphans = []
     for pid in pids:
         with contextlib.suppress(ProcessLookupError):
             orphans.append(_Orphan(pid, os.pidfd_open(pid)))
+    return orphans
+
+
+def _end(pids: Iterable[int], grace_s: float) -> tuple[int, ...]:
+    orphans = _held(pids)
     try:
         left = _living(orphans, 0.0)
         ended = tuple(sorted(each.pid for each in left))

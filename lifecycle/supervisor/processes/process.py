@@ -21,12 +21,14 @@ from typing import Any, Protocol
 from lifecycle import dataclasses
 from lifecycle.manifest import Output, Resources
 from lifecycle.plan import PlannedProcess
+from lifecycle.printable import log_line
 from lifecycle.supervisor.control.protocol import ProcessState
 from lifecycle.supervisor.processes.control_channel import ControlChannel
 from lifecycle.supervisor.processes.logs import (
     LineReader,
     LogDirectory,
     ProcessLog,
+    Traceback,
     logger_in,
     logger_of,
 )
@@ -81,6 +83,16 @@ class ProcessExit:
     def __str__(self) -> str:
         return f"{self._how()} ({self.why})" if self.why else self._how()
 
+    @property
+    def is_clean(self) -> bool:
+        """Whether it is an end that was asked for, by whomever, as systemd.service(5) has it."""
+        return self.status == 0 or self.signal in _CLEAN
+
+    @property
+    def is_crash(self) -> bool:
+        """Whether the program broke; shells say so of what they ran by 128 + the signal."""
+        return self.signal in _CRASHES or (self.status or 0) - 128 in _CRASHES
+
     def _how(self) -> str:
         if self.signal is not None:
             try:
@@ -90,6 +102,18 @@ class ProcessExit:
         if self.status is not None:
             return f"exit status {self.status}"
         return "ended, exit status unknown"
+
+
+_CLEAN = (signal.SIGHUP, signal.SIGINT, signal.SIGTERM, signal.SIGPIPE)
+_CRASHES = (
+    signal.SIGILL,
+    signal.SIGTRAP,
+    signal.SIGABRT,
+    signal.SIGBUS,
+    signal.SIGFPE,
+    signal.SIGSEGV,
+    signal.SIGSYS,
+)
 
 
 def _ignore(is_stopped: bool) -> None:
@@ -193,6 +217,9 @@ class Spawner(Protocol):
             BringUpError: it cannot be started.
         """
 
+    async def end_left(self, ended: Mapping[int, str]) -> tuple[int, ...]:
+        """End, bounded, what processes left that have ended: by pid, with their names."""
+
     async def close(self) -> None:
         """Give up the spawner; its children must have ended."""
 
@@ -223,6 +250,9 @@ STARTING_ESCALATION: Escalation = (
 
 Not SIGINT: Python answers that with a traceback from the middle of an import."""
 
+_LONGEST_WORDS = 300
+"""Characters of an error that a message repeats."""
+
 COMMAND_ESCALATION: Escalation = ESCALATION[1:]
 """For foreign commands: rclpy and rclcpp end on SIGINT."""
 
@@ -237,6 +267,7 @@ class ManagedProcess:
 
     Attributes:
         planned: what the plan declares of it.
+        carries: full names of the nodes that are gone with it, loaded components included.
         state: see `CHANGES`.
         channel: to our host; None for a foreign command.
         child: None before it was spawned.
@@ -262,8 +293,10 @@ class ManagedProcess:
         nodes: Mapping[str, str] | None = None,
         may_end: bool = False,
         outlives: bool = True,
+        carries: Iterable[str] = (),
     ) -> None:
         self.planned = planned
+        self.carries = tuple(carries)
         self._outlives = outlives
         self.is_kept = False
         self.may_end = may_end
@@ -275,6 +308,8 @@ class ManagedProcess:
         self.asked_to_end = False
         self.started_s = emit.elapsed_s
         self.last_stderr = ""
+        self._traceback = Traceback()
+        self._signals: set[int] = set()
         self.is_restarted = False
         self.joins = False
         self.on_stop: Callable[[bool], None] = lambda _: None
@@ -414,6 +449,7 @@ class ManagedProcess:
             if hurry.is_set() and number != signal.SIGKILL:
                 continue
             if number:
+                self._signals.add(number)
                 self.child.signal(number)
                 needed = signal.Signals(number).name if index else ""
             if await self._wait(wait_s, hurry if number != signal.SIGKILL else None):
@@ -439,13 +475,45 @@ class ManagedProcess:
         return self.state is ProcessState.EXITED and not self.asked_to_end and not self.is_over
 
     @property
+    def crashed(self) -> bool:
+        """Whether it was asked to end, and died instead: of nothing that we sent it.
+
+        A host of ours exits with 0, or with 1 where a callback kept it from shutting down, which it
+        says. Commands have exit statuses of their own for SIGINT.
+        """
+        if not self.asked_to_end or not self.ended.done():
+            return False
+        end = self.ended.result()
+        if end.signal is not None:
+            return end.signal not in self._signals and not end.is_clean
+        return end.is_crash or (self.channel is not None and (end.status or 0) > 1)
+
+    @property
+    def last_words(self) -> str:
+        """What it said of its end: one line of printable characters, or nothing.
+
+        That is the exception of its last traceback with its place, of a program that ended by
+        itself; else its last line on standard error. One that others killed said nothing of it.
+        """
+        end = self.ended.result() if self.ended.done() else ProcessExit()
+        if end.status == 0 or (end.signal is not None and not end.is_crash):
+            return ""
+        text = self._traceback.last if end.signal is None else ""
+        text = log_line(text or self.last_stderr.strip())
+        return text if len(text) <= _LONGEST_WORDS else f"{text[: _LONGEST_WORDS - 1]}…"
+
+    @property
     def is_over(self) -> bool:
         """Whether it has ended by itself as all of its nodes may: with exit status 0."""
         return self.may_end and self.ended.done() and self.ended.result().status == 0
 
     def _exited(self, exited: asyncio.Future[ProcessExit]) -> None:
-        self._change(ProcessState.EXITED, detail=str(exited.result()))
+        # Before anybody is notified: a listener that raises must not lose it.
+        self.state = change(self.state, ProcessState.EXITED)
         self.ended.set_result(exited.result())
+        for each in self._readers:
+            each.drain()
+        self._say(detail=str(exited.result()))
 
     async def _release(self) -> None:
         if self.channel is not None:
@@ -459,12 +527,16 @@ class ManagedProcess:
 
     def _change(self, state: ProcessState, detail: str = "") -> None:
         self.state = change(self.state, state)
-        self._emit(ProcessChanged(process=self.name, state=state, pid=self.pid, detail=detail))
+        self._say(detail)
+
+    def _say(self, detail: str = "") -> None:
+        self._emit(ProcessChanged(process=self.name, state=self.state, pid=self.pid, detail=detail))
 
     def _line(self, stream: str, line: str) -> None:
         self.log.add(line)
         if stream == "stderr" and line.strip():
             self.last_stderr = line
+            self._traceback.add(line)
         if self._node_logs and (logger := logger_in(line, self._node_logs)):
             self._node_logs[logger].add(line)
         if self.planned.run.output is not Output.LOG:

@@ -26,6 +26,7 @@ from lifecycle.verify import (
     RunEnd,
     Verdict,
     node_of,
+    rule,
 )
 
 
@@ -37,6 +38,7 @@ class StepFailedError(BringUpError):
         subject: fully qualified node name, or the process where no node is to blame.
         process: name of the process concerned; empty if there is none of ours.
         log: the file with all that its process wrote; empty if there is none.
+        gone: full names of the nodes that are not there any more, as their process has ended.
         others: what else had failed by then for causes of its own, each named once.
     """
 
@@ -48,6 +50,7 @@ class StepFailedError(BringUpError):
         self.subject = subject
         self.process = process
         self.log = log
+        self.gone: tuple[str, ...] = ()
         self.others: tuple[StepFailedError, ...] = ()
 
     @property
@@ -109,10 +112,20 @@ def never_connected(verdict: Verdict, reason: str, exit_code: ExitCode) -> Verdi
 
 
 def with_failure(verdict: Verdict, failure: StepFailedError) -> Verdict:
-    """Return `verdict`, violated, with all that failed as its first findings, each once."""
+    """Return `verdict`, violated, with all that failed as its first findings, each once.
+
+    What only follows from a process that ended is not said again: that its nodes are not there, and
+    that others lack what they brought along.
+    """
     findings = tuple(finding_of(each) for each in failure.every)
     named = {(each.rule, each.subject) for each in findings}
-    rest = (each for each in verdict.findings if (each.rule, each.subject) not in named)
+    gone = {name for each in failure.every for name in each.gone}
+    rest = (
+        each
+        for each in verdict.findings
+        if (each.rule, each.subject) not in named
+        and (rule(each.rule).about is None or gone.isdisjoint((each.subject, *each.nodes)))
+    )
     return dataclasses.replace(
         verdict, verdict=Outcome.VIOLATED, blocking=True, findings=(*findings, *rest)
     )
@@ -123,22 +136,27 @@ T = TypeVar("T")
 _AGAIN_S = 5.0
 """Far longer than any task takes to notice that it was cancelled, also on a loaded machine."""
 
+_TIMES = 6
+"""A task that does not end then is left behind: nobody may wait for it for ever."""
+
 
 async def ended(*tasks: asyncio.Future[Any]) -> None:
     """Cancel tasks and wait until each has ended, however it did, also if this is cancelled.
 
-    They are cancelled again and again: asyncio.wait_for of Python 3.10 and 3.11 may take a
+    They are cancelled again, bounded: asyncio.wait_for of Python 3.10 and 3.11 may take a
     cancellation for the end of its wait (python/cpython#86296).
     """
     cancelled: asyncio.CancelledError | None = None
-    while left := [each for each in tasks if not each.done()]:
+    for _ in range(_TIMES):
+        if not (left := [each for each in tasks if not each.done()]):
+            break
         for each in left:
             each.cancel()
         try:
             await asyncio.wait(left, timeout=_AGAIN_S)
         except asyncio.CancelledError as error:
             cancelled = error
-    await asyncio.gather(*tasks, return_exceptions=True)
+    await asyncio.gather(*(each for each in tasks if each.done()), return_exceptions=True)
     if cancelled is not None:
         raise cancelled
 
@@ -156,7 +174,7 @@ async def within(seconds: float, work: Coroutine[Any, Any, T]) -> T:
         done, _ = await asyncio.wait((task,), timeout=seconds)
     finally:
         await ended(task)
-    if not done and task.cancelled():
+    if not task.done() or (not done and task.cancelled()):
         raise asyncio.TimeoutError
     return task.result()
 
@@ -181,9 +199,7 @@ async def together(coroutines: Iterable[Coroutine[Any, Any, None]]) -> None:
     try:
         done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_EXCEPTION)
     finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        await ended(*tasks)
     # In the order given, so that a failure is the same from run to run where two come at once.
     for task in tasks:
         if task in done and not task.cancelled() and (error := task.exception()) is not None:

@@ -14,6 +14,7 @@ from collections.abc import (
     AsyncIterator,
     Awaitable,
     Callable,
+    Collection,
     Coroutine,
     Iterable,
     Iterator,
@@ -320,7 +321,7 @@ class Session:
             alive=self._process_monitor.during,
             leaves=self._process_monitor.dead.update,
             comes_back=self._process_monitor.dead.difference_update,
-            forget=observer_participant.drop_configuration,
+            forget=self._forget,
             vanishes=sightings.vanishes,
             replanned=self._replanned,
             program=networks.begin,
@@ -422,7 +423,9 @@ class Session:
                 try:
                     result = await self._until_over()
                 finally:
-                    await self._take_down()
+                    deaths = await self._take_down()
+                if deaths:
+                    result = _died_on_the_way_down(result, deaths)
                 if self._hurry.is_set() and result.exit_code == ExitCode.OK:
                     result = _hurried(result)
         finally:
@@ -598,6 +601,12 @@ class Session:
             self._emit(Notice(message="nothing is adopted: no node of the manifest runs yet"))
         self._replanned(names)
 
+    def _forget(self, nodes: Collection[NodeRun], left: Collection[int]) -> None:
+        for node in nodes:
+            self._observer_participant.drop_configuration(node.name)
+        for pid in left:
+            self._stale.forget(pid, tuple(nodes))
+
     def _alone(self, node: NodeRun) -> None:
         ours = self._fork_server.family()
         if findings := ran_before(node, self._observer_participant, ours):
@@ -650,8 +659,8 @@ class Session:
         if self._keeps and isinstance(event, SystemReached | NodeChanged):
             self._system.keep()
 
-    async def _take_down(self) -> None:
-        """End everything, also what our processes left behind."""
+    async def _take_down(self) -> list[StepFailedError]:
+        """End everything, also what our processes left behind; return who died meanwhile."""
         self._gate_sequence.phase = _STOPPING
         self._keeps = False
         self._system.release()
@@ -664,8 +673,9 @@ class Session:
         await self._records.note_segments()
         if self._authority is not None:
             await self._authority.close()
+        taking_down = TakeDown(self._system, self._emit, self._hurry)
         try:
-            await TakeDown(self._system, self._emit, self._hurry).run()
+            await taking_down.run()
         finally:
             # After the last message has left, and before what runs below us is ended.
             await self._networks.close(self._hurry)
@@ -678,6 +688,7 @@ class Session:
             self._stop.cancel()
         elif not self._stop.cancelled():
             self._stop.exception()
+        return taking_down.deaths
 
     @contextlib.contextmanager
     def _signals(self) -> Iterator[None]:
@@ -711,6 +722,26 @@ class Session:
         self._networks.replan(self._system.plan)
         self._peer_supervisors.renew()
         self._agreement.announce(self._system.first)
+
+
+_ENDS_WELL = (ExitCode.OK, ExitCode.VIOLATED, ExitCode.UNVERIFIABLE)
+
+
+def _died_on_the_way_down(result: UpResult, deaths: list[StepFailedError]) -> UpResult:
+    """Return the result of a run some of whose processes died while it was taken down.
+
+    It fails by that as by any other death; one that was interrupted, or had failed before, keeps
+    the exit code of what came first.
+    """
+    failure = deaths[0].joined(deaths[1:])
+    code = failure.exit_code if result.exit_code in _ENDS_WELL else result.exit_code
+    verdict = with_failure(result.verdict, failure)
+    assert verdict.run is not None
+    reason = f"{verdict.run.reason}, but {failure.reason} while it was taken down"
+    run = dataclasses.replace(verdict.run, reason=reason, exit_code=code)
+    return dataclasses.replace(
+        result, exit_code=code, verdict=dataclasses.replace(verdict, run=run)
+    )
 
 
 def _hurried(result: UpResult) -> UpResult:

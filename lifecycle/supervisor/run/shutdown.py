@@ -7,6 +7,7 @@ run and to roll back one that failed. Must not import rclpy.
 from __future__ import annotations
 
 import asyncio
+import functools
 from collections.abc import Awaitable, Callable, Coroutine, Iterable
 from typing import Any
 
@@ -15,8 +16,10 @@ from lifecycle.manifest import RunKind
 from lifecycle.node import Operation
 from lifecycle.supervisor.connections.desired_state import Step
 from lifecycle.supervisor.control.protocol import ProcessState, Reach
+from lifecycle.supervisor.nodes.bring_up import died
 from lifecycle.supervisor.nodes.driver import ACTIVE, FINALIZED, INACTIVE
 from lifecycle.supervisor.nodes.system import NodeRun, System
+from lifecycle.supervisor.processes.control_channel import ChannelClosedError
 from lifecycle.supervisor.processes.process import (
     COMMAND_ESCALATION,
     ESCALATION,
@@ -26,7 +29,20 @@ from lifecycle.supervisor.processes.process import (
     wait_under_load,
 )
 from lifecycle.supervisor.run.events import Emitter, Notice, WiringChanged
+from lifecycle.supervisor.run.failure import StepFailedError
 
+_DEATH_S = 0.5
+"""A channel that a host closed by itself usually means that it dies."""
+
+_WORDS_S = 0.1
+"""For what a process wrote to its channel just before it ended."""
+
+_DOING = {
+    Operation.DEACTIVATE: "deactivating",
+    Operation.DISCONNECT: "disconnecting",
+    Operation.CLEANUP: "cleaning up",
+    Operation.SHUTDOWN: "shutting down",
+}
 _UNDO = {
     Operation.ACTIVATE: Operation.DEACTIVATE,
     Operation.CONNECT: Operation.DISCONNECT,
@@ -40,6 +56,10 @@ class TakeDown:
     Args:
         hurry: once set, nothing is asked politely any more and processes are killed at once.
         nodes: take only these down, and the processes that hold no others; None for all.
+
+    Attributes:
+        deaths: of processes that ended meanwhile although nobody had asked them to, or that were
+            asked to and died; each was reported at once.
     """
 
     def __init__(
@@ -53,6 +73,8 @@ class TakeDown:
         self._system = system
         self._emit = emit
         self._hurry = hurry
+        self.deaths: list[StepFailedError] = []
+        self._dead: set[ManagedProcess] = set()
         self._polite: dict[str, asyncio.Event] = {key: asyncio.Event() for key in system.nodes}
         self._nodes = system.nodes
         if nodes is not None:
@@ -62,18 +84,51 @@ class TakeDown:
 
     async def run(self) -> None:
         """Take everything down; afterwards none of the processes runs."""
+        processes = [
+            each
+            for each in self._system.processes.values()
+            if all(key in self._nodes for key in each.planned.nodes)
+        ]
+        for process in processes:
+            if process.pid and not process.ended.done():
+                process.ended.add_done_callback(functools.partial(self._ended, process))
         await asyncio.gather(
             *(self._node(key, node) for key, node in self._nodes.items()),
-            *(
-                self._process(process)
-                for process in self._system.processes.values()
-                if all(key in self._nodes for key in process.planned.nodes)
-            ),
+            *map(self._process, processes),
         )
+        await asyncio.sleep(0)  # what ended just now is reported
+
+    def _ended(self, process: ManagedProcess, _: object) -> None:
+        unasked = not (process.asked_to_end or process.is_over)
+        if process.crashed or (unasked and not process.ended.result().is_clean):
+            self._dies(process)
+
+    def _dies(self, process: ManagedProcess) -> None:
+        if process not in self._dead:
+            self._dead.add(process)
+            keys = process.planned.nodes
+            failure = died(process, self._system.nodes[keys[0]] if len(keys) == 1 else None)
+            self.deaths.append(failure)
+            for each in failure.every:
+                self._emit(each.event(ends_run=False))
+
+    async def _look_at_end(self, process: ManagedProcess) -> None:
+        """Report a host that has ended unasked, although with status 0, in the middle.
+
+        One that others asked to end, by SIGTERM say, shuts its nodes down before it ends.
+        """
+        if process.channel is None or not process.ended.done() or process.asked_to_end:
+            return
+        await asyncio.sleep(_WORDS_S)
+        nodes = [self._system.nodes[key] for key in process.planned.nodes]
+        managed = [each for each in nodes if each.driver is not None and each.planned.managed]
+        if not process.is_over and any(each.state != FINALIZED for each in managed):
+            self._dies(process)
 
     async def _node(self, key: str, node: NodeRun) -> None:
         """Undo what was done to one node once all its dependents are down."""
         try:
+            node.doing = "being taken down"
             for dependent in self._system.dependents(key):
                 await self._polite[dependent.planned.key].wait()
             await self._undo(node)
@@ -83,6 +138,7 @@ class TakeDown:
                 await self._end(node.process)
         finally:
             self._polite[key].set()
+            node.doing = ""
 
     async def _unload(self, node: NodeRun) -> None:
         """Have its container unload a component; one that ends now takes it along."""
@@ -99,6 +155,7 @@ class TakeDown:
     async def _process(self, process: ManagedProcess) -> None:
         for key in process.planned.nodes:
             await self._polite[key].wait()
+        await self._look_at_end(process)
         await self._end(process)
         for key in process.planned.nodes:
             node = self._system.nodes[key]
@@ -144,6 +201,7 @@ class TakeDown:
         }[operation]
 
         async def perform() -> None:
+            node.doing = _DOING[operation]
             condition = await node.perform(operation)
             node.report(condition.state, connected=condition.connected)
 
@@ -155,8 +213,12 @@ class TakeDown:
         """Await one request within its limit; whether it was carried out."""
         request = asyncio.ensure_future(doing)
         hurry = asyncio.ensure_future(self._hurry.wait())
+        waits: set[asyncio.Future[Any]] = {request, hurry}
+        ended = set() if node.process is None else {node.process.ended}
         try:
-            await wait_under_load({request, hurry}, limit_s, node.run_delay_s)
+            await wait_under_load(waits | ended, limit_s, node.run_delay_s)
+            if not request.done() and node.is_gone:
+                return False
             if not request.done():
                 node.stuck = True
                 if not self._hurry.is_set():
@@ -169,6 +231,8 @@ class TakeDown:
                 return False
             request.result()
         except BringUpError as error:
+            if ended and isinstance(error, ChannelClosedError):
+                await asyncio.wait(ended, timeout=_DEATH_S)
             if not node.is_gone:
                 self._emit(Notice(message=error.message))
             return False

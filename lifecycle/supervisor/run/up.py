@@ -11,6 +11,7 @@ import contextlib
 import gc
 import os
 import re
+import threading
 import time
 import traceback
 from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
@@ -286,18 +287,31 @@ def _journal(plan: Plan, directory: RunDirectory, emit: Emitter) -> Journal:
 
 @contextlib.contextmanager
 def _working(emit: Emitter, logs: Path, system: str) -> Iterator[Worker]:
-    """Yield a worker, which removes old logs once bring-up is over: that must not wait for them."""
-    begun: list[asyncio.Future[None]] = []
+    """Yield a worker, and remove old logs once bring-up is over.
+
+    That is in a thread of its own: deaths, orders and the end of a run need the worker, and a disk
+    may be slow.
+    """
+    begun: list[threading.Thread] = []
 
     def on_event(event: Event) -> None:
         is_up = isinstance(event, SystemReached) and event.reached == Until.ACTIVE.value
         if not begun and (is_up or isinstance(event, (Failure, Stopping))):
-            work = worker.run(forget_runs, logs.parent, system, os.environ)
-            begun.append(asyncio.ensure_future(work))
+            work = (logs.parent, system, dict(os.environ))
+            begun.append(threading.Thread(target=forget_runs, args=work, daemon=True))
+            with contextlib.suppress(RuntimeError):  # no room for a thread: the next run does it
+                begun[0].start()
 
+    emit.listen(on_event)
     with contextlib.closing(Worker("lifecycle")) as worker:
-        emit.listen(on_event)
         yield worker
+    for each in begun:
+        if each.is_alive():
+            each.join(_FORGOTTEN_S)
+
+
+_FORGOTTEN_S = 1.0
+"""What is not removed then is left to the next run."""
 
 
 def _emitter(listeners: Iterable[Listener]) -> Emitter:

@@ -13,7 +13,7 @@ import os
 import selectors
 import signal
 import socket
-from collections.abc import Callable, Collection, Coroutine, Iterable
+from collections.abc import Callable, Collection, Coroutine, Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -387,6 +387,11 @@ class FakeSpawner:
     async def spawn(self, request: SpawnRequest) -> FakeProcess:
         process = self.processes[request.name] = FakeProcess(self, request)
         return process
+
+    async def end_left(self, ended: Mapping[int, str]) -> tuple[int, ...]:
+        """Nothing is left."""
+        del ended
+        return ()
 
     async def close(self) -> None:
         """Nothing to close."""
