@@ -37,8 +37,13 @@ class RestartPolicy:
             return exit_status != 0
         return self.how.restart is Restart.ALWAYS
 
-    def failed(self, now_s: float) -> float | None:
+    def failed(self, now_s: float, *, was_up: bool = True) -> float | None:
         """Take one failure.
+
+        Args:
+            now_s: by the same clock.
+            was_up: its system was up before. Until then no start is forgotten: a process that fails
+                late each time must not hold a bring-up for ever.
 
         Returns:
             When it is to be started again, by the same clock; None to give up.
@@ -49,7 +54,8 @@ class RestartPolicy:
         self._in_a_row += 1
         again_s = now_s + delay_s(self.how, self._in_a_row)
         if interval_s:
-            self._starts = [each for each in self._starts if each > again_s - interval_s]
+            if was_up:
+                self._starts = [each for each in self._starts if each > again_s - interval_s]
             if len(self._starts) >= self.how.start_limit_burst:
                 return None
         return again_s

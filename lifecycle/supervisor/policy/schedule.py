@@ -78,6 +78,9 @@ class RestartSchedule:
     Args:
         system: whose processes.
         emit: where events go, and whose clock counts.
+
+    Attributes:
+        was_up: the system was as far as it is to be; set by who brings it up.
     """
 
     def __init__(self, system: System, emit: Emitter) -> None:
@@ -92,6 +95,7 @@ class RestartSchedule:
         self._barked: dict[str, str] = {}
         self._reported: set[ManagedProcess] = set()
         self._closed = False
+        self.was_up = False
         system.liveliness.listen(self._look_at_silent)
         emit.listen(self._on_event)
 
@@ -143,7 +147,7 @@ class RestartSchedule:
             del record.history[:-_REMEMBERED]
             record.failed = process
             record.since_s = now_s if record.since_s is None else record.since_s
-            due_s = record.policy.failed(now_s)
+            due_s = record.policy.failed(now_s, was_up=self.was_up)
             if process in self._reported:
                 self._reported.discard(process)
             else:
@@ -367,10 +371,10 @@ class RestartSchedule:
         lines = "".join(f"\n  at {each.elapsed_s:.1f} s: {each.message}" for each in history)
         last = record.history[-1]
         burst = how.start_limit_burst
+        within = f"within {how.start_limit_interval_sec:g} s" if self.was_up else "during bring-up"
         message = (
-            f"cannot keep {name!r} running: it was started {burst} time{'s' * (burst != 1)} within "
-            f"{how.start_limit_interval_sec:g} s (start_limit_burst, start_limit_interval_sec) and "
-            f"failed again:{lines}"
+            f"cannot keep {name!r} running: it was started {burst} time{'s' * (burst != 1)} "
+            f"{within} (start_limit_burst, start_limit_interval_sec) and failed again:{lines}"
         )
         self._emit(
             GaveUp(process=name, restarts=record.policy.restarts, history=tuple(record.history))

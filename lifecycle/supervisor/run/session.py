@@ -635,7 +635,7 @@ class Session:
 
     async def _hold(self, stage: Stage) -> _RunEnd:
         """Keep the system for as long as was asked; return the result of the run."""
-        self._held = True
+        self._held = self._schedule.was_up = True
         hold_s = self._options.stop_after_s
         if hold_s is None and self._options.until is not Until.ACTIVE and not self._options.holds:
             hold_s = 0.0

@@ -74,6 +74,7 @@ class TakeDown:
         self._emit = emit
         self._hurry = hurry
         self.deaths: list[StepFailedError] = []
+        self._lived: set[ManagedProcess] = set()
         self._dead: set[ManagedProcess] = set()
         self._polite: dict[str, asyncio.Event] = {key: asyncio.Event() for key in system.nodes}
         self._nodes = system.nodes
@@ -91,6 +92,7 @@ class TakeDown:
         ]
         for process in processes:
             if process.pid and not process.ended.done():
+                self._lived.add(process)
                 process.ended.add_done_callback(functools.partial(self._ended, process))
         await asyncio.gather(
             *(self._node(key, node) for key, node in self._nodes.items()),
@@ -117,7 +119,8 @@ class TakeDown:
 
         One that others asked to end, by SIGTERM say, shuts its nodes down before it ends.
         """
-        if process.channel is None or not process.ended.done() or process.asked_to_end:
+        ended = process.ended.done() and not process.asked_to_end
+        if process not in self._lived or process.channel is None or not ended:
             return
         await asyncio.sleep(_WORDS_S)
         nodes = [self._system.nodes[key] for key in process.planned.nodes]

@@ -129,7 +129,7 @@ def test_what_a_container_did_counts_where_its_reply_is_lost(
     run = Up(manifest, runtime=tmp_path, variables=VARIABLES)
     try:
         run.until("system", reached="active")
-        again = verb("restart", str(manifest), "talker", runtime=tmp_path)
+        again = verb("restart", "composed", "talker", runtime=tmp_path)
         assert again.returncode == ExitCode.OK, again.stderr
         (log,) = tmp_path.glob("log/2*/container.log")
         talked = [line for line in log.read_text().splitlines() if "talker" in line]

@@ -35,6 +35,7 @@ from lifecycle.supervisor.processes.logs import (
     LineReader,
     LogDirectory,
     ProcessLog,
+    Traceback,
     check_log_root,
     ros_log_root,
 )
@@ -727,3 +728,53 @@ def test_what_runs_without_a_supervisor_has_no_cgroup_and_says_so(
         "warning: the resources of /it are not limited nor counted here, a supervisor makes a "
         f"cgroup for them{hint}\n"
     )
+
+
+FRAMES = """\
+Traceback (most recent call last):
+  File "/opt/robot/node.py", line 7, in <module>
+    rclpy.spin(node)
+  File "/usr/lib/python3/dist-packages/rclpy/executors.py", line 839, in spin_once
+    raise ValueError(text)"""
+
+
+@pytest.mark.parametrize(
+    ("lines", "last"),
+    [
+        ("[INFO] all is well", ""),
+        (f"{FRAMES}\nValueError: x", "ValueError: x (/opt/robot/node.py:7)"),
+        (f"{FRAMES}\nValueError: x\nmore of x", "ValueError: x (/opt/robot/node.py:7)"),
+        (
+            f"{FRAMES}\nKeyError: 1\n\nDuring handling of the above exception, another exception "
+            f"occurred:\n\n{FRAMES.replace('7', '9')}\nValueError: x",
+            "ValueError: x (/opt/robot/node.py:9)",
+        ),
+        ("Traceback (most recent call last):\nKeyboardInterrupt", "KeyboardInterrupt"),
+    ],
+)
+def test_the_last_exception_of_a_process_is_found_with_the_users_line(
+    lines: str, last: str
+) -> None:
+    found = Traceback()
+    for line in lines.split("\n"):
+        found.add(line)
+    assert found.last == last
+
+
+@pytest.mark.parametrize(
+    ("end", "is_clean", "is_crash"),
+    [
+        (ProcessExit(status=0), True, False),
+        (ProcessExit(status=1), False, False),
+        (ProcessExit(status=139), False, True),
+        (ProcessExit(status=130), False, False),
+        (ProcessExit(signal=signal.SIGTERM), True, False),
+        (ProcessExit(signal=signal.SIGKILL), False, False),
+        (ProcessExit(signal=signal.SIGABRT), False, True),
+        (ProcessExit(), False, False),
+    ],
+)
+def test_an_end_is_clean_or_a_crash_as_systemd_has_it(
+    end: ProcessExit, is_clean: bool, is_crash: bool
+) -> None:
+    assert (end.is_clean, end.is_crash) == (is_clean, is_crash)

@@ -89,6 +89,17 @@ def test_it_gives_up_at_the_start_after_the_burst_and_never_without_an_interval(
         endless.started(at_s + 0.1)
 
 
+def test_until_the_system_was_up_a_process_that_fails_late_each_time_is_given_up() -> None:
+    how = Supervision(restart=Restart.ON_FAILURE, start_limit_interval_sec=1.0, start_limit_burst=3)
+    policies = {was_up: RestartPolicy(how, 0.0) for was_up in (True, False)}
+    again = {was_up: [] for was_up in policies}
+    for now_s in (5.0, 10.0, 15.0):
+        for was_up, policy in policies.items():
+            again[was_up].append(policy.failed(now_s, was_up=was_up) is not None)
+            policy.started(now_s)
+    assert again == {True: [True, True, True], False: [True, True, False]}
+
+
 def test_after_a_long_run_and_after_a_person_the_delay_begins_anew() -> None:
     how = Supervision(
         restart=Restart.ALWAYS, restart_sec=1.0, restart_steps=2, restart_max_delay_sec=4.0
