@@ -687,27 +687,32 @@ class GateSequence:
             if container is not None and container.process is not None:
                 # Nobody answers for a component whose container is gone.
                 node.stuck = node.stuck or container.process.is_gone
+        # What writes to it may end as soon as nobody reads a process's output any more.
+        known = self._spawner.belonging(_pids(nodes))
         await TakeDown(self._system, self._emit, self._hurry, nodes=nodes).run()
-        await self.end_left(nodes)
+        await self.end_left(nodes, known)
 
     def nodes_of(self, failure: StepFailedError) -> tuple[NodeRun, ...]:
         """Return the nodes of the process that a failure is of."""
         every = self._system.nodes.values()
         return tuple(each for each in every if each.planned.process == failure.process)
 
-    async def end_left(self, nodes: Collection[NodeRun]) -> None:
-        """End what processes left that have ended: nothing of it runs beside a successor."""
-        ended = {
-            each.process.pid: each.process.name
-            for each in nodes
-            if each.process is not None and each.process.pid and each.process.is_gone
-        }
-        left = await self._spawner.end_left(ended) if ended else ()
+    async def end_left(
+        self, nodes: Collection[NodeRun], known: Collection[int] = frozenset()
+    ) -> None:
+        """End what processes left that have ended: nothing of it runs beside a successor.
+
+        Args:
+            nodes: of these processes.
+            known: pids of what belonged to them before.
+        """
+        ended = _pids(each for each in nodes if each.is_gone)
+        left = await self._spawner.end_left(ended, known) if ended else ()
         if left:
             names = ", ".join(map(repr, dict.fromkeys(ended.values())))
             pids = ", ".join(map(str, left))
             self._emit(Notice(message=f"ended what {names} left behind: {pids}"))
-        self._forget(nodes, left)
+        self._forget(nodes, {*left, *known})
 
     async def begin_again(
         self,
@@ -919,6 +924,12 @@ class GateSequence:
         self.phase = phase
         self._emit(SystemReached(reached=phase, elapsed_s=self._emit.elapsed_s))
         self._schedule.returned([key for key, each in self._system.nodes.items() if each.is_up])
+
+
+def _pids(nodes: Iterable[NodeRun]) -> dict[int, str]:
+    """Return the names of the processes of nodes by pid."""
+    processes = [each.process for each in nodes if each.process is not None]
+    return {each.pid: each.name for each in processes if each.pid}
 
 
 def interrupted_in(nodes: Mapping[str, NodeRun]) -> frozenset[str]:

@@ -35,7 +35,13 @@ from lifecycle.supervisor.processes.fork_server_main import (
     ChildReport,
     ForkRequest,
 )
-from lifecycle.supervisor.processes.orphans import Lineage, children, descendants, end_left
+from lifecycle.supervisor.processes.orphans import (
+    Lineage,
+    belonging,
+    children,
+    descendants,
+    end_left,
+)
 from lifecycle.supervisor.processes.process import ProcessExit, SpawnRequest, run_delay_s
 from lifecycle.supervisor.run.events import Emitter, Notice
 
@@ -338,14 +344,24 @@ class ForkServer:
             raise
         return await born
 
-    async def end_left(self, ended: Mapping[int, str]) -> tuple[int, ...]:
+    def belonging(self, processes: Mapping[int, str]) -> frozenset[int]:
+        """Return the pids of all that processes have started; their names by pid."""
+        others = self._living() - processes.keys()
+        return frozenset(belonging(self._process.run_id, self, processes, others))
+
+    async def end_left(
+        self, ended: Mapping[int, str], known: Collection[int] = ()
+    ) -> tuple[int, ...]:
         """End, bounded, what processes have left that have ended; return the pids.
 
         Args:
             ended: their names by pid.
+            known: pids of what belonged to them before.
         """
-        living = [each.pid for each in self._children.values() if not each.exited.done()]
-        return await end_left(self._process.run_id, self, ended, living)
+        return await end_left(self._process.run_id, self, ended, self._living(), known)
+
+    def _living(self) -> set[int]:
+        return {each.pid for each in self._children.values() if not each.exited.done()}
 
     def disown_ports(self) -> None:
         """Have all participants of this host send no more to ports whose process was killed."""

@@ -107,25 +107,27 @@ def end_strays(
 
 
 async def end_left(
-    run_id: str, family: ProcessFamily, ended: Mapping[int, str], living: Collection[int]
+    run_id: str,
+    family: ProcessFamily,
+    ended: Mapping[int, str],
+    living: Collection[int],
+    known: Collection[int] = (),
 ) -> tuple[int, ...]:
     """End what some processes of a run have left that have ended, and nothing of any other.
-
-    A process was left by another if it is in its session or group, if its environment carries that
-    one's name, or if it descends from one of these.
 
     Args:
         run_id: of the run.
         family: all that the run has started.
         ended: names of the planned processes that have ended, by pid.
         living: pids of those that were started and live.
+        known: pids of what belonged to them before.
 
     Returns:
         The pids that had to be ended.
     """
     found: list[int] = []
     for _ in range(_ROUNDS):
-        left = _left_by(run_id, family, ended, living)
+        left = belonging(run_id, family, ended, living) | (set(known) & family.family())
         orphans = _held(left)
         try:
             left_over = _living(orphans, 0.0)
@@ -147,24 +149,32 @@ async def end_left(
     return tuple(sorted(set(found)))
 
 
-def _left_by(
-    run_id: str, family: ProcessFamily, ended: Mapping[int, str], living: Collection[int]
+def belonging(
+    run_id: str, family: ProcessFamily, processes: Mapping[int, str], others: Collection[int]
 ) -> set[int]:
-    """Return the pids of what `ended` left, see `end_left`."""
+    """Return the pids of all that processes of a run have started, whether they live or not.
+
+    It belongs to one if it descends from it, is in its session or group, carries its name in its
+    environment, or descends from one of these.
+
+    Args:
+        run_id: of the run.
+        family: all that the run has started.
+        processes: names of planned processes by pid.
+        others: pids of the other ones that live.
+    """
     lineage = Lineage()
     every = family.family()
-    others = {each for pid in living for each in lineage.of(pid)}
-    names = set(ended.values())
-    carrying = {pid: name for pid, name in _marked(run_id).items() if name}
-    left = {pid for pid, name in carrying.items() if name in names}
+    spared = {each for pid in others for each in lineage.of(pid)}
+    names = set(processes.values())
+    found = {pid for pid, name in _marked(run_id).items() if name in names}
     for pid in every:
         groups = groups_of(pid)
-        # One that carries another's name has left the group on its way.
-        if not ended.keys().isdisjoint(groups) and others.isdisjoint(groups):
-            left.add(pid)
-    for pid in tuple(left - others):
-        left |= lineage.of(pid)
-    return left - others - {os.getpid(), family.pid}
+        if not processes.keys().isdisjoint(groups) and spared.isdisjoint(groups):
+            found.add(pid)
+    for pid in (*(found - spared), *processes):
+        found |= lineage.of(pid)
+    return found - spared - processes.keys() - {os.getpid(), family.pid}
 
 
 def reap_adopted(spare: Iterable[int]) -> None:

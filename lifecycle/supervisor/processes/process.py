@@ -217,8 +217,18 @@ class Spawner(Protocol):
             BringUpError: it cannot be started.
         """
 
-    async def end_left(self, ended: Mapping[int, str]) -> tuple[int, ...]:
-        """End, bounded, what processes left that have ended: by pid, with their names."""
+    def belonging(self, processes: Mapping[int, str]) -> frozenset[int]:
+        """Return the pids of all that processes have started; their names by pid."""
+
+    async def end_left(
+        self, ended: Mapping[int, str], known: Collection[int] = ()
+    ) -> tuple[int, ...]:
+        """End, bounded, what processes have left that have ended; return the pids.
+
+        Args:
+            ended: their names by pid.
+            known: pids of what belonged to them before.
+        """
 
     async def close(self) -> None:
         """Give up the spawner; its children must have ended."""

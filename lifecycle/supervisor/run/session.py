@@ -25,7 +25,7 @@ from typing import Any, Protocol
 from lifecycle import dataclasses
 from lifecycle.errors import ExitCode
 from lifecycle.plan import PlannedNode
-from lifecycle.run_directory import RunDirectory
+from lifecycle.run_directory import RunDirectory, start_ticks
 from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.connections.authority import Reaching, authority_of
 from lifecycle.supervisor.connections.networks import Networks
@@ -605,7 +605,8 @@ class Session:
         for node in nodes:
             self._observer_participant.drop_configuration(node.name)
         for pid in left:
-            self._stale.forget(pid, tuple(nodes))
+            if start_ticks(pid) is None:
+                self._stale.forget(pid, tuple(nodes))
 
     def _alone(self, node: NodeRun) -> None:
         ours = self._fork_server.family()

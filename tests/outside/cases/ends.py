@@ -30,6 +30,14 @@ mark("child", f"pid {os.getpid()}")
 rclpy.spin(node)
 """
 
+CHATTY = """\
+import threading
+def chat():
+    while True:
+        print("x" * 200, flush=True)
+threading.Thread(target=chat, daemon=True).start()
+"""
+
 COMMAND = """\
 manifest_version: 1
 system: kids
@@ -153,6 +161,11 @@ def _down_while_starting(run: Run) -> None:
 
 
 SETSID = "setsid python3 child.py stubborn & wait\n"
+CLEARED = (
+    'env -i HOME="$HOME" PATH="$PATH" PYTHONPATH="$PYTHONPATH" OUTSIDE="$OUTSIDE" '
+    'ROS_DOMAIN_ID="$ROS_DOMAIN_ID" ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST '
+    'ROS_LOG_DIR="$ROS_LOG_DIR" setsid python3 child.py & wait\n'
+)
 RESTARTED = ("up", "--stop-after", "12")
 
 CASES = (
@@ -177,9 +190,30 @@ CASES = (
         before="the child runs on beside its successor",
     ),
     Case(
+        attack="a shell is killed whose child writes all the time",
+        manifest=COMMAND.format(),
+        files={
+            "w.sh": "python3 child.py & wait\n",
+            "child.py": CHILD.replace("rclpy.spin", f"{CHATTY}rclpy.spin"),
+        },
+        verb=RESTARTED,
+        story=_shell_is_killed,
+        verdict=OK,
+        before="21 s in starting",
+    ),
+    Case(
         attack="a shell whose child has a session of its own is restarted by order",
         manifest=COMMAND.format(),
         files={"w.sh": SETSID, "child.py": CHILD},
+        verb=RESTARTED,
+        story=_shell_is_restarted,
+        verdict=OK,
+        before="the child runs on beside its successor",
+    ),
+    Case(
+        attack="a shell whose child has neither its session nor its variables is restarted",
+        manifest=COMMAND.format(),
+        files={"w.sh": CLEARED, "child.py": CHILD},
         verb=RESTARTED,
         story=_shell_is_restarted,
         verdict=OK,
@@ -386,6 +420,6 @@ CASES = (
         story=_down_while_starting,
         exit_code=(6, 143),
         within_s=30.0,
-        before="cannot bring up …: another supervisor runs it already; end it first: lifecycle down",
+        before="cannot bring up …: another supervisor runs it; end it first: lifecycle down",
     ),
 )

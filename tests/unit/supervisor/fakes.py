@@ -388,9 +388,16 @@ class FakeSpawner:
         process = self.processes[request.name] = FakeProcess(self, request)
         return process
 
-    async def end_left(self, ended: Mapping[int, str]) -> tuple[int, ...]:
+    def belonging(self, processes: Mapping[int, str]) -> frozenset[int]:
+        """They have started nothing."""
+        del processes
+        return frozenset()
+
+    async def end_left(
+        self, ended: Mapping[int, str], known: Collection[int] = ()
+    ) -> tuple[int, ...]:
         """Nothing is left."""
-        del ended
+        del ended, known
         return ()
 
     async def close(self) -> None:

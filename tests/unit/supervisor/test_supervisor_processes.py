@@ -745,8 +745,13 @@ Traceback (most recent call last):
         (f"{FRAMES}\nValueError: x", "ValueError: x (/opt/robot/node.py:7)"),
         (f"{FRAMES}\nValueError: x\nmore of x", "ValueError: x (/opt/robot/node.py:7)"),
         (
-            f"{FRAMES}\nKeyError: 1\n\nDuring handling of the above exception, another exception "
-            f"occurred:\n\n{FRAMES.replace('7', '9')}\nValueError: x",
+            "\n\n".join(
+                (
+                    f"{FRAMES}\nKeyError: 1",
+                    "During handling of it, another exception occurred:",
+                    f"{FRAMES.replace('7', '9')}\nValueError: x",
+                )
+            ),
             "ValueError: x (/opt/robot/node.py:9)",
         ),
         ("Traceback (most recent call last):\nKeyboardInterrupt", "KeyboardInterrupt"),
