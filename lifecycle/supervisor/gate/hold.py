@@ -393,8 +393,8 @@ class Holding:
                     raise failure
                 if failure.process:
                     self._schedule.write_off(failure.process)
-                    await self._gate_sequence.end_left(self._gate_sequence.nodes_of(failure))
                 self._emit(failure.event(ends_run=False))
+                await self._gate_sequence.end_left(self._gate_sequence.nodes_of(failure))
                 self._violated = self._violated or failure.reason
                 self._system.touched.set()
             finally:

@@ -15,7 +15,7 @@ from lifecycle.verify.view import View
 
 PROCESS_DIED = Rule(
     id="run.process-died",
-    meaning="a process of the system ended although nobody asked it to",
+    meaning="a process of the system ended although nobody asked it to, or died when asked to",
     outcomes=(Outcome.VIOLATED,),
     fix="look at the last lines of its log",
     names_log=True,
