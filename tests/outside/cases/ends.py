@@ -31,10 +31,11 @@ rclpy.spin(node)
 """
 
 CHATTY = """\
-import threading
+import threading, time
 def chat():
     while True:
-        print("x" * 200, flush=True)
+        print("x" * 80, flush=True)
+        time.sleep(0.005)
 threading.Thread(target=chat, daemon=True).start()
 """
 
