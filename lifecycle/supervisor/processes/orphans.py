@@ -26,8 +26,8 @@ from lifecycle.run_directory import (
     RUN_VARIABLE,
     RunRecord,
     boot_id,
-    is_process,
     groups_of,
+    is_process,
     parent_of,
 )
 
