@@ -496,7 +496,8 @@ def _(event: Stopping) -> str:
 
 @_describe.register(Stopped)
 def _(event: Stopped) -> str:
-    return f"stopped after {event.elapsed_s:.2f} s"
+    why = "" if event.reason in ("", "done") else f": {event.reason}"
+    return f"stopped after {event.elapsed_s:.2f} s{why}"
 
 
 def verdict_line(verdict: Verdict) -> str:

@@ -178,6 +178,14 @@ class Graph:
         """
         return await self._observer.observe(plan)
 
+    def expect_newcomers(self, *, everybody: bool = False) -> bool:
+        """Have the next `observe` wait for who came lately; return whether there may be anybody.
+
+        Args:
+            everybody: this process did not run for a while, and anybody may have come.
+        """
+        return self._observer.expect_newcomers(everybody=everybody)
+
     def drop_configuration(self, node: str) -> None:
         """Forget what a node said of itself whose process ended, on /diagnostics too."""
         self._observer.drop_configuration(node)

@@ -72,6 +72,9 @@ class DiscoveredGraph(Protocol):
     def settling_s(self) -> float:
         """Return for how long the last snapshot may miss who is there; 0 if it cannot."""
 
+    def expect_newcomers(self, *, everybody: bool = False) -> bool:
+        """Have `settling_s` wait for who came lately; return whether there may be anybody."""
+
     def offers(self, node: str, service: str) -> bool:
         """Return whether discovery shows a service on a node."""
 
@@ -351,6 +354,15 @@ class Observer:
                 if configuration is not None:
                     self.state.learn(configuration)
         return self.state.observation()
+
+    def expect_newcomers(self, *, everybody: bool = False) -> bool:
+        """Have the next `observe` wait for who came lately; return whether there may be anybody.
+
+        Args:
+            everybody: wait also for what those have to say that are known: this process did not
+                run for a while.
+        """
+        return self._discovery.expect_newcomers(everybody=everybody)
 
     async def wait_change(self) -> None:
         """Wait until a burst of changes has passed, if any came since this or `observe` was called.

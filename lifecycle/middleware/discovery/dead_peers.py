@@ -125,9 +125,17 @@ def is_of_process(prefix: str, pid: int, like: str) -> bool:
         like: the prefix of a participant on this host.
     """
     written = (pid & 0xFFFF).to_bytes(2, "little").hex()
-    return prefix[: _HOST_DIGITS.stop] == like[: _HOST_DIGITS.stop] and (
-        prefix[_PID_DIGITS] == written
-    )
+    return is_of_host(prefix, like) and prefix[_PID_DIGITS] == written
+
+
+def is_of_host(prefix: str, like: str) -> bool:
+    """Return whether a participant is one of this host, by its GUID prefix.
+
+    Args:
+        prefix: 24 hex digits.
+        like: the prefix of a participant on this host.
+    """
+    return prefix[: _HOST_DIGITS.stop] == like[: _HOST_DIGITS.stop]
 
 
 def is_alone(pid: int) -> bool:

@@ -126,7 +126,7 @@ class Probe:
             self._socket = socket.socket(family, socket.SOCK_DGRAM)
             self._socket.bind(("", 0))  # answers arrive at every address we name
             own = (self._socket.getsockname()[1],)
-        self._listeners = self._listeners_here() if self.counts else frozenset()
+        self._listeners = self.listeners_here() if self.counts else frozenset()
         self._send((*own, *self._receivers))
         if not self.counts:
             self.close()
@@ -147,7 +147,7 @@ class Probe:
         self.addresses()
         left = {each for each in self._listeners if each.port not in self._named}
         if left:
-            left &= self._listeners_here()
+            left &= self.listeners_here()
         self._listeners = frozenset(left)
         return frozenset(each.port for each in left)
 
@@ -158,7 +158,20 @@ class Probe:
             answered_at = ((each, self._socket.getsockname()[1]) for each in self._addresses)
             ask(self._socket, answered_at, targets)
 
-    def _listeners_here(self) -> frozenset[OpenSocket]:
+    def ask_newcomers(self, newcomers: Iterable[OpenSocket]) -> None:
+        """Ask everybody anew; those of this host are `silent` until they answer."""
+        self.addresses()
+        self._named = set()
+        self._listeners = frozenset(newcomers)
+        self.ask_again(to_count=True)
+
+    @property
+    def leaves_host(self) -> bool:
+        """Whether it asks participants of other hosts, too."""
+        own = frozenset(self._addresses)
+        return any(target.address not in own for target in self._targets)
+
+    def listeners_here(self) -> frozenset[OpenSocket]:
         """Return the sockets of other processes on this host that one of the targets is."""
         own = frozenset(self._addresses)
         asked: dict[int, set[str]] = {}

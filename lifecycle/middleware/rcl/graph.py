@@ -28,6 +28,7 @@ from lifecycle.middleware.discovery.dead_peers import (
     PROCESS_DIGITS,
     give_up_dead_connections,
     is_alone,
+    is_of_host,
     is_of_process,
     is_used,
     remove_participants,
@@ -48,6 +49,7 @@ from lifecycle.middleware.fastdds.participant_profile import (
     ParticipantSettings,
 )
 from lifecycle.middleware.fastdds.settings import observer_settings, stop_listening
+from lifecycle.middleware.fastdds.url_check import OpenSocket
 from lifecycle.middleware.process.process_table import programs_of
 from lifecycle.middleware.rcl.graph_changes import GraphGuard, on_graph_change
 from lifecycle.middleware.rcl.graph_queries import (
@@ -185,6 +187,8 @@ _AGREED_S = 5.0
 
 _NAMED_S = 0.2
 """Of a new participant endpoints are known first, and within so long of which nodes they are."""
+_ANNOUNCED_S = 2.0
+"""For so long a participant announces itself often enough that no newcomer waits for that."""
 
 _LOOK_S = 0.005
 _PREFIX_DIGITS = 24
@@ -260,6 +264,11 @@ class GraphObserver:
         self._stale_node_filter = StaleNodeFilter(self.node)
         self._made_s = time.monotonic()
         self._ask_silent_s = 0.0
+        self._own = ""
+        self._waits_for_newcomers = False
+        self._familiar: frozenset[OpenSocket] = frozenset()
+        self._familiar_prefixes: frozenset[str] = frozenset()
+        self._named: frozenset[str] = frozenset()
 
     @classmethod
     def on(cls, node: Node) -> GraphObserver:
@@ -354,6 +363,65 @@ class GraphObserver:
         Fast DDS needs 3 s at most for what it lost; a participant without a node by
         then has none. Judged by the last `snapshot`. Where probing is impossible, it is a time.
         """
+        left_s = self._settling_s()
+        if left_s <= 0 and self._waits_for_newcomers:
+            self._waits_for_newcomers = False
+            # Who did not come into the graph in all of the time is not waited for again.
+            self._known |= self._answered()
+            self._familiar_prefixes = self._known
+        return left_s
+
+    def expect_newcomers(self, *, everybody: bool = False) -> bool:
+        """Have `settling_s` wait for who came since; return whether there may be anybody.
+
+        A participant that is made more than 2 s after this one gets our answer to its first
+        announcement before it listens. It knows us, and says what it has, after our next one only,
+        up to 3 s later, unless we announce ourselves.
+
+        On this host participants have sockets, and who has more of them than the graph shows
+        participants is not seen yet. On others they have to be asked.
+
+        Args:
+            everybody: wait also for what those have to say that are known: this process did not
+                run for a while.
+        """
+        counting = [each for each in self._probes if each.counts]
+        if not counting or len(counting) != len(self._probes):
+            if everybody:
+                self._made_s = time.monotonic()
+            return everybody
+        if self._settling_s() > 0 and not everybody:
+            return True
+        now_s = time.monotonic()
+        if now_s - self._made_s > _ANNOUNCED_S and any(each.leaves_host for each in counting):
+            everybody = True
+        sockets = {each: each.listeners_here() for each in counting}
+        listeners = frozenset().union(*sockets.values())
+        came = listeners - self._familiar
+        own = self._own = self._own or self.prefix
+        known = {
+            each
+            for each in self._named - self._familiar_prefixes
+            if own and is_of_host(each, own) and each[:PROCESS_DIGITS] != own[:PROCESS_DIGITS]
+        }
+        self._familiar = listeners
+        if not everybody and len({each.port for each in came}) <= len(known):
+            self._familiar_prefixes = self._known
+            return False
+        if self._early is not None:
+            self._early.close()
+            self._early = None
+        self._made_s, self._waits_for_newcomers = now_s, True
+        self._asked_for -= self._answered()
+        for probe, found in sockets.items():
+            probe.ask_newcomers(found & came)
+        self.announce_ourselves()
+        return True
+
+    def _answered(self) -> frozenset[str]:
+        return frozenset().union(*(each.answered() for each in self._probes))
+
+    def _settling_s(self) -> float:
         age_s = time.monotonic() - self._made_s
         if not self._probes:
             return max(0.0, self._limit_s - age_s)
@@ -368,7 +436,7 @@ class GraphObserver:
                 for probe in self._probes:
                     probe.ask_silent()
             return min(patience_s, ANSWER_S)
-        unknown = frozenset().union(*(each.answered() for each in self._probes)) - self._known
+        unknown = self._answered() - self._known
         if not unknown:
             return 0.0
         if not unknown <= self._asked_for:
@@ -541,7 +609,8 @@ class GraphObserver:
             if made[1] is not None:
                 yield made[1]
         # Who was known and left is not on the way into the graph.
-        self._known |= frozenset(known)
+        self._known |= known
+        self._named = frozenset(known)
 
     def _shown(
         self,

@@ -36,25 +36,27 @@ from lifecycle.supervisor.control.protocol import ChangedNodes
 from lifecycle.supervisor.gate.gate import VerificationError
 from lifecycle.supervisor.gate.sequence import GateSequence, OutrunError
 from lifecycle.supervisor.gate.verification_loop import SETTLED_S, ChangeCounter, VerificationLoop
+from lifecycle.supervisor.gate.violations import without_nodes_of
 from lifecycle.supervisor.health.process_monitor import ProcessMonitor
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.policy.consequences import Consequences, Due
 from lifecycle.supervisor.policy.schedule import RestartSchedule
 from lifecycle.supervisor.run.events import ConsequenceTaken, Emitter, Notice
 from lifecycle.supervisor.run.failure import StepFailedError, ended, failure_of
-from lifecycle.verify import Outcome, Stage, Verdict, not_ok
+from lifecycle.verify import Stage, Verdict, not_ok
 
 
 class Watch:
     """Judges a system again and again while it is held.
 
     Args:
-        schedule: what is away, to be started again by policy, violates nothing by that.
+        away: returns the names of the nodes that are to be started again by policy, or wait for a
+            gate: they violate nothing by that.
         opens: whether a verdict opens a gate that is waited for; `run` returns then.
         consequences: what is done about violations; None while nothing is.
+        counts: whether what is violated counts: something is active.
 
     Attributes:
-        violated: what was seen violated for longer than a passing moment; empty if nothing was.
         due: what is to be done about a violation; `run` returns then, too. None if nothing is.
     """
 
@@ -63,18 +65,19 @@ class Watch:
         judge: VerificationLoop,
         changes: ChangeCounter,
         stage: Stage,
-        schedule: RestartSchedule | None = None,
+        away: Callable[[], frozenset[str]] = frozenset,
         *,
         opens: Callable[[Verdict], bool] = lambda _: False,
         consequences: Consequences | None = None,
+        counts: bool = True,
     ) -> None:
         self._consequences = consequences
-        self._schedule = schedule
+        self._away = away
         self._opens = opens
         self._judge = judge
         self._changes = changes
         self._stage = stage
-        self.violated = ""
+        self._counts = counts
         self.due: Due | None = None
 
     async def run(self) -> None:
@@ -84,32 +87,19 @@ class Watch:
             whole, again_s = await self._judge.settled(self._stage)
             if again_s is None and self._opens(whole):
                 return
-            away = frozenset[str]() if self._schedule is None else self._schedule.away
-            verdict = _without(whole, away)
-            bad = verdict.verdict is Outcome.VIOLATED and not self.violated
-            waits_s = [SETTLED_S if again_s is None and bad else again_s]
+            verdict = without_nodes_of(whole, self._away())
+            waits_s = [again_s]
+            if self._counts:
+                waits_s.append(self._judge.violated(whole, self._away()))
             if self._consequences is not None:
                 self.due, in_s = self._consequences.look(verdict.findings)
                 waits_s.append(in_s)
             if self.due is not None:
-                self.violated = self.violated or not_ok(verdict)
+                self._judge.violations.count(not_ok(verdict))
                 return
             wait_s = min((each for each in waits_s if each is not None), default=None)
             if await self._changes.beyond(count, wait_s):
                 await self._judge.quiet()
-            elif again_s is None and bad:
-                self.violated = not_ok(verdict) or verdict.verdict.value  # no change: it lasts
-
-
-def _without(verdict: Verdict, away: frozenset[str]) -> Verdict:
-    """Return a verdict without what is found of nodes that are to be started again."""
-    if not away:
-        return verdict
-    findings = tuple(
-        each for each in verdict.findings if away.isdisjoint((*each.nodes, each.subject))
-    )
-    outcome = Outcome.worst(each.outcome for each in findings)
-    return dataclasses.replace(verdict, verdict=outcome, findings=findings)
 
 
 class _Next(enum.Enum):
@@ -164,16 +154,14 @@ class Holding:
         self._note_segments = note_segments
         self._keep_going = keep_going
         self._mailbox = Mailbox()
-        self._violated = ""
         self._before = ""  # phase of a system that is being restarted by policy
         self._under_way: Order | None = None  # given by a person
 
-    async def hold(self, stage: Stage, hold_s: float | None) -> str:
-        """Keep the system as it is, or as it is ordered; return what was violated, else nothing.
+    async def hold(self, stage: Stage, hold_s: float | None) -> None:
+        """Keep the system as it is, or as it is ordered.
 
         Args:
-            stage: what it has reached; a violation counts only of an active system, and only if it
-                lasted for longer than a passing moment.
+            stage: what it has reached; a violation counts only of what is active, see Violations.
             hold_s: seconds, ≥ 0; None for ever.
 
         Raises:
@@ -185,26 +173,30 @@ class Holding:
         while True:
             opens = self._gate_sequence.may_let_through
             acts = self._gate_sequence.phase in (ACTIVE, HELD)
+            counts = self._gate_sequence.phase == ACTIVE or bool(self._gate_sequence.active())
             if not acts:
                 self._consequences.forget()
+            if not counts:
+                self._judge.violations.end()
             consequences = self._consequences if acts else None
             watch = Watch(
                 self._judge,
                 self._changes,
                 stage,
-                self._schedule,
+                self._away,
                 opens=opens,
                 consequences=consequences,
+                counts=counts,
             )
             watching = asyncio.ensure_future(watch.run())
             try:
                 what = await self._until_ordered(deadline, watching)
             finally:
                 await ended(watching)
-            if stage is Stage.ACTIVE or watch.due is not None:
-                self._violated = self._violated or watch.violated
             if what is None:
-                return self._violated
+                if counts and not self._judge.is_current(self._judge.latest):
+                    await self._judge.settled(stage)
+                return
             if isinstance(what, Pending):
                 await self._carry_out(what)
             elif isinstance(what, StepFailedError):
@@ -229,6 +221,11 @@ class Holding:
             differs = ExitCode.VIOLATED if change.differences else ExitCode.OK
             return Done(exit_code=differs, change=change)
         return await self._mailbox.place(order)
+
+    def _away(self) -> frozenset[str]:
+        """Return the names of the nodes that are to be started again, or wait for their gate."""
+        waiting = (each.name for each in self._gate_sequence.inactive())
+        return self._schedule.away.union(waiting)
 
     async def outrun(self) -> None:
         """Return once an order waits, or something else is to be started again."""
@@ -395,7 +392,7 @@ class Holding:
                     self._schedule.write_off(failure.process)
                 self._emit(failure.event(ends_run=False))
                 await self._gate_sequence.end_left(self._gate_sequence.nodes_of(failure))
-                self._violated = self._violated or failure.reason
+                self._judge.violations.count(failure.reason)
                 self._system.touched.set()
             finally:
                 await ended(death, order, due)

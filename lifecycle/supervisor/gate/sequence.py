@@ -790,6 +790,7 @@ class GateSequence:
         await self.until_clear(timeout_s)
         assert self._judge.latest is not None
         permit = self._gate.judge(self._judge.latest, deadline=deadline if waits else None)
+        self._judge.violations.end()
         self.trusted = taken_on_trust(permit.verdict)
         self._emit(SystemReached(reached="verified", elapsed_s=self._emit.elapsed_s))
         return permit

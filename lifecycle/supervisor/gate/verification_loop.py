@@ -22,6 +22,8 @@ from lifecycle.plan import Plan
 from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.gate.activation_guard import ActivationGuard
 from lifecycle.supervisor.gate.gate import behind_s, closes
+from lifecycle.supervisor.gate.standstill import Standstill
+from lifecycle.supervisor.gate.violations import Violations, without_nodes_of
 from lifecycle.supervisor.health.agreement import Agreement
 from lifecycle.supervisor.health.liveliness import NodeArrivals
 from lifecycle.supervisor.nodes.system import ObservedGraph, System
@@ -281,6 +283,7 @@ class VerificationLoop:
         latest: the verdict that holds; None before the first.
         seen: what was seen last.
         ahead: names of the nodes that an earlier gate let through, which are active before it.
+        violations: what was violated while the system was held.
     """
 
     def __init__(
@@ -309,7 +312,10 @@ class VerificationLoop:
         self._agreement = agreement
         self._guard = guard
         self.latest: Verdict | None = None
+        self.violations = Violations()
+        self._standstill = Standstill()
         self._mark: tuple[int, int] | None = None
+        self._stills = 0
         self.seen = Observation()
         self._presence = NodeArrivals(emit)
         self._grace_period = GracePeriod()
@@ -325,9 +331,17 @@ class VerificationLoop:
         self._mark = mark
         return verdict
 
-    def is_current(self, verdict: Verdict) -> bool:
+    def is_current(self, verdict: Verdict | None) -> bool:
         """Whether nothing changed since the look that `verdict`, the latest one, came from."""
-        return verdict is self.latest and self._mark == self._changes.mark
+        return (
+            verdict is self.latest
+            and self._mark == self._changes.mark
+            and self._stills == self._standstill.count()
+        )
+
+    def close(self) -> None:
+        """Judge no more."""
+        self._standstill.close()
 
     async def again(self, ahead: frozenset[str], deadline: float | None) -> Verdict:
         """Judge a system behind an open gate again because it changed.
@@ -357,12 +371,14 @@ class VerificationLoop:
             The verdict that holds, and after how many seconds it must be judged again if it is
             not what was found now.
         """
+        mark = self._changes.mark
         found = await self._look(stage)
         now_s = asyncio.get_running_loop().time()
         verdict, again_s = self._grace_period.after(
             self.latest, found, self._system.expected, now_s
         )
         self._stands(stage, verdict)
+        self._mark = mark if again_s is None else None
         return verdict, again_s
 
     async def keep_looking(
@@ -387,9 +403,24 @@ class VerificationLoop:
             _, again_s = self._grace_period.after(
                 self.latest, found, self._system.expected, loop.time()
             )
-            if again_s is None and self._is_worse(found, away()):
-                self._stands(Stage.CONNECTED, found)
+            if again_s is None:
+                if self._is_worse(found, away()):
+                    self._stands(Stage.CONNECTED, found)
+                again_s = self.violated(found, away())
             await self._changes.beyond(count, again_s)
+
+    def violated(self, verdict: Verdict, away: frozenset[str]) -> float | None:
+        """Take note of what is violated of nodes that are to be as planned, see Violations.
+
+        Args:
+            verdict: that holds.
+            away: full names of nodes that are not up, or wait for a gate.
+        """
+        away |= self._system.dead()  # a process that ends is a failure, and counts as that
+        if self._agreement is not None:
+            away |= self._agreement.left()
+        now_s = asyncio.get_running_loop().time()
+        return self.violations.see(without_nodes_of(verdict, away), now_s)
 
     def _is_worse(self, found: Verdict, away: frozenset[str]) -> bool:
         known = () if self.latest is None else self.latest.findings
@@ -411,6 +442,10 @@ class VerificationLoop:
             self._emit(VerdictChanged(stage=stage, verdict=verdict))
 
     async def _look(self, stage: Stage) -> Verdict:
+        if self._stills != (stills := self._standstill.count()):
+            # What arrived meanwhile was not taken in: who came has to be asked for.
+            self._stills = stills
+            self._observer.expect_newcomers(everybody=True)
         await self._system.refresh(self._observer)
         asked = self._asked()
         observation = without(await self._observer.observe(asked), self._system.dead())
@@ -471,6 +506,7 @@ class VerificationLoop:
         """
         loop = asyncio.get_running_loop()
         deadline = loop.time() + timeout_s
+        newcomers_until = min(deadline, loop.time() + UNVERIFIABLE_S)
         stable: frozenset[tuple[str, str]] = frozenset()
         since = loop.time()
         again = ASK_AGAIN_S
@@ -479,6 +515,9 @@ class VerificationLoop:
             verdict = await self.once(stage)
             now = loop.time()
             if not closes(verdict, strict=self._strict):
+                lately = stage is Stage.CONNECTED and now < newcomers_until
+                if lately and self._observer.expect_newcomers():
+                    continue  # the next look waits for them
                 unsaid_s = min(self._unsaid_s(verdict, now), deadline - now)
                 if unsaid_s <= 0 or stage is not Stage.CONNECTED:
                     return verdict

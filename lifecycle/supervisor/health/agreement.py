@@ -143,10 +143,14 @@ class Agreement:
         ours = (each for each in self._known if each.system == self._plan.system and each.left)
         return {machine: each.reason[:80] for each in ours for machine in each.machines}
 
+    def left(self) -> frozenset[str]:
+        """Return the full names of the nodes of machines that were shut down properly."""
+        machines = self.shut_down
+        return frozenset(each.full_name for each in self._plan.nodes if each.machine in machines)
+
     def follows_from_shut_down(self, verdict: Verdict) -> bool:
         """Whether nothing is violated but the absence of machines that were shut down properly."""
-        machines = self.shut_down
-        gone = {each.full_name for each in self._plan.nodes if each.machine in machines}
+        gone = self.left()
         violated = [each for each in verdict.findings if each.outcome is Outcome.VIOLATED]
         return bool(violated) and all(
             rule(each.rule).about is not None and not gone.isdisjoint(each.nodes)

@@ -175,6 +175,10 @@ class ObserverParticipant:
         """Return what is there now."""
         return await self._graph.observe(plan)
 
+    def expect_newcomers(self, *, everybody: bool = False) -> bool:
+        """Have the next `observe` wait for who came lately; return whether there may be anybody."""
+        return self._graph.expect_newcomers(everybody=everybody)
+
     @property
     def changes(self) -> int:
         """Changes so far, before their bursts have passed."""

@@ -283,6 +283,13 @@ class ObservedGraph(Protocol):
     async def observe(self, plan: Plan) -> Observation:
         """Return what the graph holds now, with the configurations put here and read there."""
 
+    def expect_newcomers(self, *, everybody: bool = False) -> bool:
+        """Have the next `observe` wait for who came lately; return whether there may be anybody.
+
+        Args:
+            everybody: this process did not run for a while, and anybody may have come.
+        """
+
     @property
     def changes(self) -> int:
         """Changes of the graph so far, each counted as soon as it is noticed."""

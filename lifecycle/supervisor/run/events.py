@@ -406,11 +406,16 @@ class Stopping:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Stopped:
-    """Nothing of the system runs any more."""
+    """Nothing of the system runs any more.
+
+    Attributes:
+        reason: why the run ended, as in its report; empty if it did not come so far.
+    """
 
     kind: ClassVar[str] = "stopped"
     exit_code: int
     elapsed_s: float
+    reason: str = ""
 
 
 Event = Union[  # noqa: UP007 - a run-time alias on Python 3.10

@@ -433,9 +433,17 @@ class Session:
             for each in self._system.adopted:
                 each.close()
             self._stale.close()
+            self._judge.close()
             await self._changes.close()
             self._ros_interface.close()
-            self._emit(Stopped(exit_code=result.exit_code, elapsed_s=self._emit.elapsed_s))
+            run = result.verdict.run
+            self._emit(
+                Stopped(
+                    exit_code=result.exit_code,
+                    elapsed_s=self._emit.elapsed_s,
+                    reason="" if run is None else run.reason,
+                )
+            )
             await server.close(result.exit_code)
         return result
 
@@ -473,8 +481,8 @@ class Session:
             reason = f"{stopping}; {not_ok(error.verdict) or error.verdict.verdict.value}"
         if end.why:
             reason = f"{reason}, but {end.why}" if reason == "done" else f"{reason}; {end.why}"
-        if restarted := self._schedule.summary():
-            reason = f"{reason}; {restarted}"
+        for also in (self._schedule.summary(), self._judge.violations.passed()):
+            reason = f"{reason}; {also}" if also else reason
         self._gate.close()
         self._gate_sequence.phase = _STOPPING
         self._ends, self._reason = stopping, failed or reason
@@ -492,9 +500,7 @@ class Session:
         """Return the result of a run that is asked to end.
 
         It is a success only if the system was verified, is what was asked for, and nothing bound
-        it to stay; an interrupt (Ctrl-C) never is, nor what a violation ends. That other machines
-        of the system were shut down before is how a system of several hosts ends, and no failure
-        of this one.
+        it to stay; an interrupt (Ctrl-C) never is, nor what a violation ends.
 
         Args:
             exit_code: of a run that is cut short.
@@ -504,8 +510,6 @@ class Session:
         end = self._outcome()
         if exit_code in (ExitCode.INTERRUPTED, ExitCode.VIOLATED):
             return dataclasses.replace(end, exit_code=exit_code)
-        if end.exit_code == ExitCode.VIOLATED and self._hosts_left():
-            end = _RunEnd()
         if end.exit_code != ExitCode.OK:
             return end
         if self._options.stop_after_s is not None:
@@ -521,12 +525,13 @@ class Session:
         latest = self._judge.latest
         return latest is not None and self._agreement.follows_from_shut_down(latest)
 
-    def _outcome(self, meanwhile: str = "") -> _RunEnd:
+    def _outcome(self) -> _RunEnd:
         """Return the result of the run of a system that was held until now.
 
-        Args:
-            meanwhile: what was violated while it was held; empty if nothing was.
+        That other machines of the system were shut down before is how a system of several hosts
+        ends, and no failure of this one.
         """
+        meanwhile = self._judge.violations.counted
         deaths = self._process_monitor.deaths()
         if deaths:
             failure = deaths[0].joined(deaths[1:])
@@ -536,11 +541,11 @@ class Session:
         end = _RunEnd()
         if self._options.until is Until.CONNECTED or latest is None:
             pass
-        elif latest.verdict is Outcome.VIOLATED:
+        elif latest.verdict is Outcome.VIOLATED and not self._hosts_left():
             end = _RunEnd(exit_code=ExitCode.VIOLATED, why=f"violated; {not_ok(latest)}")
         elif meanwhile:
             end = _RunEnd(exit_code=ExitCode.VIOLATED, why=f"violated meanwhile, {meanwhile}")
-        elif closes(latest, strict=self._options.strict):
+        elif closes(latest, strict=self._options.strict) and not self._hosts_left():
             end = _RunEnd(exit_code=ExitCode.UNVERIFIABLE, why=f"unverifiable; {not_ok(latest)}")
         elif self._gate_sequence.phase == HELD:
             end = _RunEnd(exit_code=ExitCode.VIOLATED, why="held at the gate, and not active")
@@ -640,7 +645,8 @@ class Session:
         hold_s = self._options.stop_after_s
         if hold_s is None and self._options.until is not Until.ACTIVE and not self._options.holds:
             hold_s = 0.0
-        return self._outcome(await self._holding.hold(stage, hold_s))
+        await self._holding.hold(stage, hold_s)
+        return self._outcome()
 
     async def _unless_stopped(self, phases: Coroutine[Any, Any, _RunEnd]) -> _RunEnd:
         running = asyncio.ensure_future(phases)

@@ -55,6 +55,10 @@ class FakeGraph:
             self.nodes = self.arriving.pop(0)
         return self.nodes, self.endpoints
 
+    def expect_newcomers(self, *, everybody: bool = False) -> bool:
+        del everybody
+        return False
+
     def settling_s(self) -> float:
         return 0.01 if self.arriving else 0.0
 

@@ -219,6 +219,10 @@ class FakeParticipant:
         await self._changed.wait()
         self._changed.clear()
 
+    def expect_newcomers(self, *, everybody: bool = False) -> bool:
+        del everybody
+        return False
+
     async def observe(self, plan: Plan) -> Observation:
         del plan
         hosted = [name for names in self._hosts.nodes.values() for name in names]

@@ -15,6 +15,7 @@ from lifecycle.node.host.control import Event
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.control.protocol import ProcessState, Reach
 from lifecycle.supervisor.gate.hold import Watch
+from lifecycle.supervisor.gate.violations import LASTS_S
 from lifecycle.supervisor.gate.verification_loop import (
     HEALTH_S,
     PASSING_S,
@@ -535,7 +536,7 @@ def test_what_is_held_is_judged_at_its_stage_against_what_is_expected(tmp_path: 
         bench.grow()
         # It is expected only since a moment ago.
         assert await bench.judge.settled(Stage.ACTIVE) == (OK, PASSING_S)
-        await asyncio.sleep(PASSING_S)
+        await asyncio.sleep(PASSING_S + 0.01)
         assert await bench.judge.settled(Stage.ACTIVE) == (bench.verdicts[1], None)
         assert [each["stage"] for each in bench.judged] == [Stage.ACTIVE] * 3
         assert {each.stage for each in bench.world.heard(VerdictChanged)} == {Stage.ACTIVE}
@@ -852,12 +853,15 @@ def test_while_held_a_passing_violation_is_told_but_does_not_count(tmp_path: Pat
     async def test(bench: _Bench) -> None:
         watch = Watch(bench.judge, bench.changes, Stage.ACTIVE)
         watching = asyncio.ensure_future(watch.run())
-        for delay_s in (1.0, 1.2):
+        for delay_s in (1.0, 1.0 + 0.9 * LASTS_S):
             asyncio.get_running_loop().call_later(delay_s, bench.grow)
         await asyncio.sleep(5.0)
         watching.cancel()
         assert bench.told() == [OK, UNDECLARED, OK]
-        assert not watch.violated
+        assert not bench.judge.violations.counted
+        assert bench.judge.violations.passed().endswith(
+            "not counted: /camera (graph.undeclared-publisher)"
+        )
 
     _run(tmp_path, test, OK, UNDECLARED, OK)
 
@@ -869,7 +873,9 @@ def test_while_held_a_violation_that_stands_counts_and_nothing_is_polled(tmp_pat
         asyncio.get_running_loop().call_later(1.0, bench.grow)
         await asyncio.sleep(60.0)
         watching.cancel()
-        assert watch.violated == "wrong: /camera (graph.undeclared-publisher)"
+        assert bench.judge.violations.counted == "wrong: /camera (graph.undeclared-publisher)"
+        assert not bench.judge.violations.passed()
+        # At the start, at the change, once it has lasted; and then nothing is polled.
         assert len(bench.looks) == 3
         assert {each["stage"] for each in bench.judged} == {Stage.ACTIVE}
         assert {each.stage for each in bench.world.heard(VerdictChanged)} == {Stage.ACTIVE}
@@ -877,14 +883,38 @@ def test_while_held_a_violation_that_stands_counts_and_nothing_is_polled(tmp_pat
     _run(tmp_path, test, OK, UNDECLARED)
 
 
+def test_while_held_a_violation_counts_however_busy_the_graph_is(tmp_path: Path) -> None:
+    async def test(bench: _Bench) -> None:
+        watching = asyncio.ensure_future(Watch(bench.judge, bench.changes, Stage.ACTIVE).run())
+        for tenth in range(10, 40):
+            asyncio.get_running_loop().call_later(tenth / 10, bench.grow)
+        await asyncio.sleep(5.0)
+        watching.cancel()
+        assert bench.judge.violations.counted == "wrong: /camera (graph.undeclared-publisher)"
+
+    _run(tmp_path, test, OK, *[UNDECLARED] * 15, OK)
+
+
+def test_while_held_violations_that_relieve_each_other_do_not_count(tmp_path: Path) -> None:
+    async def test(bench: _Bench) -> None:
+        watching = asyncio.ensure_future(Watch(bench.judge, bench.changes, Stage.ACTIVE).run())
+        for times in range(4):
+            asyncio.get_running_loop().call_later(1.0 + 0.8 * times, bench.grow)
+        await asyncio.sleep(6.0)
+        watching.cancel()
+        assert not bench.judge.violations.counted
+        assert "(graph.undeclared-publisher), " in bench.judge.violations.passed()
+
+    _run(tmp_path, test, OK, UNDECLARED, UNMATCHED, MISSING, OK)
+
+
 def test_while_held_a_violated_verdict_without_findings_counts_too(tmp_path: Path) -> None:
     async def test(bench: _Bench) -> None:
         watch = Watch(bench.judge, bench.changes, Stage.ACTIVE)
-        assert watch.violated == ""
         watching = asyncio.ensure_future(watch.run())
         await asyncio.sleep(2.0)
         watching.cancel()
-        assert watch.violated == "violated"
+        assert bench.judge.violations.counted == "violated"
 
     _run(tmp_path, test, verdict_of(Outcome.VIOLATED))
 
