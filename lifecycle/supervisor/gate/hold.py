@@ -35,7 +35,12 @@ from lifecycle.supervisor.control.orders import (
 from lifecycle.supervisor.control.protocol import ChangedNodes
 from lifecycle.supervisor.gate.gate import VerificationError
 from lifecycle.supervisor.gate.sequence import GateSequence, OutrunError
-from lifecycle.supervisor.gate.verification_loop import SETTLED_S, ChangeCounter, VerificationLoop
+from lifecycle.supervisor.gate.verification_loop import (
+    ASK_AGAIN_AT_MOST_S,
+    SETTLED_S,
+    ChangeCounter,
+    VerificationLoop,
+)
 from lifecycle.supervisor.gate.violations import without_nodes_of
 from lifecycle.supervisor.health.process_monitor import ProcessMonitor
 from lifecycle.supervisor.nodes.system import System
@@ -89,6 +94,8 @@ class Watch:
                 return
             verdict = without_nodes_of(whole, self._away())
             waits_s = [again_s]
+            if self._judge.asks_again(whole):
+                waits_s.append(ASK_AGAIN_AT_MOST_S)
             if self._counts:
                 waits_s.append(self._judge.violated(whole, self._away()))
             if self._consequences is not None:

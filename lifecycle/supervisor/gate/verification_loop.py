@@ -4,9 +4,8 @@ Owns: when the system is judged again, how long a verdict that closes the gate i
 `GracePeriod`: which findings may pass by themselves while a system is watched, because the facts of
 one change arrive one by one, and for how long a verdict that is worse by these alone is kept back.
 The gate itself has no grace period. The graph, or a node over its control channel, notifies when to
-verify again; only while the gate waits for what nobody notifies, a match of a node that does not
-report its own or the plan of another supervisor, does it ask again, ever more rarely. Must not
-import rclpy.
+verify again; only while what nobody notifies is missing, a match of a node that does not report its
+own or a step of another supervisor's node, does it ask again. Must not import rclpy.
 """
 
 from __future__ import annotations
@@ -180,8 +179,8 @@ AGAIN_S = 5.0
 nodes that came again by policy are let through later. Fast DDS announces every 3 s."""
 
 ASK_AGAIN_S = 0.02
-"""Two other participants match without our graph changing, so while only that is missing the nodes
-are asked again: after this long, then twice as long each time, ..."""
+"""Two other participants match without our graph changing, so while that is missing the nodes are
+asked again: after this long, then twice as long each time, ..."""
 
 ASK_AGAIN_AT_MOST_S = 0.5
 """... up to this."""
@@ -534,7 +533,7 @@ class VerificationLoop:
             if now >= until:
                 return verdict
             wait_s = until - now
-            if self._waits_for_match(verdict) or self._waits_for_others(verdict):
+            if self.asks_again(verdict):
                 wait_s, again = min(wait_s, again), min(again * 2, ASK_AGAIN_AT_MOST_S)
             if await self._changes.beyond(count, wait_s):
                 await self.quiet()
@@ -573,13 +572,21 @@ class VerificationLoop:
             if await self._changes.beyond(count, min(left_s, ASK_AGAIN_AT_MOST_S)):
                 await self.quiet()
 
+    def asks_again(self, verdict: Verdict) -> bool:
+        """Whether something is missing that nobody would report once it is there."""
+        return self._waits_for_match(verdict) or self._waits_for_others(verdict)
+
     def _waits_for_match(self, verdict: Verdict) -> bool:
-        """Whether a match is missing that no node would report: hosts report theirs."""
+        """Whether a match is missing that no node would report: hosts report theirs.
+
+        What a node of another machine said of it may be from when the link was cut.
+        """
+        others = {each.name for each in self._system.remote.values()}
         reporting = {each.name for each in self._system.nodes.values() if each.reports_changes}
         return any(
             each.outcome is Outcome.VIOLATED
             and rule(each.rule).about is About.MATCH
-            and reporting.isdisjoint(each.nodes)
+            and (reporting.isdisjoint(each.nodes) or not others.isdisjoint(each.nodes))
             for each in verdict.findings
         )
 

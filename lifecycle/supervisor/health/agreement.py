@@ -65,6 +65,10 @@ class PlanNoticeTopic(Protocol):
         """Announce and receive nothing any more."""
 
 
+FAILED = "failed: "
+"""How the reason of a supervisor begins whose run failed."""
+
+
 class PlanExchange(Protocol):
     """What carries notices, see ObserverParticipant."""
 
@@ -124,7 +128,7 @@ class Agreement:
             self._notices.announce(encode(self._notice()))
 
     def leave(self, reason: str) -> None:
-        """Say that what comes is an orderly end, and why."""
+        """Say that what comes is an orderly end, and why; begins with FAILED where a run failed."""
         if self._notices is not None:
             notice = dataclasses.replace(self._notice(), left=True, reason=" ".join(reason.split()))
             self._notices.announce(encode(notice))
@@ -144,8 +148,12 @@ class Agreement:
         return {machine: each.reason[:80] for each in ours for machine in each.machines}
 
     def left(self) -> frozenset[str]:
-        """Return the full names of the nodes of machines that were shut down properly."""
-        machines = self.shut_down
+        """Return the full names of the nodes of machines that were shut down properly.
+
+        Not of those whose run failed: that is an end nobody asked for.
+        """
+        ended = self.shut_down.items()
+        machines = {machine for machine, why in ended if not why.startswith(FAILED)}
         return frozenset(each.full_name for each in self._plan.nodes if each.machine in machines)
 
     def follows_from_shut_down(self, verdict: Verdict) -> bool:

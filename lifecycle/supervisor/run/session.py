@@ -86,6 +86,9 @@ _GLANCE_S = 1.0
 """How long `--until connected` looks for a verdict to report; it gates nothing."""
 
 
+_NOTICE_S = 0.5
+"""Another supervisor says that it ends before its nodes do, but by another topic than theirs."""
+
 _STOPPING = "stopping"
 _KEPT = (ACTIVE, PAUSED, "pausing")
 """Phases of a system that was verified and is what was asked for; in any other it is on its way."""
@@ -456,7 +459,7 @@ class Session:
     async def _until_over(self) -> UpResult:
         """Run the phases; whatever ends them becomes an exit code and a verdict."""
         reason = stopping = "done"
-        failed = ""
+        failed = how = ""
         end = _RunEnd()
         try:
             end = await self._unless_stopped(self._phases())
@@ -466,12 +469,13 @@ class Session:
         except StepFailedError as failure:
             for each in failure.every:
                 self._emit(each.event())
-            reason, stopping = failure.reason, "rolling back"
+            reason, stopping, how = failure.reason, "rolling back", agreement.FAILED
             failed = "; ".join(each.message for each in failure.every)
             verdict = with_failure(self._judge.latest or NOT_JUDGED, failure)
             end = _RunEnd(exit_code=failure.exit_code, verdict=verdict)
         except VerificationError as error:
             stopping, end = "the verdict keeps the gate closed", _RunEnd(exit_code=error.exit_code)
+            how = agreement.FAILED
             if error.again:
                 stopping = "the system changed before every node was activated"
             elif self._gate_sequence.phase == "activating":
@@ -485,7 +489,7 @@ class Session:
             reason = f"{reason}; {also}" if also else reason
         self._gate.close()
         self._gate_sequence.phase = _STOPPING
-        self._ends, self._reason = stopping, failed or reason
+        self._ends, self._reason = f"{how}{stopping}", failed or reason
         self._emit(Stopping(reason=stopping))
         run = RunEnd(
             reason=reason,
@@ -646,7 +650,21 @@ class Session:
         if hold_s is None and self._options.until is not Until.ACTIVE and not self._options.holds:
             hold_s = 0.0
         await self._holding.hold(stage, hold_s)
+        await self._others_end()
         return self._outcome()
+
+    async def _others_end(self) -> None:
+        """Wait a moment for machines that end with ours to say so, where only theirs is wrong."""
+        others = {each.name for each in self._system.remote.values()}
+        latest, deadline = self._judge.latest, asyncio.get_running_loop().time() + _NOTICE_S
+        while latest is not None and latest.verdict is Outcome.VIOLATED:
+            violated = [each for each in latest.findings if each.outcome is Outcome.VIOLATED]
+            left_s = deadline - asyncio.get_running_loop().time()
+            if left_s <= 0 or self._hosts_left():
+                return
+            if any(others.isdisjoint(each.nodes) for each in violated):
+                return
+            await self._changes.beyond(self._changes.count, left_s)
 
     async def _unless_stopped(self, phases: Coroutine[Any, Any, _RunEnd]) -> _RunEnd:
         running = asyncio.ensure_future(phases)

@@ -160,6 +160,21 @@ def still_in_a_restart(run: Run) -> None:
     os.waitpid(pid, 0)
 
 
+def still_in_a_resume(run: Run) -> None:
+    """A stranger comes while the paused system is resumed, and the supervisor does not run."""
+    run.until_active()
+    assert run.lifecycle("pause", "{}").returncode == 0
+    run.signal(signal.SIGSTOP)
+    run.stranger("stranger", "pub:/chatter")
+    pid = os.fork()
+    if pid == 0:
+        run.lifecycle("resume", "{}")  # waits for the supervisor
+        os._exit(0)
+    time.sleep(1.0)
+    run.signal(signal.SIGCONT)
+    os.waitpid(pid, 0)
+
+
 def late(run: Run) -> None:
     """A stranger comes 1.3 s before the gate would open."""
     run.until("node", node="/talker", reach="connected")
@@ -298,6 +313,17 @@ CASES = (
         exit_code=4,
         verdict=VIOLATED,
         findings=("graph.undeclared-node",),
+    ),
+    Case(
+        attack="the supervisor is stopped in a pause, a stranger comes, and it is to resume",
+        manifest=PAIR,
+        verb=("up", "--strict", "--stop-after", "12", "--timeout", "5"),
+        story=still_in_a_resume,
+        exit_code=4,
+        verdict=VIOLATED,
+        findings=("graph.undeclared-node",),
+        received=frozenset({"hello"}),
+        before="activated on the verdict of before the stop at times",
     ),
     Case(
         attack="a stranger comes shortly before the gate, long after the supervisor",

@@ -227,6 +227,8 @@ def test_only_the_absence_of_who_was_shut_down_is_how_a_system_of_several_hosts_
         await left.hears(two_machines())
         absent = _verdict(_missing("/viewer"), unmatched)
         assert not left.agreement.follows_from_shut_down(absent)
+        await left.hears(two_machines(), left=True, reason="failed: rolling back")
+        assert not left.agreement.follows_from_shut_down(absent)
         await left.hears(two_machines(), left=True, reason="lifecycle down")
         assert left.agreement.follows_from_shut_down(absent)
         for worse in (_missing("/camera"), intruder):

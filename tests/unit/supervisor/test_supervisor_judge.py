@@ -723,6 +723,31 @@ def test_nodes_are_asked_for_a_match_at_growing_intervals_up_to_half_a_second(
     _run(tmp_path, test, UNMATCHED)
 
 
+def test_while_held_a_match_with_a_node_of_another_machine_is_asked_for_until_it_is_there(
+    tmp_path: Path,
+) -> None:
+    finding = dataclasses.replace(UNMATCHED.findings[0], ends=("/camera", "/viewer"))
+    unmatched = dataclasses.replace(UNMATCHED, findings=(finding,))
+
+    async def test(bench: _Bench) -> None:
+        bench.world.system.remote = {"viewer": RemoteNode(planned_node("viewer"))}
+        bench.world.system.nodes["camera"].reports_changes = True
+
+        def match() -> None:
+            bench.verdicts = (OK,)
+
+        asyncio.get_running_loop().call_later(5.0, match)
+        watching = asyncio.ensure_future(Watch(bench.judge, bench.changes, Stage.ACTIVE).run())
+        await asyncio.sleep(5.6)
+        assert bench.judge.latest == OK
+        looks = len(bench.looks)
+        await asyncio.sleep(60.0)
+        assert len(bench.looks) == looks
+        watching.cancel()
+
+    _run(tmp_path, test, unmatched)
+
+
 def test_a_match_that_is_only_unverifiable_is_not_asked_for(tmp_path: Path) -> None:
     async def test(bench: _Bench) -> None:
         await bench.judge.until_clear(Stage.CONNECTED, 3.0)

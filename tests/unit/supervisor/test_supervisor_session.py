@@ -973,7 +973,11 @@ def test_a_run_that_is_bound_to_stay_is_cut_short_by_a_signal(tmp_path: Path) ->
             "restarting",
             "exit code 143: terminated; the system was connecting, not active",
         ),
-        ("held", "exit code 4: terminated; held at the gate, and not active"),
+        (
+            "held",
+            "exit code 4: terminated; held at the gate, and not active; violated for no longer "
+            "than 1 s, and not counted: /intruder (graph.undeclared-node)",
+        ),
     ],
 )
 def test_a_run_is_a_success_only_if_its_system_is_as_it_was_ordered(

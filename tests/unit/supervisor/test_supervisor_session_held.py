@@ -348,7 +348,10 @@ def test_a_restarted_node_stays_inactive_while_the_system_is_wrong_and_can_be_re
             "/viewer activate",
             "[system] active at 1.5 s",
         ]
-        assert world.report == "ended after it was active, exit code 0: lifecycle down"
+        assert world.report == (
+            "ended after it was active, exit code 0: lifecycle down; violated for no longer than "
+            "1 s, and not counted: /intruder (graph.undeclared-node)"
+        )
 
     run(main())
 
