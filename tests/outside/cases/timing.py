@@ -68,9 +68,21 @@ TOLERANT = _PAIR.format(
 TOOL = ("tool", "sub:/tool_a", "churn:0.12")
 
 
-def visit(run: Run, seconds: float, name: str = "stranger") -> None:
+_WRONG = '"stage":"active","verdict":{"verdict":"violated"'
+
+
+def visit(run: Run, seconds: float) -> None:
     """Have a stranger on /chatter for so long."""
-    run.stranger(name, "pub:/chatter", f"for:{seconds}")
+    run.stranger("stranger", "pub:/chatter", f"for:{seconds}")
+
+
+def glance(run: Run, name: str = "stranger") -> None:
+    """Have a stranger on /chatter until it is noticed, and no longer."""
+    before = run.output.count(_WRONG)
+    stranger = run.stranger(name, "pub:/chatter")
+    run.wait(lambda: run.output.count(_WRONG) > before, "it is noticed")
+    stranger.terminate()
+    stranger.wait()
 
 
 def lasting(run: Run) -> None:
@@ -80,20 +92,20 @@ def lasting(run: Run) -> None:
 
 def brief(run: Run) -> None:
     run.until_active()
-    visit(run, 0.25)
+    glance(run)
 
 
 def flapping(run: Run) -> None:
     run.until_active()
     for _ in range(4):
-        visit(run, 0.3)
+        glance(run)
         time.sleep(0.6)
 
 
 def taking_turns(run: Run) -> None:
     run.until_active()
     for number in range(4):
-        visit(run, 0.3, f"stranger_{number}")
+        glance(run, f"stranger_{number}")
 
 
 def in_the_end(run: Run) -> None:
@@ -104,7 +116,7 @@ def in_the_end(run: Run) -> None:
 
 def then_down(run: Run) -> None:
     lasting(run)
-    run.until_says('"stage":"active","verdict":\\{"verdict":"violated"')
+    run.wait(lambda: _WRONG in run.output, "it is noticed")
     time.sleep(3.0)
     assert run.lifecycle("down", "{}").returncode == 0
 

@@ -15,7 +15,6 @@ from lifecycle.node.host.control import Event
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.control.protocol import ProcessState, Reach
 from lifecycle.supervisor.gate.hold import Watch
-from lifecycle.supervisor.gate.violations import LASTS_S
 from lifecycle.supervisor.gate.verification_loop import (
     HEALTH_S,
     PASSING_S,
@@ -25,6 +24,7 @@ from lifecycle.supervisor.gate.verification_loop import (
     without,
     without_nodes,
 )
+from lifecycle.supervisor.gate.violations import LASTS_S
 from lifecycle.supervisor.health.liveliness import Cause
 from lifecycle.supervisor.health.process_monitor import first_death
 from lifecycle.supervisor.nodes.driver import NodeCondition
