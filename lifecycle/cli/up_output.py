@@ -496,8 +496,7 @@ def _(event: Stopping) -> str:
 
 @_describe.register(Stopped)
 def _(event: Stopped) -> str:
-    why = "" if event.reason in ("", "done") else f": {event.reason}"
-    return f"stopped after {event.elapsed_s:.2f} s{why}"
+    return f"stopped after {event.elapsed_s:.2f} s"
 
 
 def verdict_line(verdict: Verdict) -> str:
