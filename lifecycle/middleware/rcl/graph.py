@@ -408,9 +408,6 @@ class GraphObserver:
         if not everybody and len({each.port for each in came}) <= len(known):
             self._familiar_prefixes = self._known
             return False
-        if self._early is not None:
-            self._early.close()
-            self._early = None
         self._made_s, self._waits_for_newcomers = now_s, True
         self._asked_for -= self._answered()
         for probe, found in sockets.items():
