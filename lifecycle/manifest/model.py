@@ -802,6 +802,8 @@ class Policy:
             as long as they only listen: `*` matches any characters, `?` for one; a pattern with
             a slash is compared with the full name, any other with the base name.
         unverifiable_blocks: an unverifiable finding closes the gate.
+        trust: ids of rules whose unverifiable findings count neither for the gate nor for a
+            verdict; they are still reported.
         unpublished: severity of a subscription without publisher; None ignores it.
         unheard: severity of a publisher without subscription; None ignores it.
         ros_interface: what the supervisor publishes, and may be asked, in ROS.
@@ -812,6 +814,7 @@ class Policy:
     undeclared_nodes: EndpointPolicy = EndpointPolicy.DECLARED
     tolerated_nodes: tuple[str, ...] = TOLERATED_NODES
     unverifiable_blocks: bool = False
+    trust: tuple[str, ...] = ()
     unpublished: Severity | None = Severity.ERROR
     unheard: Severity | None = Severity.WARNING
     ros_interface: RosInterfaceAccess = RosInterfaceAccess.READ_ONLY

@@ -11,13 +11,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from lifecycle import dataclasses
-from lifecycle.manifest import EndpointKind, EndpointPolicy, UniqueHow
+from lifecycle.manifest import EndpointKind, EndpointPolicy, Policy, UniqueHow
 from lifecycle.network import Medium, NetworkFlowEndpoint, TransportProtocol, is_ip
 from lifecycle.plan import Plan
 from lifecycle.verify.matcher import lay_out
 from lifecycle.verify.observation import Observation
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import CHECKS, rule
+from lifecycle.verify.rules.matching import is_unreported
 from lifecycle.verify.tool_filter import OUR_NODES, of_supervisors
 from lifecycle.verify.transport import effective_transport
 from lifecycle.verify.uniqueness import Uniqueness
@@ -39,7 +40,8 @@ def flow_reports(view: View, findings: Sequence[Finding]) -> tuple[FlowReport, .
     uniqueness = view.uniqueness
 
     def unspoiled(flow: FlowView) -> Iterator[FlowReport]:
-        yield _reported(flow, uniqueness, Outcome.OK)
+        outcome = Outcome.UNVERIFIABLE if is_unreported(flow) else Outcome.OK
+        yield _reported(flow, uniqueness, outcome)
 
     reports = list(view.by_flow.each(unspoiled, name=_reported, terms=uniqueness.judged))
     spoiled = _spoiled(findings)
@@ -47,7 +49,10 @@ def flow_reports(view: View, findings: Sequence[Finding]) -> tuple[FlowReport, .
         (places,) = once(view.frame, _flows_by_place)
         for index in {index for place in spoiled for index in places.get(place, ())}:
             reports[index] = dataclasses.replace(
-                reports[index], outcome=_outcome(view.frame, index, spoiled)
+                reports[index],
+                outcome=Outcome.worst(
+                    (reports[index].outcome, _outcome(view.frame, index, spoiled))
+                ),
             )
     return tuple(reports)
 
@@ -230,8 +235,10 @@ class Verifier:
 def _verdict(view: View) -> Verdict:
     findings = tuple(finding for check in CHECKS for finding in check(view))
     return Verdict(
-        verdict=Outcome.worst(each.outcome for each in findings),
-        blocking=_blocks(findings, unverifiable_blocks=view.plan.policy.unverifiable_blocks),
+        verdict=Outcome.worst(
+            each.outcome for each in findings if not is_trusted(each, view.plan.policy)
+        ),
+        blocking=_blocks(findings, view.plan.policy),
         findings=findings,
         flows=flow_reports(view, findings),
         open_endpoints=tuple(
@@ -269,10 +276,19 @@ def _tolerated(view: View) -> tuple[ToleratedNode, ...]:
     )
 
 
-def _blocks(findings: Sequence[Finding], *, unverifiable_blocks: bool) -> bool:
+def is_trusted(finding: Finding, policy: Policy) -> bool:
+    """Return whether the manifest takes what a finding could not verify on trust."""
+    return finding.outcome is Outcome.UNVERIFIABLE and finding.rule in policy.trust
+
+
+def _blocks(findings: Sequence[Finding], policy: Policy) -> bool:
     return any(
         finding.outcome is Outcome.VIOLATED
-        or (unverifiable_blocks and rule(finding.rule).may_block)
+        or (
+            policy.unverifiable_blocks
+            and rule(finding.rule).may_block
+            and not is_trusted(finding, policy)
+        )
         for finding in findings
     )
 

@@ -188,6 +188,7 @@ class _Cases:
     def __init__(self, verdict: Verdict, plan: Plan | None, *, strict: bool) -> None:
         self._verdict = verdict
         self._blocks = strict or (plan is not None and plan.policy.unverifiable_blocks)
+        self._trust = () if plan is None else plan.policy.trust
         self._strict = strict
         self._may_block = {each.id: each.may_block for each in RULES}
 
@@ -235,6 +236,8 @@ class _Cases:
     def _refuses(self, finding: Finding) -> bool:
         """Whether a finding keeps the gate closed."""
         if finding.outcome is Outcome.UNVERIFIABLE:
+            if finding.rule in self._trust:
+                return False
             return self._blocks and (self._strict or self._may_block.get(finding.rule, True))
         return finding.outcome is Outcome.VIOLATED
 

@@ -19,7 +19,13 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 
 from lifecycle import dataclasses
-from lifecycle.manifest import Certainty, EndpointKind, QosProfile, incompatibilities
+from lifecycle.manifest import (
+    Certainty,
+    EndpointKind,
+    EndpointPolicy,
+    QosProfile,
+    incompatibilities,
+)
 from lifecycle.verify.observation import EndpointReport, ObservedEndpoint
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
@@ -58,7 +64,23 @@ UNMATCHED_FLOW = Rule(
     if_undiscovered=True,
     absence="match",
 )
-RULES = (UNMATCHED_LINK, UNMATCHED_FLOW)
+UNKNOWN_PEER = Rule(
+    id="graph.unknown-peer",
+    meaning="a declared endpoint is matched with more peers than the graph shows",
+    outcomes=(Outcome.VIOLATED,),
+    fix="look for a participant that is found by the node's addresses alone (initial peers, a"
+    " discovery server) and not by the supervisor; give the system a domain of its own",
+    concerns_flow=True,
+    heals=Heals.WITH_TIME,
+)
+UNREPORTED_FLOW = Rule(
+    id="flow.unreported",
+    meaning="neither end of a flow reports anything, so that nothing proves that data can flow",
+    outcomes=(Outcome.UNVERIFIABLE,),
+    fix="run one of its nodes in our host (`run: python`), or write it under `policy.trust`",
+    heals=Heals.WITH_TIME,
+)
+RULES = (UNMATCHED_LINK, UNMATCHED_FLOW, UNKNOWN_PEER, UNREPORTED_FLOW)
 
 
 Match = tuple[Outcome, str]
@@ -125,8 +147,75 @@ def match(
 
 
 def check(view: View) -> Iterator[Finding]:
-    """Judge every planned flow."""
+    """Judge every planned flow, then every end that reports how many peers it has."""
     yield from view.by_flow.each(_judge_flow)
+    yield from _unknown_peers(view)
+    yield from _unreported_flows(view)
+
+
+def _unknown_peers(view: View) -> Iterator[Finding]:
+    """Find declared ends that are matched with more than all that can match them.
+
+    That is what the graph shows, and what is declared and not seen (yet), which has a finding of
+    its own. Where any node may be there, so may what nobody shows.
+    """
+    if view.plan.policy.undeclared_nodes is EndpointPolicy.OPEN:
+        return
+    unseen = Counter(
+        (each.planned.kind, each.planned.resolved) for each in view.actual if each.observed is None
+    )
+    for actual in view.actual:
+        report = actual.report
+        if report is None or not report.matched or not actual.planned.kind.is_topic:
+            continue
+        topic = view.topics.get(actual.planned.resolved)
+        publishers, subscriptions = ([], []) if topic is None else once(topic, _ends_of_graph)
+        end = _end(actual)
+        publishes = end.kind is EndpointKind.PUBLISHER
+        possible = len(_possible(end, subscriptions if publishes else publishers))
+        other = EndpointKind.SUBSCRIPTION if publishes else EndpointKind.PUBLISHER
+        if report.matched <= possible + unseen[other, actual.planned.resolved]:
+            continue
+        yield UNKNOWN_PEER.on_endpoint(
+            Outcome.VIOLATED,
+            actual,
+            expected=f"at most {possible} {other.noun}{'s' * (possible != 1)}, as in the graph",
+            observed=f"matched {report.matched}",
+            message=f"cannot explain all that the {end.kind.noun} of {actual.planned.resolved} in "
+            f"{actual.node.full_name} is matched with: it counts {report.matched}, and the graph "
+            f"shows {possible} that can match it",
+        )
+
+
+def _unreported_flows(view: View) -> Iterator[Finding]:
+    """Name all flows at once of which neither end reports anything."""
+    flows = [each for each in view.flows if is_unreported(each)]
+    if not flows:
+        return
+    names = [each.subject for each in flows]
+    listed = ", ".join(names[:_NAMED]) + (
+        f" and {len(names) - _NAMED} more" * (len(names) > _NAMED)
+    )
+    yield UNREPORTED_FLOW.finding(
+        Outcome.UNVERIFIABLE,
+        subject=names[0] if len(names) == 1 else f"{len(names)} flows",
+        ends=flows[0].ends if len(names) == 1 else (),
+        expected="a report of one end",
+        observed="no report",
+        message=f"cannot verify that data can flow: neither end reports anything: {listed}",
+        at=flows[0].at,
+    )
+
+
+_NAMED = 6
+
+
+def is_unreported(flow: FlowView) -> bool:
+    """Return whether both ends of a flow are there and fit, and neither reports its matches."""
+    if flow.planned.linked or _cause(flow):
+        return False  # a link has a finding of its own, and so has what cannot match
+    ends = (*flow.publishers, *flow.subscriptions)
+    return all(end.report is None or end.report.matched is None for end in ends)
 
 
 def _judge_flow(flow: FlowView) -> Iterator[Finding]:
@@ -214,18 +303,23 @@ def _of_one_end(end: MatchEnd, other: MatchEnd, others: Sequence[MatchEnd]) -> M
 
 def _by_count(word: str, matched: int, end: MatchEnd, others: Sequence[MatchEnd]) -> Match:
     """Conclude from a number alone: it proves the pair only if it is that of all who can match."""
-    publishes = end.kind is EndpointKind.PUBLISHER
-    possible = [
-        other
-        for other in others
-        if not (obstacle(end, other) if publishes else obstacle(other, end))
-    ]
+    possible = _possible(end, others)
     reason = f"{word} matched {matched} of {len(possible)}"
     if matched == len(possible):
         return _OK
     if matched < len(possible) and (matched == 0 or all(each.expected for each in possible)):
         return Outcome.VIOLATED, reason
     return Outcome.UNVERIFIABLE, f"{reason}, and does not tell which"
+
+
+def _possible(end: MatchEnd, others: Sequence[MatchEnd]) -> list[MatchEnd]:
+    """Return the ends that can match one."""
+    publishes = end.kind is EndpointKind.PUBLISHER
+    return [
+        other
+        for other in others
+        if not (obstacle(end, other) if publishes else obstacle(other, end))
+    ]
 
 
 def _compatible(offered: QosProfile, requested: QosProfile) -> bool:

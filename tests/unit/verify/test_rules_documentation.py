@@ -76,3 +76,4 @@ def test_a_manifest_may_name_every_rule_and_every_family_in_on_violation() -> No
     assert sorted(names) == sorted(
         {"default", *(each.family for each in RULES), *(each.id for each in RULES)}
     )
+    assert sorted(schema["$defs"]["rule_id"]["enum"]) == sorted(each.id for each in RULES)

@@ -416,10 +416,6 @@ def test_an_endpoint_that_discovery_cannot_show_is_proven_by_report_and_matches(
             ("graph.unseen-endpoint", "unverifiable", "/video"),
         ),
         (
-            change_report(PUB, "/video", matched=2),
-            ("graph.unseen-endpoint", "unverifiable", "/video"),
-        ),
-        (
             change_report(PUB, "/video", mapped=False, gid=""),
             ("graph.missing-endpoint", "violated", "/video"),
         ),
@@ -431,6 +427,13 @@ def test_an_endpoint_that_discovery_cannot_show_is_proven_by_report_and_matches(
 )
 def test_without_such_a_proof_it_is_never_ok(edit: Edit, expected: tuple[str, str, str]) -> None:
     assert findings(both(HIDDEN, edit)) == [expected]
+
+
+def test_more_matches_than_the_graph_explains_are_found_beside_it() -> None:
+    assert findings(both(HIDDEN, change_report(PUB, "/video", matched=2))) == [
+        ("graph.unseen-endpoint", "unverifiable", "/video"),
+        ("graph.unknown-peer", "violated", "/video"),
+    ]
 
 
 def test_who_else_is_matched_does_not_matter_in_an_open_system() -> None:
