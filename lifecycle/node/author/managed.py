@@ -409,6 +409,11 @@ class Managed:
         """Whether the plan says what DSCP any of its endpoints sends with."""
         return any(each.dscp is not None for each in self.spec.endpoints)
 
+    @property
+    def marks(self) -> tuple[int | None, ...]:
+        """DSCP on the sender sockets of its participants, as it is now."""
+        return self.data_layer.connections.marks
+
     def get_configuration(self) -> NodeConfiguration:
         """Return this node's identity and its endpoints as they are."""
         # Whatever the policy: what a node says of itself is known before discovery shows it.

@@ -86,6 +86,17 @@ class Connections:
         """Those that were asked for and could not be made."""
         return tuple(self._failed.values())
 
+    @property
+    def marks(self) -> tuple[int | None, ...]:
+        """DSCP on the sender sockets of each participant, as it is now; None: cannot be read."""
+        found: list[int | None] = []
+        for each in tuple(self._made.values()):
+            try:
+                found.append(each.read_dscp())
+            except MiddlewareError:  # noqa: PERF203 - "not read" is what is known then
+                found.append(None)
+        return tuple(found)
+
     def find(self, connection: Connection | str) -> Connection:
         """Return the connection that is meant; the empty name is the node's own participant.
 

@@ -447,6 +447,11 @@ class ForeignNode:
         """Whether the plan says what DSCP any of its endpoints sends with."""
         return any(each.dscp is not None for each in self._spec.endpoints)
 
+    @property
+    def marks(self) -> tuple[int | None, ...]:
+        """DSCP on the sender sockets of its participants, as it is now."""
+        return self._connections.marks
+
     def close(self) -> None:
         """Take its further participants away: it is being destroyed."""
         for watch in self._watches.values():

@@ -152,6 +152,44 @@ _ANSWERED_WITHOUT_CONFIGURATION = frozenset(
 )
 
 
+class Marks:
+    """The DSCP of the nodes' sockets as it was last reported: no event says that it was changed."""
+
+    def __init__(self) -> None:
+        self._reported: dict[str, tuple[int | None, ...]] = {}
+
+    def note(self, node: Hosted) -> None:
+        """Take the marks that are reported now."""
+        if node.is_marked:
+            self._reported[node.full_name] = node.marks
+
+    def check(self, node: Hosted) -> None:
+        """Refuse to activate a node whose marks are not those that were verified.
+
+        Raises:
+            LifecycleError: its code, or another program, has changed them since.
+        """
+        before = self._reported.get(node.full_name)
+        if before is not None and node.marks != before:
+            node.configuration_changes.touch()
+            raise LifecycleError(
+                f"cannot activate {node.full_name}: the DSCP of its sockets was changed since it "
+                "was verified",
+                hint="look for IP_TOS or IPV6_TCLASS in its code",
+            )
+
+    def look(self, node: Hosted) -> None:
+        """Have marks that differ from those that were reported reported again."""
+        before = self._reported.get(node.full_name)
+        if before is not None and node.marks != before:
+            self._reported[node.full_name] = node.marks
+            node.configuration_changes.touch()
+
+
+_MARKS_S = 0.5
+"""How often marks are read again; only in processes with nodes that have some."""
+
+
 class HostCommands:
     """Carries out the commands to the nodes of one process.
 
@@ -170,6 +208,7 @@ class HostCommands:
         self._nodes = nodes
         self._report = report
         self._of_process = of_process
+        self.marks = Marks()
 
     async def execute(self, command: Command) -> Event:
         """Carry out one command and return the answer to it, whatever happens."""
@@ -198,6 +237,8 @@ class HostCommands:
         if command.operation in _NODE_INTERFACE:
             await _NODE_INTERFACE[command.operation](node.interface, command)
             return self._reply(command, ok=True)
+        if command.operation is Operation.ACTIVATE:
+            self.marks.check(node)
         result = await node.change_for_supervisor(command.operation.value)
         return self._reply(
             command, ok=result.outcome is CallbackOutcome.SUCCESS, error=result.error
@@ -217,6 +258,7 @@ class HostCommands:
         )
         configuration, reports = None, False
         if carries:
+            self.marks.note(node)
             configuration, reports = node.configuration_changes.give(self._report)
         return Event(
             kind="reply",
@@ -276,6 +318,7 @@ class Host:
         self._ended = False
         self._is_kept = False
         self._proceed = threading.Event()
+        self._left = threading.Event()
         self._nodes: dict[str, Hosted] = {}
         self._participants = Participants(context, spec)
         self._unannounced: Unannounced | None = None
@@ -392,6 +435,7 @@ class Host:
     def _end(self, reason: str) -> None:
         """Shut down and leave; from any thread but the main one."""
         self._proceed.set()
+        self._left.set()
         with self._lock:
             self._ended = True
             if self._imports:
@@ -435,6 +479,14 @@ class Host:
             if isinstance(hosted, ForeignNode):
                 hosted.configuration_changes.touch()
         self._channel.write(Event(kind="ready"))
+        if any(hosted.is_marked for hosted in self._nodes.values()):
+            threading.Thread(target=self._watch_marks, name="marks", daemon=True).start()
+
+    def _watch_marks(self) -> None:
+        """Read the marks of the sockets again and again, whatever the node's callbacks do."""
+        while not self._left.wait(_MARKS_S):
+            for hosted in tuple(self._nodes.values()):
+                self._commands.marks.look(hosted)
 
     def _report_state(self, hosted: Hosted) -> None:
         state = hosted.reported
@@ -448,6 +500,8 @@ class Host:
         )
 
     def _report_configuration(self, configuration: NodeConfiguration) -> None:
+        if (hosted := self._nodes.get(configuration.name)) is not None:
+            self._commands.marks.note(hosted)
         self._channel.write(
             Event(
                 kind="configuration",

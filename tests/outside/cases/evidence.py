@@ -1,0 +1,322 @@
+"""What ends report, and what nobody does: peers that no graph shows, marks, flows without a report.
+
+The old version believed a report that its own graph contradicted, read marks once, and called a
+flow ok of which neither end reports anything.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+from tests.outside.case import NOBODY, OK, UNVERIFIABLE, VIOLATED, Case
+from tests.outside.cases.healthy import PAIR
+from tests.outside.running import Run
+
+PORT_BASE, DOMAIN_GAIN, OFFSET_D1, PARTICIPANT_GAIN = 7400, 250, 10, 2
+"""DDSI-RTPS 9.6.2.3: ports of a domain, and of a participant's metatraffic."""
+
+PROFILE = """\
+<?xml version="1.0" encoding="UTF-8"?>
+<dds xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles"><profiles>
+<transport_descriptors><transport_descriptor><transport_id>u</transport_id><type>UDPv4</type>
+<interfaceWhiteList><address>127.0.0.1</address></interfaceWhiteList>
+</transport_descriptor></transport_descriptors>
+<participant profile_name="p" is_default_profile="true"><rtps>
+<useBuiltinTransports>false</useBuiltinTransports>
+<userTransports><transport_id>u</transport_id></userTransports>
+<builtin><metatrafficUnicastLocatorList><locator><udpv4><address>127.0.0.1</address>
+<port>{own}</port></udpv4></locator></metatrafficUnicastLocatorList>
+<initialPeersList><locator><udpv4><address>127.0.0.1</address><port>{peer}</port></udpv4></locator>
+</initialPeersList></builtin></rtps></participant></profiles></dds>
+"""
+
+
+def _udp_ports(pid: int) -> Iterator[int]:
+    """Ports of the UDP sockets of a process (proc(5))."""
+    inodes = set()
+    for each in Path(f"/proc/{pid}/fd").iterdir():
+        with contextlib.suppress(OSError):
+            if found := re.fullmatch(r"socket:\[(\d+)\]", str(each.readlink())):
+                inodes.add(found[1])
+    for line in Path("/proc/net/udp").read_text().splitlines()[1:]:
+        fields = line.split()
+        if fields[9] in inodes:
+            yield int(fields[1].rpartition(":")[2], 16)
+
+
+def _metatraffic_port(run: Run, process: str) -> int:
+    """Where the participant of a process is found by others."""
+    first = PORT_BASE + DOMAIN_GAIN * run.domain_id + OFFSET_D1
+    found: list[int] = []
+
+    def known() -> bool:
+        found[:] = [
+            port
+            for port in _udp_ports(run.pid_of(process))
+            if first <= port < first + DOMAIN_GAIN and (port - first) % PARTICIPANT_GAIN == 0
+        ]
+        return bool(found)
+
+    run.wait(known, "its metatraffic port")
+    return found[0]
+
+
+def _hidden(run: Run, *words: str, of: str = "listener") -> None:
+    """Start a stranger that only one process of the system is found by, and that finds only it."""
+    profile = run.directory / "hidden.xml"
+    profile.write_text(PROFILE.format(own=39123, peer=_metatraffic_port(run, of)))
+    run.stranger(
+        "stranger",
+        *words,
+        FASTRTPS_DEFAULT_PROFILES_FILE=str(profile),
+        ROS_AUTOMATIC_DISCOVERY_RANGE="SYSTEM_DEFAULT",
+    )
+
+
+def hidden_publisher_when_active(run: Run) -> None:
+    run.until_active()
+    _hidden(run, "pub:/chatter")
+
+
+def hidden_publisher_before_the_gate(run: Run) -> None:
+    run.until("node", node="/listener", reach="started")
+    _hidden(run, "pub:/chatter")
+
+
+def hidden_subscription(run: Run) -> None:
+    run.until_active()
+    _hidden(run, "sub:/chatter", of="talker")
+
+
+def tools_that_come_and_go(run: Run) -> None:
+    run.until_active()
+    for _ in range(3):
+        run.stranger("_ros2cli_77", "sub:/chatter", "for:0.4", wait=False).wait(10)
+
+
+SLOW = PAIR.replace(
+    '    run: {python: "nodes:Listener"}\n',
+    '    run: {python: "slow:SlowListener"}\n',
+)
+SLOW_LISTENER = {
+    "slow.py": (
+        "import time\nfrom nodes import Listener\n\n\nclass SlowListener(Listener):\n"
+        "    def on_connect(self, state=None):\n        time.sleep(4)\n"
+    )
+}
+
+MARKED = """\
+manifest_version: 1
+system: marked
+discovery: {range: localhost}
+nodes:
+  talker:
+    run: {python: "%s"}
+    interface: {publishers: [{name: chatter, type: std_msgs/msg/String}]}
+    flows: {publishers: {chatter: {unique: strictly_required, dscp: EF, transport: network}}}
+  listener:
+    run: {python: "nodes:Listener"}
+    interface: {subscriptions: [{name: chatter, type: std_msgs/msg/String}]}
+"""
+RESETTING = {
+    "resetting.py": '''"""A talker that takes the mark of its sockets away again."""
+import os, socket, threading
+from nodes import Talker
+
+
+def reset():
+    for name in os.listdir("/proc/self/fd"):
+        try:
+            each = socket.socket(fileno=os.dup(int(name)))
+        except OSError:
+            continue
+        with each:
+            try:
+                if each.getsockopt(socket.IPPROTO_IP, socket.IP_TOS):
+                    each.setsockopt(socket.IPPROTO_IP, socket.IP_TOS, 0)
+            except OSError:
+                pass
+
+
+class WhenActive(Talker):
+    def on_activate(self):
+        super().on_activate()
+        threading.Timer(0.7, reset).start()
+
+
+class WhenConnected(Talker):
+    def on_connect(self, state=None):
+        threading.Timer(0.05, reset).start()
+'''
+}
+
+FOREIGN = """\
+manifest_version: 1
+system: foreign
+discovery: {range: localhost}
+%snodes:
+  talker:
+    run: {command: [python3, talker.py]}
+    managed: false
+    interface: {publishers: [{name: chatter, type: std_msgs/msg/String}]}
+  listener:
+    run: {%s}
+    managed: false
+    interface: {subscriptions: [{name: chatter, type: std_msgs/msg/String}]}
+"""
+PLAIN = {
+    "talker.py": (
+        "import rclpy\nfrom std_msgs.msg import String\nrclpy.init()\n"
+        'node = rclpy.create_node("talker")\n'
+        'publisher = node.create_publisher(String, "chatter", 10)\n'
+        'node.create_timer(0.1, lambda: publisher.publish(String(data="hello")))\n'
+        "try:\n    rclpy.spin(node)\nexcept BaseException:\n    pass\n"
+    ),
+    "listener.py": (
+        "import rclpy\nfrom rclpy.node import Node\nfrom std_msgs.msg import String\n\n\n"
+        "class Listener(Node):\n    def __init__(self):\n        super().__init__('listener')\n"
+        "        self.create_subscription(String, 'chatter', lambda _: None, 10)\n\n\n"
+        "if __name__ == '__main__':\n    rclpy.init()\n"
+        "    try:\n        rclpy.spin(Listener())\n    except BaseException:\n        pass\n"
+    ),
+}
+COMMAND, HOSTED = "command: [python3, listener.py]", 'python: "listener:Listener"'
+TRUST = "policy: {trust: [flow.unreported]}\n"
+
+CASES = (
+    Case(
+        attack="a publisher that no graph shows feeds the listener after the gate",
+        manifest=PAIR,
+        verb=("up", "--strict", "--stop-after", "6"),
+        story=hidden_publisher_when_active,
+        exit_code=4,
+        verdict=VIOLATED,
+        findings=("graph.unknown-peer",),
+        before="ok, exit 0; 75 messages of the stranger received",
+        quick=True,
+    ),
+    Case(
+        attack="a publisher that no graph shows is there before the gate",
+        manifest=SLOW,
+        files=SLOW_LISTENER,
+        verb=("up", "--strict", "--stop-after", "2", "--timeout", "12"),
+        story=hidden_publisher_before_the_gate,
+        exit_code=4,
+        verdict=VIOLATED,
+        findings=("graph.unknown-peer",),
+        activated=NOBODY,
+        before="ok, exit 0",
+    ),
+    Case(
+        attack="a subscription that no graph shows listens to the talker",
+        manifest=PAIR,
+        verb=("up", "--strict", "--stop-after", "6"),
+        story=hidden_subscription,
+        exit_code=4,
+        verdict=VIOLATED,
+        findings=("graph.unknown-peer",),
+        before="ok, exit 0",
+    ),
+    Case(
+        attack="`ros2 topic echo` beside a strict robot disturbs nothing",
+        manifest=PAIR,
+        verb=("up", "--strict", "--stop-after", "3"),
+        strangers=(("_ros2cli_4711", "sub:/chatter"),),
+        exit_code=0,
+        verdict=OK,
+        activated=frozenset({"talker", "listener"}),
+        before="the same",
+    ),
+    Case(
+        attack="tools that come and go disturb nothing",
+        manifest=PAIR,
+        verb=("up", "--strict", "--stop-after", "9"),
+        story=tools_that_come_and_go,
+        exit_code=0,
+        verdict=OK,
+        before="the same",
+    ),
+    Case(
+        attack="a node takes its mark away after it was activated",
+        manifest=MARKED % "resetting:WhenActive",
+        files=RESETTING,
+        verb=("up", "--strict", "--stop-after", "4"),
+        exit_code=4,
+        verdict=VIOLATED,
+        findings=("flow.dscp-not-applied",),
+        before="ok for 22 s, exit 0",
+    ),
+    Case(
+        attack="a node takes its mark away between connect and gate",
+        manifest=MARKED % "resetting:WhenConnected",
+        files={**RESETTING, **SLOW_LISTENER},
+        verb=("up", "--strict", "--stop-after", "2", "--timeout", "8"),
+        exit_code=4,
+        verdict=VIOLATED,
+        findings=("flow.dscp-not-applied",),
+        activated=NOBODY,
+        before="activated first, found later",
+    ),
+    Case(
+        attack="a node that keeps its mark is ok",
+        manifest=MARKED % "nodes:Talker",
+        verb=("up", "--strict", "--stop-after", "3"),
+        exit_code=0,
+        verdict=OK,
+        before="the same",
+    ),
+    Case(
+        attack="a flow between two programs that report nothing",
+        manifest=FOREIGN % ("", COMMAND),
+        files=PLAIN,
+        verb=("up", "--stop-after", "1"),
+        exit_code=0,
+        verdict=UNVERIFIABLE,
+        findings=("flow.unreported",),
+        says=("flow.unreported",),
+        before="ok, no finding",
+        quick=True,
+    ),
+    Case(
+        attack="a strict gate and a flow between two programs that report nothing",
+        manifest=FOREIGN % ("", COMMAND),
+        files=PLAIN,
+        verb=("up", "--strict", "--stop-after", "1", "--timeout", "6"),
+        exit_code=5,
+        verdict=UNVERIFIABLE,
+        findings=("flow.unreported",),
+        before="ok, exit 0",
+    ),
+    Case(
+        attack="the manifest trusts what nobody reports",
+        manifest=FOREIGN % (TRUST, COMMAND),
+        files=PLAIN,
+        verb=("up", "--strict", "--stop-after", "1"),
+        exit_code=0,
+        verdict=OK,
+        says=("flow.unreported",),
+        before="no such key",
+    ),
+    Case(
+        attack="one end in our host proves the flow",
+        manifest=FOREIGN % ("", HOSTED),
+        files=PLAIN,
+        verb=("up", "--strict", "--stop-after", "1"),
+        exit_code=0,
+        verdict=OK,
+        not_findings=("flow.unreported",),
+        before="the same",
+    ),
+    Case(
+        attack="a manifest trusts a rule that there is not",
+        manifest=FOREIGN % ("policy: {trust: [flow.unreportet]}\n", COMMAND),
+        files=PLAIN,
+        verb=("check",),
+        exit_code=3,
+        says=("system.lifecycle.yaml:4:18", "flow.unreported"),
+        before="no such key",
+    ),
+)
