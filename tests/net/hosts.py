@@ -23,12 +23,13 @@ import uuid
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
+from tests.installation import modules
+
 _CLONE_NEWNET = 0x40000000  # linux/sched.h
 _PROGRAMS = ("ip", "unshare", "nsenter", "setpriv")
 _UNSHARE = ("unshare", "--net", "--mount", "sh", "-c")
 _END_S = 30.0
 _SETTLE_S = 30.0
-_ROOT = Path(__file__).parents[2]
 _libc = ctypes.CDLL(None, use_errno=True)
 
 _HOLD = """
@@ -104,14 +105,14 @@ class Host:
     def command(self, *argv: str, guarded: bool = False) -> list[str]:
         """Return the command line that runs `argv` here, in the process that is started with it.
 
-        It runs in the root of the source tree: entering a host leaves any other directory.
+        It runs where tests and examples can be imported: entering a host leaves any directory.
 
         Args:
             guarded: the kernel sends it SIGTERM when the thread that started it ends.
         """
         guard = ["setpriv", "--pdeathsig", "TERM"] if guarded else []
         enter = ["nsenter", "-t", str(self.pid), "-n", "-m", "--"]
-        return [*guard, *enter, "env", "-C", str(_ROOT), *argv]
+        return [*guard, *enter, "env", "-C", str(modules()), *argv]
 
     def environment(self, runtime: Path, base: Mapping[str, str] | None = None) -> dict[str, str]:
         """Return what sets a program of this host apart from one of another host.

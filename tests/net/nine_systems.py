@@ -18,12 +18,13 @@ from pathlib import Path
 
 import pytest
 
+from tests.installation import PYTHON, ROOT
 from tests.net.hosts import Host, Hosts
 from tests.net.running import up_on
 from tests.net.sockets import Socket, ip_sockets
 from tests.net.wire import Capture, Packet
 from tests.ros.supervisor.contacts import TRIES, reaches_active
-from tests.ros.supervisor.running import ROOT, Event, Up
+from tests.ros.supervisor.running import Event, Up
 
 DOMAIN = 7
 """Nobody else is in a network of our own."""
@@ -96,13 +97,17 @@ class System:
     def start(self, machine: str, module: str) -> subprocess.Popen[str]:
         """Start a module in a process that the system knows nothing of; it ends with its host."""
         return self.hosts[machine].popen(
-            *self._python(machine), "-m", module, stdout=subprocess.PIPE
+            *self._python(machine, PYTHON), "-m", module, stdout=subprocess.PIPE
         )
 
     def ask(self, machine: str, *words: str) -> list[str]:
-        """Ask something over shared memory, see tests.net.asking; return the lines."""
+        """Ask something over shared memory, see tests.net.asking; return the lines.
+
+        It is this checkout that asks, whichever installation runs the system.
+        """
         asking = ("-m", "tests.net.asking", str(DOMAIN), "shm://", *words)
-        return self.hosts[machine].run(*self._python(machine), *asking).splitlines()
+        mine = self._python(machine, Path(sys.executable))
+        return self.hosts[machine].run(*mine, *asking).splitlines()
 
     def cut(self, seconds: float = CUT_S) -> None:
         """Take the cable out for so long; both sides must notice, and be well again afterwards."""
@@ -135,14 +140,14 @@ class System:
             up.assert_gate_held()
             up.assert_nothing_left()
 
-    def _python(self, machine: str) -> list[str]:
+    def _python(self, machine: str, python: Path) -> list[str]:
         runtime = self.directory / f"{machine}-others"
         variables = {
             **self.hosts[machine].environment(runtime, {}),
             "ROS_DOMAIN_ID": str(DOMAIN),
             "PYTHONUNBUFFERED": "1",
         }
-        return ["env", *(f"{name}={value}" for name, value in variables.items()), sys.executable]
+        return ["env", *(f"{name}={value}" for name, value in variables.items()), str(python)]
 
     def _sent(self) -> Iterator[Packet]:
         for wire in (*self.outside.values(), *self.inside.values()):

@@ -1,6 +1,6 @@
 """Runs one case: its files in a directory of its own, its strangers, the command, and its marks.
 
-Owns: `Run`, `LIFECYCLE`.
+Owns: `Run`.
 """
 
 from __future__ import annotations
@@ -9,22 +9,17 @@ import contextlib
 import json
 import os
 import re
-import shutil
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from tests.installation import LIFECYCLE, PYTHON
 from tests.outside.case import Case
 
-LIFECYCLE = Path(os.environ.get("LIFECYCLE") or Path(sys.executable).with_name("lifecycle"))
-"""The command that is tried; the Python beside it runs the systems' programs."""
-
-PYTHON = LIFECYCLE.with_name("python")
 PROGRAMS = Path(__file__).with_name("programs")
 WAIT_S = 30.0
 """For an event on a busy machine; it ends with the event."""
@@ -120,6 +115,24 @@ class Run:
             line = process.stdout.readline()
             assert line == "ready\n", f"{words} did not start: {line!r}"
         return process
+
+    def python(self, *words: str, timeout_s: float = 60.0) -> str:
+        """Run a Python program beside the command to its end; return what it printed.
+
+        `run.python("client.py", "state", "/talker")`: the first word is a file of `programs/`.
+        """
+        done = subprocess.run(
+            [str(PYTHON), str(PROGRAMS / words[0]), *words[1:]],
+            cwd=self.directory,
+            env=self.environment,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=timeout_s,
+            check=False,
+        )
+        assert done.returncode == 0, f"{words}: {done.stderr}\n{self.output}"
+        return done.stdout
 
     def lifecycle(self, *words: str, timeout_s: float = 60.0) -> subprocess.CompletedProcess[str]:
         """Run another command of lifecycle to its end: `run.lifecycle("verify", "{}", "--strict")`.
@@ -303,8 +316,3 @@ def running(case: Case, directory: Path, domain_id: int) -> Iterator[Run]:
         yield run
     finally:
         run.close()
-
-
-def available() -> bool:
-    """Whether there is a command to try."""
-    return shutil.which(str(LIFECYCLE)) is not None

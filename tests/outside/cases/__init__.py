@@ -7,8 +7,10 @@ import pkgutil
 
 from tests.outside.case import Case
 
-CASES: tuple[Case, ...] = tuple(
-    case
+BY_MODULE: dict[str, tuple[Case, ...]] = {
+    module: tuple(importlib.import_module(f"{__name__}.{module}").CASES)
     for module in sorted(each.name for each in pkgutil.iter_modules(__path__))
-    for case in importlib.import_module(f"{__name__}.{module}").CASES
-)
+}
+"""By module."""
+
+CASES: tuple[Case, ...] = tuple(case for cases in BY_MODULE.values() for case in cases)

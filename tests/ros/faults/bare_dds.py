@@ -20,8 +20,6 @@ import socket
 import struct
 import time
 
-from lifecycle.network.ports import participant_ports
-
 ANNOUNCE_S = 0.1
 VENDOR = b"\x01\x10"
 HEADER = b"RTPS\x02\x03" + VENDOR
@@ -138,7 +136,7 @@ def main() -> None:
     options = parser.parse_args()
     prefix = VENDOR + os.urandom(10)
     domain = int(os.environ.get("ROS_DOMAIN_ID", "0"))
-    doors = [participant_ports(domain, n).discovery_unicast for n in range(PARTICIPANTS)]
+    doors = [7400 + 250 * domain + 10 + 2 * n for n in range(PARTICIPANTS)]  # §9.6.2.3
     speaker = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     speaker.bind(("127.0.0.1", 0))
     port = speaker.getsockname()[1]

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import sys
-
-from lifecycle.errors import ExitCode
-from tests.ros.faults.system import BARE_DDS, NODES, Fault, foreign
+from tests.installation import PYTHON
+from tests.ros.faults.system import BARE_DDS, NODES, ExitCode, Fault, foreign
 
 TALKER = "nodes/talker"
 LISTENER = "nodes/listener"
@@ -357,7 +355,7 @@ GRAPH = (
         name="a command never makes its node",
         edits={
             **_command("talker"),
-            f"{TALKER}/run": {"command": [sys.executable, "-c", "import time; time.sleep(60)"]},
+            f"{TALKER}/run": {"command": [str(PYTHON), "-c", "import time; time.sleep(60)"]},
         },
         exit_code=ExitCode.VIOLATED,
         rule="graph.missing-node",

@@ -11,7 +11,6 @@ import json
 import os
 import re
 import subprocess
-import sys
 import threading
 import time
 import uuid
@@ -20,10 +19,10 @@ from pathlib import Path
 
 import psutil
 
-from lifecycle.middleware import leftovers, segments_of
+from tests.installation import LIFECYCLE, PYTHON, modules
 from tests.ros.faults.system import Fault
+from tests.shared_memory import left_behind, used_by
 
-ROOT = Path(__file__).parents[3]
 LIMIT_S = 50.0
 """Far more than any fault takes; a run that needs it hangs."""
 
@@ -65,17 +64,17 @@ def run_up(fault: Fault, directory: Path) -> UpRun:
         "FAULT_FOREIGN_PARTITION": str(Path(__file__).with_name("foreign_partition.xml")),
     }
     # What somebody killed has left before is not ours to answer for, though we may use its port.
-    before = leftovers()
+    before = left_behind()
     with _intruder(fault, environment):
         up = subprocess.Popen(
             [
-                *(sys.executable, "-m", "lifecycle.cli", "up", str(manifest)),
+                *(str(LIFECYCLE), "up", str(manifest)),
                 *("--format", "json"),
                 # Should the fault go unnoticed, the run ends by itself and with status 0.
                 *(() if "--stop-after" in fault.options else ("--stop-after", "0.2")),
                 *fault.options,
             ],
-            cwd=ROOT,
+            cwd=modules(),
             env={**environment, "FAULT_MARKERS": str(markers), "FAULT_RUN": token},
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -97,7 +96,7 @@ def run_up(fault: Fault, directory: Path) -> UpRun:
         token=token,
         shared_memory=tuple(
             name
-            for name in leftovers(only=mapped)
+            for name in sorted(left_behind(mapped))
             # Unique ports are the same in every domain: others may leave or take one meanwhile.
             if name not in before and not re.search(r"port7[0-3]\d\d(?!\d)", name)
         ),
@@ -125,7 +124,7 @@ def _intruder(fault: Fault, environment: dict[str, str]) -> Iterator[None]:
         yield
         return
     process = subprocess.Popen(
-        [sys.executable, fault.intruder_is, *fault.intruder],
+        [str(PYTHON), fault.intruder_is, *fault.intruder],
         env=environment,
         stdout=subprocess.PIPE,
     )
@@ -167,4 +166,4 @@ class _Mapped:
         while not self._end.wait(0.1):
             with contextlib.suppress(psutil.NoSuchProcess):
                 family = [self._root, *self._root.children(recursive=True)]
-                self.names |= segments_of(each.pid for each in family)
+                self.names |= used_by(each.pid for each in family)

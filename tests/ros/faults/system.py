@@ -7,13 +7,25 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import sys
+import enum
 from collections.abc import Mapping
 from pathlib import Path
 
 import yaml
 
-from lifecycle.errors import ExitCode
+from tests.installation import PYTHON
+
+
+class ExitCode(enum.IntEnum):
+    """Those of `lifecycle up`, see docs/cli.md."""
+
+    OK = 0
+    MANIFEST_INVALID = 3
+    VIOLATED = 4
+    UNVERIFIABLE = 5
+    BRING_UP_FAILED = 6
+    INTERRUPTED = 130
+
 
 NODES = "tests.ros.faults.nodes"
 FOREIGN = str(Path(__file__).with_name("foreign.py"))
@@ -54,7 +66,7 @@ _HEALTHY: dict[str, object] = {
 
 def foreign(*arguments: str) -> list[str]:
     """Return the command line of a plain node, see foreign.py."""
-    return [sys.executable, FOREIGN, *arguments]
+    return [str(PYTHON), FOREIGN, *arguments]
 
 
 def healthy(edits: Mapping[str, object] | None = None) -> dict[str, object]:

@@ -7,10 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.errors import ExitCode
 from tests.ros.faults.catalogue import FAULTS
 from tests.ros.faults.running import UpRun, processes_of, run_up
-from tests.ros.faults.system import Fault
+from tests.ros.faults.system import ExitCode, Fault
 
 pytestmark = pytest.mark.ros
 

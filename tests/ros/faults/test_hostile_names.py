@@ -15,9 +15,8 @@ from typing import IO
 import pytest
 import yaml
 
-from lifecycle.errors import ExitCode
-from tests.ros.faults.running import ROOT
-from tests.ros.faults.system import BARE_DDS, healthy
+from tests.installation import LIFECYCLE, modules
+from tests.ros.faults.system import BARE_DDS, ExitCode, healthy
 
 pytestmark = [pytest.mark.ros, pytest.mark.thorough]
 
@@ -82,8 +81,8 @@ def active_system(directory: Path, *words: str) -> Iterator[tuple[Path, subproce
     manifest = directory / "faults.lifecycle.yaml"
     manifest.write_text(yaml.safe_dump(healthy()))
     up = subprocess.Popen(
-        [sys.executable, "-m", "lifecycle.cli", "up", str(manifest), *words],
-        cwd=ROOT,
+        [str(LIFECYCLE), "up", str(manifest), *words],
+        cwd=modules(),
         env={**os.environ, "FAULT_MARKERS": str(directory / "markers")},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
@@ -116,8 +115,8 @@ def reached(output: IO[str], *marks: str) -> str:
 
 
 def lifecycle(*words: str) -> subprocess.CompletedProcess[bytes]:
-    command = [sys.executable, "-m", "lifecycle.cli", *words]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, timeout=LIMIT_S, check=False)
+    command = [str(LIFECYCLE), *words]
+    return subprocess.run(command, cwd=modules(), capture_output=True, timeout=LIMIT_S, check=False)
 
 
 def assert_plain(output: bytes) -> str:

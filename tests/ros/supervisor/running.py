@@ -14,7 +14,6 @@ import re
 import select
 import signal
 import subprocess
-import sys
 import threading
 import time
 import uuid
@@ -26,6 +25,7 @@ import psutil
 import yaml
 
 from lifecycle.middleware import leftovers, segments_of, sweep
+from tests.installation import LIFECYCLE, modules
 
 ROOT = Path(__file__).parents[3]
 BOUND_S = 40.0
@@ -110,12 +110,15 @@ class Up:
         self._lines: queue.Queue[str] = queue.Queue()
         self._heard: list[str] = []
         # What hangs is aborted, see `finish`, and says where it stood.
-        python, *verb = command("up")
         said = (str(manifest), "--format", "json", *options)
         self.process = subprocess.Popen(
-            [*through, python, "-X", "faulthandler", *verb, *said],
-            cwd=ROOT,
-            env={**environment(runtime, self.mark), **(variables or {})},
+            [*through, *command("up"), *said],
+            cwd=modules(),
+            env={
+                **environment(runtime, self.mark),
+                "PYTHONFAULTHANDLER": "1",
+                **(variables or {}),
+            },
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
@@ -323,7 +326,7 @@ def up(
 
 def command(verb: str) -> Sequence[str]:
     """Return the command line of a verb."""
-    return (sys.executable, "-m", "lifecycle.cli", verb)
+    return (str(LIFECYCLE), verb)
 
 
 def verb(
@@ -332,7 +335,7 @@ def verb(
     """Run a verb to its end, with more variables in its environment."""
     return subprocess.run(
         [*command(name), *arguments],
-        cwd=ROOT,
+        cwd=modules(),
         env={**environment(runtime, ""), **(variables or {})},
         capture_output=True,
         text=True,
