@@ -104,6 +104,7 @@ from .qos import QosProfile as QosProfile
 from .qos import Reliability as Reliability
 from .qos import incompatibilities as incompatibilities
 from .schema import did_you_mean as did_you_mean
+from .shared import SIM_TIME as SIM_TIME
 from .yaml.document import error as error
 from .yaml.document import warning as warning
 from .yaml.source import is_outside as is_outside

@@ -73,6 +73,7 @@ from .rcl.graph_changes import ServerWatch as ServerWatch
 from .rcl.graph_changes import is_server_matched as is_server_matched
 from .rcl.graph_queries import EndpointInfo as EndpointInfo
 from .rcl.graph_queries import endpoints_of as endpoints_of
+from .rcl.graph_queries import endpoints_of_node as endpoints_of_node
 from .rcl.hidden_node import hidden_nodes as hidden_nodes
 from .rcl.library_loading import await_loading as await_loading
 from .rcl.library_loading import begin_loading as begin_loading

@@ -32,6 +32,7 @@ from lifecycle.middleware import (
     SHARED_MEMORY,
     EndpointInfo,
     endpoints_of,
+    endpoints_of_node,
     from_rclpy,
     get_network_flow_endpoints,
     guid_of,
@@ -232,6 +233,7 @@ def _foreign_connection(
         name=connection.name,
         urls=urls,
         node_name=connection.node_name,
+        prefix=_prefix_of(connection),
         established=all(each.matched for each in on if each.kind.is_topic),
         mappings=tuple(each.kind.spell(each.name) for each in on if each.name),
     )
@@ -278,6 +280,7 @@ def connection_reports(
             name=each.name,
             urls=each.urls or (spec.connections.urls if each is connections.own else ()),
             node_name=each.node_name,
+            prefix=_prefix_of(each),
             established=data_layer.status.established(each),
             mappings=tuple(mapping.spelling for mapping in data_layer.status.on(each)),
         )
@@ -408,6 +411,33 @@ def _read_gid_prefix(node: Node) -> str:
         if info is not None:
             return info.gid[:_GID_PREFIX_DIGITS]
     return ""
+
+
+def _prefix_of(connection: Connection) -> str:
+    """Return the GID prefix of a connection's own participant in hex; empty if unknown.
+
+    It has nothing but what is mapped onto it, of which this process's graph cache knows at once. Of
+    another process that has a node of this name, it may know too.
+    """
+    if connection.participant is None:
+        return ""
+    node = connection.participant.node
+    name = node.get_fully_qualified_name()
+    found: set[str] = set()
+    for kind, (side, topic) in _SHOWN_BY.items():
+        for each, _ in endpoints_of_node(node, kind, name) or ():
+            infos = endpoints_of(node, side, topic.format(each), no_mangle=not kind.is_topic)
+            found.update(info.gid[:_GID_PREFIX_DIGITS] for info in infos if info.node == name)
+    return found.pop() if len(found) == 1 else ""
+
+
+_SHOWN_BY = {
+    EndpointKind.PUBLISHER: (EndpointKind.PUBLISHER, "{}"),
+    EndpointKind.SUBSCRIPTION: (EndpointKind.SUBSCRIPTION, "{}"),
+    EndpointKind.SERVICE_SERVER: (EndpointKind.SUBSCRIPTION, "rq{}Request"),
+    EndpointKind.SERVICE_CLIENT: (EndpointKind.PUBLISHER, "rq{}Request"),
+}
+"""The DDS endpoint of each kind, and its topic: with no_mangle for services."""
 
 
 def _nfes(

@@ -44,6 +44,7 @@ from .model import StaticEndpoint as StaticEndpoint
 from .model import StaticParticipant as StaticParticipant
 from .model import in_mode as in_mode
 from .model import raw_value as raw_value
+from .model import uses_sim_time as uses_sim_time
 from .negotiation.data_layer import PARADIGMS as PARADIGMS
 from .negotiation.data_layer import SERIALIZATIONS as SERIALIZATIONS
 from .negotiation.data_layer import DataLayerGraph as DataLayerGraph

@@ -17,6 +17,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from lifecycle import dataclasses
 from lifecycle.errors import UsageError
 from lifecycle.manifest import (
+    SIM_TIME,
     After,
     Diagnostic,
     Discovery,
@@ -46,6 +47,7 @@ from lifecycle.manifest import (
     read_bytes,
     resolve,
     search_prefixes,
+    warning,
 )
 from lifecycle.network import DEFAULT_RMW, MAX_DOMAIN_ID, domain_of
 from lifecycle.plan.connections.wiring import WiredSystem, place_declared, variables_of, wire
@@ -368,7 +370,37 @@ def check_plan(
         at = problem.at or Position(file=manifest.path, line=1, column=1)
         alone = error("plan.impossible", at, problem.message, problem.hint)
         return problem.diagnostics or (alone,)
-    return ()
+    return tuple(_without_clock(manifest))
+
+
+def _without_clock(manifest: Manifest) -> Iterator[Diagnostic]:
+    """Warn of simulated time that no node is declared to publish; others may, like a bag."""
+    if any(
+        each.kind is EndpointKind.PUBLISHER and _resolved(node, each) == "/clock"
+        for node in manifest.nodes
+        for each in node.interface.endpoints
+    ):
+        return
+    files = ParameterFiles(manifest.path, manifest.modes)
+    users = [
+        (node, each)
+        for node in manifest.nodes
+        for each in files.expected(node)
+        if each.name == SIM_TIME and each.value is True
+    ]
+    if users:
+        names = ", ".join(node.key for node, _ in users[:_NAMED])
+        more = f" and {len(users) - _NAMED} more" if len(users) > _NAMED else ""
+        yield warning(
+            "check.no-clock",
+            users[0][1].at,
+            f"cannot tell who gives {names}{more} simulated time: no node declares a publisher of"
+            " '/clock'",
+            "declare it in the simulator's node, or start what publishes it before",
+        )
+
+
+_NAMED = 4
 
 
 def _wired(
@@ -519,16 +551,20 @@ def _planned_file(files: tuple[str, ...], place: str, written: str) -> PlannedFi
     )
 
 
-def _planned_endpoint(
-    node: Node, endpoint: Endpoint, need: ResolvedNeed | None, hash_of: Callable[[str], str]
-) -> PlannedEndpoint:
-    resolved = resolve(
+def _resolved(node: Node, endpoint: Endpoint) -> str:
+    return resolve(
         endpoint.name,
         node_name=node.name,
         namespace=node.namespace,
         remap=node.remap,
         kind=endpoint.kind,
     )
+
+
+def _planned_endpoint(
+    node: Node, endpoint: Endpoint, need: ResolvedNeed | None, hash_of: Callable[[str], str]
+) -> PlannedEndpoint:
+    resolved = _resolved(node, endpoint)
     planned = PlannedEndpoint(
         **declared(Endpoint, endpoint),
         resolved=resolved,

@@ -14,6 +14,7 @@ from lifecycle import dataclasses
 from lifecycle.codec import DomainId, DscpValue, Port, Positive, says
 from lifecycle.errors import ExitCode, LifecycleError
 from lifecycle.manifest import (
+    SIM_TIME,
     Authority,
     Diagnostic,
     DiscoveryMode,
@@ -408,6 +409,11 @@ class Plan(SystemDeclaration):
             KeyError: no such key.
         """
         return _by_key(self.nodes)[key]
+
+
+def uses_sim_time(node: PlannedNode) -> bool:
+    """Return whether a node is given `use_sim_time: true`, by whatever way."""
+    return any(each.name == SIM_TIME and each.value is True for each in node.expected_parameters)
 
 
 def in_mode(plan: Plan, name: str) -> Plan:

@@ -38,6 +38,7 @@ from .rules.matching import obstacle as obstacle
 from .rules.nodes import DUPLICATE_NODE as DUPLICATE_NODE
 from .rules.nodes import MISSING_NODE as MISSING_NODE
 from .rules.nodes import UNATTRIBUTED_ENDPOINT as UNATTRIBUTED_ENDPOINT
+from .rules.nodes import UNDECLARED_NODE as UNDECLARED_NODE
 from .rules.run import DEADLINE as DEADLINE
 from .rules.run import DEADLOCKED_OBSERVER as DEADLOCKED_OBSERVER
 from .rules.run import GAVE_UP as GAVE_UP
@@ -52,6 +53,8 @@ from .rules.run import TRANSITION_FAILED as TRANSITION_FAILED
 from .rules.run import node_of as node_of
 from .rules.state import ACTIVATED_AT_CLOSED_GATE as ACTIVATED_AT_CLOSED_GATE
 from .rules.state import MISSING_REPORT as MISSING_REPORT
+from .rules.time import SILENT_CLOCK as SILENT_CLOCK
+from .tool_filter import CLOCK as CLOCK
 from .tool_filter import GRAPH_TOPIC as GRAPH_TOPIC
 from .tool_filter import NO_NAMES as NO_NAMES
 from .tool_filter import NODE_SERVICES as NODE_SERVICES

@@ -22,11 +22,12 @@ from lifecycle.verify.observation import (
     ObservedNode,
 )
 from lifecycle.verify.tool_filter import (
-    Owners,
     action_part,
     fold_actions,
     is_noise_endpoint,
     known_node,
+    owners,
+    part_type,
     tolerating_pattern,
 )
 from lifecycle.verify.uniqueness import Uniqueness
@@ -90,10 +91,11 @@ def lay_out(
     reported = _by_identity(observation)
     configurations = {each.name: each for each in reversed(reported)}
     duplicated = {each.full_name for each in observation.nodes if each.count > 1}
-    owners = Owners(planned.values(), reported, plan.policy.tolerated_nodes)
-    attributed, groups = _attributed(observation, frame, configurations, owners, last)
-    tools = _tools(observation, groups, planned, owners, plan.policy.tolerated_nodes)
-    observed = _graph_nodes(observation.nodes, planned, owners, tools)
+    attributed, groups = _attributed(observation, frame, reported, configurations, last)
+    # Of two of one name, or where an endpoint is not its owner's, one is somebody else's.
+    hidden = owners(planned, reported).keys() - planned.keys() - groups.keys() - duplicated
+    tools = _tools(observation, groups, planned, hidden, plan.policy.tolerated_nodes)
+    observed = _graph_nodes(observation.nodes, planned, hidden, tools)
     parameters = {each.node: each for each in observation.parameters}
     nodes: dict[str, NodeFacts] = {}
     left_over: list[ObservedEndpoint] = []
@@ -130,7 +132,7 @@ def lay_out(
         parameters=parameters,
         actual=actual,
         actual_by_node={name: facts.actual for name, facts in nodes.items()},
-        undeclared=_undeclared(left_over, groups, actual, tools),
+        undeclared=_undeclared(left_over, groups, actual),
         unattributed=groups[""].endpoints if "" in groups else (),
         foreign=tuple(each for name in strangers for each in groups[name].endpoints),
         tools=tools,
@@ -175,8 +177,8 @@ def _by_identity(observation: Observation) -> tuple[NodeConfiguration, ...]:
 def _attributed(
     observation: Observation,
     frame: Frame,
+    reported: Iterable[NodeConfiguration],
     configurations: dict[str, NodeConfiguration],
-    owners: Owners,
     last: View | None,
 ) -> tuple[dict[str, Attributed], dict[str, NodeEndpoints]]:
     """Give each endpoint to its node: by hidden participant, or by the GID that a node reported.
@@ -189,6 +191,7 @@ def _attributed(
         The endpoints by the name that discovery shows, but for those without one; and all by the
         name of the node whose they are, sorted by it.
     """
+    hidden = owners(frame.planned, reported)
     shown: dict[str, list[ObservedEndpoint]] = {}
     for name, of_node in itertools.groupby(observation.endpoints, operator.attrgetter("node")):
         shown.setdefault(name, []).extend(of_node)
@@ -196,33 +199,33 @@ def _attributed(
     by_node: dict[str, list[Sequence[ObservedEndpoint]]] = {}
     for name, endpoints in shown.items():
         node = known_node(name)
-        if node not in frame.planned:
-            node = owners.of(node) or node
         if not node:
             for each in _unknown(endpoints, frame, configurations):
                 by_node.setdefault(each.node, []).append((each,))
             continue
-        ours = node in configurations
+        owner = hidden.get(node) if node not in frame.planned else None
+        ours = (owner.node if owner is not None else node) in configurations
         known = last.attributed.get(name) if last is not None else None
         if (
             known is None
-            or known.node != node
+            or known.owner != owner
             or known.ours is not ours
             or not _same(known.shown, endpoints)
         ):
+            judged: dict[str, list[ObservedEndpoint]] = {}
+            for each in endpoints:
+                whose = owner.node if owner is not None and owner.has(each) else node
+                if _counts(each, whose, frame, ours=ours):
+                    judged.setdefault(whose, []).append(_as_of(each, whose))
             known = Attributed(
                 shown=tuple(endpoints),
-                node=node,
+                owner=owner,
                 ours=ours,
-                judged=tuple(
-                    _as_of(each, node)
-                    for each in endpoints
-                    if _counts(each, node, frame, ours=ours)
-                ),
+                judged={whose: tuple(found) for whose, found in judged.items()},
             )
         attributed[name] = known
-        if known.judged:
-            by_node.setdefault(node, []).append(known.judged)
+        for whose, found in known.judged.items():
+            by_node.setdefault(whose, []).append(found)
     groups = {
         name: _group(
             by_node[name],
@@ -279,8 +282,7 @@ def _counts(endpoint: ObservedEndpoint, node: str, frame: Frame, *, ours: bool) 
 def _as_of(endpoint: ObservedEndpoint, node: str) -> ObservedEndpoint:
     if node == endpoint.node:
         return endpoint
-    gid = endpoint.gid if endpoint.kind.is_topic or not node else ""
-    return dataclasses.replace(endpoint, node=node, gid=gid)
+    return dataclasses.replace(endpoint, node=node)
 
 
 def _group(
@@ -305,7 +307,7 @@ def _tools(
     observation: Observation,
     groups: Iterable[str],
     planned: dict[str, PlannedNode],
-    owners: Owners,
+    hidden: Collection[str],
     patterns: Sequence[str],
 ) -> dict[str, str]:
     """Return the undeclared nodes that are tolerated by their name, and the pattern, sorted."""
@@ -313,7 +315,7 @@ def _tools(
     found = {
         name: tolerating_pattern(name, patterns)
         for name in sorted(seen - planned.keys())
-        if known_node(name) and not owners.of(name)
+        if known_node(name) and name not in hidden
     }
     return {name: pattern for name, pattern in found.items() if pattern}
 
@@ -511,30 +513,37 @@ def _undeclared(
     left_over: Sequence[ObservedEndpoint],
     groups: Mapping[str, NodeEndpoints],
     actual: Iterable[Actual],
-    tools: Collection[str],
 ) -> tuple[ObservedEndpoint, ...]:
-    """Leave out of what no declaration covers the hidden parts of actions that are there."""
+    """Leave out of what no declaration covers the parts of declared actions that are half seen."""
     if not any(action_part(each.kind, each.name) for each in left_over):
         return _sorted(left_over)
-    known_actions = {
+    seen = {
         (each.node, each.kind, each.name)
-        for name, group in groups.items()
-        if name not in tools
+        for group in groups.values()
         for each in group.endpoints
-    } | {(each.node.full_name, each.planned.kind, each.planned.resolved) for each in actual}
-    return _sorted(each for each in left_over if not _is_part_of(each, known_actions))
+        if not each.kind.is_topic
+    }
+    half = {
+        place: each.planned.type
+        for each in actual
+        if (place := (each.node.full_name, each.planned.kind, each.planned.resolved)) not in seen
+    }
+    return _sorted(each for each in left_over if not _is_part_of(each, half))
 
 
-def _is_part_of(endpoint: ObservedEndpoint, actions: set[tuple[str, EndpointKind, str]]) -> bool:
-    """Return whether an endpoint is a hidden part of an action that is declared or seen."""
+def _is_part_of(
+    endpoint: ObservedEndpoint, actions: Mapping[tuple[str, EndpointKind, str], str]
+) -> bool:
+    """Return whether an endpoint is a part of one of these actions, and has the type for it."""
     action = action_part(endpoint.kind, endpoint.name)
-    return action is not None and (endpoint.node, *action) in actions
+    type_ = actions.get((endpoint.node, *action)) if action is not None else None
+    return type_ is not None and endpoint.type == part_type(endpoint.name, type_)
 
 
 def _graph_nodes(
     nodes: Iterable[ObservedNode],
     planned: dict[str, PlannedNode],
-    owners: Owners,
+    hidden: Collection[str],
     tools: Collection[str],
 ) -> dict[str, ObservedNode]:
     """Nodes that count: tools and hidden participants of declared nodes left out."""
@@ -543,7 +552,7 @@ def _graph_nodes(
         name = node.full_name
         if not known_node(name):
             continue  # its endpoints are judged; it is no name that could be declared or not
-        if name not in planned and (name in tools or owners.of(name)):
+        if name not in planned and (name in tools or name in hidden):
             continue
         known = merged.get(name)
         merged[name] = (

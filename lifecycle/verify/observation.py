@@ -22,6 +22,7 @@ LONGEST_CONFIGURATION = 1 << 22
 """Characters of a node configuration as JSON; one of 1,000 endpoints takes about 600,000."""
 
 _GID = re.compile(r"[0-9a-f]{32}")
+_GID_PREFIX = re.compile(r"([0-9a-f]{24})?")
 _LARGEST = 2**63 - 1
 
 LONGEST_VALUE = 4096
@@ -234,6 +235,9 @@ def _wrong(found: NodeConfiguration) -> Iterable[tuple[str, object, str]]:
             yield from _outside(f"{at}.nfes.dscp", nfe.dscp, 0, 63)
             if nfe.internet_address and not _is_address(nfe.internet_address):
                 yield f"{at}.nfes.internet_address", nfe.internet_address, "an IP address"
+    for index, connection in enumerate(found.connections):
+        if not _GID_PREFIX.fullmatch(connection.prefix):
+            yield f"connections[{index}].prefix", connection.prefix, "24 hex digits, or none"
     for parameter in found.parameters or ():
         values = parameter.value if isinstance(parameter.value, tuple) else (parameter.value,)
         for value in values:
@@ -305,8 +309,11 @@ class ObservedEndpoint:
         type_hash: of the definition that it was made with, as announced (REP-2016,
             `RIHS01_df66…`; those of several messages of a service or an action in the order of
             `manifest.installed_types.join`); empty if it announces none, None if that was not seen.
-        gid: hex; empty for services and actions of a known node.
+        gid: hex, of a server that of its request reader or, for an action, of its goal service;
+            empty for clients of a known node, which it may have several of, and where the RMW shows
+            none.
         address: IP address of its participant, where its node is not known and discovery shows it.
+        silent: it publishes /clock, and whoever looked has received no time from it.
     """
 
     kind: EndpointKind
@@ -317,6 +324,7 @@ class ObservedEndpoint:
     gid: str = ""
     type_hash: str | None = None
     address: str = ""
+    silent: bool = False
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

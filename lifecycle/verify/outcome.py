@@ -34,6 +34,7 @@ class ConnectionReport:
         name: as `connect_to` named it; empty for the node's own participant.
         urls: what it was given, as text; empty if the RMW chose.
         node_name: base name of the hidden node that carries it; empty for the node's own.
+        prefix: GUID prefix of that node's participant, 24 hex digits; empty where it is not known.
         established: it exists and, where it has mappings, all of them have a matched peer.
         mappings: declared names of what is mapped onto it, `publishers/video`.
         error: why it could not be made; empty if it was.
@@ -42,6 +43,7 @@ class ConnectionReport:
     name: str
     urls: tuple[str, ...] = ()
     node_name: str = ""
+    prefix: str = ""
     established: bool = False
     mappings: tuple[str, ...] = ()
     error: str = ""

@@ -39,7 +39,7 @@ from lifecycle.manifest import (
     supervisor_status_topic,
 )
 from lifecycle.network import UniqueRequirement
-from lifecycle.plan import Plan, PlannedNode, owner_of
+from lifecycle.plan import Plan, PlannedNode, uses_sim_time
 from lifecycle.verify.observation import NodeConfiguration, ObservedEndpoint
 
 OUR_NODES = "_lifecycle_*"
@@ -69,18 +69,19 @@ PLACEHOLDER_NAMES = frozenset({"_NODE_NAME_UNKNOWN_", "_CREATED_BY_BARE_DDS_APP_
 GRAPH_TOPIC = "/lifecycle/graph"
 """Where nodes publish changes of themselves and receive those of others (lifecycle.graph)."""
 
-NOISE_TOPICS = frozenset(
-    {
-        (EndpointKind.PUBLISHER, "/rosout"),
-        (EndpointKind.PUBLISHER, "/parameter_events"),
-        (EndpointKind.SUBSCRIPTION, "/parameter_events"),
-        # every client library subscribes to it when use_sim_time is set
-        (EndpointKind.SUBSCRIPTION, "/clock"),
-        (EndpointKind.PUBLISHER, GRAPH_TOPIC),
-        (EndpointKind.SUBSCRIPTION, GRAPH_TOPIC),
-    }
-)
-"""Topics of the client libraries themselves, and ours."""
+CLOCK = "/clock", "rosgraph_msgs/msg/Clock"
+"""The topic of simulated time, and its type: who publishes it drives every `use_sim_time` node."""
+
+NOISE_TOPICS: Mapping[tuple[EndpointKind, str], str] = {
+    (EndpointKind.PUBLISHER, "/rosout"): "rcl_interfaces/msg/Log",
+    (EndpointKind.PUBLISHER, "/parameter_events"): "rcl_interfaces/msg/ParameterEvent",
+    (EndpointKind.SUBSCRIPTION, "/parameter_events"): "rcl_interfaces/msg/ParameterEvent",
+    # every client library subscribes to it when use_sim_time is set
+    (EndpointKind.SUBSCRIPTION, CLOCK[0]): CLOCK[1],
+    (EndpointKind.PUBLISHER, GRAPH_TOPIC): "std_msgs/msg/String",
+    (EndpointKind.SUBSCRIPTION, GRAPH_TOPIC): "std_msgs/msg/String",
+}
+"""Topics of the client libraries themselves, and ours, with their types."""
 
 _SERVICE_EVENT = "/_service_event"
 """What a service or client says of its calls once its introspection is configured (REP-2012)."""
@@ -125,8 +126,12 @@ that a node counts as ours only with the two that no other node has together, `O
 OURS_BY = frozenset({"get_configuration", "map_to"})
 """Who offers both under its own name is a node of ours."""
 
-NODE_TOPICS = frozenset({"_alive", "_alive_pulse", "transition_event"})
-"""Topics that a node publishes under its own name."""
+NODE_TOPICS: Mapping[str, str] = {
+    "_alive": "std_msgs/msg/String",
+    "_alive_pulse": "std_msgs/msg/Empty",
+    "transition_event": "lifecycle_msgs/msg/TransitionEvent",
+}
+"""Topics that a node publishes under its own name, and their types."""
 
 _PREFIX_DIGITS = 24
 """A GUID begins with its participant's prefix of 12 bytes (DDSI-RTPS §9.3.1)."""
@@ -213,6 +218,7 @@ class DeclaredNames:
         of_supervisors: likewise, those that only supervisors of the plan may have, whatever
             `policy.ros_interface` says.
         alive: names of the topics by which its supervisors assert their liveliness to each other.
+        simulated: nodes of the plan have `use_sim_time`, so that it matters who publishes /clock.
         diagnosed: the plan declares who reads /diagnostics, so that it must be known who are
             supervisors, those of other systems too.
     """
@@ -221,6 +227,7 @@ class DeclaredNames:
     own: frozenset[tuple[EndpointKind, str]] = frozenset()
     of_supervisors: frozenset[tuple[EndpointKind, str]] = frozenset()
     alive: frozenset[str] = frozenset()
+    simulated: bool = False
     diagnosed: bool = False
 
     @classmethod
@@ -261,6 +268,7 @@ class DeclaredNames:
             # A manifest may declare a node of its own that has them.
             of_supervisors=of_supervisors - names,
             alive=frozenset(topic for topic, _ in _alive(plan)),
+            simulated=any(map(uses_sim_time, plan.nodes)),
             diagnosed=(EndpointKind.PUBLISHER, DIAGNOSTICS_TOPIC) in names,
         )
 
@@ -490,9 +498,9 @@ def is_noise_endpoint(kind: EndpointKind, node: str, name: str, type_: str, *, o
     """Return whether an endpoint is one that client libraries make without being asked.
 
     Offering such a service counts as noise only under the node's own name; using it, under any:
-    who drives another node's lifecycle or parameters declares nothing. A service of another type
-    only has the name, and belongs to a user. An endpoint whose node is not known is never noise: it
-    may be the first sign of a node that must not be there.
+    who drives another node's lifecycle or parameters declares nothing. A topic or service of
+    another type only has the name, and belongs to a user. An endpoint whose node is not known is
+    never noise: it may be the first sign of a node that must not be there.
 
     Args:
         kind: kind of the endpoint.
@@ -506,7 +514,8 @@ def is_noise_endpoint(kind: EndpointKind, node: str, name: str, type_: str, *, o
         return False
     of_observers = name.startswith(_OUR_TOPICS) and bool(tolerating_pattern(node, ()))
     of_observers = of_observers or is_supervisor_endpoint(kind, node, name, type_)
-    if of_observers or (kind, name) in NOISE_TOPICS or _is_service_event(kind, name, type_):
+    of_library = _is_service_event(kind, name, type_) or NOISE_TOPICS.get((kind, name)) == type_
+    if of_observers or of_library:
         return True
     owner, _, base = name.rpartition("/")
     of_container = owner.endswith(_CONTAINER) and _CONTAINER_SERVICES.get(base) == type_
@@ -519,7 +528,7 @@ def is_noise_endpoint(kind: EndpointKind, node: str, name: str, type_: str, *, o
         if of_container or NODE_SERVICES.get(base) == type_:
             return True
         return OUR_SERVICES.get(base) == type_ and (ours or not offers)
-    return base in NODE_TOPICS
+    return NODE_TOPICS.get(base) == type_
 
 
 def our_nodes(endpoints: Iterable[ObservedEndpoint]) -> frozenset[str]:
@@ -589,7 +598,8 @@ def fold_actions(endpoints: Iterable[ObservedEndpoint]) -> tuple[ObservedEndpoin
 
     A server is complete with three services and two publishers, a client with three service
     clients and two subscriptions. Parts of an incomplete action stay as they are: an action that
-    discovery shows only half of is not there yet. Action endpoints already in the input stay.
+    discovery shows only half of is not there yet. So do those of another type than their action's,
+    and those of a server that are there once more. Action endpoints in the input stay.
     """
     kept: list[ObservedEndpoint] = []
     groups: dict[tuple[str, EndpointKind, str], list[ObservedEndpoint]] = {}
@@ -601,30 +611,83 @@ def fold_actions(endpoints: Iterable[ObservedEndpoint]) -> tuple[ObservedEndpoin
             groups.setdefault((endpoint.node, *action), []).append(endpoint)
     known = {(each.node, each.kind, each.name) for each in kept}
     for (node, side, name), parts in groups.items():
-        needed = dict(_ACTION_SIDES)[side]
-        if (node, side, name) in known:
-            continue
-        if {(part.kind, part.name.rpartition("/")[2]) for part in parts} == needed:
-            type_ = next(
-                part.type.removesuffix(_SEND_GOAL_TYPE_SUFFIX)
-                for part in parts
-                if part.name.endswith("/send_goal")
-            )
-            kept.append(
-                ObservedEndpoint(
-                    kind=side,
-                    node=node,
-                    name=name,
-                    type=type_,
-                    # Where the node is not known, only these identify the owner.
-                    gid="" if node else parts[0].gid,
-                    address=parts[0].address,
-                    type_hash=_action_hash(parts),
-                )
-            )
-        else:
-            kept.extend(parts)
+        named: dict[str, list[ObservedEndpoint]] = {}
+        for each in parts:
+            named.setdefault(each.name.rpartition("/")[2], []).append(each)
+        type_ = _action_type(named)
+        left = list(parts)
+        if (node, side, name) in known and side is EndpointKind.ACTION_CLIENT:
+            continue  # one that a node has several times is one end
+        while named.keys() == _ACTION_TYPES.keys():
+            # What has another type makes the action complete, and is left over.
+            chosen = {
+                part: next((e for e in found if e.type == part_type(part, type_)), found[0])
+                for part, found in named.items()
+            }
+            kept.append(_folded(node, side, name, type_, chosen))
+            serves = side is EndpointKind.ACTION_SERVER
+            for part, each in chosen.items():
+                taken = [each] if serves else [e for e in named[part] if e.type == each.type]
+                right = each.type == part_type(part, type_)
+                for one in taken:
+                    named[part].remove(one)
+                    if right:
+                        left.remove(one)
+            named = {part: found for part, found in named.items() if found}
+        kept.extend(left)
     return tuple(kept)
+
+
+def _folded(
+    node: str,
+    side: EndpointKind,
+    name: str,
+    type_: str,
+    parts: Mapping[str, ObservedEndpoint],
+) -> ObservedEndpoint:
+    first = parts["send_goal"]
+    return ObservedEndpoint(
+        kind=side,
+        node=node,
+        name=name,
+        type=type_,
+        gid=first.gid,
+        address=first.address,
+        type_hash=_action_hash(parts.values()),
+    )
+
+
+_ACTION_TYPES: Mapping[str, str] = {
+    "send_goal": "_SendGoal",
+    "cancel_goal": "action_msgs/srv/CancelGoal",
+    "get_result": "_GetResult",
+    "feedback": "_FeedbackMessage",
+    "status": "action_msgs/msg/GoalStatusArray",
+}
+"""Types of the parts of an action; of those that begin with its own type, the ends."""
+
+
+def part_type(part: str, type_: str) -> str:
+    """Return the type that a part of an action must have.
+
+    Args:
+        part: a hidden name or the end of one, `/dock/_action/send_goal`.
+        type_: of the action, `robot/action/Dock`.
+    """
+    end = _ACTION_TYPES[part.rpartition("/")[2]]
+    return f"{type_}{end}" if end.startswith("_") else end
+
+
+def _action_type(parts: Mapping[str, Iterable[ObservedEndpoint]]) -> str:
+    """Return the type of an action: that of most of its parts, of its goals where they differ."""
+    found = [
+        each.type.removesuffix(end)
+        for part, end in _ACTION_TYPES.items()
+        if end.startswith("_")
+        for each in parts.get(part, ())
+        if each.type.endswith(end)
+    ]
+    return max(found, key=found.count) if found else ""
 
 
 def _action_hash(parts: Iterable[ObservedEndpoint]) -> str | None:
@@ -635,57 +698,46 @@ def _action_hash(parts: Iterable[ObservedEndpoint]) -> str | None:
     return join(known) if len(known) == len(found) else None
 
 
-class Owners:
-    """Knows whose every hidden node is.
+@dataclasses.dataclass(frozen=True, slots=True)
+class Owner:
+    """Whose a hidden node is, as that node itself reports.
 
-    Args:
-        nodes: of the plan.
-        reported: what nodes report of themselves; only planned ones count.
-        tolerated: patterns of names of tools, whose nodes have no owner by name alone.
+    Attributes:
+        node: full name of the planned node that has it.
+        prefixes: GUID prefixes of the participants that the owner reports, 24 hex digits each: what
+            has another one is not the owner's, whatever its node is called.
     """
 
-    def __init__(
-        self,
-        nodes: Iterable[PlannedNode],
-        reported: Iterable[NodeConfiguration],
-        tolerated: Collection[str] = TOLERATED_NODES,
-    ) -> None:
-        # A pattern that is not of hidden nodes, like `*`, says nothing of these.
-        self._tools = [each for each in tolerated if each.rpartition("/")[2].startswith("_")]
-        self._owners: dict[str, str] = {}
-        self._planned: set[str] = set()
-        for node in nodes:
-            self._planned.add(node.full_name)
-            for each in node.participants:
-                self._owners[_beside(node.full_name, each.name)] = node.full_name
-        for configuration in reported:
-            if configuration.name not in self._planned:
-                continue
-            for connection in configuration.connections:
-                if connection.node_name:
-                    hidden = _beside(configuration.name, connection.node_name)
-                    self._owners[hidden] = configuration.name
+    node: str
+    prefixes: frozenset[str]
 
-    def of(self, hidden: str) -> str:
-        """Return the full name of the planned node that owns `hidden`; empty if none does."""
-        owner = self._owners.get(hidden) or owner_of(hidden)
-        return owner if owner in self._planned else self._by_name(hidden)
+    def has(self, endpoint: ObservedEndpoint) -> bool:
+        """Return whether an endpoint of the hidden node is the owner's, as far as its GID says."""
+        return not endpoint.gid or endpoint.gid[:_PREFIX_DIGITS] in self.prefixes
 
-    def _by_name(self, hidden: str) -> str:
-        """Return whose a hidden node is by its name alone, `_camera_net` beside `camera`.
 
-        What is connected while the system runs is in the graph before its node's report says so.
-        """
-        namespace, _, base = hidden.rpartition("/")
-        if tolerating_pattern(hidden, self._tools):
-            return ""  # `_ros2cli_4711` is no participant of a node `ros2cli`
-        end = base.rfind("_", 2)
-        while end > 0 and base.startswith("_"):
-            name = f"{namespace}/{base[1:end]}"
-            if name in self._planned:
-                return name  # the longest that fits
-            end = base.rfind("_", 2, end)
-        return ""
+def owners(nodes: Collection[str], reported: Iterable[NodeConfiguration]) -> dict[str, Owner]:
+    """Return whose every hidden node is, by its full name.
+
+    A name proves nothing: any process can call a node `_camera_flow_0`. Only the node that has it
+    can say so, and on which participant it is.
+
+    Args:
+        nodes: full names of the planned ones.
+        reported: what nodes report of themselves; only planned ones count.
+    """
+    found: dict[str, Owner] = {}
+    for each in reported:
+        hidden = {one.node_name for one in each.connections}
+        hidden |= {one.participant for one in each.endpoints}
+        hidden -= {""}
+        if each.name not in nodes or not hidden:
+            continue
+        prefixes = {one.prefix for one in each.connections}
+        prefixes |= {one.gid[:_PREFIX_DIGITS] for one in each.endpoints}
+        owner = Owner(each.name, frozenset(prefixes - {""}))
+        found |= {_beside(each.name, name): owner for name in hidden}
+    return found
 
 
 def is_hidden_node(full_name: str) -> bool:

@@ -32,7 +32,7 @@ from lifecycle.verify.observation import (
     ObservedEndpoint,
     ObservedNode,
 )
-from lifecycle.verify.tool_filter import DeclaredNames
+from lifecycle.verify.tool_filter import DeclaredNames, Owner
 from lifecycle.verify.uniqueness import Uniqueness
 from lifecycle.verify.verdict import Stage
 
@@ -410,15 +410,15 @@ class Attributed:
 
     Attributes:
         shown: as discovery shows them.
-        node: whose they are.
+        owner: whose they may be, if it is a hidden node of one that reports; None for its own.
         ours: that node reports its configuration.
-        judged: without what client libraries bring along, as that node's.
+        judged: without what client libraries bring along, by the node whose they are.
     """
 
     shown: tuple[ObservedEndpoint, ...]
-    node: str
+    owner: Owner | None
     ours: bool
-    judged: tuple[ObservedEndpoint, ...]
+    judged: Mapping[str, tuple[ObservedEndpoint, ...]]
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True, eq=False)

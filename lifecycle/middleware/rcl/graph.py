@@ -19,6 +19,9 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 
 import rclpy
 from rclpy.node import Node
+from rclpy.qos import qos_profile_sensor_data
+from rclpy.subscription import Subscription
+from rosgraph_msgs.msg import Clock
 
 from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError
@@ -63,6 +66,7 @@ from lifecycle.middleware.rcl.hidden_node import forget_hidden, quiet_node
 from lifecycle.middleware.rcl.stale_node_filter import StaleNodeFilter
 from lifecycle.plan import ParticipantConnections
 from lifecycle.verify import (
+    CLOCK,
     NO_NAMES,
     DeclaredNames,
     ObservedEndpoint,
@@ -111,6 +115,24 @@ class _Service:
             hashes.append("" if "" in own else "|".join(sorted(own)))
         return join(hashes) if seen else None
 
+    def servers_of(
+        self, endpoint: ObservedEndpoint, ignores: Callable[[str], bool]
+    ) -> tuple[str, ...]:
+        """Return the GID of each server of a node's end, of what reads its requests.
+
+        A client has one, which may be empty: whoever asks may ask with several.
+        """
+        if endpoint.gid or endpoint.kind is not EndpointKind.SERVICE_SERVER:
+            return (endpoint.gid,)
+        found = {
+            info.gid
+            for info in self.servers[0]
+            if info.node == endpoint.node
+            and _service_type(info.type) == endpoint.type
+            and not ignores(info.gid)
+        }
+        return tuple(sorted(found)) or ("",)
+
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class _ShownNode:
@@ -153,7 +175,10 @@ class _Kept:
             tuple[EndpointKind, str, int], tuple[EndpointInfo, ObservedEndpoint | None]
         ] = {}
         self.services: dict[str, tuple[_Listed, tuple[ObservedEndpoint, ...], bool]] = {}
-        self.hashed: dict[tuple[int, str | None], tuple[ObservedEndpoint, ObservedEndpoint]] = {}
+        self.hashed: dict[
+            tuple[int, str | None, tuple[str, ...]],
+            tuple[ObservedEndpoint, tuple[ObservedEndpoint, ...]],
+        ] = {}
         self.nodes: dict[str, ObservedNode] = {}
         self.shown: dict[str, _ShownNode] = {}
 
@@ -242,6 +267,8 @@ class GraphObserver:
         self._last: _Kept | None = None
         self._asked_for: set[str] = set()
         self._nameless_since_s: dict[str, float] = {}
+        self._clock: Subscription[Clock] | None = None
+        self._time_came = self._clock_closed = False
         self._context: rclpy.Context | None = None
         self._guard: GraphGuard | None = None
         if node is None:
@@ -325,6 +352,8 @@ class GraphObserver:
         if last is None or last.declared != frozenset(declared) or last.names is not names:
             last = _Kept(frozenset(declared), names)
         kept = _Kept(last.declared, names)
+        if names.simulated and self.owns_node:
+            self._watch_clock()
         counts = self._stale_node_filter.count()
         ourselves = self._name if self.owns_node and counts[self._name] == 1 else None
         shown: dict[str, list[ObservedEndpoint]] = {}
@@ -587,6 +616,25 @@ class GraphObserver:
     def __exit__(self, *_: object) -> None:
         self.destroy()
 
+    @property
+    def _is_silent(self) -> bool:
+        return self._clock is not None and not self._time_came
+
+    def _watch_clock(self) -> None:
+        """Receive /clock until time has come once."""
+        if self._clock is None:
+            self._clock = self.node.create_subscription(
+                Clock, CLOCK[0], self._take_time, qos_profile_sensor_data
+            )
+        elif self._time_came and not self._clock_closed:
+            self._clock_closed = True
+            self.node.destroy_subscription(self._clock)
+
+    def _take_time(self, _: Clock) -> None:
+        if not self._time_came:
+            self._time_came = True
+            self._changed()
+
     def _changed(self) -> None:
         for callback in self._callbacks:
             callback()
@@ -599,9 +647,13 @@ class GraphObserver:
             if info.node:
                 known.add(info.gid[:_PREFIX_DIGITS])
             place = (kind, topic, id(info))
+            silent = kind is EndpointKind.PUBLISHER and topic == CLOCK[0] and self._is_silent
             made = last.topical.get(place)
-            if made is None or made[0] is not info:
-                made = info, _topic_endpoint(kind, topic, info, kept.declared, kept.names)
+            if made is None or made[0] is not info or (made[1] and made[1].silent) != silent:
+                endpoint = _topic_endpoint(kind, topic, info, kept.declared, kept.names)
+                if endpoint is not None and silent:
+                    endpoint = dataclasses.replace(endpoint, silent=True)
+                made = info, endpoint
             kept.topical[place] = made
             if made[1] is not None:
                 yield made[1]
@@ -634,18 +686,25 @@ class GraphObserver:
                 ours={name} if ours else (),
             )
         hashed: list[ObservedEndpoint] = []
+        ignores = self._stale_node_filter.ignores
         for each in meant:
             if each.kind not in (EndpointKind.SERVICE_SERVER, EndpointKind.SERVICE_CLIENT):
                 hashed.append(each)
                 continue
             if each.name not in queried:
                 queried[each.name] = _Service.of(self.node, each.name)
-            place = (id(each), queried[each.name].hash_of(each))
+            service = queried[each.name]
+            place = (id(each), service.hash_of(each), service.servers_of(each, ignores))
             made = last.hashed.get(place)
             if made is None or made[0] is not each:
-                made = each, dataclasses.replace(each, type_hash=place[1])
+                made = (
+                    each,
+                    tuple(
+                        dataclasses.replace(each, type_hash=place[1], gid=gid) for gid in place[2]
+                    ),
+                )
             kept.hashed[place] = made
-            hashed.append(made[1])
+            hashed += made[1]
         if name and known is not None and _same(known.hashed, hashed):
             endpoints = known.endpoints
         else:
@@ -829,8 +888,25 @@ def _topic_endpoint(
     declared: Collection[str],
     names: DeclaredNames,
 ) -> ObservedEndpoint | None:
-    """Return a publisher or subscription; None if it is the housekeeping of a client library."""
+    """Return a publisher or subscription; None if it is the housekeeping of a client library.
+
+    One on a topic of DDS that no ROS name has is shown if it is a node's; of plain DDS programs
+    only what has the names of ROS concerns a system of ROS.
+    """
     node = known_node(info.node)
+    if not topic.startswith("/"):
+        if not node:
+            return None
+        package, _, base = info.type.replace("::dds_::", "::").replace("::", "/").rpartition("/")
+        return ObservedEndpoint(
+            kind=kind,
+            node=node,
+            name=topic,
+            type=f"{package}/{base.removesuffix('_')}" if package else base,
+            qos=info.qos,
+            gid=info.gid,
+            type_hash=info.type_hash,
+        )
     wanted = node not in declared and names.looks_for(kind, topic)
     if not wanted and is_noise_endpoint(kind, node, topic, info.type, ours=False):
         return None

@@ -154,21 +154,33 @@ def node_names(node: Node) -> list[str]:
 
 
 def topic_endpoints(node: Node) -> Iterator[tuple[EndpointKind, str, EndpointInfo]]:
-    """Yield kind, topic and endpoint of all publishers and subscriptions that `node` sees."""
-    for topic in _topics(node):
+    """Yield kind, topic and endpoint of all publishers and subscriptions that `node` sees.
+
+    A topic that is no ROS name, of a node that avoids the naming conventions of ROS, has the name
+    and the type that DDS has; it does not begin with a slash. Services are left out.
+    """
+    for name in _topics(node):
+        if name.startswith(_OF_SERVICES) or name == _DISCOVERY_INFO:
+            continue
+        topic = name.removeprefix(b"rt") if name.startswith(b"rt/") else name
         for kind in (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION):
-            for info in _endpoints(node, kind, topic, no_mangle=False):
+            for info in _endpoints(node, kind, topic, no_mangle=not topic.startswith(b"/")):
                 yield kind, _text(topic), info
+
+
+_OF_SERVICES = b"rq/", b"rr/"
+_DISCOVERY_INFO = b"ros_discovery_info"
+"""How DDS names what RMWs add to topics, `rt/chatter` (rmw_dds_common)."""
 
 
 def _topics(node: Node) -> list[bytes]:
     if not abi.is_known():
         with _read("topics"):
-            return [name.encode() for name, _ in node.get_topic_names_and_types()]
+            return [name.encode() for name, _ in node.get_topic_names_and_types(no_demangle=True)]
     library = _library()
 
     def query(handle: int, result: object) -> int:
-        return int(library.topics(handle, library.allocator, False, result))
+        return int(library.topics(handle, library.allocator, True, result))
 
     return [topic for topic, _ in _names_and_types(node, query, "topics") or ()]
 

@@ -33,7 +33,9 @@ from lifecycle.verify import (
     MISSING_REPORT,
     NOT_JUDGED,
     SERVER_OF,
+    SILENT_CLOCK,
     UNATTRIBUTED_ENDPOINT,
+    UNDECLARED_NODE,
     UNHEALTHY,
     About,
     Finding,
@@ -43,6 +45,7 @@ from lifecycle.verify import (
     Stage,
     Verdict,
     Verifier,
+    is_hidden_node,
     rule,
     verify,
 )
@@ -122,14 +125,19 @@ class GracePeriod:
 
 
 def _is_of_unknown_node(finding: Finding) -> bool:
-    """Whether a finding says that an endpoint's node is not known, or no type hash of such a one.
+    """Whether a finding says that it is not known whose an endpoint is, or no type hash of it.
+
+    Of a hidden participant discovery may be ahead of its node's report.
 
     A client and a server of a service are two DDS endpoints each, which are seen one after the
     other as they come and as they go: until both are there, none of their hash is known.
     """
     if finding.rule == DEFINITION_DIFFERS.id:
         return not finding.node and finding.outcome is Outcome.UNVERIFIABLE
-    return finding.rule == UNATTRIBUTED_ENDPOINT.id
+    if finding.rule == UNDECLARED_NODE.id:
+        return is_hidden_node(finding.node)
+    # Who publishes the time begins to once it is active.
+    return finding.rule in (UNATTRIBUTED_ENDPOINT.id, SILENT_CLOCK.id)
 
 
 def _key(finding: Finding) -> _Key:

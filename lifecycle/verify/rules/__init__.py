@@ -16,6 +16,7 @@ from lifecycle.verify.rules import (
     qos,
     run,
     state,
+    time,
 )
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.verdict import Finding
@@ -36,6 +37,7 @@ _FAMILIES: tuple[tuple[tuple[Rule, ...], Callable[[View], Iterator[Finding]]], .
     (state.REPORT_RULES, state.check_reports),
     (parameters.RULES, parameters.check),
     (declaration.RULES, declaration.check),
+    (time.RULES, time.check),
     (connections.RULES, connections.check),
     (flows.RULES, flows.check),
     (flows.TRANSPORT_RULES, flows.check_transport),

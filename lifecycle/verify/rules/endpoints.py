@@ -14,7 +14,7 @@ from lifecycle.manifest import EndpointKind, EndpointPolicy, Position
 from lifecycle.verify.observation import ObservedEndpoint
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
-from lifecycle.verify.tool_filter import OFFERS
+from lifecycle.verify.tool_filter import OFFERS, action_part, part_type
 from lifecycle.verify.verdict import Finding
 from lifecycle.verify.view import (
     Actual,
@@ -202,6 +202,10 @@ def _unseen(
 def _undeclared(view: View) -> Iterator[Finding]:
     for endpoint in view.undeclared:
         node = view.planned[endpoint.node]
+        wrong = _wrong_part(view, endpoint)
+        if wrong is not None:
+            yield wrong
+            continue
         if node.endpoint_policy is EndpointPolicy.OPEN:
             continue
         word = endpoint.kind.noun
@@ -227,6 +231,29 @@ def _undeclared(view: View) -> Iterator[Finding]:
             endpoint=endpoint.kind,
             hint=hint,
         )
+
+
+def _wrong_part(view: View, endpoint: ObservedEndpoint) -> Finding | None:
+    """Judge a part of an action that its node declares; None for everything else."""
+    part = action_part(endpoint.kind, endpoint.name)
+    if part is None:
+        return None
+    for actual in view.actual_by_node[endpoint.node]:
+        planned = actual.planned
+        if (planned.kind, planned.resolved) != part:
+            continue
+        expected = part_type(endpoint.name, planned.type)
+        if endpoint.type != expected:
+            return TYPE_MISMATCH.on_endpoint(
+                Outcome.VIOLATED,
+                actual,
+                expected=expected,
+                observed=endpoint.type or "no type",
+                message=f"cannot accept the {planned.kind.noun} of {planned.resolved} in"
+                f" {endpoint.node}: {endpoint.name} must be {expected} and is"
+                f" {endpoint.type or 'of unknown type'}",
+            )
+    return None
 
 
 def _given_name(view: View, endpoint: ObservedEndpoint) -> str:
