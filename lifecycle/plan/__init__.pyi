@@ -69,7 +69,6 @@ from .parameters import GIVEN as GIVEN
 from .parameters import NOT_FINITE as NOT_FINITE
 from .parameters import portable as portable
 from .participants import ParticipantCost as ParticipantCost
-from .participants import owner_of as owner_of
 from .participants import parameter_text as parameter_text
 from .participants import participants_cost as participants_cost
 from .programs import Resolution as Resolution

@@ -86,22 +86,6 @@ def _reason(group: ParticipantGroup) -> str:
     return " ".join(facts)
 
 
-def owner_of(participant: str) -> str:
-    """Return the full name of the node that a hidden participant node belongs to.
-
-    Args:
-        participant: a fully qualified node name, `/robot/_camera_flow_0`.
-
-    Returns:
-        `/robot/camera`; empty when the name is not a hidden participant's.
-    """
-    namespace, _, base = participant.rpartition("/")
-    stem, separator, index = base.rpartition("_flow_")
-    if not separator or not stem.startswith("_") or len(stem) == 1 or not index.isdecimal():
-        return ""
-    return f"{namespace}/{stem[1:]}"
-
-
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class ParticipantCost:
     """What DDS participants cost, as measured with Fast DDS 2.14 on 2 cores.

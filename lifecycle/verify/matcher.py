@@ -265,7 +265,9 @@ def _unknown(
                 "",
             )
         if _counts(endpoint, node, frame, ours=node in configurations):
-            yield _as_of(endpoint, node)
+            # Half of a service may be seen before its node is: it is no second one.
+            known = node and not endpoint.kind.is_topic
+            yield _as_of(dataclasses.replace(endpoint, gid="") if known else endpoint, node)
 
 
 def _counts(endpoint: ObservedEndpoint, node: str, frame: Frame, *, ours: bool) -> bool:
@@ -523,21 +525,19 @@ def _undeclared(
         for each in group.endpoints
         if not each.kind.is_topic
     }
-    half = {
-        place: each.planned.type
+    declared = {
+        (each.node.full_name, each.planned.kind, each.planned.resolved): each.planned.type
         for each in actual
-        if (place := (each.node.full_name, each.planned.kind, each.planned.resolved)) not in seen
     }
-    return _sorted(each for each in left_over if not _is_part_of(each, half))
 
+    def is_half(endpoint: ObservedEndpoint) -> bool:
+        action = action_part(endpoint.kind, endpoint.name)
+        place = (endpoint.node, *action) if action is not None else None
+        if place not in declared or (place in seen and endpoint.gid):
+            return False
+        return endpoint.type == part_type(endpoint.name, declared[place])
 
-def _is_part_of(
-    endpoint: ObservedEndpoint, actions: Mapping[tuple[str, EndpointKind, str], str]
-) -> bool:
-    """Return whether an endpoint is a part of one of these actions, and has the type for it."""
-    action = action_part(endpoint.kind, endpoint.name)
-    type_ = actions.get((endpoint.node, *action)) if action is not None else None
-    return type_ is not None and endpoint.type == part_type(endpoint.name, type_)
+    return _sorted(each for each in left_over if not is_half(each))
 
 
 def _graph_nodes(

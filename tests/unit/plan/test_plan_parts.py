@@ -21,7 +21,7 @@ from lifecycle.manifest.model import (
     UniqueHow,
 )
 from lifecycle.network.nfe import UniqueRequirement
-from lifecycle.plan import PlanError, owner_of, participants_cost
+from lifecycle.plan import PlanError, participants_cost
 from lifecycle.plan.build import dependency_levels, planned_processes
 from lifecycle.plan.participants import command_line, parameter_text
 from tests.builders import link, need, node, planned, publisher, subscription
@@ -145,26 +145,6 @@ def test_a_publisher_that_asks_for_nothing_gets_nothing(unique: UniqueRequiremen
 def test_a_unique_subscription_needs_no_participant():
     (one,) = planned(node("v", subscription("a"), needs=[need(SUB, "a", STRICTLY)])).nodes
     assert one.participants == ()
-
-
-@pytest.mark.parametrize(
-    ("name", "owner"),
-    [
-        ("/robot/_camera_flow_0", "/robot/camera"),
-        ("/_camera_flow_12", "/camera"),
-        ("/__hidden_flow_1", "/_hidden"),
-        ("/_a_flow_b_flow_3", "/a_flow_b"),
-        ("/robot/camera", ""),
-        ("/camera_flow_0", ""),
-        ("/___flow_0", "/_"),
-        ("/__flow_0", ""),
-        ("/_flow_0", ""),
-        ("/_camera_flow_x", ""),
-        ("", ""),
-    ],
-)
-def test_a_hidden_participant_tells_its_owner(name: str, owner: str):
-    assert owner_of(name) == owner
 
 
 def test_cost_grows_with_the_number_of_participants():

@@ -21,6 +21,7 @@ from lifecycle.verify import (
 )
 from lifecycle.verify.matcher import lay_out
 from lifecycle.verify.observation import NodeParameters
+from lifecycle.verify.outcome import ConnectionReport
 from lifecycle.verify.view import Actual, SeenEndpoint, View
 from tests.builders import (
     at,
@@ -118,6 +119,7 @@ def test_nodes_are_sorted_without_tools_hidden_participants_and_placeholders() -
             add_node("/zed"),
             add_node("/rviz2"),
             add_node("/robot/_camera_net"),
+            carried("_camera_net"),
             add_node("/_NODE_NAME_UNKNOWN_"),
             add_node("/an_arm"),
         )
@@ -223,12 +225,37 @@ def actual_report_owner(view: View) -> NodeConfiguration:
 
 
 def test_an_endpoint_of_a_hidden_participant_is_its_nodes() -> None:
-    view = view_after(add_endpoint(PUB, "/robot/_camera_net", "/extra", gid="99"))
+    gid = PREFIX + "00001203"
+    extra = add_endpoint(PUB, "/robot/_camera_net", "/extra", gid=gid)
+    view = view_after(both(extra, carried("_camera_net")))
     assert view.undeclared == (
         ObservedEndpoint(
-            kind=PUB, node="/robot/camera", name="/extra", type=STRING, qos=None, gid="99"
+            kind=PUB, node="/robot/camera", name="/extra", type=STRING, qos=None, gid=gid
         ),
     )
+
+
+def test_a_hidden_node_that_its_owner_does_not_report_is_a_stranger() -> None:
+    extra = add_endpoint(PUB, "/robot/_camera_net", "/extra", gid=PREFIX + "00001203")
+    for edit in (extra, both(extra, carried("_camera_net", prefix="09" * 12))):
+        view = view_after(edit)
+        assert (view.undeclared, [each.name for each in view.foreign]) == ((), ["/extra"])
+
+
+def carried(*hidden: str, prefix: str = "") -> Edit:
+    """The camera reports further participants."""
+
+    def edit(seen: Observation) -> Observation:
+        camera = next(each for each in seen.configurations if each.name == "/robot/camera")
+        more = tuple(
+            ConnectionReport(name="net", node_name=each, prefix=prefix or PREFIX) for each in hidden
+        )
+        return change_configuration("/robot/camera", connections=(*camera.connections, *more))(seen)
+
+    return edit
+
+
+PREFIX = "01" * 12
 
 
 def test_an_endpoint_of_no_node_is_the_one_that_reported_its_gid() -> None:
@@ -459,15 +486,21 @@ def test_further_names_of_a_declared_endpoint_are_left_over() -> None:
 
 
 def test_parts_of_an_action_that_is_declared_or_seen_are_not_left_over() -> None:
-    part = add_endpoint(PUB, "/robot/camera", "/robot/dock/_action/feedback", gid="99")
-    assert view_after(part).undeclared == ()
+    feedback = "robot/action/Dock_FeedbackMessage"
+    part = add_endpoint(
+        PUB, "/robot/camera", "/robot/dock/_action/feedback", gid="99", type=feedback
+    )
+    assert len(view_after(part).undeclared) == 1  # of a second one
     assert view_after(both(part, drop_endpoint(ACTION_SERVER, "/robot/dock"))).undeclared == ()
     other = add_endpoint(PUB, "/robot/camera", "/lift/_action/feedback", gid="99")
     assert [each.name for each in view_after(other).undeclared] == ["/lift/_action/feedback"]
     remote_nodes = add_endpoint(PUB, "/viewer", "/robot/dock/_action/feedback", gid="99")
     assert [each.node for each in view_after(remote_nodes).undeclared] == ["/viewer"]
     lift = add_endpoint(ACTION_SERVER, "/robot/camera", "/lift", type="a/action/B")
-    assert [each.name for each in view_after(both(other, lift)).undeclared] == ["/lift"]
+    assert [each.name for each in view_after(both(other, lift)).undeclared] == [
+        "/lift",
+        "/lift/_action/feedback",
+    ]
 
 
 def test_what_is_left_over_is_sorted_by_node_name_kind_type_and_gid() -> None:

@@ -73,18 +73,20 @@ STRING = "std_msgs/msg/String"
 SET_PARAMETERS = "rcl_interfaces/srv/SetParameters"
 TRIGGER = "std_srvs/srv/Trigger"
 GET_PARAMETERS = "rcl_interfaces/srv/GetParameters"
+EVENT = "rcl_interfaces/msg/ParameterEvent"
+TRANSITION = "lifecycle_msgs/msg/TransitionEvent"
 LOAD_NODE = "composition_interfaces/srv/LoadNode"
 
 
 @pytest.mark.parametrize(
     ("kind", "node", "name", "type_"),
     [
-        (PUB, "/a", "/rosout", STRING),
-        (PUB, "/a", "/parameter_events", STRING),
-        (SUB, "/a", "/parameter_events", STRING),
-        (SUB, "/a", "/clock", STRING),
-        (PUB, "/ns/a", "/ns/a/transition_event", STRING),
-        (SUB, "/b", "/ns/a/transition_event", STRING),
+        (PUB, "/a", "/rosout", "rcl_interfaces/msg/Log"),
+        (PUB, "/a", "/parameter_events", EVENT),
+        (SUB, "/a", "/parameter_events", EVENT),
+        (SUB, "/a", "/clock", "rosgraph_msgs/msg/Clock"),
+        (PUB, "/ns/a", "/ns/a/transition_event", TRANSITION),
+        (SUB, "/b", "/ns/a/transition_event", TRANSITION),
         (SERVER, "/ns/a", "/ns/a/get_parameters", GET_PARAMETERS),
         (SERVER, "/ns/a", "/ns/a/get_configuration", TRIGGER),
         (SERVER, "/ns/a", "/ns/a/map_to", SET_PARAMETERS),
@@ -108,7 +110,11 @@ def test_an_endpoint_of_a_client_library_is_noise(
         (SUB, "/a", "/rosout", STRING),  # a log viewer: somebody wrote that on purpose
         (PUB, "/a", "/clock", STRING),  # a simulator's main output
         (SERVER, "/a", "/b/get_parameters", GET_PARAMETERS),  # offered under another node's name
-        (PUB, "/a", "/b/transition_event", STRING),
+        (PUB, "/a", "/b/transition_event", TRANSITION),
+        (PUB, "/a", "/a/transition_event", STRING),  # only the names are the library's
+        (SUB, "/b", "/a/transition_event", STRING),
+        (PUB, "/a", "/rosout", STRING),
+        (SUB, "/a", "/clock", STRING),
         (PUB, "/a", "/reset/_service_event", STRING),
         (SUB, "/a", "/reset/_service_event", "std_srvs/srv/Trigger_Event"),
         (PUB, "", "/lifecycle/graph", STRING),  # the first sign of a node that nobody knows
@@ -211,11 +217,18 @@ def test_parts_of_two_nodes_do_not_make_one_action():
     assert sorted(fold_actions(mixed), key=str) == sorted(mixed, key=str)
 
 
-def test_an_action_that_the_observer_already_folded_swallows_its_parts():
+def test_parts_of_another_type_stay_beside_their_action():
+    some = parts()
+    wrong = [dataclasses.replace(each, type="std_msgs/msg/String") for each in some[-2:]]
+    action, *left = fold_actions([*some[:-2], *wrong])
+    assert (action.type, left) == ("robot/action/Dock", wrong)
+
+
+def test_a_second_server_of_an_action_is_another_end():
     folded = ObservedEndpoint(
         kind=ACTION_SERVER, node="/base", name="/dock", type="robot/action/Dock"
     )
-    assert fold_actions([folded, *parts()]) == (folded,)
+    assert fold_actions([folded, *parts()]) == (folded, folded)
 
 
 @pytest.mark.parametrize(
@@ -301,7 +314,7 @@ def test_who_offers_a_declared_name_or_a_declared_nodes_own_feeds_the_system(
 def test_what_feeds_the_system_is_left_in_although_it_looks_like_a_client_library() -> None:
     def event(node: str) -> ObservedEndpoint:
         return ObservedEndpoint(
-            kind=PUB, node=node, name=f"{node}/transition_event", type="lifecycle_msgs/msg/Any"
+            kind=PUB, node=node, name=f"{node}/transition_event", type=TRANSITION
         )
 
     found = [event("/one"), event("/three"), server("/one/get_parameters", GET_PARAMETERS, "/one")]
@@ -334,7 +347,7 @@ def test_an_action_of_no_node_keeps_the_gid_and_the_address_of_its_first_part() 
 
     nameless, named = fold_actions([*at_some_place(""), *at_some_place("/base")])
     assert (nameless.gid, nameless.address) == ("00", "10.0.0.0")
-    assert (named.gid, named.address) == ("", "10.0.0.0")
+    assert (named.gid, named.address) == ("00", "10.0.0.0")
 
 
 def test_several_actions_are_folded_each_by_itself() -> None:
@@ -342,7 +355,7 @@ def test_several_actions_are_folded_each_by_itself() -> None:
     folded = dataclasses.replace(
         parts()[0], kind=ACTION_SERVER, name="/dock", type="robot/action/Dock"
     )
-    assert fold_actions([folded, *parts(), *lift]) == (
+    assert fold_actions([*parts(), *lift]) == (
         folded,
         dataclasses.replace(folded, name="/lift"),
     )

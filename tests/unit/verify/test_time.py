@@ -1,0 +1,74 @@
+"""Who gives the nodes with `use_sim_time` their time."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from lifecycle.manifest import EndpointKind
+from lifecycle.plan import Plan
+from lifecycle.plan.model import ExpectedParameter
+from lifecycle.verify import Observation, Stage, verify
+from lifecycle.verify.tool_filter import CLOCK
+from tests.builders import at, endpoint, node, planned, publisher
+from tests.unit.verify.edits import Edit, add_endpoint, add_node, both, change_endpoint
+from tests.unit.verify.perfect import perfect
+
+PUB = EndpointKind.PUBLISHER
+
+
+def simulated(plan: Plan) -> Plan:
+    given = ExpectedParameter(name="use_sim_time", type="bool", value=True, optional=True, at=at(3))
+    first, *rest = plan.nodes
+    user = dataclasses.replace(first, expected_parameters=(given,))
+    return dataclasses.replace(plan, nodes=(user, *rest))
+
+
+ALONE = planned(node("user", publisher("a")))
+WITH_SIMULATOR = planned(
+    node("user", publisher("a")), node("simulator", endpoint(PUB, CLOCK[0], CLOCK[1], None))
+)
+
+
+def plays(name: str = "/rosbag2_player", **fields: object) -> Edit:
+    return both(add_node(name), add_endpoint(PUB, name, CLOCK[0], type=CLOCK[1], **fields))
+
+
+def unchanged(seen: Observation) -> Observation:
+    return seen
+
+
+@pytest.mark.parametrize(
+    ("plan", "edit", "stage", "expected"),
+    [
+        (ALONE, unchanged, Stage.CONNECTED, ["time.no-clock"]),
+        (ALONE, plays(gid="1"), Stage.CONNECTED, ["time.undeclared-clock"]),
+        (
+            ALONE,
+            both(plays(gid="1"), plays("/rqt_clock", gid="2")),
+            Stage.ACTIVE,
+            ["time.several-clocks"],
+        ),
+        (WITH_SIMULATOR, unchanged, Stage.ACTIVE, []),
+        (WITH_SIMULATOR, plays(gid="1"), Stage.ACTIVE, ["time.several-clocks"]),
+        (WITH_SIMULATOR, change_endpoint(PUB, CLOCK[0], silent=True), Stage.CONNECTED, []),
+        (
+            WITH_SIMULATOR,
+            change_endpoint(PUB, CLOCK[0], silent=True),
+            Stage.ACTIVE,
+            ["time.silent-clock"],
+        ),
+    ],
+)
+def test_who_publishes_the_clock_is_judged(
+    plan: Plan, edit: Edit, stage: Stage, expected: list[str]
+) -> None:
+    plan = simulated(plan)
+    found = verify(plan, edit(perfect(plan, stage)), stage=stage).findings
+    assert [each.rule for each in found if each.rule.startswith("time.")] == expected
+
+
+def test_without_simulated_time_it_does_not_matter_who_publishes_it() -> None:
+    verdict = verify(ALONE, plays(gid="1")(perfect(ALONE)), stage=Stage.CONNECTED)
+    assert verdict.findings == ()
