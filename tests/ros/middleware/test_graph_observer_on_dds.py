@@ -15,9 +15,11 @@ import pytest
 import rclpy
 from managed_node import ManagedNode
 from rcl_interfaces.srv import SetParameters
+from rclpy.action import ActionServer
 from rclpy.node import Node
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
+from test_msgs.action import Fibonacci
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.model import EndpointKind
@@ -285,14 +287,10 @@ def test_of_a_node_that_leaves_the_services_of_the_node_interface_stay_its_own(
 def test_the_parts_of_an_action_server_show_as_one_endpoint(
     observer: GraphObserver, make_node: MakeNode, wait_until: WaitUntil
 ) -> None:
-    # No action package can be presumed: the parts are what rcl_action makes, under other types.
-    node = make_node("dock")
-    for part in ("send_goal", "cancel_goal", "get_result"):
-        node.create_service(Trigger, f"/dock/go/_action/{part}", lambda _, response: response)
-    for part in ("feedback", "status"):
-        node.create_publisher(String, f"/dock/go/_action/{part}", 10)
-    expected = (EndpointKind.ACTION_SERVER, "/dock", "/dock/go", "std_srvs/srv/Trigger")
+    server = ActionServer(make_node("dock"), Fibonacci, "~/go", lambda _: Fibonacci.Result())
+    expected = (EndpointKind.ACTION_SERVER, "/dock", "/dock/go", "test_msgs/action/Fibonacci")
     wait_until(lambda: endpoints(observer) == [expected])
+    server.destroy()
 
 
 def test_nodes_named_as_a_tool_are_shown_and_the_observer_itself_is_not(
