@@ -56,6 +56,7 @@ from lifecycle.middleware.fastdds.url_check import OpenSocket
 from lifecycle.middleware.process.process_table import programs_of
 from lifecycle.middleware.rcl.graph_changes import GraphGuard, on_graph_change
 from lifecycle.middleware.rcl.graph_queries import (
+    RAW,
     EndpointInfo,
     endpoints_of,
     endpoints_of_node,
@@ -894,7 +895,7 @@ def _topic_endpoint(
     only what has the names of ROS concerns a system of ROS.
     """
     node = known_node(info.node)
-    if not topic.startswith("/"):
+    if topic.startswith(RAW):
         if not node:
             return None
         package, _, base = info.type.replace("::dds_::", "::").replace("::", "/").rpartition("/")

@@ -156,18 +156,25 @@ def node_names(node: Node) -> list[str]:
 def topic_endpoints(node: Node) -> Iterator[tuple[EndpointKind, str, EndpointInfo]]:
     """Yield kind, topic and endpoint of all publishers and subscriptions that `node` sees.
 
-    A topic that is no ROS name, of a node that avoids the naming conventions of ROS, has the name
-    and the type that DDS has; it does not begin with a slash. Services are left out.
+    A topic of a node that avoids the naming conventions of ROS has the type that DDS has, and its
+    name there behind `dds:`: `dds:/chatter` is not `/chatter`. Services are left out.
     """
-    for name in _topics(node):
+    names = _topics(node)
+    mangled = any(name.startswith(_OF_TOPICS) for name in names)  # not by RMWs without DDS
+    for name in names:
         if name.startswith(_OF_SERVICES) or name == _DISCOVERY_INFO:
             continue
-        topic = name.removeprefix(b"rt") if name.startswith(b"rt/") else name
+        ros = name.startswith(_OF_TOPICS) or not mangled
+        topic = name.removeprefix(b"rt") if mangled and ros else name
+        shown = _text(topic) if ros else f"{RAW}{_text(name)}"
         for kind in (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION):
-            for info in _endpoints(node, kind, topic, no_mangle=not topic.startswith(b"/")):
-                yield kind, _text(topic), info
+            for info in _endpoints(node, kind, topic, no_mangle=not ros):
+                yield kind, shown, info
 
 
+RAW = "dds:"
+"""What names of topics begin with here that are no names of ROS."""
+_OF_TOPICS = b"rt/"
 _OF_SERVICES = b"rq/", b"rr/"
 _DISCOVERY_INFO = b"ros_discovery_info"
 """How DDS names what RMWs add to topics, `rt/chatter` (rmw_dds_common)."""

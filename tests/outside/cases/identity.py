@@ -53,6 +53,34 @@ CLOCK = """\
     interface: {publishers: [{name: /clock, type: rosgraph_msgs/msg/Clock}]}
 """
 
+FOREIGN = """\
+manifest_version: 1
+system: foreign
+discovery: {range: localhost}
+nodes:
+  one:
+    run: {command: [python3, raw.py]}
+    managed: false
+    interface: {publishers: [{name: /chatter, type: std_msgs/msg/String}]}
+"""
+
+RAW = """
+import rclpy
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from std_msgs.msg import String
+
+rclpy.init()
+node = Node("one")
+node.create_publisher(String, "/chatter", 1)
+node.create_publisher(String, "/other", QoSProfile(depth=1, avoid_ros_namespace_conventions=True))
+try:
+    rclpy.spin(node)
+except BaseException:
+    node.destroy_node()
+    rclpy.try_shutdown()
+"""
+
 OWN_FLOW = "    flows: {publishers: {chatter: {unique: strictly_required}}}"
 
 ONE = """\
@@ -72,7 +100,6 @@ from lifecycle import LifecycleNode, on_timer
 from nodes import Marked, Server, mark
 from rclpy.action import ActionServer
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -134,14 +161,6 @@ class Noisy(Node):
 
 class Logs(Noisy):
     topic = "/rosout"
-
-
-class Raw(Node):
-    def __init__(self):
-        super().__init__("one")
-        self.create_publisher(
-            String, "chatter", QoSProfile(depth=1, avoid_ros_namespace_conventions=True)
-        )
 
 
 class Plain(Node):
@@ -271,7 +290,17 @@ CASES = (
         "graph.undeclared-publisher",
     ),
     _node("a node publishes strings on /rosout", "Logs", "", "graph.undeclared-publisher"),
-    _node("a node publishes on a topic of DDS", "Raw", "", "graph.undeclared-publisher"),
+    Case(
+        attack="another program's node publishes on a topic of DDS without the prefix of ROS",
+        manifest=FOREIGN,
+        files={"raw.py": RAW},
+        verb=REFUSED,
+        exit_code=4,
+        verdict=VIOLATED,
+        findings=("graph.undeclared-publisher",),
+        says=("dds:",),
+        before="ok: it was seen by nobody",
+    ),
     Case(
         attack="a plain node has only what rclpy gives it",
         manifest=ONE % ("Plain", ""),
