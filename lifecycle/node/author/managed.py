@@ -347,6 +347,12 @@ class Managed:
             self._let_through = False
             if self.state is NodeState.INACTIVE_CONNECTED:
                 return SUCCESS
+        if (
+            self._supervisor
+            and known is TransitionRequest.ACTIVATE
+            and self.state is not NodeState.ACTIVE
+        ):
+            self._let_through = False  # an earlier permit does not outlast one that fails
         result = await self._controller.change(known)
         if known is TransitionRequest.ACTIVATE and result.outcome is CallbackOutcome.SUCCESS:
             self._let_through = True

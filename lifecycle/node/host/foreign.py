@@ -15,6 +15,7 @@ from __future__ import annotations
 import collections
 import contextlib
 import inspect
+import time
 import traceback
 import types
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -484,15 +485,38 @@ class ForeignNode:
             RefusedError: not possible in its state.
         """
         if operation == "activate":
-            self._release()
-        elif operation == "deactivate":
-            result = self._transition(operation)
-            self._hold()
+            return self._activate_for_supervisor()
+        try:
+            return self._transition(operation)
+        finally:
+            if operation == "deactivate":
+                self._hold()
+
+    def _activate_for_supervisor(self) -> Result:
+        """Activate it, let through by the gate; what does not succeed leaves the gate closed."""
+        if self.reported.label == "active" and self._let_through and self._machine is not None:
+            return self._transition("activate")  # refused, and it stays as it is
+        succeeded = False
+        self._release()  # its on_activate may publish
+        limit_s = self._spec.timeouts.activate_s
+        began_s = time.monotonic()
+        try:
+            result = self._transition("activate")
+            took_s = time.monotonic() - began_s
+            if result.outcome is CallbackOutcome.SUCCESS and took_s >= limit_s:
+                # Nobody waits for it any more.
+                self._transition("deactivate")
+                why = (
+                    f"cannot accept {self.full_name}: on_activate blocked for {took_s:.1f} s, its "
+                    f"deadline is {limit_s:g} s"
+                )
+                self.complain(why)
+                return Result(outcome=CallbackOutcome.ERROR, error=why)
+            succeeded = result.outcome is CallbackOutcome.SUCCESS
             return result
-        result = self._transition(operation)
-        if operation == "activate" and result.outcome is not CallbackOutcome.SUCCESS:
-            self._hold()
-        return result
+        finally:
+            if not succeeded:
+                self._hold()
 
     async def bring_up(self) -> Result:
         """Configure and activate without a supervisor; stops at what does not succeed."""
