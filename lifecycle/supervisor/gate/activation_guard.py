@@ -25,6 +25,13 @@ from lifecycle.verify import ACTIVATED_AT_CLOSED_GATE, Finding, Observation, Out
 TRIES = 5
 """A node that is activated again and again is not deactivated for ever: its finding stays."""
 
+BY_ITSELF = "was activated by its own code or another client while the gate is closed"
+
+TO_DO = (
+    "leave its activation to the supervisor: remove trigger_activate or change_state from its code, "
+    "and end the client that asks for it"
+)
+
 
 class ActivationGuard:
     """Watches over the managed nodes that were brought up, and not asked to activate."""
@@ -32,30 +39,42 @@ class ActivationGuard:
     def __init__(self, system: System) -> None:
         self._system = system
         self._tries: dict[str, int] = {}
+        self._given_up: set[str] = set()
         self._deactivating: dict[str, asyncio.Task[None]] = {}
 
     def look(self, observation: Observation) -> None:
         """Deactivate at once what is active without the gate having let it through."""
         states = {each.full_name: each.state for each in observation.nodes}
+        self._given_up &= {name for name, state in states.items() if state == ACTIVE}
         for node in self._system.nodes.values():
-            if node.planned.managed and Operation.ACTIVATE in node.undo:
+            if node.planned.managed and node.is_let_through:
                 self._tries.pop(node.name, None)
+                self._given_up.discard(node.name)
             elif states.get(node.name) == ACTIVE and _is_held(node):
                 self._deactivate(node)
 
+    @property
+    def has_given_up(self) -> bool:
+        """Whether a node was activated again more often than it is deactivated."""
+        return bool(self._given_up)
+
     def findings(self) -> tuple[Finding, ...]:
-        """Return a finding for each node whose deactivation is not over."""
+        """Return a finding for each node whose deactivation is not over, or is given up."""
         return tuple(
             ACTIVATED_AT_CLOSED_GATE.on_node(
                 Outcome.VIOLATED,
                 node.planned,
                 expected="inactive",
-                observed="activated by another client",
-                message=f"cannot accept node {node.name}: another client activated it while the "
-                "gate is closed; it is being deactivated",
+                observed="activated by its own code or another client",
+                message=f"cannot accept node {node.name}: it {BY_ITSELF}; "
+                + (
+                    f"it was deactivated {TRIES} times; {TO_DO}"
+                    if node.name in self._given_up
+                    else "it is being deactivated"
+                ),
             )
             for node in self._system.nodes.values()
-            if node.name in self._deactivating
+            if node.name in self._deactivating or node.name in self._given_up
         )
 
     async def follow(self, observer: ObservationSource, changes: ChangeSource) -> None:
@@ -74,10 +93,13 @@ class ActivationGuard:
 
     def _deactivate(self, node: NodeRun) -> None:
         tries = self._tries.get(node.name, 0)
-        if node.name in self._deactivating or tries >= TRIES:
+        if node.name in self._deactivating:
+            return
+        if tries >= TRIES:
+            self._given_up.add(node.name)
             return
         self._tries[node.name] = tries + 1
-        text = f"{node.name!r} was activated by another client while the gate is closed: "
+        text = f"{node.name!r} {BY_ITSELF}: "
         if tries + 1 < TRIES:
             text += "it is deactivated"
         else:

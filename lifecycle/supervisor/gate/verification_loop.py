@@ -538,7 +538,7 @@ class VerificationLoop:
             if unchanged_s is not None:
                 patience = unchanged_s if patience is None else min(patience, unchanged_s)
             until = deadline if patience is None else min(deadline, since + patience)
-            if now >= until:
+            if now >= until or (self._guard is not None and self._guard.has_given_up):
                 return verdict
             wait_s = until - now
             if self.asks_again(verdict):

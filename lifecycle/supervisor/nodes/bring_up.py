@@ -21,8 +21,15 @@ from lifecycle.manifest import Condition, RosArguments, RunKind, TargetState
 from lifecycle.node import HostSpec, Operation
 from lifecycle.plan import DEFAULT, GIVEN, PlannedNode
 from lifecycle.supervisor.control.protocol import ProcessState, Reach
+from lifecycle.supervisor.gate.activation_guard import BY_ITSELF, TO_DO, TRIES
 from lifecycle.supervisor.gate.gate import Permit
-from lifecycle.supervisor.nodes.driver import ACTIVE, ControlDriver, NodeCondition, NodeDriver
+from lifecycle.supervisor.nodes.driver import (
+    ACTIVE,
+    ActiveError,
+    ControlDriver,
+    NodeCondition,
+    NodeDriver,
+)
 from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.processes.control_channel import (
     ChannelClosedError,
@@ -570,13 +577,17 @@ class BringUp:
         }[operation]
         await self._may_begin()
         node.doing = _ING[operation]
+        node.permit = permit
         # Noted before it is sent: a request without an answer may have been carried out.
         if operation is not Operation.DEACTIVATE:
             node.undo.append(operation)
         try:
-            standing = await self._step(
-                node, node.perform(operation, permit), limit_s, rule=TRANSITION_FAILED
+            doing = (
+                self._configure(node)
+                if operation is Operation.CONFIGURE
+                else node.perform(operation, permit)
             )
+            standing = await self._step(node, doing, limit_s, rule=TRANSITION_FAILED)
         except StepFailedError:
             if permit is not None and node.name not in permit.sent:
                 permit.expire()  # it was not the node that took so long
@@ -585,6 +596,25 @@ class BringUp:
         if standing.already and node.process is None and operation in _TO_UNDO:
             node.undo.remove(operation)
         node.advance(reach, standing)
+
+    async def _configure(self, node: NodeRun) -> NodeCondition:
+        """Configure a node; one that this run started and that is active is deactivated first.
+
+        Nobody but its own code has had it activate, so nothing depends on that; one that others
+        started may be at work.
+        """
+        for _ in range(TRIES):
+            try:
+                return await node.perform(Operation.CONFIGURE)
+            except ActiveError:
+                if node.planned.run.kind is RunKind.ATTACH:
+                    raise
+            self._system.emit(Notice(message=f"{node.name!r} {BY_ITSELF}: it is deactivated"))
+            await node.perform(Operation.DEACTIVATE)
+        raise BringUpError(
+            f"cannot configure {node.name!r}: it was activated again each of the {TRIES} times "
+            f"that it was deactivated; {TO_DO}"
+        )
 
     async def _start(self, node: NodeRun) -> None:
         """Have the node's process started, or find a node that others start."""

@@ -49,6 +49,10 @@ class NodeCondition:
     already: bool = False
 
 
+class ActiveError(BringUpError):
+    """A node is active before it was verified, so that it cannot be configured."""
+
+
 class NodeDriver(Protocol):
     """Drives one managed node. Deadlines are the caller's: every call may be cancelled."""
 
@@ -227,16 +231,14 @@ class ServiceDriver:
                 raise BringUpError(f"cannot {operation.value} {self._node!r}: it refused")
             return _standing(state, already=not asked)
         wanted = _REACHED[operation]
+        if state == wanted and operation is Operation.ACTIVATE and permit is not None:
+            await permit.use(self._node)
+            # The gate may have had it deactivated meanwhile.
+            state = await self._state(limit_s)
         if state == wanted:
-            if operation is Operation.ACTIVATE and permit is not None:
-                await permit.use(self._node)
             return _standing(state, already=True)
         if operation is Operation.CONFIGURE and state == ACTIVE:
-            raise BringUpError(
-                f"cannot configure {self._node!r}: it is active already, and nobody verified it; "
-                f"have it adopted as it is with 'lifecycle up --adopt', or deactivate it first: "
-                f"ros2 lifecycle set {self._node} deactivate"
-            )
+            raise self._active()
         if operation is Operation.ACTIVATE:
             if permit is None:
                 raise BringUpError(f"cannot activate {self._node!r} without a permit from the gate")
@@ -249,10 +251,19 @@ class ServiceDriver:
         else:
             accepted = await self._change(operation, limit_s)
         state = await self._state(limit_s)
+        if operation is Operation.CONFIGURE and state == ACTIVE:
+            raise self._active()  # meanwhile
         if state != wanted:
             reason = "it stayed" if accepted else "it refused and is"
             raise BringUpError(f"cannot {operation.value} {self._node!r}: {reason} {state}")
         return _standing(state)
+
+    def _active(self) -> ActiveError:
+        return ActiveError(
+            f"cannot configure {self._node!r}: it is active already, and nobody verified it; "
+            f"have it adopted as it is with 'lifecycle up --adopt', or deactivate it first: "
+            f"ros2 lifecycle set {self._node} deactivate"
+        )
 
     async def _change(self, operation: Operation, limit_s: float) -> bool:
         return await self._services.change_state(self._node, operation.value, timeout_s=limit_s)

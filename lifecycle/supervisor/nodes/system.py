@@ -310,6 +310,7 @@ class NodeRun:
         reach: how far it is brought up.
         doing: what it does or waits for at this moment, for messages; empty when nothing.
         undo: what has to be undone, oldest first.
+        permit: the gate's, of the activate that is in `undo`; None for what needed none.
         stuck: an operation on it was given up: a polite request would wait behind it.
         connections: names of what the authority connected it to, oldest first.
         found: state in which it was adopted, `running` for one that is not managed; empty for one
@@ -334,6 +335,7 @@ class NodeRun:
         self.configuration: NodeConfiguration | None = None
         self.doing = ""
         self.undo: list[Operation] = []
+        self.permit: Permit | None = None
         self.stuck = False
         self.connections: tuple[str, ...] = ()
         self.found = ""
@@ -353,6 +355,7 @@ class NodeRun:
         self.process = process
         self.configuration = None
         self.undo = []
+        self.permit = None
         self.stuck = False
         self.connections = ()
         self.reports_changes = False
@@ -363,6 +366,12 @@ class NodeRun:
         self.connected = False
         self.state = ""
         self.advance(Reach.WAITING)
+
+    @property
+    def is_let_through(self) -> bool:
+        """Whether it was asked to activate: waiting for its turn is not enough."""
+        asked = self.permit is None or self.name in self.permit.sent
+        return Operation.ACTIVATE in self.undo and asked
 
     @property
     def name(self) -> str:

@@ -31,7 +31,7 @@ STATE_UNVERIFIABLE = Rule(
 )
 ACTIVATED_AT_CLOSED_GATE = Rule(
     id="state.activated-at-closed-gate",
-    meaning="another client activated a managed node while the gate is closed",
+    meaning="a managed node was activated by its own code or another client at a closed gate",
     outcomes=(Outcome.VIOLATED,),
     fix="find out who drives the node beside the supervisor, and let the gate activate it",
     about=About.PROGRESS,

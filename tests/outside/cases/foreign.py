@@ -1,0 +1,127 @@
+"""Nodes that are not in our hosts: they drive themselves, hang, change, and say what is untrue."""
+
+from __future__ import annotations
+
+from tests.outside.case import OK, Case
+
+EAGER = {
+    "eager.py": '''\
+"""A managed node of rclpy's that activates itself."""
+
+import os
+import time
+from pathlib import Path
+
+import rclpy
+from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
+
+
+class Eager(LifecycleNode):
+    def __init__(self):
+        super().__init__("base")
+        self.delay_s = float(os.environ["DELAY"])
+        self.after = os.environ["AFTER"]
+        self.left = int(os.environ["TIMES"])
+        if self.after == "start":
+            self.soon(self.up)
+
+    def soon(self, what):
+        def once():
+            self.destroy_timer(timer)
+            what()
+
+        timer = self.create_timer(self.delay_s, once)
+
+    def up(self):
+        try:
+            self.trigger_configure()
+        except Exception as error:
+            print("not configured:", error, flush=True)
+        self.act()
+
+    def act(self):
+        if self.left:
+            self.left -= 1
+            try:
+                self.trigger_activate()
+            except Exception as error:
+                print("not activated:", error, flush=True)
+
+    def mark(self, what):
+        with Path(os.environ["OUTSIDE"], "marks").open("a") as file:
+            file.write(f"{time.time():.3f} base {what}\n")
+
+    def on_configure(self, state):
+        if self.after == "configure":
+            self.soon(self.act)
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_activate(self, state):
+        self.mark("activated")
+        return super().on_activate(state)
+
+    def on_deactivate(self, state):
+        self.mark("deactivated")
+        if self.left:
+            self.soon(self.act)
+        return super().on_deactivate(state)
+
+
+rclpy.init()
+try:
+    rclpy.spin(Eager())
+except (KeyboardInterrupt, rclpy.executors.ExternalShutdownException):
+    pass
+'''
+}
+
+
+def eager(delay_s: float, *, after: str, times: int = 1) -> str:
+    """A node that activates itself so long after its start, or its configure, so many times."""
+    return f"""\
+manifest_version: 1
+system: eager
+discovery: {{range: localhost}}
+policy: {{unpublished: ignore}}
+nodes:
+  base:
+    run:
+      command: [python3, eager.py]
+      environment: {{DELAY: "{delay_s}", AFTER: {after}, TIMES: "{times}"}}
+    managed: true
+  listener:
+    run: {{python: "nodes:Listener"}}
+    interface: {{subscriptions: [{{name: chatter, type: std_msgs/msg/String}}]}}
+"""
+
+
+CASES = (
+    *(
+        Case(
+            attack=f"a managed node activates itself {delay_s:g} s after its {after}",
+            manifest=eager(delay_s, after=after),
+            verb=("up", "--strict", "--stop-after", "1"),
+            verdict=OK,
+            activated=frozenset({"base", "listener"}),
+            before=before,
+            quick=(delay_s, after) == (0.01, "start"),
+        )
+        for after, delay_s, before in (
+            ("start", 0.01, "exit code 6, with the advice to use --adopt"),
+            ("start", 0.1, "exit code 6 or 0"),
+            ("start", 0.5, "exit code 0"),
+            ("configure", 0.03, "exit code 0"),
+            ("configure", 0.2, "exit code 0"),
+        )
+    ),
+    Case(
+        attack="a managed node activates itself each time that it is deactivated",
+        manifest=eager(0.01, after="start", times=1000),
+        verb=("up", "--strict", "--stop-after", "1"),
+        exit_code=(4, 6),
+        not_says=("--adopt",),
+        says=("remove trigger_activate or change_state from its code",),
+        within_s=15.0,
+        before="exit code 6, with the advice to use --adopt",
+    ),
+)
