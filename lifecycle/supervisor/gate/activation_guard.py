@@ -28,8 +28,8 @@ TRIES = 5
 BY_ITSELF = "was activated by its own code or another client while the gate is closed"
 
 TO_DO = (
-    "leave its activation to the supervisor: remove trigger_activate or change_state from its code, "
-    "and end the client that asks for it"
+    "leave its activation to the supervisor: remove trigger_activate or change_state from its "
+    "code, and end the client that asks for it"
 )
 
 
