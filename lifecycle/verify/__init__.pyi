@@ -42,6 +42,7 @@ from .rules.nodes import UNDECLARED_NODE as UNDECLARED_NODE
 from .rules.run import DEADLINE as DEADLINE
 from .rules.run import DEADLOCKED_OBSERVER as DEADLOCKED_OBSERVER
 from .rules.run import GAVE_UP as GAVE_UP
+from .rules.run import NOT_ANSWERING as NOT_ANSWERING
 from .rules.run import NOT_PROGRAMMED as NOT_PROGRAMMED
 from .rules.run import NOT_WIRED as NOT_WIRED
 from .rules.run import PLAN_UNKNOWN as PLAN_UNKNOWN

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from lifecycle_msgs.msg import TransitionEvent
 from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
 from rcl_interfaces.msg import Parameter, ParameterEvent, ParameterType, ParameterValue
-from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically
 from rclpy.clock import Clock, ClockType
 from rclpy.parameter import Parameter as RclpyParameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_profile_parameter_events
@@ -361,6 +361,27 @@ class NodeClients:
             raise MiddlewareError(
                 f"cannot set {names} of {node!r} while it runs: it says {answer.result.reason!r}"
             )
+
+    async def answers(self, node: str, *, managed: bool, timeout_s: float) -> bool | None:
+        """Return whether a node answers one small request; None where it serves nothing to ask.
+
+        Args:
+            node: fully qualified name.
+            managed: it has a state, which is asked for; else it is asked for no parameter.
+            timeout_s: seconds, > 0.
+        """
+        service, type_, request = (
+            (f"{node}/get_state", GetState, GetState.Request())
+            if managed
+            else (f"{node}/get_parameters", GetParameters, GetParameters.Request())
+        )
+        if not self._observer.offers(node, service):
+            return None
+        try:
+            await self._calls.call(service, type_, request, timeout_s=timeout_s, repeat=False)
+        except ServiceUnansweredError as error:
+            return False if error.found else None
+        return True
 
     async def report_parameters(
         self, node: str, names: Collection[str] | None, *, timeout_s: float = TIMEOUT_S

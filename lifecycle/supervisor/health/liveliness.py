@@ -25,6 +25,7 @@ from lifecycle.supervisor.run.events import (
 )
 from lifecycle.verify import (
     DEADLOCKED_OBSERVER,
+    NOT_ANSWERING,
     SILENT_NODE,
     Finding,
     Observation,
@@ -77,6 +78,7 @@ class SilenceMonitor:
         self._is_there = is_there
         self._listeners = [changed]
         self._silent: dict[str, _Silence] = {}
+        self._unanswering: dict[str, str] = {}
         self._observer_is_deadlocked = ""
 
     @property
@@ -137,10 +139,25 @@ class SilenceMonitor:
         if news:
             self._tell()
 
+    def unanswered(self, node: str, after_s: float) -> None:
+        """Note that a node that is in no host of ours has answered no request for so long."""
+        if node not in self._unanswering:
+            detail = f"it has answered no request for {after_s:g} s: it hangs, or nobody spins it"
+            self._unanswering[node] = detail
+            self._emit(Notice(message=_message(node, detail)))
+            self._tell()
+
+    def answered(self, node: str) -> None:
+        """Note that it answers, or is not asked any more."""
+        if self._unanswering.pop(node, None) is not None:
+            self._emit(Notice(message=f"{node!r} answers again"))
+            self._tell()
+
     def forget(self, nodes: Iterable[str]) -> None:
         """Drop what is known of nodes whose process ended."""
         for name in nodes:
             self._silent.pop(name, None)
+            self._unanswering.pop(name, None)
 
     def watch_over(
         self, process: ManagedProcess, nodes: Iterable[str]
@@ -188,16 +205,31 @@ class SilenceMonitor:
 
     def findings(self) -> tuple[Finding, ...]:
         """Return one finding for each silent node, and one if we receive nothing ourselves."""
-        return self._of_the_observer() + tuple(
-            SILENT_NODE.finding(
-                Outcome.VIOLATED,
-                subject=name,
-                expected="alive",
-                observed=", ".join(cause.value for cause in silence.causes),
-                message=_message(name, _why(silence)),
-                node=name,
+        return (
+            self._of_the_observer()
+            + tuple(
+                SILENT_NODE.finding(
+                    Outcome.VIOLATED,
+                    subject=name,
+                    expected="alive",
+                    observed=", ".join(cause.value for cause in silence.causes),
+                    message=_message(name, _why(silence)),
+                    node=name,
+                )
+                for name, silence in sorted(self._silent.items())
             )
-            for name, silence in sorted(self._silent.items())
+            + tuple(
+                NOT_ANSWERING.finding(
+                    Outcome.UNVERIFIABLE,
+                    subject=name,
+                    expected="alive",
+                    observed="no answer",
+                    message=_message(name, why),
+                    node=name,
+                )
+                for name, why in sorted(self._unanswering.items())
+                if name not in self._silent
+            )
         )
 
     def _of_the_observer(self) -> tuple[Finding, ...]:

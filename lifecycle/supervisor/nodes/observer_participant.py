@@ -111,6 +111,12 @@ class ObserverParticipant:
         """Return the driver of a managed node that is not hosted by us."""
         return ServiceDriver(self._graph.clients, node)
 
+    async def answers(self, node: PlannedNode, *, timeout_s: float) -> bool | None:
+        """Return whether a node answers a request, within seconds; None: it serves nothing."""
+        return await self._graph.clients.answers(
+            node.full_name, managed=node.managed, timeout_s=timeout_s
+        )
+
     def node_interface(self, node: str) -> NodeInterfaceClient:
         """Return what drives the node interface of any node that has one, by full name."""
         return NodeInterfaceClient(self._graph.clients, node)

@@ -41,6 +41,7 @@ from lifecycle.supervisor.gate.sequence import GateSequence
 from lifecycle.supervisor.gate.verification_loop import ChangeCounter, Recorder, VerificationLoop
 from lifecycle.supervisor.health import agreement, peer_supervisors
 from lifecycle.supervisor.health.agreement import Agreement
+from lifecycle.supervisor.health.answering import Answering, Asking
 from lifecycle.supervisor.health.peer_supervisors import PeerSupervisors
 from lifecycle.supervisor.health.process_monitor import (
     ParticipantRegistry,
@@ -162,6 +163,7 @@ class SessionParticipant(
     ServiceNames,
     Offering,
     Census,
+    Asking,
     Protocol,
 ):
     """What a session needs of its participant in the graph, see nodes/observer_participant.py.
@@ -421,11 +423,14 @@ class Session:
             asyncio.ensure_future(self._interfaces.follow()),
             asyncio.ensure_future(watch_reception(self._system)),
         )
+        answering = Answering(self._system, self._observer_participant)
+        asking = asyncio.ensure_future(answering.follow())
         try:
             with self._signals():
                 try:
                     result = await self._until_over()
                 finally:
+                    await ended(asking)
                     deaths = await self._take_down()
                 if deaths:
                     result = _died_on_the_way_down(result, deaths)

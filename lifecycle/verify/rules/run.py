@@ -67,6 +67,14 @@ SILENT_NODE = Rule(
     heals=Heals.WITH_TIME,
     about=About.PRESENCE,
 )
+NOT_ANSWERING = Rule(
+    id="run.not-answering",
+    meaning="a node that is in no host of ours answers no request",
+    outcomes=(Outcome.UNVERIFIABLE,),
+    fix="look at what its callbacks wait for, and whether its process was stopped",
+    heals=Heals.WITH_TIME,
+    about=About.PRESENCE,
+)
 DEADLOCKED_OBSERVER = Rule(
     id="run.deadlocked-observer",
     meaning="the supervisor receives nothing from the graph any more",
@@ -95,6 +103,7 @@ RULES = (
     NOT_PROGRAMMED,
     NOT_WIRED,
     SILENT_NODE,
+    NOT_ANSWERING,
     DEADLOCKED_OBSERVER,
     PLANS_DIFFER,
     PLAN_UNKNOWN,

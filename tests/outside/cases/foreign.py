@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from tests.outside.case import OK, Case
+from tests.outside.running import Run
 
 EAGER = {
     "eager.py": '''\
@@ -49,7 +50,7 @@ class Eager(LifecycleNode):
 
     def mark(self, what):
         with Path(os.environ["OUTSIDE"], "marks").open("a") as file:
-            file.write(f"{time.time():.3f} base {what}\n")
+            file.write(f"{time.time():.3f} base {what}\\n")
 
     def on_configure(self, state):
         if self.after == "configure":
@@ -95,11 +96,82 @@ nodes:
 """
 
 
+HANGING = {
+    "hang.py": """\
+import os
+import time
+
+import rclpy
+from rclpy.lifecycle import LifecycleNode
+from rclpy.node import Node
+
+managed = os.environ.get("MANAGED") == "yes"
+base = LifecycleNode if managed else Node
+
+
+class Hang(base):
+    def __init__(self):
+        super().__init__("base", start_parameter_services=os.environ.get("SERVES") != "no")
+        self.began = time.monotonic()
+        self.timer = self.create_timer(0.2, self.work)
+
+    def work(self):
+        hang_s = float(os.environ["HANG"])
+        if hang_s and time.monotonic() - self.began > float(os.environ["BEGINS"]):
+            time.sleep(hang_s)
+            self.began = time.monotonic() + float(os.environ.get("PAUSE", "1000"))
+
+
+rclpy.init()
+try:
+    rclpy.spin(Hang())
+except (KeyboardInterrupt, rclpy.executors.ExternalShutdownException):
+    pass
+"""
+}
+
+
+def hanging(hang_s: float, *, managed: bool = False, serves: bool = True) -> str:
+    """A node of which one callback sleeps for so long, beginning 1.5 s after it was made."""
+    return f"""\
+manifest_version: 1
+system: hanging
+discovery: {{range: localhost}}
+policy: {{unpublished: ignore}}
+nodes:
+  base:
+    run:
+      command: [python3, hang.py]
+      environment:
+        HANG: "{hang_s:g}"
+        BEGINS: "1.5"
+        MANAGED: "{"yes" if managed else ""}"
+        SERVES: "{"" if serves else "no"}"
+    managed: {str(managed).lower()}
+  listener:
+    run: {{python: "nodes:Listener"}}
+    interface: {{subscriptions: [{{name: chatter, type: std_msgs/msg/String}}]}}
+"""
+
+
+def noticed(run: Run) -> None:
+    """Wait until the verdict names the node, no longer than 10 s from when it hangs."""
+    run.until_active()
+    run.until_says(r'"rule":"run\.not-answering"', timeout_s=12.0)
+
+
+def noticed_and_healed(run: Run) -> None:
+    """Wait for the finding, and for its end."""
+    noticed(run)
+    run.until_says(r"'/base' answers again", timeout_s=12.0)
+
+
 CASES = (
     *(
         Case(
             attack=f"a managed node activates itself {delay_s:g} s after its {after}",
             manifest=eager(delay_s, after=after),
+            files=EAGER,
             verb=("up", "--strict", "--stop-after", "1"),
             verdict=OK,
             activated=frozenset({"base", "listener"}),
@@ -117,11 +189,46 @@ CASES = (
     Case(
         attack="a managed node activates itself each time that it is deactivated",
         manifest=eager(0.01, after="start", times=1000),
+        files=EAGER,
         verb=("up", "--strict", "--stop-after", "1"),
         exit_code=(4, 6),
         not_says=("--adopt",),
         says=("remove trigger_activate or change_state from its code",),
         within_s=15.0,
         before="exit code 6, with the advice to use --adopt",
+    ),
+    *(
+        Case(
+            attack=f"a {'managed' if managed else 'plain'} node of a command hangs in a callback",
+            manifest=hanging(9.0, managed=managed),
+            files=HANGING,
+            verb=("up", "--strict", "--stop-after", "16"),
+            story=noticed_and_healed,
+            exit_code=(0, 4, 5),
+            before="ok, or noticed 16 s late",
+        )
+        for managed in (False, True)
+    ),
+    *(
+        Case(
+            attack=f"a {'managed' if managed else 'plain'} node of a command is busy for 2 s",
+            manifest=hanging(2.0, managed=managed),
+            files=HANGING,
+            verb=("up", "--strict", "--stop-after", "6"),
+            verdict=OK,
+            not_says=("run.not-answering",),
+            before="ok",
+        )
+        for managed in (False, True)
+    ),
+    Case(
+        attack="a plain node of a command serves no parameters",
+        manifest=hanging(0.0, serves=False),
+        files=HANGING,
+        verb=("up", "--strict", "--stop-after", "12"),
+        verdict=OK,
+        says=("'/base' serves no parameters: whether it hangs is not seen",),
+        not_says=("run.not-answering",),
+        before="ok",
     ),
 )
