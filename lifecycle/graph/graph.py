@@ -186,6 +186,10 @@ class Graph:
         """
         return self._observer.expect_newcomers(everybody=everybody)
 
+    def reread_parameters(self) -> bool:
+        """Have the next `observe` read all parameters again; return whether it reads any."""
+        return self._observer.reread_parameters()
+
     def drop_configuration(self, node: str) -> None:
         """Forget what a node said of itself whose process ended, on /diagnostics too."""
         self._observer.drop_configuration(node)

@@ -364,6 +364,10 @@ class Observer:
         """
         return self._discovery.expect_newcomers(everybody=everybody)
 
+    def reread_parameters(self) -> bool:
+        """Have the next `observe` read all parameters again; return whether it reads any."""
+        return self._parameters.reread()
+
     async def wait_change(self) -> None:
         """Wait until a burst of changes has passed, if any came since this or `observe` was called.
 
@@ -469,6 +473,9 @@ class Observer:
             self._events.scheduler.post(self._follow_soon)
 
     def _moved(self, name: str) -> None:
+        if self._loop is not None:
+            with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
+                self._loop.call_soon_threadsafe(self._parameters.reread, name)
         self._wake()
         if self._follows:
             self.state.reread(name)

@@ -127,6 +127,20 @@ class ParameterReadings:
         for name in tuple(self._nodes):
             self.forget(name)
 
+    def reread(self, node: str | None = None) -> bool:
+        """Have the next `follow` wait for readings that begin now; None for all nodes.
+
+        A node need not publish that its parameters changed, and its transitions may change them.
+
+        Returns:
+            Whether any is read.
+        """
+        nodes = [*self._nodes.values()] if node is None else [self._nodes.get(node)]
+        for each in nodes:
+            if each is not None:
+                each.reread()
+        return any(each is not None for each in nodes)
+
     def _changed(self, node: str, names: frozenset[str]) -> None:
         # Any thread.
         with self._lock:
@@ -157,6 +171,7 @@ class _Node:
         self.latest: NodeParameters | None = None
         self.due = asyncio.Event()
         self.first: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._wanted = 0
         self._name = name
         self._clients = clients
         self._wake = wake
@@ -167,6 +182,13 @@ class _Node:
         missing = self.latest is not None and self.latest.error == SERVES_NONE
         if missing and self._clients.serves_parameters(self._name):
             self.due.set()
+
+    def reread(self) -> None:
+        """Read at once, and have who follows wait for it."""
+        self._wanted += 1
+        if self.first.done():
+            self.first = asyncio.get_running_loop().create_future()
+        self.due.set()
 
     def close(self) -> None:
         self._task.cancel()
@@ -179,16 +201,17 @@ class _Node:
         notified = True
         while True:
             self.due.clear()
+            wanted = self._wanted
             found = await self._read()
             unanswered = unanswered + 1 if found.error == _NO_ANSWER else 0
             # A node that is busy for a moment, and of which no event says that it has changed,
             # is what it was.
             is_busy = unanswered == 1 and not notified
             if found != self.latest and not is_busy:
-                self.latest = found
-                if self.first.done():
+                is_first, self.latest = self.latest is None, found
+                if not is_first:
                     self._wake()
-            if not self.first.done():
+            if not self.first.done() and self._wanted == wanted:
                 self.first.set_result(None)
             notified = await set_within(self.due, pause_s)
             if notified:

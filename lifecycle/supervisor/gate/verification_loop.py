@@ -517,11 +517,16 @@ class VerificationLoop:
         stable: frozenset[tuple[str, str]] = frozenset()
         since = loop.time()
         again = ASK_AGAIN_S
+        is_read_again = stage is not Stage.CONNECTED
         while True:
             count = self._changes.count
             verdict = await self.once(stage)
             now = loop.time()
             if not closes(verdict, strict=self._strict):
+                if not is_read_again:
+                    is_read_again = True
+                    if now < deadline and self._observer.reread_parameters():
+                        continue  # nodes of others need not say that theirs changed
                 lately = stage is Stage.CONNECTED and now < newcomers_until
                 if lately and self._observer.expect_newcomers():
                     continue  # the next look waits for them

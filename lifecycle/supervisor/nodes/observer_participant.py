@@ -185,6 +185,10 @@ class ObserverParticipant:
         """Have the next `observe` wait for who came lately; return whether there may be anybody."""
         return self._graph.expect_newcomers(everybody=everybody)
 
+    def reread_parameters(self) -> bool:
+        """Have the next `observe` read all parameters again; return whether it reads any."""
+        return self._graph.reread_parameters()
+
     @property
     def changes(self) -> int:
         """Changes so far, before their bursts have passed."""

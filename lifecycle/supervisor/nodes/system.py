@@ -290,6 +290,9 @@ class ObservedGraph(Protocol):
             everybody: this process did not run for a while, and anybody may have come.
         """
 
+    def reread_parameters(self) -> bool:
+        """Have the next `observe` read all parameters again; return whether it reads any."""
+
     @property
     def changes(self) -> int:
         """Changes of the graph so far, each counted as soon as it is noticed."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tests.outside.case import OK, Case
+from tests.outside.case import NOBODY, OK, VIOLATED, Case
 from tests.outside.running import Run
 
 EAGER = {
@@ -166,6 +166,64 @@ def noticed_and_healed(run: Run) -> None:
     run.until_says(r"'/base' answers again", timeout_s=12.0)
 
 
+SHIFTY = {
+    "shifty.py": '''\
+import os
+
+import rclpy
+from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
+from rclpy.parameter import Parameter
+
+
+class Shifty(LifecycleNode):
+    """Changes its gain, or undeclares it, and publishes no event of that."""
+
+    def __init__(self):
+        super().__init__("base")
+        self.declare_parameter("gain", 2.0)
+        if os.environ["AFTER_S"]:
+            self.timer = self.create_timer(float(os.environ["AFTER_S"]), self.shift)
+
+    def on_configure(self, state):
+        if not os.environ["AFTER_S"]:
+            self.shift()
+        return TransitionCallbackReturn.SUCCESS
+
+    def shift(self):
+        how = os.environ["HOW"]
+        if how == "change":
+            self._parameters["gain"] = Parameter("gain", value=3.0)
+        elif how == "undeclare" and self.has_parameter("gain"):
+            del self._parameters["gain"]
+
+
+rclpy.init()
+try:
+    rclpy.spin(Shifty())
+except (KeyboardInterrupt, rclpy.executors.ExternalShutdownException):
+    pass
+'''
+}
+
+
+def shifty(how: str) -> str:
+    """A node that changes, or undeclares, its parameter in on_configure; or does not."""
+    return f"""\
+manifest_version: 1
+system: shifty
+discovery: {{range: localhost}}
+policy: {{unpublished: ignore}}
+nodes:
+  base:
+    run: {{command: [python3, shifty.py], environment: {{HOW: {how}, AFTER_S: ""}}}}
+    managed: true
+    parameters: {{gain: {{type: double, value: 2.0}}}}
+  listener:
+    run: {{python: "nodes:Listener"}}
+    interface: {{subscriptions: [{{name: chatter, type: std_msgs/msg/String}}]}}
+"""
+
+
 CASES = (
     *(
         Case(
@@ -230,5 +288,23 @@ CASES = (
         says=("'/base' serves no parameters: whether it hangs is not seen",),
         not_says=("run.not-answering",),
         before="ok",
+    ),
+    *(
+        Case(
+            attack=f"a managed node would {how} a parameter in on_configure without an event",
+            manifest=shifty(how),
+            files=SHIFTY,
+            verb=("up", "--strict", "--stop-after", "1", "--timeout", "6"),
+            exit_code=0 if how == "keep" else 4,
+            verdict=OK if how == "keep" else VIOLATED,
+            findings=() if how == "keep" else (rule,),
+            activated=frozenset({"listener"}) if how == "keep" else NOBODY,
+            before="ok, by the reading from before",
+        )
+        for how, rule in (
+            ("change", "param.value-differs"),
+            ("undeclare", "param.missing"),
+            ("keep", ""),
+        )
     ),
 )

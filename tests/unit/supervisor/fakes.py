@@ -417,6 +417,9 @@ class FakeGraph:
     def changes(self) -> int:
         return self._count + self.changed.is_set()
 
+    def reread_parameters(self) -> bool:
+        return False
+
     def expect_newcomers(self, *, everybody: bool = False) -> bool:
         del everybody
         return False

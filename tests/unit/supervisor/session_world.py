@@ -219,6 +219,12 @@ class FakeParticipant:
         await self._changed.wait()
         self._changed.clear()
 
+    async def answers(self, node: PlannedNode, *, timeout_s: float) -> bool | None:
+        return True
+
+    def reread_parameters(self) -> bool:
+        return False
+
     def expect_newcomers(self, *, everybody: bool = False) -> bool:
         del everybody
         return False
