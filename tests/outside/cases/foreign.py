@@ -217,7 +217,7 @@ nodes:
   base:
     run: {{command: [python3, shifty.py], environment: {{HOW: {how}, AFTER_S: ""}}}}
     managed: true
-    parameters: {{gain: {{type: double, value: 2.0}}}}
+    parameters: {{gain: 2.0}}
   listener:
     run: {{python: "nodes:Listener"}}
     interface: {{subscriptions: [{{name: chatter, type: std_msgs/msg/String}}]}}

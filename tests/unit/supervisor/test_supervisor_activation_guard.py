@@ -56,10 +56,11 @@ def test_a_node_that_somebody_activates_is_deactivated_at_once_and_found(tmp_pat
         assert bench.services.requests == ["deactivate"]
         assert bench.guard.findings() == ()
         assert bench.world.system.touched.is_set()
-        assert [each.message for each in bench.world.heard(Notice)] == [
+        (notice,) = bench.world.heard(Notice)
+        assert notice.message == (
             "'/base' was activated by its own code or another client while the gate is closed: "
             "it is deactivated"
-        ]
+        )
 
     run(main())
 
