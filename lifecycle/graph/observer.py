@@ -401,10 +401,12 @@ class Observer:
         planned: Collection[str],
         given: Collection[str],
     ) -> dict[str, Answer]:
+        # What only a node can know is believed of those in our hosts, and of no other program.
+        ours = {each.full_name for each in plan.nodes if each.run.python}
         answers = dict(
             await asyncio.gather(
                 *(
-                    self._ask(node)
+                    self._ask(node, reports=node.full_name in ours)
                     for node in nodes
                     if node.full_name in planned and node.full_name not in given
                 )
@@ -424,12 +426,14 @@ class Observer:
             )
         return answers
 
-    async def _ask(self, node: ObservedNode) -> tuple[str, Answer]:
+    async def _ask(self, node: ObservedNode, *, reports: bool) -> tuple[str, Answer]:
         name = node.full_name
         self._asked.add(name)
         if not node.managed:
-            return name, (None, await self._ask_configuration(name))
+            return name, (None, await self._ask_configuration(name) if reports else None)
         self._follow_transitions(name)
+        if not reports:
+            return name, (await self._ask_state(name), None)
         state, configuration = await asyncio.gather(
             self._ask_state(name), self._ask_configuration(name)
         )

@@ -332,21 +332,25 @@ def attached_to(plan: Plan, keys: Collection[str]) -> Plan:
         plan: of the whole system.
         keys: of nodes.
     """
-    attached = Run(kind=RunKind.ATTACH)
     chosen = frozenset(keys)
     return dataclasses.replace(
         plan,
         nodes=tuple(
-            dataclasses.replace(each, run=attached) if each.key in chosen else each
+            dataclasses.replace(each, run=_attached(each.run)) if each.key in chosen else each
             for each in plan.nodes
         ),
         processes=tuple(
-            dataclasses.replace(each, run=attached, argv=())
+            dataclasses.replace(each, run=_attached(each.run), argv=())
             if chosen.issuperset(each.nodes)
             else each
             for each in plan.processes
         ),
     )
+
+
+def _attached(run: Run) -> Run:
+    """Others run it; that a host of ours does (`lifecycle run`) is known by its class."""
+    return Run(kind=RunKind.ATTACH, python=run.python)
 
 
 def check_plan(

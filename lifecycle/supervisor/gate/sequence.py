@@ -683,6 +683,7 @@ class GateSequence:
         """Take nodes down, in reverse order, with all of their processes."""
         self._leaves({each.process.name for each in nodes if each.process is not None})
         for node in nodes:
+            node.is_up = False  # what is missing of it from now on is no violation
             container = self._system.nodes.get(node.planned.run.container)
             if container is not None and container.process is not None:
                 # Nobody answers for a component whose container is gone.

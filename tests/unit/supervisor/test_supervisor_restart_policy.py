@@ -663,7 +663,7 @@ def test_what_is_active_outlives_a_killed_supervisor_and_nothing_does_before_or_
         async def look() -> None:
             for line in ("[gate]", "[system] active", "[backoff]", "[restarted]", "[stopping]"):
                 await world.story.until(line)
-                await asyncio.sleep(0.0)
+                await asyncio.sleep(0.01 if line == "[stopping]" else 0.0)
                 found[line] = sorted(world.hosts.kept)
                 if line == "[system] active":
                     world.kill("camera")
