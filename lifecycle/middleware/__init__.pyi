@@ -40,6 +40,7 @@ from .fastdds.settings import stop_listening as stop_listening
 from .fastdds.settings import unknown_versions as unknown_versions
 from .process.busy_timer import BusySign as BusySign
 from .process.busy_timer import Overdue as Overdue
+from .process.busy_timer import label as label
 from .process.clock import ClockTimer as ClockTimer
 from .process.control import adopt_orphans as adopt_orphans
 from .process.control import check_descriptors as check_descriptors
@@ -66,8 +67,11 @@ from .process.shared_memory import segments_by_holder as segments_by_holder
 from .process.shared_memory import segments_of as segments_of
 from .process.shared_memory import still_there as still_there
 from .process.shared_memory import sweep as sweep
+from .process.stacks import brief as brief
+from .process.stacks import show_stacks_here as show_stacks_here
 from .process.teardown import leave_and_exit as leave_and_exit
 from .rcl.executor import NodeExecutor as NodeExecutor
+from .rcl.executor import described as described
 from .rcl.graph import GraphObserver as GraphObserver
 from .rcl.graph_changes import ServerWatch as ServerWatch
 from .rcl.graph_changes import is_server_matched as is_server_matched

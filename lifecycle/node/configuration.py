@@ -520,8 +520,12 @@ class ConfigurationChanges:
         """Something of the configuration has changed, match counts included; from any thread."""
         with self._lock:
             self._behind = list(self._listeners)
-        if self._listeners and not self._scheduled:
-            self._scheduled = bool(self._later(self._notify))
+            if self._scheduled or not self._behind:
+                return
+            # Before it is handed over: it may have run when `later` returns.
+            self._scheduled = True
+        if not self._later(self._notify):
+            self._scheduled = False
 
     def give(self, listener: Listener) -> tuple[NodeConfiguration, bool]:
         """Return the configuration as it is now to who gives it to `listener`.
@@ -536,8 +540,8 @@ class ConfigurationChanges:
         return self._collect(), behind
 
     def _notify(self) -> None:
-        self._scheduled = False
         with self._lock:
+            self._scheduled = False
             behind, self._behind = self._behind, []
         if not behind:
             return

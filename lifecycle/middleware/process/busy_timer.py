@@ -11,6 +11,9 @@ machine a callback of milliseconds takes seconds. The kernel counts it for each 
 /proc/TID/schedstat, Documentation/scheduler/sched-stats.rst), up to its last turn. The busy one
 reads that when it arms the timer, the watcher when it looks.
 
+The page has room for what the busy one does, in words, and the file behind it for where its threads
+stand (stacks.py).
+
 Python has timerfd from 3.13 on; until then it is called through ctypes.
 """
 
@@ -29,6 +32,7 @@ from pathlib import Path
 
 from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError
+from lifecycle.middleware.process import stacks
 from lifecycle.middleware.process.control import CLOCK_MONOTONIC, TimerSpec, libc
 
 _TFD_NONBLOCK = 0o4000
@@ -39,6 +43,9 @@ _SINCE = 0
 _LIMIT = 1
 _THREAD = 2
 _DELAY = 3
+_ANSWERS = 4
+_WHAT = 64
+_WHAT_BYTES = 256
 _NS = 1_000_000_000
 _STAT_BYTES = 128
 _LEAST_NS = 1_000_000
@@ -135,9 +142,19 @@ class BusySign:
         """Be busy for all threads: what any of them waited for a processor is not its own time."""
         self._of_process = True
 
-    def begin(self, after_s: float = 0.0) -> None:
-        """Be busy from now on, or from so many seconds on unless `begin` or `end` comes before."""
+    def show_stacks(self) -> None:
+        """Have this process show where it stands, see `where`."""
+        self._words[_ANSWERS] = stacks.answer(self._page)
+
+    def begin(self, after_s: float = 0.0, what: bytes = b"\0") -> None:
+        """Be busy from now on, or from so many seconds on unless `begin` or `end` comes before.
+
+        Args:
+            after_s: seconds.
+            what: is done; from `label`.
+        """
         words = self._words
+        self._memory[_WHAT : _WHAT + len(what)] = what
         words[_SINCE] = time.monotonic_ns() + round(after_s * _NS)
         # Read anew, after the page says busy: a watcher that the timer wakes must see it.
         now = time.monotonic_ns()
@@ -209,6 +226,32 @@ class BusySign:
         uncounted = max(0, turns.at_ns - first.at_ns - ran - counted)
         return now - since - waited - uncounted, part
 
+    @property
+    def busy_s(self) -> float:
+        """Seconds that the holder has been busy; 0 if it is not."""
+        since = self._words[_SINCE]
+        return max(0.0, (time.monotonic_ns() - since) / _NS) if since else 0.0
+
+    @property
+    def what(self) -> str:
+        """What the holder does, as it calls it; empty where it does not say."""
+        text = bytes(self._memory[_WHAT : _WHAT + _WHAT_BYTES])
+        return text.partition(b"\0")[0].decode(errors="replace")
+
+    def where(self, pid: int) -> str:
+        """Return where the threads of the holder stand, as faulthandler writes it.
+
+        Waits for up to a quarter of a second.
+
+        Args:
+            pid: of the holder.
+
+        Returns:
+            Empty if it does not answer: it was stopped, or is not one of ours.
+        """
+        answers = pid > 0 and self._words[_ANSWERS]
+        return stacks.ask(pid, self._page, _PAGE_BYTES) if answers else ""
+
     def close(self) -> None:
         """Close this side; again is harmless."""
         if self._timer < 0:
@@ -245,6 +288,11 @@ class BusySign:
     def _arm(self, ns: int) -> None:
         spec = TimerSpec.once(ns)
         self._set_time(self._timer, 0, ctypes.byref(spec), None)
+
+
+def label(text: str) -> bytes:
+    """Return what `BusySign.begin` takes."""
+    return text.encode()[: _WHAT_BYTES - 1] + b"\0"
 
 
 def _turns_of(thread: int, now: int) -> _Turns | None:

@@ -414,6 +414,23 @@ class NodeExecutor(SingleThreadedExecutor):  # type: ignore[misc]  # rclpy is no
         self._call(waitable, waitable.execute, data)
 
 
+def described(callback: Callable[[], None]) -> str:
+    """Return what a callback from `next_callback` is of, in words; empty for the rest of a task."""
+    if not isinstance(callback, functools.partial):
+        return ""
+    entity, kind = callback.args[0], callback.func.__name__
+    try:
+        if kind == "_run_subscription":
+            return f"of the subscription of {entity.topic_name}"
+        if kind == "_run_service":
+            return f"of the service {entity.service_name}"
+        if kind == "_run_timer":
+            return f"of a timer of {entity.timer_period_ns / 1e9:g} s"
+    except (InvalidHandle, AttributeError):
+        pass  # a callback before it has destroyed it
+    return ""
+
+
 def _call_timer(handle: Any) -> bool | None:
     """Begin a timer's next period; None if it was cancelled since."""
     if not handle.is_timer_ready():

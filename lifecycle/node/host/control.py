@@ -14,6 +14,7 @@ import enum
 import importlib
 import logging
 import os
+import select
 import socket
 import sys
 import threading
@@ -167,8 +168,18 @@ _OURS = f"{Path(__file__).parents[1]}{os.sep}"
 """Where the host's own modules are."""
 
 
+_LAST_S = 1.0
+"""For a supervisor to read what is still to be sent when a host ends."""
+
+_NEWEST = frozenset({"state", "configuration", "beat"})
+"""Events of which only the latest of a node is worth sending to who has not read the one before."""
+
+
 class HostChannel:
-    """JSON lines both ways; written from two threads, read from one.
+    """JSON lines both ways; written from any thread, read from one.
+
+    Who writes never waits: what a supervisor that was stopped, or is slow, has no room for is kept
+    in order until it reads on, and of what is reported unasked only the newest.
 
     Attributes:
         descriptors: of the busy sign, beside the first byte; none if it is not watched.
@@ -185,7 +196,11 @@ class HostChannel:
         self.descriptors = tuple(found)
         for descriptor in found:
             os.set_inheritable(descriptor, False)
-        self._lock = threading.Lock()
+        self._changed = threading.Condition()
+        self._begun = b""  # the rest of a line of which a part was sent
+        self._kept: dict[tuple[object, ...], bytes] = {}  # by what it is of, in order
+        self._number = 0
+        self._sends = False
 
     def fileno(self) -> int:
         """Return the descriptor that is readable when `receive` is worth a call."""
@@ -216,12 +231,54 @@ class HostChannel:
             yield bytes(line)
 
     def write(self, event: Event) -> None:
-        """Send one event; a supervisor that has gone is noticed by the reader, not here."""
-        with self._lock:
+        """Send one event, now or later; that a supervisor has gone is noticed by the reader."""
+        line = codec.to_json(event) + b"\n"
+        with self._changed:
+            self._number += 1
+            key = (event.kind, event.node) if event.kind in _NEWEST else (self._number,)
+            self._kept.pop(key, None)  # the newer one takes a place behind all others
+            self._kept[key] = line
+            if self._sends or self._flush():
+                return
+            self._sends = True
             try:
-                self._control.sendall(codec.to_json(event) + b"\n")
+                threading.Thread(target=self._send, name="reports", daemon=True).start()
+            except RuntimeError:  # at the limit of threads: the next report tries again
+                self._sends = False
+
+    def drain(self) -> None:
+        """Wait until all was sent, as long as a supervisor that runs may take."""
+        with self._changed:
+            self._changed.wait_for(lambda: not (self._begun or self._kept), _LAST_S)
+
+    def _flush(self) -> bool:
+        """Send what there is room for, with the lock held; whether that is all."""
+        while self._begun or self._kept:
+            if not self._begun:
+                self._begun = self._kept.pop(next(iter(self._kept)))
+            try:
+                sent = self._control.send(self._begun, socket.MSG_DONTWAIT)
+            except BlockingIOError:
+                return False
             except OSError as error:
-                logging.getLogger(__name__).debug("cannot tell the supervisor: %s", error)
+                logging.getLogger(__name__).debug("cannot report to the supervisor: %s", error)
+                self._begun = b""
+                self._kept.clear()
+                break
+            self._begun = self._begun[sent:]
+        return True
+
+    def _send(self) -> None:
+        """Send what is kept, as soon as there is room for it."""
+        room = select.poll()
+        room.register(self._control, select.POLLOUT)
+        while True:
+            room.poll()
+            with self._changed:
+                if self._flush():
+                    self._sends = False
+                    self._changed.notify_all()
+                    return
 
 
 def report_failure(channel: HostChannel, node: str, error: Exception) -> None:
@@ -237,6 +294,7 @@ def report_failure(channel: HostChannel, node: str, error: Exception) -> None:
 def give_up(channel: HostChannel, node: str, error: Exception) -> NoReturn:
     """Report a failure, and end the process."""
     report_failure(channel, node, error)
+    channel.drain()
     from lifecycle.middleware import leave_and_exit
 
     leave_and_exit(1)

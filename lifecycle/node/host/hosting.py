@@ -310,6 +310,7 @@ class Host:
         watchdog: Watchdog | Prober | None = None
         if channel.descriptors:
             sign = BusySign(*channel.descriptors)
+            sign.show_stacks()
             kind = Watchdog if run.executor is Executor.SINGLE else Prober
             watchdog = kind(sign, lambda _: channel.write(Event(kind="beat")))
         self._loop = NodeLoop(context, watchdog, executor=run.executor, threads=run.threads)
@@ -368,7 +369,7 @@ class Host:
                     # Outside the handler: what fails next is not a consequence of this.
                     self._give_up(index, failure)
             self._loop.call_soon(self._ready)
-            self._loop.spin_and_exit()
+            self._loop.spin_and_exit(self._channel.drain)
         raise AssertionError("spin_and_exit returned")
 
     def _participant_made(self, rcl_node: int) -> None:
@@ -445,6 +446,7 @@ class Host:
     def _leave(self, code: int = 0) -> NoReturn:
         """Leave without shutting nodes down: none of them has been configured."""
         nodes = self._loop.nodes
+        self._channel.drain()
         leave_and_exit(
             code,
             nodes=nodes,

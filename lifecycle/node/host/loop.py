@@ -15,6 +15,7 @@ may be locked by the very callback that hangs.
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import select
 import signal
@@ -22,6 +23,7 @@ import socket
 import sys
 import threading
 import traceback
+import weakref
 from collections.abc import Callable, Coroutine, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -40,9 +42,12 @@ from lifecycle.middleware import (
     ClockTimer,
     NodeExecutor,
     Watching,
+    described,
     hidden_nodes,
+    label,
     leave_and_exit,
     republish_names,
+    show_stacks_here,
     wake_participants,
 )
 from lifecycle.node.author.node import LifecycleNode
@@ -93,21 +98,31 @@ class Watchdog:
         self._on_overlong = on_overlong
         self._running = False
         self._changing: set[str] = set()
+        self._labels: weakref.WeakKeyDictionary[Any, bytes] = weakref.WeakKeyDictionary()
 
     def add(self, hosted: Hosted) -> None:
         """Leave the transitions of a node to their own deadlines."""
         hosted.add_listener(self._follow)
 
-    def begin(self) -> None:
+    def begin(self, callback: Callable[[], None]) -> None:
         """Note that a callback begins."""
         self._running = True
         if not self._changing:
-            self._sign.begin()
+            self._sign.begin(what=self._label(callback))
 
     def end(self) -> None:
         """Note that it has ended."""
         self._running = False
         self._idle()
+
+    def _label(self, callback: Callable[[], None]) -> bytes:
+        entity = callback.args[0] if isinstance(callback, functools.partial) else None
+        if entity is None:
+            return label("")
+        found = self._labels.get(entity)
+        if found is None:
+            found = self._labels[entity] = label(described(callback))
+        return found
 
     def _follow(self, hosted: Hosted) -> None:
         """A transition begins or ends, inside a callback as everything does."""
@@ -365,11 +380,14 @@ class NodeLoop:
             guard.start()
         self.call_soon(self._shut_down, reason)
 
-    def spin_and_exit(self) -> None:
+    def spin_and_exit(self, last: Callable[[], object] = lambda: None) -> None:
         """Spin until stopped, then end the process; never returns.
 
         An exception in a message, service or timer callback ends the process, as in rclpy: its
         traceback is printed, then all nodes are shut down.
+
+        Args:
+            last: is called once no callback runs any more.
         """
         if self._own is not self._executor:
             threading.Thread(target=self._spin_own, name="executor", daemon=True).start()
@@ -386,6 +404,7 @@ class NodeLoop:
             self._own.shutdown(_LEAVE_S)
         self._executor.shutdown()
         contexts = dict.fromkeys([self._context, *(node.context for node in self._nodes)])
+        last()
         leave_and_exit(self._code, nodes=self._nodes, contexts=contexts)
 
     def _clock_set(self) -> bool:
@@ -406,7 +425,7 @@ class NodeLoop:
         if self._watchdog is None:
             callback()
             return
-        self._watchdog.begin()
+        self._watchdog.begin(callback)
         try:
             callback()
         finally:
@@ -498,6 +517,7 @@ def on_signal(
     before_descriptor = signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
 
     def read() -> None:
+        show_stacks_here()
         poll = select.poll()
         poll.register(receiver, select.POLLIN)
         for each in beside:

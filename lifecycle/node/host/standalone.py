@@ -33,6 +33,7 @@ from lifecycle.middleware import (
     BusySign,
     Overdue,
     ParticipantSettings,
+    brief,
     follow_nodes,
     node_topic,
     noting_shared_memory,
@@ -67,6 +68,7 @@ class OwnLiveliness:
 
     def __init__(self, limit_s: float, executor: Executor = Executor.SINGLE) -> None:
         self._sign = BusySign.make(limit_s)
+        self._sign.show_stacks()
         self._lock = threading.Lock()
         self._silent: dict[str, str] = {}
         self._publisher: AlivePublisher | None = None
@@ -89,9 +91,11 @@ class OwnLiveliness:
         while select.select([self._sign], [], []):
             why = self._sign.overdue()
             if why is Overdue.HANGS:
+                what = f" {self._sign.what}" if self._sign.what else ""
+                where = brief(self._sign.where(os.getpid()))
                 self._announce(
-                    f"a callback in its process (pid {os.getpid()}) has been running for "
-                    f"{self._sign.limit_s:g} s"
+                    f"a callback{what} in its process (pid {os.getpid()}) has been running for "
+                    f"more than {self._sign.limit_s:g} s{where and f', in {where}'}"
                 )
             elif why is Overdue.UNSERVED and not self._silent:
                 self._announce(

@@ -30,6 +30,7 @@ from lifecycle.verify import (
     Finding,
     Observation,
     Outcome,
+    Verdict,
     is_hidden_node,
     is_noise_node,
 )
@@ -57,6 +58,7 @@ class Cause(enum.Enum):
 class _Silence:
     since_s: float
     causes: dict[Cause, str]
+    hangs_since_s: float = 0.0
 
 
 class SilenceMonitor:
@@ -99,8 +101,17 @@ class SilenceMonitor:
         silence = self._silent.get(node)
         return silence is not None and bool({Cause.STOPPED, Cause.LOST} & silence.causes.keys())
 
-    def fell_silent(self, nodes: Iterable[str], cause: Cause, detail: str) -> None:
-        """Note that nodes are silent; `detail` is half a sentence."""
+    def fell_silent(
+        self, nodes: Iterable[str], cause: Cause, detail: str, *, busy_s: float = 0.0
+    ) -> None:
+        """Note that nodes are silent.
+
+        Args:
+            nodes: their names.
+            cause: why.
+            detail: half a sentence.
+            busy_s: seconds for which a callback of theirs has been running.
+        """
         news = False
         for name in nodes:
             silence = self._silent.get(name)
@@ -111,6 +122,10 @@ class SilenceMonitor:
             elif cause not in silence.causes:
                 silence.causes[cause] = detail
                 news = True
+            else:
+                continue
+            if cause is Cause.HUNG:
+                silence.hangs_since_s = self._emit.elapsed_s - busy_s
         if news:
             self._tell()
 
@@ -180,9 +195,14 @@ class SilenceMonitor:
             assert process.channel is not None
             where = f"its process {process.name!r} (pid {process.pid})"
             if why is Overdue.HANGS:
-                limit_s = process.channel.silent_s
-                detail = f"a callback in {where} has been running for {limit_s:g} s"
-                self.fell_silent(names, Cause.HUNG, detail)
+                limit_s, busy_s = process.channel.silent_s, process.channel.busy_s
+                what = f" {process.channel.what}" if process.channel.what else ""
+                at = process.where()
+                detail = (
+                    f"a callback{what} in {where} has been running for more than {limit_s:g} s"
+                    f"{at and f', in {at}'}"
+                )
+                self.fell_silent(names, Cause.HUNG, detail, busy_s=busy_s)
             elif why is Overdue.UNSERVED:
                 detail = f"{where} gets no processor for its callback: the machine is overloaded"
                 self.fell_silent(names, Cause.UNSERVED, detail)
@@ -231,6 +251,18 @@ class SilenceMonitor:
                 if name not in self._silent
             )
         )
+
+    def by_now(self, verdict: Verdict) -> Verdict:
+        """Return a verdict that says for how long nodes have hung by now."""
+        found = []
+        for each in verdict.findings:
+            silence = self._silent.get(each.subject)
+            if each.rule == SILENT_NODE.id and silence and Cause.HUNG in silence.causes:
+                busy_s = self._emit.elapsed_s - silence.hangs_since_s
+                message = f"{_message(each.subject, _why(silence))}; {busy_s:.1f} s by now"
+                each = dataclasses.replace(each, message=message)  # noqa: PLW2901
+            found.append(each)
+        return dataclasses.replace(verdict, findings=tuple(found))
 
     def _of_the_observer(self) -> tuple[Finding, ...]:
         if not self._observer_is_deadlocked:

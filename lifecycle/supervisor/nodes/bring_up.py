@@ -821,9 +821,10 @@ def _start_failed(error: HostFailedError, name: str, **process: str) -> StepFail
 
 
 def _too_late(node: NodeRun, limit_s: float) -> StepFailedError:
+    where = "" if node.process is None else node.process.where()
     return StepFailedError(
         f"cannot bring up {node.name!r}: it was still {node.doing} after {limit_s:g} s"
-        f"{_unnamed(node)}",
+        f"{where and f', in {where}'}{_unnamed(node)}",
         rule=DEADLINE,
         subject=node.name,
         **_process_of(node),

@@ -83,6 +83,20 @@ class ControlChannel:
         """Its executor may be busy for so long at a time: its nodes share it."""
         return max(node.timeouts.silent_s for node in self._spec.nodes)
 
+    @property
+    def busy_s(self) -> float:
+        """Seconds that its executor has been busy; 0 if it is not, or nobody knows."""
+        return 0.0 if self._sign is None else self._sign.busy_s
+
+    @property
+    def what(self) -> str:
+        """What its executor does, as `of the service /reset`; empty where nobody knows."""
+        return "" if self._sign is None else self._sign.what
+
+    def where(self, pid: int) -> str:
+        """Return where the threads of the host stand; empty if it does not say, see BusySign."""
+        return "" if self._sign is None else self._sign.where(pid)
+
     async def open(self) -> socket.socket:
         """Make the pair, send the host its spec, and return the end that the host inherits.
 

@@ -20,6 +20,7 @@ from typing import Any, Protocol
 
 from lifecycle import dataclasses
 from lifecycle.manifest import Output, Resources
+from lifecycle.middleware import brief
 from lifecycle.plan import PlannedProcess
 from lifecycle.printable import log_line
 from lifecycle.supervisor.control.protocol import ProcessState
@@ -344,6 +345,16 @@ class ManagedProcess:
     def pid(self) -> int:
         """Process id; 0 before it was spawned."""
         return 0 if self.child is None else self.child.pid
+
+    def where(self) -> str:
+        """Return where a callback of it stands, in short, and write all of it into the log.
+
+        Empty of a process that does not say: it is a command, or was stopped.
+        """
+        stacks = "" if self.channel is None else self.channel.where(self.pid)
+        for line in stacks.splitlines():
+            self.log.add(line)
+        return brief(stacks)
 
     async def spawn(self, spawner: Spawner, channel: ControlChannel | None) -> None:
         """Start the process; returns once it exists.

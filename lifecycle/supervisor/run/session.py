@@ -502,7 +502,9 @@ class Session:
             exit_code=end.exit_code,
             trusted=self._gate_sequence.trusted,
         )
-        verdict = dataclasses.replace(end.verdict or self._judge.latest or NOT_JUDGED, run=run)
+        verdict = self._system.liveliness.by_now(
+            dataclasses.replace(end.verdict or self._judge.latest or NOT_JUDGED, run=run)
+        )
         return UpResult(exit_code=end.exit_code, verdict=verdict, plan=self._system.first)
 
     def _cut_short(self, exit_code: ExitCode) -> _RunEnd:
