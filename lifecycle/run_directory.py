@@ -50,11 +50,6 @@ LEDGER_NAME = "programmed.json"
 LEDGER_LOCK_NAME = "programmed.lock"
 """File beside it, locked while it is changed."""
 
-SENT_PREFIX = "sent-"
-"""Beginning of the name of a directory in a run directory that holds what another host sent: the
-manifest of this run, and the pipes of its supervisor, see fleet/agent.py."""
-
-
 OWN_CHILD = threading.Lock()
 """Held while a thread runs a program and waits for it. If that were reaped as an orphan first,
 its exit code would be lost, and `subprocess` takes a lost one for success."""
@@ -378,11 +373,7 @@ class RunDirectory:
         with contextlib.suppress(FileNotFoundError):
             for each in tuple(self.path.iterdir()):
                 # The lock last: who takes it must not find what is being removed.
-                if each.name.startswith(SENT_PREFIX):
-                    import shutil  # loads decompressors, and few runs were sent
-
-                    shutil.rmtree(each, ignore_errors=True)
-                elif each.name not in (LEDGER_NAME, "lock"):
+                if each.name not in (LEDGER_NAME, "lock"):
                     with contextlib.suppress(IsADirectoryError):
                         each.unlink(missing_ok=True)
             (self.path / "lock").unlink(missing_ok=True)
@@ -613,9 +604,8 @@ def _refuse_unless_run(path: Path) -> None:
         return  # just removed by the run that had it
     # A run that ends removes its lock last, and leaves what is programmed still.
     marks = ("lock", LEDGER_NAME, LEDGER_LOCK_NAME)
-    others = {each for each in names if not each.startswith(SENT_PREFIX)}
-    if others and names.isdisjoint(marks) and read_record(path) is None:
-        raise _unusable(path, f"it holds {min(others)!r}, and was no run's")
+    if names and names.isdisjoint(marks) and read_record(path) is None:
+        raise _unusable(path, f"it holds {min(names)!r}, and was no run's")
 
 
 def _refuse_unsafe_parents(root: Path) -> None:

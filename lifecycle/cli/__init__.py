@@ -58,9 +58,6 @@ _ELSEWHERE = {
 }
 """Verb → module that has it, as `VERB_command`; all others have a module of their name."""
 
-_UNLISTED = frozenset({"host-agent"})
-"""Verbs that programs of ours use, see fleet/."""
-
 _PARTICIPANTS = frozenset({"up", "verify", "flows", "graph", "capture", "run"})
 """Verbs that make participants, here or in processes that they start."""
 
@@ -131,7 +128,7 @@ class _Verbs(click.Group):
         """Look first whether there is such a verb, and one that needs the RMW can have it."""
         if ctx.resilient_parsing:  # for shell completion
             return super().resolve_command(ctx, args)
-        if args and args[0] not in _UNLISTED | VERBS.keys() and not args[0].startswith("-"):
+        if args and args[0] not in VERBS and not args[0].startswith("-"):
             from difflib import get_close_matches
 
             close = get_close_matches(args[0], VERBS, n=1)
@@ -163,7 +160,7 @@ class _Verbs(click.Group):
         cmd_name: str,
     ) -> click.Command | None:
         """Import the verb's module, see above."""
-        if cmd_name not in _UNLISTED | VERBS.keys():
+        if cmd_name not in VERBS:
             return None
         module = _ELSEWHERE.get(cmd_name, cmd_name.replace("-", "_"))
         name = f"{cmd_name}_command" if cmd_name in _ELSEWHERE else "command"

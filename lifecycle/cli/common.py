@@ -184,38 +184,6 @@ def machine_option(help_: str) -> Callable[[F], F]:
     )
 
 
-def hosts_options(function: F) -> F:
-    """Add `--hosts`, and how the hosts are reached."""
-    function = click.option(
-        "--remote-command",
-        default="lifecycle",
-        show_default=True,
-        envvar="LIFECYCLE_REMOTE_COMMAND",
-        metavar="TEXT",
-        help="With --hosts: what runs lifecycle there, for its shell: '. WORKSPACE/setup.sh && "
-        "VENV/bin/lifecycle'.",
-    )(function)
-    function = click.option(
-        "--host",
-        "chosen",
-        multiple=True,
-        metavar="MACHINE=[USER@]HOST",
-        help="With --hosts: where ssh finds a machine, else at its address; may be given several "
-        "times.",
-    )(function)
-    return click.option(
-        "--hosts",
-        is_flag=True,
-        help="On all machines of the manifest, over ssh; see docs/several_hosts.md.",
-    )(function)
-
-
-def check_hosts(hosts: bool, chosen: tuple[str, ...]) -> None:
-    """Refuse `--host` without `--hosts`; raises UsageError."""
-    if chosen and not hosts:
-        raise UsageError(f"cannot use --host {chosen[0]} without --hosts")
-
-
 def target_run(
     environment: Mapping[str, str], target: str, assignments: tuple[str, ...], machine: str
 ) -> Path:

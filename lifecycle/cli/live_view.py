@@ -17,11 +17,8 @@ from rich.live import Live as RichLive
 from rich.table import Table
 from rich.text import Text
 
-from lifecycle.cli.hosts import PlainHosts, event_of
 from lifecycle.cli.standard_streams import Writer
 from lifecycle.cli.up_output import Rollback, describe, verdict_line
-from lifecycle.codec import from_json, to_json
-from lifecycle.fleet import Record
 from lifecycle.printable import log_line, one_line
 from lifecycle.supervisor import (
     Event,
@@ -30,8 +27,6 @@ from lifecycle.supervisor import (
     NodeChanged,
     NodeStatus,
     ProcessChanged,
-    Reach,
-    RunStarted,
     Stopped,
     Stopping,
     SystemReached,
@@ -39,7 +34,7 @@ from lifecycle.supervisor import (
     UpResult,
     VerdictChanged,
 )
-from lifecycle.verify import Outcome, not_ok, render_text
+from lifecycle.verify import Outcome, render_text
 
 _REDRAW_S = 0.04
 """At most 25 times a second, however many events there are."""
@@ -235,136 +230,3 @@ def _away(node: NodeStatus) -> str:
     if node.next_try_s is not None:
         return f"starts again in {node.next_try_s:.1f} s"
     return f"restarted {node.restarts}×" if node.restarts else ""
-
-
-class LiveHosts:
-    """The combined view of `lifecycle up --hosts`: a row for each host, lines scroll above it.
-
-    Use it in a `with`.
-
-    Args:
-        system: its name.
-        hosts: names of its machines.
-        writer: of the terminal.
-        console: None for one on `writer`.
-    """
-
-    def __init__(
-        self,
-        system: str,
-        hosts: Sequence[str],
-        *,
-        writer: Writer,
-        console: Console | None = None,
-    ) -> None:
-        self._system = system
-        self._writer = writer
-        self._console = console or Console(file=writer.stream(), highlight=False)
-        self._live = RichLive(console=self._console, auto_refresh=False, transient=False)
-        self._rows = {each: _HostRow() for each in hosts}
-        self._lines = PlainHosts(self)
-        self._drawn_s = 0.0
-
-    def __enter__(self) -> LiveHosts:  # noqa: PYI034 - typing.Self is not in Python 3.10
-        self._live.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._draw()
-        self._live.stop()
-
-    def put(self, text: str, *, kept: bool = True) -> None:
-        """Print lines above the table; log lines are left out while the terminal is stopped."""
-        if kept or not self._writer.is_behind:
-            self._console.print(Text(text.rstrip("\n")))
-
-    def close(self) -> None:
-        """Be a sink of which nothing is left."""
-
-    def __call__(self, host: str, record: Record) -> None:
-        """Show one event of a host, or of all."""
-        urgent = not host
-        if (row := self._rows.get(host)) is not None:
-            urgent = row.note(record)
-            if (event := event_of(record)) is not None:
-                urgent = row.take(event)
-        # What is in the table need not scroll by as well.
-        if record.get("event") not in ("node", "process", "verdict"):
-            self._lines(host, record)
-        now_s = time.monotonic()
-        if urgent or now_s - self._drawn_s >= _REDRAW_S:
-            self._drawn_s = now_s
-            self._draw()
-
-    def _draw(self) -> None:
-        if self._writer.is_behind:
-            return
-        table = Table(box=box.SIMPLE_HEAD, pad_edge=False, header_style="bold")
-        table.add_column(Text(one_line(self._system)), no_wrap=True)
-        for column in ("supervisor", "system", "active", "clock", "verdict"):
-            table.add_column(column, no_wrap=True)
-        for name, row in self._rows.items():
-            table.add_row(_short(one_line(name), "bold"), *row.cells())
-        self._live.update(table, refresh=True)
-
-
-class _HostRow:
-    """What the table shows of one host."""
-
-    def __init__(self) -> None:
-        self._link = "connecting"
-        self._reached = ""
-        self._nodes: dict[str, bool] = {}
-        self._clock = ""
-        self._verdict: Outcome | None = None
-        self._why = ""
-
-    def note(self, record: Record) -> bool:
-        """Take an event of the coordinator; whether it is to be seen at once."""
-        if record.get("event") == "clock":
-            ahead_ms, around_ms = record["offset_s"] * 1e3, record["uncertainty_s"] * 1e3
-            self._clock = f"{ahead_ms:+.1f} ms ± {around_ms:.1f}"
-        if record.get("event") != "host":
-            return False
-        self._link = str(record["state"])
-        with contextlib.suppress(ValueError):
-            status = from_json(to_json(record["status"]), SystemStatus)
-            self._reached = status.phase
-            own = [each for each in status.nodes if each.process_state is not None]
-            self._nodes = {each.node: each.state == "active" for each in own}
-        return True
-
-    def take(self, event: Event) -> bool:
-        """Take an event of the supervisor; whether it is to be seen at once."""
-        if isinstance(event, RunStarted):
-            self._nodes = dict.fromkeys(event.nodes, False)
-        elif isinstance(event, NodeChanged) and event.node in self._nodes:
-            self._nodes[event.node] = event.reach is Reach.ACTIVE
-        elif isinstance(event, SystemReached):
-            self._reached = event.reached
-        elif isinstance(event, Stopping):
-            self._reached = "stopping"
-        elif isinstance(event, VerdictChanged):
-            self._verdict = event.verdict.verdict
-            self._why = not_ok(event.verdict)
-        return isinstance(event, SystemReached | Failure)
-
-    def cells(self) -> tuple[Text, ...]:
-        """Return the columns after its name."""
-        bad = self._link in ("cut", "failed", "left", "taken")
-        link = {"started": "runs", "attached": "runs", "healed": "runs"}.get(self._link, self._link)
-        active = sum(self._nodes.values())
-        count = f"{active}/{len(self._nodes)}" if self._nodes else "–"
-        is_all = bool(self._nodes) and active == len(self._nodes)
-        verdict = "–" if self._verdict is None else self._verdict.value
-        colour = "" if self._verdict is None else _OUTCOMES[self._verdict]
-        why = f"; {self._why}" if self._why else ""
-        return (
-            Text(link, style="red" if bad else "green" if link == "runs" else "yellow"),
-            _short(
-                one_line(self._reached), "bold green" if self._reached == "active" else "yellow"
-            ),
-            Text(count, style="green" if is_all else "yellow"),
-            Text(self._clock, style="dim"),
-            _short(one_line(f"{verdict}{why}"), colour),
-        )

@@ -7,10 +7,9 @@ nothing: it is opened before the rest of a command is imported.
 
 from __future__ import annotations
 
-import json
 import os
 import stat
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -19,7 +18,7 @@ import click
 
 from lifecycle import dataclasses
 from lifecycle.errors import ExitCode, LifecycleError, UsageError, exhausted
-from lifecycle.printable import json_text, lines, one_line
+from lifecycle.printable import lines
 
 if TYPE_CHECKING:
     from lifecycle.plan import Plan
@@ -146,7 +145,6 @@ def format_verdict(
     *,
     colour: bool = False,
     strict: bool = False,
-    machines: Mapping[str, Verdict | None] | None = None,
 ) -> str:
     """Return `verdict` as "text", "json", "junit", "sarif" or "github" (text and annotations).
 
@@ -156,14 +154,9 @@ def format_verdict(
         format_: see above.
         colour: mark outcomes of text with ANSI colours.
         strict: what cannot be verified counts as refused.
-        machines: verdicts that `verdict` is made of, by machine, for text and JSON; None for a
-            machine whose supervisor gave none.
     """
     from lifecycle.verify import Outcome, render_text, to_json, to_junit, to_sarif
 
-    if format_ == "json" and machines is not None:
-        parts = {name: each and json.loads(to_json(each)) for name, each in machines.items()}
-        return json_text(json.dumps({**json.loads(to_json(verdict)), "machines": parts}))
     if format_ == "json":
         return to_json(verdict)
     if format_ == "junit":
@@ -171,9 +164,6 @@ def format_verdict(
     if format_ == "sarif":
         return to_sarif(verdict)
     text = render_text(verdict, colour=colour)
-    for name, each in (machines or {}).items():
-        own = "no verdict\n" if each is None else render_text(each, colour=colour)
-        text += f"\nmachine {one_line(name)}: {own}"
     if format_ == "github":
         found = [
             annotation(
@@ -241,23 +231,16 @@ class ReportFile:
             reason = "it never came to its end: the process was killed"
             self._write(_unjudged(reason, ExitCode.INTERNAL))
 
-    def end(
-        self,
-        verdict: Verdict,
-        plan: Plan | None = None,
-        *,
-        machines: Mapping[str, Verdict | None] | None = None,
-    ) -> None:
+    def end(self, verdict: Verdict, plan: Plan | None = None) -> None:
         """Write how it ended.
 
         Args:
             verdict: the last one.
             plan: what it is of, where another manifest was taken since `begin`.
-            machines: see `format_verdict`.
         """
         self._ended = True
         self._plan = plan or self._plan
-        self._write(verdict, machines)
+        self._write(verdict)
 
     def __exit__(
         self,
@@ -273,15 +256,11 @@ class ReportFile:
             # What went wrong first decides the exit code.
             click.echo(str(unwritable), err=True)
 
-    def _write(
-        self, verdict: Verdict, machines: Mapping[str, Verdict | None] | None = None
-    ) -> None:
+    def _write(self, verdict: Verdict) -> None:
         """Replace what is in the file; raises UsageError if it cannot be written any more."""
         if self._path is not None:
             format_ = report_format(self._path)
-            text = format_verdict(
-                verdict, self._plan, format_, strict=self._strict, machines=machines
-            )
+            text = format_verdict(verdict, self._plan, format_, strict=self._strict)
             write_report(self._path, text)
 
 

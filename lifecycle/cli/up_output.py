@@ -68,16 +68,6 @@ class RunOutput(Protocol):
         """Show the result, and return once that is written or not taken."""
 
 
-class Sink(Protocol):
-    """Where lines go; it never blocks and never fails."""
-
-    def put(self, text: str, *, kept: bool = True) -> None:
-        """Take whole lines; those that are not `kept` may be dropped where not read."""
-
-    def close(self) -> None:
-        """Write what is left, bounded; again is harmless."""
-
-
 @contextlib.contextmanager
 def output(format_: str, timings_until: str = "") -> Iterator[RunOutput]:
     """Give the output for `format_`, and for text what suits the terminal.
@@ -133,20 +123,20 @@ def _json_notice(text: str) -> str:
 class JsonLines:
     """One JSON object per line; `event` names its kind, and the last one is the verdict."""
 
-    def __init__(self, sink: Sink) -> None:
-        self._sink = sink
+    def __init__(self, writer: Writer) -> None:
+        self._writer = writer
 
     def watch(self, status: Callable[[], SystemStatus]) -> None:
         """Need nothing more than the events."""
 
     def __call__(self, event: Event) -> None:
         """Write one event."""
-        self._sink.put(_json_line(event), kept=not isinstance(event, LogLine))
+        self._writer.put(_json_line(event), kept=not isinstance(event, LogLine))
 
     def finish(self, result: UpResult) -> None:
         """Write the verdict."""
-        self._sink.put(to_json(result.verdict) + "\n")
-        self._sink.close()
+        self._writer.put(to_json(result.verdict) + "\n")
+        self._writer.close()
 
 
 class Timings:
@@ -272,8 +262,8 @@ class Rollback:
 class PlainLines:
     """One line per event, for logs and pipes."""
 
-    def __init__(self, sink: Sink) -> None:
-        self._sink = sink
+    def __init__(self, writer: Writer) -> None:
+        self._writer = writer
         self._reached: dict[str, Reach] = {}
         self._stopping = False
         self._judged: str | None = None
@@ -301,7 +291,7 @@ class PlainLines:
                 return
             self._judged = line
         if line is not None:
-            self._sink.put(line + "\n", kept=not isinstance(event, LogLine))
+            self._writer.put(line + "\n", kept=not isinstance(event, LogLine))
 
     def _is_on_the_way(self, event: NodeChanged) -> bool:
         """Whether a change is one of the many between two steps, which a log need not hold."""
@@ -313,8 +303,8 @@ class PlainLines:
     def finish(self, result: UpResult) -> None:
         """Write the verdict, in full where it is not ok."""
         flows = result.verdict.verdict is not Outcome.VIOLATED
-        self._sink.put(render_text(result.verdict, flows=flows))
-        self._sink.close()
+        self._writer.put(render_text(result.verdict, flows=flows))
+        self._writer.close()
 
 
 def describe(event: Event) -> str | None:

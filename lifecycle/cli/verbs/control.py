@@ -14,11 +14,8 @@ import click
 from lifecycle.cli.common import (
     asking,
     assignments_argument,
-    check_hosts,
     completing,
     format_option,
-    hosts_options,
-    is_manifest,
     load_manifest,
     machine_option,
     say_differences,
@@ -126,7 +123,6 @@ def _of_cgroup(node: NodeStatus) -> str:
 )
 @assignments_argument
 @machine_option("As it was given to `lifecycle up`.")
-@hosts_options
 @format_option("text", "json")
 @click.option("--watch", is_flag=True, help="Show it again at every change; Ctrl-C ends.")
 @click.option(
@@ -140,9 +136,6 @@ def status_command(
     target: str | None,
     assignments: tuple[str, ...],
     machine: str,
-    hosts: bool,
-    chosen: tuple[str, ...],
-    remote_command: str,
     format_: str,
     watch: bool,
     probe: str | None,
@@ -151,31 +144,9 @@ def status_command(
 
     TARGET is a manifest or the name of a system; without one, all that run are listed. Exits with
     4 if the last verdict is violated.
-
-    With --hosts, TARGET is a manifest, and all its machines are asked at once. A host that does not
-    answer, or on which the system does not run, is named as unverifiable: exits with 5 then, if
-    nothing is violated.
     """
-    check_hosts(hosts, chosen)
     if watch and probe is not None:
         raise UsageError("cannot probe and watch at once; a probe prints nothing")
-    if hosts:
-        if watch:
-            raise UsageError(
-                "cannot use --watch with --hosts",
-                hint="lifecycle up MANIFEST --hosts follows what runs",
-            )
-        target = _manifest_of_hosts("status", target or "", machine)
-        from lifecycle.cli.hosts import status_of_hosts
-
-        return status_of_hosts(
-            target,
-            assignments,
-            chosen=chosen,
-            remote_command=remote_command,
-            format_=format_,
-            probe=probe,
-        )
     if target is None:
         if watch:
             raise UsageError("cannot watch without a TARGET", hint="lifecycle status lists them")
@@ -197,21 +168,6 @@ def status_command(
     else:
         click.echo(status_text(seen))
     return ExitCode.VIOLATED if seen.verdict is Outcome.VIOLATED else ExitCode.OK
-
-
-def _manifest_of_hosts(verb: str, target: str, machine: str) -> str:
-    """Return the manifest whose machines are all meant.
-
-    Raises:
-        UsageError: it is none, or one machine is named.
-    """
-    if machine or not is_manifest(target):
-        named = f"{target!r}, which is no manifest" if target else "no TARGET"
-        raise UsageError(
-            f"cannot use {'--machine' if machine else named}, with --hosts",
-            hint=f"the manifest says where the machines are: lifecycle {verb} MANIFEST --hosts",
-        )
-    return target
 
 
 def _watch(path: Path, format_: str) -> int:
@@ -311,35 +267,19 @@ def give_order(  # noqa: PLR0917 - in the order of the command line
 
 @click.command("down")
 @target_arguments
-@hosts_options
 @timeout_option(60.0, "How long it may take.")
 def down_command(
     *,
     target: str,
     assignments: tuple[str, ...],
     machine: str,
-    hosts: bool,
-    chosen: tuple[str, ...],
-    remote_command: str,
     timeout: float,
 ) -> int:
     """End a running system in reverse order, and wait until nothing of it is left.
 
     TARGET is a manifest, or the name of a running system as `lifecycle status` shows it. Where the
-    supervisor itself was killed, what it left behind is ended too. With --hosts, TARGET is a
-    manifest, and all its machines are ended at once.
+    supervisor itself was killed, what it left behind is ended too.
     """
-    check_hosts(hosts, chosen)
-    if hosts:
-        from lifecycle.cli.hosts import down_on_hosts
-
-        return down_on_hosts(
-            _manifest_of_hosts("down", target, machine),
-            assignments,
-            chosen=chosen,
-            remote_command=remote_command,
-            timeout_s=timeout,
-        )
     path = target_run(os.environ, target, assignments, machine)
     from lifecycle.supervisor import down
 

@@ -11,10 +11,8 @@ import click
 
 from lifecycle.cli.common import (
     NetworkCommand,
-    check_hosts,
     completing,
     format_option,
-    hosts_options,
     import_without,
     load_manifest,
     machine_option,
@@ -52,7 +50,6 @@ if TYPE_CHECKING:
     metavar="SECONDS",
     help="Hold it so long, then shut down; no success if it ended before, or was violated.",
 )
-@click.option("--hold", is_flag=True, hidden=True)  # what `--hosts` has each supervisor do
 @timeout_option(
     None,
     "For everything from the first start to the system being active.",
@@ -61,7 +58,6 @@ if TYPE_CHECKING:
 @report_option
 @click.option("--strict", is_flag=True, help="What cannot be verified keeps the gate closed.")
 @machine_option("Run only this machine's nodes; default: all whose address is this host's.")
-@hosts_options
 @click.option(
     "--keep-going",
     is_flag=True,
@@ -105,14 +101,10 @@ def command(
     format_: str,
     until: str,
     stop_after: float | None,
-    hold: bool,
     timeout: float | None,
     report: Path | None,
     strict: bool,
     machine: str,
-    hosts: bool,
-    chosen: tuple[str, ...],
-    remote_command: str,
     keep_going: bool,
     timings: bool,
     without: tuple[str, ...],
@@ -131,28 +123,7 @@ def command(
 
     --program tells networks which flows were verified before anything is activated, and takes it
     back in the end.
-
-    --hosts does so on all machines of the manifest, over ssh, and ends all in order. Should this
-    command be killed, its terminal be closed or a link be cut, they run on: the same command
-    follows them again, and `lifecycle down MANIFEST --hosts` ends them.
     """
-    check_hosts(hosts, chosen)
-    if hosts:
-        from lifecycle.cli.hosts import up_on_hosts
-
-        given: dict[str, Any] = {"until": until, "stop_after": stop_after, "timeout": timeout}
-        given |= {"report": report, "strict": strict, "machine": machine, "adopt": adopt}
-        given |= {"keep_going": keep_going, "timings": timings, "without": without}
-        given |= {"domain": domain, "targets": targets or bool(rest), "mapping": mapping}
-        given |= {"flow_labels": flow_labels}
-        return up_on_hosts(
-            manifest,
-            assignments,
-            chosen=chosen,
-            remote_command=remote_command,
-            format_=format_,
-            options=given,
-        )
     from lifecycle.supervisor import Ended, Ending
 
     try:
@@ -186,7 +157,6 @@ def command(
                 options = UpOptions(
                     until=Until(until),
                     stop_after_s=stop_after,
-                    holds=hold,
                     timeout_s=timeout,
                     strict=strict,
                     machine=machine,

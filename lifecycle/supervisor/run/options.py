@@ -50,9 +50,7 @@ class UpOptions:
     """How to bring a system up.
 
     Attributes:
-        stop_after_s: hold it so long, ≥ 0; None holds an active system until it is asked to end,
-            and one that is only connected or verified where `holds` is set.
-        holds: see above; for hosts that wait for each other.
+        stop_after_s: hold it so long, ≥ 0; None holds an active system until it is asked to end.
         timeout_s: for everything from the first start to the system being active, > 0; None for
             one that follows the number of processes, see `bring_up_s` and `gate_s`.
         strict: what cannot be verified keeps the gate closed.
@@ -65,7 +63,6 @@ class UpOptions:
 
     until: Until = Until.ACTIVE
     stop_after_s: float | None = None
-    holds: bool = False
     timeout_s: float | None = None
     strict: bool = False
     machine: str = ""

@@ -654,7 +654,7 @@ class Session:
         """Keep the system for as long as was asked; return the result of the run."""
         self._held = self._schedule.was_up = True
         hold_s = self._options.stop_after_s
-        if hold_s is None and self._options.until is not Until.ACTIVE and not self._options.holds:
+        if hold_s is None and self._options.until is not Until.ACTIVE:
             hold_s = 0.0
         await self._holding.hold(stage, hold_s)
         await self._others_end()
