@@ -1,12 +1,12 @@
 """A plan as units and manifests of the engines that start programs: each machine's part as one.
 
-Owns: what systemd, podman (Quadlet), Kubernetes and Compose are given so that the supervisor of a
+Owns: what systemd and Kubernetes are given so that the supervisor of a
 machine is started with it, is ready only once its system is active and verified, is ended when its
 event loop hangs, and is started again where that can help: by the engine where the manifest leaves
 that to it, never by both. Pure; nothing is asked of an engine.
 
-Sources: systemd.service(5), systemd.exec(5), systemd.resource-control(5); podman-systemd.unit(5);
-the Kubernetes API v1 and apps/v1; the Compose Specification.
+Sources: systemd.service(5), systemd.exec(5), systemd.resource-control(5);
+the Kubernetes API v1 and apps/v1.
 """
 
 from __future__ import annotations
@@ -225,22 +225,8 @@ def _systemd_restart(deployment: Deployment, machine: str) -> Iterator[tuple[str
     yield "RestartSec", 2
 
 
-def quadlet(deployment: Deployment) -> dict[str, str]:
-    """Return a `.container` file for each machine, by file name; podman makes units of them."""
-    return {
-        f"{deployment.name(machine)}.container": _quadlet_unit(deployment, machine)
-        for machine in deployment.machines
-    }
-
-
-def _refuse_cgroups(deployment: Deployment, machine: str, engine: str, limits: str) -> None:
-    """Refuse a part whose supervisor is to make cgroups, which it cannot in a container.
-
-    Args:
-        deployment: with the part.
-        machine: of the part.
-        engine: as people call it.
-        limits: what limits a whole container there.
+def _refuse_cgroups(deployment: Deployment, machine: str) -> None:
+    """Refuse a part whose supervisor is to limit processes, which it cannot in a container.
 
     Raises:
         UsageError: it is to.
@@ -249,95 +235,14 @@ def _refuse_cgroups(deployment: Deployment, machine: str, engine: str, limits: s
         at = resources.at
         raise UsageError(
             f"{at.file}:{at.line}:{at.column}: cannot give process {process.name!r} its "
-            f"'run.resources' in a container of {engine}: its supervisor would make a cgroup for "
+            "'run.resources' in a container of Kubernetes: its supervisor would make a cgroup for "
             "it, and the cgroup file system is read-only in a container without privileges",
-            hint=f"leave 'resources' out and limit the whole container ({limits}), or write a "
-            "unit: lifecycle export systemd",
+            hint="leave 'resources' out and limit the whole container (resources.limits), or write "
+            "a unit: lifecycle export systemd",
         )
-
-
-def _quadlet_unit(deployment: Deployment, machine: str) -> str:
-    _refuse_cgroups(deployment, machine, "podman", "PodmanArgs=--memory=, --cpus=, --pids-limit=")
-    return _sections(
-        deployment,
-        machine,
-        Unit=[
-            ("Description", _title(deployment, machine)),
-            ("Wants", "network-online.target"),
-            ("After", "network-online.target"),
-        ],
-        Container=[
-            ("Image", deployment.image),
-            ("Exec", _command(deployment.arguments(machine))),
-            ("Network", "host"),
-            ("PodmanArgs", f"--entrypoint=lifecycle --ipc=host --stop-timeout={deployment.stop_s}"),
-            ("Notify", "true"),
-            # podman passes readiness on, but no watchdog.
-            ("HealthCmd", _command(deployment.probe("live"))),
-            ("HealthInterval", f"{PROBE_S}s"),
-            ("HealthTimeout", f"{PROBE_S}s"),
-            ("HealthRetries", WATCHDOG_S // PROBE_S),
-            ("HealthStartPeriod", f"{deployment.start_s}s"),
-            ("HealthOnFailure", "kill"),
-            ("User", _USER),
-            ("DropCapability", "all"),
-            ("NoNewPrivileges", "true"),
-            ("ReadOnly", "true"),
-            ("Tmpfs", "/tmp"),  # noqa: S108 - the container's own
-            *(("Environment", f"{name}={value}") for name, value in _ENVIRONMENT.items()),
-        ],
-        Service=[
-            ("TimeoutStartSec", deployment.start_s),
-            ("TimeoutStopSec", deployment.stop_s + PROBE_S),
-            *_systemd_restart(deployment, machine),
-        ],
-        Install=[("WantedBy", "default.target")],
-    )
 
 
 _ENVIRONMENT = {"HOME": "/tmp", "ROS_LOG_DIR": "/tmp/log"}  # noqa: S108 - the container's own
-
-
-def compose(deployment: Deployment) -> dict[str, str]:
-    """Return a Compose file for each machine, by file name."""
-    return {
-        f"compose.{deployment.name(machine)}.yaml": _yaml(
-            deployment, machine, [_compose_project(deployment, machine)]
-        )
-        for machine in deployment.machines
-    }
-
-
-def _compose_project(deployment: Deployment, machine: str) -> dict[str, object]:
-    _refuse_cgroups(deployment, machine, "Compose", "mem_limit, cpus, pids_limit")
-    service = {
-        "image": deployment.image,
-        "container_name": deployment.name(machine),
-        "entrypoint": ["lifecycle"],
-        "command": [each.replace("$", "$$") for each in deployment.arguments(machine)],
-        "network_mode": "host",
-        "ipc": "host",
-        "user": f"{_USER}:{_USER}",
-        "read_only": True,
-        "tmpfs": ["/tmp"],  # noqa: S108 - the container's own
-        "environment": dict(_ENVIRONMENT),
-        "cap_drop": ["ALL"],
-        "security_opt": ["no-new-privileges:true"],
-        "init": False,
-        "stop_signal": "SIGTERM",
-        "stop_grace_period": f"{deployment.stop_s}s",
-        # Compose knows no exit codes: `on-failure` with a bound starts no hopeless case for ever.
-        "restart": "no" if deployment.restarts(machine) else "on-failure:5",
-        "healthcheck": {
-            "test": ["CMD", *deployment.probe("ready")],
-            "interval": f"{PROBE_S}s",
-            "timeout": f"{PROBE_S}s",
-            "retries": 3,
-            "start_period": f"{deployment.start_s}s",
-        },
-    }
-    # No `name` of the project: docker-compose 1 refuses it. The container has one in any case.
-    return {"services": {deployment.name(machine): service}}
 
 
 def kubernetes(deployment: Deployment) -> dict[str, str]:
@@ -385,7 +290,7 @@ def _kubernetes_object(deployment: Deployment, machine: str) -> dict[str, object
 
 
 def _pod(deployment: Deployment, machine: str) -> dict[str, object]:
-    _refuse_cgroups(deployment, machine, "Kubernetes", "resources.limits")
+    _refuse_cgroups(deployment, machine)
 
     def probe(what: str, failures: int) -> dict[str, object]:
         return {
@@ -442,8 +347,6 @@ def _pod(deployment: Deployment, machine: str) -> dict[str, object]:
 
 ENGINES: Mapping[str, Callable[[Deployment], dict[str, str]]] = {
     "systemd": systemd,
-    "quadlet": quadlet,
-    "compose": compose,
     "kubernetes": kubernetes,
 }
 """What each engine is given: a new one is a function and a line here."""

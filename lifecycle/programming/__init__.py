@@ -1,6 +1,6 @@
 """Programs networks from verified flows: `rules` renders their rules, `apply` installs them.
 
-`rules` is pure: nftables, tc, a NEF, CAMARA, Zenoh, Fast DDS Pro. `apply` has the targets, the
+`rules` is pure: nftables, tc, a NEF, CAMARA, CSV. `apply` has the targets, the
 ledger of what is ours in each, and HTTP. Must not import rclpy.
 """
 

@@ -81,14 +81,6 @@ _WRITTEN_FOR = {
         "Type=notify, ready once active and verified; the watchdog is the supervisor's event loop. "
         "Check the file with `systemd-analyze verify`, copy it to /etc/systemd/system."
     ),
-    "quadlet": (
-        "Write a .container file for each machine, of which podman makes a systemd unit.\n\n"
-        "As `systemd`, in a container of --image. Copy it to /etc/containers/systemd."
-    ),
-    "compose": (
-        "Write a Compose file for each machine.\n\n"
-        "Healthy once active and verified. `docker compose -f FILE config` checks it."
-    ),
     "kubernetes": (
         "Write the Kubernetes object of each machine's part, on the node of the machine's name.\n\n"
         "Ready once active and verified, live while the supervisor answers. "
@@ -179,8 +171,6 @@ for _engine in _WRITTEN_FOR:
 
 _VARIABLES = {
     "systemd": "EnvironmentFile= or LoadCredential=",
-    "quadlet": "Secret=…,type=env",
-    "compose": "env_file: or secrets:",
     "kubernetes": "a Secret, by valueFrom: secretKeyRef",
 }
 """By what each engine gives a process variables that are in none of the files written here."""
@@ -249,7 +239,6 @@ def _up_options(more: str, *, container: bool) -> tuple[tuple[str, ...], float]:
 
 
 _NOT_OF_ENGINES = {
-    "hosts": "each machine's engine starts its own part",
     "machine": "each file names its machine",
 }
 

@@ -123,7 +123,7 @@ def _ends(nfes: Sequence[NetworkFlowEndpoint]) -> str:
     return " ".join(dict.fromkeys(each.describe() for each in nfes)) or "unknown"
 
 
-NAMES = ("nft", "nft-json", "tc", "nef", "camara", "fastdds-pro", "zenoh", "csv")
+NAMES = ("nft", "tc", "nef", "camara", "csv")
 
 
 class Export:

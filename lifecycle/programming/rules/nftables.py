@@ -14,7 +14,6 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 
 from lifecycle import dataclasses
-from lifecycle.codec import to_json
 from lifecycle.network import InternetProtocol, code_points, describe, dscp_name
 from lifecycle.programming.rules.rules import FlowRule, LeftOut, asks, named
 
@@ -149,47 +148,6 @@ def render_nft(
     return "\n".join(lines) + "\n"
 
 
-def render_nft_json(rules: Iterable[FlowRule], *, system: str, digest: str) -> str:
-    """Return the same ruleset as libnftables JSON, for `nft -j -f` (libnftables-json(5)).
-
-    nftables 1.0.6 reads no comment of a table in JSON, so the managed-by comment is that of a rule
-    which counts what passes, first in the chain.
-
-    Raises:
-        ValueError: the system's name is not one that a manifest may have.
-    """
-    table = {"family": FAMILY, "name": table_name(system)}
-    place = {"family": FAMILY, "table": table_name(system)}
-    groups = tuple(_groups(tuple(rules)))
-    managed = {
-        **place,
-        "chain": CHAIN,
-        "comment": _comment(managed_comment(system, digest)),
-        "expr": [{"counter": None}],
-    }
-    chain = {
-        **place,
-        "name": CHAIN,
-        "type": "filter",
-        "hook": "postrouting",
-        "prio": PRIORITY_MANGLE,
-        "policy": "accept",
-    }
-    commands: list[object] = [
-        {"add": {"table": table}},
-        {"delete": {"table": table}},
-        {"add": {"table": table}},
-        {"add": {"chain": chain}},
-        {"add": {"rule": managed}},
-    ]
-    for group in groups:
-        commands += [
-            {"add": {"set": {**place, **_json_set(group)}}},
-            {"add": {"rule": {**place, "chain": CHAIN, **_json_rule(group)}}},
-        ]
-    return to_json({"nftables": commands}).decode()
-
-
 def render_nft_removal(system: str) -> str:
     """Return commands for `nft -f` that remove the system's table, and do so if there is none.
 
@@ -305,28 +263,3 @@ def _comment(text: str) -> str:
     if len(encoded) <= MAX_COMMENT_BYTES:
         return plain
     return encoded[: MAX_COMMENT_BYTES - 3].decode(errors="ignore") + "..."
-
-
-def _json_set(group: _Group) -> dict[str, object]:
-    return {
-        "name": group.name,
-        "type": [part.type for part in group.parts],
-        "elem": [
-            {"elem": {"val": {"concat": list(each.values)}, "comment": each.comment}}
-            for each in group.elements
-        ],
-    }
-
-
-def _json_rule(group: _Group) -> dict[str, object]:
-    left = [{"payload": {"protocol": p.protocol, "field": p.field}} for p in group.parts]
-    key = {"payload": {"protocol": group.network, "field": group.field}}
-    value = int(group.value, 16) if group.field == "flowlabel" else group.value
-    return {
-        "comment": group.comment,
-        "expr": [
-            {"match": {"op": "==", "left": {"concat": left}, "right": f"@{group.name}"}},
-            {"mangle": {"key": key, "value": value}},
-            {"counter": None},
-        ],
-    }

@@ -16,12 +16,10 @@ from lifecycle import dataclasses
 from lifecycle.network import DscpMapping, FlowTuple, dscp_name, tos
 from lifecycle.plan import Plan
 from lifecycle.programming.rules.camara import CamaraSettings, render_camara
-from lifecycle.programming.rules.fastdds_pro import render_fastdds_pro
 from lifecycle.programming.rules.nef import NefSettings, render_nef
-from lifecycle.programming.rules.nftables import render_nft, render_nft_json
+from lifecycle.programming.rules.nftables import render_nft
 from lifecycle.programming.rules.rules import RuleSet, SourceAddress, flow_rules, rules_digest
 from lifecycle.programming.rules.tc import TcSettings, render_tc
-from lifecycle.programming.rules.zenoh import render_zenoh
 from lifecycle.verify import FlowReport
 
 COLUMNS = (
@@ -180,10 +178,6 @@ def _nft(given: ExportInput) -> str:
     )
 
 
-def _nft_json(given: ExportInput) -> str:
-    return render_nft_json(given.rules.rules, system=given.plan.system, digest=given.digest) + "\n"
-
-
 def _tc(given: ExportInput) -> str:
     return render_tc(
         given.rules.rules,
@@ -204,16 +198,6 @@ def _camara(given: ExportInput) -> str:
     return render_camara(given.rules.rules, settings, left_out=given.rules.left_out) + "\n"
 
 
-def _fastdds_pro(given: ExportInput) -> str:
-    return render_fastdds_pro(
-        given.rules.rules, system=given.plan.system, left_out=given.rules.left_out
-    )
-
-
-def _zenoh(given: ExportInput) -> str:
-    return render_zenoh(given.rules.rules, left_out=given.rules.left_out)
-
-
 def _csv(given: ExportInput) -> str:
     return flows_to_csv(given.flows)
 
@@ -227,12 +211,9 @@ def _needed(settings: T | None, name: str, what: str) -> T:
 EXPORTS: Mapping[str, Callable[[ExportInput], str]] = MappingProxyType(
     {
         "nft": _nft,
-        "nft-json": _nft_json,
         "tc": _tc,
         "nef": _nef,
         "camara": _camara,
-        "fastdds-pro": _fastdds_pro,
-        "zenoh": _zenoh,
         "csv": _csv,
     }
 )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import configparser
 import os
-import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -84,7 +83,7 @@ def test_who_programs_networks_may_do_that_and_no_more(tmp_path: Path) -> None:
     service = sections(text)["Service"]
     assert service["AmbientCapabilities"] == service["CapabilityBoundingSet"] == "CAP_NET_ADMIN"
     with pytest.raises(UsageError, match="export systemd"):
-        exported(tmp_path, "compose", TELEOP, "--image", "i", "--up", "--program nft")
+        exported(tmp_path, "kubernetes", TELEOP, "--image", "i", "--up", "--program nft")
 
 
 def test_words_with_signs_of_systemd_stand_for_themselves() -> None:
@@ -123,38 +122,12 @@ def test_machines_of_kubernetes_are_its_nodes(tmp_path: Path) -> None:
         assert pod["hostIPC"]
 
 
-def test_compose_has_a_service_that_is_healthy_once_verified() -> None:
-    made = yaml.safe_load(written("compose", words=("a:=$b",)))
-    (service,) = made["services"].values()
-    assert service["command"] == ["up", "/system/robot.lifecycle.yaml", "a:=$$b"]
-    assert service["healthcheck"]["test"][-2:] == ["--probe", "ready"]
-    assert (service["network_mode"], service["ipc"], service["cap_drop"]) == (
-        "host",
-        "host",
-        ["ALL"],
-    )
-
-
-@pytest.mark.parametrize(
-    ("restarts", "unit", "composed"),
-    [(False, "on-failure", "on-failure:5"), (True, "on-abnormal", "no")],
-)
-def test_what_fails_is_restarted_by_one_of_both(restarts: bool, unit: str, composed: str) -> None:
+@pytest.mark.parametrize(("restarts", "unit"), [(False, "on-failure"), (True, "on-abnormal")])
+def test_what_fails_is_restarted_by_one_of_both(restarts: bool, unit: str) -> None:
     plan = restarting(restarts=restarts)
     assert sections(written("systemd", plan=plan))["Service"]["Restart"] == unit
-    assert sections(written("quadlet", plan=plan))["Service"]["Restart"] == unit
-    (service,) = yaml.safe_load(written("compose", plan=plan))["services"].values()
-    assert service["restart"] == composed
     pod = yaml.safe_load(written("kubernetes", plan=plan))["spec"]
     assert pod.get("restartPolicy") == ("Never" if restarts else None)
-
-
-def test_a_quadlet_is_probed_because_podman_passes_no_watchdog_on() -> None:
-    unit = sections(written("quadlet"))
-    assert "WatchdogSec" not in unit["Service"]
-    assert unit["Container"]["HealthCmd"] == "lifecycle status robot --probe live"
-    assert unit["Container"]["HealthOnFailure"] == "kill"
-    assert unit["Container"]["Notify"] == "true"
 
 
 def test_a_manifest_that_restarts_a_node_leaves_the_engine_its_supervisor(tmp_path: Path) -> None:
@@ -190,26 +163,16 @@ def test_a_supervisor_that_makes_cgroups_has_them_delegated_to_it(tmp_path: Path
     assert "Delegate" not in sections(files["limited-there.service"])["Service"]
 
 
-@pytest.mark.parametrize(
-    ("engine", "called", "limits"),
-    [
-        ("quadlet", "podman", "PodmanArgs=--memory=, --cpus=, --pids-limit="),
-        ("compose", "Compose", "mem_limit, cpus, pids_limit"),
-        ("kubernetes", "Kubernetes", "resources.limits"),
-    ],
-)
-def test_a_container_in_which_no_cgroups_can_be_made_is_refused(
-    tmp_path: Path, engine: str, called: str, limits: str
-) -> None:
+def test_a_container_in_which_no_cgroups_can_be_made_is_refused(tmp_path: Path) -> None:
     manifest = tmp_path / "limited.lifecycle.yaml"
     manifest.write_text(LIMITED)
     with pytest.raises(UsageError) as raised:
-        exported(tmp_path / "out", engine, str(manifest), "--image", "i")
+        exported(tmp_path / "out", "kubernetes", str(manifest), "--image", "i")
     assert str(raised.value) == (
         f"{manifest}:9:27: cannot give process 'arm' its 'run.resources' in a container of "
-        f"{called}: its supervisor would make a cgroup for it, and the cgroup file system is "
+        "Kubernetes: its supervisor would make a cgroup for it, and the cgroup file system is "
         "read-only in a container without privileges; leave 'resources' out and limit the whole "
-        f"container ({limits}), or write a unit: lifecycle export systemd"
+        "container (resources.limits), or write a unit: lifecycle export systemd"
     )
     assert not (tmp_path / "out").exists()
 
@@ -233,7 +196,7 @@ nodes:
   cart: {run: {command: [cart]}, parameters: {what: $(arg what)}}
 """
 SIGNS = 'x y\nTimeoutStartSec=1\n %h $HOME ${A} "q" \' \\ ; é \t'
-"""What a shell, systemd, Compose and Kubernetes each would read as something else."""
+"""What a shell, systemd and Kubernetes each would read as something else."""
 
 
 @pytest.fixture(scope="module")
@@ -245,7 +208,7 @@ def awkward(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     shipped = ROOT / "manifests"
     for engine, option in (
         ("systemd", ("--program", "/bin/true", "--up", "--strict --timeout 600")),
-        *((each, ("--image", "reg:5000/robot:1")) for each in ("quadlet", "compose", "kubernetes")),
+        ("kubernetes", ("--image", "reg:5000/robot:1")),
     ):
         for words in (
             (str(manifest), f"what:={SIGNS}"),
@@ -276,7 +239,7 @@ def test_no_two_parts_have_one_file(awkward: dict[str, Path]) -> None:
     for folder in awkward.values():
         names = [each.name for each in folder.iterdir()]
         assert len(names) == 4 + 1 + 2 + 2
-        assert max(map(len, names)) < 63 + len("compose..container")
+        assert max(map(len, names)) <= 63 + len(".service")
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd is not installed")
@@ -286,51 +249,6 @@ def test_systemd_finds_nothing_wrong_with_its_units(
     exported(tmp_path, "systemd", TELEOP, "--program", "/bin/true", "--up", "--program 'nft'")
     for folder in (awkward["systemd"], tmp_path):
         assert checked("systemd-analyze", "verify", "--man=no", *folder.iterdir()) == ""
-
-
-GENERATOR = next(
-    filter(
-        Path.exists,
-        (
-            Path(each, "podman/quadlet")
-            for each in ("/usr/libexec", "/usr/lib", "/usr/local/libexec")
-        ),
-    ),
-    Path(os.environ.get("QUADLET", "quadlet")),
-)
-
-
-@pytest.mark.skipif(not GENERATOR.exists(), reason="podman's quadlet (4.4) is not installed")
-def test_podman_makes_units_of_quadlets(awkward: dict[str, Path], tmp_path: Path) -> None:
-    """`--dryrun` names what it cannot use, but ends with 0 for some of it."""
-    said = checked(GENERATOR, "-dryrun", QUADLET_UNIT_DIRS=str(awkward["quadlet"]))
-    assert said.count("ExecStart=/usr/bin/podman run") == 9
-    assert not re.search("unsupported|converting|error", said, re.IGNORECASE)
-    assert r'"what:=x y\nTimeoutStartSec=1\n %%h $$HOME $${A} \"q\" ' in said
-
-
-COMPOSE = [
-    each
-    for each in (["docker", "compose"], ["docker-compose"])
-    if shutil.which(each[0])
-    and subprocess.run([*each, "version"], capture_output=True, check=False).returncode == 0
-]
-
-
-@pytest.mark.skipif(not COMPOSE, reason="neither docker compose nor docker-compose is installed")
-def test_compose_finds_nothing_wrong_with_its_files(awkward: dict[str, Path]) -> None:
-    # One of each kind: docker-compose 1 takes half a second to start.
-    chosen = [
-        each for each in awkward["compose"].iterdir() if not re.search("left|right|ope", each.name)
-    ]
-    assert len(chosen) == 4
-    for command in COMPOSE:
-        for each in chosen:
-            made = yaml.safe_load(checked(*command, "-f", each, "config"))
-            (service,) = made["services"].values()
-            if "what:" in each.read_text():
-                # `config` writes `$` doubled, as it reads it.
-                assert service["command"][-1].replace("$$", "$") == f"what:={SIGNS}"
 
 
 @pytest.mark.skipif(shutil.which("kubectl") is None, reason="kubectl is not installed")
@@ -401,9 +319,10 @@ def test_an_engine_waits_as_long_as_nodes_may_take(awkward: dict[str, Path]) -> 
     many = plan_of(*(planned_node(f"n{number}") for number in range(120)))
     service = sections(written("systemd", plan=many))["Service"]
     assert int(service["TimeoutStartSec"]) >= 30 + 120
-    (text,) = (each.read_text() for each in awkward["compose"].iterdir() if "left-arm" in each.name)
-    (part,) = yaml.safe_load(text)["services"].values()
-    assert int(part["stop_grace_period"].rstrip("s")) > 90
+    pods = awkward["kubernetes"].iterdir()
+    (text,) = (each.read_text() for each in pods if "left-arm" in each.name)
+    pod = yaml.safe_load(text)["spec"]["template"]["spec"]
+    assert pod["terminationGracePeriodSeconds"] > 90
 
 
 @pytest.mark.parametrize(
@@ -413,7 +332,6 @@ def test_an_engine_waits_as_long_as_nodes_may_take(awkward: dict[str, Path]) -> 
             "--until verified",
             "cannot use --until verified in --up: only an active system is ever ready",
         ),
-        ("--hosts", "cannot use --hosts in --up: each machine's engine starts its own part"),
         ("--machine x", "cannot use --machine in --up: each file names its machine"),
         (
             "a:=b",
@@ -433,7 +351,7 @@ def test_places_that_an_engine_would_not_find_are_refused(tmp_path: Path) -> Non
     with pytest.raises(UsageError, match=r"cannot use --program '\./lifecycle' in a unit"):
         exported(tmp_path, "systemd", TELEOP, "--program", "./lifecycle")
     with pytest.raises(UsageError, match="cannot use image 'a b'"):
-        exported(tmp_path, "compose", TELEOP, "--image", "a b")
+        exported(tmp_path, "kubernetes", TELEOP, "--image", "a b")
 
 
 _ARGUED = """manifest_version: 1

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import re
 from pathlib import Path
 
@@ -16,7 +15,6 @@ from lifecycle.programming.rules.nftables import (
     nft_keyword,
     parse_managed_comment,
     render_nft,
-    render_nft_json,
     render_nft_removal,
     table_name,
 )
@@ -39,22 +37,10 @@ def test_a_ruleset_is_one_table_that_is_replaced_in_one_transaction() -> None:
     assert ruleset() == (EXPECTED / "teleop.nft").read_text(encoding="utf-8")
 
 
-def test_a_json_ruleset_is_the_same_table() -> None:
-    made = json.loads(render_nft_json(RULES, system="teleop", digest=DIGEST))
-    assert made == json.loads((EXPECTED / "teleop.nft.json").read_text(encoding="utf-8"))
-
-
 def test_nft_accepts_the_ruleset(tmp_path: Path) -> None:
     file = tmp_path / "teleop.nft"
     file.write_text(ruleset(), encoding="utf-8")
     done = in_a_network_namespace("nft", "-c", "-f", str(file))
-    assert (done.returncode, done.stderr) == (0, "")
-
-
-def test_nft_accepts_the_json_ruleset(tmp_path: Path) -> None:
-    file = tmp_path / "teleop.json"
-    file.write_text(render_nft_json(RULES, system="teleop", digest=DIGEST), encoding="utf-8")
-    done = in_a_network_namespace("nft", "-j", "-c", "-f", str(file))
     assert (done.returncode, done.stderr) == (0, "")
 
 
@@ -74,19 +60,16 @@ def test_nft_knows_how_every_dscp_is_spelled(tmp_path: Path) -> None:
     assert all(f"DSCP {dscp} = " in comment for dscp, comment in spelled.items())
 
 
-@pytest.mark.parametrize("form", ["text", "json"])
 def test_applied_twice_there_is_one_table_and_removed_twice_there_is_none(
-    tmp_path: Path, form: str
+    tmp_path: Path,
 ) -> None:
     ours, gone = tmp_path / "ours", tmp_path / "gone"
-    text = ruleset() if form == "text" else render_nft_json(RULES, system="teleop", digest=DIGEST)
-    ours.write_text(text, encoding="utf-8")
+    ours.write_text(ruleset(), encoding="utf-8")
     gone.write_text(render_nft_removal("teleop"), encoding="utf-8")
-    json_flag = "-j" if form == "json" else ""
     script = f"""set -e
 nft add table inet someone_else
-nft {json_flag} -f {ours}; nft list ruleset > {tmp_path}/once
-nft {json_flag} -f {ours}; nft list ruleset > {tmp_path}/twice
+nft -f {ours}; nft list ruleset > {tmp_path}/once
+nft -f {ours}; nft list ruleset > {tmp_path}/twice
 nft -f {gone}; nft -f {gone}; nft list ruleset"""
     done = in_a_network_namespace("sh", "-c", script, needs="nft")
     assert (done.returncode, done.stderr) == (0, "")
