@@ -41,8 +41,6 @@ VERBS: dict[str, str] = {
     "capture": "write a manifest from a running system, gaps marked",
     "logs": "show what the processes of the latest run have written, or follow it",
     "history": "show what happened in a run, from its journal",
-    "explain": "say which fact turned a finding of a run, and when",
-    "replay": "judge what a run saw again, with today's rules",
     "run": "run one node of a manifest in this terminal, without a supervisor",
     "ports": "DDS port arithmetic and platform limits",
     "init": "make a package of one's own: nodes, manifest, tests, CI workflow",
@@ -52,7 +50,6 @@ VERBS: dict[str, str] = {
 
 _ELSEWHERE = {
     **dict.fromkeys(("pause", "resume", "restart", "mode", "down", "status"), "control"),
-    **dict.fromkeys(("explain", "replay"), "history"),
     "schema": "init",
     "import": "import_",
 }
@@ -67,7 +64,7 @@ _ORDERLY = frozenset({ExitCode.OK, ExitCode.VIOLATED, ExitCode.UNVERIFIABLE})
 
 _LINUX = _PARTICIPANTS | {
     *("pause", "resume", "restart", "mode", "apply", "down", "status"),
-    *("logs", "history", "explain", "replay"),
+    *("logs", "history"),
 }
 """Verbs that run nodes, or are about what runs or ran."""
 

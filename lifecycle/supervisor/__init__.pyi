@@ -47,16 +47,10 @@ from .run.events import WiringLost as WiringLost
 from .run.events import from_record as from_record
 from .run.events import to_record as to_record
 from .run.failure import ended_early as ended_early
-from .run.history import Explanation as Explanation
 from .run.history import RecordedRun as RecordedRun
-from .run.history import Rejudged as Rejudged
-from .run.history import explained as explained
 from .run.history import journal_files as journal_files
 from .run.history import moment_of as moment_of
-from .run.history import named_findings as named_findings
 from .run.history import read_run as read_run
-from .run.history import replayed as replayed
-from .run.history import was_set_s as was_set_s
 from .run.looking import attached_picture as attached_picture
 from .run.looking import attached_pictures as attached_pictures
 from .run.looking import capture_running as capture_running

@@ -11,7 +11,7 @@ own or a step of another supervisor's node, does it ask again. Must not import r
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator
 from typing import Protocol
 
 from lifecycle import dataclasses
@@ -266,23 +266,6 @@ class Looker(Protocol):
         """Whether something is missing, as of the last observation, that is still to be made."""
 
 
-class Recorder(Protocol):
-    """What keeps what was seen and found, see run/journal.py."""
-
-    def looked(
-        self,
-        plan: Plan,
-        observation: Observation,
-        verdict: Verdict,
-        *,
-        stage: Stage,
-        machines: frozenset[str] | None,
-        ahead: frozenset[str],
-        over: Mapping[str, str],
-    ) -> None:
-        """Take what `verify` was given, and what it found."""
-
-
 class VerificationLoop:
     """Judges one system.
 
@@ -305,10 +288,8 @@ class VerificationLoop:
         looker: Looker | None = None,
         agreement: Agreement | None = None,
         guard: ActivationGuard | None = None,
-        recorder: Recorder | None = None,
     ) -> None:
         self._system = system
-        self._recorder = recorder
         self._observer = observer
         self._changes = changes
         self._emit = emit
@@ -470,16 +451,6 @@ class VerificationLoop:
         verdict = judge(
             expected, observation, stage=stage, machines=machines, ahead=ahead, over=over
         )
-        if self._recorder is not None:
-            self._recorder.looked(
-                expected,
-                observation,
-                verdict,
-                stage=stage,
-                machines=machines,
-                ahead=ahead,
-                over=over,
-            )
         if self._looker is not None:
             verdict = with_findings(verdict, self._looker.findings())
         if self._guard is not None:

@@ -741,10 +741,6 @@ class System:
         every = (*self.processes.values(), *(() if self.server is None else (self.server,)))
         return tuple(each for each in every if each.pid and not each.is_gone)
 
-    def output_positions(self) -> dict[str, int]:
-        """Return how many bytes the log file of each process has."""
-        return {each.name: each.log.position for each in self.processes.values()}
-
     def dead(self) -> frozenset[str]:
         """Return the names of the nodes whose process has ended.
 

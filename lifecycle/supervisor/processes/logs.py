@@ -419,11 +419,6 @@ class ProcessLog:
         return self._file
 
     @property
-    def position(self) -> int:
-        """Bytes in the file; 0 before the first line."""
-        return self._bytes
-
-    @property
     def shown(self) -> str:
         """Its path for messages; empty where there is no file."""
         return str(self.path) if self._kept else ""

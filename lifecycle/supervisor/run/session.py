@@ -38,7 +38,7 @@ from lifecycle.supervisor.gate.activation_guard import ActivationGuard
 from lifecycle.supervisor.gate.gate import Gate, VerificationError, closes
 from lifecycle.supervisor.gate.hold import Holding
 from lifecycle.supervisor.gate.sequence import GateSequence
-from lifecycle.supervisor.gate.verification_loop import ChangeCounter, Recorder, VerificationLoop
+from lifecycle.supervisor.gate.verification_loop import ChangeCounter, VerificationLoop
 from lifecycle.supervisor.health import agreement, peer_supervisors
 from lifecycle.supervisor.health.agreement import Agreement
 from lifecycle.supervisor.health.answering import Answering, Asking
@@ -237,7 +237,6 @@ class Session:
         emit: where events go.
         ending: knows of signals that came before.
         worker: for what blocks.
-        recorder: keeps what was seen and found.
     """
 
     def __init__(
@@ -253,7 +252,6 @@ class Session:
         emit: Emitter,
         ending: Ending,
         worker: Worker,
-        recorder: Recorder | None = None,
     ) -> None:
         self._worker = worker
         self._system = system
@@ -286,7 +284,6 @@ class Session:
             looker=self._authority,
             agreement=self._agreement,
             guard=self._guard,
-            recorder=recorder,
         )
         self._gate = Gate(strict=options.strict, judging=self._judge)
         sightings = Sightings(system, observer_participant, self._changes)

@@ -216,8 +216,7 @@ def _up(
                 processes=processes,
                 variables=_graph_variables(os.environ),
             )
-            leaving.enter_context(journal.writing(logs, positions=system.output_positions))
-            leaving.enter_context(journal.noting_use(lambda: system.living))
+            leaving.enter_context(journal.writing(logs))
             fork_server = ForkServer(forerunner.process, emit, directory)
             worker = leaving.enter_context(_working(emit, logs, plan.system))
             records = leaving.enter_context(noting(directory, system, fork_server, worker, emit))
@@ -241,7 +240,6 @@ def _up(
                     emit=emit,
                     ending=ending,
                     worker=worker,
-                    recorder=journal,
                 )
                 leaving.push_async_callback(session.leave)
                 if on_start is not None:

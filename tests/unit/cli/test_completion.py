@@ -106,8 +106,7 @@ def _asked(line: str, place: Path, shell: str = "bash") -> list[str]:
         ("lifecycle logs ", ["plain camera"]),
         ("lifecycle logs --system ", ["plain arm", "plain leg"]),
         ("lifecycle history ", ["plain 2026-11-23-13-00-00-000000-host-1-17-arm"]),
-        ("lifecycle replay --system leg ", []),
-        ("lifecycle explain --run 2", ["plain 2026-11-23-13-00-00-000000-host-1-17-arm"]),
+        ("lifecycle history --system leg ", []),
     ],
 )
 def test_what_can_come_next_is_offered(line: str, offered: list[str], place: Path) -> None:
