@@ -6,10 +6,8 @@ does, but for a prefix that AMENT_PREFIX_PATH need not name: wheels install the 
 interface, from the `share/<package>/<kind>/<Type>.json` that rosidl installs beside every
 definition, and how the hashes of a service's and an action's messages are put together.
 
-And the upper bound of a type's serialized size, from the `.idl` file that every interface package
-installs, also for what was written as `.msg`: `struct Name { … }`, its fields and typedefs are read
-as rosidl writes or accepts them
-(https://design.ros2.org/articles/idl_interface_definition.html); all else is skipped.
+And the upper bound of a type's serialized size, from the same file, which describes each field
+(type_description_interfaces/msg/FieldType).
 
 Imports no message package, so that a manifest is checked without ROS installed or sourced. Reads
 the file system.
@@ -21,9 +19,8 @@ import enum
 import functools
 import json
 import os
-import re
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
 from lifecycle import dataclasses
@@ -169,27 +166,16 @@ def _hashes(path: Path) -> Mapping[str, str]:
         return {}
 
 
-_WORD = re.compile(
-    r"""//[^\n]*|/\*.*?\*/|\#[^\n]*      # comments and includes
-    |"(?:\\.|[^"\\])*"|'(?:\\.|[^'\\])'  # text of annotations and defaults
-    |[A-Za-z_][\w]*(?:::[A-Za-z_]\w*)*   # names, scoped ones whole
-    |[\d.][\w.+-]*|\S""",
-    re.VERBOSE | re.DOTALL,
-)
-_SKIPPED = ("//", "/*", "#")
-_UNSIGNED = {"short": "uint16", "long": "uint32"}
-
-
-class IdlError(Exception):
-    """The text is not IDL of the kind that is read here."""
+class DescriptionError(Exception):
+    """A type description does not have what type_description_interfaces/msg/FieldType says."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Field:
-    """One field of a structure, typedefs followed.
+    """One field of a message type.
 
     Attributes:
-        type: a primitive's IDL name, `string`, `wstring`, or a scoped name `a::msg::B`.
+        type: a primitive's name in FieldType.msg, `string`, `wstring`, or a type `a/msg/B`.
         length: number of items of a fixed array, 1 for a single value.
         is_sequence: of variable length.
         bound: most items of a sequence; None if it has no bound.
@@ -203,131 +189,54 @@ class Field:
     string_bound: int | None = None
 
 
-def parse_struct(text: str, name: str) -> tuple[Field, ...]:
-    """Return the fields of the structure `name`.
+_NESTED = 1
+_NUMBERS = (
+    *("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64"),
+    *("float", "double", "long_double", "char", "wchar", "boolean", "byte"),
+)
+_PRIMITIVE_IDS = dict(enumerate(_NUMBERS, start=2))
+_STRINGS = {17: "string", 18: "wstring", 21: "string", 22: "wstring"}
+_BOUNDED_STRINGS = (21, 22)
+_ARRAY, _BOUNDED, _UNBOUNDED = 1, 2, 3
+_FORM = 48
+"""type_description_interfaces/msg/FieldType: a type, and in steps of 48 its array, its bounded and
+its unbounded sequence."""
+
+
+def described_fields(description: object) -> tuple[Field, ...]:
+    """Return the fields of an IndividualTypeDescription as rosidl installs it in JSON.
 
     Raises:
-        IdlError: there is no such structure, or it holds something that is not understood.
+        DescriptionError: it is none, or has a kind of field that is not known here.
     """
-    return _Parser(text).struct(name)
+    try:
+        return tuple(_described(each["type"]) for each in description["fields"])  # type: ignore[index]
+    except (KeyError, TypeError, ValueError) as error:
+        raise DescriptionError(f"cannot read the fields of a type: {error!r}") from error
 
 
-class _Parser:
-    def __init__(self, text: str) -> None:
-        found: list[str] = _WORD.findall(text)
-        self._words: list[str] = [each for each in found if not each.startswith(_SKIPPED)]
-        self._at = 0
-        self._typedefs: dict[str, Field] = {}
+def _described(type_: Mapping[str, object]) -> Field:
+    number, capacity, string_capacity = (
+        _count(type_[each]) for each in ("type_id", "capacity", "string_capacity")
+    )
+    form, of = divmod(number, _FORM)
+    name = str(type_["nested_type_name"]) if of == _NESTED else _STRINGS.get(of)
+    name = name or _PRIMITIVE_IDS.get(of, "")
+    if not name or form > _UNBOUNDED:
+        raise DescriptionError(f"cannot read a field of type_id {number}")
+    return Field(
+        type=name,
+        length=capacity if form == _ARRAY else 1,
+        is_sequence=form in (_BOUNDED, _UNBOUNDED),
+        bound=capacity if form == _BOUNDED else None,
+        string_bound=string_capacity if of in _BOUNDED_STRINGS else None,
+    )
 
-    def struct(self, name: str) -> tuple[Field, ...]:
-        while self._at < len(self._words):
-            word = self._next()
-            if word == "@":
-                self._annotation()
-            elif word == "typedef":
-                type_ = self._type()
-                self._typedefs.update(self._declarators(type_))
-            elif word == "struct" and self._peek() == name:
-                self._next()
-                return tuple(self._members())
-        raise IdlError(f"cannot find struct {name!r}")
 
-    def _members(self) -> Iterator[Field]:
-        self._expect("{")
-        while self._peek() != "}":
-            while self._peek() == "@":
-                self._next()
-                self._annotation()
-            yield from self._declarators(self._type()).values()
-
-    def _type(self) -> Field:
-        word = self._next()
-        if word == "sequence":
-            return self._sequence()
-        if word in ("string", "wstring"):
-            bound = None
-            if self._peek() == "<":
-                self._next()
-                bound = self._number()
-                self._expect(">")
-            return Field(type=word, string_bound=bound)
-        if word == "unsigned":
-            word = _UNSIGNED.get(self._next(), "")
-            if word == "uint32" and self._peek() == "long":
-                self._next()
-                word = "uint64"
-        elif word == "long" and self._peek() in ("long", "double"):
-            word = {"long": "int64", "double": "long double"}[self._next()]
-        if word in self._typedefs:
-            return self._typedefs[word]
-        if not word or not (word[0].isalpha() or word[0] == "_"):
-            raise IdlError(f"cannot read a type at {word!r}")
-        return Field(type=word)
-
-    def _sequence(self) -> Field:
-        self._expect("<")
-        item = self._type()
-        bound = None
-        if self._peek() == ",":
-            self._next()
-            bound = self._number()
-        self._expect(">")
-        if item.is_sequence or item.length != 1:
-            raise IdlError("cannot read a sequence of sequences or arrays")
-        return dataclasses.replace(item, is_sequence=True, bound=bound)
-
-    def _declarators(self, type_: Field) -> dict[str, Field]:
-        """Read `name[3][4], other;` after a type."""
-        found: dict[str, Field] = {}
-        while True:
-            name, length = self._next(), 1
-            if not name.isidentifier():
-                raise IdlError(f"cannot read {name!r} as the name of a field")
-            while self._peek() == "[":
-                self._next()
-                length *= self._number()
-                self._expect("]")
-            if length != 1 and type_.is_sequence:
-                raise IdlError("cannot read an array of sequences")
-            found[name] = dataclasses.replace(type_, length=type_.length * length)
-            word = self._next()
-            if word == ";":
-                return found
-            if word != ",":
-                raise IdlError(f"cannot read {word!r} after a name")
-
-    def _annotation(self) -> None:
-        """Skip `@name` or `@name(…)`; the @ is read."""
-        self._next()
-        if self._peek() != "(":
-            return
-        depth = 0
-        while True:
-            word = self._next()
-            depth += {"(": 1, ")": -1}.get(word, 0)
-            if depth == 0:
-                return
-
-    def _number(self) -> int:
-        word = self._next()
-        try:
-            return int(word, 0)
-        except ValueError:
-            raise IdlError(f"cannot use {word!r} as a bound") from None
-
-    def _expect(self, word: str) -> None:
-        if (found := self._next()) != word:
-            raise IdlError(f"cannot read {found!r} where {word!r} must be")
-
-    def _peek(self) -> str:
-        if self._at >= len(self._words):
-            raise IdlError("cannot read on: the text ends")
-        return self._words[self._at]
-
-    def _next(self) -> str:
-        word = self._peek()
-        self._at += 1
-        return word
+def _count(value: object) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+        raise DescriptionError(f"cannot use {value!r} as a count")
+    return value
 
 
 _ENCAPSULATION = 4
@@ -337,16 +246,14 @@ _LENGTH = 4
 _WCHAR = 4
 _PRIMITIVES = {
     "boolean": 1,
-    "octet": 1,
+    "byte": 1,
     "char": 1,
     "int8": 1,
     "uint8": 1,
     "int16": 2,
     "uint16": 2,
-    "short": 2,
     "int32": 4,
     "uint32": 4,
-    "long": 4,
     "float": 4,
     "wchar": _WCHAR,
     "int64": 8,
@@ -443,14 +350,15 @@ def _repeat(type_: str, layout: _Layout, count: int, prefixes: Sequence[Path], d
 
 
 def _fields(type_: str, prefixes: Sequence[Path]) -> tuple[Field, ...] | None:
-    """Return the fields of a type, `a/msg/B` or IDL's `a::msg::B`; None if it cannot be read."""
-    package, _, rest = type_.replace("::", "/").partition("/")
+    """Return the fields of a type `a/msg/B`; None if its description cannot be read."""
+    package, _, rest = type_.partition("/")
     index = find_resource("rosidl_interfaces", package, prefixes)
     if index is None or not rest:
         return None
     # <prefix>/share/ament_index/resource_index/rosidl_interfaces/<package>
-    path = index.parents[3] / package / f"{rest}.idl"
+    path = index.parents[3] / package / f"{rest}.json"
     try:
-        return parse_struct(path.read_text(encoding="utf-8"), rest.rpartition("/")[2])
-    except (OSError, UnicodeDecodeError, IdlError):
+        described = json.loads(path.read_text(encoding="utf-8"))["type_description_msg"]
+        return described_fields(described["type_description"])
+    except (OSError, ValueError, KeyError, TypeError, RecursionError, DescriptionError):
         return None

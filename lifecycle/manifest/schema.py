@@ -12,7 +12,6 @@ from __future__ import annotations
 import functools
 import itertools
 import json
-import re
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -290,8 +289,6 @@ def validate(
     found: list[tuple[Place, Diagnostic]] = []
     seen: set[tuple[Place, str]] = set()
     plain = document.root.plain()
-    if _is_sound(plain, definition, is_resolved=is_resolved):
-        return ()
     errors = _validator(definition, is_resolved).iter_errors(plain)
     broken = list(violations(errors))
     enums = {each.place for each in broken if each.keyword == "enum"}
@@ -401,143 +398,3 @@ def _misspelt(each: Violation) -> set[str]:
     """Return the known keys that unknown ones probably mean: the unknown key is finding enough."""
     known = each.schema.get("properties", {})
     return {nearest(key, known) for key in each.value if key not in known}
-
-
-class _UndecidedError(Exception):
-    """What holds for a value is left to jsonschema."""
-
-
-def _is_sound(value: object, definition: str, *, is_resolved: bool) -> bool:
-    """Return whether a document surely fits; if not, jsonschema decides, and says why.
-
-    Most documents fit, and loading jsonschema takes longer than all the rest of loading one.
-    """
-    schema = _schema(definition, is_resolved)
-    try:
-        return _holds(schema, value, schema["$defs"])
-    except _UndecidedError:
-        return False
-
-
-def _holds(schema: Any, value: Any, definitions: Mapping[str, Any]) -> bool:
-    if isinstance(schema, bool):
-        return schema
-    for keyword, operand in schema.items():
-        if keyword in _ANNOTATIONS:
-            continue
-        if keyword == "type":
-            fits = any(_is_type(value, each) for each in _listed(operand))
-        elif keyword == "$ref":
-            fits = _holds(definitions[operand.removeprefix("#/$defs/")], value, definitions)
-        elif keyword in {"anyOf", "oneOf"}:
-            holding = (_holds(each, value, definitions) for each in operand)
-            fits = any(holding) if keyword == "anyOf" else sum(holding) == 1
-        elif keyword == "not":
-            fits = not _holds(operand, value, definitions)
-        elif keyword in {"enum", "const"}:
-            fits = _is_one_of(value, operand if keyword == "enum" else [operand])
-        elif isinstance(value, dict):
-            fits = _mapping_holds(keyword, schema, value, definitions)
-        elif isinstance(value, list):
-            fits = _list_holds(keyword, operand, value, definitions)
-        else:
-            fits = _scalar_holds(keyword, operand, value)
-        if not fits:
-            return False
-    return True
-
-
-_ANNOTATIONS = frozenset(
-    ("$schema", "$id", "$defs", "title", "description", "default", "examples")
-) | {"patternErrorMessage"}
-_OF_MAPPINGS = frozenset(
-    ("properties", "additionalProperties", "propertyNames", "required", "minProperties")
-)
-_OF_LISTS = frozenset(("items", "minItems", "uniqueItems"))
-_OF_SCALARS = frozenset(("pattern", "minLength", "minimum", "maximum", "exclusiveMinimum"))
-_KNOWN = _OF_MAPPINGS | _OF_LISTS | _OF_SCALARS
-
-
-def _ignored(keyword: str) -> bool:
-    """Return that a keyword is for values of another type; of an unknown one nobody knows."""
-    if keyword not in _KNOWN:
-        raise _UndecidedError
-    return True
-
-
-def _is_type(value: object, name: str) -> bool:
-    if isinstance(value, bool):
-        return name == "boolean"
-    if name == "integer":
-        return isinstance(value, int) or (isinstance(value, float) and value.is_integer())
-    return isinstance(value, _PYTHON_TYPES[name])
-
-
-_PYTHON_TYPES: dict[str, type | tuple[type, ...]] = {
-    "string": str,
-    "number": (int, float),
-    "boolean": bool,
-    "array": list,
-    "object": dict,
-    "null": type(None),
-}
-
-
-def _is_one_of(value: object, allowed: list[Any]) -> bool:
-    """Return whether a value equals one, as JSON Schema has it: 1 is 1.0, and not true."""
-    if any(isinstance(each, dict | list) for each in allowed):
-        raise _UndecidedError
-    return any(
-        each == value and isinstance(each, bool) is isinstance(value, bool) for each in allowed
-    )
-
-
-def _mapping_holds(
-    keyword: str,
-    schema: Mapping[str, Any],
-    value: Mapping[str, Any],
-    definitions: Mapping[str, Any],
-) -> bool:
-    operand = schema[keyword]
-    if keyword == "properties":
-        return all(
-            _holds(operand[key], each, definitions) for key, each in value.items() if key in operand
-        )
-    if keyword == "additionalProperties":
-        known = schema.get("properties", {})
-        return all(_holds(operand, value[key], definitions) for key in value if key not in known)
-    if keyword == "propertyNames":
-        return all(_holds(operand, key, definitions) for key in value)
-    if keyword == "required":
-        return all(key in value for key in operand)
-    return len(value) >= operand if keyword == "minProperties" else _ignored(keyword)
-
-
-def _list_holds(
-    keyword: str, operand: Any, value: list[Any], definitions: Mapping[str, Any]
-) -> bool:
-    if keyword == "items":
-        return all(_holds(operand, each, definitions) for each in value)
-    if keyword == "minItems":
-        return len(value) >= int(operand)
-    if keyword == "uniqueItems" and operand:
-        if not all(isinstance(each, str) for each in value):
-            raise _UndecidedError
-        return len({*value}) == len(value)
-    return _ignored(keyword)
-
-
-def _scalar_holds(keyword: str, operand: Any, value: Any) -> bool:
-    if isinstance(value, str):
-        if keyword == "pattern":
-            return re.search(operand, value) is not None
-        if keyword == "minLength":
-            return len(value) >= int(operand)
-    elif isinstance(value, int | float) and not isinstance(value, bool):
-        if keyword == "minimum":
-            return not value < operand
-        if keyword == "maximum":
-            return not value > operand
-        if keyword == "exclusiveMinimum":
-            return not value <= operand
-    return _ignored(keyword)

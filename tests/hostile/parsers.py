@@ -22,7 +22,7 @@ from lifecycle.graph.messages import GraphMessageError, Joined, encode
 from lifecycle.graph.messages import decode as decode_message
 from lifecycle.manifest import ManifestError, load
 from lifecycle.manifest.diagnostics import Position
-from lifecycle.manifest.installed_types import IdlError, _hashes, parse_struct
+from lifecycle.manifest.installed_types import DescriptionError, _hashes, described_fields
 from lifecycle.manifest.nodl import read_interface
 from lifecycle.node.host.control import Event
 from lifecycle.plan.comparison import PlanNoticeError, announced_plan, notice_of
@@ -123,8 +123,14 @@ publishers:
 parameters:
   rate: {type: double, default_value: 1.0}
 """
-_IDL = b"""module a { module msg { typedef long x[3];
-  struct B { @default(value=1) sequence<double, 4> c; string<9> d; x e; }; }; };"""
+_DESCRIPTION = json.dumps(
+    {
+        "fields": [
+            {"type": {"type_id": 107, "capacity": 4, "string_capacity": 0, "nested_type_name": ""}},
+            {"type": {"type_id": 21, "capacity": 0, "string_capacity": 9, "nested_type_name": ""}},
+        ]
+    }
+).encode()
 _HASHES = json.dumps(
     {"type_hashes": [{"type_name": "a/msg/B", "hash_string": "RIHS01_ab"}]}
 ).encode()
@@ -197,8 +203,10 @@ READERS: dict[str, Reader] = {
     ),
     "output of a tool": Reader(good=b"qdisc htb 1f10:", read=_printed, errors=()),
     "NoDL document": Reader(good=_NODL, read=_file("a.nodl.yaml", _nodl), errors=(ManifestError,)),
-    "installed IDL": Reader(
-        good=_IDL, read=lambda data, _: parse_struct(_text(data), "B"), errors=(IdlError,)
+    "installed type description": Reader(
+        good=_DESCRIPTION,
+        read=lambda data, _: described_fields(json.loads(data)),
+        errors=(DescriptionError, ValueError),
     ),
     "installed type hashes": Reader(good=_HASHES, read=_file("B.json", _hash), errors=()),
     "manifest": Reader(

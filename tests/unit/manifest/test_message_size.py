@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import struct
 from pathlib import Path
 
@@ -11,29 +12,45 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lifecycle.manifest.installed_types import (
+    DescriptionError,
     Field,
-    IdlError,
     bounded_size,
-    parse_struct,
+    described_fields,
     search_prefixes,
 )
 
 INSTALLED = search_prefixes({})
 
 
+NAMES = (
+    *("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64"),
+    *("float", "double", "long_double", "char", "wchar", "boolean", "byte"),
+)
+IDS = {name: number for number, name in enumerate(NAMES, start=2)}
+FORMS = {"": 0, "array": 48, "bounded": 96, "unbounded": 144}
+
+
+def field(type_: str, form: str = "", capacity: int = 0, *, text: int = 0) -> dict[str, object]:
+    """Describe a field as rosidl does; `text` is the bound of a string."""
+    number = 1 if "/" in type_ else IDS.get(type_) or {"string": 17, "wstring": 18}[type_]
+    number += 4 if text else 0
+    described = {"type_id": number + FORMS[form], "capacity": capacity, "string_capacity": text}
+    return {"name": "a", "type": {**described, "nested_type_name": type_ if "/" in type_ else ""}}
+
+
 @pytest.fixture
 def package(tmp_path: Path):
-    """Install definitions `Name="…"` as package `p` and return the prefix."""
+    """Install descriptions `Name=[fields]` as package `p` and return the prefix."""
 
-    def install(**structures: str) -> list[Path]:
+    def install(**structures: list[dict[str, object]]) -> list[Path]:
         index = tmp_path / "share/ament_index/resource_index/rosidl_interfaces/p"
         index.parent.mkdir(parents=True, exist_ok=True)
         index.write_text("".join(f"msg/{name}.idl\n" for name in structures))
         folder = tmp_path / "share/p/msg"
         folder.mkdir(parents=True, exist_ok=True)
         for name, fields in structures.items():
-            text = f"module p {{ module msg {{ {fields} }}; }};"
-            (folder / f"{name}.idl").write_text(text)
+            described = {"type_description": {"type_name": f"p/msg/{name}", "fields": fields}}
+            (folder / f"{name}.json").write_text(json.dumps({"type_description_msg": described}))
         return [tmp_path]
 
     return install
@@ -72,38 +89,32 @@ def test_without_a_bound_or_a_definition_nothing_is_claimed(type_: str) -> None:
 @pytest.mark.parametrize(
     ("fields", "payload"),
     [
-        ("boolean a; double b;", 8 + 8),
-        ("double a; boolean b;", 8 + 1),
-        ("string<10> a;", 4 + 11),
-        ("wstring<3> a;", 4 + 16),
-        ("sequence<uint16, 5> a;", 4 + 10),
+        ([field("boolean"), field("double")], 8 + 8),
+        ([field("double"), field("boolean")], 8 + 1),
+        ([field("string", text=10)], 4 + 11),
+        ([field("wstring", text=3)], 4 + 16),
+        ([field("uint16", "bounded", 5)], 4 + 10),
         # After what has no fixed length, the most padding there can be.
-        ("string<10> a; double b;", 15 + 7 + 8),
-        ("sequence<string<4>, 2> a;", 4 + 9 + (3 + 9)),
-        ("octet a; long long b;", 8 + 8),
-        ("unsigned short a; unsigned long b; unsigned long long c;", 16),
-        ("@key @default (value=TRUE) boolean a, b[2][3];", 7),
-        ("wchar a; float b; char c;", 9),
+        ([field("string", text=10), field("double")], 15 + 7 + 8),
+        ([field("string", "bounded", 2, text=4)], 4 + 9 + (3 + 9)),
+        ([field("byte"), field("int64")], 8 + 8),
+        ([field("uint16"), field("uint32"), field("uint64")], 16),
+        ([field("boolean"), field("boolean", "array", 6)], 7),
+        ([field("wchar"), field("float"), field("char")], 9),
     ],
 )
-def test_fields_are_laid_out_as_in_cdr(package, fields: str, payload: int) -> None:
-    assert bounded_size("p/msg/M", package(M=f"struct M {{ {fields} }};")) == 4 + payload
+def test_fields_are_laid_out_as_in_cdr(
+    package, fields: list[dict[str, object]], payload: int
+) -> None:
+    assert bounded_size("p/msg/M", package(M=fields)) == 4 + payload
 
 
-def test_nested_types_and_typedefs_are_followed(package) -> None:
+def test_nested_types_are_followed(package) -> None:
     prefixes = package(
-        Inner="struct Inner { double x; boolean y; };",
-        M="""
-        // a comment, "quoted"
-        module M_Constants { const uint8 A = 1; const string B = "struct M { long x; };"; };
-        /* struct M { double wrong; }; */
-        typedef p::msg::Inner Inner__3[3];
-        @verbatim (language="comment", text="struct M { double wrong; }; )")
-        struct M { Inner__3 all; sequence<p::msg::Inner, 2> some; };
-        """,
+        Inner=[field("double"), field("boolean")],
+        M=[field("p/msg/Inner", "array", 3), field("p/msg/Inner", "bounded", 2)],
     )
-    inner = [(8 + 1), (7 + 8 + 1), (7 + 8 + 1)]
-    some = sum(inner)
+    some = sum([(8 + 1), (7 + 8 + 1), (7 + 8 + 1)])
     padded = some + -some % 4 + 4
     for _ in range(2):
         padded += -padded % 8 + 9
@@ -111,9 +122,7 @@ def test_nested_types_and_typedefs_are_followed(package) -> None:
 
 
 def test_a_long_array_is_not_laid_out_item_by_item(package) -> None:
-    prefixes = package(
-        Inner="struct Inner { double x; };", M="struct M { p::msg::Inner a[1000000]; };"
-    )
+    prefixes = package(Inner=[field("double")], M=[field("p/msg/Inner", "array", 1_000_000)])
     size = bounded_size("p/msg/M", prefixes)
     assert size is not None
     assert 8_000_000 <= size <= 16_000_000
@@ -122,39 +131,42 @@ def test_a_long_array_is_not_laid_out_item_by_item(package) -> None:
 @pytest.mark.parametrize(
     "fields",
     [
-        "sequence<double> a;",
-        "sequence<double, A_CONSTANT> a;",
-        "sequence<sequence<double, 2>, 2> a;",
-        "p::msg::M a;",  # itself, without end
-        "map<long, long> a;",
-        "long double a;",
-        "double",
+        [field("double", "unbounded")],
+        [field("p/msg/M")],  # itself, without end
+        [field("long_double")],
+        [{"name": "a"}],
+        [{"name": "a", "type": {"type_id": 500, "capacity": 0, "string_capacity": 0}}],
+        ["a"],
     ],
 )
-def test_what_is_not_understood_or_has_no_end_has_no_bound(package, fields: str) -> None:
-    assert bounded_size("p/msg/M", package(M=f"struct M {{ {fields} }};")) is None
+def test_what_is_not_understood_or_has_no_end_has_no_bound(package, fields) -> None:
+    assert bounded_size("p/msg/M", package(M=fields)) is None
 
 
-def test_every_installed_message_definition_is_read() -> None:
-    files = [file for prefix in INSTALLED for file in (prefix / "share").glob("*/msg/*.idl")]
+def test_every_installed_message_description_is_read() -> None:
+    files = [file for prefix in INSTALLED for file in (prefix / "share").glob("*/msg/*.json")]
     if not files:
         pytest.skip("no interface packages are installed")
     for file in files:
-        assert isinstance(parse_struct(file.read_text(encoding="utf-8"), file.stem), tuple)
+        described = json.loads(file.read_text(encoding="utf-8"))["type_description_msg"]
+        fields = described_fields(described["type_description"])
+        assert len(fields) == len(described["type_description"]["fields"])
 
 
-def test_a_file_without_the_structure_is_no_definition() -> None:
-    with pytest.raises(IdlError, match="cannot find struct 'M'"):
-        parse_struct("module p { struct N { long a; }; };", "M")
+_KEYS = st.sampled_from(["fields", "type", "type_id", "capacity", "string_capacity"])
+_ANYTHING = st.recursive(
+    st.none() | st.integers() | st.text(),
+    lambda each: st.lists(each) | st.dictionaries(_KEYS, each),
+)
 
 
-@given(st.text(alphabet="struct M{};<>,[]@()\"'/* \n0aé", max_size=60))
-def test_any_text_is_a_definition_or_an_idl_error(text: str) -> None:
-    with contextlib.suppress(IdlError):
-        assert all(isinstance(each, Field) for each in parse_struct(f"struct M {text}", "M"))
+@given(_ANYTHING)
+def test_anything_is_a_description_or_an_error(value: object) -> None:
+    with contextlib.suppress(DescriptionError):
+        assert all(isinstance(each, Field) for each in described_fields(value))
 
 
-_SCALARS = {"boolean": "?", "uint16": "H", "uint32": "I", "double": "d", "octet": "B"}
+_SCALARS = {"boolean": "?", "uint16": "H", "uint32": "I", "double": "d", "byte": "B"}
 
 
 @given(st.lists(st.sampled_from(sorted(_SCALARS)), min_size=1, max_size=12))
