@@ -18,6 +18,7 @@ from typing import NoReturn
 import click
 from click.shell_completion import CompletionItem
 
+from lifecycle.cli.completion import COMPLETE
 from lifecycle.cli.standard_streams import own_streams
 from lifecycle.errors import ExitCode, LifecycleError, UsageError, exhausted
 from lifecycle.printable import lines
@@ -45,7 +46,6 @@ VERBS: dict[str, str] = {
     "ports": "DDS port arithmetic and platform limits",
     "init": "make a package of one's own: nodes, manifest, tests, CI workflow",
     "schema": "print the manifest's JSON Schema, or install it for editors",
-    "completion": "print what switches on completion in bash, zsh or fish",
 }
 
 _ELSEWHERE = {
@@ -110,10 +110,6 @@ def _check_ros(verb: str) -> None:
         # rcl asks the variable alone, and makes no node with logs without it.
         if home := home_directory(os.environ):
             os.environ["HOME"] = home
-
-
-COMPLETE = "_LIFECYCLE_COMPLETE"
-"""Variable by which a shell asks what can come next, see verbs/completion.py."""
 
 
 class _Verbs(click.Group):
@@ -184,9 +180,9 @@ def cli() -> None:
 def program() -> int:
     """Run `lifecycle` as a process of its own."""
     if COMPLETE in os.environ:
-        from lifecycle.cli.verbs.completion import answer
+        from click.shell_completion import shell_complete
 
-        return answer(cli, os.environ)
+        return shell_complete(cli, {}, "lifecycle", COMPLETE, os.environ[COMPLETE])
     verb = sys.argv[1:2]
     if verb == ["run"]:  # whose streams are the user's node's
         return main()

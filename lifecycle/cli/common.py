@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 from click.core import ParameterSource
 
+from lifecycle.cli.completion import completing
 from lifecycle.errors import UsageError
 from lifecycle.printable import lines
 
@@ -56,17 +57,6 @@ def assignments_argument(function: F) -> F:
         metavar="[NAME:=VALUE]...",
         shell_complete=completing("arguments"),
     )(function)
-
-
-def completing(what: str) -> Completer:
-    """Return the shell completion of an argument; kinds as `completion.found` has them."""
-
-    def complete(context: click.Context, _: click.Parameter, incomplete: str) -> list[Any]:
-        from lifecycle.cli.verbs.completion import found
-
-        return found(what, context, incomplete)
-
-    return complete
 
 
 def format_option(*formats: str) -> Callable[[F], F]:

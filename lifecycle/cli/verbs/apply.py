@@ -14,12 +14,12 @@ import click
 from lifecycle import dataclasses
 from lifecycle.cli.common import (
     assignments_argument,
-    completing,
     format_option,
     load_manifest,
     machine_option,
     timeout_option,
 )
+from lifecycle.cli.completion import completing
 from lifecycle.codec import Count, says, to_json
 from lifecycle.errors import BringUpError, ExitCode, UsageError
 from lifecycle.printable import json_text, lines

@@ -14,7 +14,6 @@ import click
 from lifecycle.cli.common import (
     asking,
     assignments_argument,
-    completing,
     format_option,
     load_manifest,
     machine_option,
@@ -25,6 +24,7 @@ from lifecycle.cli.common import (
     target_run,
     timeout_option,
 )
+from lifecycle.cli.completion import completing
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.printable import json_text, lines, one_line
 

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from lifecycle.cli.common import completing, format_option
+from lifecycle.cli.common import format_option
+from lifecycle.cli.completion import completing
 from lifecycle.cli.standard_streams import echo_while_read
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.printable import json_text, lines, one_line
@@ -37,7 +38,6 @@ def _system_option(function: F) -> F:
         "--system",
         default="",
         metavar="NAME",
-        shell_complete=completing("logged_systems"),
         help="The latest run of this system.",
     )(function)
 

@@ -17,7 +17,6 @@ from pathlib import Path
 
 import click
 
-from lifecycle.cli.common import completing
 from lifecycle.cli.standard_streams import echo_while_read
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.printable import log_line
@@ -29,13 +28,13 @@ _HEAD = re.compile(r"==> (.*) <==\n")
 
 
 @click.command("logs")
-@click.argument("node", required=False, metavar="[NODE]", shell_complete=completing("logged"))
+@click.argument("node", required=False, metavar="[NODE]")
 @click.option("-f", "--follow", is_flag=True, help="Go on with what is written, until Ctrl-C.")
 @click.option(
     "--system",
     default="",
     metavar="NAME",
-    shell_complete=completing("logged_systems"),
+    shell_complete=None,
     help="Of this system; default: of any.",
 )
 @click.option(

@@ -13,10 +13,10 @@ import click
 from lifecycle import dataclasses
 from lifecycle.cli.common import (
     assignments_argument,
-    completing,
     format_option,
     load_manifest,
 )
+from lifecycle.cli.completion import completing
 from lifecycle.codec import to_json
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest import Discovery

@@ -11,7 +11,8 @@ from typing import NoReturn
 
 import click
 
-from lifecycle.cli.common import completing, load_manifest
+from lifecycle.cli.common import load_manifest
+from lifecycle.cli.completion import completing
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest import DiscoveryRange, Resources, RunKind
 from lifecycle.middleware import limit_resources, peers_environment, refuse_new_privileges

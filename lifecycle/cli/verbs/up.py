@@ -11,7 +11,6 @@ import click
 
 from lifecycle.cli.common import (
     NetworkCommand,
-    completing,
     format_option,
     import_without,
     load_manifest,
@@ -21,6 +20,7 @@ from lifecycle.cli.common import (
     timeout_option,
     treatment_options,
 )
+from lifecycle.cli.completion import completing
 from lifecycle.cli.report import ReportFile, report_option, written_or_said
 from lifecycle.cli.standard_streams import are_own
 from lifecycle.errors import ExitCode, UsageError

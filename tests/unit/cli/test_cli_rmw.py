@@ -97,7 +97,7 @@ def test_a_verb_that_needs_ros_says_how_to_get_it(verb: str) -> None:
 
 
 @pytest.mark.parametrize("platform", ["darwin", "win32"])
-@pytest.mark.parametrize("verb", ["up", "status", "logs", "replay"])
+@pytest.mark.parametrize("verb", ["up", "status", "logs", "history"])
 def test_what_runs_nodes_says_that_it_needs_linux(platform: str, verb: str) -> None:
     done = _bare(platform, verb, MANIFEST)
     assert (done.returncode, done.stdout) == (ExitCode.USAGE, "")

@@ -203,12 +203,12 @@ def test_a_verb_that_asks_a_supervisor_loads_no_plan_and_no_rule(
     assert {each for each in ours if not each.startswith("lifecycle.cli")} == TO_ASK
 
 
-def test_checking_a_manifest_that_fits_loads_no_json_schema_validator(
+def test_checking_a_manifest_loads_nothing_of_ros(
     environment: dict[str, str],
 ) -> None:
     printed, loaded = _loaded(environment, ["check", "manifests/first_node.lifecycle.yaml"])
     assert printed.endswith(": ok\n")
-    assert loaded & {"asyncio", "jsonschema", "rclpy", "rich"} == set()
+    assert loaded & {"asyncio", "rclpy", "rich"} == set()
 
 
 @pytest.mark.parametrize(
