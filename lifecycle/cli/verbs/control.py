@@ -171,22 +171,21 @@ def status_command(
 
 
 def _watch(path: Path, format_: str) -> int:
-    from lifecycle.cli.screen import Screen
+    from lifecycle.cli.watched import Watched
     from lifecycle.codec import to_json
     from lifecycle.supervisor import follow
     from lifecycle.verify import Outcome
 
     verdict = None
     last = ""
-    with Screen(whole=format_ == "text") as screen, asking(path):
+    with Watched(whole=format_ == "text") as shown, asking(path):
         for seen in follow(path / "control"):
             verdict, is_json = seen.status.verdict, format_ == "json"
             text = json_text(to_json(seen.status).decode()) if is_json else ""
             text = text or status_text(seen.status)
             if text != last:
-                screen.show(last := text)
-    if not screen.quit:
-        click.echo(f"{path.name}: its supervisor has ended", err=True)
+                shown.show(last := text)
+    click.echo(f"{path.name}: its supervisor has ended", err=True)
     return ExitCode.VIOLATED if verdict is Outcome.VIOLATED else ExitCode.OK
 
 

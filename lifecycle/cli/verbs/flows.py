@@ -27,8 +27,8 @@ from lifecycle.cli.common import (
     timeout_option,
     treatment_options,
 )
-from lifecycle.cli.screen import Screen
 from lifecycle.cli.verbs.verify import exit_code
+from lifecycle.cli.watched import Watched
 from lifecycle.codec import to_json
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest import UniqueHow
@@ -233,8 +233,8 @@ def _show(
         click.echo(render_flows(verdict.flows, format_))
 
     if watch:
-        with Screen(whole=format_ == "text") as screen:
-            follow_running(plan, lambda seen: screen.show(render_flows(seen.flows, format_)))
+        with Watched(whole=format_ == "text") as shown:
+            follow_running(plan, lambda seen: shown.show(render_flows(seen.flows, format_)))
         return ExitCode.OK  # `q`: only a key ends it
     asked = click.get_current_context().get_parameter_source("timeout")
     waits = asked is not click.core.ParameterSource.DEFAULT or supervisor_of(os.environ, plan, "")

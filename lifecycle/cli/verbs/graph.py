@@ -18,7 +18,7 @@ from lifecycle.cli.common import (
     target_run,
     timeout_option,
 )
-from lifecycle.cli.screen import Screen
+from lifecycle.cli.watched import Watched
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.printable import json_text
 
@@ -61,8 +61,8 @@ def command(
     """
     _check_watched(format_, output, watch=watch)
     path, plan = _found(target, assignments, machine)
-    with Screen(whole=watch and output is None and format_ == "text") as screen:
-        draw = _drawing(format_, output, screen)
+    with Watched(whole=watch and output is None and format_ == "text") as shown:
+        draw = _drawing(format_, output, shown)
         if path is not None:
             _supervised(path, draw, watch=watch)
         elif plan is not None:
@@ -74,7 +74,7 @@ def command(
                 picture = attached_picture(plan, timeout_s=timeout)
                 draw(picture)
                 _say_if_empty(picture, plan)
-    if path is not None and watch and not screen.quit:
+    if path is not None and watch:
         click.echo(f"{path.name}: its supervisor has ended", err=True)
     return ExitCode.OK
 
@@ -123,7 +123,7 @@ def _check_watched(format_: str, output: Path | None, *, watch: bool) -> None:
         )
 
 
-def _drawing(format_: str, output: Path | None, screen: Screen) -> Callable[[Picture], None]:
+def _drawing(format_: str, output: Path | None, shown: Watched) -> Callable[[Picture], None]:
     """Return what shows or writes one picture."""
 
     def draw(picture: Picture) -> None:
@@ -131,7 +131,7 @@ def _drawing(format_: str, output: Path | None, screen: Screen) -> Callable[[Pic
         if output is not None:
             write_picture(output, text)
         else:
-            screen.show(text)
+            shown.show(text)
 
     return draw
 
