@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 @click.command("graph")
 @target_arguments
-@format_option("text", "mermaid", "dot", "svg", "html", "json")
+@format_option("text", "mermaid", "svg", "html", "json")
 @click.option(
     "--output",
     type=click.Path(dir_okay=False, path_type=Path),

@@ -14,12 +14,12 @@ from lifecycle.plan import Plan, build_plan, render_text, without_secrets
 
 @click.command("plan")
 @manifest_arguments
-@format_option("text", "json", "mermaid", "dot", "svg", "html")
+@format_option("text", "json", "mermaid", "svg", "html")
 def command(manifest: str, assignments: tuple[str, ...], format_: str) -> int:
     """Show what a manifest becomes: processes, order, nodes, participants, flows, ports.
 
     Starts nothing and needs no ROS. The other formats draw it, as `lifecycle graph` draws what runs
-    beside it: mermaid for Markdown, dot for Graphviz, svg and html for a browser.
+    beside it: mermaid for Markdown, svg and html for a browser.
     """
     loaded = load_manifest(manifest, assignments)
     plan = build_plan(loaded.manifest)

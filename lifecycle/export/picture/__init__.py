@@ -1,4 +1,4 @@
-"""Pictures of a plan, and of what runs beside it: text, Mermaid, DOT, SVG, HTML. Pure."""
+"""Pictures of a plan, and of what runs beside it: text, Mermaid, SVG, HTML. Pure."""
 
 from __future__ import annotations
 
@@ -8,12 +8,11 @@ from lifecycle.export.picture.build import Supervised, build_picture, planned_pi
 from lifecycle.export.picture.html import picture_to_html
 from lifecycle.export.picture.model import Picture, PicturedNodeState, Presence
 from lifecycle.export.picture.svg import picture_to_svg
-from lifecycle.export.picture.text import picture_to_dot, picture_to_mermaid, picture_to_text
+from lifecycle.export.picture.text import picture_to_mermaid, picture_to_text
 
 WRITERS: Mapping[str, Callable[[Picture], str]] = {
     "text": picture_to_text,
     "mermaid": picture_to_mermaid,
-    "dot": picture_to_dot,
     "svg": picture_to_svg,
     "html": picture_to_html,
 }
@@ -26,7 +25,6 @@ __all__ = [
     "Presence",
     "Supervised",
     "build_picture",
-    "picture_to_dot",
     "picture_to_html",
     "picture_to_mermaid",
     "picture_to_svg",

@@ -1,7 +1,7 @@
-"""A picture as text: plain, Graphviz DOT, and Mermaid for Markdown. Pure.
+"""A picture as text: plain, and Mermaid for Markdown. Pure.
 
-Owns: the lines of the plain one; nodes, frames and edge labels that the two graphs share, which lay
-themselves out, and the syntax and escapes of each. One graph shows what rows and columns show in
+Owns: the lines of the plain one; nodes, frames and edge labels of the graph, which lays itself
+out, and its syntax and escapes. One graph shows what rows and columns show in
 two.
 """
 
@@ -251,68 +251,6 @@ def _arrow_words(
         if flow.outcome not in (Outcome.OK, None):
             words.append(flow.outcome.value)
     return tuple(filter(None, dict.fromkeys([*words, *arrow.notes])))
-
-
-_STYLES = {
-    Presence.PRESENT: "solid",
-    Presence.MISSING: "dashed",
-    Presence.UNDECLARED: "dotted",
-    Presence.PLANNED: "solid",
-}
-
-
-def picture_to_dot(picture: Picture) -> str:
-    """Return one digraph: nodes by machine and process, edges with their flows.
-
-    States are colours and labels; missing is dashed and red, undeclared is dotted and orange; edges
-    of unique flows are bold.
-    """
-    lines = [
-        f"digraph {'planned' if picture.verdict is None else 'running'} {{",
-        f"  label={_dot_quoted(picture.title)};",
-        "  rankdir=LR; labelloc=t; compound=true;",
-        '  graph [fontname="sans-serif", style=rounded];',
-        '  node [fontname="sans-serif", shape=box];',
-        '  edge [fontname="sans-serif", fontsize=10];',
-        *framed(picture, _dot_opening, "}", _dot_node),
-    ]
-    for number, edge in enumerate(edges(picture)):
-        lines += [f"  {each}" for each in _dot_edge(edge, f"stub{number}")]
-    return "\n".join([*lines, "}"]) + "\n"
-
-
-def _dot_opening(id_: str, title: str) -> str:
-    return f"subgraph cluster_{id_} {{ label={_dot_quoted(title)};"
-
-
-def _dot_node(node: PicturedNode) -> str:
-    look = STATES[node.state]
-    return (
-        f"{node.id} [label={_dot_quoted(*node_words(node))}, "
-        f'style="rounded,filled,{_STYLES[node.presence]}", fillcolor="{look.fill}", '
-        f'fontcolor="{look.ink}", color="{LINES[node.presence]}", penwidth=2];'
-    )
-
-
-def _dot_edge(edge: Edge, stub: str) -> Iterator[str]:
-    """An end without an opposite is drawn towards an empty circle."""
-    if not (edge.source and edge.target):
-        yield f'{stub} [shape=circle, width=0.15, label=""];'
-    head = "normal" if edge.kind is LineKind.TOPIC else "empty"
-    yield (
-        f"{edge.source or stub} -> {edge.target or stub} [label={_dot_quoted(*edge.words)}, "
-        f'arrowhead={head}, style={_STYLES[edge.presence]}, color="{LINES[edge.presence]}"'
-        f"{', penwidth=3' if edge.unique else ''}];"
-    )
-
-
-def _dot_quoted(*words: str) -> str:
-    r"""A quoted label of several lines: `\n` ends one, and a backslash would escape something."""
-    return '"' + r"\n".join(map(_dot_escape, words)) + '"'
-
-
-def _dot_escape(word: str) -> str:
-    return one_line(" ".join(word.replace("\\", "\\\\").replace('"', '\\"').split()))
 
 
 def picture_to_mermaid(picture: Picture) -> str:

@@ -24,7 +24,6 @@ from lifecycle.export.picture import (
     Presence,
     Supervised,
     build_picture,
-    picture_to_dot,
     picture_to_html,
     picture_to_mermaid,
     picture_to_svg,
@@ -334,26 +333,6 @@ def test_nothing_of_a_graph_is_taken_for_markup(
         assert any('alert("x")' in (each.text or "") for each in root.iter(f"{SVG}text"))
     elif write is picture_to_mermaid:
         assert "<script" not in text
-    elif write is picture_to_dot and shutil.which("dot"):
-        subprocess.run(
-            ["dot", "-Tsvg"], input=text, text=True, capture_output=True, check=True, timeout=20
-        )
-
-
-@pytest.mark.parametrize("picture", PICTURES.values(), ids=PICTURES)
-def test_graphviz_reads_a_picture(picture: Picture) -> None:
-    if shutil.which("dot") is None:
-        pytest.skip("graphviz is not installed")
-    run = subprocess.run(
-        ["dot", "-Tsvg"],
-        input=picture_to_dot(picture),
-        text=True,
-        capture_output=True,
-        check=True,
-        timeout=30,
-    )
-    titles = {each.text for each in ET.fromstring(run.stdout).iter(f"{SVG}title")}
-    assert {each.id for each in picture.nodes()} <= titles
 
 
 def test_mermaid_marks_each_node_and_edge() -> None:

@@ -16,7 +16,6 @@ from lifecycle.export.picture import (
     WRITERS,
     PicturedNodeState,
     Presence,
-    picture_to_dot,
     picture_to_html,
     picture_to_mermaid,
     picture_to_svg,
@@ -145,46 +144,6 @@ _camera_flow_0"| n2
   classDef plain fill:#cfe8e0,color:#1b2733,stroke:#4d5a66
 """
     )
-
-
-def test_a_dot_picture_shows_the_same() -> None:
-    lines = picture_to_dot(planned_picture(article())).splitlines()
-    assert lines[:2] == ["digraph planned {", '  label="system robot, domain 7";']
-    assert lines[6:] == [
-        '  subgraph cluster_m0 { label="machine d1 (10.0.0.1)";',
-        '    subgraph cluster_m0p0 { label="process n1";',
-        (
-            r'      n0 [label="/camera\n▣ managed\n_camera_flow_0: unique publisher video marked '
-            r'EF = DSCP 46 =\nTOS 184 (0xb8)", style="rounded,filled,solid", fillcolor="#dbe6f3", '
-            'fontcolor="#1b2733", color="#4d5a66", penwidth=2];'
-        ),
-        (
-            r'      n1 [label="/battery\n▣ managed", style="rounded,filled,solid", '
-            'fillcolor="#dbe6f3", fontcolor="#1b2733", color="#4d5a66", penwidth=2];'
-        ),
-        "    }",
-        (
-            r'    n3 [label="/base\n◆ not managed", style="rounded,filled,solid", '
-            'fillcolor="#cfe8e0", fontcolor="#1b2733", color="#4d5a66", penwidth=2];'
-        ),
-        "  }",
-        '  subgraph cluster_m1 { label="machine d2 (10.0.0.2)";',
-        (
-            r'    n2 [label="/viewer\n▣ managed", style="rounded,filled,solid", '
-            'fillcolor="#dbe6f3", fontcolor="#1b2733", color="#4d5a66", penwidth=2];'
-        ),
-        "  }",
-        (
-            r'  n0 -> n2 [label="/video\nudpv4 · EF\nstrongly unique demanded\npublisher unique '
-            r"strictly_required\nsubscription unique strictly_required\nat most 5 ms\nby "
-            '_camera_flow_0", arrowhead=normal, style=solid, color="#4d5a66", penwidth=3];'
-        ),
-        r'  n1 -> n2 [label="/level\nudpv4", arrowhead=normal, style=solid, color="#4d5a66"];',
-        '  stub2 [shape=circle, width=0.15, label=""];',
-        '  n3 -> stub2 [label="/odometry", arrowhead=normal, style=solid, color="#4d5a66"];',
-        '  n2 -> n3 [label="/reset", arrowhead=empty, style=solid, color="#4d5a66"];',
-        "}",
-    ]
 
 
 def test_an_svg_picture_says_everything_in_text() -> None:
@@ -391,12 +350,8 @@ def test_nothing_in_an_svg_overlaps_or_leaves_its_place(plan: Plan) -> None:
 
 
 @given(plan=plans())
-def test_dot_and_mermaid_quote_what_they_are_given(plan: Plan) -> None:
+def test_mermaid_quotes_what_it_is_given(plan: Plan) -> None:
     picture = planned_picture(plan)
-    dot = picture_to_dot(picture)
-    outside = re.sub(r'"(?:[^"\\\n]|\\.)*"', "", dot)
-    assert '"' not in outside
-    assert outside.count("{") == outside.count("}")
     body = picture_to_mermaid(picture).split("---\n", maxsplit=2)[2]
     outside = re.sub(r'"[^"\n]*"', "", body)
     assert '"' not in outside
