@@ -18,15 +18,13 @@ COMPLETE = "_LIFECYCLE_COMPLETE"
 """Variable by which a shell asks what can come next (click's, by the program's name)."""
 
 Source = Callable[[click.Context], Iterable[str]]
-Completer = Callable[[click.Context, click.Parameter, str], list[CompletionItem[Any]]]
+Completer = Callable[[click.Context, click.Parameter, str], list[Any]]
 
 
 def completing(what: str) -> Completer:
     """Return the shell completion of an argument: words of these kinds, see `_SOURCES`."""
 
-    def complete(
-        context: click.Context, _: click.Parameter, incomplete: str
-    ) -> list[CompletionItem[Any]]:
+    def complete(context: click.Context, _: click.Parameter, incomplete: str) -> list[Any]:
         if "manifests" in what and not incomplete.isidentifier() and incomplete:
             return [CompletionItem(incomplete, type="file")]
         words = [word for each in what.split() for word in _words(each, context)]
