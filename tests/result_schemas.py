@@ -80,7 +80,6 @@ RESULTS = {
     "graph": Result(
         type_=Picture,
         title="Picture of a system (lifecycle graph --format json)",
-        always={"PicturedArrow": ("notes",)},
     ),
     "journal": Result(
         type_=JournalLine,

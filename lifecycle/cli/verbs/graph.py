@@ -82,7 +82,7 @@ def command(
 def _say_if_empty(picture: Picture, plan: Plan) -> None:
     from lifecycle.export import PicturedNodeState
 
-    if all(node.state is PicturedNodeState.ABSENT for node in picture.nodes()):
+    if all(node.state is PicturedNodeState.ABSENT for node in picture.nodes):
         click.echo(
             f"no node in the graph; looked in ROS domain {plan.domain_id}, discovery range "
             f"{plan.discovery_range.value}",

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from lifecycle.export.picture.build import Supervised, build_picture, planned_picture
-from lifecycle.export.picture.html import picture_to_html
-from lifecycle.export.picture.model import Picture, PicturedNodeState, Presence
-from lifecycle.export.picture.svg import picture_to_svg
+from lifecycle.export.picture.drawing import picture_to_svg
+from lifecycle.export.picture.model import Picture
+from lifecycle.export.picture.page import picture_to_html
 from lifecycle.export.picture.text import picture_to_mermaid, picture_to_text
 
 WRITERS: Mapping[str, Callable[[Picture], str]] = {
@@ -17,17 +16,3 @@ WRITERS: Mapping[str, Callable[[Picture], str]] = {
     "html": picture_to_html,
 }
 """What writes a picture, by the value of `--format`."""
-
-__all__ = [
-    "WRITERS",
-    "Picture",
-    "PicturedNodeState",
-    "Presence",
-    "Supervised",
-    "build_picture",
-    "picture_to_html",
-    "picture_to_mermaid",
-    "picture_to_svg",
-    "picture_to_text",
-    "planned_picture",
-]

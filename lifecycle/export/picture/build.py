@@ -1,37 +1,50 @@
-"""Builds the picture of a ROS graph from a plan, or from Plan × Observation × Verdict.
+"""Builds the picture of a ROS graph from a plan, or from Plan × Observation × Verdict. Pure.
 
-Owns: the picture as a whole, its nodes and where they are. The matching of plan and observation is
-`verify.matcher`'s; nothing here judges again. Pure.
+The matching of plan and observation is `verify`'s; nothing here judges again.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import itertools
+from collections.abc import Callable, Iterator, Mapping
 
 from lifecycle import dataclasses
-from lifecycle.export.picture.lines import pictured_flows, pictured_lines, pictured_participants
 from lifecycle.export.picture.model import (
-    Basis,
+    REMARKS,
+    LineKind,
     Picture,
-    PicturedFinding,
-    PicturedMachine,
+    PicturedEnd,
+    PicturedFlow,
+    PicturedLine,
     PicturedNode,
     PicturedNodeState,
-    PicturedProcess,
     Presence,
 )
-from lifecycle.manifest import RunKind
+from lifecycle.manifest import EndpointKind, RunKind, UniqueHow
+from lifecycle.network import UniqueRequirement, describe
 from lifecycle.plan import Plan
-from lifecycle.verify import Observation, Stage, Verdict, View, lay_out
+from lifecycle.verify import Finding, FlowView, Observation, Outcome, Stage, Verdict, View, lay_out
 
-UNKNOWN_NODE = ""
-"""Name of the node of endpoints whose node is not known."""
+UNKNOWN = "unknown node"
+"""What the node of endpoints is called whose node is not known."""
 
 _STATES = {
     "active": PicturedNodeState.ACTIVE,
     "inactive": PicturedNodeState.INACTIVE,
     "unconfigured": PicturedNodeState.UNCONFIGURED,
     "finalized": PicturedNodeState.FINALIZED,
+}
+_KINDS = (
+    (LineKind.TOPIC, EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION),
+    (LineKind.SERVICE, EndpointKind.SERVICE_CLIENT, EndpointKind.SERVICE_SERVER),
+    (LineKind.ACTION, EndpointKind.ACTION_CLIENT, EndpointKind.ACTION_SERVER),
+)
+_WORST_FIRST = (Presence.MISSING, Presence.UNDECLARED, Presence.PRESENT, Presence.PLANNED)
+_UNIQUE = {
+    None: "",
+    UniqueHow.NOT: "not unique",
+    UniqueHow.WEAKLY: "weakly unique",
+    UniqueHow.STRONGLY: "strongly unique",
 }
 
 
@@ -55,7 +68,7 @@ class Supervised:
 def build_picture(
     plan: Plan,
     observation: Observation,
-    verdict: Verdict,
+    verdict: Verdict | None,
     *,
     phase: str = "",
     supervised: Mapping[str, Supervised] | None = None,
@@ -65,153 +78,203 @@ def build_picture(
     Args:
         plan: what was declared.
         observation: what is there; empty if nothing runs.
-        verdict: on the two; its findings are put at what they name.
+        verdict: on the two; its findings are put at what they name. None for a plan alone.
         phase: of the supervisor; empty without one.
         supervised: by full node name, what a supervisor adds.
     """
-    basis = Basis.of(lay_out(plan, observation, Stage.ACTIVE), verdict)
-    return _picture(basis, phase, supervised or {})
-
-
-def planned_picture(plan: Plan) -> Picture:
-    """Return the picture of a plan: everything that is declared, and nothing about what runs."""
-    return _picture(Basis.of(lay_out(plan, Observation(), Stage.ACTIVE), None), "", {})
-
-
-def _picture(basis: Basis, phase: str, supervised: Mapping[str, Supervised]) -> Picture:
-    plan = basis.view.plan
-    nodes = _nodes(basis, supervised)
+    view = lay_out(plan, observation, Stage.ACTIVE)
+    builder = _Builder(view, verdict, supervised or {})
     return Picture(
         system=plan.system,
         domain_id=plan.domain_id,
         phase=phase,
-        verdict=basis.verdict.verdict if basis.verdict else None,
-        machines=tuple(_machines(plan, nodes)),
-        lines=tuple(pictured_lines(basis, nodes)),
-        flows=pictured_flows(basis, nodes),
-        findings=tuple(
-            PicturedFinding(
-                number=number,
-                rule=each.rule,
-                outcome=each.outcome,
-                subject=each.subject,
-                message=each.message,
-                hint=each.hint,
-                at=each.at,
-            )
-            for number, each in enumerate(basis.findings, start=1)
-        ),
+        verdict=verdict.verdict if verdict else None,
+        nodes=tuple(builder.nodes()),
+        lines=tuple(builder.lines()),
+        findings=builder.findings,
     )
 
 
-def _nodes(basis: Basis, supervised: Mapping[str, Supervised]) -> dict[str, PicturedNode]:
-    """Every node by full name: declared ones in plan order, then others by name."""
-    view = basis.view
-    others = {name for name in view.observed if name not in view.planned}
-    others |= {each.node for each in view.foreign}
-    names = [*view.planned, *sorted(others)]
-    if view.unattributed:
-        names.append(UNKNOWN_NODE)
-    return {
-        name: _node(f"n{number}", name, basis, supervised.get(name, Supervised()))
-        for number, name in enumerate(names)
-    }
+def planned_picture(plan: Plan) -> Picture:
+    """Return the picture of a plan: everything that is declared, and nothing about what runs."""
+    return build_picture(plan, Observation(), None)
 
 
-def _node(id_: str, name: str, basis: Basis, supervised: Supervised) -> PicturedNode:
-    view = basis.view
-    planned = view.planned.get(name)
-    configuration = view.configurations.get(name)
-    presence = Presence.UNDECLARED
-    if planned is not None:
-        presence = basis.absent if view.is_absent(planned) else Presence.PRESENT
-    pid = supervised.pid or (configuration.identity.process_id if configuration else None)
-    return PicturedNode(
-        id=id_,
-        name=name or "unknown node",
-        presence=presence,
-        state=_state(name, view, presence, supervised),
-        machine=planned.machine if planned else "",
-        process=planned.process if planned else "",
-        pid=pid or None,
-        notes=tuple(_notes(name, basis, supervised)),
-        participants=pictured_participants(basis, id_, name, presence),
-        findings=basis.numbers(
-            name, concerns=lambda each: bool(name) and name in (each.node, each.subject)
-        ),
-    )
+class _Builder:
+    def __init__(
+        self, view: View, verdict: Verdict | None, supervised: Mapping[str, Supervised]
+    ) -> None:
+        self._view = view
+        self._verdict = verdict
+        self._supervised = supervised
+        self._absent = Presence.PLANNED if verdict is None else Presence.MISSING
+        self.findings = verdict.findings if verdict else ()
+        self._planned_flows = {(e.planned.topic, *e.ends): e for e in view.flows}
+        flows = verdict.flows if verdict else ()
+        self._reports = {(each.topic, each.publisher, each.subscription): each for each in flows}
 
+    def _numbers(self, concerns: Callable[[Finding], bool]) -> tuple[int, ...]:
+        return tuple(n for n, each in enumerate(self.findings, start=1) if concerns(each))
 
-def _state(name: str, view: View, presence: Presence, supervised: Supervised) -> PicturedNodeState:
-    observed = view.observed.get(name)
-    configuration = view.configurations.get(name)
-    if supervised.dead:
-        return PicturedNodeState.DEAD
-    if presence is Presence.MISSING:
-        return PicturedNodeState.ABSENT
-    if presence is Presence.PLANNED:
-        return PicturedNodeState.MANAGED if view.planned[name].managed else PicturedNodeState.PLAIN
-    if supervised.silent:
-        return PicturedNodeState.SILENT
-    reported = (observed.state if observed else None) or (
-        configuration.state if configuration else ""
-    )
-    if reported:
-        state = _STATES.get(reported, PicturedNodeState.CHANGING)
-        connected = configuration is not None and configuration.connected
-        return (
-            PicturedNodeState.CONNECTED
-            if connected and state is PicturedNodeState.INACTIVE
-            else state
+    def nodes(self) -> Iterator[PicturedNode]:
+        view = self._view
+        others = {name for name in view.observed if name not in view.planned}
+        others |= {each.node for each in view.foreign}
+        unknown = [""] if view.unattributed else []
+        for name in (*view.planned, *sorted(others), *unknown):
+            yield self._node(name)
+
+    def _node(self, name: str) -> PicturedNode:
+        planned = self._view.planned.get(name)
+        configuration = self._view.configurations.get(name)
+        supervised = self._supervised.get(name, Supervised())
+        presence = Presence.UNDECLARED
+        if planned is not None:
+            presence = self._absent if self._view.is_absent(planned) else Presence.PRESENT
+        pid = supervised.pid or (configuration.identity.process_id if configuration else None)
+        addresses = {each.name: each.address for each in self._view.plan.machines}
+        address = addresses.get(planned.machine if planned else "", "")
+        where = f" ({address})" if address else ""
+        return PicturedNode(
+            name=name or UNKNOWN,
+            presence=presence,
+            state=self._state(name, presence, supervised),
+            machine=f"machine {planned.machine}{where}" if planned and planned.machine else "",
+            process=planned.process if planned else "",
+            pid=pid or None,
+            notes=tuple(self._notes(name, supervised)),
+            findings=self._numbers(lambda each: bool(name) and name in (each.node, each.subject)),
         )
-    return _unreported_state(None if observed is None else observed.managed, presence)
 
+    def _state(self, name: str, presence: Presence, supervised: Supervised) -> PicturedNodeState:
+        state = PicturedNodeState
+        observed, report = self._view.observed.get(name), self._view.configurations.get(name)
+        managed = observed.managed if observed else None
+        said = (observed.state if observed else None) or (report.state if report else "")
+        if supervised.dead or presence is Presence.MISSING:
+            return state.DEAD if supervised.dead else state.ABSENT
+        if presence is Presence.PLANNED:
+            return state.MANAGED if self._view.planned[name].managed else state.PLAIN
+        if said and not supervised.silent:
+            is_connected = said == "inactive" and report is not None and report.connected
+            return state.CONNECTED if is_connected else _STATES.get(said, state.CHANGING)
+        if managed is False and not supervised.silent:
+            return state.PLAIN
+        # A declared node was asked; an undeclared one was not.
+        asked = managed and presence is Presence.PRESENT
+        return state.SILENT if asked or supervised.silent else state.UNKNOWN
 
-def _unreported_state(managed: bool | None, presence: Presence) -> PicturedNodeState:
-    """The state of a node that reports none."""
-    if managed is False:
-        return PicturedNodeState.PLAIN
-    # A declared node was asked; an undeclared one was not.
-    asked = managed and presence is Presence.PRESENT
-    return PicturedNodeState.SILENT if asked else PicturedNodeState.UNKNOWN
+    def _notes(self, name: str, supervised: Supervised) -> Iterator[str]:
+        planned, observed = self._view.planned.get(name), self._view.observed.get(name)
+        if planned is not None and planned.run.kind is RunKind.ATTACH:
+            yield "started by others"
+        if planned is not None and self._verdict is None:
+            yield from (f"after {each.node} {each.condition.value}" for each in planned.after)
+        if observed is not None and observed.count > 1:
+            yield f"{observed.count} of this name"
+        if supervised.doing:
+            yield supervised.doing
 
-
-def _notes(name: str, basis: Basis, supervised: Supervised) -> Iterable[str]:
-    planned = basis.view.planned.get(name)
-    observed = basis.view.observed.get(name)
-    if planned is None:
-        yield "not declared"
-    elif planned.run.kind is RunKind.ATTACH:
-        yield "started by others"
-    if planned is not None and basis.verdict is None:
-        yield from (f"after {each.node} {each.condition.value}" for each in planned.after)
-    if observed is not None and observed.count > 1:
-        yield f"{observed.count} of this name"
-    if supervised.doing:
-        yield supervised.doing
-
-
-def _machines(plan: Plan, nodes: Mapping[str, PicturedNode]) -> Iterable[PicturedMachine]:
-    addresses = {machine.name: machine.address for machine in plan.machines}
-    declared = {node.key: nodes[node.full_name] for node in plan.nodes}
-    names = dict.fromkeys(process.machine for process in plan.processes)
-    for name in names:
-        address = addresses.get(name, "")
-        title = f"machine {name}{f' ({address})' if address else ''}" if name else "this host"
-        yield PicturedMachine(
-            title=title,
-            processes=tuple(
-                PicturedProcess(
-                    title="" if process.nodes == (process.name,) else f"process {process.name}",
-                    nodes=tuple(declared[key] for key in process.nodes),
+    def lines(self) -> Iterator[PicturedLine]:
+        rows: dict[tuple[EndpointKind, str], dict[PicturedEnd, str]] = {}
+        for kind, name, type_, end in self._ends():
+            rows.setdefault((kind, name), {})[end] = type_
+        for line_kind, source_kind, target_kind in _KINDS:
+            names = dict.fromkeys(n for kind, n in rows if kind in (source_kind, target_kind))
+            for name in names:
+                sources, targets = (
+                    rows.get((source_kind, name), {}),
+                    rows.get((target_kind, name), {}),
                 )
-                for process in plan.processes
-                if process.machine == name
-            ),
+                yield PicturedLine(
+                    kind=line_kind,
+                    name=name,
+                    types=tuple(dict.fromkeys((*sources.values(), *targets.values()))),
+                    sources=tuple(sources),
+                    targets=tuple(targets),
+                    flows=tuple(self._flows(name, sources, targets)),
+                )
+
+    def _ends(self) -> Iterator[tuple[EndpointKind, str, str, PicturedEnd]]:
+        """Kind, name and type of every end: several of a node on one name are one."""
+        view = self._view
+        for each in view.actual:
+            planned, type_ = each.planned, each.observed.type if each.observed else ""
+            notes = [f"declared as {planned.type}"] if type_ not in ("", planned.type) else []
+            notes += [each.report.error] if each.report and each.report.error else []
+            presence = Presence.PRESENT if each.observed else self._absent
+            end = self._end(planned.kind, planned.resolved, each.node.full_name, presence, notes)
+            yield planned.kind, planned.resolved, type_ or planned.type, end
+        for other in (*view.undeclared, *view.foreign, *view.unattributed):
+            end = self._end(other.kind, other.name, other.node, Presence.UNDECLARED, [])
+            yield other.kind, other.name, other.type, end
+
+    def _end(
+        self, kind: EndpointKind, name: str, node: str, presence: Presence, notes: list[str]
+    ) -> PicturedEnd:
+        def concerns(finding: Finding) -> bool:
+            its = finding.subject == name and finding.node in (node, "")
+            return its and finding.endpoint in (kind, None)
+
+        return PicturedEnd(
+            node=node or UNKNOWN,
+            presence=presence,
+            notes=tuple(notes),
+            findings=self._numbers(concerns),
         )
-    others = [node for node in nodes.values() if node.presence is Presence.UNDECLARED]
-    if others:
-        yield PicturedMachine(
-            title="not declared",
-            processes=tuple(PicturedProcess(title="", nodes=(node,)) for node in others),
-        )
+
+    def _flows(
+        self, name: str, sources: Mapping[PicturedEnd, str], targets: Mapping[PicturedEnd, str]
+    ) -> Iterator[PicturedFlow]:
+        for (source, sent), (target, taken) in itertools.product(sources.items(), targets.items()):
+            key = (name, source.node, target.node)
+            planned, report = self._planned_flows.get(key), self._reports.get(key)
+            subject = f"{name}: {source.node} → {target.node}"
+            outcomes = [each.outcome for each in self.findings if each.subject == subject]
+            notes = list(_demands(planned)) if planned else []
+            label, unique = _asked(planned) if planned and not self._verdict else ("", False)
+            if sent != taken:
+                notes.append("types differ")
+                outcomes += [Outcome.VIOLATED] if self._verdict else []
+            if report is not None:
+                outcomes.append(report.outcome)
+                notes = [*(each.describe() for each in report.tuples), *notes]
+                label = _label(report.effective_transport, report.dscp, _UNIQUE[report.unique])
+                unique = report.unique in (UniqueHow.WEAKLY, UniqueHow.STRONGLY)
+            found = {source.presence, target.presence}
+            presence = next(each for each in _WORST_FIRST if each in found)
+            yield PicturedFlow(
+                source=source.node,
+                target=target.node,
+                presence=presence,
+                outcome=next((each for each in _WORST_OUTCOME if each in outcomes), None),
+                label=presence.value if presence in REMARKS else label,
+                notes=tuple(notes),
+                unique=unique,
+            )
+
+
+_WORST_OUTCOME = (Outcome.VIOLATED, Outcome.UNVERIFIABLE, Outcome.OK)
+
+
+def _label(medium: str, dscp: int | None, unique: str = "") -> str:
+    marked = "" if dscp is None else describe(dscp).partition(" = ")[0]
+    return " · ".join(filter(None, (medium, marked, unique)))
+
+
+def _asked(flow: FlowView) -> tuple[str, bool]:
+    """Return what is to carry a planned flow, with which mark, and whether it is to be unique."""
+    dscp = next((each.planned.dscp for each in flow.publishers), None)
+    return _label(flow.planned.medium, dscp), flow.planned.unique is not UniqueHow.NOT
+
+
+def _demands(flow: FlowView) -> Iterator[str]:
+    if flow.planned.unique is not UniqueHow.NOT:
+        yield f"{flow.planned.unique.value} unique demanded"
+    for word, need in zip(("publisher", "subscription"), flow.requirement, strict=True):
+        if need is not UniqueRequirement.NOT_REQUIRED:
+            yield f"{word} unique {need.value}"
+    if flow.planned.max_delay_ms is not None:
+        yield f"at most {flow.planned.max_delay_ms:g} ms"
+    if flow.five_qi is not None:
+        yield f"5QI {flow.five_qi}"

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 
-from lifecycle.export.picture import Picture, Supervised, build_picture
+from lifecycle.export.picture.build import Supervised, build_picture
+from lifecycle.export.picture.model import Picture
 from lifecycle.manifest.model import Discovery, EndpointKind, Machine, UniqueHow
 from lifecycle.manifest.qos import QosProfile, Reliability
 from lifecycle.network.nfe import UniqueRequirement

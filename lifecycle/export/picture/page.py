@@ -1,0 +1,102 @@
+"""A picture as one self-contained HTML page: verdict, drawing, findings, a filter. Pure.
+
+It needs no network and no other file, and nothing of a graph is ever taken for markup. Its script
+only hides what does not have the words of the filter; without it everything is there.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from html import escape
+
+from lifecycle.export.picture.drawing import picture_to_svg
+from lifecycle.export.picture.model import OUTCOMES, Picture
+from lifecycle.printable import one_line
+from lifecycle.verify import Finding, Outcome
+
+CSS = """\
+body{margin:0 1.5rem;font:15px/1.45 system-ui,sans-serif;color:#1b2733;background:#fff}
+.verdict{display:inline-block;padding:.25rem .6rem;border-radius:.4rem;border:1px solid #8ea3bb}
+.ok{background:#e3f4ee}.violated{background:#fbe9e7}.unverifiable{background:#fdf3dc}
+.figure{overflow:auto;max-height:85vh;border:1px solid #dde4ec;border-radius:.4rem}
+table{border-collapse:collapse;width:100%;font-size:.9rem}
+th,td{padding:.35rem .6rem;text-align:left;vertical-align:top;border-bottom:1px solid #e6ebf1}
+.gone{opacity:.15}
+"""
+
+SCRIPT = """\
+"use strict";
+var filter = document.getElementById("filter");
+filter.parentElement.hidden = false;
+filter.addEventListener("input", function () {
+  var wanted = filter.value.trim().toLowerCase();
+  document.querySelectorAll("tbody tr, svg g.row").forEach(function (row) {
+    row.classList.toggle("gone", !row.textContent.toLowerCase().includes(wanted));
+  });
+});
+"""
+
+_SAYS = {
+    Outcome.OK: "What runs is what was declared.",
+    Outcome.VIOLATED: "What runs is not what was declared.",
+    Outcome.UNVERIFIABLE: "Not everything could be verified.",
+}
+
+
+def picture_to_html(picture: Picture) -> str:
+    """Return the whole page."""
+    return "\n".join(_page(picture)) + "\n"
+
+
+def _page(picture: Picture) -> Iterator[str]:
+    yield '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">'
+    yield (
+        '<meta http-equiv="Content-Security-Policy" content="default-src \'none\'; '
+        "style-src 'unsafe-inline'; script-src 'unsafe-inline'\">"
+    )
+    yield f"<title>{_text(picture.title)}</title>\n<style>\n{CSS}</style>\n</head>\n<body>"
+    phase = f", {picture.phase}" if picture.phase else ""
+    yield f"<h1>{_text(picture.system)}</h1>"
+    yield f"<p>ROS domain {picture.domain_id}{_text(phase)}</p>"
+    if picture.verdict is None:
+        yield "<p>What is declared; whether it runs was not looked at.</p>"
+    else:
+        symbol = OUTCOMES[picture.verdict].symbol
+        yield (
+            f'<p class="verdict {picture.verdict.value}"><strong>{symbol} verdict '
+            f"{picture.verdict.value}</strong> {_SAYS[picture.verdict]}</p>"
+        )
+    yield (
+        '<p hidden><label for="filter">Show only what names </label>'
+        '<input id="filter" type="search" autocomplete="off"></p>'
+    )
+    yield f'<div class="figure" tabindex="0">\n{picture_to_svg(picture)}</div>'
+    yield (
+        "<p>Each column is a node, each row a topic, service or action, from who publishes or asks "
+        "(●) to who subscribes or answers (▶). Dashed: missing; dotted: not declared; thick: a "
+        "unique flow.</p>"
+    )
+    if picture.findings:
+        heads = ("no.", "outcome", "rule", "what", "where")
+        cells = "".join(f'<th scope="col">{each}</th>' for each in heads)
+        yield f"<h2>Findings</h2>\n<table><thead><tr>{cells}</tr></thead><tbody>"
+        yield from itertools.starmap(_finding, enumerate(picture.findings, start=1))
+        yield "</tbody></table>"
+    yield f"<script>\n{SCRIPT}</script>\n</body>\n</html>"
+
+
+def _finding(number: int, finding: Finding) -> str:
+    hint = f"<br><em>{_text(finding.hint)}</em>" if finding.hint else ""
+    cells = (
+        f"{OUTCOMES[finding.outcome].symbol} {finding.outcome.value}",
+        f"<code>{_text(finding.rule)}</code>",
+        f"{_text(finding.message)}{hint}",
+        f"<code>{_text(finding.at)}</code>" if finding.at else "–",
+    )
+    rest = "".join(f"<td>{each}</td>" for each in cells)
+    return f'<tr><th scope="row">⚠{number}</th>{rest}</tr>'
+
+
+def _text(words: str) -> str:
+    return escape(one_line(words))
