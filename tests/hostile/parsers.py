@@ -40,7 +40,7 @@ from lifecycle.supervisor.control.server import LookAnswer, QuestionWithPlan
 from lifecycle.verify import Stage
 from lifecycle.verify.observation import ConfigurationError, decode_configuration
 from tests.hostile.attack import Attack, HostileClass, Place, mutated
-from tests.unit.programming.apply.fakes import FakeTool
+from tests.unit.programming.apply.fakes import FakeTool, failed
 from tests.unit.programming.apply.samples import nef_settings
 from tests.unit.verify.perfect import perfect
 from tests.unit.verify.test_verify_rules import PLAN
@@ -104,7 +104,10 @@ def _tc(data: bytes, folder: Path) -> object:
     from lifecycle.programming.apply.targets.tc import TcTarget
     from lifecycle.programming.rules.tc import TcSettings
 
-    tool = FakeTool(("tc", ToolOutput(returncode=0, stdout=_text(data), stderr="")))
+    tool = FakeTool(
+        ("tc", ToolOutput(returncode=0, stdout=_text(data), stderr="")),
+        ("nft list", failed("Error: No such file or directory")),
+    )
     settings = TcSettings(device="eth0", link_kbit=20_000)
     return TcTarget("robot", settings, Ledger(folder, "robot"), tool).plan([])
 

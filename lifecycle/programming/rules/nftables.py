@@ -1,4 +1,4 @@
-"""Flow rules as an nftables ruleset, as a file for `nft -f` and as JSON for libnftables.
+"""Flow rules as an nftables ruleset, a file for `nft -f`.
 
 Owns: the one table of a system, `inet flowqos_<system>`, and everything in it. The table is
 replaced as a whole in one transaction, so that applying it twice changes nothing and no foreign
@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
+from typing import NamedTuple
 
 from lifecycle import dataclasses
 from lifecycle.network import InternetProtocol, code_points, describe, dscp_name
@@ -19,8 +20,6 @@ from lifecycle.programming.rules.rules import FlowRule, LeftOut, asks, named
 
 FAMILY = "inet"
 CHAIN = "post"
-PRIORITY_MANGLE = -150
-"""The value of `priority mangle` in the postrouting hook (NF_IP_PRI_MANGLE)."""
 
 MAX_COMMENT_BYTES = 127
 """Longest comment that nftables keeps (NFTNL_UDATA_COMMENT_MAXLEN, with its final zero 128)."""
@@ -29,16 +28,18 @@ _SYSTEM = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 _MANAGED = re.compile(r"managed-by=lifecycle digest=(?P<digest>[0-9a-f]+)")
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class _Part:
-    """One selector of a concatenation: as nft writes it, and its type in a JSON set."""
+class Action(NamedTuple):
+    """What is set on the packets of a rule.
 
-    protocol: str
-    field: str
-    type: str
+    Attributes:
+        suffix: ends the name of its set, `ef`.
+        statement: as nft writes it; `{network}` stands for `ip` or `ip6`.
+        comment: for people.
+    """
 
-    def __str__(self) -> str:
-        return f"{self.protocol} {self.field}"
+    suffix: str
+    statement: str
+    comment: str
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,22 +47,10 @@ class _Group:
     """Flows that one nft rule treats: their set, what selects them and what is set on them."""
 
     name: str
-    parts: tuple[_Part, ...]
-    network: str
-    field: str
-    value: str
+    selector: str
+    statement: str
     comment: str
-    elements: tuple[_Element, ...]
-
-    @property
-    def selector(self) -> str:
-        return " . ".join(map(str, self.parts))
-
-
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class _Element:
-    values: tuple[str | int, ...]
-    comment: str
+    elements: tuple[tuple[str, str], ...]  # (tuple, comment)
 
 
 def table_name(system: str) -> str:
@@ -110,42 +99,96 @@ def render_nft(
         ValueError: the system's name is not one that a manifest may have.
     """
     every = tuple(rules)
-    table = table_name(system)
     lines = [
         f"# Marks the verified flows of system {system}. Check without privilege:",
         "#   unshare -Urn nft -c -f FILE",
         "# Marking alone gives no priority: each hop must also queue by DSCP.",
         *(f"# {line}" for line in _remarks(every, left_out)),
-        f"add table {FAMILY} {table}",
-        f"delete table {FAMILY} {table}",
-        f"table {FAMILY} {table} {{",
-        f'  comment "{_comment(managed_comment(system, digest))}"',
     ]
-    groups = tuple(_groups(every))
+    table = render_table(
+        table_name(system), managed_comment(system, digest), [(each, marks(each)) for each in every]
+    )
+    return "\n".join(lines) + "\n" + table
+
+
+def marks(rule: FlowRule) -> tuple[Action, ...]:
+    """Return what is written into the packets of a rule; empty if nothing is."""
+    found = []
+    if rule.dscp is not None:
+        name = dscp_name(rule.dscp).lower()
+        found.append(
+            Action(
+                suffix=f"dscp{name}" if name.isdecimal() else name,
+                statement=f"{{network}} dscp set {nft_keyword(rule.dscp)}",
+                comment=describe(rule.dscp),
+            )
+        )
+    if rule.flow_label:
+        text = f"{rule.flow_label:#07x}"
+        found.append(
+            Action(
+                suffix=f"label_{rule.flow_label:05x}",
+                statement=f"{{network}} flowlabel set {text}",
+                comment=f"flow label {text}",
+            )
+        )
+    return tuple(found)
+
+
+def render_table(
+    table: str,
+    comment: str,
+    actions: Iterable[tuple[FlowRule, Sequence[Action]]],
+    *,
+    priority: str = "mangle",
+    device: str = "",
+    more: Sequence[str] = (),
+) -> str:
+    """Return commands for `nft -f` that replace a table in one transaction.
+
+    Args:
+        table: its name.
+        comment: of the table.
+        actions: what is set on the packets of each rule.
+        priority: of its chain in the postrouting hook.
+        device: only packets that leave by it; empty for all.
+        more: further lines of the chain.
+    """
+    groups = tuple(_groups(actions))
+    where = f'oifname "{device}" ' if device else ""
+    lines = [
+        render_table_removal(table).rstrip(),
+        f"table {FAMILY} {table} {{",
+        f'  comment "{_comment(comment)}"',
+    ]
     for group in groups:
         lines += [
             f"  set {group.name} {{",
             f"    typeof {group.selector}",
             "    elements = {",
-            *(
-                f'      {" . ".join(map(str, each.values))} comment "{each.comment}",'
-                for each in group.elements
-            ),
+            *(f'      {key} comment "{names}",' for key, names in group.elements),
             "    }",
             "  }",
         ]
     lines += [
         f"  chain {CHAIN} {{",
-        "    type filter hook postrouting priority mangle; policy accept;",
+        f"    type filter hook postrouting priority {priority}; policy accept;",
         *(
-            f"    {group.selector} @{group.name} {group.network} {group.field} set {group.value}"
-            f' counter comment "{group.comment}"'
+            f"    {where}{group.selector} @{group.name} {group.statement}"
+            f' counter comment "{_comment(group.comment)}"'
             for group in groups
         ),
+        *(f"    {where}{each}" for each in more),
         "  }",
         "}",
     ]
     return "\n".join(lines) + "\n"
+
+
+def render_table_removal(table: str) -> str:
+    """Return commands for `nft -f` that remove a table, and do so if there is none."""
+    # `destroy` would say it in one line, but nftables 1.0.6 does not know the keyword.
+    return f"add table {FAMILY} {table}\ndelete table {FAMILY} {table}\n"
 
 
 def render_nft_removal(system: str) -> str:
@@ -154,9 +197,7 @@ def render_nft_removal(system: str) -> str:
     Raises:
         ValueError: the system's name is not one that a manifest may have.
     """
-    # `destroy` would say it in one line, but nftables 1.0.6 does not know the keyword.
-    table = table_name(system)
-    return f"add table {FAMILY} {table}\ndelete table {FAMILY} {table}\n"
+    return render_table_removal(table_name(system))
 
 
 def nft_keyword(dscp: int) -> str:
@@ -179,81 +220,41 @@ def _remarks(rules: Sequence[FlowRule], left_out: Sequence[LeftOut]) -> Iterator
             yield f"left out: {named(rule)}: it has no DSCP and no flow label to set"
 
 
-def _groups(rules: Sequence[FlowRule]) -> Iterator[_Group]:
+def _groups(actions: Iterable[tuple[FlowRule, Sequence[Action]]]) -> Iterator[_Group]:
     """Flows by what is set on them: `ip dscp set … map {}` fails, so each class has its own set."""
-    marked: dict[tuple[int, str, str, bool], list[FlowRule]] = {}
-    labelled: dict[tuple[int, str, str, bool], list[FlowRule]] = {}
-    for rule in rules:
+    groups: dict[tuple[Action, str, str, bool], list[FlowRule]] = {}
+    for rule, those in actions:
         network = "ip6" if rule.internet_protocol is InternetProtocol.IPV6 else "ip"
-        kind = (network, rule.transport_protocol.value, bool(rule.source_address))
-        if rule.dscp is not None:
-            marked.setdefault((rule.dscp, *kind), []).append(rule)
-        if rule.flow_label:
-            labelled.setdefault((rule.flow_label, *kind), []).append(rule)
-    for (dscp, network, transport, sourced), members in marked.items():
-        name = dscp_name(dscp).lower()
-        yield _group(
-            members,
-            suffix=f"dscp{name}" if name.isdecimal() else name,
-            network=network,
-            transport=transport,
-            sourced=sourced,
-            change=("dscp", nft_keyword(dscp), describe(dscp)),
-        )
-    for (label, network, transport, sourced), members in labelled.items():
-        text = f"{label:#07x}"
-        yield _group(
-            members,
-            suffix=f"label_{label:05x}",
-            network=network,
-            transport=transport,
-            sourced=sourced,
-            change=("flowlabel", text, f"flow label {text}"),
+        for action in those:
+            key = (action, network, rule.transport_protocol.value, bool(rule.source_address))
+            groups.setdefault(key, []).append(rule)
+    for (action, network, transport, sourced), members in groups.items():
+        # f: whole flows; p: flows whose source address is not known, matched by port and
+        # destination.
+        letter, digit = "f" if sourced else "p", "6" if network == "ip6" else "4"
+        source = f"{network} saddr . " if sourced else ""
+        yield _Group(
+            name=f"{letter}{digit}_{'' if transport == 'udp' else f'{transport}_'}{action.suffix}",
+            selector=f"{source}{transport} sport . {network} daddr . {transport} dport",
+            statement=action.statement.format(network=network),
+            comment=action.comment,
+            elements=tuple(_elements(members)),
         )
 
 
-def _group(
-    rules: Sequence[FlowRule],
-    *,
-    suffix: str,
-    network: str,
-    transport: str,
-    sourced: bool,
-    change: tuple[str, str, str],
-) -> _Group:
-    address = "ipv6_addr" if network == "ip6" else "ipv4_addr"
-    parts = (
-        _Part(protocol=network, field="saddr", type=address),
-        _Part(protocol=transport, field="sport", type="inet_service"),
-        _Part(protocol=network, field="daddr", type=address),
-        _Part(protocol=transport, field="dport", type="inet_service"),
-    )
-    # f: whole flows; p: flows whose source address is not known, matched by port and destination.
-    letter, digit = "f" if sourced else "p", "6" if network == "ip6" else "4"
-    field, value, comment = change
-    return _Group(
-        name=f"{letter}{digit}_{'' if transport == 'udp' else f'{transport}_'}{suffix}",
-        parts=parts if sourced else parts[1:],
-        network=network,
-        field=field,
-        value=value,
-        comment=_comment(comment),
-        elements=tuple(_elements(rules)),
-    )
+def element(rule: FlowRule) -> str:
+    """Return the element of a set that matches a rule: `10.9.0.1 . 17900 . 10.9.0.2 . 17910`."""
+    source = f"{rule.source_address} . " if rule.source_address else ""
+    return f"{source}{rule.source_port} . {rule.destination_address} . {rule.destination_port}"
 
 
-def _elements(rules: Sequence[FlowRule]) -> Iterator[_Element]:
+def _elements(rules: Sequence[FlowRule]) -> Iterator[tuple[str, str]]:
     """Each element once: several flows of one class may share a 5-tuple."""
-
-    def values(rule: FlowRule) -> tuple[str | int, ...]:
-        source = (rule.source_address,) if rule.source_address else ()
-        return (*source, rule.source_port, rule.destination_address, rule.destination_port)
-
-    flows: dict[tuple[str | int, ...], list[str]] = {}
+    flows: dict[str, list[str]] = {}
     for rule in rules:
-        flows.setdefault(values(rule), []).append(named(rule))
+        flows.setdefault(element(rule), []).append(named(rule))
     for key, names in flows.items():
-        yield _Element(values=key, comment=_comment(", ".join(dict.fromkeys(names))))
+        yield key, _comment(", ".join(dict.fromkeys(names)))
 
 
 def _comment(text: str) -> str:

@@ -183,7 +183,6 @@ def _tc(given: ExportInput) -> str:
         given.rules.rules,
         _needed(given.settings.tc, "tc", "the network device"),
         system=given.plan.system,
-        digest=given.digest,
         left_out=given.rules.left_out,
     )
 

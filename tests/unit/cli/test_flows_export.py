@@ -54,7 +54,7 @@ def test_bodies_take_the_settings_of_their_server(
             "tc",
             (
                 "cannot export tc: nothing says the network device; give tc its settings; "
-                "give --device eth0"
+                "give --device eth0 --rate 20mbit"
             ),
         ),
         (
@@ -105,7 +105,7 @@ def test_flows_refuses_options_that_do_not_fit(options: list[str], message: str)
             ["--program", "tc"],
             (
                 "cannot program tc without a device; only devices that are named are touched; "
-                "give --device eth0"
+                "give --device eth0 --rate 20mbit"
             ),
         ),
     ],

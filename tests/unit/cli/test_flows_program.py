@@ -85,7 +85,7 @@ def test_options_of_tc_are_read_with_their_units() -> None:
         (["nft"], {"config": "f"}, "cannot use --config without --target nef or camara"),
         (["tc"], {"device": "e0", "rate": "fast"}, "cannot use rate 'fast'"),
         (["tc"], {"device": "e0", "rate": "1mbit", "queue": "50"}, "cannot use queue '50'"),
-        (["tc"], {"device": "e0", "queue": "50ms"}, "cannot use --queue without --rate"),
+        (["tc"], {"device": "e0", "queue": "50ms"}, "cannot program tc without the rate"),
         (
             ["tc"],
             {"device": "e0", "guarantee": ("ef",)},

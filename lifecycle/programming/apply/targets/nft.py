@@ -9,8 +9,9 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from lifecycle import dataclasses
 from lifecycle.errors import UsageError
-from lifecycle.programming.apply.ledger import Entry, Ledger, TargetRecord, digest_of
+from lifecycle.programming.apply.ledger import Ledger, TargetRecord
 from lifecycle.programming.apply.target import (
     ChangeKind,
     FlowChange,
@@ -25,20 +26,117 @@ from lifecycle.programming.apply.targets.registry import TargetOptions, Targets
 from lifecycle.programming.apply.tool import HostTool, Tool, demand, failure, qdiscs_of
 from lifecycle.programming.rules.nftables import (
     FAMILY,
+    element,
     parse_managed_comment,
     render_nft,
     render_nft_removal,
     table_name,
 )
-from lifecycle.programming.rules.rules import FlowRule, rules_digest
+from lifecycle.programming.rules.rules import FlowRule, named, rules_digest
 
 KIND = "nft"
 
-_COUNTS = re.compile(r"counter packets \d+ bytes \d+")
+_ELEMENT = re.compile(
+    r'set (?P<set>\w+) \{|(?P<key>[0-9a-f.:]+(?: \. [0-9a-f.:]+)+) comment "(?P<comment>[^"]*)"'
+)
+_NAMED = 100
+"""Characters of a flow's name that surely fit into an element's comment."""
+
 _NONE_SUCH = re.compile(r"No such file or directory", re.IGNORECASE)
 
 _BAND_QDISCS = ("pfifo_fast", "prio")
 """They sort by the old TOS bits, where EF, CS6 and DF share the middle band and AF*1 the worst."""
+
+
+class NftTable:
+    """One table, read and replaced as a whole. Its comment says that it is ours.
+
+    Args:
+        name: of the table.
+        tool: runs nft.
+    """
+
+    def __init__(self, name: str, tool: Tool) -> None:
+        self._name = name
+        self._tool = tool
+
+    def __str__(self) -> str:
+        return f"nft table {FAMILY} {self._name}"
+
+    def listing(self) -> str:
+        """Return the table as nft shows it; empty if there is none.
+
+        Raises:
+            NotOursError: a table of this name is not ours.
+            PrivilegeError: reading needs the same privilege as writing.
+        """
+        argv = ["nft", "list", "table", FAMILY, self._name]
+        output = self._tool.run(argv)
+        if output.returncode != 0:
+            if _NONE_SUCH.search(output.stderr):
+                return ""
+            raise failure(output, argv, doing=f"read {self}")
+        if parse_managed_comment(output.stdout) is None:
+            raise NotOursError(
+                f"cannot use {self}: it exists and is not marked as managed by lifecycle",
+                hint=f"look at it: nft list table {FAMILY} {self._name}",
+            )
+        return output.stdout
+
+    def write(self, text: str) -> None:
+        """Replace it: nft takes a ruleset whole or not at all."""
+        demand(self._tool, ["nft", "-f", "-"], doing=f"write {self}", stdin=text)
+
+
+def compare(
+    listing: str, text: str, rules: Sequence[FlowRule], *, detail: str = ""
+) -> tuple[FlowChange, ...]:
+    """Return what replacing a table changes, flow by flow.
+
+    Args:
+        listing: the table as nft shows it; empty if there is none.
+        text: what would be written.
+        rules: that it was made from.
+        detail: why all of them change; empty to find that out.
+    """
+    there, wanted = _elements(listing), _elements(text)
+    names = [comment for *_, comment in there]
+    equal = bool(listing) and parse_managed_comment(listing) == parse_managed_comment(text)
+    altered = equal and (there != wanted or listing.count(" counter ") != text.count(" counter "))
+    if altered:
+        detail = "the table was changed by others"
+    # The digest is also of what no element shows, such as a 5QI.
+    unseen = there == wanted and not equal
+    changes = []
+    for rule in rules:
+        known = not wanted or any(named(rule)[:_NAMED] in each for each in names)
+        kind = ChangeKind.UPDATE if listing and known else ChangeKind.CREATE
+        key = element(rule)
+        if listing and not (altered or unseen) and _sets(there, key) == _sets(wanted, key):
+            kind = ChangeKind.KEEP
+        changes.append(FlowChange(kind=kind, key=rule.key, what=describe_rule(rule), detail=detail))
+    lasting = {comment for *_, comment in wanted}
+    changes += [
+        FlowChange(kind=ChangeKind.DELETE, key=each, what="")
+        for each in dict.fromkeys(names)
+        if each not in lasting
+    ]
+    return tuple(changes)
+
+
+def _elements(text: str) -> list[tuple[str, str, str]]:
+    """(set, tuple, comment) of each element of a table, as written or as shown."""
+    found = []
+    name = ""
+    for each in _ELEMENT.finditer(text):
+        name = each["set"] or name
+        if each["key"]:
+            found.append((name, each["key"], each["comment"]))
+    return sorted(found)
+
+
+def _sets(elements: Sequence[tuple[str, str, str]], key: str) -> set[str]:
+    return {name for name, other, _ in elements if other == key}
 
 
 class NftTarget:
@@ -46,20 +144,21 @@ class NftTarget:
 
     Args:
         system: names the table.
-        ledger: of the system.
+        ledger: of the system; says that there is a table, for who removes it later.
         tool: runs nft.
     """
 
     def __init__(self, system: str, ledger: Ledger, tool: Tool | None = None) -> None:
         self._system = system
-        self._table = table_name(system)
+        self._scope = table_name(system)
         self._ledger = ledger
         self._tool = tool or HostTool()
+        self._table = NftTable(self._scope, self._tool)
 
     @property
     def name(self) -> str:
         """The table."""
-        return f"nft table {FAMILY} {self._table}"
+        return str(self._table)
 
     def plan(self, rules: Sequence[FlowRule]) -> TargetChanges:
         """Compare the table with the rules.
@@ -69,32 +168,33 @@ class NftTarget:
             PrivilegeError: reading needs the same privilege as writing.
         """
         marking, left_out = _marking(rules)
+        listing = self._table.listing()
+        detail = ""
+        if not listing and self._ledger.record(KIND, self._scope) is not None:
+            detail = "the table was gone"
         return TargetChanges(
             target=self.name,
-            changes=self._compare(marking),
+            changes=compare(listing, self._text(marking), marking, detail=detail),
             left_out=left_out,
             warnings=self._warnings() if marking else (),
         )
 
     def apply(self, rules: Sequence[FlowRule]) -> TargetChanges:
         """Replace the table if anything differs."""
-        marking, _ = _marking(rules)
+        marking, left_out = _marking(rules)
         if not marking:
-            return self._nothing_to_mark(rules)
+            return dataclasses.replace(self.remove(), left_out=left_out)
         planned = self.plan(rules)
-        if not planned.pending:
+        before = self._ledger.record(KIND, self._scope)
+        if not planned.pending and before is not None:
             return planned
-        text = self._text(marking)
-        before = self._ledger.record(KIND, self._table)
         # Written first: a crash in between leaves an entry without a table, which is harmless.
-        self._ledger.put(self._record(marking, seen=""))
+        self._ledger.put(TargetRecord(target=KIND, scope=self._scope))
         try:
-            self._write(text)
+            self._table.write(self._text(marking))
         except ProgrammingError:
-            # nft takes a ruleset whole or not at all, so all is as it was.
-            self._ledger.restore(KIND, self._table, before)
+            self._ledger.restore(KIND, self._scope, before)
             raise
-        self._ledger.put(self._record(marking, seen=digest_of(_steady(self._listing()))))
         return planned
 
     def dry_run(self, rules: Sequence[FlowRule]) -> str:
@@ -124,101 +224,21 @@ class NftTarget:
 
     def remove(self) -> TargetChanges:
         """Delete the table if it is ours."""
-        record = self._ledger.record(KIND, self._table)
-        listing = self._listing()
-        entries = [] if record is None else [(each.key, each.what) for each in record.entries]
+        if self._ledger.record(KIND, self._scope) is None and not self._table.listing():
+            return TargetChanges(target=self.name)
+        listing = self._table.listing()
+        names = list(dict.fromkeys(comment for *_, comment in _elements(listing)))
         if listing:
-            self._insist_ours(listing)
-            self._write(render_nft_removal(self._system))
-            entries = entries or [(self._table, "")]
-        else:
-            entries = []
-        self._ledger.drop(KIND, self._table)
-        return deletions(self.name, entries)
+            self._table.write(render_nft_removal(self._system))
+        self._ledger.drop(KIND, self._scope)
+        return deletions(self.name, [(each, "") for each in names])
 
     def renew(self) -> float | None:
         """A table does not expire."""
         return None
 
-    def _nothing_to_mark(self, rules: Sequence[FlowRule]) -> TargetChanges:
-        """No rule, no table."""
-        left_out = _marking(rules)[1]
-        if self._ledger.record(KIND, self._table) is None and not self._listing():
-            return TargetChanges(target=self.name, left_out=left_out)
-        removed = self.remove()
-        return TargetChanges(target=self.name, changes=removed.changes, left_out=left_out)
-
-    def _compare(self, rules: Sequence[FlowRule]) -> tuple[FlowChange, ...]:
-        listing = self._listing()
-        if listing:
-            self._insist_ours(listing)
-        record = self._ledger.record(KIND, self._table)
-        detail = ""
-        if not listing and record is not None and record.entries:
-            detail = "the table was gone"
-            record = None
-        elif listing and record is not None and not record.seen:
-            detail = "an earlier attempt did not finish"
-        elif listing and record is not None and record.seen != digest_of(_steady(listing)):
-            detail = "the table was changed by others"
-        before = {} if record is None else {each.key: each for each in record.entries}
-        gone = detail if not listing else ""
-        changes = []
-        for rule in rules:
-            old = before.pop(rule.key, None)
-            kind = ChangeKind.CREATE
-            if old is not None:
-                same = old.digest == rules_digest([rule]) and not detail
-                kind = ChangeKind.KEEP if same else ChangeKind.UPDATE
-            why = gone if old is None else detail
-            changes.append(
-                FlowChange(kind=kind, key=rule.key, what=describe_rule(rule), detail=why)
-            )
-        changes += [
-            FlowChange(kind=ChangeKind.DELETE, key=each.key, what=each.what)
-            for each in before.values()
-        ]
-        return tuple(changes)
-
     def _text(self, rules: Sequence[FlowRule]) -> str:
         return render_nft(rules, system=self._system, digest=rules_digest(rules))
-
-    def _write(self, text: str) -> None:
-        demand(self._tool, ["nft", "-f", "-"], doing=f"write {self.name}", stdin=text)
-
-    def _listing(self) -> str:
-        """The table as nft shows it; empty if there is none."""
-        argv = ["nft", "list", "table", FAMILY, self._table]
-        output = self._tool.run(argv)
-        if output.returncode == 0:
-            return output.stdout
-        if _NONE_SUCH.search(output.stderr):
-            return ""
-        raise failure(output, argv, doing=f"read {self.name}")
-
-    def _insist_ours(self, listing: str) -> None:
-        if parse_managed_comment(listing) is None:
-            raise NotOursError(
-                f"cannot use {self.name}: it exists and is not marked as managed by lifecycle",
-                hint=f"look at it: nft list table {FAMILY} {self._table}",
-            )
-
-    def _record(self, rules: Sequence[FlowRule], *, seen: str) -> TargetRecord:
-        return TargetRecord(
-            target=KIND,
-            scope=self._table,
-            digest=rules_digest(rules),
-            seen=seen,
-            entries=tuple(
-                Entry(
-                    key=rule.key,
-                    digest=rules_digest([rule]),
-                    what=describe_rule(rule),
-                    id=self._table,
-                )
-                for rule in rules
-            ),
-        )
 
     def _warnings(self) -> tuple[str, ...]:
         """Say where marks change nothing."""
@@ -259,11 +279,6 @@ def _marking(rules: Sequence[FlowRule]) -> tuple[tuple[FlowRule, ...], tuple[str
         if each not in marking
     )
     return marking, left_out
-
-
-def _steady(listing: str) -> str:
-    """A listing without what changes by itself: counters."""
-    return _COUNTS.sub("counter", listing)
 
 
 class NftOptions(TargetOptions):

@@ -36,8 +36,6 @@ class TargetOption:
         choices: all values that it may have; empty for any.
         default: its value where it is not given.
         multiple: it may be given several times, and its value is a tuple.
-        needs: name of another option, without which this one means nothing.
-        why: it needs that.
     """
 
     flag: str
@@ -46,8 +44,6 @@ class TargetOption:
     choices: tuple[str, ...] = ()
     default: str = ""
     multiple: bool = False
-    needs: str = ""
-    why: str = ""
 
     @property
     def name(self) -> str:
@@ -193,13 +189,10 @@ def read_targets(
     takers = target_options()
     for those in dict.fromkeys(takers.values()):
         of_those = [each for each, names in takers.items() if names == those]
-        bound = [each for each in of_those if not each.needs and not each.default]
+        bound = [each for each in of_those if not each.default]
         if not {*those} & {*chosen} and any(given.get(each.name) for each in bound):
             flags = _either([each.flag for each in bound])
             raise UsageError(f"cannot use {flags} without {option} {_either(those)}")
-        for each in of_those:
-            if each.needs and given.get(each.name) and not given.get(each.needs):
-                raise UsageError(f"cannot use {each.flag} without --{each.needs}: {each.why}")
     return tuple(target_kind(each).read(given) for each in chosen)
 
 

@@ -159,7 +159,7 @@ def test_what_is_no_token_is_refused_without_being_quoted(text: str, tmp_path: P
             {"kind": "tc"},
             (
                 "cannot program tc without a device; only devices that are named are touched; "
-                "give --device eth0"
+                "give --device eth0 --rate 20mbit"
             ),
         ),
         (

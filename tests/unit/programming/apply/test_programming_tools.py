@@ -17,7 +17,7 @@ from lifecycle.programming.apply.target import (
     TargetChanges,
 )
 from lifecycle.programming.apply.targets.nft import NftTarget
-from lifecycle.programming.apply.targets.tc import parse_queue, parse_rate, probe_features
+from lifecycle.programming.apply.targets.tc import parse_queue, parse_rate
 from lifecycle.programming.apply.tool import HostTool, ToolOutput, demand
 from tests.unit.programming.apply.fakes import FakeTool, failed
 from tests.unit.programming.apply.samples import ledger_in, rule
@@ -134,34 +134,6 @@ def test_a_write_that_failed_is_not_taken_for_done(tmp_path: Path) -> None:
 
     assert target.plan([rule()]).pending
     assert ledger.read().targets == ()
-
-
-def test_where_no_namespace_can_be_made_nothing_is_known_of_the_kernel() -> None:
-    tool = FakeTool(("unshare", failed("unshare failed: Operation not permitted")))
-
-    assert probe_features(tool) is None
-    assert tool.lines == ["unshare -n tc -batch -", "unshare -Urn tc -batch -"]
-
-
-def test_root_without_the_capability_is_not_taken_for_a_kernel_without_queues() -> None:
-    refused = failed("RTNETLINK answers: Operation not permitted\nCommand failed -:1\n")
-    tool = FakeTool(("unshare -n", refused))
-
-    features = probe_features(tool)
-
-    assert features is not None
-    assert features.qdiscs == ("htb", "prio")
-    assert {line.split()[1] for line in tool.lines[1:]} == {"-Urn"}
-    assert probe_features(FakeTool(("unshare", refused))) is None
-
-
-def test_a_kernel_without_traffic_control_has_no_queues_at_all() -> None:
-    tool = FakeTool(("unshare", failed("RTNETLINK answers: Operation not supported\n")))
-
-    features = probe_features(tool)
-
-    assert features is not None
-    assert features.qdiscs == ()
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from lifecycle.programming.rules.nftables import render_nft
-from lifecycle.programming.rules.tc import TcFeatures, TcMatch, TcSettings, render_tc
+from lifecycle.programming.rules.tc import TcMatch, TcSettings, render_tc
 from tests.unit.programming.rules.samples import in_a_network_namespace, rule
 
 RULES = (
@@ -86,24 +86,20 @@ nft list chain inet flowqos_wire post""",
 def test_each_flow_goes_to_its_class_and_the_rest_to_the_rest(
     tmp_path: Path, match: TcMatch
 ) -> None:
-    settings = TcSettings(
-        device="lo", link_kbit=100_000, match=match, features=TcFeatures(classifiers=("u32",))
-    )
-    lines = render_tc(RULES, settings, system="wire", digest="0")
-    (tmp_path / "tc").write_text(lines, encoding="utf-8")
+    settings = TcSettings(device="lo", link_kbit=100_000, match=match)
+    (tmp_path / "tc").write_text(render_tc(RULES, settings, system="wire"), encoding="utf-8")
     (tmp_path / "nft").write_text(render_nft(RULES, system="wire", digest="0"), encoding="utf-8")
     (tmp_path / "send.py").write_text(SENDER, encoding="utf-8")
     # Marks are set before packets are queued, so nft and tc work together on one host.
     out = run(
         f"""tc qdisc add dev lo root handle 1: htb || exit 77
-tc filter add dev lo parent 1: protocol ip u32 match u32 0 0 || exit 77
 set -e
 tc qdisc del dev lo root
 {f"nft -f {tmp_path}/nft" if match is TcMatch.MARK else ":"}
-tc -batch {tmp_path}/tc
+sh {tmp_path}/tc
 {sys.executable} {tmp_path}/send.py > /dev/null
 tc -s class show dev lo""",
-        "nft" if match is TcMatch.MARK else "tc",
+        "nft",
     )
     sent = re.findall(r"class htb 1f10:(\w+) parent .*?\n Sent \d+ bytes (\d+) pkt", out)
     counts = {minor: int(packets) for minor, packets in sent}

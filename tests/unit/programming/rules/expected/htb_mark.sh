@@ -1,4 +1,4 @@
-# managed-by=lifecycle digest=0123456789abcdef system=teleop handle=1f10:
+# Queues the verified flows of system teleop on eth0: sh FILE
 # /video /robot/camera → /viewer: udp 10.9.0.1:17900 → 10.9.0.2:17910: EF = DSCP 46 = TOS 184 (0xb8), 5QI 85, at most 5 ms
 # /depth /robot/camera → /viewer: udp 10.9.0.1:17901 → 10.9.0.2:17911: EF = DSCP 46 = TOS 184 (0xb8)
 # /bulk /robot/camera → /viewer: udp *:17900 → 10.9.0.2:17912: LE = DSCP 1 = TOS 4 (0x04)
@@ -6,7 +6,9 @@
 # /lidar /robot/camera → /viewer: udp [fd09::1]:17904 → [fd09::2]:17914: NQB = DSCP 45 = TOS 180 (0xb4), flow label 0x12345
 # /touch /robot/camera → /viewer: udp 10.9.0.1:17905 → 10.9.0.2:17915: 5QI 9
 # left out: /map /robot/camera → /viewer: not verified: its verdict is unverifiable
-# left out: /touch /robot/camera → /viewer: it has no DSCP, and filters look at nothing else here
+# left out: /touch /robot/camera → /viewer: it has no DSCP, and rules look at nothing else here
+set -e
+tc -batch - <<'END'
 qdisc add dev eth0 root handle 1f10: htb default 0xfff
 class replace dev eth0 parent 1f10: classid 1f10:1 htb rate 20000kbit ceil 20000kbit quantum 3028
 # class 1f10:12e: EF = DSCP 46 = TOS 184 (0xb8)
@@ -27,13 +29,22 @@ qdisc replace dev eth0 parent 1f10:fff handle 2fff: bfifo limit 125000
 # class 1f10:101: LE = DSCP 1 = TOS 4 (0x04)
 class replace dev eth0 parent 1f10:1 classid 1f10:101 htb rate 200kbit ceil 20000kbit prio 7 quantum 3028
 qdisc replace dev eth0 parent 1f10:101 handle 2101: bfifo limit 125000
-filter replace dev eth0 parent 1f10: protocol ip pref 10 handle 800::fff u32 match u8 0x00 0xf0 at 0 flowid 1f10:fff
-filter replace dev eth0 parent 1f10: protocol ipv6 pref 11 handle 801::fff u32 match u8 0x00 0xf0 at 0 flowid 1f10:fff
-filter replace dev eth0 parent 1f10: protocol ip pref 10 handle 800::1 u32 match ip dsfield 0xb8 0xfc flowid 1f10:12e
-filter replace dev eth0 parent 1f10: protocol ipv6 pref 11 handle 801::2 u32 match ip6 priority 0xb8 0xfc flowid 1f10:12e
-filter replace dev eth0 parent 1f10: protocol ip pref 10 handle 800::3 u32 match ip dsfield 0xb4 0xfc flowid 1f10:12d
-filter replace dev eth0 parent 1f10: protocol ipv6 pref 11 handle 801::4 u32 match ip6 priority 0xb4 0xfc flowid 1f10:12d
-filter replace dev eth0 parent 1f10: protocol ip pref 10 handle 800::5 u32 match ip dsfield 0x14 0xfc flowid 1f10:105
-filter replace dev eth0 parent 1f10: protocol ipv6 pref 11 handle 801::6 u32 match ip6 priority 0x14 0xfc flowid 1f10:105
-filter replace dev eth0 parent 1f10: protocol ip pref 10 handle 800::7 u32 match ip dsfield 0x04 0xfc flowid 1f10:101
-filter replace dev eth0 parent 1f10: protocol ipv6 pref 11 handle 801::8 u32 match ip6 priority 0x04 0xfc flowid 1f10:101
+END
+nft -f - <<'END'
+add table inet flowtc_eth0_teleop
+delete table inet flowtc_eth0_teleop
+table inet flowtc_eth0_teleop {
+  comment "managed-by=lifecycle digest=bc508001f9af9193 classes=1036aad88a87bbfa"
+  chain post {
+    type filter hook postrouting priority -149; policy accept;
+    oifname "eth0" ip dscp lephb meta priority set 1f10:101 counter comment "LE = DSCP 1 = TOS 4 (0x04)"
+    oifname "eth0" ip6 dscp lephb meta priority set 1f10:101 counter comment "LE = DSCP 1 = TOS 4 (0x04)"
+    oifname "eth0" ip dscp 5 meta priority set 1f10:105 counter comment "DSCP 5 = TOS 20 (0x14)"
+    oifname "eth0" ip6 dscp 5 meta priority set 1f10:105 counter comment "DSCP 5 = TOS 20 (0x14)"
+    oifname "eth0" ip dscp 45 meta priority set 1f10:12d counter comment "NQB = DSCP 45 = TOS 180 (0xb4)"
+    oifname "eth0" ip6 dscp 45 meta priority set 1f10:12d counter comment "NQB = DSCP 45 = TOS 180 (0xb4)"
+    oifname "eth0" ip dscp ef meta priority set 1f10:12e counter comment "EF = DSCP 46 = TOS 184 (0xb8)"
+    oifname "eth0" ip6 dscp ef meta priority set 1f10:12e counter comment "EF = DSCP 46 = TOS 184 (0xb8)"
+  }
+}
+END
