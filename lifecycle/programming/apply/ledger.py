@@ -1,16 +1,15 @@
 """The ledger: what this package made in networks, written down before and after it is made.
 
-Owns: the file `programmed.json` in a run directory. It outlives the process, so that a second apply
-changes nothing, a removal deletes only what is ours, and the next run finds what a dead one left.
-It holds ids and digests, never a credential.
+Owns: the file `programmed.json` in a run directory. It outlives the process, so that a removal
+deletes only what is ours, and the next run finds what a dead one left. Of tables and devices of
+this host it has the names only: what they hold is marked there. Of servers it has the body of each
+request, before it is sent, and the id that the server gave it; never a credential.
 """
 
 from __future__ import annotations
 
 import contextlib
-import enum
 import fcntl
-import hashlib
 import os
 import stat
 import time
@@ -40,31 +39,21 @@ _LOCK_CHECK_S = 0.05
 """A lock cannot be waited for with a deadline."""
 
 
-class EntryState(enum.Enum):
-    """How far something is."""
-
-    PENDING = "pending"  # asked for, but not known to be made
-    MADE = "made"
-
-
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Entry:
-    """One thing of ours in a network, for one flow.
+    """One thing of ours at a server, for one flow.
 
     Attributes:
         key: of its FlowRule.
-        id: what the network calls it: a subscription, a session, a filter's preference; empty
-            while pending.
-        digest: of what was asked for.
+        id: what the server calls it, a subscription or a session; empty while it was asked for and
+            is not known to be made.
         what: for people.
         expires_s: seconds since the epoch; None if it does not expire.
         body: what was asked for, as JSON; what finds it again while its id is not known.
     """
 
     key: str
-    digest: str
     what: str
-    state: EntryState = EntryState.MADE
     id: str = ""
     expires_s: float | None = None
     body: str = ""
@@ -78,16 +67,11 @@ class TargetRecord:
         target: "nft", "tc", "nef" or "camara".
         scope: which one of that kind: a table, a device, a URL.
         settings: path of the settings file that says how to get there; empty if none is needed.
-        digest: of the whole of what was asked for, where it is made in one piece.
-        seen: digest of what the network showed right after it was made, to notice a change by
-            others; empty where that is not read.
     """
 
     target: str
     scope: str
     settings: str = ""
-    digest: str = ""
-    seen: str = ""
     entries: tuple[Entry, ...] = ()
 
     def entry(self, key: str) -> Entry | None:
@@ -184,10 +168,6 @@ class Ledger:
         """Nothing of ours is left in one network."""
         self._write(self._others(target, scope), None)
 
-    def restore(self, target: str, scope: str, record: TargetRecord | None) -> None:
-        """Write down what was of ours in one network before; None if nothing was."""
-        self._write(self._others(target, scope), record)
-
     def _others(self, target: str, scope: str) -> tuple[TargetRecord, ...]:
         return tuple(
             each for each in self.read().targets if (each.target, each.scope) != (target, scope)
@@ -232,12 +212,6 @@ def owner_is_dead(file: LedgerFile) -> bool:
     if file.owner is None:
         return False
     return file.boot_id != boot_id() or not is_process(file.owner.pid, file.owner.start_ticks)
-
-
-def digest_of(*parts: str) -> str:
-    """Return a digest of texts: 16 hex digits, enough to distinguish changes."""
-    whole = hashlib.sha256("\0".join(parts).encode())
-    return whole.hexdigest()[:16]
 
 
 def _own_directory(path: Path) -> None:

@@ -18,10 +18,8 @@ from lifecycle.errors import LifecycleError, UsageError
 from lifecycle.programming.apply.http import Api
 from lifecycle.programming.apply.ledger import (
     Entry,
-    EntryState,
     Ledger,
     TargetRecord,
-    digest_of,
 )
 from lifecycle.programming.apply.settings import ServerSettings, Settings, load_settings
 from lifecycle.programming.apply.target import (
@@ -229,7 +227,7 @@ class RemoteTarget:
         """
         errors: list[tuple[str, LifecycleError]] = []
         for entry in self._record().entries:
-            if entry.state is not EntryState.MADE:
+            if not entry.id:
                 continue
             try:
                 made = self._service.prolong(entry, json.loads(entry.body))
@@ -247,11 +245,11 @@ class RemoteTarget:
         if entry is None:
             return ChangeKind.CREATE, ""
         asked: Body = json.loads(entry.body)
-        if entry.state is EntryState.PENDING:
+        if not entry.id:
             found = self._service.find(asked)
             if found is None:
                 return ChangeKind.CREATE, "asked for before, but never made"
-            self._note(dataclasses.replace(entry, id=found.id, state=EntryState.MADE))
+            self._note(dataclasses.replace(entry, id=found.id))
             entry = self._record().entry(entry.key)
             assert entry is not None
         seen = self._service.see(entry.id, asked)
@@ -301,7 +299,7 @@ class RemoteTarget:
 
     def _delete(self, entry: Entry) -> None:
         id_ = entry.id
-        if entry.state is EntryState.PENDING:
+        if not entry.id:
             found = self._service.find(json.loads(entry.body))
             id_ = "" if found is None else found.id
         if id_:
@@ -331,15 +329,12 @@ class RemoteTarget:
 
 
 def _entry(change: FlowChange, body: Body, made: Made | None) -> Entry:
-    text = json.dumps(body, sort_keys=True)
     return Entry(
         key=change.key,
-        digest=digest_of(text),
         what=change.what,
-        state=EntryState.PENDING if made is None else EntryState.MADE,
         id="" if made is None else made.id,
         expires_s=None if made is None else made.expires_s,
-        body=text,
+        body=json.dumps(body, sort_keys=True),
     )
 
 

@@ -161,11 +161,6 @@ def qdiscs_of(text: str, argv: Sequence[str], *, doing: str) -> tuple[Qdisc, ...
         ) from error
 
 
-def refused(output: ToolOutput, *, by: str) -> bool:
-    """Whether a program failed for want of a privilege, or the program `by` that starts it did."""
-    return bool(_NO_PRIVILEGE.search(output.stderr)) or output.stderr.startswith(f"{by}:")
-
-
 def failure(output: ToolOutput, argv: Sequence[str], *, doing: str) -> ProgrammingError:
     """Return the error that a failed program means."""
     command = shlex.join(argv)

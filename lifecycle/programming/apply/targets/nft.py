@@ -185,15 +185,16 @@ class NftTarget:
         if not marking:
             return dataclasses.replace(self.remove(), left_out=left_out)
         planned = self.plan(rules)
-        before = self._ledger.record(KIND, self._scope)
-        if not planned.pending and before is not None:
+        recorded = self._ledger.record(KIND, self._scope) is not None
+        if not planned.pending and recorded:
             return planned
         # Written first: a crash in between leaves an entry without a table, which is harmless.
         self._ledger.put(TargetRecord(target=KIND, scope=self._scope))
         try:
             self._table.write(self._text(marking))
         except ProgrammingError:
-            self._ledger.restore(KIND, self._scope, before)
+            if not recorded:
+                self._ledger.drop(KIND, self._scope)
             raise
         return planned
 

@@ -229,7 +229,7 @@ def test_the_source_address_is_what_this_host_sends_from_where_it_is_the_publish
 
 def test_a_ledger_keeps_targets_apart_and_vanishes_with_the_last_entry(tmp_path: Path) -> None:
     ledger = ledger_in(tmp_path)
-    entry = Entry(key="k", digest="d", what="w")
+    entry = Entry(key="k", what="w")
     one = TargetRecord(target="nft", scope="t", entries=(entry,))
     other = TargetRecord(target="tc", scope="eth0")
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.programming.apply.ledger import EntryState, Ledger
+from lifecycle.programming.apply.ledger import Ledger
 from lifecycle.programming.apply.target import FlowChange, PartlyError, Target, TargetChanges
 from lifecycle.programming.apply.targets.registry import Targets, target_kind
 from tests.unit.programming.apply.samples import (
@@ -257,7 +257,7 @@ def test_a_pending_session_of_a_dead_run_is_found_and_removed(bench: Bench) -> N
     target = bench.make()
     target.apply([rule()])
     (record,) = bench.ledger.read().targets
-    died = dataclasses.replace(record.entries[0], id="", state=EntryState.PENDING)
+    died = dataclasses.replace(record.entries[0], id="")
     bench.ledger.put(dataclasses.replace(record, entries=(died,)))
 
     target.remove()

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.programming.apply.ledger import EntryState, Ledger
+from lifecycle.programming.apply.ledger import Ledger
 from lifecycle.programming.apply.target import ChangeKind, PartlyError, Target, TargetChanges
 from lifecycle.programming.apply.targets.registry import Targets, target_kind
 from tests.unit.programming.apply.samples import (
@@ -276,7 +276,7 @@ def test_a_server_error_leaves_a_pending_entry_that_the_next_apply_settles(bench
         bench.target.apply([rule()])
 
     (record,) = bench.ledger.read().targets
-    assert [each.state for each in record.entries] == [EntryState.PENDING]
+    assert [each.id for each in record.entries] == [""]
     (change,) = bench.target.apply([rule()]).changes
     assert change.detail == "asked for before, but never made"
     assert list(bench.server.subscriptions) == ["sub-1"]
@@ -285,7 +285,7 @@ def test_a_server_error_leaves_a_pending_entry_that_the_next_apply_settles(bench
 def test_a_run_that_died_before_the_answer_is_found_and_removed_by_the_next(bench: Bench) -> None:
     bench.target.apply([rule()])
     (record,) = bench.ledger.read().targets
-    died = dataclasses.replace(record.entries[0], id="", state=EntryState.PENDING)
+    died = dataclasses.replace(record.entries[0], id="")
     bench.ledger.put(dataclasses.replace(record, entries=(died,)))
 
     bench.again().remove()
