@@ -107,6 +107,5 @@ from .schema import did_you_mean as did_you_mean
 from .shared import SIM_TIME as SIM_TIME
 from .yaml.document import error as error
 from .yaml.document import warning as warning
-from .yaml.source import is_outside as is_outside
 from .yaml.source import noting_files as noting_files
 from .yaml.source import read_bytes as read_bytes

@@ -44,7 +44,7 @@ from lifecycle.manifest.shared import Shared, settle
 from lifecycle.manifest.yaml import include
 from lifecycle.manifest.yaml.arguments import CONDITIONS, Substituted, substitute
 from lifecycle.manifest.yaml.document import Cursor, Document, Place, Value, error, note
-from lifecycle.manifest.yaml.source import is_outside, note_file, read_document
+from lifecycle.manifest.yaml.source import note_file, read_document
 from lifecycle.manifest.yaml.substitutions import Programs, Surroundings, folder_of
 from lifecycle.manifest.yaml.yaml_parser import quote
 from lifecycle.network import DscpMapping, TransportPriorityMapping, dscp_mappings, parse_mapping
@@ -245,13 +245,12 @@ def load(
     """
     variables = os.environ if environment is None else environment
     origin = include.Origin.of(Path(path))
-    loading = _Loading(variables, origin)
+    loading = _Loading(variables)
     manifest = loading.read(origin, arguments, ())
     found = loading.found
 
     def every() -> tuple[Diagnostic, ...]:
-        quoted = _without_outside_text(found, os.fspath(path), variables, loading.outside)
-        return _sorted(quoted, loading.files)
+        return _sorted(found, loading.files)
 
     if manifest is None:
         raise ManifestError(every())
@@ -510,17 +509,14 @@ class _Loading:
         files: as they were read.
         machines: names of all that are declared; None if not all are known.
         lost: keys of nodes that are declared and could not be built; None if there may be any.
-        outside: (file, line, column) of values that hold text of files that is not to be quoted.
     """
 
-    def __init__(self, environment: Mapping[str, str], outermost: include.Origin) -> None:
+    def __init__(self, environment: Mapping[str, str]) -> None:
         self.found: list[Diagnostic] = []
         self.files: list[str] = []
         self.machines: frozenset[str] | None = frozenset()
         self.lost: frozenset[str] | None = frozenset()
-        self.outside: set[tuple[str, int, int]] = set()
         self._environment = environment
-        self._path = os.fspath(outermost.path)
         self._programs = Programs(environment)
         self._documents = 0
         self._outermost: Manifest | None = None
@@ -601,17 +597,10 @@ class _Loading:
         surroundings = Surroundings(
             environment=self._environment,
             folder=folder_of(origin.path),
-            outermost=self._path,
             programs=self._programs,
         )
-        unquotable = [
-            name
-            for name, each in (entry.entries("arguments") if entry else ())
-            if (each.document.file, each.value.line, each.value.column) in self.outside
-        ]
-        found = substitute(document, given, surroundings, include=entry, unquotable=unquotable)
+        found = substitute(document, given, surroundings, include=entry)
         self.found += found.diagnostics
-        self.outside |= {(document.file, line, column) for line, column in found.outside}
         for place in found.left_out:
             self.found += _misspelt(document, place)
         return found
@@ -795,51 +784,6 @@ def _is_list(document: Document, key: str) -> bool:
 
 def _mark(each: Diagnostic) -> tuple[str, int, int]:
     return each.at.file, each.at.line, each.at.column
-
-
-_READING = ("yaml.", "manifest.", "nodl.", "check.parameter")
-"""Rules whose messages quote what a file holds before it is known to be one of ours."""
-
-
-def _without_outside_text(
-    found: Sequence[Diagnostic],
-    manifest: str,
-    environment: Mapping[str, str],
-    read: Collection[tuple[str, int, int]],
-) -> list[Diagnostic]:
-    """Return findings that quote nothing of files outside the manifest's tree.
-
-    Args:
-        found: findings.
-        manifest: the outermost manifest.
-        environment: for AMENT_PREFIX_PATH.
-        read: values that hold text which `$(file …)` has read from such a file.
-    """
-    outside: dict[str, bool] = {}
-    kept = []
-    for each in found:
-        file = each.at.file
-        if file not in outside:
-            outside[file] = is_outside(file, manifest, environment)
-        if _mark(each) in read and each.rule != "manifest.substitution":
-            each = dataclasses.replace(  # noqa: PLW2901 - the same finding, without the text
-                each,
-                message=f"cannot use what is written here ({each.rule})",
-                hint=f"not quoted, as $(file …) read it outside the folder of {manifest}",
-            )
-        if outside[file] and each.rule.startswith(_READING) and each.rule not in _QUOTES_NOTHING:
-            each = dataclasses.replace(  # noqa: PLW2901 - the same finding, without the text
-                each,
-                at=dataclasses.replace(each.at, path=""),
-                message=f"cannot use what is written here ({each.rule})",
-                hint=f"not quoted, as the file is outside the folder of {manifest}; open it there, "
-                "or move it",
-            )
-        kept.append(each)
-    return kept
-
-
-_QUOTES_NOTHING = frozenset({"yaml.file", "yaml.empty", "manifest.suffix"})
 
 
 def _sorted(found: Sequence[Diagnostic], read: Iterable[str]) -> tuple[Diagnostic, ...]:

@@ -27,7 +27,6 @@ from tests.hostile.attack import (
     in_process,
     mutated,
 )
-from tests.unit.manifest.test_outside_text import PARAMETERS, SHADOW
 
 CORPUS = Path(__file__).parents[1] / "corpus"
 GOOD = sorted((CORPUS / "valid").glob("*.lifecycle.yaml"))
@@ -302,18 +301,6 @@ def _run_directory(make: Callable[[Path], object], words: tuple[str, ...], place
     check(in_process(*words, variables={"XDG_RUNTIME_DIR": str(folder)}, limit_s=8.0))
 
 
-def _secret(use: str, text: str, place: Place) -> None:
-    folder = place.folder()
-    (folder / "robot").mkdir()
-    (folder / "secret.yaml").write_text(text)
-    manifest = folder / "robot" / "m.lifecycle.yaml"
-    manifest.write_text("manifest_version: 1\nsystem: robot\n" + use)
-    done = in_process("check", str(manifest))
-    check(done)
-    if "hunter" in done.out + done.err:
-        raise Unhandled(f"it quotes a file outside the folder: {done.err}")
-
-
 def attacks(rng: random.Random) -> list[Attack]:
     found = []
 
@@ -339,15 +326,6 @@ def attacks(rng: random.Random) -> list[Attack]:
     for name, run in RUNS.items():
         for words in (("status", "small"), ("down", "small"), ("pause", "small@7")):
             add(f"{name}: {words[0]}", _run_directory, run, words)
-    for index, use in enumerate(
-        (
-            "include: [{manifest: '../secret.yaml'}]\nnodes: {n: {run: {python: 'x:Y'}}}\n",
-            "nodes: {n: {run: {python: 'x:Y'}, interface: 'local://../secret.yaml'}}\n",
-            "nodes: {n: {run: {python: 'x:Y'}, parameter_files: ['../secret.yaml']}}\n",
-        )
-    ):
-        for text in (SHADOW, PARAMETERS, "a: [hunter2"):
-            add(f"secret {index} {text[:9]!r}", _secret, use, text)
     return found
 
 

@@ -29,7 +29,7 @@ from lifecycle.manifest.model import ModeParameter, Node, ParameterValue, RunKin
 from lifecycle.manifest.nodl import nearest_file
 from lifecycle.manifest.schema import did_you_mean
 from lifecycle.manifest.yaml.document import Document, Place, Value, error, note, warning
-from lifecycle.manifest.yaml.source import is_outside, read_document
+from lifecycle.manifest.yaml.source import read_document
 from lifecycle.manifest.yaml.yaml_parser import INT64_MAX, INT64_MIN, not_finite, quote
 
 _SCALARS = {bool: "bool", int: "int", float: "double", str: "string"}
@@ -505,7 +505,7 @@ def check_parameter_files(system: DeclaredSystem) -> Iterator[Diagnostic]:
     for path, file in files.items():
         for node in file.readers:
             if file.readable:
-                yield from _unmatched_node(path, file, node, system.manifest.path)
+                yield from _unmatched_node(path, file, node)
                 yield from _values(file, node)
         yield from _unmatched_sections(file, system)
         yield from _unknown_to_all(file)
@@ -530,17 +530,13 @@ def _read(path: str, file: _ParameterFile, node: Node, index: int) -> Iterator[D
     yield from found
 
 
-def _unmatched_node(
-    path: str, file: _ParameterFile, node: Node, manifest: str
-) -> Iterator[Diagnostic]:
+def _unmatched_node(path: str, file: _ParameterFile, node: Node) -> Iterator[Diagnostic]:
     name = full_name(node)
     if any(section.matches(name) for section in file.sections):
         return
     at = node.where(f"parameter_files.{node.parameter_files.index(path)}")
     patterns = [section.pattern for section in file.sections]
     listed = ", ".join(repr(each) for each in patterns) or "no node"
-    if is_outside(path, manifest, os.environ):
-        listed = "others" if patterns else "no node"
     message = f"cannot find node {name!r} in {file.shown!r}: it is for {listed}"
     hint = f"name the section {name}, or /** for every node"
     yield warning("check.parameter-file-unmatched", at, message, hint)

@@ -10,7 +10,7 @@ is one whole unquoted value.
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 
 from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError
@@ -44,7 +44,6 @@ class Substituted:
             read; they are reported in `diagnostics` and stay in `document` as written.
         left_out: nodes, includes and groups whose condition does not hold. Nodes are no longer in
             `document`; the others are, as written, so that those after them keep their numbers.
-        outside: (line, column) of values that hold text of files that is not to be quoted.
     """
 
     document: Document
@@ -52,7 +51,6 @@ class Substituted:
     diagnostics: tuple[Diagnostic, ...]
     broken: tuple[Place, ...]
     left_out: tuple[Place, ...] = ()
-    outside: frozenset[tuple[int, int]] = frozenset()
 
 
 def substitute(
@@ -61,7 +59,6 @@ def substitute(
     surroundings: Surroundings = NOWHERE,
     *,
     include: Cursor | None = None,
-    unquotable: Collection[str] = (),
 ) -> Substituted:
     """Resolve a document's arguments, then every substitution in its values.
 
@@ -71,10 +68,8 @@ def substitute(
         given: values by argument name, from the command line or from an including manifest.
         surroundings: what substitutions read from outside.
         include: the entry of the including manifest that gives the values.
-        unquotable: arguments whose given value is text that is not to be quoted.
     """
     work = _Substitution(document, surroundings, include)
-    work.unquotable = {*unquotable} & given.keys()
     work.resolve_arguments(given)
     return Substituted(
         document=dataclasses.replace(document, root=work.system(document.root)),
@@ -82,7 +77,6 @@ def substitute(
         diagnostics=tuple(work.found),
         broken=tuple(work.broken),
         left_out=tuple(work.left_out),
-        outside=frozenset(work.outside),
     )
 
 
@@ -96,9 +90,6 @@ class _Substitution:
         self.found: list[Diagnostic] = []
         self.broken: list[Place] = []
         self.left_out: list[Place] = []
-        self.outside: set[tuple[int, int]] = set()
-        self.unquotable: set[str] = set()  # arguments that hold text of files outside
-        self._reads_outside = False
         self._document = document
         self._surroundings = surroundings
         self._include = include
@@ -156,8 +147,6 @@ class _Substitution:
         if isinstance(default.data, (tuple, Mapping)) or default.data is None:
             return None
         resolved = self.value(default, (*place, "default"))
-        if (default.line, default.column) in self.outside:
-            self.unquotable.add(str(place[-1]))
         return None if (*place, "default") in self.broken else resolved.text
 
     def _check_choice(self, name: str, value: str, place: Place) -> None:
@@ -261,7 +250,7 @@ class _Substitution:
         return self._scalar(value, place)
 
     def _scalar(self, value: Value, place: Place) -> Value:
-        text, self._reads_outside = "", False
+        text = ""
         try:
             parts = parse_text(value.text)
             text = self._text(parts, place)
@@ -276,11 +265,8 @@ class _Substitution:
             if problem.message:
                 self._report("manifest.substitution", place, problem.message, problem.hint)
         except ValueError as problem:
-            shown = "this" if self._reads_outside else quote(text)
-            self._report("yaml.number", place, f"cannot use {shown}: {problem}")
+            self._report("yaml.number", place, f"cannot use {quote(text)}: {problem}")
         else:
-            if self._reads_outside:
-                self.outside.add((value.line, value.column))
             return dataclasses.replace(value, data=data, text=text)
         self.broken.append(place)
         return value
@@ -330,9 +316,7 @@ class _Substitution:
             raise LifecycleError(message, hint="put a word that has spaces in quotes")
         if each.kind == "find-pkg-share":
             return self._surroundings.package_share(words[0])
-        text, is_outside = self._surroundings.file(words[0])
-        self._reads_outside |= is_outside
-        return text
+        return self._surroundings.file(words[0])
 
     def _words_of(self, parts: Text, place: Place) -> list[str]:
         """Split text at its spaces; what a substitution in it becomes is never split."""
@@ -354,7 +338,6 @@ class _Substitution:
 
     def _argument(self, name: str, place: Place) -> str:
         if name in self.values:
-            self._reads_outside |= name in self.unquotable
             return self.values[name]
         if name not in self._declared:
             declared = ", ".join(self._declared)

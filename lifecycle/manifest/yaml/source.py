@@ -141,32 +141,6 @@ def note_file(path: Path, data: bytes) -> None:
         noted[os.path.abspath(path)] = data  # noqa: PTH100
 
 
-def is_outside(file: str, manifest: str, environment: Mapping[str, str]) -> bool:
-    """Whether a file is neither in the folder of a manifest nor of an installed package.
-
-    What such a file holds is not for the manifest's author: `include: /etc/shadow` must not
-    have root print it. Links are followed, so that none leads out of the folder.
-
-    Args:
-        file: any file.
-        manifest: the outermost manifest.
-        environment: for AMENT_PREFIX_PATH, which is the user's choice.
-    """
-    try:
-        folder = os.path.realpath(Path(manifest).parent)
-        if _is_below(os.path.realpath(file), folder):
-            return False
-    except (OSError, ValueError):  # a name that no file can have
-        return True
-    prefixes = [each for each in environment.get("AMENT_PREFIX_PATH", "").split(":") if each]
-    written = os.path.abspath(file)  # noqa: PTH100 - an installation made of links is one too
-    return not any(_is_below(written, os.path.abspath(each)) for each in prefixes)  # noqa: PTH100
-
-
-def _is_below(path: str, folder: str) -> bool:
-    return path.startswith(folder.rstrip("/") + "/")
-
-
 def _kernel_devices() -> set[int]:
     """Where every file claims to be a regular one; reading /proc/kmsg waits, and takes away."""
     found = set()

@@ -27,7 +27,7 @@ from lifecycle.errors import LifecycleError
 from lifecycle.manifest.diagnostics import ManifestError
 from lifecycle.manifest.installed_types import find_resource, list_resources, search_prefixes
 from lifecycle.manifest.schema import did_you_mean
-from lifecycle.manifest.yaml.source import MAX_BYTES, decode, is_outside, read_bytes
+from lifecycle.manifest.yaml.source import MAX_BYTES, decode, read_bytes
 from lifecycle.manifest.yaml.yaml_parser import quote
 
 MAX_DEPTH = 8
@@ -347,12 +347,10 @@ class Surroundings:
     Attributes:
         environment: variables, and AMENT_PREFIX_PATH with them.
         folder: what relative paths start from, where programs are started.
-        outermost: path of the manifest that includes all others.
     """
 
     environment: Mapping[str, str]
     folder: str
-    outermost: str
     programs: Programs
 
     def variable(self, name: str, default: Callable[[], str] | None) -> str:
@@ -390,8 +388,8 @@ class Surroundings:
         # PREFIX/share/ament_index/resource_index/packages/NAME
         return str(found.parents[3] / name)
 
-    def file(self, path: str) -> tuple[str, bool]:
-        """Return a file's text, without the last line break, and whether it is not to be quoted.
+    def file(self, path: str) -> str:
+        """Return a file's text, without the last line break.
 
         Raises:
             LifecycleError: there is none, it is too long, or it is no text.
@@ -406,13 +404,11 @@ class Surroundings:
                 reason = found.message.rpartition(": ")[2]
             elif (found.at.line, found.at.column) != (1, 1):
                 reason = f"line {found.at.line}: {reason}"
-            if is_outside(full, self.outermost, self.environment):
-                reason = "it is no text file that can be read"
             raise LifecycleError(f"cannot read {quote(path, limit=200)}: {reason}") from problem
-        return _without_last_break(text), is_outside(full, self.outermost, self.environment)
+        return _without_last_break(text)
 
 
-NOWHERE = Surroundings(environment={}, folder=os.curdir, outermost="", programs=Programs({}))
+NOWHERE = Surroundings(environment={}, folder=os.curdir, programs=Programs({}))
 """For documents that are not of a file."""
 
 
