@@ -1,10 +1,10 @@
 """Load a manifest file: parse, substitute, validate, build, join includes, check. The entry point.
 
-Owns: `load`: the run of source → arguments → schema → build for a manifest and everything it
-includes, then of the checks, with every finding gathered on the way; what one document declares,
-before it is joined with others by `include`. A part with an error is left out, and the rest is
-checked in the same run. It is imported when `load` is asked for: a process that hosts a node needs
-a manifest's types, but never YAML nor JSON Schema, and those are half of what it would import.
+Owns: `load`: the run of source → arguments and schema → build for a manifest and everything it
+includes, then of the checks; what one document declares, before it is joined with others by
+`include`. A phase that finds errors reports all that it finds and is the last one. It is imported
+when `load` is asked for: a process that hosts a node needs a manifest's types, but never YAML nor
+JSON Schema, and those are half of what it would import.
 Touches the file system; needs no ROS.
 """
 
@@ -12,8 +12,7 @@ from __future__ import annotations
 
 import ipaddress
 import os
-import re
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 
@@ -28,8 +27,7 @@ from lifecycle.manifest.building import (
     quantities,
     section_positions,
 )
-from lifecycle.manifest.checks import check, check_sound
-from lifecycle.manifest.checks.system import SEPARABLE, Partial
+from lifecycle.manifest.checks import check
 from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position, Severity
 from lifecycle.manifest.model import (
     Link,
@@ -39,10 +37,10 @@ from lifecycle.manifest.model import (
     Node,
     Policy,
 )
-from lifecycle.manifest.schema import MANIFEST, nearest, read_schema, validate
+from lifecycle.manifest.schema import validate
 from lifecycle.manifest.shared import Shared, settle
 from lifecycle.manifest.yaml import include
-from lifecycle.manifest.yaml.arguments import CONDITIONS, Substituted, substitute
+from lifecycle.manifest.yaml.arguments import Substituted, substitute
 from lifecycle.manifest.yaml.document import Cursor, Document, Place, Value, error, note
 from lifecycle.manifest.yaml.source import note_file, read_document
 from lifecycle.manifest.yaml.substitutions import Programs, Surroundings, folder_of
@@ -124,20 +122,18 @@ def build_manifest(
     arguments: tuple[tuple[str, str], ...],
     base: Path,
     environment: Mapping[str, str],
-    unsound: Collection[Place],
     found: Findings,
     machine: str = THIS_HOST,
 ) -> Manifest:
     """Build what one document declares, its includes not yet joined.
 
     Args:
-        root: a document that fits the schema, or what is left of it without the parts that do not.
+        root: a document that fits the schema.
         path: as the user wrote it.
         arguments: resolved values by name.
         base: folder that its relative paths start from.
         environment: for AMENT_PREFIX_PATH, where interfaces by reference are searched.
-        unsound: links to leave out, which keep their place in the list.
-        found: findings are appended here; with an error among them, what is wrong is left out.
+        found: findings are appended here.
         machine: of nodes that name none.
     """
     nodes = tuple(
@@ -157,7 +153,7 @@ def build_manifest(
         on_violation=build_on_violation(root),
         modes=build_modes(root, found),
         nodes=nodes,
-        links=tuple(_link(each) for each in root.items("links") if each.place not in unsound),
+        links=tuple(_link(each) for each in root.items("links")),
         positions=section_positions(root),
     )
 
@@ -252,7 +248,7 @@ def load(
     def every() -> tuple[Diagnostic, ...]:
         return _sorted(found, loading.files)
 
-    if manifest is None:
+    if manifest is None or _has_errors(found):
         raise ManifestError(every())
     manifest = settle(_without_left_out(manifest), found)
     if not manifest.nodes and manifest.left_out:
@@ -266,12 +262,9 @@ def load(
                 "lifecycle check --arguments lists what they follow",
             )
         )
-    if wrong := [each for each in found if each.severity is Severity.ERROR]:
-        part = partial(manifest, wrong, lost=loading.lost, machines=loading.machines)
-        found += check_sound(part, environment=variables)
-        raise ManifestError(every())
-    found += check(manifest, environment=variables)
-    if any(each.severity is Severity.ERROR for each in found):
+    if not _has_errors(found):
+        found += check(manifest, environment=variables)
+    if _has_errors(found):
         raise ManifestError(every())
     warnings = every()
     unproven = tuple(each for each in warnings if each.is_unproven)
@@ -349,125 +342,6 @@ def _without_left_out(manifest: Manifest) -> Manifest:
     return dataclasses.replace(manifest, nodes=nodes, links=links, modes=modes)
 
 
-_SEGMENTS = re.compile(r"[^.\[]+")
-"""Finds `nodes`, `camera`, `interface` in `nodes.camera.interface[0]`."""
-
-
-def sound(document: Document, unsound: Sequence[Place]) -> Document:
-    """Return a document without the parts, nodes, machines and sections that hold unsound values.
-
-    Links stay in their list, so that the others keep their numbers; see `links`.
-    """
-    broken = links(unsound)
-    cut = {_cut(place) for place in unsound if place and place[:2] not in broken}
-    return dataclasses.replace(document, root=_without(document.root, cut))
-
-
-def links(unsound: Iterable[Place]) -> frozenset[Place]:
-    """Return the places of the links that hold unsound values."""
-    return frozenset(place[:2] for place in unsound if place[:1] == ("links",) and len(place) > 1)
-
-
-def lost(document: Document, rest: Document) -> frozenset[str] | None:
-    """Return the keys of nodes that are left out of `rest`; None if they are not known."""
-    every, kept = entries(document, "nodes"), entries(rest, "nodes")
-    if every is None or kept is None:
-        return every
-    return every - kept
-
-
-def entries(document: Document, section: str) -> frozenset[str] | None:
-    """Return the keys in a section, none where it is missing; None if it is no mapping."""
-    value = document.find((section,))
-    if value is None:
-        return frozenset()
-    return frozenset(value.data) if isinstance(value.data, Mapping) else None
-
-
-def partial(
-    manifest: Manifest,
-    wrong: Iterable[Diagnostic],
-    *,
-    lost: frozenset[str] | None,
-    machines: frozenset[str] | None,
-) -> Partial:
-    """Return what is left of a manifest without the nodes whose name or endpoints are not sound.
-
-    Args:
-        manifest: what could be built.
-        wrong: every error so far.
-        lost: keys of nodes that could not be built; None if there may be any.
-        machines: names of all that are declared; None if not all are known.
-    """
-    flaws: dict[tuple[str, str], set[str]] = {}
-    sections: set[str] = set()
-    for each in wrong:
-        section, *inside = _inside_groups(each.at.path)[:3] or [""]
-        if section == "nodes" and inside:
-            flaws.setdefault((each.at.file, inside[0]), set()).add(_part(inside[1:]))
-        else:
-            sections.add(section)
-    flawed = {node.key: frozenset(flaws.get(_place(node), ())) for node in manifest.nodes}
-    nodes = tuple(each for each in manifest.nodes if "" not in flawed[each.key])
-    if lost is not None:
-        lost |= {each.key for each in manifest.nodes} - {each.key for each in nodes}
-    if machines is not None:
-        machines |= {each.name for each in manifest.machines}
-    return Partial(
-        manifest=dataclasses.replace(manifest, nodes=nodes),
-        flawed=flawed,
-        sections=frozenset(sections),
-        lost=lost,
-        machines=machines,
-    )
-
-
-def _place(node: Node) -> tuple[str, str]:
-    """The file and the key by which findings name a node; an include may have given it a prefix."""
-    return node.at.file, _inside_groups(node.at.path)[1]
-
-
-def _inside_groups(path: str) -> list[str]:
-    """Return the steps of a place, those to the group that it is in left out."""
-    steps = _SEGMENTS.findall(path)
-    while steps[:1] == ["groups"] and len(steps) > 2:
-        steps = steps[2:]
-    return steps
-
-
-def _part(inside: Iterable[str | int]) -> str:
-    """Return the separable part of a node that a place in it belongs to; empty for the whole node.
-
-    A key that is none is the one that it was most probably meant to be.
-    """
-    key = str(next(iter(inside), ""))
-    keys = read_schema(MANIFEST)["$defs"]["node"]["properties"]
-    meant = key if key in keys else nearest(key, keys)
-    return meant if meant in SEPARABLE else ""
-
-
-def _cut(place: Place) -> Place:
-    """Return the place of what is left out with an unsound value."""
-    if place[0] == "nodes" and len(place) > 1:
-        part = _part(place[2:])
-        return (*place[:2], part) if part else place[:2]
-    return place[: 2 if place[0] == "machines" else 1]
-
-
-def _without(value: Value, cut: Iterable[Place]) -> Value:
-    if not isinstance(value.data, Mapping):
-        return value
-    below: dict[str | int, list[Place]] = {}
-    for first, *rest in cut:
-        below.setdefault(first, []).append(tuple(rest))
-    kept = {
-        key: _without(each, below.get(key, ()))
-        for key, each in value.data.items()
-        if () not in below.get(key, ())
-    }
-    return dataclasses.replace(value, data=kept)
-
-
 SUFFIX = ".lifecycle.yaml"
 """What a manifest's name ends in; plain `.yaml` belongs to ROS launch files."""
 
@@ -478,24 +352,16 @@ class _Reading:
 
     Attributes:
         chain: the manifests that include it, and itself.
-        unsound: places of what is wrong.
         left_out: places that conditions leave out.
     """
 
     origin: include.Origin
     chain: tuple[include.Origin, ...]
-    unsound: tuple[Place, ...]
     left_out: tuple[Place, ...]
 
     def leaves_out(self, each: Cursor) -> bool:
         """Whether an entry of `include` or `groups` is left out."""
         return (*each.document.place, *each.place) in self.left_out
-
-    def is_unsound(self, each: Cursor, keys: Collection[str]) -> bool:
-        """Whether an entry cannot be used; where there are `keys`, because of them alone."""
-        place = (*each.document.place, *each.place)
-        inside = [found[len(place) :] for found in self.unsound if found[: len(place)] == place]
-        return any(not keys or not found or found[0] in keys for found in inside)
 
 
 NOTHING = Shared(machine=THIS_HOST)
@@ -507,15 +373,11 @@ class _Loading:
     Attributes:
         found: errors and warnings so far.
         files: as they were read.
-        machines: names of all that are declared; None if not all are known.
-        lost: keys of nodes that are declared and could not be built; None if there may be any.
     """
 
     def __init__(self, environment: Mapping[str, str]) -> None:
         self.found: list[Diagnostic] = []
         self.files: list[str] = []
-        self.machines: frozenset[str] | None = frozenset()
-        self.lost: frozenset[str] | None = frozenset()
         self._environment = environment
         self._programs = Programs(environment)
         self._documents = 0
@@ -528,7 +390,6 @@ class _Loading:
         chain: tuple[include.Origin, ...],
         *,
         entry: Cursor | None = None,
-        prefix: str = "",
         shared: Shared = NOTHING,
     ) -> Manifest | None:
         """Read one manifest and what it includes.
@@ -538,21 +399,19 @@ class _Loading:
             given: argument values.
             chain: the manifests that include it, outermost first.
             entry: the include that names it.
-            prefix: what all its includes put before its keys.
             shared: what the including manifests and groups share.
 
         Returns:
-            What is declared, as far as it is sound; None if the file cannot be read at all.
+            What is declared; None if the file cannot be read or does not fit the schema.
         """
-        flaws: list[Diagnostic] = []
         self.files.append(origin.shown)
         try:
-            document = read_document(origin.path, shown=origin.shown, found=flaws)
+            document = read_document(origin.path, shown=origin.shown)
         except ManifestError as problem:
             self.found += problem.diagnostics
             return None
-        self.found += flaws
         self._check_suffix(document)
+        before = len(self.found)
         substituted = self._substituted(document, origin, given, entry)
         document = substituted.document
         emptied = [
@@ -561,31 +420,26 @@ class _Loading:
             if (around := document.find(place[:-1])) is not None and not around.data
         ]
         ignore = [*substituted.broken, *substituted.left_out, *emptied]
-        violations = validate(document, ignore=ignore)
-        self.found += [each for _, each in violations]
-        unsound = [*substituted.broken, *(place for place, _ in violations)]
-        root = Cursor.root(sound(document, unsound))
+        self.found += [each for _, each in validate(document, ignore=ignore)]
+        if _has_errors(self.found[before:]):
+            return None
+        root = Cursor.root(document)
         manifest = build_manifest(
             root,
             path=origin.shown,
             arguments=substituted.arguments,
             base=origin.path.parent,
             environment=self._environment,
-            unsound=links(unsound),
             found=self.found,
             machine=shared.machine,
         )
-        self.machines = _union(self.machines, entries(document, "machines"))
         self._check_outermost(root, manifest)
         reading = _Reading(
             origin=origin,
             chain=(*chain, origin),
-            unsound=tuple(unsound),
             left_out=substituted.left_out,
         )
-        return self._contents(
-            reading, root, manifest, document=document, prefix=prefix, shared=shared
-        )
+        return self._contents(reading, root, manifest, shared=shared)
 
     def _substituted(
         self,
@@ -611,48 +465,37 @@ class _Loading:
         root: Cursor,
         manifest: Manifest,
         *,
-        document: Document,
-        prefix: str,
         shared: Shared,
     ) -> Manifest:
         """Give the nodes of a document or group what they share, and add groups and includes."""
         shared = shared.inner(root, self.found)
-        self.lost = _union(self.lost, lost(document, root.document), prefix)
         manifest = dataclasses.replace(
             manifest,
             nodes=tuple(shared.given_to(node) for node in manifest.nodes),
             left_out=tuple(
                 str(place[-1])
                 for place in reading.left_out
-                if place[:-1] == (*document.place, "nodes")
+                if place[:-1] == (*root.document.place, "nodes")
             ),
         )
-        for each in Cursor.root(document).items("include") if _is_list(document, "include") else ():
+        for each in root.items("include"):
             if reading.leaves_out(each):
                 key = each.text("prefix")
                 here = (f"{key}/",) if key and "$(" not in key else ()
                 manifest = dataclasses.replace(manifest, left_out=(*manifest.left_out, *here))
-            elif reading.is_unsound(each, ()):
-                self._unread()
             else:
-                manifest = self._include(manifest, each, reading.chain, prefix, shared)
-        for each in Cursor.root(document).items("groups") if _is_list(document, "groups") else ():
+                manifest = self._include(manifest, each, reading.chain, shared)
+        for each in root.items("groups"):
             if reading.leaves_out(each):
                 keys = tuple(_keys_of(each.value))
                 manifest = dataclasses.replace(manifest, left_out=(*manifest.left_out, *keys))
-            elif reading.is_unsound(each, ("namespace", "prefix", "machine", *CONDITIONS)):
-                self._unread()
             else:
-                manifest = self._group(reading, manifest, each, prefix, shared)
+                manifest = self._group(reading, manifest, each, shared)
         return manifest
 
-    def _group(
-        self, reading: _Reading, outer: Manifest, entry: Cursor, prefix: str, shared: Shared
-    ) -> Manifest:
+    def _group(self, reading: _Reading, outer: Manifest, entry: Cursor, shared: Shared) -> Manifest:
         place = (*entry.document.place, *entry.place)
-        document = Document(file=entry.document.file, root=entry.value, place=place)
-        unsound = [each[len(place) :] for each in reading.unsound if each[: len(place)] == place]
-        root = Cursor.root(sound(document, unsound))
+        root = Cursor.root(Document(file=entry.document.file, root=entry.value, place=place))
         nodes = tuple(
             build_node(
                 key,
@@ -672,8 +515,6 @@ class _Loading:
             reading,
             root,
             inner,
-            document=document,
-            prefix=include.join_key(prefix, own),
             shared=shared,
         )
         inner = include.move(inner, prefix=own, namespace=root.text("namespace"))
@@ -684,19 +525,16 @@ class _Loading:
         outer: Manifest,
         entry: Cursor,
         chain: tuple[include.Origin, ...],
-        prefix: str,
         shared: Shared,
     ) -> Manifest:
         origin = include.locate(entry, chain, self.found)
         if origin is None:
-            self._unread()
             return outer
         self._documents += 1
         if self._documents > include.MAX_DOCUMENTS:
             if self._documents == include.MAX_DOCUMENTS + 1:
                 message = f"cannot include more than {include.MAX_DOCUMENTS} manifests"
                 self.found.append(error("manifest.include", entry.at, message))
-            self._unread()
             return outer
         given = {name: each.value.text for name, each in entry.entries("arguments")}
         own = entry.text("prefix")
@@ -705,18 +543,12 @@ class _Loading:
             given,
             chain,
             entry=entry,
-            prefix=include.join_key(prefix, own),
             shared=shared,
         )
         if inner is None:
-            self._unread()
             return outer
         inner = include.move(inner, prefix=own, namespace=entry.text("namespace"))
         return include.join(outer, inner, entry.at, self.found)
-
-    def _unread(self) -> None:
-        """Note that a manifest is missing which may declare whatever is looked for."""
-        self.machines = self.lost = None
 
     def _check_suffix(self, document: Document) -> None:
         if not document.file.endswith(SUFFIX):
@@ -741,15 +573,6 @@ class _Loading:
                 message = f"cannot use the {key} of an included manifest; the including one's holds"
                 at = root.document.key_at((key,))
                 self.found.append(note("manifest.include-ignored", at, message))
-
-
-def _union(
-    known: frozenset[str] | None, keys: frozenset[str] | None, prefix: str = ""
-) -> frozenset[str] | None:
-    """Add keys, under a prefix, to those that are known; None if either are not all known."""
-    if known is None or keys is None:
-        return None
-    return known | {include.join_key(prefix, key) for key in keys}
 
 
 def _misspelt(document: Document, place: Place) -> list[Diagnostic]:
@@ -777,28 +600,14 @@ def _keys_of(group: Value) -> Iterator[str]:
             yield from _keys_of(each)
 
 
-def _is_list(document: Document, key: str) -> bool:
-    section = document.find((key,))
-    return section is not None and isinstance(section.data, tuple)
-
-
-def _mark(each: Diagnostic) -> tuple[str, int, int]:
-    return each.at.file, each.at.line, each.at.column
-
-
 def _sorted(found: Sequence[Diagnostic], read: Iterable[str]) -> tuple[Diagnostic, ...]:
-    """Return findings without repetitions, by file in the order of reading, then by position.
-
-    Of a value that is refused as YAML nothing else is reported: `.nan` is no number, that is all.
-    """
-    refused = {_mark(each) for each in found if each.rule.startswith("yaml.")}
-    unique = [
-        each
-        for each in dict.fromkeys(found)
-        # A finding about a whole document has the position of its first key.
-        if each.rule.startswith("yaml.") or not each.at.path or _mark(each) not in refused
-    ]
+    """Return findings without repetitions, by file in the order of reading, then by position."""
+    unique = list(dict.fromkeys(found))
     files = list(dict.fromkeys([*read, *(each.at.file for each in unique)]))
     return tuple(
         sorted(unique, key=lambda each: (files.index(each.at.file), each.at.line, each.at.column))
     )
+
+
+def _has_errors(found: Iterable[Diagnostic]) -> bool:
+    return any(each.severity is Severity.ERROR for each in found)

@@ -1,9 +1,8 @@
-"""Static checks of a whole manifest: the registry of `check.*` rules and which of them can run.
+"""Static checks of a whole manifest: the registry of `check.*` rules.
 
 Owns: `CHECKS`, the one registry. Each check is a generator of diagnostics with rule ids `check.*`
-and declares what it needs: in a manifest that already has errors, a check runs on the nodes that
-are sound for it, if mending those errors cannot remove its findings. Needs no ROS: types are read
-from the ament index.
+and reads a manifest that was read and built without an error. Needs no ROS: types are read from
+the ament index.
 """
 
 from __future__ import annotations
@@ -46,14 +45,14 @@ from lifecycle.manifest.checks.parameters import (
     check_parameter_files,
     check_parameters,
 )
-from lifecycle.manifest.checks.system import DeclaredSystem, Partial
+from lifecycle.manifest.checks.system import DeclaredSystem
 from lifecycle.manifest.checks.transport import check_discovery, check_middleware, check_transport
 from lifecycle.manifest.diagnostics import Diagnostic
 from lifecycle.manifest.flows import FlowNeeds
 from lifecycle.manifest.installed_types import search_prefixes
 from lifecycle.manifest.model import Manifest
 
-__all__ = ["CHECKS", "Check", "Scope", "check", "check_sound"]
+__all__ = ["CHECKS", "Scope", "check"]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -61,13 +60,11 @@ class Scope:
     """What a check may read.
 
     Attributes:
-        system: the manifest, or the part of it that is sound for the check.
-        machines: names of all machines that are declared.
+        system: the manifest, with the names of its endpoints resolved.
         environment: of the process that will run the system.
     """
 
     system: DeclaredSystem
-    machines: tuple[str, ...]
     environment: Mapping[str, str]
 
     @functools.cached_property
@@ -81,103 +78,35 @@ class Scope:
         return FlowNeeds(self.system.manifest, self.prefixes)
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Check:
-    """One check, and what must be sound so that its findings hold.
-
-    Attributes:
-        run: yields what it finds.
-        parts: keys of a node without which the node is left out (see `SEPARABLE`).
-        sections: sections of the document that must be sound.
-        machines: the names of all declared machines must be known.
-        whole: it holds only of a manifest in which nothing is wrong.
-        whole_rules: these of its rules do: what they are about may be among what is left out.
-    """
-
-    run: Callable[[Scope], Iterator[Diagnostic]]
-    parts: tuple[str, ...] = ()
-    sections: frozenset[str] = frozenset()
-    machines: bool = False
-    whole: bool = False
-    whole_rules: frozenset[str] = frozenset()
-
-    def holds_of(self, part: Partial) -> bool:
-        """Whether what it needs of a document is sound in this part of it."""
-        known = part.machines is not None or not self.machines
-        return not self.whole and known and part.sound(*self.sections)
-
-
-_REACH = frozenset({"discovery", "machines", "data_layer"})
-_FLOWS = frozenset({"network", "links", "machines"})
-_WIRED = ("connections", "flows", "run")
-
-CHECKS = (
-    Check(run=lambda scope: check_names(scope.system)),
-    Check(run=lambda scope: check_remaps(scope.system)),
-    Check(run=lambda scope: check_types(scope.system, scope.prefixes)),
-    Check(run=lambda scope: check_qos(scope.system)),
-    Check(run=lambda scope: check_counterparts(scope.system), whole=True),
-    Check(run=lambda scope: check_order(scope.system), parts=("after",)),
-    Check(run=lambda scope: check_parameters(scope.system), parts=("run",)),
-    Check(
-        run=lambda scope: check_parameter_files(scope.system),
-        parts=("parameters", "parameter_files", "run"),
-        whole_rules=frozenset({"check.parameter-file-unmatched"}),
-    ),
-    Check(run=lambda scope: check_machines(scope.system, scope.machines), machines=True),
-    Check(run=lambda scope: check_processes(scope.system), parts=("run",)),
-    Check(run=lambda scope: check_programs(scope.system), parts=("run",)),
-    Check(run=lambda scope: check_supervision(scope.system), parts=("run",)),
-    Check(run=lambda scope: check_health(scope.system)),
-    Check(
-        run=lambda scope: check_on_violation(scope.system),
-        parts=("run",),
-        sections=frozenset({"modes"}),
-    ),
-    Check(run=lambda scope: check_modes(scope.system), parts=("run", "after")),
-    Check(
-        run=lambda scope: check_mode_parameters(scope.system),
-        parts=("run", "interface", "parameters", "parameter_files"),
-    ),
-    Check(
-        run=lambda scope: check_ports(scope.system, scope.needs, scope.environment),
-        whole=True,
-    ),
-    Check(
-        run=lambda scope: check_discovery(scope.system, scope.environment),
-        parts=("run",),
-        sections=_REACH,
-    ),
-    Check(run=lambda scope: check_mapped_endpoints(scope.system)),
-    Check(
-        run=lambda scope: check_connections(scope.system, scope.needs),
-        parts=_WIRED,
-        sections=_REACH | _FLOWS,
-    ),
-    Check(
-        run=lambda scope: check_urls(scope.system),
-        parts=("connections",),
-        sections=_REACH,
-        whole_rules=frozenset({"check.connection-peer"}),
-    ),
-    Check(run=lambda scope: check_flow_endpoints(scope.system)),
-    Check(run=lambda scope: check_flows(scope.system, scope.needs), parts=_WIRED, sections=_FLOWS),
-    Check(
-        run=lambda scope: check_transport(scope.system, scope.needs, scope.environment),
-        whole=True,
-    ),
-    Check(run=lambda scope: check_identifiers(scope.system, scope.needs), whole=True),
-    Check(
-        run=lambda scope: check_middleware(scope.system, scope.needs, scope.environment),
-        parts=_WIRED,
-        sections=_FLOWS,
-    ),
-    Check(run=lambda scope: check_links(scope.system)),
-    Check(
-        run=lambda scope: check_link_uniqueness(scope.system, scope.needs),
-        parts=("flows",),
-        sections=frozenset({"network"}),
-    ),
+CHECKS: tuple[Callable[[Scope], Iterator[Diagnostic]], ...] = (
+    lambda scope: check_names(scope.system),
+    lambda scope: check_remaps(scope.system),
+    lambda scope: check_types(scope.system, scope.prefixes),
+    lambda scope: check_qos(scope.system),
+    lambda scope: check_counterparts(scope.system),
+    lambda scope: check_order(scope.system),
+    lambda scope: check_parameters(scope.system),
+    lambda scope: check_parameter_files(scope.system),
+    lambda scope: check_machines(scope.system),
+    lambda scope: check_processes(scope.system),
+    lambda scope: check_programs(scope.system),
+    lambda scope: check_supervision(scope.system),
+    lambda scope: check_health(scope.system),
+    lambda scope: check_on_violation(scope.system),
+    lambda scope: check_modes(scope.system),
+    lambda scope: check_mode_parameters(scope.system),
+    lambda scope: check_ports(scope.system, scope.needs, scope.environment),
+    lambda scope: check_discovery(scope.system, scope.environment),
+    lambda scope: check_mapped_endpoints(scope.system),
+    lambda scope: check_connections(scope.system, scope.needs),
+    lambda scope: check_urls(scope.system),
+    lambda scope: check_flow_endpoints(scope.system),
+    lambda scope: check_flows(scope.system, scope.needs),
+    lambda scope: check_transport(scope.system, scope.needs, scope.environment),
+    lambda scope: check_identifiers(scope.system, scope.needs),
+    lambda scope: check_middleware(scope.system, scope.needs, scope.environment),
+    lambda scope: check_links(scope.system),
+    lambda scope: check_link_uniqueness(scope.system, scope.needs),
 )
 
 
@@ -196,41 +125,10 @@ def check(
     """
     scope = Scope(
         system=DeclaredSystem.of(manifest),
-        machines=tuple(each.name for each in manifest.machines),
         environment=os.environ if environment is None else environment,
     )
-    found = [finding for each in CHECKS for finding in each.run(scope)]
+    found = [finding for each in CHECKS for finding in each(scope)]
     files = {each.at.file: None for each in found}
     rank = {file: index for index, file in enumerate((manifest.path, *files))}
     found.sort(key=lambda each: (rank[each.at.file], each.at.line, each.at.column))
     return tuple(dict.fromkeys(found))
-
-
-def check_sound(
-    part: Partial, *, environment: Mapping[str, str] | None = None
-) -> tuple[Diagnostic, ...]:
-    """Check what is left of a manifest without what is wrong already.
-
-    Args:
-        part: as `load` has built it.
-        environment: as for `check`.
-    """
-    variables = os.environ if environment is None else environment
-    scopes: dict[tuple[str, ...], Scope] = {}
-
-    def scope(parts: tuple[str, ...]) -> Scope:
-        if parts not in scopes:
-            scopes[parts] = Scope(
-                system=part.system(*parts),
-                machines=tuple(sorted(part.machines or ())),
-                environment=variables,
-            )
-        return scopes[parts]
-
-    return tuple(
-        finding
-        for each in CHECKS
-        if each.holds_of(part)
-        for finding in each.run(scope(each.parts))
-        if finding.rule not in each.whole_rules
-    )

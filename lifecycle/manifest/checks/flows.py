@@ -330,13 +330,11 @@ def _end(
     system: DeclaredSystem, link: Link, key: str, kind: EndpointKind
 ) -> Iterator[Resolved | Diagnostic]:
     """Yield the endpoints at one end of a link, or why there are none."""
-    if not system.may_exist(key):
+    if key not in system.nodes:
         message = f"cannot link node {key!r}: there is no such node"
-        hint = did_you_mean(key, system.known)
+        hint = did_you_mean(key, system.nodes)
         yield error("check.link-unknown-node", link.at, message, hint)
         return
-    if key not in system.nodes:
-        return  # its own errors are reported first
     found = [each for each in system.named(kind, link.topic) if each.node.key == key]
     if found:
         yield from found

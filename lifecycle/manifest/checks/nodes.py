@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import functools
 import shlex
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 
 from lifecycle.manifest.checks.system import DeclaredSystem, rmw_of, spell
 from lifecycle.manifest.diagnostics import Diagnostic, Position
@@ -58,8 +58,9 @@ _SUPERVISOR = 1
 """The observer of the supervisor that each host has."""
 
 
-def check_machines(system: DeclaredSystem, declared: Collection[str]) -> Iterator[Diagnostic]:
-    """Yield findings about nodes on machines that are not `declared`."""
+def check_machines(system: DeclaredSystem) -> Iterator[Diagnostic]:
+    """Yield findings about nodes on machines that are not declared."""
+    declared = [each.name for each in system.manifest.machines]
     for node in system.manifest.nodes:
         if node.machine not in declared:
             message = (
@@ -228,10 +229,10 @@ def check_modes(system: DeclaredSystem) -> Iterator[Diagnostic]:
     for mode in system.manifest.modes:
         for key in mode.inactive:
             node = system.nodes.get(key)
-            if not system.may_exist(key):
+            if node is None:
                 message = f"cannot keep {key!r} inactive in mode {mode.name!r}: no such node"
-                yield error("check.mode", mode.at, message, did_you_mean(key, system.known))
-            elif node is not None and (why := _never_deactivated(node)):
+                yield error("check.mode", mode.at, message, did_you_mean(key, system.nodes))
+            elif why := _never_deactivated(node):
                 message = f"cannot keep {key!r} inactive in mode {mode.name!r}: {why}"
                 yield error("check.mode", mode.at, message, "remove it from the mode")
         for node in system.manifest.nodes:
@@ -345,11 +346,11 @@ def _container(node: Node, system: DeclaredSystem) -> Iterator[Diagnostic]:
     if name.startswith("/"):
         if problem := full_name_problem(name):
             yield error("check.container", at, f"cannot load {node.key!r} into {name!r}: {problem}")
-    elif not system.may_exist(name):
+    elif name not in system.nodes:
         message = f"cannot load {node.key!r} into {name!r}: there is no such node"
-        hint = did_you_mean(name, system.known) or "others' containers have a full name, '/NAME'"
+        hint = did_you_mean(name, system.nodes) or "others' containers have a full name, '/NAME'"
         yield error("check.container", at, message, hint)
-    elif name in system.nodes and system.nodes[name].machine != node.machine:
+    elif system.nodes[name].machine != node.machine:
         other = system.nodes[name]
         message = (
             f"cannot load {node.key!r} into {name!r}: it is for machine {node.machine!r}, "
@@ -507,12 +508,10 @@ def check_order(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about the start order of nodes."""
     for node in system.manifest.nodes:
         for after in node.after:
-            if not system.may_exist(after.node):
+            if after.node not in system.nodes:
                 message = f"cannot wait for node {after.node!r}: there is no such node"
-                hint = did_you_mean(after.node, system.known)
+                hint = did_you_mean(after.node, system.nodes)
                 yield error("check.after-unknown", after.at, message, hint)
-            elif after.node not in system.nodes:
-                continue  # its own errors are reported first
             elif after.node == node.key:
                 message = f"cannot make {node.key!r} wait for itself"
                 yield error("check.after-self", after.at, message, "remove it")

@@ -218,12 +218,12 @@ def check_mode_parameters(system: DeclaredSystem) -> Iterator[Diagnostic]:
         for each in mode.parameters:
             what = f"cannot set parameter {each.name!r} of {each.node!r} in mode {mode.name!r}"
             node = system.nodes.get(each.node)
-            if not system.may_exist(each.node):
-                hint = did_you_mean(each.node, system.known)
+            if node is None:
+                hint = did_you_mean(each.node, system.nodes)
                 yield error("check.mode", each.at, f"{what}: no such node", hint)
-            elif node is not None and (why := _never_set(node, each)):
+            elif why := _never_set(node, each):
                 yield error("check.mode", each.at, f"{what}{why[0]}", why[1])
-            elif node is not None and not _is_given(node, each.name):
+            elif not _is_given(node, each.name):
                 others = [
                     other.name
                     for other in modes
@@ -544,11 +544,14 @@ def _unmatched_node(path: str, file: _ParameterFile, node: Node) -> Iterator[Dia
 
 def _unmatched_file_of_command(node: Node, system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Warn of sections of a command's `--params-file` that are for no node, or not for its own."""
+    files = [each.file for each in command_line_parameters(node) if each.file]
+    if not files:
+        return
     process = node.process or node.key
     every = [full_name(each) for each in system.manifest.nodes]
     names = [full_name(e) for e in system.manifest.nodes if process == (e.process or e.key)]
-    for path in (each.file for each in command_line_parameters(node)):
-        if not path or not os.path.lexists(path):
+    for path in files:
+        if not os.path.lexists(path):
             continue
         shown = shown_path(path, system.manifest.path)
         at = node.where("run.command")

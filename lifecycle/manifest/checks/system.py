@@ -77,17 +77,14 @@ class DeclaredSystem:
     Attributes:
         endpoints: in the order of the manifest.
         unresolved: the endpoints that are missing from `endpoints`.
-        lost: keys of nodes that are declared, but left out because something is wrong in them; None
-            if there may be any, because a file or section that may declare them is unreadable.
     """
 
     manifest: Manifest
     endpoints: tuple[Resolved, ...]
     unresolved: tuple[UnresolvedEndpoint, ...]
-    lost: frozenset[str] | None = frozenset()
 
     @classmethod
-    def of(cls, manifest: Manifest, *, lost: frozenset[str] | None = frozenset()) -> DeclaredSystem:
+    def of(cls, manifest: Manifest) -> DeclaredSystem:
         """Resolve every endpoint of a manifest; rules that rcl refuses are left out."""
         resolved: list[Resolved] = []
         unresolved: list[UnresolvedEndpoint] = []
@@ -103,17 +100,7 @@ class DeclaredSystem:
             manifest=manifest,
             endpoints=tuple(resolved),
             unresolved=tuple(unresolved),
-            lost=lost,
         )
-
-    def may_exist(self, key: str) -> bool:
-        """Whether there is a node of this key, or may be once what is wrong has been put right."""
-        return key in self.nodes or self.lost is None or key in self.lost
-
-    @property
-    def known(self) -> list[str]:
-        """Keys of nodes that are declared, to suggest one of them."""
-        return [*self.nodes, *sorted(self.lost or ())]
 
     @functools.cached_property
     def nodes(self) -> dict[str, Node]:
@@ -242,53 +229,6 @@ def _of_supervisors(manifest: Manifest) -> Iterator[tuple[EndpointKind, str]]:
         yield EndpointKind.PUBLISHER, supervisor_status_topic(prefix)
         for name in supervisor_services(access, (each.name for each in manifest.modes)):
             yield EndpointKind.SERVICE_SERVER, f"{prefix}/{name}"
-
-
-SEPARABLE = frozenset(
-    {
-        "after",
-        "connections",
-        "flows",
-        "log_level",
-        "parameter_files",
-        "parameters",
-        "run",
-        "timeouts",
-    }
-)
-"""Keys of a node that can be wrong while its name and its endpoints are what they are."""
-
-
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Partial:
-    """What is left of a manifest.
-
-    Attributes:
-        manifest: with the nodes whose name and endpoints are sound, and the links that are.
-        flawed: by node key, which of its SEPARABLE parts are not sound; those may be left out.
-        sections: sections of the document that are not sound as a whole.
-        lost: as `System.lost`.
-        machines: names of all that are declared; None if not all are known.
-    """
-
-    manifest: Manifest
-    flawed: Mapping[str, frozenset[str]]
-    sections: frozenset[str]
-    lost: frozenset[str] | None
-    machines: frozenset[str] | None
-
-    def system(self, *needed: str) -> DeclaredSystem:
-        """Return the nodes of which the `needed` parts are sound."""
-        nodes = self.manifest.nodes
-        kept = tuple(each for each in nodes if not self.flawed.get(each.key, set()) & {*needed})
-        lost = self.lost
-        if lost is not None:
-            lost |= {each.key for each in nodes} - {each.key for each in kept}
-        return DeclaredSystem.of(dataclasses.replace(self.manifest, nodes=kept), lost=lost)
-
-    def sound(self, *sections: str) -> bool:
-        """Whether nothing is wrong in these sections."""
-        return not self.sections & {*sections}
 
 
 def rmw_of(node: Node, environment: Mapping[str, str]) -> str:

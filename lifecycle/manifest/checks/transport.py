@@ -172,9 +172,7 @@ def _server(system: DeclaredSystem, section: Position) -> Iterator[Diagnostic]:
         message = f"cannot run the discovery server on machine {name!r}: there is no such machine"
         hint = did_you_mean(name, machines) or "declare it under 'machines:'"
         yield error("check.discovery-server", at, message, hint)
-    elif system.lost == frozenset() and name not in {
-        node.machine for node in system.manifest.nodes
-    }:
+    elif name not in {node.machine for node in system.manifest.nodes}:
         message = (
             f"cannot run the discovery server on machine {name!r}: no node runs there, so nobody "
             "starts a supervisor"
