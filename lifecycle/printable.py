@@ -4,12 +4,14 @@ Owns: which characters reach a terminal, a log or a report as they are. Names in
 other nodes and lines of processes are chosen by others: ESC moves a cursor, a newline begins a line
 that looks like ours, U+202E turns a line around (CVE-2021-42574), a lone surrogate cannot be
 written at all. What `str.isprintable` calls no printable character is written as Python would,
-`\x1b`, `\n`, `\u202e`. Imports nothing of the package.
+`\x1b`, `\n`, `\u202e`. Also how cells are aligned in columns. Imports nothing of the package.
 """
 
 from __future__ import annotations
 
 import re
+import textwrap
+from collections.abc import Sequence
 
 _COLOUR = re.compile("\x1b\\[[0-9;:]*m")
 """SGR (ECMA-48 §8.3.117): it changes how text looks, and nothing else."""
@@ -38,6 +40,42 @@ def json_text(text: str) -> str:
     if text.isprintable():
         return text
     return "".join(each if each == "\n" else _json_escaped(each) for each in text)
+
+
+_GAP = "  "
+_LEAST = 24
+"""Columns that the last cell keeps even when the others are wide."""
+
+
+def columns(rows: Sequence[Sequence[str]], *, indent: int = 0, width: int = 0) -> list[str]:
+    """Align the cells of rows in columns; the last cell of a row wraps under itself.
+
+    Args:
+        rows: all of one length.
+        indent: spaces before each line.
+        width: columns that a line should not pass, where words that are longer than what is left
+            stay whole; 0 never wraps, so that each row is one line.
+
+    Returns:
+        Lines without trailing blanks; columns that are empty in every row take no space.
+    """
+    sizes = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    *fixed, last = [column for column, size in enumerate(sizes) if size] or [0]
+    text: list[str] = []
+    for row in rows:
+        first = " " * indent + "".join(row[each].ljust(sizes[each]) + _GAP for each in fixed)
+        if not width:
+            text.append(first + row[last])
+            continue
+        text += textwrap.wrap(
+            row[last],
+            max(width, len(first) + _LEAST),
+            initial_indent=first,
+            subsequent_indent=" " * len(first),
+            break_long_words=False,
+            break_on_hyphens=False,
+        ) or [first]
+    return [line.rstrip() for line in text]
 
 
 def _escaped(character: str) -> str:

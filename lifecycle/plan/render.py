@@ -6,8 +6,7 @@ Owns: that text. JSON is written by `lifecycle.codec`, pictures by export/. Pure
 from __future__ import annotations
 
 import shlex
-import textwrap
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 
 from lifecycle.manifest import (
     BEST_AVAILABLE_NS,
@@ -44,42 +43,7 @@ from lifecycle.plan.model import (
     PlannedProcess,
 )
 from lifecycle.plan.participants import ParticipantCost, participants_cost
-
-_GAP = "  "
-_LEAST = 24
-"""Columns that the last cell keeps even when the others are wide."""
-
-
-def table(rows: Sequence[Sequence[str]], *, indent: int = 2, width: int = 100) -> list[str]:
-    """Align the columns of `rows`; the last cell of a row wraps under itself.
-
-    Args:
-        rows: all of one length.
-        indent: spaces before each line.
-        width: columns that a line should not pass. Words longer than what is left stay whole.
-
-    Returns:
-        Lines without trailing blanks; columns that are empty in every row take no space.
-    """
-    if not rows:
-        return []
-    sizes = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    used = [column for column, size in enumerate(sizes) if size]
-    lines: list[str] = []
-    for row in rows:
-        fixed = "".join(row[column].ljust(sizes[column]) + _GAP for column in used[:-1])
-        first = " " * indent + fixed
-        last = row[used[-1]] if used else ""
-        lines += textwrap.wrap(
-            last,
-            max(width, len(first) + _LEAST),
-            initial_indent=first,
-            subsequent_indent=" " * len(first),
-            break_long_words=False,
-            break_on_hyphens=False,
-        ) or [first]
-    return [line.rstrip() for line in lines]
-
+from lifecycle.printable import columns
 
 RMW_CHOOSES = "as the RMW chooses"
 
@@ -112,7 +76,7 @@ def data_layer(plan: Plan, width: int) -> list[str]:
         if machine and any(not other for other, _ in plan.observers):
             continue  # the one host's, under another name
         rows += [(named if not i else "", text) for i, text in enumerate(_spelled(each))]
-    return table(rows, width=width)
+    return columns(rows, indent=2, width=width)
 
 
 def connections(plan: Plan, width: int) -> list[str]:
@@ -121,7 +85,7 @@ def connections(plan: Plan, width: int) -> list[str]:
     for node in plan.nodes:
         rows = list(_rows(node))
         if rows:
-            lines += [f"  {node.full_name}", *table(rows, indent=4, width=width)]
+            lines += [f"  {node.full_name}", *columns(rows, indent=4, width=width)]
     return lines
 
 
@@ -191,10 +155,10 @@ def participants(plan: Plan, width: int) -> list[str]:
     )
     costs.append(("system", f"{_cost(cost)}; {discovery}"))
     return [
-        *table(rows, width=width),
+        *columns(rows, indent=2, width=width),
         "  cost",
-        *table(costs, indent=4, width=width),
-        *table([(_alternatives(plan, extra),)], width=width),
+        *columns(costs, indent=4, width=width),
+        *columns([(_alternatives(plan, extra),)], indent=2, width=width),
     ]
 
 
@@ -248,7 +212,7 @@ def middleware(plan: Plan, width: int) -> list[str]:
             rows.append(
                 ("" if rows and word != cells[0][0] else rmw, word, f"{support}: {cell.how}")
             )
-    return table(rows, width=width)
+    return columns(rows, indent=2, width=width)
 
 
 def _own_rmws(plan: Plan) -> Iterator[str]:
@@ -274,7 +238,10 @@ def notes(plan: Plan, width: int) -> list[str]:
         rows.append(("every unique or marked flow", _NEEDS_A_RULE))
     lines: list[str] = []
     for head, text in rows:
-        lines += [*table([(head,)], width=width), *table([(text,)], indent=6, width=width)]
+        lines += [
+            *columns([(head,)], indent=2, width=width),
+            *columns([(text,)], indent=6, width=width),
+        ]
     return lines
 
 
@@ -360,7 +327,7 @@ def _processes(plan: Plan, width: int) -> list[str]:
         (process.name, process.machine, process.run.kind.value, _started_as(plan, process))
         for process in plan.processes
     ]
-    return table(rows, width=width)
+    return columns(rows, indent=2, width=width)
 
 
 def _started_as(plan: Plan, process: PlannedProcess) -> str:
@@ -372,11 +339,12 @@ def _started_as(plan: Plan, process: PlannedProcess) -> str:
 
 
 def _order(plan: Plan, width: int) -> list[str]:
-    return table(
+    return columns(
         [
             (f"{number}.", ", ".join(_waiting(plan.node(key)) for key in level))
             for number, level in enumerate(plan.levels, start=1)
         ],
+        indent=2,
         width=width,
     )
 
@@ -414,13 +382,13 @@ def _endpoints(node: PlannedNode, width: int) -> list[str]:
     rows = [
         (each.kind.noun, each.resolved, each.type, _endpoint_facts(each)) for each in node.endpoints
     ]
-    lines = table(rows, indent=4, width=width)
+    lines = columns(rows, indent=4, width=width)
     if len(lines) == len(rows) and all(len(line) <= width for line in lines):
         return lines
     lines = []
-    heads = table([row[:3] for row in rows], indent=4, width=width)
+    heads = columns([row[:3] for row in rows], indent=4, width=width)
     for head, row in zip(heads, rows, strict=True):
-        lines += [head, *table([row[3:]], indent=8, width=width)] if row[3] else [head]
+        lines += [head, *columns([row[3:]], indent=8, width=width)] if row[3] else [head]
     return lines
 
 
@@ -486,7 +454,7 @@ def _flows(plan: Plan, width: int) -> list[str]:
         ends = f"{plan.node(flow.publisher).full_name} → {plan.node(flow.subscription).full_name}"
         told = filter(None, (medium(flow), ", ".join(needs)))
         rows.append((flow.topic, ends, "; ".join(told)))
-    return table(rows, width=width)
+    return columns(rows, indent=2, width=width)
 
 
 def _ports(plan: Plan, width: int) -> list[str]:
@@ -506,7 +474,7 @@ def _ports(plan: Plan, width: int) -> list[str]:
             )
             for each in machine.participants
         ]
-        lines += table(rows, indent=4, width=width)
+        lines += columns(rows, indent=4, width=width)
         if machine.unique_subscriptions:
             ports = unique_flow_ports()
             lines.append(

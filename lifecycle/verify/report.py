@@ -28,7 +28,7 @@ from lifecycle import codec
 from lifecycle.manifest import UniqueHow
 from lifecycle.network import NETWORK_MEDIA, describe
 from lifecycle.plan import Plan
-from lifecycle.printable import json_text, lines, one_line
+from lifecycle.printable import columns, json_text, lines, one_line
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import RULES
 from lifecycle.verify.rules.catalogue import Rule
@@ -128,15 +128,13 @@ def _flows(flows: Sequence[FlowReport], *, colour: bool) -> list[str]:
             _UNIQUE[flow.unique],
             "" if flow.dscp is None else describe(flow.dscp),
             flow.effective_transport,
+            _paint(flow.outcome.value, flow.outcome, colour=colour),
         )
         for flow in flows
     ]
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     lines = []
-    for flow, row in zip(flows, rows, strict=True):
-        cells = [cell.ljust(size) for cell, size in zip(row, widths, strict=True) if size]
-        outcome = _paint(flow.outcome.value, flow.outcome, colour=colour)
-        lines.append("  " + "  ".join([*cells, outcome]))
+    for flow, line in zip(flows, columns(rows, indent=2), strict=True):
+        lines.append(line)
         if flow.effective_transport in NETWORK_MEDIA:
             lines += [one_line(f"    {each.describe()}") for each in flow.tuples]
     return lines

@@ -7,7 +7,7 @@ import json
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lifecycle.printable import json_text, lines, log_line, one_line
+from lifecycle.printable import columns, json_text, lines, log_line, one_line
 
 ANY = st.text(st.characters())
 
@@ -40,3 +40,13 @@ def test_json_reads_back_the_same_and_is_printable(value, indent):
     text = json_text(json.dumps(value, ensure_ascii=False, indent=indent))
     assert json.loads(text) == value
     assert text.replace("\n", "").isprintable()
+
+
+def test_a_table_aligns_wraps_its_last_cell_and_drops_empty_columns():
+    rows = [("a", "", "one two three four five six"), ("long", "", "x")]
+    assert columns(rows, indent=2, width=34) == [
+        "  a     one two three four five",
+        "        six",
+        "  long  x",
+    ]
+    assert columns([]) == []

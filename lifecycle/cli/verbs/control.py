@@ -26,7 +26,7 @@ from lifecycle.cli.common import (
 )
 from lifecycle.cli.completion import completing
 from lifecycle.errors import ExitCode, UsageError
-from lifecycle.printable import json_text, lines, one_line
+from lifecycle.printable import columns, json_text, lines, one_line
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -44,7 +44,6 @@ def status_text(status: SystemStatus) -> str:
     verdict = "not judged yet" if status.verdict is None else status.verdict.value
     verdict += f" ({status.not_ok})" if status.not_ok else ""
     rows = [_HEADS, *(tuple(map(one_line, _row(node))) for node in status.nodes)]
-    widths = [max(len(row[index]) for row in rows) for index in range(len(_HEADS))]
     living = sum(not node.died and node.next_try_s is None for node in status.nodes)
     count = "" if living == len(status.nodes) else f" {living}/{len(status.nodes)}"
     mode = f", mode {status.mode}" if status.mode else ""
@@ -56,9 +55,8 @@ def status_text(status: SystemStatus) -> str:
         f"up for {status.elapsed_s:.1f} s{applied}"
     )
     text = [one_line(head)]
-    for row, node in zip(rows, (None, *status.nodes), strict=True):
-        cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
-        text.append("  ".join(cells).rstrip())
+    for line, node in zip(columns(rows), (None, *status.nodes), strict=True):
+        text.append(line)
         text += [
             one_line(f"  {connection_text(each)}") for each in (node.connections if node else ())
         ]

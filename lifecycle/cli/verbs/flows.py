@@ -33,7 +33,7 @@ from lifecycle.codec import to_json
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest import UniqueHow
 from lifecycle.network import NetworkFlowEndpoint, describe
-from lifecycle.printable import json_text, lines, one_line
+from lifecycle.printable import columns, json_text, lines, one_line
 from lifecycle.programming import flows_to_csv
 from lifecycle.verify import FlowReport
 
@@ -75,11 +75,7 @@ def render_flows(flows: Sequence[FlowReport], format_: str) -> str:
     if not flows:
         return "no flow"
     rows = [_HEADS, *(tuple(map(one_line, row)) for flow in flows for row in _rows(flow))]
-    widths = [max(len(row[index]) for row in rows) for index in range(len(_HEADS))]
-    return "\n".join(
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-        for row in rows
-    )
+    return "\n".join(columns(rows))
 
 
 def _rows(flow: FlowReport) -> Iterator[tuple[str, ...]]:

@@ -19,7 +19,7 @@ from lifecycle.export.picture.model import (
     Presence,
     words,
 )
-from lifecycle.printable import one_line
+from lifecycle.printable import columns, one_line
 from lifecycle.verify import Outcome
 
 _ARROWS = {Presence.MISSING: "╌╌▷", Presence.UNDECLARED: "··▶"}
@@ -33,11 +33,7 @@ def picture_to_text(picture: Picture) -> str:
 def _document(picture: Picture) -> Iterator[str]:
     yield picture.title
     yield ""
-    rows = [_row(node) for node in picture.nodes]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:
-        cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True) if width)
-        yield "  " + "  ".join(cells)
+    yield from columns([_row(node) for node in picture.nodes], indent=2)
     for line in picture.lines:
         yield ""
         yield f"  {line.kind.value} {line.name}  {' ≠ '.join(line.types)}"

@@ -24,7 +24,7 @@ from lifecycle.manifest.model import (
 from lifecycle.manifest.qos import PRESETS, History, Liveliness, QosProfile
 from lifecycle.plan import build_plan
 from lifecycle.plan.connections.hosts import demand
-from lifecycle.plan.render import render_text, spell_qos, table
+from lifecycle.plan.render import render_text, spell_qos
 from tests.builders import at, need, node, planned, publisher, subscription, teleop
 
 TELEOP = """\
@@ -192,16 +192,6 @@ def test_a_profile_is_spelled_in_one_line(qos: QosProfile, words: list[str]):
     assert spell_qos(qos) == ", ".join(words)
 
 
-def test_a_table_aligns_wraps_its_last_cell_and_drops_empty_columns():
-    rows = [("a", "", "one two three four five six"), ("long", "", "x")]
-    assert table(rows, indent=2, width=34) == [
-        "  a     one two three four five",
-        "        six",
-        "  long  x",
-    ]
-    assert table([]) == []
-
-
 def test_participants_are_counted_machine_by_machine():
     robot, operator = demand(build_plan(teleop(), environment={}))
     assert [each.owner for each in robot.participants] == [
@@ -271,7 +261,7 @@ def test_the_verb_shows_json(tmp_path: Path):
 
 @pytest.mark.parametrize(
     ("format_", "start"),
-    [("mermaid", "flowchart"), ("dot", "digraph"), ("svg", "<svg"), ("html", "<!DOCTYPE html>")],
+    [("mermaid", "flowchart"), ("svg", "<svg"), ("html", "<!DOCTYPE html>")],
 )
 def test_the_verb_draws(tmp_path: Path, format_: str, start: str):
     result = plan_verb(tmp_path, "--format", format_)
