@@ -21,14 +21,13 @@ from __future__ import annotations
 import json
 import textwrap
 from collections.abc import Iterable, Sequence
-from urllib.parse import quote
-from xml.etree import ElementTree as ET
 
 from lifecycle import codec
+from lifecycle.ci_formats import Case, Json, Result, Suite, junit, sarif
 from lifecycle.manifest import UniqueHow
 from lifecycle.network import NETWORK_MEDIA, describe
 from lifecycle.plan import Plan
-from lifecycle.printable import columns, json_text, lines, one_line
+from lifecycle.printable import columns, json_text, one_line
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import RULES
 from lifecycle.verify.rules.catalogue import Rule
@@ -155,29 +154,19 @@ def to_junit(verdict: Verdict, plan: Plan | None, *, strict: bool = False) -> st
         plan: None where there is none, because the manifest cannot be used.
         strict: what cannot be verified refuses the system, whatever its policy says.
     """
-    name = f"lifecycle verify {plan.system}" if plan else "lifecycle verify"
-    root = ET.Element("testsuites", name=_legal(name))
     writer = _Cases(verdict, plan, strict=strict)
-    suite = ET.SubElement(root, "testsuite", name="manifest")
-    writer.of_manifest(suite)
+    suites = [Suite(name="manifest", cases=[writer.of_manifest()])]
     families: dict[str, list[Rule]] = {}
     for rule in RULES:
         families.setdefault(rule.id.partition(".")[0], []).append(rule)
     for family, rules in families.items():
-        suite = ET.SubElement(root, "testsuite", name=family)
-        for rule in rules:
-            writer.of_rule(suite, rule)
+        cases = [writer.of_rule(rule) for rule in rules]
         if family == "run":
-            writer.of_end(suite)
-        if family == "flow" and verdict.flows:
-            _note(suite, "".join(f"{_flow(each)}\n" for each in verdict.flows))
-    total = [0, 0, 0]
-    for suite in root:
-        _count(suite, total)
-    for key, value in zip(("tests", "failures", "skipped"), total, strict=True):
-        root.set(key, str(value))
-    ET.indent(root)
-    return '<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(root, encoding="unicode") + "\n"
+            cases.append(writer.of_end())
+        flows = verdict.flows if family == "flow" else ()
+        note = "".join(f"{_flow(each)}\n" for each in flows)
+        suites.append(Suite(name=family, cases=cases, note=note))
+    return junit(suites, name=f"lifecycle verify {plan.system}" if plan else "lifecycle verify")
 
 
 class _Cases:
@@ -190,46 +179,47 @@ class _Cases:
         self._strict = strict
         self._may_block = {each.id: each.may_block for each in RULES}
 
-    def of_manifest(self, suite: ET.Element) -> None:
+    def of_manifest(self) -> Case:
         """Hold what is wrong with the manifest itself: no rule of the running system."""
-        case = ET.SubElement(suite, "testcase", classname="manifest", name="the manifest is valid")
-        self._findings(case, [each for each in self._verdict.findings if each.rule not in _IDS])
+        found = [each for each in self._verdict.findings if each.rule not in _IDS]
+        return self._case("manifest", "the manifest is valid", found)
 
-    def of_rule(self, suite: ET.Element, rule: Rule) -> None:
+    def of_rule(self, rule: Rule) -> Case:
         """Hold all findings of one rule."""
-        case = ET.SubElement(suite, "testcase", classname=rule.id, name=_legal(rule.meaning))
-        findings = [each for each in self._verdict.findings if each.rule == rule.id]
-        self._findings(case, findings)
-        if not findings and not self._verdict.judged:
-            _not_judged(case)
+        found = [each for each in self._verdict.findings if each.rule == rule.id]
+        skipped = ""
+        if not found and not self._verdict.judged:
+            skipped = "not judged; see the end of the run"
+        return self._case(rule.id, rule.meaning, found, skipped=skipped)
 
-    def of_end(self, suite: ET.Element) -> None:
+    def of_end(self) -> Case:
         """Fail where the run was no success: one without a judged system must not read well."""
-        case = ET.SubElement(suite, "testcase", classname="run", name="end")
         run = self._verdict.run
         if run is None and self._verdict.judged:
-            return
+            return Case(classname="run", name="end")
         run = run or RunEnd(reason="nothing was judged", reached=None, exit_code=1)
+        text = run.describe() + "\n"
         if run.exit_code == 0:
-            _note(case, run.describe() + "\n")
-        else:
-            _failure(case, run.reason, run.describe() + "\n")
+            return Case(classname="run", name="end", note=text)
+        return Case(classname="run", name="end", failure=(run.reason, text))
 
-    def _findings(self, case: ET.Element, findings: list[Finding]) -> None:
-        if not findings:
-            return
+    def _case(
+        self, classname: str, name: str, findings: Sequence[Finding], *, skipped: str = ""
+    ) -> Case:
         bad = [each for each in findings if self._refuses(each)]
-        for first in bad[:1] or findings[:1]:
-            if first.at:
-                file, line, _ = first.at.rsplit(":", 2)
-                case.set("file", _legal(file))
-                case.set("line", line)
+        allowed = [each for each in findings if each not in bad]
+        failure = None
         if bad:
             more = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
-            _failure(case, bad[0].message + more, _described(bad))
-        allowed = [each for each in findings if each not in bad]
-        if allowed:
-            _note(case, _described(allowed))
+            failure = (bad[0].message + more, _described(bad))
+        return Case(
+            classname=classname,
+            name=name,
+            at=next((each.at for each in (*bad, *allowed)), ""),
+            failure=failure,
+            note=_described(allowed),
+            skipped=skipped,
+        )
 
     def _refuses(self, finding: Finding) -> bool:
         """Whether a finding keeps the gate closed."""
@@ -253,46 +243,12 @@ def _flow(flow: FlowReport) -> str:
     return one_line(f"{flow.topic}: {flow.publisher} → {flow.subscription}: {flow.outcome.value}")
 
 
-def _failure(case: ET.Element, message: str, text: str) -> None:
-    ET.SubElement(case, "failure", message=_legal(message)).text = _legal(text)
-
-
-def _note(place: ET.Element, text: str) -> None:
-    ET.SubElement(place, "system-out").text = _legal(text)
-
-
-def _not_judged(case: ET.Element) -> None:
-    ET.SubElement(case, "skipped", message="not judged; see the end of the run")
-
-
-def _count(suite: ET.Element, total: list[int]) -> None:
-    """Fill in a suite's counts and add them to the total."""
-    counts = (
-        len(suite.findall("testcase")),
-        len(suite.findall("testcase/failure")),
-        len(suite.findall("testcase/skipped")),
-    )
-    for index, (name, value) in enumerate(
-        zip(("tests", "failures", "skipped"), counts, strict=True)
-    ):
-        suite.set(name, str(value))
-        total[index] += value
-
-
-def _legal(text: str) -> str:
-    return lines(text)
-
-
-_SCHEMA = "https://json.schemastore.org/sarif-2.1.0.json"
 _LEVELS = {Outcome.VIOLATED: "error", Outcome.UNVERIFIABLE: "warning", Outcome.OK: "none"}
-
-_Json = dict[str, object]
 
 
 def to_sarif(verdict: Verdict) -> str:
     """Write a SARIF log with one run; every rule is described, found or not."""
-    index = {rule.id: position for position, rule in enumerate(RULES)}
-    rules = [
+    rules: list[Json] = [
         {
             "id": rule.id,
             "shortDescription": {"text": rule.meaning},
@@ -301,70 +257,47 @@ def to_sarif(verdict: Verdict) -> str:
         }
         for rule in RULES
     ]
-    log = {
-        "$schema": _SCHEMA,
-        "version": "2.1.0",
-        "runs": [
-            {
-                "tool": {"driver": {"name": "lifecycle", "rules": rules}},
-                "columnKind": "unicodeCodePoints",
-                "results": [
-                    *(_result(each, index.get(each.rule)) for each in verdict.findings),
-                    *_end_result(verdict),
-                ],
-                "properties": {"verdict": verdict.verdict.value},
-                **_invocations(verdict.run),
-            }
-        ],
-    }
-    return json_text(json.dumps(log, ensure_ascii=False, indent=2)) + "\n"
+    return sarif(
+        [*map(_result, verdict.findings), *_end_result(verdict)],
+        rules,
+        properties={"verdict": verdict.verdict.value},
+        invocation=_invocation(verdict.run),
+    )
 
 
-def _invocations(run: RunEnd | None) -> _Json:
+def _invocation(run: RunEnd | None) -> Json | None:
     if run is None:
-        return {}
-    ended = {
+        return None
+    return {
         "executionSuccessful": run.exit_code == 0,
         "exitCode": run.exit_code,
         "exitCodeDescription": run.describe(),
     }
-    return {"invocations": [ended]}
 
 
-def _end_result(verdict: Verdict) -> list[_Json]:
+def _end_result(verdict: Verdict) -> list[Result]:
     """Return the error of a run that was no success, for a log that has none."""
     run = verdict.run
     if run is None or run.exit_code == 0:
         return []
     if any(each.outcome is Outcome.VIOLATED for each in verdict.findings):
         return []
-    return [{"ruleId": "run.end", "level": "error", "message": {"text": run.describe()}}]
+    return [Result(rule="run.end", level="error", text=run.describe())]
 
 
-def _result(finding: Finding, rule_index: int | None) -> _Json:
-    location: _Json = {
-        "logicalLocations": [{"fullyQualifiedName": finding.subject, "kind": "resource"}]
-    }
-    if finding.at:
-        file, line, column = finding.at.rsplit(":", 2)
-        location["physicalLocation"] = {
-            "artifactLocation": {"uri": quote(file)},
-            "region": {"startLine": int(line), "startColumn": int(column)},
-        }
-    return {
-        "ruleId": finding.rule,
-        **({} if rule_index is None else {"ruleIndex": rule_index}),
-        "level": _LEVELS[finding.outcome],
-        "message": {
-            "text": f"{finding.message}; {finding.hint}" if finding.hint else finding.message
-        },
-        "locations": [location],
-        "properties": {
+def _result(finding: Finding) -> Result:
+    return Result(
+        rule=finding.rule,
+        level=_LEVELS[finding.outcome],
+        text=f"{finding.message}; {finding.hint}" if finding.hint else finding.message,
+        subject=finding.subject,
+        at=finding.at,
+        properties={
             "outcome": finding.outcome.value,
             "expected": finding.expected,
             "observed": finding.observed,
         },
-    }
+    )
 
 
 def to_json(verdict: Verdict, *, indent: int | None = None) -> str:

@@ -7,16 +7,13 @@ ever skipped.
 
 from __future__ import annotations
 
-import json
 import os
-import re
-import xml.etree.ElementTree as ET
 from pathlib import Path
-from urllib.parse import quote
 
 import click
 
 from lifecycle import dataclasses
+from lifecycle.ci_formats import Case, Result, Suite, junit, sarif
 from lifecycle.cli.common import (
     format_option,
     machine_option,
@@ -45,8 +42,6 @@ from lifecycle.manifest import (
 )
 from lifecycle.plan import Resolution, UnresolvedProgram, check_plan, effective_domain
 from lifecycle.printable import json_text, lines
-
-_NOT_XML = re.compile(r"[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 TESTS = {
     "document": ("yaml.", "manifest.", "nodl."),
@@ -98,9 +93,9 @@ def write_check(report: CheckReport, format_: str, *, strict: bool) -> str:
     if format_ == "json":
         return to_json(report).decode()
     if format_ == "sarif":
-        return _sarif(report)
+        return _sarif(report).rstrip("\n")
     if format_ == "junit":
-        return _junit(report, strict=strict)
+        return _junit(report, strict=strict).rstrip("\n")
     lines = [*map(str, report.diagnostics), *map(str, report.unresolved), summary(report)]
     if format_ == "github":
         lines += [
@@ -143,33 +138,26 @@ def _count(number: int, word: str) -> str:
 
 
 def _junit(report: CheckReport, *, strict: bool) -> str:
-    suites = ET.Element("testsuites")
-    suite = ET.SubElement(suites, "testsuite", name=_legal(f"lifecycle check {report.manifest}"))
-    failures = 0
+    cases = []
     for name in TESTS:
-        case = ET.SubElement(suite, "testcase", classname="check", name=name)
         found = [each for each in report.diagnostics if _test(each.rule) == name]
         bad = [
-            each
+            str(each)
             for each in found
             if each.severity is Severity.ERROR or (strict and each.is_unproven)
         ]
         notes = list(map(str, report.unresolved)) if name == "programs" else []
-        said = [str(each) for each in found if each not in bad]
-        if bad or (strict and notes):
-            failures += 1
-            failed = [*map(str, bad), *(notes if strict else ())]
-            failure = ET.SubElement(case, "failure", message=_legal(failed[0]))
-            failure.text = _legal("\n".join(failed))
-        if said or notes:
-            out = ET.SubElement(case, "system-out")
-            out.text = _legal("\n".join([*said, *notes]))
-    for each in (suites, suite):
-        each.set("tests", str(len(TESTS)))
-        each.set("failures", str(failures))
-        each.set("skipped", "0")
-    ET.indent(suites)
-    return '<?xml version="1.0" encoding="utf-8"?>\n' + ET.tostring(suites, encoding="unicode")
+        said = [text for text in map(str, found) if text not in bad]
+        failed = [*bad, *(notes if strict else ())]
+        cases.append(
+            Case(
+                classname="check",
+                name=name,
+                failure=(failed[0], "\n".join(failed)) if failed else None,
+                note="\n".join([*said, *notes]),
+            )
+        )
+    return junit([Suite(name=f"lifecycle check {report.manifest}", cases=cases)])
 
 
 def _test(rule: str) -> str:
@@ -178,73 +166,33 @@ def _test(rule: str) -> str:
 
 def _sarif(report: CheckReport) -> str:
     rules = sorted({each.rule for each in report.diagnostics} | {_UNRESOLVED})
-    results = [
+    found = [
         _result(
             each.rule,
-            rules,
             each.severity.value,
             f"{each.message}; {each.hint}" if each.hint else each.message,
-            each,
+            each.at,
         )
         for each in report.diagnostics
-    ] + [
-        _result(
-            _UNRESOLVED,
-            rules,
-            "note",
-            f"could not resolve {each.subject}: {each.reason}",
-            each,
-        )
+    ]
+    unresolved = [
+        _result(_UNRESOLVED, "note", f"could not resolve {each.subject}: {each.reason}", each.at)
         for each in report.unresolved
     ]
-    log = {
-        "$schema": "https://json.schemastore.org/sarif-2.1.0.json",
-        "version": "2.1.0",
-        "runs": [
-            {
-                "tool": {
-                    "driver": {"name": "lifecycle", "rules": [{"id": each} for each in rules]}
-                },
-                "columnKind": "unicodeCodePoints",
-                "results": results,
-                "properties": {"ok": report.ok, "summary": summary(report)},
-                "invocations": [{"executionSuccessful": report.ok}],
-            }
-        ],
-    }
-    return json.dumps(log, ensure_ascii=False, indent=2)
+    return sarif(
+        [*found, *unresolved],
+        [{"id": each} for each in rules],
+        properties={"ok": report.ok, "summary": summary(report)},
+        invocation={"executionSuccessful": report.ok},
+    )
 
 
 _UNRESOLVED = "program.unresolved"
 
 
-def _result(
-    rule: str, rules: list[str], level: str, text: str, found: Diagnostic | UnresolvedProgram
-) -> dict[str, object]:
-    at = found.at
-    return {
-        "ruleId": rule,
-        "ruleIndex": rules.index(rule),
-        "level": level,
-        "message": {"text": text},
-        "locations": [
-            {
-                "physicalLocation": {
-                    "artifactLocation": {"uri": quote(at.file)},
-                    "region": {"startLine": at.line, "startColumn": at.column},
-                },
-                **(
-                    {"logicalLocations": [{"fullyQualifiedName": at.path, "kind": "resource"}]}
-                    if at.path
-                    else {}
-                ),
-            }
-        ],
-    }
-
-
-def _legal(text: str) -> str:
-    return _NOT_XML.sub("\ufffd", text)
+def _result(rule: str, level: str, text: str, at: Position) -> Result:
+    where = f"{at.file}:{at.line}:{at.column}"
+    return Result(rule=rule, level=level, text=text, subject=at.path, at=where)
 
 
 @click.command()
@@ -288,7 +236,7 @@ def command(
     unwritten = ExitCode.OK if report is None else _write(report, found, strict=strict)
     text = write_check(found, format_, strict=strict)
     # Names of files are not ours to trust.
-    shown = {"text": lines, "github": lines, "json": json_text, "sarif": json_text}
+    shown = {"text": lines, "github": lines, "json": json_text}
     click.echo(shown.get(format_, str)(text))
     return found.exit_code(strict=strict) or unwritten
 

@@ -1,0 +1,161 @@
+"""JUnit XML and SARIF 2.1.0, as continuous integration and editors read them: one writer of each.
+
+Owns: the shape of both, for `check` and `verify`; what is in them is their callers'. Source of the
+latter: OASIS SARIF 2.1.0. Pure.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from urllib.parse import quote
+from xml.etree import ElementTree as ET
+
+import msgspec
+
+from lifecycle.printable import json_text, lines
+
+Json = dict[str, object]
+
+
+class Case(msgspec.Struct, frozen=True, kw_only=True):
+    """One test case of JUnit.
+
+    Attributes:
+        name: says what holds if it passes.
+        at: `file:line:column` that it is about; empty for none.
+        failure: (message, text); None if it passes.
+        note: text beside its result; empty for none.
+        skipped: why it was not judged; empty if it was.
+    """
+
+    classname: str
+    name: str
+    at: str = ""
+    failure: tuple[str, str] | None = None
+    note: str = ""
+    skipped: str = ""
+
+
+class Suite(msgspec.Struct, frozen=True, kw_only=True):
+    """Test cases under one name, and text that is of all of them."""
+
+    name: str
+    cases: Sequence[Case]
+    note: str = ""
+
+
+def junit(suites: Iterable[Suite], *, name: str = "") -> str:
+    """Return JUnit XML.
+
+    Args:
+        suites: in their order.
+        name: of the whole; empty for none.
+    """
+    root = ET.Element("testsuites", {"name": lines(name)} if name else {})
+    every: list[Case] = []
+    for suite in suites:
+        element = ET.SubElement(root, "testsuite", name=lines(suite.name))
+        for case in suite.cases:
+            _case(element, case)
+        _note(element, suite.note)
+        _count(element, suite.cases)
+        every += suite.cases
+    _count(root, every)
+    ET.indent(root)
+    return '<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(root, encoding="unicode") + "\n"
+
+
+def _case(suite: ET.Element, case: Case) -> None:
+    element = ET.SubElement(suite, "testcase", classname=case.classname, name=lines(case.name))
+    if case.at:
+        file, line, _ = case.at.rsplit(":", 2)
+        element.set("file", lines(file))
+        element.set("line", line)
+    if case.failure is not None:
+        message, text = map(lines, case.failure)
+        ET.SubElement(element, "failure", message=message).text = text
+    _note(element, case.note)
+    if case.skipped:
+        ET.SubElement(element, "skipped", message=case.skipped)
+
+
+def _note(place: ET.Element, text: str) -> None:
+    if text:
+        ET.SubElement(place, "system-out").text = lines(text)
+
+
+def _count(element: ET.Element, cases: Sequence[Case]) -> None:
+    element.set("tests", str(len(cases)))
+    element.set("failures", str(sum(each.failure is not None for each in cases)))
+    element.set("skipped", str(sum(bool(each.skipped) for each in cases)))
+
+
+class Result(msgspec.Struct, frozen=True, kw_only=True):
+    """One result of SARIF.
+
+    Attributes:
+        level: "error", "warning", "note" or "none".
+        subject: what it is about, in words of the system; empty for none.
+        at: `file:line:column` of a declaration; empty for none.
+        properties: for readers of this tool.
+    """
+
+    rule: str
+    level: str
+    text: str
+    subject: str = ""
+    at: str = ""
+    properties: Json = {}
+
+
+def sarif(
+    results: Iterable[Result],
+    rules: Sequence[Mapping[str, object]],
+    *,
+    properties: Json,
+    invocation: Json | None,
+) -> str:
+    """Return a SARIF log with one run.
+
+    Args:
+        results: in their order.
+        rules: each with its `id`.
+        properties: of the run.
+        invocation: how it ended; None if it did not yet.
+    """
+    index = {rule["id"]: position for position, rule in enumerate(rules)}
+    run: Json = {
+        "tool": {"driver": {"name": "lifecycle", "rules": rules}},
+        "columnKind": "unicodeCodePoints",
+        "results": [_result(each, index.get(each.rule)) for each in results],
+        "properties": properties,
+    }
+    if invocation is not None:
+        run["invocations"] = [invocation]
+    log = {
+        "$schema": "https://json.schemastore.org/sarif-2.1.0.json",
+        "version": "2.1.0",
+        "runs": [run],
+    }
+    return json_text(json.dumps(log, ensure_ascii=False, indent=2)) + "\n"
+
+
+def _result(each: Result, rule_index: int | None) -> Json:
+    location: Json = {}
+    if each.subject:
+        location["logicalLocations"] = [{"fullyQualifiedName": each.subject, "kind": "resource"}]
+    if each.at:
+        file, line, column = each.at.rsplit(":", 2)
+        location["physicalLocation"] = {
+            "artifactLocation": {"uri": quote(file)},
+            "region": {"startLine": int(line), "startColumn": int(column)},
+        }
+    return {
+        "ruleId": each.rule,
+        **({} if rule_index is None else {"ruleIndex": rule_index}),
+        "level": each.level,
+        "message": {"text": each.text},
+        **({"locations": [location]} if location else {}),
+        **({"properties": each.properties} if each.properties else {}),
+    }
