@@ -13,12 +13,12 @@ from types import MappingProxyType
 from typing import TypeVar
 
 from lifecycle import dataclasses
-from lifecycle.network import DscpMapping, FlowTuple, dscp_name, tos
+from lifecycle.network import FlowTuple, dscp_name, tos
 from lifecycle.plan import Plan
 from lifecycle.programming.rules.camara import CamaraSettings, render_camara
 from lifecycle.programming.rules.nef import NefSettings, render_nef
 from lifecycle.programming.rules.nftables import render_nft
-from lifecycle.programming.rules.rules import RuleSet, SourceAddress, flow_rules, rules_digest
+from lifecycle.programming.rules.rules import RuleSet, rules_digest
 from lifecycle.programming.rules.tc import TcSettings, render_tc
 from lifecycle.verify import FlowReport
 
@@ -137,36 +137,6 @@ class ExportInput:
     def digest(self) -> str:
         """Sixteen hexadecimal digits that are equal for equal rules."""
         return rules_digest(self.rules.rules)
-
-
-def export_input(
-    flows: Iterable[FlowReport],
-    plan: Plan,
-    *,
-    settings: ExportSettings = ExportSettings(),
-    source_address: SourceAddress | None = None,
-    mapping: DscpMapping | None = None,
-    label_flows: bool = False,
-) -> ExportInput:
-    """Return what every export takes.
-
-    Args:
-        flows: of a verdict.
-        plan: that they were judged against.
-        settings: for the exports that need some.
-        source_address: see `flow_rules`.
-        mapping: see `flow_rules`.
-        label_flows: see `flow_rules`.
-    """
-    every = tuple(flows)
-    return ExportInput(
-        flows=every,
-        plan=plan,
-        rules=flow_rules(
-            every, plan, source_address=source_address, mapping=mapping, label_flows=label_flows
-        ),
-        settings=settings,
-    )
 
 
 def _nft(given: ExportInput) -> str:

@@ -8,7 +8,8 @@ import pytest
 
 from lifecycle.programming.rules.camara import CamaraSettings
 from lifecycle.programming.rules.nef import NefSettings
-from lifecycle.programming.rules.registry import EXPORTS, ExportSettings, export_input, flows_to_csv
+from lifecycle.programming.rules.registry import EXPORTS, ExportInput, ExportSettings, flows_to_csv
+from lifecycle.programming.rules.rules import flow_rules
 from lifecycle.programming.rules.tc import TcSettings
 from tests.unit.programming.rules.samples import plan, report
 
@@ -22,6 +23,11 @@ SETTINGS = ExportSettings(
     ),
     camara=CamaraSettings(devices=("10.77.0.2",), qos_profiles={85: "QOS_E"}),
 )
+
+
+def given(settings: ExportSettings = ExportSettings()) -> ExportInput:
+    rules = flow_rules(FLOWS, plan())
+    return ExportInput(flows=FLOWS, plan=plan(), rules=rules, settings=settings)
 
 
 def cannot(message: str) -> object:
@@ -40,7 +46,7 @@ def test_every_export_of_the_issue_has_its_name() -> None:
 
 @pytest.mark.parametrize("name", EXPORTS)
 def test_every_export_shows_the_flow_and_names_what_it_left_out(name: str) -> None:
-    text = EXPORTS[name](export_input(FLOWS, plan(), settings=SETTINGS))
+    text = EXPORTS[name](given(SETTINGS))
     assert text.endswith("\n")
     assert "/robot/video" in text
     assert "/robot/status" in text
@@ -50,7 +56,7 @@ def test_every_export_shows_the_flow_and_names_what_it_left_out(name: str) -> No
 
 
 def test_the_csv_is_that_of_the_reports() -> None:
-    assert EXPORTS["csv"](export_input(FLOWS, plan())) == flows_to_csv(FLOWS)
+    assert EXPORTS["csv"](given()) == flows_to_csv(FLOWS)
 
 
 @pytest.mark.parametrize(
@@ -75,4 +81,4 @@ def test_the_csv_is_that_of_the_reports() -> None:
 )
 def test_an_export_that_lacks_its_settings_says_which(name: str, message: str) -> None:
     with cannot(message):
-        EXPORTS[name](export_input(FLOWS, plan()))
+        EXPORTS[name](given())
