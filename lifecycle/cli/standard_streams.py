@@ -133,11 +133,6 @@ def own_streams(*, waits: bool = True) -> Streams:
     return Streams(stdout, writer)
 
 
-def are_own() -> bool:
-    """Return whether they are: this process is a program of ours, with nobody else's threads."""
-    return isinstance(getattr(getattr(sys.stdout, "buffer", None), "raw", None), _Tolerant)
-
-
 def echo_while_read(text: str) -> None:
     """Print one text of many that follow changes; end the verb once they are not read any more.
 

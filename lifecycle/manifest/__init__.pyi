@@ -55,7 +55,6 @@ from .model import ModeParameter as ModeParameter
 from .model import Node as Node
 from .model import NodeDeclaration as NodeDeclaration
 from .model import OnFailure as OnFailure
-from .model import OnSupervisorLost as OnSupervisorLost
 from .model import OnViolation as OnViolation
 from .model import Output as Output
 from .model import ParameterDeclaration as ParameterDeclaration

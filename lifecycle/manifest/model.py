@@ -343,16 +343,9 @@ class OnFailure(enum.Enum):
     ALL = "all"
 
 
-class OnSupervisorLost(enum.Enum):
-    """What a process that was active does once its supervisor was killed."""
-
-    KEEP = "keep"  # it goes on
-    DEACTIVATE = "deactivate"  # its nodes deactivate themselves; what cannot do that ends
-
-
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Supervision:
-    """What is done when the process of a node, or its supervisor, fails; as systemd spells it.
+    """What is done when the process of a node fails; as systemd spells it.
 
     All nodes of one process have the same. Seconds.
 
@@ -369,7 +362,6 @@ class Supervision:
         on_failure: who goes down, and comes again, with it.
         watchdog_sec: a process that is stopped by a signal or hangs in a callback for so long is
             ended with SIGKILL, which is a failure; 0 for never.
-        on_supervisor_lost: what it does itself when its supervisor is killed.
     """
 
     restart: Restart = Restart.NO
@@ -380,7 +372,6 @@ class Supervision:
     start_limit_interval_sec: float = 10.0
     on_failure: OnFailure = OnFailure.NODE
     watchdog_sec: float = 3.0
-    on_supervisor_lost: OnSupervisorLost = OnSupervisorLost.KEEP
 
 
 SUPERVISION_KEYS = tuple(each.name for each in dataclasses.fields(Supervision))
@@ -689,7 +680,6 @@ __all__ = [
     "Network",
     "Node",
     "OnFailure",
-    "OnSupervisorLost",
     "OnViolation",
     "Output",
     "ParameterDeclaration",

@@ -146,6 +146,8 @@ def did_you_mean(word: str, known: Collection[str]) -> str:
 def unknown_key(key: str, known: Iterable[str]) -> tuple[str, str]:
     """Return message and hint for a key that the schema does not know."""
     words = list(known)
+    if key in _GONE:
+        return f"cannot use {quote(key)} any more: {_GONE[key]}", "remove it"
     message = f"cannot use the unknown key {quote(key)}; allowed: {', '.join(words)}"
     return message, did_you_mean(key, words)
 
@@ -154,6 +156,12 @@ def missing_key(key: str, schema: Mapping[str, Any]) -> tuple[str, str]:
     """Return message and hint for a key that must be there."""
     example = (schema.get("examples") or [schema.get("const", "…")])[0]
     return f"cannot do without the key {key!r}", f"add '{key}: {example}'"
+
+
+_GONE = {
+    "on_supervisor_lost": "nodes whose supervisor is gone are deactivated, and their process ends",
+}
+"""Keys of earlier versions, and what holds without them."""
 
 
 def bad_key(each: Violation) -> tuple[str, str]:

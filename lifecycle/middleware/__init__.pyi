@@ -48,13 +48,11 @@ from .process.control import check_memory as check_memory
 from .process.control import check_threads as check_threads
 from .process.control import drop_network_administration as drop_network_administration
 from .process.control import exit_after as exit_after
-from .process.control import fill_heap as fill_heap
 from .process.control import interface_addresses as interface_addresses
 from .process.control import limit_resources as limit_resources
 from .process.control import machine_id as machine_id
 from .process.control import no_room_for_threads as no_room_for_threads
 from .process.control import refuse_new_privileges as refuse_new_privileges
-from .process.control import rename_process as rename_process
 from .process.process_table import note_ended as note_ended
 from .process.reception import Reception as Reception
 from .process.shared_memory import Creations as Creations

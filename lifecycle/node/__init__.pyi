@@ -18,10 +18,7 @@ from .host.control import Command as Command
 from .host.control import Event as Event
 from .host.control import HostSpec as HostSpec
 from .host.control import Operation as Operation
-from .host.host import needed_by as needed_by
 from .host.host import preload as preload
-from .host.host import preload_for_some as preload_for_some
-from .host.host import preload_shared as preload_shared
 from .host.host import serve as serve
 from .host.in_process import NodeInProcess as NodeInProcess
 from .host.standalone import run as run

@@ -137,7 +137,7 @@ def _as_run(node: PlannedNode) -> object:
         after=(),
         state=TargetState.UNCONFIGURED if unmanaged else TargetState.ACTIVE,
         may_end=False,
-        supervision=Supervision(on_supervisor_lost=node.supervision.on_supervisor_lost),
+        supervision=Supervision(),
         on_violation=(),
         timeouts=node.timeouts if hosted else Timeouts(),
     )

@@ -13,7 +13,7 @@ from .control.protocol import Reach as Reach
 from .control.protocol import SystemStatus as SystemStatus
 from .control.server import follow as follow
 from .gate.gate import closes as closes
-from .processes.forerunner import Forerunner as Forerunner
+from .processes.fork_server_process import ForkServerProcess as ForkServerProcess
 from .processes.logs import check_log_root as check_log_root
 from .processes.logs import is_running as is_running
 from .processes.logs import ros_log_root as ros_log_root

@@ -22,7 +22,6 @@ from lifecycle.cli.common import (
 )
 from lifecycle.cli.completion import completing
 from lifecycle.cli.report import ReportFile, report_option, written_or_said
-from lifecycle.cli.standard_streams import are_own
 from lifecycle.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
@@ -31,7 +30,7 @@ if TYPE_CHECKING:
 
     from lifecycle.cli.up_output import RunOutput
     from lifecycle.programming import TargetOptions, Treatment
-    from lifecycle.supervisor import Forerunner, SystemStatus, UpResult
+    from lifecycle.supervisor import ForkServerProcess, SystemStatus, UpResult
 
 
 @click.command("up", cls=NetworkCommand)
@@ -134,10 +133,8 @@ def command(
             ending.unmasked(),
         ):
             program = _networks(targets, **rest)
-            # A Python of its own imports while we do and read the manifest. A fork of ours follows
-            # once that is read.
-            forks = are_own() and not program
-            forerunner = None if forks else _forerunner(program)
+            # It imports while we do and read the manifest.
+            process = _fork_server(program)
             try:
                 # ssl takes 6 ms, and a supervisor's loop has no connections with TLS.
                 import_without("asyncio", "ssl")
@@ -149,8 +146,6 @@ def command(
                 if without:
                     plan = started_by_others(plan, without)
                 written.begin(plan)
-                if forerunner is None:
-                    forerunner = _forerunner(program, forks=True)
                 from lifecycle.cli.up_output import output
                 from lifecycle.supervisor import Until, UpOptions, ended_early, up
 
@@ -180,7 +175,7 @@ def command(
                             plan,
                             options,
                             [listener],
-                            forerunner=forerunner,
+                            process=process,
                             ending=ending,
                             on_start=on_start,
                             conclude=conclude,
@@ -188,8 +183,7 @@ def command(
                     except Ended as ended:
                         return conclude(ended_early(ended.reason, ended.exit_code))
             finally:
-                if forerunner is not None:
-                    forerunner.close()
+                process.close()
     except Ended as ended:
         click.echo(f"ended before anything was started: {ended.reason}", err=True)
         return ended.exit_code
@@ -208,10 +202,10 @@ def _load_rclpy() -> None:
     begin_loading()
 
 
-def _forerunner(program: tuple[TargetOptions, ...], *, forks: bool = False) -> Forerunner:
-    from lifecycle.supervisor import Forerunner
+def _fork_server(program: tuple[TargetOptions, ...]) -> ForkServerProcess:
+    from lifecycle.supervisor import ForkServerProcess
 
-    return Forerunner(without=_tokens(program), programs=bool(program), forks=forks)
+    return ForkServerProcess(without=_tokens(program), programs=bool(program))
 
 
 @contextlib.contextmanager

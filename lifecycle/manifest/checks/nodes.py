@@ -155,7 +155,7 @@ def check_supervision(system: DeclaredSystem) -> Iterator[Diagnostic]:
             continue
         if (node.process or node.key) not in restarted:
             for key in own:
-                if key not in ("restart", "on_supervisor_lost"):
+                if key != "restart":
                     message = f"cannot use {key} of {node.key!r}: it is not started again"
                     yield error("check.restart", places[key], message, _NOT_RESTARTED)
             continue

@@ -1,8 +1,8 @@
 """Linux process control through ctypes: prctl(2), the deadman timer, and the C library.
 
 Owns: prctl(2), the deadman timer of timer_create(2), loading the C library and its timers'
-arguments, the heap that a fork shares and what it is called, addresses of interfaces, and whether
-threads can be started: what Python's standard library lacks. Linux only.
+arguments, addresses of interfaces, and whether threads can be started: what Python's standard
+library lacks. Linux only.
 Must not import rclpy: a fork server uses it before rclpy is loaded.
 """
 
@@ -16,7 +16,7 @@ import os
 import resource
 import signal
 import socket
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from lifecycle.errors import MiddlewareError
@@ -51,9 +51,6 @@ def libc() -> ctypes.CDLL:
     return ctypes.CDLL(None, use_errno=True)
 
 
-_PR_SET_NAME = 15
-_PR_SET_MM = 35
-_PR_SET_MM_MAP = 14
 _PR_SET_CHILD_SUBREAPER = 36
 _PR_SET_NO_NEW_PRIVS = 38
 _PR_CAP_AMBIENT = 47
@@ -90,124 +87,6 @@ def adopt_orphans() -> None:
         MiddlewareError: the kernel refused.
     """
     _prctl(_PR_SET_CHILD_SUBREAPER, 1)
-
-
-class _HeapInfo(ctypes.Structure):
-    """`struct mallinfo2` of mallinfo(3)."""
-
-    _fields_ = tuple(
-        (name, ctypes.c_size_t)
-        for name in (
-            *("arena", "ordblks", "smblks", "hblks", "hblkhd"),
-            *("usmblks", "fsmblks", "uordblks", "fordblks", "keepcost"),
-        )
-    )
-
-
-_GAPS = (*(1 << power for power in range(16, 10, -1)), *range(1016, 8, -16))
-"""Bytes, largest first: all sizes that malloc keeps lists of free chunks of, and some beyond."""
-
-_MOST_GAPS = 1 << 15
-_LARGEST_HEAP = 1 << 36
-"""Bytes; other memory of malloc's, which it maps, is farther away than that."""
-
-
-def fill_heap() -> None:
-    """Take the free chunks within malloc's heap, for ever, before this process forks.
-
-    Children then get fresh pages for what they allocate, close together, and do not copy one shared
-    page after another to use a gap in it: 1.3 MiB less of each node. It takes 2 ms and no memory
-    that was not there. Does nothing where the C library is not glibc 2.33 or later.
-    """
-    library = ctypes.PyDLL(None)  # keeps the interpreter's lock: each call takes no time
-    try:
-        info, allocate, release, end = (
-            getattr(library, name) for name in ("mallinfo2", "malloc", "free", "sbrk")
-        )
-    except AttributeError:
-        return
-    info.restype = _HeapInfo
-    allocate.argtypes, allocate.restype = (ctypes.c_size_t,), ctypes.c_void_p
-    release.argtypes, release.restype = (ctypes.c_void_p,), None
-    end.argtypes, end.restype = (ctypes.c_ssize_t,), ctypes.c_void_p
-    left = _MOST_GAPS
-    for size in _GAPS:
-        while left > 0:
-            left -= 1
-            # What is free at the end of the heap is nobody's gap.
-            top = end(0) - info().keepcost
-            chunk = allocate(size)
-            if chunk is None or not top - _LARGEST_HEAP < chunk < top:
-                release(chunk)
-                break
-
-
-class _MemoryMap(ctypes.Structure):
-    """`struct prctl_mm_map` of linux/prctl.h: where the kernel finds what it shows in /proc."""
-
-    _fields_ = (
-        *(
-            (name, ctypes.c_uint64)
-            for name in (
-                *("start_code", "end_code", "start_data", "end_data", "start_brk", "brk"),
-                *("start_stack", "arg_start", "arg_end", "env_start", "env_end"),
-            )
-        ),
-        ("auxv", ctypes.c_void_p),
-        ("auxv_size", ctypes.c_uint32),
-        ("exe_fd", ctypes.c_uint32),
-    )
-
-
-_IN_STAT = {
-    "start_code": 26,
-    "end_code": 27,
-    "start_stack": 28,
-    "start_data": 45,
-    "end_data": 46,
-    "start_brk": 47,
-}
-"""Fields of proc_pid_stat(5), counted from 1."""
-
-_NO_FILE = 0xFFFFFFFF
-
-_names: list[ctypes.Array[ctypes.c_char]] = []
-"""What the kernel shows of this process, for as long as it lives."""
-
-
-def rename_process(argv: Sequence[str], environment: Mapping[str, str]) -> None:
-    """Have others see this process as if it had been executed so: /proc/PID/cmdline and environ.
-
-    For a fork that is something else than its parent, and for all that it forks. Its own variables
-    are os.environ's.
-
-    Args:
-        argv: its command line; the first is a path.
-        environment: its complete environment.
-
-    Raises:
-        MiddlewareError: the kernel refuses, as one without CONFIG_CHECKPOINT_RESTORE does.
-    """
-    words = b"".join(os.fsencode(each) + b"\0" for each in argv)
-    variables = b"".join(os.fsencode(f"{name}={environment[name]}\0") for name in environment)
-    text = ctypes.create_string_buffer(words + variables)
-    try:
-        stat = Path("/proc/self/stat").read_bytes().rpartition(b")")[2].split()
-        found = {name: int(stat[field - 3]) for name, field in _IN_STAT.items()}
-    except (OSError, ValueError, IndexError) as error:
-        raise MiddlewareError("cannot use /proc/self/stat") from error
-    start = ctypes.addressof(text)
-    map_ = _MemoryMap(**found, exe_fd=_NO_FILE)
-    map_.arg_start, map_.arg_end = start, start + len(words)
-    map_.env_start, map_.env_end = map_.arg_end, map_.arg_end + len(variables)
-    end = ctypes.PyDLL(None).sbrk
-    end.argtypes, end.restype = (ctypes.c_ssize_t,), ctypes.c_void_p
-    arguments = (_PR_SET_MM_MAP, ctypes.addressof(map_), ctypes.sizeof(map_))
-    map_.brk = end(0)  # last, as what is allocated may move it
-    _prctl(_PR_SET_MM, *arguments)
-    _names.append(text)
-    name = ctypes.create_string_buffer(os.fsencode(os.path.basename(argv[0])))  # noqa: PTH119
-    _prctl(_PR_SET_NAME, ctypes.addressof(name))
 
 
 def refuse_new_privileges() -> None:

@@ -5,7 +5,8 @@ writing these lines in a host, and the descriptors that arrive beside the first 
 
 It carries what the lifecycle services and `~/get_configuration` carry, without waiting for
 discovery; both ways drive the same state machine. End of file from the supervisor makes a host shut
-down, unless it was told to KEEP. Imports no rclpy.
+down; without an END before it the supervisor was killed, and nodes are deactivated first. Imports
+no rclpy.
 """
 
 from __future__ import annotations
@@ -58,11 +59,10 @@ class Operation(enum.Enum):
     # announce to the graph anew which nodes are here.
     SEND_AGAIN_SOON = "send_again_soon"
     REPUBLISH_NAMES = "republish_names"
-    # Those that are not answered: all have gathered, go on; and should the supervisor be killed, do
-    # what `on_supervisor_lost` says, or again end with it.
+    # Those that are not answered: all have gathered, go on; and what follows is an orderly end of
+    # file, not that of a supervisor that was killed.
     PROCEED = "proceed"
-    KEEP = "keep"
-    RELEASE = "release"
+    END = "end"
 
 
 INTERFACE_ON_DEMAND = ("alias", "connect_to", "disconnect", "remap")
@@ -99,6 +99,7 @@ class HostSpec:
         unannounced: its participant is made so, see `Unannounced`; only if it gathers.
         names_by_udp: likewise, see ParticipantSettings.
         folders: absolute, of the manifest and what it includes: modules are looked for there.
+        log: file that it appends its output to once its supervisor was killed; empty for none.
     """
 
     system: str
@@ -110,6 +111,7 @@ class HostSpec:
     unannounced: bool = False
     names_by_udp: bool = False
     folders: tuple[str, ...] = ()
+    log: str = ""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,8 +1,8 @@
 """Construct and run the nodes of a host process: carry out the supervisor's commands, report back.
 
 Owns: the order of a host's life: construct every node, say "ready", obey, and at end of file shut
-down and leave, or outlive a supervisor that was killed; which nodes of a process share a
-participant, and what a class must be to be hosted; what is reported without a request; what each
+down and leave, nodes deactivated first if the supervisor was killed; which nodes of a process share
+a participant, and what a class must be to be hosted; what is reported without a request; what each
 Operation of control.py does to the nodes, by the same state machines that the lifecycle services
 drive, and that each command is answered exactly once. It holds no state of its nodes. While the
 user's modules are imported there is nothing to shut down: then it ends at once, and silently.
@@ -12,7 +12,9 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import os
 import signal
+import stat
 import sys
 import threading
 import traceback
@@ -26,7 +28,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from lifecycle import codec
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest import Executor, OnSupervisorLost
+from lifecycle.manifest import Executor
 from lifecycle.middleware import (
     ENDPOINTS_MADE_S,
     BusySign,
@@ -317,7 +319,8 @@ class Host:
         self._lock = threading.Lock()
         self._imports = False
         self._ended = False
-        self._is_kept = False
+        self._output = _Output(spec.log)
+        self._is_orderly = False
         self._proceed = threading.Event()
         self._left = threading.Event()
         self._nodes: dict[str, Hosted] = {}
@@ -517,10 +520,10 @@ class Host:
     def _receive(self) -> bool:
         """Take what the supervisor sends; False once it has ended the channel."""
         if not self._channel.receive():
-            if self._is_kept:
-                self._outlive()
-            else:
+            if self._is_orderly:
                 self._end("end of the control channel")
+            else:
+                self._lose_supervisor()
             return False
         self._obey()
         return True
@@ -536,56 +539,80 @@ class Host:
                 continue
             if command.operation is Operation.PROCEED:
                 self._proceed.set()
-            elif command.operation in (Operation.KEEP, Operation.RELEASE):
-                self._is_kept = command.operation is Operation.KEEP
+            elif command.operation is Operation.END:
+                self._is_orderly = True
             else:
                 self._loop.call_soon(self._execute, command)
 
-    def _outlive(self) -> None:
-        """Go on without the supervisor, which was killed: as before, or with inactive nodes."""
-        self._loop.call_soon(self._serve_all)  # nobody is left to see who asks
-        if self._spec.nodes[0].supervision.on_supervisor_lost is OnSupervisorLost.KEEP:
-            _say("nodes go on (on_supervisor_lost: keep)")
-            return
+    def _lose_supervisor(self) -> None:
+        """Deactivate what is active, and leave, bounded: the supervisor was killed."""
+        self._output.take_over()
+        self._proceed.set()
+        with self._lock:
+            self._ended = True
+            if self._imports:
+                self._leave()
+        _say("nodes are deactivated, and this process ends")
         limit_s = sum(each.spec.timeouts.deactivate_s for each in self._nodes.values()) + _LEAVE_S
         late = f"nodes are not deactivated within {limit_s:g} s after the supervisor has gone"
         guard = threading.Timer(limit_s, self._loop.stop, (late,), {"code": 1})
         guard.daemon = True
         guard.start()
-        self._loop.call_soon(self._deactivate, guard)
+        self._loop.call_soon(self._deactivate)
 
-    async def _serve_all(self) -> None:
-        for hosted in self._nodes.values():
-            for operation in SERVED_ON_DEMAND:
-                hosted.serve(operation)
-
-    async def _deactivate(self, guard: threading.Timer) -> None:
-        """Deactivate what is active, and end this process if that fails: it must not go on."""
-        failed = ""
+    async def _deactivate(self) -> None:
+        """Deactivate what is active, the last one first, and end this process."""
         for hosted in reversed(self._nodes.values()):
             if hosted.spec.managed and hosted.reported.label != "active":
                 continue
             try:
                 result = await hosted.change_for_supervisor("deactivate")
+                failed = result.outcome is not CallbackOutcome.SUCCESS and result.error
             except Exception as error:  # noqa: BLE001 - the user's code
                 traceback.print_exc()
-                failed = f"{hosted.full_name} cannot be deactivated: {error}"
-            else:
-                if result.outcome is not CallbackOutcome.SUCCESS:
-                    failed = f"{hosted.full_name} cannot be deactivated: {result.error}"
-        guard.cancel()
-        if failed:
-            _say(f"{failed}; the process ends")
-            self._loop.stop(failed, code=1)
-        else:
-            _say("nodes are inactive (on_supervisor_lost: deactivate)")
+                failed = str(error)
+            if failed:
+                _say(f"{hosted.full_name} cannot be deactivated: {failed}")
+        self._loop.stop("the supervisor is gone", code=0)
 
     async def _execute(self, command: Command) -> None:
         self._channel.write(await self._commands.execute(command))
 
 
+class _Output:
+    """Standard output and error, which must not break with the supervisor that reads them.
+
+    Args:
+        log: see HostSpec.
+    """
+
+    def __init__(self, log: str) -> None:
+        self._log = log
+        # While we have them open to read, too, writing cannot fail (EPIPE).
+        self._pipes = {
+            number: os.open(f"/proc/self/fd/{number}", os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+            for number in (1, 2)
+            if stat.S_ISFIFO(os.fstat(number).st_mode)
+        }
+
+    def take_over(self) -> None:
+        """Write to the log from now on, what nobody has read first."""
+        try:
+            log = os.open(self._log or os.devnull, os.O_WRONLY | os.O_APPEND | os.O_CLOEXEC)
+        except OSError:
+            log = os.open(os.devnull, os.O_WRONLY | os.O_CLOEXEC)
+        for number, pipe in self._pipes.items():
+            os.dup2(log, number)
+            with contextlib.suppress(BlockingIOError):
+                os.write(log, os.read(pipe, _PIPE_BYTES))
+            os.close(pipe)
+        os.close(log)
+
+
+_PIPE_BYTES = 1 << 16
+
+
 def _say(what: str) -> None:
-    # The fork server reads it now; where that is gone, too, nobody does.
     with contextlib.suppress(OSError):
         sys.stderr.write(f"the supervisor is gone: {what}\n")
         sys.stderr.flush()

@@ -658,6 +658,7 @@ class BringUp:
                     unannounced=self._gathering is not None and self._gathering.unannounced,
                     names_by_udp=self._gathering is not None and self._gathering.names_by_udp,
                     folders=manifest_folders(node.planned for node in nodes),
+                    log=process.log.shown,
                 ),
                 self._system.on_host_event,
                 hung,

@@ -16,7 +16,7 @@ from typing import Protocol
 
 from lifecycle import dataclasses
 from lifecycle.errors import BringUpError
-from lifecycle.manifest import Condition, OnSupervisorLost, RunKind, TargetState
+from lifecycle.manifest import Condition, RunKind, TargetState
 from lifecycle.node import SERVED_ON_DEMAND, Operation
 from lifecycle.node import Event as HostEvent
 from lifecycle.plan import Plan, PlannedNode, PlannedProcess, attached_to, in_mode
@@ -26,6 +26,7 @@ from lifecycle.supervisor.health.liveliness import SilenceMonitor
 from lifecycle.supervisor.nodes.driver import ACTIVE, INACTIVE, NodeCondition, NodeDriver
 from lifecycle.supervisor.processes.adopted_process import AdoptedProcess, RunningNode
 from lifecycle.supervisor.processes.control_channel import ControlChannel
+from lifecycle.supervisor.processes.fork_server_main import GRACE_S
 from lifecycle.supervisor.processes.logs import LogDirectory
 from lifecycle.supervisor.processes.process import ManagedProcess, own_run_delay_s
 from lifecycle.supervisor.run.events import Emitter, NodeChanged, Notice, RequestSent
@@ -265,7 +266,6 @@ _BURST_S = 0.5
 
 _OFFER_S = 5.0
 
-_KEEP = OnSupervisorLost.KEEP
 
 _REPORTING = {
     True: (Reach.CONFIGURED, Reach.CONNECTED, Reach.ACTIVE),
@@ -584,26 +584,14 @@ class System:
                 if each.key in planned.nodes
                 or (each.run.component and each.run.container in planned.nodes)
             ],
-            # A host of ours deactivates its nodes itself.
-            outlives=planned.run.kind is RunKind.PYTHON
-            or all(each.supervision.on_supervisor_lost is _KEEP for each in nodes),
+            # A host of ours deactivates its nodes and shuts them down.
+            grace_s=GRACE_S
+            + sum(
+                each.timeouts.deactivate_s + each.timeouts.shutdown_s
+                for each in nodes
+                if planned.run.kind is RunKind.PYTHON
+            ),
         )
-
-    def keep(self) -> None:
-        """Have each process whose nodes are all active, as far as they are to be, outlive us."""
-        for process in self.processes.values():
-            if not process.is_kept and all(
-                node.is_up and (node.reach is Reach.ACTIVE or not node.is_to_be_active)
-                for node in (self.nodes[key] for key in process.planned.nodes)
-            ):
-                process.keep()
-        if self.server is not None:
-            self.server.keep()
-
-    def release(self) -> None:
-        """Have everything end with us, however we end."""
-        for process in self.living:
-            process.release()
 
     def over(self) -> dict[str, str]:
         """Return how the process ended of each node that has ended by itself as it may."""

@@ -135,14 +135,6 @@ class ControlChannel:
         """Have the host go on, see HostSpec.gathers."""
         self._tell(Operation.PROCEED)
 
-    def keep(self) -> None:
-        """Have the host outlive us, should we be killed, as its manifest says."""
-        self._tell(Operation.KEEP)
-
-    def release(self) -> None:
-        """Have the host end with us again, as it does until `keep`."""
-        self._tell(Operation.RELEASE)
-
     def _tell(self, operation: Operation) -> None:
         """Send what is not answered."""
         if self._writer is not None:
@@ -255,9 +247,10 @@ class ControlChannel:
                 reply.set_exception(error)
 
     async def close(self) -> None:
-        """Close our end, which makes the host shut down."""
+        """End it in order, which makes the host shut down."""
         self._watch_no_more()
         if self._writer is not None:
+            self._tell(Operation.END)
             writer, self._writer = self._writer, None
             writer.close()
             closed = asyncio.ensure_future(writer.wait_closed())

@@ -1,8 +1,8 @@
 """The supervisor's side of a fork server: a `Spawner` over a socket.
 
-Owns: asking it to fork, starting it anew when it was killed, and following its children by
-pidfd, so that an end is noticed at once. Children of a fork server that died become this process's
-own, which then learns by itself how they end and whether they are stopped. Must not import rclpy.
+Owns: asking it to fork, and following its children by pidfd, so that an end is noticed at once. A
+run whose fork server dies fails: its children become this process's own, and are ended. Must not
+import rclpy.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -23,18 +23,16 @@ from lifecycle.errors import BringUpError
 from lifecycle.graph import set_within
 from lifecycle.manifest import RunKind
 from lifecycle.run_directory import PROCESS_VARIABLE
-from lifecycle.supervisor.processes.forerunner import CLOSE_S, ForkServerProcess
 from lifecycle.supervisor.processes.fork_server_main import (
     DISOWN,
-    KEEP,
     LARGEST_MESSAGE,
     MSG_CMSG_CLOEXEC,
-    RELEASE,
     SERVES,
     SWEEP,
     ChildReport,
     ForkRequest,
 )
+from lifecycle.supervisor.processes.fork_server_process import CLOSE_S, ForkServerProcess
 from lifecycle.supervisor.processes.orphans import (
     Lineage,
     belonging,
@@ -43,7 +41,6 @@ from lifecycle.supervisor.processes.orphans import (
     end_left,
 )
 from lifecycle.supervisor.processes.process import ProcessExit, SpawnRequest, run_delay_s
-from lifecycle.supervisor.run.events import Emitter, Notice
 
 if TYPE_CHECKING:
     from lifecycle.plan import PlannedProcess
@@ -55,15 +52,8 @@ _STATUS_WAIT_S = 1.0
 _READY_S = 10.0
 """A fork server serves after 0.2 s; a loaded machine takes longer."""
 
-_SOON_S = 2.0
-"""One that dies sooner after its start is started again only when it is needed."""
-
-_TRIES = 3
-
 _SWEPT_S = 5.0
 """A sweep takes milliseconds, on a loaded machine longer; what is left is swept at the end."""
-
-_STOPS = os.WSTOPPED | os.WCONTINUED | os.WNOHANG
 
 _HOST = "lifecycle.node.host.host"
 
@@ -77,7 +67,6 @@ class ForkServerChild:
     Args:
         on_stop: see SpawnRequest.
         lineage: which processes descend from it.
-        send: sends the fork server a message with descriptors.
         group: the cgroup that it joins; None for none.
     """
 
@@ -87,14 +76,12 @@ class ForkServerChild:
         pidfd: int,
         on_stop: Callable[[bool], None],
         lineage: Lineage,
-        send: Callable[[str, Collection[int]], None],
         *,
         group: ProcessCgroup | None = None,
     ) -> None:
         self.pid = pid
         self._group = group
         self._clearing: asyncio.Future[None] | None = None
-        self._send = send
         self._lineage = lineage
         self.exited: asyncio.Future[ProcessExit] = asyncio.get_running_loop().create_future()
         self.on_stop = on_stop
@@ -114,17 +101,6 @@ class ForkServerChild:
             # It has not reached setsid yet, or only its pidfd is left of it.
             with contextlib.suppress(ProcessLookupError):
                 signal.pidfd_send_signal(self._pidfd, number)
-
-    def keep(self, log: str, outputs: Collection[int]) -> None:
-        """Have the fork server spare it, and read its output, should this process be killed.
-
-        Children of a fork server that died are not known to another one, which ends them then.
-        """
-        self._send(f"{KEEP}\n{self.pid}\n{log}", outputs)
-
-    def release(self) -> None:
-        """Have the fork server end it, should this process be killed."""
-        self._send(f"{RELEASE}\n{self.pid}\n", ())
 
     @property
     def cgroup(self) -> Path | None:
@@ -150,23 +126,11 @@ class ForkServerChild:
         else:
             self._loop.call_later(_STATUS_WAIT_S, self.settle, None)
 
-    def adopt(self) -> None:
-        """Take it as our own child: the fork server has died, and we are the subreaper."""
+    def orphaned(self) -> None:
+        """Learn by ourselves how it ends: the fork server has died, and we are the subreaper."""
         self._is_ours = True
         if self._has_ended:
             self.settle(None)
-        self.note_stops()
-
-    def note_stops(self) -> None:
-        """Report that it was stopped or continues, where we are its parent."""
-        if not self._is_ours:
-            return
-        with contextlib.suppress(ChildProcessError):
-            while (
-                self._pidfd is not None
-                and (found := os.waitid(os.P_PIDFD, self._pidfd, _STOPS)) is not None
-            ):
-                self.on_stop(found.si_code != os.CLD_CONTINUED)
 
     def settle(self, raw: int | None) -> None:
         """Take the wait status, or find it ourselves."""
@@ -199,21 +163,17 @@ class _Pending(NamedTuple):
 
 
 class ForkServer:
-    """A `Spawner` that asks a process to fork, and starts another one if that is killed.
+    """A `Spawner` that asks a process to fork.
 
     Args:
-        process: the first one.
-        emit: where it is reported if one dies.
+        process: that process; ended by `close`.
         recorder: notes the cgroup of the run; None where no process has resources.
+
+    Attributes:
+        died: resolves with how, if it ends unasked; nothing can be started any more.
     """
 
-    def __init__(
-        self,
-        process: ForkServerProcess,
-        emit: Emitter | None = None,
-        recorder: RunRecorder | None = None,
-    ) -> None:
-        self._emit = emit or Emitter()
+    def __init__(self, process: ForkServerProcess, recorder: RunRecorder | None = None) -> None:
         self._recorder = recorder
         self._cgroup: RunCgroup | None = None
         self._pending: dict[int, _Pending] = {}
@@ -224,9 +184,16 @@ class ForkServer:
         # Of a shell that became this process by exec: no part of the run.
         self._foreign = children()
         self._lineage = Lineage()
-        self._has_died = False
+        self.died: asyncio.Future[str] = self._loop.create_future()
         self._closed = False
-        self._begin(process)
+        self._process = process
+        self._alive = True
+        self._serves = asyncio.Event()
+        self._gone = asyncio.Event()
+        self._pidfd = os.pidfd_open(process.popen.pid)
+        process.socket.setblocking(False)
+        self._loop.add_reader(process.socket, self._reports)
+        self._loop.add_reader(self._pidfd, self._ended)
 
     @property
     def pid(self) -> int:
@@ -241,35 +208,38 @@ class ForkServer:
     def family(self) -> frozenset[int]:
         """Return the pids of all that descends from what was started, but for the fork server."""
         roots = {self.pid}
-        if self._has_died:
+        if self.died.done():
             # What it had adopted, and what it had started, is ours now.
             roots |= children() - self._foreign
         return frozenset(roots.union(*map(descendants, roots)) - {self.pid})
 
     async def ready(self) -> None:
-        """Have the fork server answer, bounded; if it has died, another one.
+        """Have the fork server answer, bounded.
 
         Raises:
-            BringUpError: it does not, or cannot be started.
+            BringUpError: it does not, or has died.
         """
-        deadline = self._loop.time() + _READY_S
-        for _ in range(_TRIES):
-            if not self._alive and not self._closed:
-                self._begin(self._process.again())
-            process, gone = self._process, self._gone
-            self._serves.clear()
-            try:
-                process.socket.send(to_json(SERVES))
-            except ConnectionError:
-                await set_within(gone, deadline - self._loop.time())
-                continue
-            except OSError as error:
-                raise BringUpError(f"cannot ask the fork server: {error.strerror}") from error
-            if not await set_within(self._serves, deadline - self._loop.time()):
-                raise BringUpError(f"the fork server does not answer within {_READY_S:g} s")
-            if self._alive and process is self._process:
-                return
-        raise BringUpError(f"the fork server {self._how}")
+        self._serves.clear()
+        with self._asking():
+            self._process.socket.send(to_json(SERVES))
+        if not await set_within(self._serves, _READY_S):
+            raise BringUpError(f"the fork server does not answer within {_READY_S:g} s")
+        self._check()
+
+    @contextlib.contextmanager
+    def _asking(self) -> Iterator[None]:
+        """Raise BringUpError if it has died, or cannot be asked."""
+        self._check()
+        try:
+            yield
+        except ConnectionError as error:  # it is dying: nothing was forked
+            raise BringUpError("the fork server has died") from error
+        except OSError as error:
+            raise BringUpError(f"cannot ask the fork server: {error.strerror}") from error
+
+    def _check(self) -> None:
+        if not self._alive:
+            raise BringUpError(self.died.result() if self.died.done() else "the fork server ended")
 
     def confine(self, processes: Iterable[PlannedProcess]) -> None:
         """Make the run's cgroup, where processes ask for resources, see `Spawner`.
@@ -301,13 +271,7 @@ class ForkServer:
             if request.resources is not None:
                 assert self._cgroup is not None
                 group = self._cgroup.make(request.name, request.resources)
-            if not self._alive:
-                await self.ready()
-            try:
-                return await self._forked(request, group)
-            except ConnectionError:  # it is dying: nothing was forked
-                await self.ready()
-                return await self._forked(request, group)
+            return await self._forked(request, group)
         except (BringUpError, OSError) as error:
             if group is not None:
                 await group.end()
@@ -315,7 +279,7 @@ class ForkServer:
             raise BringUpError(f"cannot start process {request.name!r}: {message}") from error
 
     async def _forked(self, request: SpawnRequest, group: ProcessCgroup | None) -> ForkServerChild:
-        """Have it fork; raises OSError if it cannot be asked, BringUpError otherwise."""
+        """Have it fork; raises BringUpError if it cannot."""
         self._next += 1
         descriptors = [request.stdout, request.stderr]
         argv = request.argv
@@ -333,15 +297,13 @@ class ForkServer:
             control=request.control is not None,
             limits=request.limits,
             no_new_privileges=request.no_new_privileges,
+            grace_s=request.grace_s,
             cgroup="" if group is None else group.procs,
         )
         born: asyncio.Future[ForkServerChild] = self._loop.create_future()
-        self._pending[message.id] = _Pending(born, request, group)
-        try:
+        with self._asking():
             socket.send_fds(self._process.socket, [to_json(message)], descriptors)
-        except OSError:
-            del self._pending[message.id]
-            raise
+        self._pending[message.id] = _Pending(born, request, group)
         return await born
 
     def belonging(self, processes: Mapping[int, str]) -> frozenset[int]:
@@ -365,7 +327,7 @@ class ForkServer:
 
     def disown_ports(self) -> None:
         """Have all participants of this host send no more to ports whose process was killed."""
-        self._send(DISOWN, ())
+        self._send(DISOWN)
 
     async def sweep(self, names: Collection[str]) -> tuple[str, ...]:
         """Have files of shared memory removed that are unused, see `lifecycle.middleware.sweep`.
@@ -378,28 +340,16 @@ class ForkServer:
         self._next += 1
         number, swept = self._next, self._loop.create_future()
         self._sweeping[number] = swept
-        self._send("\n".join((SWEEP, str(number), *names)), ())
+        self._send("\n".join((SWEEP, str(number), *names)))
         done, _ = await asyncio.wait((swept,), timeout=_SWEPT_S)
         self._sweeping.pop(number, None)
         return swept.result() if done else ()
 
-    def _send(self, message: str, descriptors: Collection[int]) -> None:
+    def _send(self, message: str) -> None:
         """Send what is not answered; one that has died is noticed elsewhere."""
         if self._alive:
             with contextlib.suppress(OSError):
-                socket.send_fds(self._process.socket, [message.encode()], list(descriptors))
-
-    def _begin(self, process: ForkServerProcess) -> None:
-        self._process = process
-        self._alive = True
-        self._how = ""
-        self._serves = asyncio.Event()
-        self._gone = asyncio.Event()
-        self._began_s = self._loop.time()
-        self._pidfd = os.pidfd_open(process.popen.pid)
-        process.socket.setblocking(False)
-        self._loop.add_reader(process.socket, self._reports)
-        self._loop.add_reader(self._pidfd, self._ended)
+                self._process.socket.send(message.encode())
 
     def _reports(self) -> None:
         """Take one report; at end of file it is about to end."""
@@ -442,7 +392,7 @@ class ForkServer:
                 born.set_exception(BringUpError(report.error))
             return
         child = ForkServerChild(
-            report.pid, descriptors[0], request.on_stop, self._lineage, self._send, group=group
+            report.pid, descriptors[0], request.on_stop, self._lineage, group=group
         )
         self._children[report.id] = child
         child.exited.add_done_callback(lambda _: self._children.pop(report.id, None))
@@ -465,50 +415,30 @@ class ForkServer:
         self._loop.remove_reader(self._process.socket)
         self._process.socket.close()
         self._alive = False
-        self._has_died = True
         exit_ = ProcessExit(status=status) if status >= 0 else ProcessExit(signal=-status)
-        self._how = f"ended unasked ({exit_})"
+        self.died.set_result(f"the fork server (pid {self.pid}) ended unasked: {exit_}")
+        self._serves.set()
         for child in tuple(self._children.values()):
-            child.adopt()
+            child.orphaned()
         for born, _, _ in self._pending.values():
             if not born.done():
-                born.set_exception(BringUpError(f"the fork server {self._how}"))
+                born.set_exception(BringUpError(self.died.result()))
         self._pending.clear()
         for swept in self._sweeping.values():
             swept.set_result(())
         self._sweeping.clear()
-        self._renew()
-
-    def _renew(self) -> None:
-        """Start another one, and say so."""
-        lost, waits = f"the fork server (pid {self.pid}) {self._how}", self._serves
-        what = "another one is started when it is needed"
-        if self._loop.time() - self._began_s > _SOON_S:
-            try:
-                self._begin(self._process.again())
-                what = f"another one (pid {self.pid}) is started"
-            except BringUpError as error:
-                what = error.message
-        waits.set()
-        self._emit(Notice(message=f"{lost}; what it started runs on, and {what}"))
-
-    def note_stops(self) -> None:
-        """Take SIGCHLD: children that were left to us may have been stopped, or continue."""
-        for child in tuple(self._children.values()):
-            child.note_stops()
 
     async def close(self) -> None:
         """End the fork server; its children must have ended. Then the run's cgroup is removed."""
         await self._end()
-        if self._cgroup is not None and (left := self._cgroup.close()):
-            self._emit(Notice(message=left))
+        if self._cgroup is not None:
+            self._cgroup.close()
 
     async def _end(self) -> None:
         self._closed = True
         if not self._alive:
             return
         self._alive = False
-        self._how = "is ended"
         self._loop.remove_reader(self._process.socket)
         self._process.socket.close()
         if not await set_within(self._gone, CLOSE_S):

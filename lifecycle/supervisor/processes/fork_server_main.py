@@ -1,15 +1,12 @@
-"""The fork server's own process: forks the processes of a system, and guards them.
+"""The fork server's own process: forks the processes of a system.
 
 Owns: what runs in `python -m lifecycle.supervisor.processes.fork_server_main SOCKET_FD [--preload]
-[--programs] [--again]`, or in a fork of the supervisor that is made to be the same (`become`), so
-that what both need is imported once. It stays single-threaded and never calls rclpy.init, so that
-forking is safe and every child is a participant of its own; with `--preload` a forked host skips
-~130 ms of imports. For the same reason it is who handles shared memory that processes have left
+[--programs]`. It stays single-threaded and never calls rclpy.init, so that forking is safe and
+every child is a participant of its own; with `--preload` a forked host skips ~130 ms of imports.
+For the same reason it handles shared memory that processes have left
 (lifecycle.middleware.process.shared_memory). Each child leads a session of its own. It adopts what
 its children leave behind (PR_SET_CHILD_SUBREAPER), so as long as it lives, what descends from it is
-what the run started. If the supervisor vanishes it ends what is left of its children, bounded, and
-of those of a fork server before it that was killed; those that are to be kept it reads, so that
-none of them writes to a pipe without a reader.
+what the run started. If the supervisor vanishes it ends what is left of its children, bounded.
 """
 
 from __future__ import annotations
@@ -24,9 +21,9 @@ import sys
 import time
 import traceback
 import warnings
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import NoReturn
 
 from lifecycle import dataclasses
 from lifecycle.codec import from_json, to_json
@@ -35,22 +32,20 @@ from lifecycle.middleware import (
     adopt_orphans,
     disown_ports,
     drop_network_administration,
-    fill_heap,
     limit_resources,
     refuse_new_privileges,
-    rename_process,
     sweep,
 )
-from lifecycle.supervisor.processes.forerunner import PRELOAD
-
-if TYPE_CHECKING:
-    from lifecycle.supervisor.processes.logs import ProcessLog
+from lifecycle.supervisor.processes.fork_server_process import PRELOAD
 
 LARGEST_MESSAGE = 1 << 18
 """Bytes; a request is one datagram, its argv and variables must fit."""
 
 MSG_CMSG_CLOEXEC = 0x40000000
 """recvmsg(2): descriptors arrive close-on-exec; the socket module does not name it."""
+
+GRACE_S = 4.0
+"""How long orphans get to end by themselves once the supervisor is gone."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,6 +56,7 @@ class ForkRequest:
         id: ≥ 1; 0 only asks whether the fork server serves, which answers with the same id.
         limits: see SpawnRequest.
         no_new_privileges: likewise.
+        grace_s: seconds that the process gets to end by itself once the supervisor is gone.
         cgroup: file that it writes to join its cgroup; empty to stay in that of the fork server.
     """
 
@@ -71,6 +67,7 @@ class ForkRequest:
     control: bool
     limits: tuple[tuple[str, int], ...] = ()
     no_new_privileges: bool = False
+    grace_s: float = GRACE_S
     cgroup: str = ""
 
 
@@ -99,84 +96,30 @@ class ChildReport:
     swept: tuple[str, ...] | None = None
 
 
-KEEP = "keep"
-"""Begins a message: should the supervisor vanish, spare the child of this pid, and write its output
-to this file; one a line, with our ends of its output."""
-
-RELEASE = "release"
-"""Begins a message: should the supervisor vanish, end the child of this pid, as all others."""
-
 DISOWN = "disown"
 """A message: have all let go of ports in shared memory whose process was killed; not answered."""
 
 SWEEP = "sweep"
 """Begins a message: remove unused files of shared memory; an id and their names, one a line."""
 
-
-GRACE_S = 4.0
-"""How long orphans get to end by themselves once the supervisor is gone."""
-
 _CHILD_SIGNAL = -1
 _ENDED = os.WEXITED | os.WNOWAIT | os.WNOHANG
 _STOPS = os.WSTOPPED | os.WCONTINUED | os.WNOHANG
-_PIPE_BYTES = 65536
-_STDOUT, _STDERR = 1, 2
+_WAKEUP_BYTES = 4096
 
 
-class _Kept:
-    """A child that outlives the supervisor, and its output.
-
-    Attributes:
-        log: file that it is written to; empty for none.
-    """
-
-    def __init__(self, log: str, outputs: Iterable[int]) -> None:
-        self.log = log
-        self.outputs = list(outputs)
-        self._rest = b""
-        self._file: ProcessLog | None = None
-
-    def open(self) -> None:
-        """Begin to write its log; nobody else does any more."""
-        from lifecycle.supervisor.processes.logs import LogDirectory, ProcessLog
-
-        if self.log:
-            path = Path(self.log)
-            self._file = ProcessLog(LogDirectory(path.parent, lambda _: None), path.stem)
-            self._file.open()
-
-    def read(self, output: int) -> bool:
-        """Take what it wrote; False at end of file."""
-        try:
-            data = os.read(output, _PIPE_BYTES)
-        except BlockingIOError:
-            return True
-        *lines, self._rest = (self._rest + data).split(b"\n")
-        if len(self._rest) >= _PIPE_BYTES or not data:
-            lines, self._rest = [*lines, self._rest], b""
-        for line in lines:
-            if self._file is not None and line:
-                self._file.add(line.decode(errors="replace"))
-        return bool(data)
-
-    def close(self) -> None:
-        """Give up its output."""
-        for each in self.outputs:
-            os.close(each)
-        self.outputs = []
-        if self._file is not None:
-            self._file.close()
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class _Child:
+    request: ForkRequest
+    pidfd: int
 
 
 class _ForkServer:
-    def __init__(self, sock: socket.socket, *, again: bool) -> None:
+    def __init__(self, sock: socket.socket) -> None:
         self._sock = sock
-        self._again = again
-        self._serves = True
         self._selector = selectors.DefaultSelector()
         self._selector.register(sock, selectors.EVENT_READ, None)
-        self._children: dict[int, tuple[int, int]] = {}  # pid → (request id, pidfd)
-        self._kept: dict[int, _Kept] = {}  # by pid
+        self._children: dict[int, _Child] = {}  # by pid
         # SIGCHLD notifies a parent that a child was stopped; nothing else does.
         self._signals = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
         signal.signal(signal.SIGCHLD, _arrived)
@@ -185,16 +128,15 @@ class _ForkServer:
 
     def serve(self) -> None:
         """Fork on request and report ends until the supervisor closes its side."""
-        while True:
+        serves = True
+        while serves:
             for key, _ in self._selector.select():
-                if key.data == _CHILD_SIGNAL:
-                    self._note_stops()
-                    self._bury_adopted()
-                elif key.data is not None:
-                    self._reap(key.data)
+                if key.data is not None:
+                    self._bury(key.data)
                 elif not self._request():
-                    self._guard()
-                    return
+                    serves = False
+        self._selector.unregister(self._sock)
+        self._end_all()
 
     def _request(self) -> bool:
         """Serve one request; False at end of file."""
@@ -208,22 +150,16 @@ class _ForkServer:
             return False
         if data.startswith(b"{"):
             self._fork(from_json(data, ForkRequest), descriptors)
-        else:
-            self._obey(data.decode(), descriptors)
-        return True
-
-    def _obey(self, message: str, descriptors: Collection[int]) -> None:
-        """Do what one of the words above says."""
-        word, *lines = message.split("\n")
+            return True
+        word, *lines = data.decode().split("\n")
         if word == DISOWN:
             disown_ports()
         elif word == SWEEP:
             number, *names = lines
             self._tell(ChildReport(id=int(number), swept=sweep(names)))
-        elif word in (KEEP, RELEASE):
-            self._keep(message, descriptors)
         elif word == PRELOAD:
-            _preload_for_some(lines)
+            _preload(lines)
+        return True
 
     def _fork(self, request: ForkRequest, descriptors: list[int]) -> None:
         if request == SERVES:
@@ -243,61 +179,39 @@ class _ForkServer:
         for descriptor in descriptors:
             os.close(descriptor)
         if pid > 0:
-            self._born(request.id, pid)
+            pidfd = os.pidfd_open(pid)
+            self._children[pid] = _Child(request=request, pidfd=pidfd)
+            self._selector.register(pidfd, selectors.EVENT_READ, pid)
+            self._tell(ChildReport(id=request.id, pid=pid), pidfd)
 
-    def _keep(self, message: str, outputs: Iterable[int]) -> None:
-        """Spare a child should the supervisor vanish, or not any more."""
-        what, pid, log = message.split("\n", 2)
-        kept = _Kept(log, outputs)
-        if what == KEEP and int(pid) in self._children:
-            self._kept[int(pid)] = kept
-        else:
-            kept.close()
-            self._give_up(int(pid))
-
-    def _give_up(self, pid: int) -> None:
-        """Keep a child no more."""
-        if (kept := self._kept.pop(pid, None)) is not None:
-            for each in kept.outputs:
-                with contextlib.suppress(KeyError):
-                    self._selector.unregister(each)
-                if not self._serves:
-                    kept.read(each)
-            kept.close()
-
-    def _born(self, request: int, pid: int) -> None:
-        pidfd = os.pidfd_open(pid)
-        self._children[pid] = (request, pidfd)
-        self._selector.register(pidfd, selectors.EVENT_READ, pid)
-        self._tell(ChildReport(id=request, pid=pid), pidfd)
-
-    def _reap(self, pid: int) -> None:
-        if pid not in self._children:
-            return  # on the way to an adopted one
-        request, pidfd = self._children.pop(pid)
-        self._selector.unregister(pidfd)
-        os.close(pidfd)
-        _, status = os.waitpid(pid, 0)
-        self._give_up(pid)
-        self._tell(ChildReport(id=request, pid=pid, status=status))
+    def _bury(self, pid: int) -> None:
+        """Reap a child that has ended, or whatever SIGCHLD has announced."""
+        if pid == _CHILD_SIGNAL:
+            self._note_stops()
+            self._bury_adopted()
+        elif pid in self._children:  # not buried on the way to an adopted one
+            child = self._children.pop(pid)
+            self._selector.unregister(child.pidfd)
+            os.close(child.pidfd)
+            _, status = os.waitpid(pid, 0)
+            self._tell(ChildReport(id=child.request.id, pid=pid, status=status))
 
     def _note_stops(self) -> None:
         """Report which children were stopped or continue."""
         with contextlib.suppress(BlockingIOError):
-            os.read(self._signals[0], _PIPE_BYTES)
+            os.read(self._signals[0], _WAKEUP_BYTES)
         with contextlib.suppress(ChildProcessError):
             while (found := os.waitid(os.P_ALL, 0, _STOPS)) is not None:
-                if found.si_pid in self._children:
-                    request, _ = self._children[found.si_pid]
+                if child := self._children.get(found.si_pid):
                     stopped = found.si_code != os.CLD_CONTINUED
-                    self._tell(ChildReport(id=request, pid=found.si_pid, stopped=stopped))
+                    self._tell(ChildReport(id=child.request.id, pid=found.si_pid, stopped=stopped))
 
     def _bury_adopted(self) -> None:
         """Reap orphans that have ended, and children where one of them is in between."""
         with contextlib.suppress(ChildProcessError):
             while (found := os.waitid(os.P_ALL, 0, _ENDED)) is not None:
                 if found.si_pid in self._children:
-                    self._reap(found.si_pid)
+                    self._bury(found.si_pid)
                 else:
                     os.waitpid(found.si_pid, 0)
 
@@ -306,50 +220,24 @@ class _ForkServer:
         with contextlib.suppress(ConnectionError):
             socket.send_fds(self._sock, [to_json(report)], descriptors)
 
-    def _guard(self) -> None:
-        """End what is left: hosts end by themselves at end of file, commands are asked to.
+    def _end_all(self) -> None:
+        """End what is left, bounded: the supervisor is gone.
 
-        What is kept is read until it ends; that may be asked for by the next `up`, or by `down`.
+        Hosts notice the end of their control channel, deactivate their nodes and end by themselves;
+        commands are asked to.
         """
-        self._serves = False
-        self._selector.unregister(self._sock)
-        for kept in self._kept.values():
-            kept.open()
-            for output in kept.outputs:
-                self._selector.register(output, selectors.EVENT_READ, kept)
-        self._signal(signal.SIGINT)
-        deadline = time.monotonic() + GRACE_S
-        while self._doomed() and (left := deadline - time.monotonic()) > 0:
-            self._attend(left)
-        self._signal(signal.SIGKILL)
-        for pid in self._doomed():
-            self._reap(pid)
-        if self._again:
-            from lifecycle.run_directory import RUN_VARIABLE
-            from lifecycle.supervisor.processes.orphans import end_strays
-
-            end_strays(os.environ.get(RUN_VARIABLE, ""), spare=self._kept)
-        while self._kept:
-            self._attend(None)
-
-    def _attend(self, limit_s: float | None) -> None:
-        """Bury children that have ended, and take what those that are kept write."""
-        for key, _ in self._selector.select(limit_s):
-            if key.data == _CHILD_SIGNAL:
-                self._note_stops()
-                self._bury_adopted()
-            elif not isinstance(key.data, _Kept):
-                self._reap(key.data)
-            elif key.fd in key.data.outputs and not key.data.read(key.fd):
-                self._selector.unregister(key.fd)
-
-    def _doomed(self) -> tuple[int, ...]:
-        return tuple(pid for pid in self._children if pid not in self._kept)
-
-    def _signal(self, number: int) -> None:
-        for pid in self._doomed():
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(pid, number)
+        began_s = time.monotonic()
+        for pid, child in self._children.items():
+            if not child.request.control:
+                _signal(pid, signal.SIGINT)
+        while self._children:
+            passed_s = time.monotonic() - began_s
+            left_s = {pid: c.request.grace_s - passed_s for pid, c in self._children.items()}
+            for pid, each_s in left_s.items():
+                if each_s <= 0:
+                    _signal(pid, signal.SIGKILL)
+            for key, _ in self._selector.select(max(0.0, min(left_s.values())) or None):
+                self._bury(key.data)
 
     def _become(self, request: ForkRequest, descriptors: list[int]) -> NoReturn:
         """Turn this fork into the requested process; never returns to the fork server's code."""
@@ -362,10 +250,8 @@ class _ForkServer:
                 os.close(descriptor)
             self._selector.close()
             self._sock.close()
-            for _, pidfd in self._children.values():
-                os.close(pidfd)
-            for kept in self._kept.values():
-                kept.close()
+            for child in self._children.values():
+                os.close(child.pidfd)
             # A host takes them itself, once there is something to shut down; until then it ends
             # at once, and without a KeyboardInterrupt in the middle of an import.
             signal.signal(signal.SIGINT, signal.SIG_DFL)
@@ -390,6 +276,12 @@ class _ForkServer:
 
 def _arrived(number: int, frame: object) -> None:
     """Replace the default, which notifies nothing; the wake-up descriptor ends the select."""
+
+
+def _signal(pid: int, number: int) -> None:
+    """Signal a child's group, which it leads once it has reached setsid."""
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(pid, number)
 
 
 def _take_streams(stdout: int, stderr: int) -> None:
@@ -425,12 +317,7 @@ def _join(procs: str) -> None:
 
 
 def _run(argv: tuple[str, ...], control: int | None) -> int:
-    """Serve as our host, or become another program.
-
-    A host ends by itself when its control channel does. A command has none: it outlives a fork
-    server that is killed, as hosts do, and is ended by the supervisor, the next fork server or the
-    next `up`.
-    """
+    """Serve as our host, or become another program."""
     if not argv:
         assert control is not None
         from lifecycle.node import serve
@@ -456,131 +343,36 @@ def _reseed() -> None:
         numpy_random.seed()
 
 
-_BLAS_TIMEOUT = "OPENBLAS_THREAD_TIMEOUT"
-"""The logarithm of how many cycles a thread of OpenBLAS looks for work before it sleeps."""
-
-
-@contextlib.contextmanager
-def _idle_blas() -> Iterator[None]:
-    """Have threads that numpy starts when it is imported sleep at once, as nothing uses them yet.
-
-    Else they look for work for 26 ms and more, each of them, while all processors are needed. What
-    a node calculates wakes them, in microseconds.
-    """
-    before = os.environ.get(_BLAS_TIMEOUT)
-    os.environ.setdefault(_BLAS_TIMEOUT, "4")  # the least
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ[_BLAS_TIMEOUT]
-
-
-def _preload() -> None:
-    from lifecycle.node import preload
-
-    with _pages_shared():
-        preload()
-
-
-def _preload_for_some(names: Iterable[str]) -> None:
-    from lifecycle.node import preload_for_some
-
-    with _pages_shared():
-        preload_for_some(names)
-
-
 @contextlib.contextmanager
 def _pages_shared() -> Iterator[None]:
-    """Keep the pages of what is imported inside shared: a first collection would touch them.
-
-    None takes place meanwhile: importing makes next to no garbage, and a lot to look through.
-    """
+    """Keep the pages of what is imported inside shared: a first collection would touch them."""
     gc.disable()
-    with _idle_blas():
-        yield
-    fill_heap()
+    yield
     gc.freeze()
     gc.enable()
 
 
-def import_shared() -> None:
-    """Import what a supervisor needs as well as a fork server, before one becomes the other."""
-    from lifecycle.node import preload_shared
+def _preload(types: Iterable[str]) -> None:
+    """Import what every Python node has, and interface types."""
+    from lifecycle.node import preload
 
-    with _idle_blas():
-        preload_shared()
-
-
-def become(
-    argv: Sequence[str], environment: Mapping[str, str], control: int, mask: Iterable[int]
-) -> NoReturn:
-    """Turn a fork of a supervisor into what `argv` would start; never returns.
-
-    Like a program it has an environment, a command line and a session of its own, the descriptors
-    and handlers of signals that a program would inherit, and none of its parent's threads. Where
-    the kernel does not let it have that environment for all to see, by which others recognise what
-    belongs to a run, it executes the program.
-
-    Args:
-        argv: a command line of this module, by `python -m`.
-        environment: complete.
-        control: descriptor of its socket.
-        mask: of signals; while this is called all are blocked.
-    """
-    os.setsid()
-    for number in map(int, signal.valid_signals()):
-        if callable(signal.getsignal(number)):
-            signal.signal(number, signal.SIG_DFL)
-    for each in os.listdir("/proc/self/fd"):  # noqa: PTH208 - names are numbers
-        if int(each) > _STDERR and int(each) != control:
-            with contextlib.suppress(OSError):  # that by which they are listed
-                os.close(int(each))
-    null = os.open(os.devnull, os.O_RDONLY)
-    os.dup2(null, 0)
-    os.close(null)
-    try:
-        rename_process(argv, environment)
-    except MiddlewareError:
-        os.set_inheritable(control, True)
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-        os.execve(argv[0], [*argv], environment)  # noqa: S606 - as the supervisor would
-    for name in os.environ.keys() - environment.keys():
-        del os.environ[name]
-    os.environ.update(environment)
-    # The supervisor has streams of its own, and a thread that writes one of them.
-    sys.stdin, sys.stdout, sys.stderr = sys.__stdin__, sys.__stdout__, sys.__stderr__
-    for name, number in (("stdout", _STDOUT), ("stderr", _STDERR)):
-        if getattr(sys, name) is None:
-            setattr(sys, name, os.fdopen(number, "w", closefd=False))
-    module = sys.modules[__name__]
-    sys.modules["__main__"] = module
-    sys.orig_argv = [*argv]
-    sys.argv = [str(module.__file__), *argv[3:]]
-    if not getattr(sys.flags, "safe_path", False):
-        sys.path[0] = os.getcwd()  # noqa: PTH109 - it is a text
-    main(mask)
+    with _pages_shared():
+        preload(types)
 
 
-def main(mask: Iterable[int] | None = None) -> NoReturn:
-    """Run the fork server: the arguments of this program are what a ForkServerProcess gives it.
-
-    Args:
-        mask: of signals, once they are handled; None leaves it.
-    """
+def main() -> NoReturn:
+    """Run the fork server: the arguments of this program are what a ForkServerProcess gives it."""
     descriptor, *options = sys.argv[1:]
     # Ctrl-C is the supervisor's to handle, and its end is what ends us.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    if mask is not None:
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
     adopt_orphans()
     if "--programs" in options and os.geteuid() != 0:
         drop_network_administration()
     if "--preload" in options:
-        _preload()
+        _preload(())
     with socket.socket(fileno=int(descriptor)) as control:
-        _ForkServer(control, again="--again" in options).serve()
+        _ForkServer(control).serve()
     os._exit(0)
 
 

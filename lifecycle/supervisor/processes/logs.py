@@ -192,11 +192,6 @@ class LineReader:
         os.set_blocking(descriptor, False)
         self._loop.add_reader(descriptor, self._read)
 
-    @property
-    def descriptors(self) -> tuple[int, ...]:
-        """The pipe; nothing once it is closed."""
-        return (self._descriptor,) if self._open else ()
-
     def drain(self) -> None:
         """Read what is there: of a process that has ended, its last words."""
         for _ in range(_LARGEST_PIPE // LONGEST_LINE):

@@ -25,6 +25,7 @@ from lifecycle.plan import PlannedProcess
 from lifecycle.printable import log_line
 from lifecycle.supervisor.control.protocol import ProcessState
 from lifecycle.supervisor.processes.control_channel import ControlChannel
+from lifecycle.supervisor.processes.fork_server_main import GRACE_S
 from lifecycle.supervisor.processes.logs import (
     LineReader,
     LogDirectory,
@@ -138,6 +139,7 @@ class SpawnRequest:
             continues.
         limits: (name, value) of setrlimit(2), `RLIMIT_NOFILE`.
         no_new_privileges: see prctl(2), PR_SET_NO_NEW_PRIVS.
+        grace_s: seconds that it gets to end by itself should the supervisor be killed.
         resources: of a cgroup of its own, see `Spawner.confine`; None for none.
     """
 
@@ -152,6 +154,7 @@ class SpawnRequest:
     prefix: tuple[str, ...] = ()
     limits: tuple[tuple[str, int], ...] = ()
     no_new_privileges: bool = False
+    grace_s: float = GRACE_S
     resources: Resources | None = None
 
 
@@ -172,17 +175,6 @@ class Child(Protocol):
 
     def signal(self, number: int) -> None:
         """Send a signal to the process and everything in its group; harmless once it ended."""
-
-    def keep(self, log: str, outputs: Collection[int]) -> None:
-        """Leave it running should this supervisor be killed.
-
-        Args:
-            log: file that its output is written to then; empty for none.
-            outputs: descriptors of our ends of its output, for who reads it then.
-        """
-
-    def release(self) -> None:
-        """Have it end with this supervisor again, as it does until `keep`."""
 
     def run_delay_s(self) -> float:
         """Return the seconds that its threads have waited for a processor, added up.
@@ -274,7 +266,7 @@ class ManagedProcess:
     Args:
         nodes: keys of its nodes by their full names; of several, each has a log file of its own
             beside the process's, with the lines of its logger.
-        outlives: `keep` has it outlive a supervisor that is killed.
+        grace_s: see SpawnRequest.
 
     Attributes:
         planned: what the plan declares of it.
@@ -290,7 +282,6 @@ class ManagedProcess:
         started_s: when it was spawned, in seconds since the supervisor started.
         is_restarted: another one ran in its place before.
         joins: others ran before it that have to discover it, and go on.
-        is_kept: it outlives a supervisor that is killed.
         last_stderr: the last line that it wrote to standard error; empty if none.
     """
 
@@ -303,13 +294,12 @@ class ManagedProcess:
         variables: tuple[tuple[str, str], ...] = (),
         nodes: Mapping[str, str] | None = None,
         may_end: bool = False,
-        outlives: bool = True,
+        grace_s: float = GRACE_S,
         carries: Iterable[str] = (),
     ) -> None:
         self.planned = planned
         self.carries = tuple(carries)
-        self._outlives = outlives
-        self.is_kept = False
+        self._grace_s = grace_s
         self.may_end = may_end
         self._variables = variables
         self.state = ProcessState.STARTING
@@ -391,6 +381,7 @@ class ManagedProcess:
                     prefix=() if channel is None else self.planned.run.prefix,
                     limits=() if limits is None else limits.resources(),
                     no_new_privileges=self.planned.run.no_new_privileges,
+                    grace_s=self._grace_s,
                     resources=self.planned.run.resources,
                 )
             )
@@ -415,24 +406,6 @@ class ManagedProcess:
         """Note that the process does its work: its nodes are there."""
         if self.state is ProcessState.STARTING:
             self._change(ProcessState.RUNNING)
-
-    def keep(self) -> None:
-        """Have it outlive a supervisor that is killed, if its manifest has it do so."""
-        if self._outlives and not self.is_kept and self.state is ProcessState.RUNNING:
-            assert self.child is not None
-            self.is_kept = True
-            outputs = [each for reader in self._readers for each in reader.descriptors]
-            self.child.keep(self.log.shown, outputs)
-            if self.channel is not None:
-                self.channel.keep()
-
-    def release(self) -> None:
-        """Have it end with this supervisor, however that ends."""
-        if self.is_kept and self.child is not None:
-            self.is_kept = False
-            self.child.release()
-            if self.channel is not None:
-                self.channel.release()
 
     def back_off(self) -> None:
         """Note that it has ended and that another one is to be started in its place."""
@@ -462,7 +435,6 @@ class ManagedProcess:
         if self.state in (ProcessState.STARTING, ProcessState.RUNNING):
             self.asked_to_end = True
             self._change(ProcessState.STOPPING)
-        self.release()
         if self.channel is not None:
             await self.channel.close()
         needed = ""

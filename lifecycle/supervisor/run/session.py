@@ -68,9 +68,7 @@ from lifecycle.supervisor.processes.orphans import ProcessFamily, end_strays, re
 from lifecycle.supervisor.processes.process import Spawner
 from lifecycle.supervisor.run.events import (
     Emitter,
-    Event,
     LogLine,
-    NodeChanged,
     Notice,
     Stopped,
     Stopping,
@@ -81,7 +79,16 @@ from lifecycle.supervisor.run.options import Until, UpOptions, UpResult
 from lifecycle.supervisor.run.records import Records
 from lifecycle.supervisor.run.shutdown import TakeDown
 from lifecycle.supervisor.run.signals import ENDED_BY, Ending
-from lifecycle.verify import NOT_JUDGED, Outcome, RunEnd, Stage, Verdict, missing, not_ok
+from lifecycle.verify import (
+    NOT_JUDGED,
+    PROCESS_DIED,
+    Outcome,
+    RunEnd,
+    Stage,
+    Verdict,
+    missing,
+    not_ok,
+)
 
 _GLANCE_S = 1.0
 """How long `--until connected` looks for a verdict to report; it gates nothing."""
@@ -216,8 +223,9 @@ class SessionForkServer(Spawner, ProcessFamily, Protocol):
     def waited_for(self) -> tuple[int, ...]:
         """Pids of processes whose ends the fork server reads: no other code may reap them."""
 
-    def note_stops(self) -> None:
-        """Look, after SIGCHLD, which children were stopped or continue."""
+    @property
+    def died(self) -> asyncio.Future[str]:
+        """Resolves with how, if the fork server ends unasked."""
 
     def disown_ports(self) -> None:
         """Have all participants of this host send no more to ports whose process was killed."""
@@ -265,7 +273,6 @@ class Session:
         self._furthest: str | None = None
         self._time: _Time | None = None  # of the bring-up, while it lasts
         self._held = False
-        self._keeps = False
         self._ends = ""
         self._reason = ""
         self._hurry = asyncio.Event()
@@ -414,7 +421,6 @@ class Session:
         self._emit.listen(lambda event: None if isinstance(event, LogLine) else server.changed())
         self._emit.listen(self._ros_interface.on_event)
         self._ros_interface.begin()
-        self._emit.listen(self._keep)
         result = UpResult(exit_code=ExitCode.INTERNAL, verdict=NOT_JUDGED)
         beside = (
             asyncio.ensure_future(self._interfaces.follow()),
@@ -673,26 +679,24 @@ class Session:
     async def _unless_stopped(self, phases: Coroutine[Any, Any, _RunEnd]) -> _RunEnd:
         running = asyncio.ensure_future(phases)
         try:
-            waits: set[asyncio.Future[Any]] = {running, self._stop}
+            died = self._fork_server.died
+            waits: set[asyncio.Future[Any]] = {running, self._stop, died}
             await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
             if self._stop.done():
                 self._stop.result()
+            if died.done():
+                raise StepFailedError(
+                    f"cannot go on: {died.result()}",
+                    rule=PROCESS_DIED,
+                    subject="fork server",
+                )
             return running.result()
         finally:
             await ended(running)
 
-    def _keep(self, event: Event) -> None:
-        """From when the system is active, have what is active outlive this process if killed."""
-        if isinstance(event, SystemReached) and event.reached == ACTIVE:
-            self._keeps = True
-        if self._keeps and isinstance(event, SystemReached | NodeChanged):
-            self._system.keep()
-
     async def _take_down(self) -> list[StepFailedError]:
         """End everything, also what our processes left behind; return who died meanwhile."""
         self._gate_sequence.phase = _STOPPING
-        self._keeps = False
-        self._system.release()
         self._schedule.close()
         self._agreement.leave(self._ends)
         self._observer_participant.prepare_to_leave()
@@ -736,7 +740,6 @@ class Session:
             self._ending.resume()
 
     def _child_changed(self) -> None:
-        self._fork_server.note_stops()
         reap_adopted(self._fork_server.waited_for)
 
     def _ended_by(self, number: int) -> None:

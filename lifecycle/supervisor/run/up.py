@@ -33,7 +33,6 @@ from lifecycle.middleware import (
     peers_environment,
     sweep,
 )
-from lifecycle.node import needed_by
 from lifecycle.plan import Plan, PlannedProcess, moved_observer, reached_hosts
 from lifecycle.run_directory import (
     RunDirectory,
@@ -48,8 +47,8 @@ from lifecycle.supervisor.control.protocol import SystemStatus
 from lifecycle.supervisor.control.ros_interface import check_installed
 from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
 from lifecycle.supervisor.nodes.system import System
-from lifecycle.supervisor.processes.forerunner import Forerunner
 from lifecycle.supervisor.processes.fork_server import ForkServer
+from lifecycle.supervisor.processes.fork_server_process import ForkServerProcess
 from lifecycle.supervisor.processes.logs import (
     begin_logs,
     check_log_root,
@@ -104,7 +103,7 @@ def up(
     options: UpOptions,
     listeners: Iterable[Listener] = (),
     *,
-    forerunner: Forerunner | None = None,
+    process: ForkServerProcess | None = None,
     ending: Ending | None = None,
     on_start: Callable[[Callable[[], SystemStatus]], None] | None = None,
     conclude: Conclude | None = None,
@@ -119,7 +118,7 @@ def up(
         options: how.
         listeners: get every event, in this thread. One that raises gets nothing more; the run
             goes on to its end, and then what it raised is raised.
-        forerunner: used and ended.
+        process: of a fork server that was started before; used and ended.
         ending: has noted signals since before this call; entered by the caller.
         on_start: given the way to ask for the status, once there is a system.
         conclude: given how the run ended, once nothing of the system runs any more; returns the
@@ -139,7 +138,7 @@ def up(
                 plan,
                 options,
                 listeners,
-                forerunner=forerunner,
+                process=process,
                 ending=ours,
                 on_start=on_start,
                 conclude=conclude,
@@ -150,7 +149,7 @@ def up(
             plan,
             options,
             guarded,
-            forerunner=forerunner,
+            process=process,
             ending=ending,
             on_start=on_start,
             conclude=conclude,
@@ -182,7 +181,7 @@ def _up(
     options: UpOptions,
     listeners: Iterable[Listener],
     *,
-    forerunner: Forerunner | None,
+    process: ForkServerProcess | None,
     ending: Ending,
     on_start: Callable[[Callable[[], SystemStatus]], None] | None,
     conclude: Conclude | None,
@@ -191,8 +190,8 @@ def _up(
     processes = local_processes(plan, options.machine)
     service = ServiceManager.of(os.environ)
     emit = _emitter((*listeners, service.on_event))
-    forerunner = _preloading(forerunner, plan, options, processes)
-    directory = _acquired(plan, options, forerunner)
+    process = _preloading(process, plan, options, processes)
+    directory = _acquired(plan, options, process)
     records: Records | None = None
     journal = _journal(plan, directory, emit)
     try:
@@ -217,7 +216,7 @@ def _up(
                 variables=_graph_variables(os.environ),
             )
             leaving.enter_context(journal.writing(logs))
-            fork_server = ForkServer(forerunner.process, emit, directory)
+            fork_server = ForkServer(process, directory)
             worker = leaving.enter_context(_working(emit, logs, plan.system))
             records = leaving.enter_context(noting(directory, system, fork_server, worker, emit))
             try:
@@ -257,21 +256,21 @@ def _up(
 
         return asyncio.run(_leaving_last(run, conclude))
     finally:
-        forerunner.close()
+        process.close()
         _sweep(records)
         directory.release()
 
 
-def _acquired(plan: Plan, options: UpOptions, forerunner: Forerunner) -> RunDirectory:
+def _acquired(plan: Plan, options: UpOptions, process: ForkServerProcess) -> RunDirectory:
     try:
         return RunDirectory.acquire(
             runtime_root(os.environ),
             run_name(plan, options.machine),
-            forerunner.run_id,
+            process.run_id,
             domain_id=plan.domain_id,
         )
     except LifecycleError:
-        forerunner.close()
+        process.close()
         raise
 
 
@@ -341,21 +340,22 @@ async def _leaving_last(
 
 
 def _preloading(
-    forerunner: Forerunner | None,
+    process: ForkServerProcess | None,
     plan: Plan,
     options: UpOptions,
     processes: Iterable[PlannedProcess],
-) -> Forerunner:
-    """Have a fork server load what our Python nodes need, once for all of them."""
+) -> ForkServerProcess:
+    """Have a fork server load the interface types of our Python nodes, once for all of them."""
     python = [each for each in processes if each.run.kind is RunKind.PYTHON]
-    if forerunner is None:
-        without = token_variables(options.program)
-        forerunner = Forerunner(
-            preload=bool(python), without=without, programs=bool(options.program)
+    if process is None:
+        process = ForkServerProcess(
+            preload=bool(python),
+            without=token_variables(options.program),
+            programs=bool(options.program),
         )
-    nodes = (plan.node(key) for process in python for key in process.nodes)
-    forerunner.process.preload(needed_by(nodes))
-    return forerunner
+    nodes = (plan.node(key) for each in python for key in each.nodes)
+    process.preload(dict.fromkeys(each.type for node in nodes for each in node.endpoints))
+    return process
 
 
 _LET_GO_S = 0.5

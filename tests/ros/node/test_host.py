@@ -10,7 +10,6 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -24,10 +23,8 @@ from std_msgs.msg import String
 from lifecycle import codec
 from lifecycle.manifest.model import DiscoveryRange, Executor, Run, RunKind, Timeouts
 from lifecycle.middleware.fastdds.url_check import open_sockets, udp_sockets
-from lifecycle.middleware.rcl import library_loading
 from lifecycle.network import participant_ports
 from lifecycle.node.host.control import Command, Event, HostSpec, Operation
-from lifecycle.node.host.host import needed_by, preload_shared
 
 HERE = Path(__file__).parent
 CONFIGURE, CONNECT, ACTIVATE = Operation.CONFIGURE, Operation.CONNECT, Operation.ACTIVATE
@@ -487,23 +484,11 @@ os._exit(os.waitstatus_to_exitcode(os.wait()[1]))
     assert process.wait(30) == 0
 
 
-def test_a_process_that_will_fork_waits_for_the_thread_that_loads_libraries(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    ends = threading.Event()
-    loading = threading.Thread(target=ends.wait)
-    loading.start()
-    monkeypatch.setattr(library_loading, "_threads", [loading])
-    threading.Timer(0.2, ends.set).start()
-    preload_shared()
-    assert not loading.is_alive()
-
-
 def test_what_hosts_are_forked_from_imports_only_what_every_node_needs() -> None:
     code = (
-        "import sys; from lifecycle.node import preload, preload_for_some; preload(); "
-        "print(*sys.modules); preload_for_some(['example_interfaces/msg/No', 'rclpy.action']); "
-        "print('rclpy.action' in sys.modules)"
+        "import sys; from lifecycle.node import preload; preload(); "
+        "print(*sys.modules); preload(['example_interfaces/msg/No', 'sensor_msgs/msg/Imu']); "
+        "print('sensor_msgs' in sys.modules)"
     )
     modules, also = subprocess.check_output(
         [sys.executable, "-c", code], text=True, timeout=30
@@ -513,29 +498,6 @@ def test_what_hosts_are_forked_from_imports_only_what_every_node_needs() -> None
         modules.split()
     )
     assert also == "True"
-
-
-@pytest.mark.parametrize(
-    ("source", "needs"),
-    [
-        ("import numpy as np", True),
-        ("from numpy.linalg import norm", True),
-        ("    import cv2  # late", True),
-        ("import numpydoc", False),
-        ("# import numpy", False),
-    ],
-)
-def test_numpy_is_preloaded_for_nodes_whose_file_imports_it(
-    tmp_path: Path, source: str, needs: bool
-) -> None:
-    (tmp_path / "vision").mkdir()
-    (tmp_path / "vision" / "camera.py").write_text(f"import math\n{source}\n")
-    node = hosted("one", "Good")
-    run = dataclasses.replace(node.run, python="vision.camera:Camera")
-    at = dataclasses.replace(node.at, file=str(tmp_path / "robot.lifecycle.yaml"))
-    assert ("numpy" in needed_by([dataclasses.replace(node, run=run, at=at)])) is needs
-    gone = dataclasses.replace(run, python="vision.gone:Camera")
-    assert "numpy" not in needed_by([dataclasses.replace(node, run=gone, at=at)])
 
 
 @pytest.mark.parametrize(

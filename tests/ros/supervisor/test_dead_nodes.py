@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import psutil
 import pytest
 import rclpy
 from rclpy.node import Node
@@ -219,73 +218,3 @@ def test_where_ports_are_fixed_a_killed_node_is_gone_and_comes_back_at_once(
         print(f"gone after {gone_s:.3f} s, back after {back_s:.1f} s")
         assert verb("down", "pair", runtime=tmp_path).returncode == ExitCode.OK
         assert run.finish() == ExitCode.OK
-
-
-def fork_server(run: Up) -> psutil.Process | None:
-    """Return the process that forks the system's, and itself is no fork."""
-    run.catch_up()
-    forks = {each["pid"] for each in run.of_kind("process")}
-    return next(
-        (
-            each
-            for each in psutil.Process(run.process.pid).children()
-            if "lifecycle.supervisor.processes.fork_server_main" in each.cmdline()
-            and each.pid not in forks
-        ),
-        None,
-    )
-
-
-def kill_fork_server(run: Up) -> psutil.Process | None:
-    """Kill it; return the one that was started in its place at once, unless it was young."""
-    old = fork_server(run)
-    assert old is not None
-    since = len(run.events)
-    old.kill()
-    said = run.met("notice", since=since)["message"]
-    new = fork_server(run)
-    how = "one is started when it is needed" if new is None else f"one (pid {new.pid}) is started"
-    assert said == (
-        f"the fork server (pid {old.pid}) ended unasked (killed by SIGKILL); what it started runs "
-        f"on, and another {how}"
-    )
-    return new
-
-
-def test_a_killed_fork_server_is_replaced_and_its_nodes_stay_up_and_supervised(
-    tmp_path: Path, fresh_domain: int
-) -> None:
-    with up(pair(tmp_path, fresh_domain), "--keep-going", runtime=tmp_path) as run:
-        run.until("system", reached="active")
-        nodes = {name: run.pid_of(name) for name in ("talker", "listener")}
-        kill_fork_server(run)
-        assert [run.pid_of(name) for name in nodes] == [*nodes.values()]
-        assert psutil.Process(nodes["talker"]).ppid() == run.process.pid
-
-        # Stopped: told to the supervisor as the parent that it is now.
-        os.kill(nodes["listener"], signal.SIGSTOP)
-        run.until_found("run.silent-node", "/listener")
-        os.kill(nodes["listener"], signal.SIGCONT)
-        since = run.catch_up()
-        run.until_not_found("run.silent-node", since=since - 1)
-
-        done = verb("restart", "pair", "talker", runtime=tmp_path)
-        assert (done.returncode, done.stderr) == (ExitCode.OK, "")
-        new = fork_server(run)
-        assert new is not None
-        assert psutil.Process(run.pid_of("talker")).ppid() == new.pid
-        assert run.pid_of("listener") == nodes["listener"]
-
-        # Killed: with the status that only a parent gets.
-        kill(run, "listener")
-        died = run.until("failure", rule="run.process-died")
-        assert died["message"].endswith(f"pid {nodes['listener']} died: killed by SIGKILL")
-        restarts_at_once(run, tmp_path, "listener")
-
-        # Again and again: then only what needs it has it started.
-        assert kill_fork_server(run) is None or kill_fork_server(run) is None
-        run.note_segments()
-        assert verb("restart", "pair", runtime=tmp_path).returncode == ExitCode.OK
-        assert verb("down", "pair", runtime=tmp_path).returncode == ExitCode.OK
-        assert run.finish() == ExitCode.OK
-        run.assert_nothing_left()

@@ -631,67 +631,6 @@ def test_the_next_up_sweeps_what_a_killed_supervisor_left(
         killed.assert_nothing_left()
 
 
-def test_a_system_outlives_its_supervisor_as_its_nodes_say_until_the_next_up_or_down(
-    tmp_path: Path, fresh_domain: int
-) -> None:
-    edit = {
-        "nodes/talker/run/python": "tests.ros.supervisor.systems:Counting",
-        "nodes/safe": {
-            "run": {"python": "tests.ros.supervisor.systems:Listener"},
-            "on_supervisor_lost": "deactivate",
-            "timeouts": {"silent_s": 8},
-            "interface": {"subscriptions": [{"name": "chatter", "type": "std_msgs/msg/String"}]},
-        },
-    }
-    manifest = pair(tmp_path, fresh_domain, edit=edit)
-    with up(manifest, runtime=tmp_path) as killed:
-        killed.until("system", reached="active")
-        killed.note_segments()
-        killed.met("log", process="listener")
-        (logs,) = (tmp_path / "log").glob("20*")
-        killed.signal(signal.SIGKILL)
-        killed.process.wait(BOUND_S)
-        pids = {each: killed.pid_of(each) for each in ("talker", "listener", "safe")}
-
-        def log_of(process: str) -> str:
-            return (logs / f"{process}.log").read_text()
-
-        began, heard = time.monotonic(), log_of("listener").count("heard")
-        gone = "the supervisor is gone: nodes are inactive (on_supervisor_lost: deactivate)"
-        while gone not in log_of("safe"):
-            assert time.monotonic() < began + BOUND_S, log_of("safe")
-            time.sleep(0.02)
-        deaf = log_of("safe").count("heard")
-        while log_of("listener").count("heard") < heard + 20:
-            assert time.monotonic() < began + BOUND_S, log_of("listener")
-            time.sleep(0.02)
-        assert log_of("safe").count("heard") == deaf
-        assert all(psutil.pid_exists(pid) for pid in pids.values())
-
-        status = verb("status", "pair", runtime=tmp_path)
-        assert (status.returncode, status.stdout) == (ExitCode.USAGE, "")
-        still = ", ".join(f"{each} (pid {pid})" for each, pid in sorted(pids.items()))
-        name = f"pair@{fresh_domain}"
-        said = (
-            f"cannot ask '{name}': its supervisor (pid {killed.process.pid}) died; 3 processes "
-            f"still run: {still}; end them: lifecycle down {name}; the next lifecycle up does so, "
-            "too\n"
-        )
-        assert status.stderr == said
-        listed = verb("status", runtime=tmp_path)
-        assert (listed.stdout, listed.stderr) == ("no system runs\n", said)
-
-        with up(manifest, runtime=tmp_path) as following:
-            following.until("system", reached="active")
-            assert left_of(killed.mark) == []
-            following.signal(signal.SIGKILL)
-            following.process.wait(BOUND_S)
-            assert verb("down", "pair", runtime=tmp_path).returncode == ExitCode.OK
-            following.assert_nothing_left()
-        killed.assert_nothing_left()
-    assert verb("status", runtime=tmp_path).stderr == ""
-
-
 def test_a_plain_command_is_started_verified_and_ended(tmp_path: Path, fresh_domain: int) -> None:
     code = (
         "import rclpy; from rclpy.node import Node; from std_msgs.msg import String\n"

@@ -14,8 +14,10 @@ from click.testing import CliRunner
 from lifecycle.cli.verbs import up
 from lifecycle.errors import ExitCode, UsageError
 
+FORK_SERVER = "lifecycle.supervisor.processes.fork_server_process.ForkServerProcess"
 
-class _NoForerunner:
+
+class _NoForkServer:
     def __init__(self, **_: object) -> None:
         """Start nothing."""
 
@@ -40,7 +42,7 @@ def test_an_interrupt_while_the_manifest_is_read_is_told(
 ) -> None:
     manifest = tmp_path / "m.lifecycle.yaml"
     manifest.write_text("manifest_version: 1\nsystem: s\n")
-    monkeypatch.setattr("lifecycle.supervisor.processes.forerunner.Forerunner", _NoForerunner)
+    monkeypatch.setattr(FORK_SERVER, _NoForkServer)
     monkeypatch.setattr(up, "load_manifest", lambda *_, **__: signal.raise_signal(number))
     report = tmp_path / "report.json"
     words = [str(manifest), "--report", str(report)]
@@ -55,7 +57,8 @@ def test_a_report_that_cannot_be_written_is_refused_before_anything_is_started(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(
-        "lifecycle.supervisor.processes.forerunner.Forerunner", lambda: pytest.fail("it started")
+        FORK_SERVER,
+        lambda: pytest.fail("it started"),
     )
     words = [str(tmp_path / "m.lifecycle.yaml"), "--report", str(tmp_path / "no" / "report.xml")]
     with pytest.raises(UsageError, match=r"cannot write report .*: No such file or directory"):

@@ -23,7 +23,6 @@ from lifecycle.manifest import (
     Manifest,
     Node,
     OnFailure,
-    OnSupervisorLost,
     QosProfile,
     Reliability,
     Resources,
@@ -502,7 +501,6 @@ def test_what_is_done_when_a_process_fails_is_its_nodes_or_nearest_to_it_or_any_
         start_limit_interval_sec=60.0,
         on_failure=OnFailure.DEPENDENTS,
         watchdog_sec=2.0,
-        on_supervisor_lost=OnSupervisorLost.DEACTIVATE,
     )
     arms = Supervision(restart=Restart.ON_FAILURE, restart_sec=0.2, on_failure=OnFailure.ALL)
     assert found["left"] == found["right"] == arms

@@ -180,28 +180,6 @@ def test_only_sockets_that_receive_discovery_of_the_domain_get_more_room() -> No
     assert after == before
 
 
-def test_a_filled_heap_has_no_gap_that_a_child_would_write_into() -> None:
-    program = """
-import ctypes
-from lifecycle.middleware import fill_heap
-
-library = ctypes.PyDLL(None)
-library.malloc.argtypes, library.malloc.restype = (ctypes.c_size_t,), ctypes.c_void_p
-library.free.argtypes = (ctypes.c_void_p,)
-chunks = [library.malloc(size) for size in (200, 700, 3000) for _ in range(1000)]
-gaps = set(chunks[::2])
-for chunk in gaps:
-    library.free(chunk)
-fill_heap()
-later = {library.malloc(size) for size in (200, 700, 3000) for _ in range(300)}
-print(len(gaps), len(gaps & later))
-"""
-    done = subprocess.run(
-        [sys.executable, "-c", program], check=True, capture_output=True, text=True, timeout=30
-    )
-    assert done.stdout == "1500 0\n"
-
-
 def test_the_addresses_of_interfaces_are_those_that_psutil_knows() -> None:
     families = socket.AF_INET, socket.AF_INET6
     known = {

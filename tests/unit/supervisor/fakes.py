@@ -172,12 +172,6 @@ class FakeProcess:
         if number >= self._spawner.ends_at.get(self._name, 0) or number == signal.SIGKILL:
             self.end(ProcessExit(signal=number))
 
-    def keep(self, log: str, outputs: Collection[int]) -> None:
-        self._spawner.kept.add(self._name)
-
-    def release(self) -> None:
-        self._spawner.kept.discard(self._name)
-
     def run_delay_s(self) -> float:
         self._spawner.looked_at.append(self._name)
         share = self._spawner.starves.get(self._name, 0.0)
@@ -191,7 +185,6 @@ class FakeProcess:
             if self._task is not None:
                 self._task.cancel()
             os.close(self._stdout)
-            self._spawner.kept.discard(self._name)
             self.exited.set_result(how)
             self._spawner.gone(self._name)
 
@@ -218,7 +211,7 @@ class FakeProcess:
                 return
             while line := await reader.readline():
                 command = from_json(line, Command)
-                if command.operation in (Operation.KEEP, Operation.RELEASE):
+                if command.operation is Operation.END:
                     continue
                 state, connected = _STATES.get(command.operation, ("active", True))
                 before = self._spawner.interfaces.get(command.node)
@@ -302,7 +295,6 @@ class FakeSpawner:
         looked_at: processes of which it was read how long they waited for a processor.
         ends_at: processes that do not end by themselves, and the signal that ends them.
         processes: by name.
-        kept: those that are to outlive the supervisor, should it be killed.
         interfaces: what a node reports, by full name; steps of wiring change it.
         tells: hosts tell unasked what nodes report whenever that changes, as ours do.
         nodes: full names of the nodes that are in the graph, by process.
@@ -321,7 +313,6 @@ class FakeSpawner:
         self.looked_at: list[str] = []
         self.ends_at: dict[str, int] = {}
         self.processes: dict[str, FakeProcess] = {}
-        self.kept: set[str] = set()
         self.interfaces: dict[str, NodeConfiguration] = {}
         self.reports_changes = False
         self.nodes: dict[str, tuple[str, ...]] = {}

@@ -89,6 +89,7 @@ class FakeForkServer(FakeSpawner):
         self.reports_changes = True
         self.cannot_start = ""
         self.lingers_s = 0.0
+        self.died: asyncio.Future[str] = asyncio.get_running_loop().create_future()
 
     def gone(self, process: str) -> None:
         asyncio.get_running_loop().call_later(self.lingers_s, super().gone, process)
@@ -103,9 +104,6 @@ class FakeForkServer(FakeSpawner):
 
     def family(self) -> frozenset[int]:
         return frozenset()
-
-    def note_stops(self) -> None:
-        """No child is of the kernel's."""
 
     def disown_ports(self) -> None:
         """There is no shared memory."""

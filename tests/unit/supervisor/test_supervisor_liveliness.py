@@ -25,7 +25,8 @@ from lifecycle.supervisor.health.liveliness import Cause, NodeArrivals, SilenceM
 from lifecycle.supervisor.health.peer_supervisors import CALL_EACH_S, Listener, PeerSupervisors
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.control_channel import ChannelClosedError, ControlChannel
-from lifecycle.supervisor.processes.fork_server import ForkServer, ForkServerProcess
+from lifecycle.supervisor.processes.fork_server import ForkServer
+from lifecycle.supervisor.processes.fork_server_process import ForkServerProcess
 from lifecycle.supervisor.processes.logs import LogDirectory
 from lifecycle.supervisor.processes.process import ManagedProcess
 from lifecycle.supervisor.run.events import (
@@ -574,7 +575,7 @@ def test_closing_a_channel_closes_its_busy_sign(tmp_path: Path) -> None:
 def test_a_fork_server_tells_that_a_process_was_stopped_and_continues(tmp_path: Path) -> None:
     async def test() -> None:
         told: asyncio.Queue[bool] = asyncio.Queue()
-        fork_server = ForkServer(ForkServerProcess(preload=False, environment=os.environ))
+        fork_server = ForkServer(ForkServerProcess(preload=False))
         argv = ("sleep", "60")
         planned = PlannedProcess(
             name="it",

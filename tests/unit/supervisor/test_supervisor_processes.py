@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
 import os
 import pwd
 import signal
 import subprocess
 import sys
 import time
-import uuid
 from collections.abc import Coroutine, Iterator
 from pathlib import Path
 from typing import Any
@@ -28,8 +26,9 @@ from lifecycle.run_directory import RUN_VARIABLE, ChildRecord, RunRecord, boot_i
 from lifecycle.supervisor.control.protocol import ProcessState
 from lifecycle.supervisor.processes import logs
 from lifecycle.supervisor.processes.control_channel import ControlChannel
-from lifecycle.supervisor.processes.fork_server import ForkServer, ForkServerProcess
+from lifecycle.supervisor.processes.fork_server import ForkServer
 from lifecycle.supervisor.processes.fork_server_main import ForkRequest, _confine
+from lifecycle.supervisor.processes.fork_server_process import ForkServerProcess
 from lifecycle.supervisor.processes.logs import (
     LONGEST_LINE,
     LineReader,
@@ -100,7 +99,7 @@ class _Bench:
 
 @contextlib.asynccontextmanager
 async def _bench(tmp_path: Path) -> Any:
-    fork_server = ForkServer(ForkServerProcess(preload=False, environment=os.environ))
+    fork_server = ForkServer(ForkServerProcess(preload=False))
     bench = _Bench(tmp_path, fork_server)
     try:
         yield bench
@@ -207,103 +206,33 @@ def test_a_process_that_ignores_sigint_and_sigterm_is_killed_with_its_group(
     _run(test())
 
 
-def test_a_fork_server_that_was_killed_is_replaced_and_what_it_started_runs_on(
+def test_a_fork_server_that_is_killed_starts_nothing_more_and_its_children_are_ours(
     tmp_path: Path,
 ) -> None:
     async def test() -> None:
-        environment = {**os.environ, RUN_VARIABLE: uuid.uuid4().hex}
-        process = ForkServerProcess(preload=False, environment=environment)
-        fork_server = ForkServer(process)
-        bench = _Bench(tmp_path, fork_server)
-        first = await bench.start("sleep", "60")
-        process.popen.kill()
-        await fork_server.ready()
-        second = await bench.start("sleep", "60")
-        assert fork_server.pid != process.popen.pid
-        assert not first.ended.done()
-        os.kill(first.pid, signal.SIGKILL)
-        await first.ended
-
-        third = await bench.start("sleep", "60")
-        os.kill(fork_server.pid, signal.SIGKILL)
-        await fork_server.ready()
-        # Another fork server guards what those before it started, should the supervisor vanish.
-        fork_server._process.socket.shutdown(2)
-        await asyncio.gather(second.ended, third.ended)
-        await bench.close()
+        async with _bench(tmp_path) as bench:
+            first = await bench.start("sleep", "60")
+            server = bench.fork_server
+            os.kill(server.pid, signal.SIGKILL)
+            how = await server.died
+            assert how == f"the fork server (pid {server.pid}) ended unasked: killed by SIGKILL"
+            with pytest.raises(BringUpError) as caught:
+                await bench.start("true")
+            assert str(caught.value) == f"cannot start process 'it': {how}"
+            assert not first.ended.done()
+            assert await first.end(COMMAND_ESCALATION, asyncio.Event()) == ""
+            assert first.ended.done()
 
     _run(test())
 
 
-_FORKS = """
-import json, os, signal, sys
-from pathlib import Path
-
-from lifecycle.codec import to_json
-from lifecycle.errors import MiddlewareError
-from lifecycle.supervisor.processes import fork_server_main
-from lifecycle.supervisor.processes.forerunner import ForkServerProcess
-
-
-def refuse(*_):
-    raise MiddlewareError("refused")
-
-
-if sys.argv[1] == "refused":
-    fork_server_main.rename_process = refuse
-fork_server_main.import_shared = lambda: None  # which needs ROS
-signal.signal(signal.SIGHUP, lambda *_: None)
-signal.signal(signal.SIGUSR1, signal.SIG_IGN)
-held = open("/proc/self/status")
-environment = {**os.environ, "OF_THE_RUN": "1"}
-del environment["OURS"]
-process = ForkServerProcess(preload=False, environment=environment, forks=True)
-process.socket.send(to_json(fork_server_main.SERVES))
-process.socket.recv(1000)
-proc = Path(f"/proc/{process.popen.pid}")
-status = dict(line.split(":", 1) for line in (proc / "status").read_text().splitlines())
-shown = (proc / "environ").read_bytes().split(b"\\0")[:-1]
-print(json.dumps({
-    "argv": (proc / "cmdline").read_bytes().decode().split("\\0"),
-    "as given": sorted(shown) == sorted(f"{n}={v}".encode() for n, v in environment.items()),
-    "files": sorted(os.readlink(each) for each in (proc / "fd").iterdir() if int(each.name) > 2),
-    "input": os.readlink(proc / "fd" / "0"),
-    "caught": int(status["SigCgt"], 16) & 0x7fff,
-    "blocked": int(status["SigBlk"], 16),
-    "ignores": [n for n in (1, 2, 10, 15) if int(status["SigIgn"], 16) >> (n - 1) & 1],
-    "leads": os.getsid(process.popen.pid) == process.popen.pid,
-    "mask": len(signal.pthread_sigmask(signal.SIG_BLOCK, ())),
-}))
-process.close()
-print(process.popen.wait())
-"""
-
-
-@pytest.mark.parametrize("rename", ["allowed", "refused"])
-def test_a_fork_of_the_supervisor_is_a_fork_server_as_a_program_of_its_own_is(rename: str) -> None:
-    result = subprocess.run(
-        (PYTHON, "-c", _FORKS, rename),
-        env={**os.environ, "OURS": "1"},
-        stdin=subprocess.PIPE,
-        capture_output=True,
-        text=True,
-        timeout=BOUND_S,
-        check=False,
-    )
-    assert result.stderr == ""
-    found, exit_code = result.stdout.splitlines()
-    seen = json.loads(found)
-    assert seen["argv"][:3] == [PYTHON, "-m", "lifecycle.supervisor.processes.fork_server_main"]
-    assert seen["as given"]
-    # Its socket, what it waits with, and what signals wake it by; nothing of ours.
-    assert [each.partition(":")[0] for each in seen["files"]] == [
-        *("anon_inode", "pipe", "pipe", "socket")
-    ]
-    assert seen["input"] == os.devnull
-    assert seen["ignores"] == [signal.SIGINT, signal.SIGUSR1, signal.SIGTERM]
-    assert (seen["caught"], seen["blocked"], seen["mask"]) == (0, 0, 0)
-    assert seen["leads"]
-    assert exit_code == "0"
+def test_a_python_that_does_not_exist_cannot_be_a_fork_server(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(sys, "executable", "/no/such/python")
+    expected = "cannot start the fork server: No such file or directory"
+    with pytest.raises(BringUpError, match=expected):
+        ForkServerProcess(preload=False)
 
 
 def test_shared_memory_that_was_left_is_the_fork_servers_matter(tmp_path: Path) -> None:
@@ -337,30 +266,9 @@ def test_shared_memory_that_was_left_is_the_fork_servers_matter(tmp_path: Path) 
             each.unlink(missing_ok=True)
 
 
-def test_without_any_fork_server_nothing_can_be_started(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    async def test() -> None:
-        process = ForkServerProcess(preload=False, environment=os.environ)
-        fork_server = ForkServer(process)
-        process.popen.kill()
-        process.popen.wait()
-        monkeypatch.setattr(sys, "executable", "/no/such/python")
-        bench = _Bench(tmp_path, fork_server)
-        expected = (
-            "cannot start process 'it': cannot start the fork server: No such file or directory"
-        )
-        with pytest.raises(BringUpError) as caught:
-            await bench.start("true")
-        assert str(caught.value) == expected
-        await bench.close()
-
-    _run(test())
-
-
 def test_when_the_supervisor_vanishes_the_fork_server_ends_what_it_forked(tmp_path: Path) -> None:
     async def test() -> None:
-        process = ForkServerProcess(preload=False, environment=os.environ)
+        process = ForkServerProcess(preload=False)
         fork_server = ForkServer(process)
         bench = _Bench(tmp_path, fork_server)
         child = await bench.start("sleep", "60")
@@ -368,41 +276,6 @@ def test_when_the_supervisor_vanishes_the_fork_server_ends_what_it_forked(tmp_pa
         assert await asyncio.get_running_loop().run_in_executor(None, process.popen.wait) == 0
         assert not psutil.pid_exists(child.pid)
         await child.ended
-        await bench.close()
-
-    _run(test())
-
-
-def test_what_is_kept_outlives_the_supervisor_and_its_output_goes_to_its_log(
-    tmp_path: Path,
-) -> None:
-    writes = "import time\nfor n in range(10**9): print(f'line {n}', flush=True); time.sleep(0.02)"
-
-    async def test() -> None:
-        process = ForkServerProcess(preload=False, environment=os.environ)
-        bench = _Bench(tmp_path, ForkServer(process))
-        kept, let_go, never = [await bench.start(PYTHON, "-c", writes) for _ in range(3)]
-        for each in (kept, let_go):
-            each.running()
-            each.keep()
-        let_go.release()
-        await bench.spoke.wait()
-        for each in (kept, let_go, never):  # as the kernel does when this process is killed
-            for reader in each._readers:
-                reader.close()
-        process.socket.shutdown(2)
-        await asyncio.gather(let_go.ended, never.ended)
-        size = kept.log.path.stat().st_size
-        deadline = time.monotonic() + BOUND_S
-        while kept.log.path.stat().st_size < size + 100:
-            assert time.monotonic() < deadline
-            await asyncio.sleep(0.02)
-        assert psutil.pid_exists(kept.pid)
-        assert kept.log.path.read_text().rstrip("\n").rpartition("\n")[2].startswith("line ")
-        os.kill(kept.pid, signal.SIGTERM)
-        await kept.ended
-        # Nothing is left to guard.
-        assert await asyncio.get_running_loop().run_in_executor(None, process.popen.wait) == 0
         await bench.close()
 
     _run(test())

@@ -17,7 +17,6 @@ import pytest
 from lifecycle.manifest import (
     Condition,
     OnFailure,
-    OnSupervisorLost,
     Restart,
     RunKind,
     Supervision,
@@ -641,42 +640,6 @@ def test_status_says_what_failed_and_when_it_is_started_again(tmp_path: Path) ->
             world.hosts.ways.clear()
 
         await world.run(look())
-
-    run(main())
-
-
-def test_what_is_active_outlives_a_killed_supervisor_and_nothing_does_before_or_at_the_end(
-    tmp_path: Path,
-) -> None:
-    ends = dataclasses.replace(ON_FAILURE, on_supervisor_lost=OnSupervisorLost.DEACTIVATE)
-
-    async def main() -> None:
-        plan = plan_of(
-            planned_node("camera", supervision=ON_FAILURE),
-            planned_node("viewer", supervision=ends),
-            planned_node("driver", kind=RunKind.COMMAND, managed=False, supervision=ON_FAILURE),
-            planned_node("alarm", kind=RunKind.COMMAND, managed=False, supervision=ends),
-        )
-        world = SessionWorld(plan, tmp_path, stop_after_s=10.0)
-        found = {}
-
-        async def look() -> None:
-            for line in ("[gate]", "[system] active", "[backoff]", "[restarted]", "[stopping]"):
-                await world.story.until(line)
-                await asyncio.sleep(0.01 if line == "[stopping]" else 0.0)
-                found[line] = sorted(world.hosts.kept)
-                if line == "[system] active":
-                    world.kill("camera")
-
-        await world.run(look())
-        # Hosts deactivate their nodes themselves; a command that is to be inactive ends instead.
-        assert found == {
-            "[gate]": [],
-            "[system] active": ["camera", "driver", "viewer"],
-            "[backoff]": ["driver", "viewer"],
-            "[restarted]": ["camera", "driver", "viewer"],
-            "[stopping]": [],
-        }
 
     run(main())
 
