@@ -30,6 +30,7 @@ from lifecycle.middleware import (
     discovery_peers,
     disown_ports,
     exit_after,
+    load_type_support,
     peers_environment,
     sweep,
 )
@@ -419,6 +420,8 @@ async def _observer_participant(
     """
     with ending.raised():
         await _until_interface_is_up(plan, options, emit)
+    # rclpy would import with it what generates Python from IDL: 20 ms, and not without warnings.
+    load_type_support("rcl_interfaces/msg/ParameterEvent")
     layer = plan.data_layer
     dynamic = layer.source is DataLayerSource.DYNAMIC
     wires = layer.authority is Authority.SUPERVISOR
