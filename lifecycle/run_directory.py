@@ -37,13 +37,10 @@ PROCESS_VARIABLE = "LIFECYCLE_PROCESS"
 _OURS = os.O_CLOEXEC | os.O_NOFOLLOW
 
 _LONGEST_RECORD = 16 * 2**20
-"""Bytes; a record names processes and shared memory, a few kB."""
+"""Bytes; a record names processes, a few kB."""
 
 _RECORD_NAME = "record.json"
 _PART_NAME = ".record.json"
-_MADE_NAME = "made"
-"""Names of shared memory made since the record was written, one a line."""
-
 LEDGER_NAME = "programmed.json"
 """File in a run directory that lists what is ours in networks, see programming/apply/ledger.py."""
 
@@ -77,7 +74,6 @@ class RunRecord:
         run_id: value of LIFECYCLE_RUN in every process of the run.
         boot_id: of the kernel; a record of an earlier boot names no living process.
         began_s: seconds since the epoch.
-        segments: names of the shared memory files that the processes were seen to use.
         domain_id: where the system is; None if it was not written down.
         participant: GUID prefix of the supervisor's own, 24 hex digits; empty before there is one.
         cgroup: directory of the cgroup with all of its processes; empty for none.
@@ -89,7 +85,6 @@ class RunRecord:
     began_s: float
     supervisor: ChildRecord
     children: tuple[ChildRecord, ...] = ()
-    segments: tuple[str, ...] = ()
     domain_id: int | None = None
     participant: str = ""
     cgroup: str = ""
@@ -227,7 +222,7 @@ class RunDirectory:
         self.participant = ""
         self._cgroup = ""
         self._controllers: tuple[str, ...] = ()
-        self._recorded: tuple[tuple[ChildRecord, ...], Iterable[str]] = (), ()
+        self._recorded: tuple[ChildRecord, ...] = ()
         self.began_s = time.time()
         self.previous: RunRecord | None = None
         self._lock: int | None = None
@@ -307,20 +302,6 @@ class RunDirectory:
         """Where `lifecycle down` and `status` reach the supervisor."""
         return self.path / "control"
 
-    def note_made(self, segments: Iterable[str]) -> None:
-        """Add shared memory to the record, until the next `record`; takes microseconds.
-
-        Raises:
-            OSError: it cannot be written.
-        """
-        made = os.open(
-            self.path / _MADE_NAME, os.O_WRONLY | os.O_CREAT | os.O_APPEND | _OURS, 0o600
-        )
-        try:
-            os.write(made, "".join(f"{each}\n" for each in segments).encode())
-        finally:
-            os.close(made)
-
     def note_cgroup(self, path: str, controllers: Iterable[str]) -> None:
         """Add the run's cgroup to the record; where that cannot be written, to the next one.
 
@@ -330,13 +311,13 @@ class RunDirectory:
         """
         self._cgroup, self._controllers = path, tuple(controllers)
         with contextlib.suppress(OSError):
-            self.record(*self._recorded)
+            self.record(self._recorded)
 
-    def record(self, children: tuple[ChildRecord, ...], segments: Iterable[str] = ()) -> None:
+    def record(self, children: tuple[ChildRecord, ...]) -> None:
         """Write down what runs, in one piece."""
         from lifecycle import codec
 
-        self._recorded = children, segments
+        self._recorded = children
         record = RunRecord(
             run_id=self.run_id,
             boot_id=boot_id(),
@@ -345,7 +326,6 @@ class RunDirectory:
                 name="supervisor", pid=os.getpid(), start_ticks=start_ticks(os.getpid()) or 0
             ),
             children=children,
-            segments=tuple(sorted(segments)),
             domain_id=self.domain_id,
             participant=self.participant,
             cgroup=self._cgroup,
@@ -360,8 +340,6 @@ class RunDirectory:
         # auto_da_alloc), which takes long on a busy one; who reads meanwhile finds the other name.
         (self.path / _RECORD_NAME).unlink(missing_ok=True)
         part.rename(self.path / _RECORD_NAME)
-        with contextlib.suppress(FileNotFoundError):
-            os.truncate(self.path / _MADE_NAME, 0)
 
     def release(self) -> None:
         """Remove the directory and give up the lock; nothing of ours may run.
@@ -390,12 +368,7 @@ def read_record(path: Path) -> RunRecord | None:
     # It may just take the place of the one before it.
     for name in (_RECORD_NAME, _PART_NAME, _RECORD_NAME):
         with contextlib.suppress(OSError, ValueError):
-            record = codec.from_json(_regular(path / name), RunRecord, longest=_LONGEST_RECORD)
-            with contextlib.suppress(OSError):
-                made = _regular(path / _MADE_NAME).decode("ascii", "ignore").split()
-                segments = tuple(sorted({*record.segments, *made}))
-                record = dataclasses.replace(record, segments=segments)
-            return record
+            return codec.from_json(_regular(path / name), RunRecord, longest=_LONGEST_RECORD)
     return None
 
 

@@ -55,15 +55,12 @@ from .process.control import no_room_for_threads as no_room_for_threads
 from .process.control import refuse_new_privileges as refuse_new_privileges
 from .process.process_table import note_ended as note_ended
 from .process.reception import Reception as Reception
-from .process.shared_memory import Creations as Creations
 from .process.shared_memory import check_room as check_room
 from .process.shared_memory import check_room_to_load as check_room_to_load
 from .process.shared_memory import disown_ports as disown_ports
 from .process.shared_memory import holds_shared_memory as holds_shared_memory
 from .process.shared_memory import leftovers as leftovers
-from .process.shared_memory import segments_by_holder as segments_by_holder
 from .process.shared_memory import segments_of as segments_of
-from .process.shared_memory import still_there as still_there
 from .process.shared_memory import sweep as sweep
 from .process.stacks import brief as brief
 from .process.stacks import show_stacks_here as show_stacks_here

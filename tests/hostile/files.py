@@ -233,7 +233,6 @@ RECORD = json.dumps(
         "began_s": 1.0,
         "supervisor": {"name": "supervisor", "pid": 1, "start_ticks": 1},
         "children": [{"name": "init", "pid": 1, "start_ticks": 1}],
-        "segments": ["../../etc/passwd", "fastrtps_0123456789abcdef"],
         "domain_id": 0,
     }
 )

@@ -110,25 +110,6 @@ def test_what_a_killed_supervisor_wrote_is_found_by_the_next(tmp_path: Path) -> 
     assert RunDirectory.acquire(tmp_path, "robot@30", "ghi").previous is None
 
 
-def test_shared_memory_is_in_the_record_as_soon_as_it_is_made(tmp_path: Path) -> None:
-    run = RunDirectory.acquire(tmp_path, "robot@30", "abc")
-    run.record((), ["fastrtps_port1"])
-    run.note_made(["fastrtps_port2"])
-    run.note_made(["fastrtps_port3"])
-    made = ("fastrtps_port1", "fastrtps_port2", "fastrtps_port3")
-    record = read_record(run.path)
-    assert record is not None
-    assert record.segments == made
-    # Killed while it wrote the next one.
-    (run.path / "record.json").rename(run.path / ".record.json")
-    assert read_record(run.path) == record
-    run.record((), made[:1])
-    record = read_record(run.path)
-    assert record is not None
-    assert record.segments == made[:1]
-    run.release()
-
-
 def test_a_directory_that_others_can_write_is_refused(tmp_path: Path) -> None:
     root = tmp_path / "open"
     root.mkdir()

@@ -25,7 +25,7 @@ into processes without participants over shared memory.
 from __future__ import annotations
 
 import contextlib
-import ctypes
+import errno
 import fcntl
 import mmap
 import os
@@ -38,25 +38,19 @@ from pathlib import Path
 
 from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.process.control import libc
 
 _DIRECTORY = Path("/dev/shm")  # noqa: S108 - where shm_open(3) keeps them
 _FILE = re.compile(
     r"(?P<semaphore>sem\.)?(?P<group>fastrtps_(?:port\d+|[0-9a-f]{16}))(?P<rest>_el|_sl|_mutex)?"
 )
-_IN_CREATE = 0x100
-_EVENT_BYTES = 65536
-_CREATED = re.compile(
-    rb"(?<=\0)(?:sem\.)?(fastrtps_(?:port\d+|[0-9a-f]{16}))(?:_el|_sl|_mutex)?(?=\0)"
-)
-"""Names of files in what inotify(7) gives: after the number of their bytes, with null bytes behind.
-Fast DDS makes a hundred for each participant, and many of them by way of another name."""
-
 _LOCK_FIELDS = 8
 """Of a held lock in /proc/locks: number, FLOCK, ADVISORY, WRITE, pid, file, start, end."""
 
 _AGAIN_S = 0.02
 """So often it is tried again to remove what others still use: no event says that they let go."""
+
+_NEW_S = 0.1
+"""Files of Fast DDS are locked by their owner within milliseconds."""
 
 _PORT = "fastrtps_port"
 _LOCKS = ("_el", "_sl")
@@ -105,6 +99,12 @@ class _SharedFile:
     group: str
     inode: _Inode
     uid: int
+    made_s: float
+
+    @property
+    def is_new(self) -> bool:
+        """Whether a process may have made it, and not yet locked it."""
+        return 0 <= time.time() - self.made_s < _NEW_S
 
     @property
     def is_lock(self) -> bool:
@@ -131,82 +131,17 @@ def segments_of(pids: Iterable[int]) -> frozenset[str]:
     return frozenset(name for name, (group, _) in names.items() if group in owned)
 
 
-def segments_by_holder() -> dict[int, frozenset[str]]:
-    """Return the names of the Fast DDS files that processes own, by the pids of the owners.
-
-    One reading for all processes, but nothing of one that has opened a lock file and not locked it
-    yet, nor of processes of other PID namespaces; `segments_of` is sure.
-
-    Raises:
-        OSError: /proc/locks cannot be read, see proc_locks(5).
-    """
-    names = _names()
-    locks = _lock_files(names)
-    held: dict[int, set[str]] = {}
-    for pid, inode in _locks() if locks else ():
-        if group := locks.get(inode):
-            held.setdefault(pid, set()).add(group)
-    return {
-        pid: frozenset(name for name, (group, _) in names.items() if group in groups)
-        for pid, groups in held.items()
-    }
-
-
 def _locks() -> Iterator[tuple[int, _Inode]]:
     """Yield who holds a lock on a whole file, and on which, of this PID namespace.
 
     Raises:
-        OSError: see `segments_by_holder`.
+        OSError: /proc/locks cannot be read, see proc_locks(5).
     """
     for line in Path("/proc/locks").read_text(encoding="ascii").splitlines():
         fields = line.split()
         if len(fields) >= _LOCK_FIELDS and fields[1] == "FLOCK":
             major, minor, inode = fields[5].split(":")
             yield int(fields[4]), (os.makedev(int(major, 16), int(minor, 16)), int(inode))
-
-
-def still_there(groups: Collection[str]) -> frozenset[str]:
-    """Return those of some groups, see `Creations.take`, that still have a file."""
-    return frozenset(groups) & {group for group, _ in _names().values()} if groups else frozenset()
-
-
-class Creations:
-    """Notices that a process, ours or not, makes files of a segment or of a port (inotify(7)).
-
-    Attributes:
-        descriptor: readable as soon as one was created.
-    """
-
-    def __init__(self) -> None:
-        """Begin.
-
-        Raises:
-            OSError: there is no /dev/shm, or this user has too many inotify instances.
-        """
-        self.descriptor = libc().inotify_init1(os.O_NONBLOCK | os.O_CLOEXEC)
-        if self.descriptor < 0:
-            raise _failed()
-        path = os.fsencode(_DIRECTORY)
-        if libc().inotify_add_watch(self.descriptor, path, _IN_CREATE) < 0:
-            error = _failed()
-            os.close(self.descriptor)
-            raise error
-
-    def take(self) -> frozenset[str]:
-        """Take what came; return the groups of which a file was created, for `sweep`."""
-        try:
-            data = os.read(self.descriptor, _EVENT_BYTES)
-        except BlockingIOError:
-            return frozenset()
-        return frozenset(map(bytes.decode, set(_CREATED.findall(data))))
-
-    def close(self) -> None:
-        """End it."""
-        os.close(self.descriptor)
-
-
-def _failed() -> OSError:
-    return OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()), str(_DIRECTORY))
 
 
 def check_room() -> None:
@@ -254,26 +189,28 @@ def _no_room(free: int, who: str) -> MiddlewareError:
     )
 
 
-def sweep(only: Collection[str], *, within_s: float = 0.0) -> tuple[str, ...]:
-    """Remove the files of this user in the groups of these names that are proven to be unused.
+def sweep(only: Collection[str] | None = None, *, within_s: float = 0.0) -> tuple[str, ...]:
+    """Remove the files of this user that are proven to be unused.
 
     Args:
-        only: names that processes which have ended were seen to own.
-        within_s: seconds to try again while others use some. They let go of the port of a
-            participant that left when they next send over shared memory
+        only: names of files, whose groups are considered; None is all, but for what was made just
+            now: its owner may not have locked it yet.
+        within_s: seconds to try again while others still use what no process owns. They let go of
+            the port of a participant that left when they next send over shared memory
             (SharedMemTransport::cleanup_output_ports in Fast DDS 2.14), of one that was killed only
             seconds later; and where one was killed that had sent there, none removes it.
 
     Returns:
         The names removed, sorted; empty where there is no /dev/shm.
     """
-    removed = _unused(only, remove=True)
     deadline = time.monotonic() + within_s
-    groups = {_group(name) for name in only} if within_s else set()
-    while still_there(groups) and time.monotonic() < deadline:
+    removed: tuple[str, ...] = ()
+    while True:
+        found, in_use = _unused(only, remove=True)
+        removed += found
+        if not in_use or time.monotonic() >= deadline:
+            return tuple(sorted(removed))
         time.sleep(_AGAIN_S)
-        removed += _unused(only, remove=True)
-    return tuple(sorted(removed))
 
 
 def disown_ports() -> tuple[str, ...]:
@@ -347,46 +284,65 @@ def _port_flags(memory: mmap.mmap, number: int) -> int | None:
 
 def leftovers(*, only: Collection[str] | None = None) -> tuple[str, ...]:
     """Return what `sweep` would remove, sorted, and remove nothing; None considers all groups."""
-    return _unused(only, remove=False)
+    return _unused(only, remove=False)[0]
 
 
-def _unused(only: Collection[str] | None, *, remove: bool) -> tuple[str, ...]:
+def _unused(only: Collection[str] | None, *, remove: bool) -> tuple[tuple[str, ...], bool]:
+    """Return the names of unused files, and whether others use some that no process owns."""
     wanted = None if only is None else {_group(name) for name in only}
     groups: dict[str, list[_SharedFile]] = {}
     for file in _files(lambda group: wanted is None or group in wanted):
         groups.setdefault(file.group, []).append(file)
-    found = []
-    for group in sorted(groups):
-        with _claimed(groups[group]) as claimed:
-            for file in groups[group] if claimed else ():
-                if remove:
-                    file.path.unlink(missing_ok=True)
-                found.append(file.path.name)
-    return tuple(sorted(found))
+    found: list[str] = []
+    in_use = False
+    for group, files in groups.items():
+        if any(file.uid != os.getuid() for file in files):
+            continue
+        if only is None and remove and any(file.is_new for file in files):
+            in_use = True
+            continue
+        with contextlib.ExitStack() as claims:
+            try:
+                _claim_all(group, files, claims)
+            except _InUseError:
+                in_use = True
+            except OSError:
+                continue  # owned by a process, or not as it was listed
+            else:
+                for file in files:
+                    if remove:
+                        file.path.unlink(missing_ok=True)
+                    found.append(file.path.name)
+    return tuple(sorted(found)), in_use
 
 
-@contextlib.contextmanager
-def _claimed(files: Collection[_SharedFile]) -> Iterator[bool]:
-    """Hold a group against all other processes for the length of the block.
+class _InUseError(Exception):
+    """No process owns it, and some have it open or mapped."""
 
-    Yields:
-        Whether it is: False where a file is in use, another user's, or not as it was listed.
+
+def _claim_all(group: str, files: Collection[_SharedFile], claims: contextlib.ExitStack) -> None:
+    """Hold a group against all other processes.
+
+    Raises:
+        _InUseError: see there.
+        OSError: a process owns it, or it is not as it was listed.
     """
-    if any(file.uid != os.getuid() for file in files):
-        yield False
-        return
     locked = any(file.is_lock for file in files)
-    with contextlib.ExitStack() as claims:
-        try:
-            # The semaphore first: opening the port after this waits until we are done.
-            for file in sorted(files, key=lambda each: not each.is_mutex):
-                if file.is_lock or file.is_port or not locked:
-                    claims.enter_context(_claim(file))
-            # What was made meanwhile belongs to a process that just opens it.
-            same = set(_files(next(iter(files)).group.__eq__)) == set(files)
-        except OSError:
-            same = False
-        yield same
+    in_use: OSError | None = None
+    # The semaphore first: opening the port after this waits until we are done.
+    for file in sorted(files, key=lambda each: not each.is_mutex):
+        if file.is_lock or file.is_port or not locked:
+            try:
+                claims.enter_context(_claim(file))
+            except BlockingIOError as error:
+                if file.is_lock:
+                    raise
+                in_use = error
+    if in_use is not None:
+        raise _InUseError from in_use
+    # What was made meanwhile belongs to a process that just opens it.
+    if set(_of_group(group)) != set(files):
+        raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), group)
 
 
 @contextlib.contextmanager
@@ -430,20 +386,34 @@ def _files(is_wanted: Callable[[str], bool]) -> list[_SharedFile]:
     """Return the files of some groups."""
     found = []
     for entry in _listing(_DIRECTORY):
-        of = _group(entry.name)
-        if not of or not is_wanted(of):
-            continue
-        with contextlib.suppress(FileNotFoundError):
-            status = entry.stat(follow_symlinks=False)
-            found.append(
-                _SharedFile(
-                    path=Path(entry.path),
-                    group=of,
-                    inode=(status.st_dev, status.st_ino),
-                    uid=status.st_uid,
-                )
-            )
+        group = _group(entry.name)
+        if group and is_wanted(group) and (file := _shared_file(Path(entry.path), group)):
+            found.append(file)
     return found
+
+
+_BEFORE_GROUP, _AFTER_GROUP = ("", "sem."), ("", "_el", "_sl", "_mutex")
+
+
+def _of_group(group: str) -> list[_SharedFile]:
+    """Return the files of a group, without a look at all the others: there may be thousands."""
+    names = (f"{before}{group}{after}" for before in _BEFORE_GROUP for after in _AFTER_GROUP)
+    found = (_shared_file(_DIRECTORY / name, group) for name in names)
+    return [each for each in found if each is not None]
+
+
+def _shared_file(path: Path, group: str) -> _SharedFile | None:
+    try:
+        status = path.lstat()
+    except FileNotFoundError:
+        return None
+    return _SharedFile(
+        path=path,
+        group=group,
+        inode=(status.st_dev, status.st_ino),
+        uid=status.st_uid,
+        made_s=status.st_ctime,
+    )
 
 
 def _listing(directory: Path) -> list[os.DirEntry[str]]:

@@ -153,8 +153,8 @@ def down(path: Path, timeout_s: float) -> ExitCode:
     directory = RunDirectory.acquire(path.parent, path.name, new_run_id())
     try:
         if directory.previous is not None:
-            _, segments = end_run(directory.previous)
-            sweep(segments)
+            end_run(directory.previous)
+            sweep()
         remove_programmed(path, max(1.0, deadline - time.monotonic()))
     finally:
         directory.release()

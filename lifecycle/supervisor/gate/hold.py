@@ -128,7 +128,6 @@ class Holding:
         revisions: knows which manifest runs.
         process_monitor: notices processes that end.
         emit: where events go.
-        note_segments: called when processes may be new.
         keep_going: a process that ends is reported, and does not end the run.
         stop: ends the run, as `lifecycle down` does, with a reason and an exit code.
     """
@@ -144,7 +143,6 @@ class Holding:
         revisions: Revisions,
         process_monitor: ProcessMonitor,
         emit: Emitter,
-        note_segments: Callable[[], Awaitable[None]],
         keep_going: bool,
         stop: Callable[[str, ExitCode], None],
     ) -> None:
@@ -158,7 +156,6 @@ class Holding:
         self._revisions = revisions
         self._process_monitor = process_monitor
         self._emit = emit
-        self._note_segments = note_segments
         self._keep_going = keep_going
         self._mailbox = Mailbox()
         self._before = ""  # phase of a system that is being restarted by policy
@@ -175,7 +172,6 @@ class Holding:
             StepFailedError: a process ended, or an order failed.
             VerificationError: an order could not be carried out behind the gate.
         """
-        await self._note_segments()
         deadline = None if hold_s is None else asyncio.get_running_loop().time() + hold_s
         while True:
             opens = self._gate_sequence.may_let_through
@@ -296,7 +292,6 @@ class Holding:
         """Start again what is due."""
         keys = self._schedule.begin()
         await self._gate_sequence.carry_out(Order(kind=OrderKind.RESTART, keys=keys))
-        await self._note_segments()
 
     async def _let_through(self) -> None:
         """Let through its gate what waits there."""
@@ -323,13 +318,11 @@ class Holding:
                 change = await self._apply(pending.order)
             else:
                 await self._carry_out_in_spite(self._taking(pending.order))
-            await self._note_segments()
         except (UsageError, NotBegunError) as error:
             pending.finish(Done(exit_code=error.exit_code, error=str(error)))
         except RolledBackError as error:
             pending.finish(Done(exit_code=error.exit_code, error=str(error)))
             self._emit(Notice(message=str(error)))
-            await self._note_segments()
             if error.ends is not None:
                 raise error.ends from error
         except StepFailedError as error:

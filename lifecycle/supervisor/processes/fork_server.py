@@ -28,7 +28,6 @@ from lifecycle.supervisor.processes.fork_server_main import (
     LARGEST_MESSAGE,
     MSG_CMSG_CLOEXEC,
     SERVES,
-    SWEEP,
     ChildReport,
     ForkRequest,
 )
@@ -51,9 +50,6 @@ _STATUS_WAIT_S = 1.0
 
 _READY_S = 10.0
 """A fork server serves after 0.2 s; a loaded machine takes longer."""
-
-_SWEPT_S = 5.0
-"""A sweep takes milliseconds, on a loaded machine longer; what is left is swept at the end."""
 
 _HOST = "lifecycle.node.host.host"
 
@@ -178,7 +174,6 @@ class ForkServer:
         self._cgroup: RunCgroup | None = None
         self._pending: dict[int, _Pending] = {}
         self._children: dict[int, ForkServerChild] = {}
-        self._sweeping: dict[int, asyncio.Future[tuple[str, ...]]] = {}
         self._next = 0
         self._loop = asyncio.get_running_loop()
         # Of a shell that became this process by exec: no part of the run.
@@ -329,22 +324,6 @@ class ForkServer:
         """Have all participants of this host send no more to ports whose process was killed."""
         self._send(DISOWN)
 
-    async def sweep(self, names: Collection[str]) -> tuple[str, ...]:
-        """Have files of shared memory removed that are unused, see `lifecycle.middleware.sweep`.
-
-        Returns:
-            The names removed; none if the fork server is gone, or does not answer.
-        """
-        if not names or not self._alive:
-            return ()
-        self._next += 1
-        number, swept = self._next, self._loop.create_future()
-        self._sweeping[number] = swept
-        self._send("\n".join((SWEEP, str(number), *names)))
-        done, _ = await asyncio.wait((swept,), timeout=_SWEPT_S)
-        self._sweeping.pop(number, None)
-        return swept.result() if done else ()
-
     def _send(self, message: str) -> None:
         """Send what is not answered; one that has died is noticed elsewhere."""
         if self._alive:
@@ -371,9 +350,6 @@ class ForkServer:
         report = from_json(data, ChildReport)
         if report.id == SERVES.id:
             self._serves.set()
-        elif report.swept is not None:
-            if report.id in self._sweeping:
-                self._sweeping.pop(report.id).set_result(report.swept)
         elif report.stopped is not None:
             if report.id in self._children:
                 self._children[report.id].on_stop(report.stopped)
@@ -424,9 +400,6 @@ class ForkServer:
             if not born.done():
                 born.set_exception(BringUpError(self.died.result()))
         self._pending.clear()
-        for swept in self._sweeping.values():
-            swept.set_result(())
-        self._sweeping.clear()
 
     async def close(self) -> None:
         """End the fork server; its children must have ended. Then the run's cgroup is removed."""

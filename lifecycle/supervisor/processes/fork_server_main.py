@@ -3,7 +3,7 @@
 Owns: what runs in `python -m lifecycle.supervisor.processes.fork_server_main SOCKET_FD [--preload]
 [--programs]`. It stays single-threaded and never calls rclpy.init, so that forking is safe and
 every child is a participant of its own; with `--preload` a forked host skips ~130 ms of imports.
-For the same reason it handles shared memory that processes have left
+For the same reason it has all let go of shared memory whose owner was killed
 (lifecycle.middleware.process.shared_memory). Each child leads a session of its own. It adopts what
 its children leave behind (PR_SET_CHILD_SUBREAPER), so as long as it lives, what descends from it is
 what the run started. If the supervisor vanishes it ends what is left of its children, bounded.
@@ -34,7 +34,6 @@ from lifecycle.middleware import (
     drop_network_administration,
     limit_resources,
     refuse_new_privileges,
-    sweep,
 )
 from lifecycle.supervisor.processes.fork_server_process import PRELOAD
 
@@ -85,7 +84,6 @@ class ChildReport:
         status: waitpid(2) status; None while it runs.
         error: why it could not be forked.
         stopped: a signal stopped it (True) or made it continue (False); None reports neither.
-        swept: names of the files removed, where `SWEEP` asked with this id.
     """
 
     id: int
@@ -93,14 +91,10 @@ class ChildReport:
     status: int | None = None
     error: str = ""
     stopped: bool | None = None
-    swept: tuple[str, ...] | None = None
 
 
 DISOWN = "disown"
 """A message: have all let go of ports in shared memory whose process was killed; not answered."""
-
-SWEEP = "sweep"
-"""Begins a message: remove unused files of shared memory; an id and their names, one a line."""
 
 _CHILD_SIGNAL = -1
 _ENDED = os.WEXITED | os.WNOWAIT | os.WNOHANG
@@ -154,9 +148,6 @@ class _ForkServer:
         word, *lines = data.decode().split("\n")
         if word == DISOWN:
             disown_ports()
-        elif word == SWEEP:
-            number, *names = lines
-            self._tell(ChildReport(id=int(number), swept=sweep(names)))
         elif word == PRELOAD:
             _preload(lines)
         return True

@@ -19,7 +19,6 @@ from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Protocol
 
-from lifecycle.middleware import segments_of
 from lifecycle.run_directory import (
     OWN_CHILD,
     PROCESS_VARIABLE,
@@ -193,15 +192,10 @@ def reap_adopted(spare: Iterable[int]) -> None:
         OWN_CHILD.release()
 
 
-def end_run(record: RunRecord) -> tuple[tuple[int, ...], frozenset[str]]:
-    """End what is left of a run whose supervisor was killed.
-
-    Returns:
-        The pids that were ended, and the shared memory files that the run was seen to own.
-    """
-    recorded = frozenset(record.segments)
+def end_run(record: RunRecord) -> tuple[int, ...]:
+    """End what is left of a run whose supervisor was killed; return the pids."""
     if record.boot_id != boot_id():
-        return (), recorded
+        return ()
     pids = {child.pid for child in record.children if is_process(child.pid, child.start_ticks)}
     pids |= _carrying(record.run_id)
     if record.cgroup:
@@ -211,12 +205,10 @@ def end_run(record: RunRecord) -> tuple[tuple[int, ...], frozenset[str]]:
     for pid in tuple(pids):
         pids.update(descendants(pid))
     pids.discard(os.getpid())
-    # What they own now may be newer than the record.
-    owned = segments_of(pids)
     ended = _end(pids, GRACE_S)
     if record.cgroup:
         remove_left(record.cgroup, record.controllers, record.run_id)
-    return ended, recorded | owned
+    return ended
 
 
 def children() -> frozenset[int]:

@@ -351,7 +351,6 @@ class Session:
             revisions=self._revisions,
             process_monitor=self._process_monitor,
             emit=emit,
-            note_segments=self._records.note_segments,
             keep_going=options.keep_going,
             stop=self.stop,
         )
@@ -703,7 +702,6 @@ class Session:
         self._holding.close(f"cannot go on: {self._system.plan.system!r} is being taken down")
         await self._guard.close()
         await self._bring_up.close()
-        await self._records.note_segments()
         if self._authority is not None:
             await self._authority.close()
         taking_down = TakeDown(self._system, self._emit, self._hurry)

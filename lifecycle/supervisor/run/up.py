@@ -78,7 +78,7 @@ from lifecycle.supervisor.run.options import (
     observer_connections,
     own_machines,
 )
-from lifecycle.supervisor.run.records import Records, noting
+from lifecycle.supervisor.run.records import Records
 from lifecycle.supervisor.run.service_manager import ServiceManager
 from lifecycle.supervisor.run.session import Session
 from lifecycle.supervisor.run.signals import Ending
@@ -193,7 +193,6 @@ def _up(
     emit = _emitter((*listeners, service.on_event))
     process = _preloading(process, plan, options, processes)
     directory = _acquired(plan, options, process)
-    records: Records | None = None
     journal = _journal(plan, directory, emit)
     try:
         if directory.previous is not None:
@@ -206,7 +205,6 @@ def _up(
         _enter_graph(plan, options, directory)
 
         async def run(leaving: contextlib.AsyncExitStack) -> UpResult:
-            nonlocal records
             leaving.callback(service.watch())
             logs = begin_logs(log_directory(os.environ, plan.system))
             system = System(
@@ -219,7 +217,9 @@ def _up(
             leaving.enter_context(journal.writing(logs))
             fork_server = ForkServer(process, directory)
             worker = leaving.enter_context(_working(emit, logs, plan.system))
-            records = leaving.enter_context(noting(directory, system, fork_server, worker, emit))
+            records = Records(directory, system, fork_server, emit)
+            leaving.callback(records.close)
+            records.write()
             try:
                 fork_server.confine(processes)
                 # Before any participant: who asks a server that is not there waits to ask again.
@@ -227,7 +227,6 @@ def _up(
                     await discovery_server.begin(system, fork_server, ours=_serves(plan, options))
                 observer_participant = await _observer_participant(plan, options, emit, ending)
                 leaving.callback(_succeed(directory, observer_participant).destroy)
-                await records.note_segments()
                 emit(_started(system, observer_participant, str(logs)))
                 session = Session(
                     system,
@@ -253,12 +252,13 @@ def _up(
                 return UpResult(exit_code=failure.exit_code, verdict=verdict)
             finally:
                 await discovery_server.end(system, asyncio.Event())
-                await _close(fork_server, records, emit)
+                await fork_server.close()
 
         return asyncio.run(_leaving_last(run, conclude))
     finally:
         process.close()
-        _sweep(records)
+        # Once our own participant is gone, too.
+        sweep(within_s=_LET_GO_S)
         directory.release()
 
 
@@ -363,19 +363,6 @@ _LET_GO_S = 0.5
 """Others let go of the port of a participant that left when they next send over shared memory: most
 within milliseconds, one that sends nothing perhaps never. Then the port stays for who uses it next.
 """
-
-
-async def _close(fork_server: ForkServer, records: Records, emit: Emitter) -> None:
-    """Have the fork server remove the shared memory that processes have left, and end it."""
-    if swept := await fork_server.sweep(records.left()):
-        emit(Notice(message=f"removed shared memory left in /dev/shm: {', '.join(swept)}"))
-    await fork_server.close()
-
-
-def _sweep(records: Records | None) -> None:
-    """Remove what is still left once our own participant is gone, too."""
-    if records:
-        sweep(records.left(), within_s=_LET_GO_S)
 
 
 @contextlib.contextmanager
@@ -536,9 +523,9 @@ def _succeed(
 
 def _clean_up_after(record: RunRecord, emit: Emitter) -> None:
     """Sweep what a supervisor left that had no chance to do it itself."""
-    ended, segments = end_run(record)
+    ended = end_run(record)
     disown_ports()
-    swept = sweep(segments)
+    swept = sweep()
     if ended or swept:
         emit(
             Notice(

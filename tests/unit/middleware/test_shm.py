@@ -7,8 +7,8 @@ import ctypes
 import fcntl
 import mmap
 import os
-import select
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,13 +17,10 @@ import pytest
 from lifecycle.middleware import (
     disown_ports,
     leftovers,
-    segments_by_holder,
     segments_of,
-    still_there,
     sweep,
 )
 from lifecycle.middleware.process import shared_memory
-from lifecycle.middleware.process.shared_memory import Creations
 from tests.builders import port_node
 
 SEGMENT = "fastrtps_0123456789abcdef"
@@ -208,18 +205,25 @@ def test_what_others_let_go_of_a_moment_later_is_removed_then(directory: Path) -
     assert names(directory) == ()
 
 
-def test_the_creation_of_fast_ddss_files_is_noticed_and_of_nothing_else(directory: Path) -> None:
-    creations = Creations()
-    try:
-        make(directory, "other_el", f"{PORT}x", f"{PORT}_el.part", f"my{PORT}", f"sem.x{SEGMENT}")
-        assert creations.take() == frozenset()
-        make(directory, f"{PORT}_sl", SEGMENT, f"sem.{PORT}_mutex")
-        assert select.select([creations.descriptor], [], [], 5)[0]
-        assert creations.take() == {PORT, SEGMENT}
-        assert creations.take() == frozenset()
-        assert still_there((PORT, "fastrtps_port1")) == {PORT}
-    finally:
-        creations.close()
+def test_all_that_is_unused_goes_but_for_what_was_made_just_now(
+    directory: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its owner may not have locked it yet."""
+    make(directory, *GROUP, SEGMENT, "other")
+    monkeypatch.setattr(shared_memory, "_NEW_S", 60.0)
+    assert sweep() == ()
+    monkeypatch.setattr(shared_memory, "_NEW_S", 0.2)
+    assert sweep(within_s=5.0) == tuple(sorted((*GROUP, SEGMENT)))
+    assert names(directory) == ("other",)
+
+
+def test_what_a_process_owns_is_not_waited_for(directory: Path) -> None:
+    make(directory, *GROUP)
+    began_s = time.monotonic()
+    with (directory / f"{PORT}_el").open("rb") as lock, (directory / PORT).open("rb"):
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        assert sweep(ALL, within_s=60.0) == ()
+    assert time.monotonic() - began_s < 30
 
 
 def test_a_process_owns_the_groups_whose_lock_file_it_has_open(directory: Path) -> None:
@@ -227,14 +231,6 @@ def test_a_process_owns_the_groups_whose_lock_file_it_has_open(directory: Path) 
     with (directory / f"{PORT}_el").open("rb"), (directory / SEGMENT).open("rb"):
         assert segments_of([os.getpid()]) == frozenset(GROUP)
     assert segments_of([os.getpid()]) == frozenset()
-
-
-def test_the_kernels_list_of_locks_names_the_owner_of_a_group(directory: Path) -> None:
-    make(directory, *GROUP, SEGMENT, f"{SEGMENT}_el")
-    with (directory / f"{PORT}_el").open("rb") as lock, (directory / f"{SEGMENT}_el").open("rb"):
-        assert segments_by_holder() == {}
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        assert segments_by_holder() == {os.getpid(): frozenset(GROUP)}
 
 
 def test_a_process_that_has_ended_owns_nothing() -> None:
@@ -307,5 +303,3 @@ def test_a_machine_without_shared_memory_has_nothing_to_sweep(
 ) -> None:
     monkeypatch.setattr(shared_memory, "_DIRECTORY", tmp_path / "missing")
     assert (sweep(ALL), leftovers(), segments_of([os.getpid()])) == ((), (), frozenset())
-    with pytest.raises(FileNotFoundError):
-        Creations()

@@ -642,7 +642,7 @@ class SessionWorld:
                 self.system,
                 self._options,
                 directory=directory,
-                records=Records(directory, self.system, self.hosts, self.worker, self._emit),
+                records=Records(directory, self.system, self.hosts, self._emit),
                 fork_server=self.hosts,
                 observer_participant=self.graph,
                 networks=self.networks,
