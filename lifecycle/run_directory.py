@@ -18,7 +18,7 @@ import stat
 import struct
 import threading
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -76,8 +76,6 @@ class RunRecord:
         began_s: seconds since the epoch.
         domain_id: where the system is; None if it was not written down.
         participant: GUID prefix of the supervisor's own, 24 hex digits; empty before there is one.
-        cgroup: directory of the cgroup with all of its processes; empty for none.
-        controllers: of cgroups, that it has enabled in that one's parent.
     """
 
     run_id: str
@@ -87,8 +85,6 @@ class RunRecord:
     children: tuple[ChildRecord, ...] = ()
     domain_id: int | None = None
     participant: str = ""
-    cgroup: str = ""
-    controllers: tuple[str, ...] = ()
 
 
 def new_run_id() -> str:
@@ -220,9 +216,6 @@ class RunDirectory:
         self.run_id = run_id
         self.domain_id = domain_id
         self.participant = ""
-        self._cgroup = ""
-        self._controllers: tuple[str, ...] = ()
-        self._recorded: tuple[ChildRecord, ...] = ()
         self.began_s = time.time()
         self.previous: RunRecord | None = None
         self._lock: int | None = None
@@ -302,22 +295,10 @@ class RunDirectory:
         """Where `lifecycle down` and `status` reach the supervisor."""
         return self.path / "control"
 
-    def note_cgroup(self, path: str, controllers: Iterable[str]) -> None:
-        """Add the run's cgroup to the record; where that cannot be written, to the next one.
-
-        Args:
-            path: its directory.
-            controllers: see RunRecord.
-        """
-        self._cgroup, self._controllers = path, tuple(controllers)
-        with contextlib.suppress(OSError):
-            self.record(self._recorded)
-
     def record(self, children: tuple[ChildRecord, ...]) -> None:
         """Write down what runs, in one piece."""
         from lifecycle import codec
 
-        self._recorded = children
         record = RunRecord(
             run_id=self.run_id,
             boot_id=boot_id(),
@@ -328,8 +309,6 @@ class RunDirectory:
             children=children,
             domain_id=self.domain_id,
             participant=self.participant,
-            cgroup=self._cgroup,
-            controllers=self._controllers,
         )
         part = self.path / _PART_NAME
         part.unlink(missing_ok=True)

@@ -108,7 +108,7 @@ class Deployment:
         )
 
     def limited(self, machine: str) -> tuple[tuple[PlannedProcess, Resources], ...]:
-        """Return the processes of a machine for which its supervisor makes cgroups."""
+        """Return the processes of a machine that have `run.resources`."""
         return tuple(
             (each, each.run.resources)
             for each in self.plan.processes
@@ -178,7 +178,6 @@ def _systemd_unit(deployment: Deployment, machine: str) -> str:
         ("RestrictSUIDSGID", "yes"),
         ("LockPersonality", "yes"),
         *_systemd_capabilities(deployment),
-        *_systemd_delegation(deployment, machine),
     ]
     return _sections(
         deployment,
@@ -200,18 +199,6 @@ def _systemd_capabilities(deployment: Deployment) -> Iterator[tuple[str, object]
         yield "AmbientCapabilities", allowed
 
 
-_COUNTED = ("memory", "pids")
-"""What a cgroup uses is counted by its controllers, also where nothing is limited."""
-
-
-def _systemd_delegation(deployment: Deployment, machine: str) -> Iterator[tuple[str, object]]:
-    """Let the supervisor make cgroups below the unit's own, see systemd.resource-control(5)."""
-    limited = deployment.limited(machine)
-    if limited:
-        controllers = {*_COUNTED, *(name for _, each in limited for name in each.controllers())}
-        yield "Delegate", " ".join(sorted(controllers))
-
-
 def _systemd_restart(deployment: Deployment, machine: str) -> Iterator[tuple[str, object]]:
     """What is restarted by whom: nodes by the supervisor, or all of it by systemd; never both.
 
@@ -225,7 +212,7 @@ def _systemd_restart(deployment: Deployment, machine: str) -> Iterator[tuple[str
     yield "RestartSec", 2
 
 
-def _refuse_cgroups(deployment: Deployment, machine: str) -> None:
+def _refuse_resources(deployment: Deployment, machine: str) -> None:
     """Refuse a part whose supervisor is to limit processes, which it cannot in a container.
 
     Raises:
@@ -235,8 +222,8 @@ def _refuse_cgroups(deployment: Deployment, machine: str) -> None:
         at = resources.at
         raise UsageError(
             f"{at.file}:{at.line}:{at.column}: cannot give process {process.name!r} its "
-            "'run.resources' in a container of Kubernetes: its supervisor would make a cgroup for "
-            "it, and the cgroup file system is read-only in a container without privileges",
+            "'run.resources' in a container of Kubernetes: systemd limits what a process may use, "
+            "and does not run there",
             hint="leave 'resources' out and limit the whole container (resources.limits), or write "
             "a unit: lifecycle export systemd",
         )
@@ -290,7 +277,7 @@ def _kubernetes_object(deployment: Deployment, machine: str) -> dict[str, object
 
 
 def _pod(deployment: Deployment, machine: str) -> dict[str, object]:
-    _refuse_cgroups(deployment, machine)
+    _refuse_resources(deployment, machine)
 
     def probe(what: str, failures: int) -> dict[str, object]:
         return {

@@ -203,7 +203,7 @@ class Limits:
 class Resources:
     """What a process and all that it starts may use together, as systemd.resource-control(5).
 
-    None sets no limit. The process has a cgroup of its own in any case, see cgroup-v2.rst.
+    None sets no limit. systemd sets them, for a scope of the process.
 
     Attributes:
         at: of the key `resources`.
@@ -222,22 +222,6 @@ class Resources:
     cpu_weight: Positive | None = None
     tasks_max: Positive | None = None
 
-    def settings(self) -> tuple[tuple[str, str], ...]:
-        """Return file of the cgroup and what is written there, cgroup-v2.rst, of those set."""
-        quota = self.cpu_quota_percent and f"{self.cpu_quota_percent * 1000} {_PERIOD_US}"
-        found = (
-            ("memory.max", self.memory_max_mib and self.memory_max_mib * 2**20),
-            ("memory.high", self.memory_high_mib and self.memory_high_mib * 2**20),
-            ("cpu.max", quota),
-            ("cpu.weight", self.cpu_weight),
-            ("pids.max", self.tasks_max),
-        )
-        return tuple((name, str(value)) for name, value in found if value is not None)
-
-    def controllers(self) -> frozenset[str]:
-        """Return the controllers of the kernel that its limits take: memory, cpu, pids."""
-        return frozenset(name.partition(".")[0] for name, _ in self.settings())
-
     def properties(self) -> tuple[str, ...]:
         """Return the limits as systemd.resource-control(5) spells them, `MemoryMax=64M`."""
         found = (
@@ -248,10 +232,6 @@ class Resources:
             ("TasksMax", self.tasks_max, ""),
         )
         return tuple(f"{name}={value}{unit}" for name, value, unit in found if value is not None)
-
-
-_PERIOD_US = 100_000
-"""Of cpu.max, the kernel's default and systemd's."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -275,7 +255,7 @@ class Run:
         no_new_privileges: the process, and what it starts, can gain none by execve(2), as
             NoNewPrivileges= of systemd.exec(5).
         limits: None for those of the supervisor.
-        resources: None for no cgroup of its own.
+        resources: None for no limits.
     """
 
     kind: RunKind

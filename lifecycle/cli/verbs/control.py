@@ -93,23 +93,10 @@ def _history(node: NodeStatus) -> str:
         parts.append(f"up for {node.uptime_s:.1f} s")
     if node.restarts:
         parts.append(f"restarted {node.restarts} time{'s' * (node.restarts != 1)}")
-    if node.cgroup_cpu_s is not None:
-        parts.append(_of_cgroup(node))
     if (last := node.last_failure) is not None:
         stderr = f" ({last.stderr})" if last.stderr else ""
         parts.append(f"last failure {last.at}: {last.message}{stderr}")
     return "; ".join(parts)
-
-
-def _of_cgroup(node: NodeStatus) -> str:
-    """Say what the whole cgroup of a node's process uses, as far as the kernel counts it."""
-    memory, tasks = node.cgroup_memory_bytes, node.cgroup_tasks
-    parts = [f"{node.cgroup_cpu_s:.1f} s CPU"]
-    if memory is not None:
-        parts.append(f"{memory / 2**20:.1f} MiB")
-    if tasks is not None:
-        parts.append(f"{tasks} tasks")
-    return f"cgroup: {', '.join(parts)}"
 
 
 @click.command("status")

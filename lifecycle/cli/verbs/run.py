@@ -67,14 +67,14 @@ def command(manifest: str, node: str, words: tuple[str, ...], *, auto: bool) -> 
 
 
 def _say_unlimited(name: str, resources: Resources) -> None:
-    """Say that a node runs in the cgroup of this terminal, and how it would not."""
+    """Say that nothing limits a node that is run in this terminal, and what would."""
     properties = "".join(f" -p {each}" for each in resources.properties())
-    hint = f": systemd-run --user --scope{properties} lifecycle run ..." if properties else ""
-    click.echo(
-        f"warning: the resources of {name} are not limited nor counted here, a supervisor makes a "
-        f"cgroup for them{hint}",
-        err=True,
-    )
+    if properties:
+        click.echo(
+            f"warning: the resources of {name} are not limited here, as by lifecycle up: "
+            f"systemd-run --user --scope{properties} lifecycle run ...",
+            err=True,
+        )
 
 
 def find_node(plan: Plan, name: str) -> PlannedNode:

@@ -100,10 +100,6 @@ class NodeStatus(msgspec.Struct, frozen=True, kw_only=True):
             nodes of one process have the same, also of what follows.
         rss_bytes: resident memory of its process, what it shares with others included.
         threads: how many its process has.
-        cgroup_cpu_s: user and system time that all in its process's own cgroup have used; None
-            where it has none, see `run.resources`.
-        cgroup_memory_bytes: memory of that cgroup; None also where the kernel does not count it.
-        cgroup_tasks: processes and threads in it; likewise.
     """
 
     node: str
@@ -129,9 +125,6 @@ class NodeStatus(msgspec.Struct, frozen=True, kw_only=True):
     cpu_s: float | None = None
     rss_bytes: int | None = None
     threads: int | None = None
-    cgroup_cpu_s: float | None = None
-    cgroup_memory_bytes: int | None = None
-    cgroup_tasks: int | None = None
 
 
 class SystemStatus(msgspec.Struct, frozen=True, kw_only=True):

@@ -320,9 +320,6 @@ def _timeless(status: SystemStatus) -> SystemStatus:
                 cpu_s=None,
                 rss_bytes=None,
                 threads=None,
-                cgroup_cpu_s=None,
-                cgroup_memory_bytes=None,
-                cgroup_tasks=None,
             )
             for each in status.nodes
         ),
@@ -402,13 +399,6 @@ def _of_node(
         values.append(("uptime_s", f"{node.uptime_s:.1f}"))
     if node.rss_bytes is not None:
         values += [("cpu_s", f"{node.cpu_s:.2f}"), ("rss_bytes", str(node.rss_bytes))]
-    if node.cgroup_cpu_s is not None:
-        values.append(("cgroup_cpu_s", f"{node.cgroup_cpu_s:.2f}"))
-        counted = {
-            "cgroup_memory_bytes": node.cgroup_memory_bytes,
-            "cgroup_tasks": node.cgroup_tasks,
-        }
-        values += [(name, str(count)) for name, count in counted.items() if count is not None]
     if node.last_failure is not None:
         values.append(("last_failure", f"{node.last_failure.at}: {node.last_failure.message}"))
     return level, f"{label[0]}: {node.node}", message, label[1], tuple(values)

@@ -50,7 +50,6 @@ def node_status(
         if node.name in (flow.publisher, flow.subscription)
     ]
     use = None if process is None else uses.get(process.pid)
-    group = None if use is None else use.cgroup
     external = node.planned.run.kind is RunKind.ATTACH
     return NodeStatus(
         node=node.name,
@@ -83,9 +82,6 @@ def node_status(
         cpu_s=None if use is None else use.cpu_s,
         rss_bytes=None if use is None else use.rss_bytes,
         threads=None if use is None else use.threads,
-        cgroup_cpu_s=None if group is None else group.cpu_s,
-        cgroup_memory_bytes=None if group is None else group.memory_bytes,
-        cgroup_tasks=None if group is None else group.tasks,
     )
 
 
@@ -111,7 +107,7 @@ def system_status(
     silent = system.liveliness.silent
     processes = {node.process for node in system.nodes.values() if node.process is not None}
     living = [each for each in processes if each.pid and not each.is_gone]
-    uses = {each.pid: resource_use(each.pid, each.cgroup) for each in living}
+    uses = {each.pid: resource_use(each.pid) for each in living}
     return SystemStatus(
         system=system.plan.system,
         domain_id=system.plan.domain_id,

@@ -190,7 +190,6 @@ class Applying:
         if change.ends_or_starts:
             try:
                 await self._spawner.ready()
-                self._spawner.confine(plan.processes)
             except (BringUpError, UsageError) as error:
                 raise NotBegunError(
                     f"cannot apply {plan.manifest_path}: {error}; everything stays as it is"

@@ -22,7 +22,7 @@ from collections import Counter
 from collections.abc import AsyncIterator, Callable, Collection, Coroutine, Iterable, Mapping
 from typing import Any
 
-from lifecycle.errors import BringUpError, UsageError
+from lifecycle.errors import BringUpError
 from lifecycle.manifest import TargetState
 from lifecycle.node import Operation
 from lifecycle.plan import Plan, PlanError, moving_nodes, restarted
@@ -359,9 +359,7 @@ class GateSequence:
             nodes = tuple(each for each in nodes if each.planned.key in found)
         try:
             await self._spawner.ready()
-            if order.reload and order.plan is not None:
-                self._spawner.confine(order.plan.processes)
-        except (BringUpError, UsageError) as error:
+        except BringUpError as error:
             raise NotBegunError(
                 f"cannot restart {order.node or self._system.plan.system!r}: {error}; "
                 "everything stays as it is"

@@ -26,6 +26,7 @@ from lifecycle.supervisor.gate.violations import Violations, without_nodes_of
 from lifecycle.supervisor.health.agreement import Agreement
 from lifecycle.supervisor.health.liveliness import NodeArrivals
 from lifecycle.supervisor.nodes.system import ObservedGraph, System
+from lifecycle.supervisor.processes.scope import unlimited
 from lifecycle.supervisor.run.events import Emitter, VerdictChanged
 from lifecycle.supervisor.run.failure import ended
 from lifecycle.verify import (
@@ -456,6 +457,9 @@ class VerificationLoop:
         if self._guard is not None:
             verdict = with_findings(verdict, self._guard.findings())
         verdict = with_findings(verdict, self._system.liveliness.findings())
+        verdict = with_findings(
+            verdict, unlimited(each.planned for each in self._system.processes.values())
+        )
         if self._agreement is not None:
             verdict = self._agreement.explained(verdict)
             verdict = with_findings(verdict, self._agreement.findings(observation))

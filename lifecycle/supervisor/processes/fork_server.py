@@ -13,15 +13,12 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Callable, Collection, Iterator, Mapping
+from typing import NamedTuple
 
-from lifecycle import dataclasses
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import BringUpError
 from lifecycle.graph import set_within
-from lifecycle.manifest import RunKind
 from lifecycle.run_directory import PROCESS_VARIABLE
 from lifecycle.supervisor.processes.fork_server_main import (
     DISOWN,
@@ -40,10 +37,7 @@ from lifecycle.supervisor.processes.orphans import (
     end_left,
 )
 from lifecycle.supervisor.processes.process import ProcessExit, SpawnRequest, run_delay_s
-
-if TYPE_CHECKING:
-    from lifecycle.plan import PlannedProcess
-    from lifecycle.supervisor.processes.cgroup import ProcessCgroup, RunCgroup, RunRecorder
+from lifecycle.supervisor.processes.scope import scope
 
 _STATUS_WAIT_S = 1.0
 """The fork server reaps within microseconds; after this long its report does not come any more."""
@@ -63,7 +57,6 @@ class ForkServerChild:
     Args:
         on_stop: see SpawnRequest.
         lineage: which processes descend from it.
-        group: the cgroup that it joins; None for none.
     """
 
     def __init__(
@@ -72,12 +65,8 @@ class ForkServerChild:
         pidfd: int,
         on_stop: Callable[[bool], None],
         lineage: Lineage,
-        *,
-        group: ProcessCgroup | None = None,
     ) -> None:
         self.pid = pid
-        self._group = group
-        self._clearing: asyncio.Future[None] | None = None
         self._lineage = lineage
         self.exited: asyncio.Future[ProcessExit] = asyncio.get_running_loop().create_future()
         self.on_stop = on_stop
@@ -97,16 +86,6 @@ class ForkServerChild:
             # It has not reached setsid yet, or only its pidfd is left of it.
             with contextlib.suppress(ProcessLookupError):
                 signal.pidfd_send_signal(self._pidfd, number)
-
-    @property
-    def cgroup(self) -> Path | None:
-        """Directory of its own cgroup; None if it has none."""
-        return None if self._group is None else self._group.path
-
-    async def cleared(self) -> None:
-        """Wait until what it left in its cgroup has ended and that is gone, bounded."""
-        if self._clearing is not None:
-            await asyncio.shield(self._clearing)
 
     def run_delay_s(self) -> float:
         """Return how long its threads, and those of its descendants, waited for a processor."""
@@ -144,9 +123,6 @@ class ForkServerChild:
                     exit_ = ProcessExit(signal=found.si_status)
         os.close(self._pidfd)
         self._pidfd = None
-        if self._group is not None:
-            exit_ = dataclasses.replace(exit_, why=self._group.explain())
-            self._clearing = asyncio.ensure_future(self._group.end())
         self.exited.set_result(exit_)
 
 
@@ -155,7 +131,6 @@ class _Pending(NamedTuple):
 
     born: asyncio.Future[ForkServerChild]
     request: SpawnRequest
-    group: ProcessCgroup | None
 
 
 class ForkServer:
@@ -163,15 +138,12 @@ class ForkServer:
 
     Args:
         process: that process; ended by `close`.
-        recorder: notes the cgroup of the run; None where no process has resources.
 
     Attributes:
         died: resolves with how, if it ends unasked; nothing can be started any more.
     """
 
-    def __init__(self, process: ForkServerProcess, recorder: RunRecorder | None = None) -> None:
-        self._recorder = recorder
-        self._cgroup: RunCgroup | None = None
+    def __init__(self, process: ForkServerProcess) -> None:
         self._pending: dict[int, _Pending] = {}
         self._children: dict[int, ForkServerChild] = {}
         self._next = 0
@@ -236,54 +208,30 @@ class ForkServer:
         if not self._alive:
             raise BringUpError(self.died.result() if self.died.done() else "the fork server ended")
 
-    def confine(self, processes: Iterable[PlannedProcess]) -> None:
-        """Make the run's cgroup, where processes ask for resources, see `Spawner`.
-
-        Raises:
-            CgroupError: that cannot be, or they cannot have what they ask for.
-        """
-        asking = [
-            each
-            for each in processes
-            if each.run.resources is not None and each.run.kind is not RunKind.ATTACH
-        ]
-        if not asking or self._recorder is None:
-            return
-        from lifecycle.supervisor.processes.cgroup import RunCgroup
-
-        made = self._cgroup or RunCgroup.below_own(self._recorder, asking[0])
-        made.prepare(asking, self)
-        self._cgroup = made
-
     async def spawn(self, request: SpawnRequest) -> ForkServerChild:
         """Fork one process.
 
         Raises:
             BringUpError: the fork server is gone, or the system is out of processes.
         """
-        group: ProcessCgroup | None = None
         try:
-            if request.resources is not None:
-                assert self._cgroup is not None
-                group = self._cgroup.make(request.name, request.resources)
-            return await self._forked(request, group)
+            return await self._forked(request)
         except (BringUpError, OSError) as error:
-            if group is not None:
-                await group.end()
             message = error.message if isinstance(error, BringUpError) else str(error)
             raise BringUpError(f"cannot start process {request.name!r}: {message}") from error
 
-    async def _forked(self, request: SpawnRequest, group: ProcessCgroup | None) -> ForkServerChild:
+    async def _forked(self, request: SpawnRequest) -> ForkServerChild:
         """Have it fork; raises BringUpError if it cannot."""
         self._next += 1
         descriptors = [request.stdout, request.stderr]
-        argv = request.argv
+        limits = scope(request.resources)
+        argv = (*limits, *request.argv)
         if request.control is not None:
             descriptors.append(request.control)
             fresh = any(name.startswith(_FRESH_INTERPRETER) for name, _ in request.environment)
-            if fresh or request.prefix:
+            if fresh or request.prefix or limits:
                 host = (sys.executable, "-m", _HOST, "--control-fd", "{control}")
-                argv = (*request.prefix, *host)
+                argv = (*limits, *request.prefix, *host)
         message = ForkRequest(
             id=self._next,
             argv=argv,
@@ -293,12 +241,11 @@ class ForkServer:
             limits=request.limits,
             no_new_privileges=request.no_new_privileges,
             grace_s=request.grace_s,
-            cgroup="" if group is None else group.procs,
         )
         born: asyncio.Future[ForkServerChild] = self._loop.create_future()
         with self._asking():
             socket.send_fds(self._process.socket, [to_json(message)], descriptors)
-        self._pending[message.id] = _Pending(born, request, group)
+        self._pending[message.id] = _Pending(born, request)
         return await born
 
     def belonging(self, processes: Mapping[int, str]) -> frozenset[int]:
@@ -362,14 +309,12 @@ class ForkServer:
         return True
 
     def _born(self, report: ChildReport, descriptors: list[int]) -> None:
-        born, request, group = self._pending.pop(report.id)
+        born, request = self._pending.pop(report.id)
         if report.error:
             if not born.done():
                 born.set_exception(BringUpError(report.error))
             return
-        child = ForkServerChild(
-            report.pid, descriptors[0], request.on_stop, self._lineage, group=group
-        )
+        child = ForkServerChild(report.pid, descriptors[0], request.on_stop, self._lineage)
         self._children[report.id] = child
         child.exited.add_done_callback(lambda _: self._children.pop(report.id, None))
         if born.cancelled():
@@ -396,18 +341,13 @@ class ForkServer:
         self._serves.set()
         for child in tuple(self._children.values()):
             child.orphaned()
-        for born, _, _ in self._pending.values():
+        for born, _ in self._pending.values():
             if not born.done():
                 born.set_exception(BringUpError(self.died.result()))
         self._pending.clear()
 
     async def close(self) -> None:
-        """End the fork server; its children must have ended. Then the run's cgroup is removed."""
-        await self._end()
-        if self._cgroup is not None:
-            self._cgroup.close()
-
-    async def _end(self) -> None:
+        """End the fork server; its children must have ended."""
         self._closed = True
         if not self._alive:
             return

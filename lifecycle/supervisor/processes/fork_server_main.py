@@ -22,7 +22,6 @@ import time
 import traceback
 import warnings
 from collections.abc import Iterable, Iterator
-from pathlib import Path
 from typing import NoReturn
 
 from lifecycle import dataclasses
@@ -56,7 +55,6 @@ class ForkRequest:
         limits: see SpawnRequest.
         no_new_privileges: likewise.
         grace_s: seconds that the process gets to end by itself once the supervisor is gone.
-        cgroup: file that it writes to join its cgroup; empty to stay in that of the fork server.
     """
 
     id: int
@@ -67,7 +65,6 @@ class ForkRequest:
     limits: tuple[tuple[str, int], ...] = ()
     no_new_privileges: bool = False
     grace_s: float = GRACE_S
-    cgroup: str = ""
 
 
 SERVES = ForkRequest(id=0, argv=(), environment=(), working_directory="", control=False)
@@ -285,25 +282,12 @@ def _take_streams(stdout: int, stderr: int) -> None:
 
 
 def _confine(request: ForkRequest) -> None:
-    if request.cgroup:
-        _join(request.cgroup)
     try:
         limit_resources(request.limits)
         if request.no_new_privileges:
             refuse_new_privileges()
     except MiddlewareError as error:
         print(error, file=sys.stderr)
-        raise SystemExit(1) from error
-
-
-def _join(procs: str) -> None:
-    """Have this process, and all that it will start, in a cgroup, see cgroups(7)."""
-    try:
-        descriptor = os.open(procs, os.O_WRONLY | os.O_CLOEXEC)
-        os.write(descriptor, b"0")
-        os.close(descriptor)
-    except OSError as error:
-        print(f"cannot join cgroup {str(Path(procs).parent)!r}: {error.strerror}", file=sys.stderr)
         raise SystemExit(1) from error
 
 

@@ -198,17 +198,10 @@ def end_run(record: RunRecord) -> tuple[int, ...]:
         return ()
     pids = {child.pid for child in record.children if is_process(child.pid, child.start_ticks)}
     pids |= _carrying(record.run_id)
-    if record.cgroup:
-        from lifecycle.supervisor.processes.cgroup import pids_left, remove_left
-
-        pids |= pids_left(record.cgroup, record.run_id)
     for pid in tuple(pids):
         pids.update(descendants(pid))
     pids.discard(os.getpid())
-    ended = _end(pids, GRACE_S)
-    if record.cgroup:
-        remove_left(record.cgroup, record.controllers, record.run_id)
-    return ended
+    return _end(pids, GRACE_S)
 
 
 def children() -> frozenset[int]:

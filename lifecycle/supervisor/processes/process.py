@@ -69,21 +69,16 @@ class ProcessExit:
     Attributes:
         status: exit status, 0–255; None if a signal ended it or it is not known.
         signal: number of the signal that ended it; None otherwise.
-        why: what else is known of its end; empty if nothing is.
     """
 
     status: int | None = None
     signal: int | None = None
-    why: str = ""
 
     @classmethod
     def from_wait(cls, raw: int) -> ProcessExit:
         """Decode the status of waitpid(2)."""
         code = os.waitstatus_to_exitcode(raw)
         return cls(status=code) if code >= 0 else cls(signal=-code)
-
-    def __str__(self) -> str:
-        return f"{self._how()} ({self.why})" if self.why else self._how()
 
     @property
     def is_clean(self) -> bool:
@@ -95,7 +90,7 @@ class ProcessExit:
         """Whether the program broke; shells say so of what they ran by 128 + the signal."""
         return self.signal in _CRASHES or (self.status or 0) - 128 in _CRASHES
 
-    def _how(self) -> str:
+    def __str__(self) -> str:
         if self.signal is not None:
             try:
                 return f"killed by {signal.Signals(self.signal).name}"
@@ -140,7 +135,7 @@ class SpawnRequest:
         limits: (name, value) of setrlimit(2), `RLIMIT_NOFILE`.
         no_new_privileges: see prctl(2), PR_SET_NO_NEW_PRIVS.
         grace_s: seconds that it gets to end by itself should the supervisor be killed.
-        resources: of a cgroup of its own, see `Spawner.confine`; None for none.
+        resources: that it and all that it starts may use together, see scope.py; None for all.
     """
 
     name: str
@@ -169,10 +164,6 @@ class Child(Protocol):
     pid: int
     exited: asyncio.Future[ProcessExit]
 
-    @property
-    def cgroup(self) -> Path | None:
-        """Directory of its own cgroup, cgroups(7); None if it has none."""
-
     def signal(self, number: int) -> None:
         """Send a signal to the process and everything in its group; harmless once it ended."""
 
@@ -181,9 +172,6 @@ class Child(Protocol):
 
         Those of all its descendants count, too; 0 where the kernel does not say.
         """
-
-    async def cleared(self) -> None:
-        """Wait, bounded, until its cgroup is gone with all that it left there; it has ended."""
 
 
 class Spawner(Protocol):
@@ -194,13 +182,6 @@ class Spawner(Protocol):
 
         Raises:
             BringUpError: they cannot.
-        """
-
-    def confine(self, processes: Iterable[PlannedProcess]) -> None:
-        """Make sure, before any is started, that those that ask for resources can have them.
-
-        Raises:
-            CgroupError: they cannot; nothing has changed.
         """
 
     async def spawn(self, request: SpawnRequest) -> Child:
@@ -397,11 +378,6 @@ class ManagedProcess:
         """Return its run delay and ours, seconds: ready to run, but without CPU."""
         return own_run_delay_s() + (0.0 if self.child is None else self.child.run_delay_s())
 
-    @property
-    def cgroup(self) -> Path | None:
-        """Directory of its own cgroup; None if it has none."""
-        return None if self.child is None else self.child.cgroup
-
     def running(self) -> None:
         """Note that the process does its work: its nodes are there."""
         if self.state is ProcessState.STARTING:
@@ -511,8 +487,6 @@ class ManagedProcess:
     async def _release(self) -> None:
         if self.channel is not None:
             await self.channel.close()
-        if self.child is not None and self.ended.done():
-            await self.child.cleared()
         for reader in self._readers:
             reader.close()
         for log in (self.log, *self._node_logs.values()):

@@ -40,6 +40,7 @@ from lifecycle.supervisor.control.server import SupervisorSnapshot, follow
 from lifecycle.supervisor.gate.gate import closes
 from lifecycle.supervisor.gate.verification_loop import GracePeriod, with_findings
 from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant, settled
+from lifecycle.supervisor.processes.scope import unlimited
 from lifecycle.supervisor.run.options import onlooker_connections, own_machines
 from lifecycle.verify import (
     Heals,
@@ -222,10 +223,12 @@ def _judged(
     expected = Expectation.of(plan, observation)
     over = {each.full_name: "" for each in expected.plan.nodes if each.may_end and may_be_over}
     verdict = verify(expected.plan, observation, stage=Stage.ACTIVE, over=over)
+    own = own_machines(plan, "")
+    ours = (each for each in plan.processes if each.machine in own)
     return JudgedSystem(
         plan=expected.plan,
         observation=observation,
-        verdict=with_findings(verdict, expected.findings),
+        verdict=with_findings(verdict, (*expected.findings, *unlimited(ours))),
         rmw=observer_participant.rmw,
         limits=observer_participant.unknown_versions,
     )

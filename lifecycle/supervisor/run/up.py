@@ -215,13 +215,12 @@ def _up(
                 variables=_graph_variables(os.environ),
             )
             leaving.enter_context(journal.writing(logs))
-            fork_server = ForkServer(process, directory)
+            fork_server = ForkServer(process)
             worker = leaving.enter_context(_working(emit, logs, plan.system))
             records = Records(directory, system, fork_server, emit)
             leaving.callback(records.close)
             records.write()
             try:
-                fork_server.confine(processes)
                 # Before any participant: who asks a server that is not there waits to ask again.
                 with ending.raised():
                     await discovery_server.begin(system, fork_server, ours=_serves(plan, options))

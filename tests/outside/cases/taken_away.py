@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 from pathlib import Path
 
-from tests.outside.case import OK, VIOLATED, Case
+from tests.outside.case import NOBODY, OK, UNVERIFIABLE, VIOLATED, Case
 from tests.outside.running import Run
 
 GONE_S = 15.0
@@ -81,7 +82,12 @@ def _kill(run: Run) -> None:
     run.until_active()
     run.wait(lambda: len(run.marks("listener", "received")) > 2, "messages")
     run.signal(signal.SIGKILL)
-    run.wait(lambda: run.processes() == [], "the end of all processes", timeout_s=GONE_S)
+    try:
+        run.wait(lambda: run.processes() == [], "the end of all processes", timeout_s=GONE_S)
+    finally:
+        for each in run.processes():
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(int(each.split()[0]), signal.SIGKILL)
 
 
 def _supervisor_is_killed(run: Run) -> None:
@@ -121,6 +127,19 @@ def _down(run: Run) -> None:
     run.until_active()
     assert run.lifecycle("down", "robot").returncode == 0
 
+
+LIMITED = """\
+manifest_version: 1
+system: robot
+discovery: {range: localhost}
+nodes:
+  talker:
+    run: {python: "parts:Chatty", resources: {memory_max_mib: 900}}
+    interface: {publishers: [{name: chatter, type: std_msgs/msg/String}]}
+  listener:
+    run: {python: "nodes:Listener"}
+    interface: {subscriptions: [{name: chatter, type: std_msgs/msg/String}]}
+"""
 
 PAIR = SYSTEM[: SYSTEM.index("  failing:")]
 FILES = {"parts.py": NODES}
@@ -180,3 +199,32 @@ CASES = (
         quick=True,
     ),
 )
+
+UNLIMITED = (
+    Case(
+        attack="limits of resources that nothing sets are unverifiable",
+        manifest=LIMITED,
+        files=FILES,
+        verb=("up", "--stop-after", "1"),
+        exit_code=0,
+        verdict=UNVERIFIABLE,
+        findings=("declaration.unproven",),
+        says=("systemd does not run here",),
+        activated=frozenset({"talker", "listener"}),
+        before="refused: the controller is not delegated to this supervisor's cgroup",
+    ),
+    Case(
+        attack="limits of resources that nothing sets are refused by --strict",
+        manifest=LIMITED,
+        files=FILES,
+        verb=("up", "--strict", "--timeout", "8"),
+        exit_code=5,
+        verdict=UNVERIFIABLE,
+        findings=("declaration.unproven",),
+        activated=NOBODY,
+        before="refused: the controller is not delegated to this supervisor's cgroup",
+    ),
+)
+
+if not Path("/run/systemd/system").is_dir():
+    CASES += UNLIMITED

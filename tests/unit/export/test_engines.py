@@ -155,24 +155,24 @@ nodes:
 """
 
 
-def test_a_supervisor_that_makes_cgroups_has_them_delegated_to_it(tmp_path: Path) -> None:
+def test_a_unit_delegates_nothing_as_processes_are_limited_in_scopes(tmp_path: Path) -> None:
     manifest = tmp_path / "limited.lifecycle.yaml"
     manifest.write_text(LIMITED)
     files = exported(tmp_path / "out", "systemd", str(manifest))
-    assert sections(files["limited-here.service"])["Service"]["Delegate"] == "cpu memory pids"
-    assert "Delegate" not in sections(files["limited-there.service"])["Service"]
+    for text in files.values():
+        assert "Delegate" not in sections(text)["Service"]
 
 
-def test_a_container_in_which_no_cgroups_can_be_made_is_refused(tmp_path: Path) -> None:
+def test_a_container_in_which_nothing_limits_processes_is_refused(tmp_path: Path) -> None:
     manifest = tmp_path / "limited.lifecycle.yaml"
     manifest.write_text(LIMITED)
     with pytest.raises(UsageError) as raised:
         exported(tmp_path / "out", "kubernetes", str(manifest), "--image", "i")
     assert str(raised.value) == (
         f"{manifest}:9:27: cannot give process 'arm' its 'run.resources' in a container of "
-        "Kubernetes: its supervisor would make a cgroup for it, and the cgroup file system is "
-        "read-only in a container without privileges; leave 'resources' out and limit the whole "
-        "container (resources.limits), or write a unit: lifecycle export systemd"
+        "Kubernetes: systemd limits what a process may use, and does not run there; leave "
+        "'resources' out and limit the whole container (resources.limits), or write a unit: "
+        "lifecycle export systemd"
     )
     assert not (tmp_path / "out").exists()
 

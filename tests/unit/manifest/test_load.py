@@ -114,7 +114,7 @@ def test_machines_with_this_host_added_for_nodes_that_name_none(every_key: Manif
     ]
 
 
-def test_resources_in_the_words_of_the_kernel_and_of_systemd(every_key: Manifest) -> None:
+def test_resources_in_the_words_of_systemd(every_key: Manifest) -> None:
     resources = _node(every_key, "talker").run.resources
     assert resources is not None
     assert (Path(resources.at.file).name, resources.at.line, resources.at.column) == (
@@ -122,14 +122,6 @@ def test_resources_in_the_words_of_the_kernel_and_of_systemd(every_key: Manifest
         36,
         7,
     )
-    assert resources.settings() == (
-        ("memory.max", "536870912"),
-        ("memory.high", "402653184"),
-        ("cpu.max", "150000 100000"),
-        ("cpu.weight", "200"),
-        ("pids.max", "64"),
-    )
-    assert resources.controllers() == {"cpu", "memory", "pids"}
     assert resources.properties() == (
         "MemoryMax=512M",
         "MemoryHigh=384M",
@@ -138,7 +130,7 @@ def test_resources_in_the_words_of_the_kernel_and_of_systemd(every_key: Manifest
         "TasksMax=64",
     )
     bare = Resources(at=resources.at)
-    assert (bare.settings(), bare.controllers(), bare.properties()) == ((), frozenset(), ())
+    assert bare.properties() == ()
 
 
 def test_ways_to_run(every_key: Manifest) -> None:

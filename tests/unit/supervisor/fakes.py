@@ -13,17 +13,16 @@ import os
 import selectors
 import signal
 import socket
-from collections.abc import Callable, Collection, Coroutine, Iterable, Mapping
+from collections.abc import Callable, Collection, Coroutine, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.node.host.control import Command, Event, HostSpec, Operation
-from lifecycle.plan.model import Plan, PlannedNode, PlannedProcess
+from lifecycle.plan.model import Plan, PlannedNode
 from lifecycle.supervisor.nodes.bring_up import BringUp
 from lifecycle.supervisor.nodes.system import System
-from lifecycle.supervisor.processes.cgroup import CgroupError
 from lifecycle.supervisor.processes.process import ProcessExit, SpawnRequest
 from lifecycle.supervisor.run.events import Emitter
 from lifecycle.supervisor.run.events import Event as SupervisorEvent
@@ -154,7 +153,6 @@ class FakeProcess:
     def __init__(self, spawner: FakeSpawner, request: SpawnRequest) -> None:
         self.pid = spawner.next_pid()
         self.exited: asyncio.Future[ProcessExit] = asyncio.get_running_loop().create_future()
-        self.cgroup: Path | None = None
         self.signals: list[int] = []
         self._spawner = spawner
         self._name = request.name
@@ -176,9 +174,6 @@ class FakeProcess:
         self._spawner.looked_at.append(self._name)
         share = self._spawner.starves.get(self._name, 0.0)
         return share * asyncio.get_running_loop().time()
-
-    async def cleared(self) -> None:
-        """It has no cgroup."""
 
     def end(self, how: ProcessExit) -> None:
         if not self.exited.done():
@@ -299,7 +294,6 @@ class FakeSpawner:
         tells: hosts tell unasked what nodes report whenever that changes, as ours do.
         nodes: full names of the nodes that are in the graph, by process.
         changed: called whenever the graph looks otherwise.
-        refuses: why no process can have resources; empty if all can.
         gathers: what each host was given of it and of `unannounced`, see HostSpec.
         names_by_udp: likewise.
     """
@@ -317,7 +311,6 @@ class FakeSpawner:
         self.reports_changes = False
         self.nodes: dict[str, tuple[str, ...]] = {}
         self.changed: Callable[[], None] = lambda: None
-        self.refuses = ""
         self.gathers: list[tuple[int, bool]] = []
         self.names_by_udp: list[bool] = []
         self._pid = _FIRST_PID
@@ -367,13 +360,6 @@ class FakeSpawner:
 
     async def ready(self) -> None:
         """Always."""
-
-    def confine(self, processes: Iterable[PlannedProcess]) -> None:
-        """Refuse if it is to."""
-        asked = [each.name for each in processes if each.run.resources is not None]
-        if asked and self.refuses:
-            raise CgroupError(self.refuses)
-        self.log += [f"{name} confined" for name in asked]
 
     async def spawn(self, request: SpawnRequest) -> FakeProcess:
         process = self.processes[request.name] = FakeProcess(self, request)

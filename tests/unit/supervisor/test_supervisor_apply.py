@@ -15,7 +15,6 @@ from lifecycle.manifest import (
     EndpointPolicy,
     Mode,
     Policy,
-    Resources,
     Restart,
     Supervision,
 )
@@ -74,29 +73,6 @@ def _since_begun(world: SessionWorld) -> list[str]:
 
 def _told(answer: Answer) -> str:
     return f"{answer.exit_code} {answer.error}".rstrip()
-
-
-@pytest.mark.parametrize("reloads", [False, True])
-def test_resources_that_cannot_be_had_are_refused_before_anything_is_ended(
-    tmp_path: Path, *, reloads: bool
-) -> None:
-    limited = dataclasses.replace(VIEWER.run, resources=Resources(at=HERE, tasks_max=20))
-    other = plan_of(CAMERA, dataclasses.replace(VIEWER, run=limited))
-    why = "the controller 'pids' is not delegated"
-
-    async def acts(world: SessionWorld) -> None:
-        world.hosts.refuses = why
-        if reloads:
-            told = await world.order(ControlRequest.RESTART, reload=other)
-            what = "restart 'robot'"
-        else:
-            told = _told(await world.apply(other))
-            what = "apply robot.lifecycle.yaml"
-        assert told == f"6 cannot {what}: {why}; everything stays as it is"
-
-    world = _session(tmp_path, CHAIN, acts)
-    assert "viewer SIGTERM" not in world.hosts.log
-    assert [each for each in world.hosts.log if each.endswith("confined")] == []
 
 
 def test_an_added_node_goes_through_the_gate_while_the_others_stay_active(tmp_path: Path) -> None:

@@ -569,27 +569,6 @@ def test_a_status_lists_connections_below_their_node() -> None:
     ]
 
 
-@pytest.mark.parametrize(
-    ("memory", "tasks", "text"),
-    [
-        (88_080_384, 14, "cgroup: 12.3 s CPU, 84.0 MiB, 14 tasks"),
-        (None, None, "cgroup: 12.3 s CPU"),
-    ],
-)
-def test_a_status_says_what_the_whole_cgroup_of_a_process_uses(
-    memory: int | None, tasks: int | None, text: str
-) -> None:
-    node = msgspec.structs.replace(
-        STATUS.nodes[0],
-        doing="",
-        cgroup_cpu_s=12.34,
-        cgroup_memory_bytes=memory,
-        cgroup_tasks=tasks,
-    )
-    lines = status_text(msgspec.structs.replace(STATUS, nodes=(node,))).splitlines()
-    assert lines[2].endswith(f"  {text}")
-
-
 def test_a_dead_node_is_shown_as_dead_with_how_it_ended() -> None:
     dead = msgspec.structs.replace(
         STATUS.nodes[0],

@@ -18,16 +18,16 @@ import psutil
 import pytest
 
 from lifecycle.errors import BringUpError, UsageError
-from lifecycle.manifest.model import Run, RunKind
+from lifecycle.manifest.diagnostics import Position
+from lifecycle.manifest.model import Resources, Run, RunKind
 from lifecycle.node.host.control import HostSpec
 from lifecycle.plan import build_plan
 from lifecycle.plan.model import PlannedProcess
 from lifecycle.run_directory import RUN_VARIABLE, ChildRecord, RunRecord, boot_id, start_ticks
 from lifecycle.supervisor.control.protocol import ProcessState
-from lifecycle.supervisor.processes import logs
+from lifecycle.supervisor.processes import logs, scope
 from lifecycle.supervisor.processes.control_channel import ControlChannel
 from lifecycle.supervisor.processes.fork_server import ForkServer
-from lifecycle.supervisor.processes.fork_server_main import ForkRequest, _confine
 from lifecycle.supervisor.processes.fork_server_process import ForkServerProcess
 from lifecycle.supervisor.processes.logs import (
     LONGEST_LINE,
@@ -46,6 +46,7 @@ from lifecycle.supervisor.processes.process import (
     change,
 )
 from lifecycle.supervisor.run.events import Emitter, LogLine
+from lifecycle.verify import Outcome
 from tests.builders import port_node, teleop
 
 PYTHON = sys.executable
@@ -79,12 +80,17 @@ class _Bench:
             await process.end(COMMAND_ESCALATION, asyncio.Event())
         await self.fork_server.close()
 
-    async def start(self, *argv: str, environment: tuple[tuple[str, str], ...] = ()) -> Any:
+    async def start(
+        self,
+        *argv: str,
+        environment: tuple[tuple[str, str], ...] = (),
+        resources: Resources | None = None,
+    ) -> Any:
         process = ManagedProcess(
             PlannedProcess(
                 name="it",
                 machine="",
-                run=Run(kind=RunKind.COMMAND, command=argv),
+                run=Run(kind=RunKind.COMMAND, command=argv, resources=resources),
                 nodes=("it",),
                 argv=argv,
                 environment=environment,
@@ -539,23 +545,6 @@ def test_a_process_is_confined_with_all_that_it_starts_and_a_limit_too_high_fail
     assert done.stderr.endswith("; allowed: 77\n")
 
 
-def test_a_process_that_cannot_join_its_cgroup_ends_before_its_own_code_runs(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    request = ForkRequest(
-        id=1,
-        argv=(),
-        environment=(),
-        working_directory="",
-        control=False,
-        cgroup=str(tmp_path / "gone" / "cgroup.procs"),
-    )
-    with pytest.raises(SystemExit, match="1"):
-        _confine(request)
-    gone = str(tmp_path / "gone")
-    assert capsys.readouterr().err == f"cannot join cgroup {gone!r}: No such file or directory\n"
-
-
 def test_what_runs_without_a_supervisor_is_confined_as_well(tmp_path: Path) -> None:
     manifest = tmp_path / "one.lifecycle.yaml"
     manifest.write_text(
@@ -569,17 +558,17 @@ def test_what_runs_without_a_supervisor_is_confined_as_well(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(
-    ("resources", "hint"),
+    ("resources", "said"),
     [
         (
             "{memory_max_mib: 64, cpu_quota_percent: 50}",
-            ": systemd-run --user --scope -p MemoryMax=64M -p CPUQuota=50% lifecycle run ...",
+            "systemd-run --user --scope -p MemoryMax=64M -p CPUQuota=50% lifecycle run ...",
         ),
         ("{}", ""),
     ],
 )
-def test_what_runs_without_a_supervisor_has_no_cgroup_and_says_so(
-    tmp_path: Path, resources: str, hint: str
+def test_what_runs_without_a_supervisor_is_not_limited_and_says_so(
+    tmp_path: Path, resources: str, said: str
 ) -> None:
     manifest = tmp_path / "one.lifecycle.yaml"
     manifest.write_text(
@@ -588,11 +577,65 @@ def test_what_runs_without_a_supervisor_has_no_cgroup_and_says_so(
     )
     words = [sys.executable, "-m", "lifecycle", "run", str(manifest), "it"]
     done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=60)
-    assert done.returncode == 0
-    assert done.stderr == (
-        "warning: the resources of /it are not limited nor counted here, a supervisor makes a "
-        f"cgroup for them{hint}\n"
+    if said:
+        said = f"warning: the resources of /it are not limited here, as by lifecycle up: {said}\n"
+    assert (done.returncode, done.stderr) == (0, said)
+
+
+_SYSTEMD_RUN = """\
+#!/bin/sh
+echo "$@" > {log}
+while [ "$1" != -- ]; do shift; done
+shift
+exec "$@"
+"""
+
+
+def test_systemd_limits_a_process_in_a_scope_that_has_its_pid_and_descriptors(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As systemd-run(1): it makes the scope of itself, and becomes the command."""
+    log = tmp_path / "asked"
+    program = tmp_path / "systemd-run"
+    program.write_text(_SYSTEMD_RUN.format(log=log))
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    monkeypatch.setattr(scope, "why_unlimited", lambda: "")
+    resources = Resources(at=Position(file="m", line=1, column=1), memory_max_mib=64, tasks_max=9)
+
+    async def test() -> None:
+        async with _bench(tmp_path) as bench:
+            process = await bench.start("sh", "-c", "echo $$", resources=resources)
+            assert await process.ended == ProcessExit(status=0)
+            await process.end(COMMAND_ESCALATION, asyncio.Event())
+            assert bench.lines == [str(process.pid)]
+
+    _run(test())
+    user = "--user " if os.geteuid() else ""
+    assert log.read_text() == (
+        f"--scope --quiet --collect {user}--property=MemoryMax=64M --property=TasksMax=9 -- "
+        "sh -c echo $$\n"
     )
+
+
+def test_limits_that_nothing_sets_are_unverifiable(monkeypatch: pytest.MonkeyPatch) -> None:
+    at = Position(file="m", line=1, column=1)
+    processes = [
+        PlannedProcess(name=name, machine="", run=run, nodes=(name,))
+        for name, run in (
+            ("it", Run(kind=RunKind.COMMAND, resources=Resources(at=at, tasks_max=9))),
+            ("bare", Run(kind=RunKind.COMMAND, resources=Resources(at=at))),
+            ("others", Run(kind=RunKind.ATTACH)),
+        )
+    ]
+    monkeypatch.setattr(scope, "why_unlimited", lambda: "systemd does not run here")
+    (found,) = scope.unlimited(processes)
+    assert (found.rule, found.outcome) == ("declaration.unproven", Outcome.UNVERIFIABLE)
+    assert (found.subject, found.at, found.expected) == ("it", at, "limited: TasksMax=9")
+    assert found.message == "cannot limit the resources of process 'it': systemd does not run here"
+    assert scope.scope(processes[0].run.resources) == ()
+    monkeypatch.setattr(scope, "why_unlimited", lambda: "")
+    assert scope.unlimited(processes) == ()
 
 
 FRAMES = """\
