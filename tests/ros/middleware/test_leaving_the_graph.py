@@ -93,9 +93,11 @@ def test_leaving_tells_the_graph_and_leaves_no_shared_memory(
     assert ours
     assert not [name for name in ours if "port" not in name and Path("/dev/shm", name).exists()]
     observer.destroy()
-    # Of two that leave at once neither may take itself for the last: then it is unused, and swept.
+    # Of two that leave at once neither may take itself for the last: then it is unused, and swept,
+    # perhaps by a supervisor that ends meanwhile in another test process.
     left = {name for name in domains_own(ours) if Path("/dev/shm", name).exists()}
-    assert set(sweep(left, within_s=1.0)) == left, users_of(left)
+    assert set(sweep(left, within_s=1.0)) <= left
+    assert not any(Path("/dev/shm", name).exists() for name in left), users_of(left)
 
 
 _COUNTS = """
