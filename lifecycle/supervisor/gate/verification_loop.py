@@ -453,7 +453,7 @@ class VerificationLoop:
             # What arrived meanwhile was not taken in: who came has to be asked for.
             self._stills = stills
             self._observer.expect_newcomers(everybody=True)
-        await self._system.refresh(self._observer)
+        await self._system.refresh(self._observer, marks=stage is Stage.CONNECTED)
         asked = self._asked()
         observation = without(await self._observer.observe(asked), self._system.dead())
         self.seen = observation
