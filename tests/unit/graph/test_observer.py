@@ -15,6 +15,7 @@ from lifecycle.graph import GraphEvents, ManualScheduler
 from lifecycle.graph.observer import Diagnostic, DiagnosticReadings, Observer
 from lifecycle.manifest.model import (
     EndpointKind,
+    Run,
     RunKind,
 )
 from lifecycle.plan.model import ExpectedParameter, Plan
@@ -222,7 +223,10 @@ def test_a_node_is_believed_of_itself_in_a_host_of_ours_only(
     clients.configurations = {"/a": configuration("/a")}
     graph.foreign = {"/a"} if where == "foreign" else set()
     graph.elsewhere = {"/a"} if where == "elsewhere" else set()
-    observation = run(observer.observe(plan_of(planned_node("a", kind=kind))))
+    node = planned_node("a", kind=kind)
+    if kind is not RunKind.PYTHON:
+        node = dataclasses.replace(node, run=Run(kind=kind))
+    observation = run(observer.observe(plan_of(node)))
     assert observation.nodes[0].state == "active"
     assert bool(observation.configurations) is believed
 
