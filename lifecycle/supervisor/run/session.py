@@ -294,6 +294,7 @@ class Session:
             system, observer_participant, disown_ports=fork_server.disown_ports
         )
         emit.listen(self._stale.on_event)
+        emit.listen(self._judge.on_event)
         self._records = records
         self._process_monitor = ProcessMonitor(system)
         self._schedule = RestartSchedule(system, emit)
@@ -521,7 +522,7 @@ class Session:
             return _RunEnd(exit_code=exit_code, why=self._waits())
         end = self._outcome()
         if exit_code in (ExitCode.INTERRUPTED, ExitCode.VIOLATED):
-            return dataclasses.replace(end, exit_code=exit_code)
+            end = dataclasses.replace(end, exit_code=exit_code)
         if end.exit_code != ExitCode.OK:
             return end
         if self._options.stop_after_s is not None:
