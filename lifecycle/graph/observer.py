@@ -1,8 +1,8 @@
 """Updates the graph's state from discovery, nodes' services and parameters.
 
-Owns: what is asked of which node, and when; which of discovery's nodes are members of the graph,
-and what counts as the configuration of one that serves none; what /diagnostics says of nodes; when
-a change is worth another look.
+Owns: what is asked of which node, and when, and whose answers count; which of discovery's nodes are
+members of the graph, and what counts as the configuration of one that serves none; what
+/diagnostics says of nodes; when a change is worth another look.
 It looks when it is asked to, and when something happened.
 """
 
@@ -77,6 +77,9 @@ class DiscoveredGraph(Protocol):
 
     def offers(self, node: str, service: str) -> bool:
         """Return whether discovery shows a service on a node."""
+
+    def hosted(self, nodes: Iterable[str]) -> Mapping[str, bool]:
+        """Return which nodes of this machine are in hosts of ours; others are left out."""
 
     def on_change(self, callback: Callable[[], None]) -> Remove:
         """Call `callback` from any thread after each change; return what takes it away."""
@@ -329,7 +332,7 @@ class Observer:
                 if node.health is not None and node.health.diagnostics
             }
         )
-        answers = await self._ask_all(plan, nodes, planned, given)
+        answers = self._believed(plan, await self._ask_all(plan, nodes, planned, given))
         asked = {name: configuration for name, (_, configuration) in answers.items()}
         self._checksums = {name: each.checksum for name, each in asked.items() if each is not None}
         reporting = {
@@ -401,12 +404,10 @@ class Observer:
         planned: Collection[str],
         given: Collection[str],
     ) -> dict[str, Answer]:
-        # What only a node can know is believed of those in our hosts, and of no other program.
-        ours = {each.full_name for each in plan.nodes if each.run.python}
         answers = dict(
             await asyncio.gather(
                 *(
-                    self._ask(node, reports=node.full_name in ours)
+                    self._ask(node)
                     for node in nodes
                     if node.full_name in planned and node.full_name not in given
                 )
@@ -426,14 +427,27 @@ class Observer:
             )
         return answers
 
-    async def _ask(self, node: ObservedNode, *, reports: bool) -> tuple[str, Answer]:
+    def _believed(self, plan: Plan, answers: Mapping[str, Answer]) -> dict[str, Answer]:
+        """Leave out what nodes say of themselves that are in no host of ours.
+
+        On this machine a host shows that it is one. Of another machine's nodes those count that the
+        plan has in a host: its supervisor started them there.
+        """
+        here = self._discovery.hosted(
+            name for name, (_, configuration) in answers.items() if configuration is not None
+        )
+        elsewhere = {each.full_name: bool(each.run.python) for each in plan.nodes}
+        return {
+            name: (state, configuration if here.get(name, elsewhere.get(name, True)) else None)
+            for name, (state, configuration) in answers.items()
+        }
+
+    async def _ask(self, node: ObservedNode) -> tuple[str, Answer]:
         name = node.full_name
         self._asked.add(name)
         if not node.managed:
-            return name, (None, await self._ask_configuration(name) if reports else None)
+            return name, (None, await self._ask_configuration(name))
         self._follow_transitions(name)
-        if not reports:
-            return name, (await self._ask_state(name), None)
         state, configuration = await asyncio.gather(
             self._ask_state(name), self._ask_configuration(name)
         )

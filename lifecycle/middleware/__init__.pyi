@@ -53,6 +53,8 @@ from .process.control import limit_resources as limit_resources
 from .process.control import machine_id as machine_id
 from .process.control import no_room_for_threads as no_room_for_threads
 from .process.control import refuse_new_privileges as refuse_new_privileges
+from .process.hosted import is_vouched_for as is_vouched_for
+from .process.hosted import vouch_for as vouch_for
 from .process.process_table import note_ended as note_ended
 from .process.reception import Reception as Reception
 from .process.shared_memory import check_room as check_room

@@ -40,6 +40,7 @@ from lifecycle.middleware import (
     is_server_matched,
     machine_id,
     matched_with,
+    vouch_for,
 )
 from lifecycle.network import (
     CONNECTABLE,
@@ -248,12 +249,13 @@ def _document(
     connections: tuple[ConnectionReport, ...],
     health: HealthReport | None = None,
 ) -> NodeConfiguration:
-    name = node.get_fully_qualified_name()
+    name, prefix = node.get_fully_qualified_name(), _gid_prefix(node)
+    vouch_for(prefix)  # before it is answered with
     configuration = NodeConfiguration(
         identity=Identity(
             machine_id=machine_id(),
             process_id=os.getpid(),
-            node_id=f"{name}@{_gid_prefix(node)}",
+            node_id=f"{name}@{prefix}",
         ),
         name=name,
         state=state,

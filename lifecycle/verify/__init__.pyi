@@ -3,6 +3,7 @@ from .judge import missing as missing
 from .judge import not_ok as not_ok
 from .judge import taken_on_trust as taken_on_trust
 from .judge import verify as verify
+from .judge import with_only as with_only
 from .matcher import lay_out as lay_out
 from .observation import SERVES_NONE as SERVES_NONE
 from .observation import ConfigurationError as ConfigurationError
@@ -32,6 +33,7 @@ from .rules.endpoints import DEFINITION_DIFFERS as DEFINITION_DIFFERS
 from .rules.health import UNHEALTHY as UNHEALTHY
 from .rules.health import health_of as health_of
 from .rules.matching import SERVER_OF as SERVER_OF
+from .rules.matching import UNKNOWN_PEER as UNKNOWN_PEER
 from .rules.matching import MatchEnd as MatchEnd
 from .rules.matching import match as match
 from .rules.matching import obstacle as obstacle

@@ -250,6 +250,16 @@ def _verdict(view: View) -> Verdict:
     )
 
 
+def with_only(verdict: Verdict, findings: tuple[Finding, ...], policy: Policy) -> Verdict:
+    """Return `verdict` with these of its findings, and what follows from them."""
+    return dataclasses.replace(
+        verdict,
+        verdict=Outcome.worst(each.outcome for each in findings if not is_trusted(each, policy)),
+        blocking=_blocks(findings, policy),
+        findings=findings,
+    )
+
+
 def _tolerated(view: View) -> tuple[ToleratedNode, ...]:
     """List the undeclared nodes that the policy lets be there, sorted by name."""
     because = {name: f"tolerated_nodes: {pattern}" for name, pattern in view.tools.items()}

@@ -53,6 +53,7 @@ from lifecycle.middleware.fastdds.participant_profile import (
 )
 from lifecycle.middleware.fastdds.settings import observer_settings, stop_listening
 from lifecycle.middleware.fastdds.url_check import OpenSocket
+from lifecycle.middleware.process.hosted import is_vouched_for
 from lifecycle.middleware.process.process_table import programs_of
 from lifecycle.middleware.rcl.graph_changes import GraphGuard, on_graph_change
 from lifecycle.middleware.rcl.graph_queries import (
@@ -477,6 +478,20 @@ class GraphObserver:
         """GUID prefix of its own participant, 24 hex digits; empty where that is not known."""
         homes = self._stale_node_filter.homes()
         return next(iter(homes.get(self.node.get_fully_qualified_name(), ())), "")
+
+    def hosted(self, nodes: Iterable[str]) -> dict[str, bool]:
+        """Return which nodes of this machine are in hosts of ours, see `process/hosted.py`.
+
+        Args:
+            nodes: fully qualified names; those on other machines are not in the result.
+        """
+        homes, found = self._stale_node_filter.homes(), {}
+        own = next(iter(homes.get(self.node.get_fully_qualified_name(), ())), "")
+        for name in nodes:
+            here = [each for each in homes.get(name, ()) if own and is_of_host(each, own)]
+            if here:
+                found[name] = all(map(is_vouched_for, here))
+        return found
 
     def announce_ourselves(self) -> None:
         """Have our participant announce itself to all others of this host, as far as that goes."""

@@ -19,6 +19,7 @@ from lifecycle.graph import set_within
 from lifecycle.manifest import EndpointKind
 from lifecycle.plan import Plan
 from lifecycle.supervisor.connections import discovery_server
+from lifecycle.supervisor.control.protocol import ProcessState
 from lifecycle.supervisor.gate.activation_guard import ActivationGuard
 from lifecycle.supervisor.gate.gate import behind_s, closes
 from lifecycle.supervisor.gate.standstill import Standstill
@@ -27,7 +28,7 @@ from lifecycle.supervisor.health.agreement import Agreement
 from lifecycle.supervisor.health.liveliness import NodeArrivals
 from lifecycle.supervisor.nodes.system import ObservedGraph, System
 from lifecycle.supervisor.processes.scope import unlimited
-from lifecycle.supervisor.run.events import Emitter, VerdictChanged
+from lifecycle.supervisor.run.events import Emitter, Event, ProcessChanged, VerdictChanged
 from lifecycle.supervisor.run.failure import ended
 from lifecycle.verify import (
     DEFINITION_DIFFERS,
@@ -38,6 +39,7 @@ from lifecycle.verify import (
     UNATTRIBUTED_ENDPOINT,
     UNDECLARED_NODE,
     UNHEALTHY,
+    UNKNOWN_PEER,
     About,
     Finding,
     Heals,
@@ -49,11 +51,15 @@ from lifecycle.verify import (
     is_hidden_node,
     rule,
     verify,
+    with_only,
 )
 
 PASSING_S = 1.0
 """Discovery shows a newcomer's endpoints before its name, measured 0.02–0.45 s earlier; what nodes
 have only just been asked for, or have just made in code, is seen 0.01–0.1 s later."""
+
+LEASE_S = 21.0
+"""Fast DDS forgets a participant that left without notice after 20 s, by default."""
 
 _Key = tuple[str, str, str, EndpointKind | None]
 _Place = tuple[object, ...]
@@ -310,6 +316,8 @@ class VerificationLoop:
         self._grace_period = GracePeriod()
         self._unsaid: dict[str, float] = {}
         self._asked_of: tuple[Plan, frozenset[str], Plan] | None = None
+        self._left: dict[str, float] = {}  # topics of processes that ended, and until when
+        self._again: asyncio.TimerHandle | None = None
         self.ahead: frozenset[str] = frozenset()
 
     async def once(self, stage: Stage) -> Verdict:
@@ -328,9 +336,41 @@ class VerificationLoop:
             and self._stills == self._standstill.count()
         )
 
+    def on_event(self, event: Event) -> None:
+        """Take an event of the system; of interest are ends of processes."""
+        if not isinstance(event, ProcessChanged) or event.state is not ProcessState.EXITED:
+            return
+        process = self._system.processes.get(event.process)
+        until_s = asyncio.get_running_loop().time() + LEASE_S
+        for key in () if process is None else process.planned.nodes:
+            if (node := self._system.nodes.get(key)) is not None:
+                self._left.update({each.resolved: until_s for each in node.planned.endpoints})
+
+    def _without_left(self, verdict: Verdict) -> Verdict:
+        """Return a verdict that takes what a process of ours left for what it is, while it lasts.
+
+        Over TCP an end counts a peer that was killed until its lease runs out, and nothing can
+        take it away before.
+        """
+        loop = asyncio.get_running_loop()
+        self._left = {topic: at for topic, at in self._left.items() if at > loop.time()}
+        findings = tuple(
+            each
+            for each in verdict.findings
+            if each.rule != UNKNOWN_PEER.id or each.subject not in self._left
+        )
+        if len(findings) == len(verdict.findings):
+            return verdict
+        if self._again is not None:
+            self._again.cancel()
+        self._again = loop.call_at(min(self._left.values()), self._system.touched.set)
+        return with_only(verdict, findings, self._system.expected.policy)
+
     def close(self) -> None:
         """Judge no more."""
         self._standstill.close()
+        if self._again is not None:
+            self._again.cancel()
 
     async def again(self, ahead: frozenset[str], deadline: float | None) -> Verdict:
         """Judge a system behind an open gate again because it changed.
@@ -435,7 +475,7 @@ class VerificationLoop:
             # What arrived meanwhile was not taken in: who came has to be asked for.
             self._stills = stills
             self._observer.expect_newcomers(everybody=True)
-        await self._system.refresh(self._observer)
+        await self._system.refresh(self._observer, marks=stage is Stage.CONNECTED)
         asked = self._asked()
         observation = without(await self._observer.observe(asked), self._system.dead())
         self.seen = observation
@@ -452,6 +492,7 @@ class VerificationLoop:
         verdict = judge(
             expected, observation, stage=stage, machines=machines, ahead=ahead, over=over
         )
+        verdict = self._without_left(verdict)
         if self._looker is not None:
             verdict = with_findings(verdict, self._looker.findings())
         if self._guard is not None:

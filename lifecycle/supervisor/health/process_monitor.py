@@ -17,7 +17,7 @@ from typing import Any, Protocol
 from lifecycle.errors import BringUpError
 from lifecycle.node import Operation
 from lifecycle.supervisor.control.protocol import ProcessState, Reach
-from lifecycle.supervisor.gate.verification_loop import ChangeCounter
+from lifecycle.supervisor.gate.verification_loop import LEASE_S, ChangeCounter
 from lifecycle.supervisor.nodes.bring_up import ALSO_S, died
 from lifecycle.supervisor.nodes.system import NodeRun, ObservedGraph, System
 from lifecycle.supervisor.processes.adopted_process import AdoptedProcess
@@ -339,10 +339,6 @@ def _reported(node: NodeRun) -> Iterable[str]:
         yield each.gid[:_PREFIX_DIGITS]
 
 
-_LEASE_S = 21.0
-"""Fast DDS forgets a participant that left without notice after 20 s, by default."""
-
-
 class Sightings:
     """Who is in the graph of one system, as an event to wait for."""
 
@@ -362,7 +358,7 @@ class Sightings:
     async def vanishes(self, name: str) -> None:
         """Wait until discovery shows no node of this name, or its lease must have run out."""
         loop = asyncio.get_running_loop()
-        deadline = loop.time() + _LEASE_S
+        deadline = loop.time() + LEASE_S
         while (left_s := deadline - loop.time()) > 0:
             count = self._changes.count
             if not await self._is_there(name):

@@ -795,11 +795,15 @@ class System:
             or any(after.node == key for after in node.planned.after)
         )
 
-    async def refresh(self, observer: ObservedGraph) -> None:
+    async def refresh(self, observer: ObservedGraph, *, marks: bool = False) -> None:
         """Read the configuration of every reachable node and give it to the observer.
 
         One whose host reports every change by itself is not asked. A node that does not answer
         keeps its last one: that it is gone is for the graph and its process to say.
+
+        Args:
+            observer: see above.
+            marks: ask those, too, of which a DSCP is declared: no event says that another was set.
         """
         nodes = [
             node
@@ -809,7 +813,14 @@ class System:
             and not node.stuck
             and node.name not in self.liveliness.silent
         ]
-        await asyncio.gather(*(self._refresh(node) for node in nodes if not node.reports_changes))
+        await asyncio.gather(
+            *(
+                self._refresh(node)
+                for node in nodes
+                if not node.reports_changes
+                or (marks and any(each.dscp is not None for each in node.planned.endpoints))
+            )
+        )
         for node in nodes:
             if node.configuration is not None:
                 observer.put_configuration(node.configuration)

@@ -298,6 +298,7 @@ class Session:
             system, observer_participant, disown_ports=fork_server.disown_ports
         )
         emit.listen(self._stale.on_event)
+        emit.listen(self._judge.on_event)
         self._records = records
         self._process_monitor = ProcessMonitor(system)
         self._schedule = RestartSchedule(system, emit)
@@ -513,7 +514,8 @@ class Session:
         """Return the result of a run that is asked to end.
 
         It is a success only if the system was verified, is what was asked for, and nothing bound
-        it to stay; an interrupt (Ctrl-C) never is, nor what a violation ends.
+        it to stay; an interrupt (Ctrl-C) never is, nor what a violation ends. What was violated
+        meanwhile and is over is said, and no failure of who ends a run that was to last for ever.
 
         Args:
             exit_code: of a run that is cut short.
@@ -522,7 +524,7 @@ class Session:
             return _RunEnd(exit_code=exit_code, why=self._waits())
         end = self._outcome()
         if exit_code in (ExitCode.INTERRUPTED, ExitCode.VIOLATED):
-            return dataclasses.replace(end, exit_code=exit_code)
+            end = dataclasses.replace(end, exit_code=exit_code)
         if end.exit_code != ExitCode.OK:
             return end
         if self._options.stop_after_s is not None:
@@ -531,6 +533,8 @@ class Session:
         if self._options.until is Until.ACTIVE and self._gate_sequence.phase not in _KEPT:
             why = f"the system was {self._gate_sequence.phase}, not active"
             return _RunEnd(exit_code=exit_code, why=why)
+        if meanwhile := self._judge.violations.counted:
+            return dataclasses.replace(end, why=f"violated meanwhile, {meanwhile}")
         return end
 
     def _hosts_left(self) -> bool:
@@ -538,13 +542,15 @@ class Session:
         latest = self._judge.latest
         return latest is not None and self._agreement.follows_from_shut_down(latest)
 
-    def _outcome(self) -> _RunEnd:
+    def _outcome(self, meanwhile: str = "") -> _RunEnd:
         """Return the result of the run of a system that was held until now.
 
         That other machines of the system were shut down before is how a system of several hosts
         ends, and no failure of this one.
+
+        Args:
+            meanwhile: violations that are over and count, as text.
         """
-        meanwhile = self._judge.violations.counted
         deaths = self._process_monitor.deaths()
         if deaths:
             failure = deaths[0].joined(deaths[1:])
@@ -660,7 +666,7 @@ class Session:
             hold_s = 0.0
         await self._holding.hold(stage, hold_s)
         await self._others_end()
-        return self._outcome()
+        return self._outcome(self._judge.violations.counted)
 
     async def _others_end(self) -> None:
         """Wait a moment for machines that end with ours to say so, where only theirs is wrong."""

@@ -159,7 +159,8 @@ def _unknown_peers(view: View) -> Iterator[Finding]:
 
     That is what the graph shows, and what is declared and not seen (yet), which has a finding of
     its own. Where any node may be there, so may what nobody shows. What every client library
-    subscribes to by itself, /clock, is left out of the graph, and so cannot be counted.
+    subscribes to by itself, /clock, is left out of the graph, and so cannot be counted. Nodes of
+    another machine are for its supervisor: it sees tools that look no further than that machine.
     """
     if view.plan.policy.undeclared_nodes is EndpointPolicy.OPEN:
         return
@@ -169,6 +170,8 @@ def _unknown_peers(view: View) -> Iterator[Finding]:
     for actual in view.actual:
         report = actual.report
         if report is None or not report.matched or not actual.planned.kind.is_topic:
+            continue
+        if not view.brings_up(actual.node):
             continue
         topic = view.topics.get(actual.planned.resolved)
         publishers, subscriptions = ([], []) if topic is None else once(topic, _ends_of_graph)

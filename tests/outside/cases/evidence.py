@@ -97,6 +97,25 @@ def tools_that_come_and_go(run: Run) -> None:
         run.stranger("_ros2cli_77", "sub:/chatter", "for:0.4", wait=False).wait(10)
 
 
+def liar(run: Run) -> None:
+    run.program("liar.py")
+
+
+def liar_beside_verify(run: Run) -> None:
+    liar(run)
+    run.stranger("listener", "sub:/chatter")
+
+
+def node_of_ours(run: Run) -> None:
+    run.program("-m", "lifecycle", "run", "own.yaml", "talker", "--manual", wait=False)
+
+
+def verify_beside(run: Run) -> None:
+    run.until_active()
+    beside = run.lifecycle("verify", "{}", "--strict")
+    assert beside.returncode == 0, beside.stdout + beside.stderr
+
+
 SLOW = PAIR.replace(
     '    run: {python: "nodes:Listener"}\n',
     '    run: {python: "slow:SlowListener"}\n',
@@ -183,6 +202,110 @@ PLAIN = {
         "    try:\n        rclpy.spin(Listener())\n    except BaseException:\n        pass\n"
     ),
 }
+LYING = """\
+manifest_version: 1
+system: lying
+discovery: {range: localhost}
+nodes:
+  talker:
+    run: {%s}
+    managed: false
+    interface: {publishers: [{name: chatter, type: std_msgs/msg/String, qos: {depth: 10}}]}
+    flows: {publishers: {chatter: {transport: network}}}
+  listener:
+    run: {python: "nodes:Listener"}
+    interface: {subscriptions: [{name: chatter, type: std_msgs/msg/String}]}
+"""
+LIAR = {
+    "liar.py": '''"""A plain node of depth 1 that reports, as a node in a host, depth 10."""
+import json
+import os
+import rclpy
+from rcl_interfaces.srv import SetParameters
+from rclpy.qos import QoSProfile
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+rclpy.init()
+node = rclpy.create_node("talker")
+publisher = node.create_publisher(String, "chatter", QoSProfile(depth=1))
+
+
+def gids(infos):
+    return sorted(bytes(each.endpoint_gid)[:16].hex() for each in infos)
+
+
+def describe(_, response):
+    (own,) = gids(node.get_publishers_info_by_topic("/chatter"))
+    peers = gids(node.get_subscriptions_info_by_topic("/chatter"))
+    machine = "/etc/machine-id" if os.path.exists("/etc/machine-id") else os.devnull
+    publishes = {
+        "kind": "publishers",
+        "name": "chatter",
+        "resolved": "/chatter",
+        "type": "std_msgs/msg/String",
+        "qos": {
+            "history": "KEEP_LAST",
+            "depth": 10,
+            "reliability": "RELIABLE",
+            "durability": "VOLATILE",
+            "liveliness": "AUTOMATIC",
+        },
+        "gid": own,
+        "mapped": True,
+        "matched": len(peers),
+        "peers": peers,
+        "nfes": [
+            {
+                "transport_protocol": "udp",
+                "internet_protocol": "ipv4",
+                "transport_port": 40001,
+                "internet_address": "127.0.0.1",
+            }
+        ],
+    }
+    document = {
+        "identity": {
+            "machine_id": open(machine).read().strip(),
+            "process_id": os.getpid(),
+            "node_id": "/talker@" + own[:24],
+        },
+        "name": "/talker",
+        "state": "",
+        "connected": True,
+        "rmw": "rmw_fastrtps_cpp",
+        "transports": ["udpv4"],
+        "serializations": ["cdr"],
+        "paradigms": ["publish-subscribe"],
+        "endpoints": [publishes],
+    }
+    response.success, response.message = True, json.dumps(document)
+    return response
+
+
+node.create_service(Trigger, "~/get_configuration", describe)
+node.create_service(SetParameters, "~/map_to", lambda _, response: response)
+node.create_timer(0.1, lambda: publisher.publish(String(data="lie")))
+print("ready", flush=True)
+try:
+    rclpy.spin(node)
+except BaseException:
+    pass
+''',
+}
+HONEST = """\
+manifest_version: 1
+system: honest
+discovery: {range: localhost}
+nodes:
+  talker:
+    run: {%s}
+    interface: {publishers: [{name: chatter, type: std_msgs/msg/String, qos: {depth: 10}}]}
+  listener:
+    run: {python: "nodes:Listener"}
+    interface: {subscriptions: [{name: chatter, type: std_msgs/msg/String}]}
+"""
+ATTACHED, LIES = "attach: true", "command: [python3, liar.py]"
 COMMAND, HOSTED = "command: [python3, listener.py]", 'python: "listener:Listener"'
 TRUST = "policy: {trust: [flow.unreported]}\n"
 
@@ -318,5 +441,61 @@ CASES = (
         exit_code=3,
         says=("system.lifecycle.yaml:4:18", "flow.unreported"),
         before="no such key",
+    ),
+    Case(
+        attack="a foreign node says of itself what only it can know",
+        manifest=LYING % ATTACHED,
+        files=LIAR,
+        verb=("up", "--strict", "--stop-after", "1", "--timeout", "8"),
+        story=liar,
+        exit_code=5,
+        verdict=UNVERIFIABLE,
+        findings=("graph.qos-unverifiable", "flow.wrong-transport"),
+        activated=NOBODY,
+        before="ok, exit 0",
+        quick=True,
+    ),
+    Case(
+        attack="a program that the system starts says of itself what only it can know",
+        manifest=LYING % LIES,
+        files=LIAR,
+        verb=("up", "--stop-after", "1"),
+        exit_code=0,
+        verdict=UNVERIFIABLE,
+        findings=("graph.qos-unverifiable", "flow.wrong-transport"),
+        before="ok, exit 0",
+    ),
+    Case(
+        attack="a foreign node passes for one of a host where no supervisor runs",
+        manifest=(LYING % 'python: "nodes:Talker"').replace(
+            'run: {python: "nodes:Listener"}', "run: {attach: true}\n    managed: false"
+        ),
+        files=LIAR,
+        verb=("verify", "--strict", "--timeout", "4"),
+        story=liar_beside_verify,
+        exit_code=4,
+        verdict=VIOLATED,
+        findings=("config.missing-report",),
+        before="ok, exit 0",
+    ),
+    Case(
+        attack="a node of ours that no supervisor started proves what it says",
+        manifest=HONEST % ATTACHED,
+        files={"own.yaml": HONEST % 'python: "nodes:Talker"'},
+        verb=("up", "--strict", "--stop-after", "1"),
+        story=node_of_ours,
+        exit_code=0,
+        verdict=OK,
+        activated=frozenset({"talker", "listener"}),
+        before="the same",
+    ),
+    Case(
+        attack="`verify` from another process proves what nodes say under their supervisor",
+        manifest=HONEST % 'python: "nodes:Talker"',
+        verb=("up", "--strict", "--stop-after", "12"),
+        story=verify_beside,
+        exit_code=0,
+        verdict=OK,
+        before="the same",
     ),
 )

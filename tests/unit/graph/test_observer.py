@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import logging
-from collections.abc import Awaitable, Callable, Collection, Sequence
+from collections.abc import Awaitable, Callable, Collection, Iterable, Sequence
 from typing import Any, TypeVar
 
 import pytest
@@ -15,6 +15,7 @@ from lifecycle.graph import GraphEvents, ManualScheduler
 from lifecycle.graph.observer import Diagnostic, DiagnosticReadings, Observer
 from lifecycle.manifest.model import (
     EndpointKind,
+    Run,
     RunKind,
 )
 from lifecycle.plan.model import ExpectedParameter, Plan
@@ -46,6 +47,8 @@ class FakeGraph:
         self.destroyed = False
         self.arriving: list[tuple[ObservedNode, ...]] = []
         self.offered: set[str] = set()
+        self.foreign: set[str] = set()
+        self.elsewhere: set[str] = set()
 
     def snapshot(
         self, *, declared: Collection[str] = (), names: DeclaredNames = NO_NAMES
@@ -64,6 +67,9 @@ class FakeGraph:
 
     def offers(self, node: str, service: str) -> bool:
         return service in self.offered
+
+    def hosted(self, nodes: Iterable[str]) -> dict[str, bool]:
+        return {each: each not in self.foreign for each in nodes if each not in self.elsewhere}
 
     def on_change(self, callback: Callable[[], None]) -> Callable[[], None]:
         self.callbacks.append(callback)
@@ -189,6 +195,40 @@ def test_a_node_without_lifecycle_services_is_not_asked_for_its_state(
     assert clients.asked == []
     assert observation.nodes == graph.nodes
     assert observation.configurations == (configuration("/a", state="active"),)
+
+
+@pytest.mark.parametrize(
+    ("kind", "where", "believed"),
+    [
+        (RunKind.ATTACH, "a host of ours", True),
+        (RunKind.ATTACH, "foreign", False),
+        (RunKind.ATTACH, "elsewhere", False),
+        (RunKind.COMMAND, "foreign", False),
+        (RunKind.PYTHON, "a host of ours", True),
+        (RunKind.PYTHON, "foreign", False),
+        (RunKind.PYTHON, "elsewhere", True),
+    ],
+)
+def test_a_node_is_believed_of_itself_in_a_host_of_ours_only(
+    graph: FakeGraph,
+    clients: FakeClients,
+    observer: Observer,
+    kind: RunKind,
+    where: str,
+    *,
+    believed: bool,
+) -> None:
+    graph.nodes = managed("/a")
+    clients.states = {"/a": "active"}
+    clients.configurations = {"/a": configuration("/a")}
+    graph.foreign = {"/a"} if where == "foreign" else set()
+    graph.elsewhere = {"/a"} if where == "elsewhere" else set()
+    node = planned_node("a", kind=kind)
+    if kind is not RunKind.PYTHON:
+        node = dataclasses.replace(node, run=Run(kind=kind))
+    observation = run(observer.observe(plan_of(node)))
+    assert observation.nodes[0].state == "active"
+    assert bool(observation.configurations) is believed
 
 
 def test_what_was_put_is_believed_and_not_asked_for(
