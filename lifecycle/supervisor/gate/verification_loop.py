@@ -143,8 +143,9 @@ def _is_of_unknown_node(finding: Finding) -> bool:
         return not finding.node and finding.outcome is Outcome.UNVERIFIABLE
     if finding.rule == UNDECLARED_NODE.id:
         return is_hidden_node(finding.node)
-    # Who publishes the time begins to once it is active.
-    return finding.rule in (UNATTRIBUTED_ENDPOINT.id, SILENT_CLOCK.id)
+    # Who publishes the time begins to once it is active. A tool that comes or goes changes what is
+    # matched and what the graph shows at different moments.
+    return finding.rule in (UNATTRIBUTED_ENDPOINT.id, SILENT_CLOCK.id, UNKNOWN_PEER.id)
 
 
 def _key(finding: Finding) -> _Key:

@@ -20,6 +20,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 from lifecycle import dataclasses
 from lifecycle.manifest import (
+    DIAGNOSTICS_TOPIC,
     Certainty,
     EndpointKind,
     EndpointPolicy,
@@ -167,6 +168,8 @@ def _unknown_peers(view: View) -> Iterator[Finding]:
     unseen = Counter(
         (each.planned.kind, each.planned.resolved) for each in view.actual if each.observed is None
     )
+    if any(each.health is not None and each.health.diagnostics for each in view.plan.nodes):
+        unseen[(EndpointKind.SUBSCRIPTION, DIAGNOSTICS_TOPIC)] += 1  # the supervisor's own
     for actual in view.actual:
         report = actual.report
         if report is None or not report.matched or not actual.planned.kind.is_topic:
