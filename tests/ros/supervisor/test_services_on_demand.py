@@ -145,17 +145,3 @@ def test_a_node_describes_its_types_once_a_client_asks(
         run.signal(signal.SIGTERM)
         assert run.finish() == ExitCode.OK
         assert run.verdict["findings"] == []
-
-
-def test_a_node_whose_supervisor_was_killed_serves_its_parameters_to_whoever_asks_later(
-    tmp_path: Path, fresh_domain: int, asker: Asker
-) -> None:
-    with up(pair(tmp_path, fresh_domain, edit=_OPEN), runtime=tmp_path) as run:
-        run.until("system", reached="active")
-        run.note_segments()
-        run.met("log", process="listener")
-        run.signal(signal.SIGKILL)
-        run.process.wait(BOUND_S)
-        assert asker.value_of("/listener", "use_sim_time") is False
-        with GraphObserver(fresh_domain) as graph:
-            assert offered(graph, "/listener", *PARAMETERS, *INTERFACE, *TYPES)
