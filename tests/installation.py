@@ -33,12 +33,12 @@ PYTHON = LIFECYCLE.with_name("python")
 
 @functools.cache
 def modules() -> Path:
-    """Return a directory to run in, from which tests and examples can be imported.
+    """Return a directory to run in, from which tests, examples and benchmarks can be imported.
 
     Not the checkout itself: its package would come before the one that is tried.
     """
     directory = Path(tempfile.mkdtemp(prefix="lifecycle-tests-"))
     atexit.register(shutil.rmtree, directory, ignore_errors=True)
-    for name in ("tests", "examples", "manifests"):
+    for name in ("tests", "examples", "manifests", "benchmarks"):
         (directory / name).symlink_to(ROOT / name)
     return directory
