@@ -168,10 +168,9 @@ def test_a_hung_executor_is_noticed_within_a_second_and_so_is_its_end(
         assert turns(running, "/hanging", since) == ["silent", "violated", "alive", "ok"]
         (finding,) = [each for each in verdict["findings"] if each["node"] == "/hanging"]
         assert finding["rule"] == "run.silent-node"
-        assert finding["message"] == (
-            f"cannot rely on '/hanging': a callback in its process 'hanging' (pid {pid}) has been "
-            "running for 0.8 s"
-        )
+        assert finding["message"].startswith("cannot rely on '/hanging': a callback ")
+        running_for = f"its process 'hanging' (pid {pid}) has been running for more than 0.8 s"
+        assert running_for in finding["message"]
         return max(
             stalls.taken(began, violated) - WITHIN_S - BUSY_MACHINE_S,
             stalls.taken(ended, alive) - WITHIN_S,
