@@ -69,6 +69,7 @@ TOOL = ("tool", "sub:/tool_a", "churn:0.12")
 
 
 _WRONG = '"stage":"active","verdict":{"verdict":"violated"'
+_NAMED = '"rule":"graph.undeclared-node"'
 
 
 def visit(run: Run, seconds: float) -> None:
@@ -78,9 +79,9 @@ def visit(run: Run, seconds: float) -> None:
 
 def glance(run: Run, name: str = "stranger") -> None:
     """Have a stranger on /chatter until it is noticed, and no longer."""
-    before = run.output.count(_WRONG)
+    before = run.output.count(_NAMED)
     stranger = run.stranger(name, "pub:/chatter")
-    run.wait(lambda: run.output.count(_WRONG) > before, "it is noticed")
+    run.wait(lambda: run.output.count(_NAMED) > before, "it is noticed by its name")
     stranger.terminate()
     stranger.wait()
 
@@ -250,7 +251,7 @@ CASES = (
         verb=STAYS_8,
         story=taking_turns,
         exit_code=0,
-        says=(NOT_COUNTED, "(graph.undeclared-node)"),
+        says=(NOT_COUNTED, "/stranger_0 (graph.undeclared-node)"),
         before="exit 0, and the last line says nothing of it",
     ),
     Case(
