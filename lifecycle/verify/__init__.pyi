@@ -3,6 +3,7 @@ from .judge import missing as missing
 from .judge import not_ok as not_ok
 from .judge import taken_on_trust as taken_on_trust
 from .judge import verify as verify
+from .judge import with_findings as with_findings
 from .judge import with_only as with_only
 from .matcher import lay_out as lay_out
 from .observation import SERVES_NONE as SERVES_NONE

@@ -260,6 +260,22 @@ def with_only(verdict: Verdict, findings: tuple[Finding, ...], policy: Policy) -
     )
 
 
+def with_findings(verdict: Verdict, findings: tuple[Finding, ...], policy: Policy) -> Verdict:
+    """Return `verdict` with what the supervisor itself found, before the other findings.
+
+    It makes a verdict worse, never better.
+    """
+    if not findings:
+        return verdict
+    added = with_only(verdict, findings, policy)
+    return dataclasses.replace(
+        added,
+        verdict=Outcome.worst((verdict.verdict, added.verdict)),
+        blocking=verdict.blocking or added.blocking,
+        findings=(*findings, *verdict.findings),
+    )
+
+
 def _tolerated(view: View) -> tuple[ToleratedNode, ...]:
     """List the undeclared nodes that the policy lets be there, sorted by name."""
     because = {name: f"tolerated_nodes: {pattern}" for name, pattern in view.tools.items()}

@@ -51,6 +51,7 @@ from lifecycle.verify import (
     is_hidden_node,
     rule,
     verify,
+    with_findings,
     with_only,
 )
 
@@ -462,7 +463,7 @@ class VerificationLoop:
 
     def refuse(self, findings: tuple[Finding, ...]) -> Verdict:
         """Judge by what was found before anything was started; return the verdict."""
-        verdict = with_findings(NOT_JUDGED, findings)
+        verdict = with_findings(NOT_JUDGED, findings, self._system.expected.policy)
         self._stands(Stage.CONNECTED, verdict)
         return verdict
 
@@ -494,18 +495,18 @@ class VerificationLoop:
             expected, observation, stage=stage, machines=machines, ahead=ahead, over=over
         )
         verdict = self._without_left(verdict)
+        policy = expected.policy
         if self._looker is not None:
-            verdict = with_findings(verdict, self._looker.findings())
+            verdict = with_findings(verdict, self._looker.findings(), policy)
         if self._guard is not None:
-            verdict = with_findings(verdict, self._guard.findings())
-        verdict = with_findings(verdict, self._system.liveliness.findings())
-        verdict = with_findings(
-            verdict, unlimited(each.planned for each in self._system.processes.values())
-        )
+            verdict = with_findings(verdict, self._guard.findings(), policy)
+        verdict = with_findings(verdict, self._system.liveliness.findings(), policy)
+        limits = unlimited(each.planned for each in self._system.processes.values())
+        verdict = with_findings(verdict, limits, policy)
         if self._agreement is not None:
             verdict = self._agreement.explained(verdict)
-            verdict = with_findings(verdict, self._agreement.findings(observation))
-        return with_findings(verdict, discovery_server.findings(self._system))
+            verdict = with_findings(verdict, self._agreement.findings(observation), policy)
+        return with_findings(verdict, discovery_server.findings(self._system), policy)
 
     def _asked(self) -> Plan:
         """Return the plan without silent nodes; the same object while that is the same."""
@@ -634,19 +635,6 @@ class VerificationLoop:
         end = loop.time() + BURST_S
         while loop.time() < end and await self._changes.beyond(self._changes.count, QUIET_S):
             pass
-
-
-def with_findings(verdict: Verdict, findings: tuple[Finding, ...]) -> Verdict:
-    """Return `verdict` with what the supervisor itself found."""
-    if not findings:
-        return verdict
-    outcomes = [each.outcome for each in findings]
-    return dataclasses.replace(
-        verdict,
-        verdict=Outcome.worst((verdict.verdict, *outcomes)),
-        blocking=verdict.blocking or Outcome.VIOLATED in outcomes,
-        findings=(*findings, *verdict.findings),
-    )
 
 
 def without(observation: Observation, dead: frozenset[str]) -> Observation:

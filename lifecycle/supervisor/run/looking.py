@@ -38,7 +38,7 @@ from lifecycle.supervisor.control.client import look
 from lifecycle.supervisor.control.protocol import ProcessState, Reach, SystemStatus
 from lifecycle.supervisor.control.server import SupervisorSnapshot, follow
 from lifecycle.supervisor.gate.gate import closes
-from lifecycle.supervisor.gate.verification_loop import GracePeriod, with_findings
+from lifecycle.supervisor.gate.verification_loop import GracePeriod
 from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant, settled
 from lifecycle.supervisor.processes.scope import unlimited
 from lifecycle.supervisor.run.options import onlooker_connections, own_machines
@@ -53,6 +53,7 @@ from lifecycle.verify import (
     rule,
     tolerating_pattern,
     verify,
+    with_findings,
 )
 
 if TYPE_CHECKING:
@@ -225,10 +226,11 @@ def _judged(
     verdict = verify(expected.plan, observation, stage=Stage.ACTIVE, over=over)
     own = own_machines(plan, "")
     ours = (each for each in plan.processes if each.machine in own)
+    found = (*expected.findings, *unlimited(ours))
     return JudgedSystem(
         plan=expected.plan,
         observation=observation,
-        verdict=with_findings(verdict, (*expected.findings, *unlimited(ours))),
+        verdict=with_findings(verdict, found, expected.plan.policy),
         rmw=observer_participant.rmw,
         limits=observer_participant.unknown_versions,
     )

@@ -224,6 +224,17 @@ UNLIMITED = (
         activated=NOBODY,
         before="refused: the controller is not delegated to this supervisor's cgroup",
     ),
+    Case(
+        attack="limits of resources that nothing sets pass --strict where the manifest trusts that",
+        manifest=LIMITED + "policy: {trust: [declaration.unproven]}\n",
+        files=FILES,
+        verb=("up", "--strict", "--stop-after", "1", "--timeout", "8"),
+        exit_code=0,
+        verdict=OK,
+        findings=("declaration.unproven",),
+        activated=frozenset({"talker", "listener"}),
+        before="refused: the controller is not delegated to this supervisor's cgroup",
+    ),
 )
 
 if not Path("/run/systemd/system").is_dir():

@@ -10,14 +10,14 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.manifest.model import DiscoveryRange, Machine, RunKind
+from lifecycle.manifest.model import DiscoveryRange, Machine, Policy, RunKind
 from lifecycle.middleware import machine_id
 from lifecycle.plan.comparison import decode, encode, notice_of, plan_checksum
 from lifecycle.plan.model import Plan
-from lifecycle.supervisor.gate.verification_loop import with_findings
 from lifecycle.supervisor.health.agreement import ANNOUNCED_S, Agreement
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.run.events import Emitter
+from lifecycle.verify.judge import with_findings
 from lifecycle.verify.observation import Observation, ObservedNode
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.matching import UNMATCHED_FLOW
@@ -685,7 +685,7 @@ def test_an_unverifiable_finding_does_not_close_the_gate_by_itself() -> None:
         observed="",
         message="cannot tell",
     )
-    verdict = with_findings(_verdict(), (unknown,))
+    verdict = with_findings(_verdict(), (unknown,), Policy())
     assert (verdict.verdict, verdict.blocking) == (Outcome.UNVERIFIABLE, False)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from lifecycle.manifest.model import EndpointKind
+from lifecycle.manifest.model import EndpointKind, Policy
 from lifecycle.node.host.control import Event
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.control.protocol import ProcessState, Reach
@@ -20,7 +20,6 @@ from lifecycle.supervisor.gate.verification_loop import (
     PASSING_S,
     ChangeCounter,
     VerificationLoop,
-    with_findings,
     without,
     without_nodes,
 )
@@ -31,6 +30,7 @@ from lifecycle.supervisor.nodes.driver import NodeCondition
 from lifecycle.supervisor.nodes.system import RemoteNode, System
 from lifecycle.supervisor.processes.process import ManagedProcess, ProcessExit
 from lifecycle.supervisor.run.events import NodeJoined, VerdictChanged
+from lifecycle.verify.judge import with_findings
 from lifecycle.verify.observation import (
     NodeConfiguration,
     NodeParameters,
@@ -471,15 +471,24 @@ def test_what_is_seen_is_judged_against_what_is_expected_with_what_others_find(
 def test_what_the_supervisor_finds_comes_first_and_makes_a_verdict_worse_never_better() -> None:
     for outcome, blocking in ((Outcome.VIOLATED, True), (Outcome.UNVERIFIABLE, False)):
         (finding,) = verdict_of(outcome, "run.plan-unknown").findings
-        assert with_findings(UNATTRIBUTED, (finding,)) == dataclasses.replace(
+        assert with_findings(UNATTRIBUTED, (finding,), Policy()) == dataclasses.replace(
             UNATTRIBUTED,
             verdict=outcome,
             blocking=blocking,
             findings=(finding, *UNATTRIBUTED.findings),
         )
-        assert with_findings(MISSING, (finding,)).verdict is Outcome.VIOLATED
-        assert with_findings(MISSING, (finding,)).blocking
-    assert with_findings(MISSING, ()) is MISSING
+        assert with_findings(MISSING, (finding,), Policy()).verdict is Outcome.VIOLATED
+        assert with_findings(MISSING, (finding,), Policy()).blocking
+    assert with_findings(MISSING, (), Policy()) is MISSING
+
+
+def test_the_policy_holds_for_what_the_supervisor_finds_too() -> None:
+    (finding,) = verdict_of(Outcome.UNVERIFIABLE, "run.not-answering").findings
+    blocked = with_findings(OK, (finding,), Policy(unverifiable_blocks=True))
+    assert (blocked.verdict, blocked.blocking) == (Outcome.UNVERIFIABLE, True)
+    trusts = Policy(unverifiable_blocks=True, trust=(finding.rule,))
+    trusted = with_findings(OK, (finding,), trusts)
+    assert (trusted.verdict, trusted.blocking, trusted.findings) == (Outcome.OK, False, (finding,))
 
 
 def test_of_a_process_that_ended_the_nodes_are_left_out_and_of_the_server_it_is_told(
