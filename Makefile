@@ -7,6 +7,8 @@ STAMP  := $(VENV)/.installed
 # How many tests run at once; most of them wait. Each has a domain of its own, tests/ros/conftest.py.
 WORKERS ?= 3
 PYTEST  := $(BIN)/python -m pytest
+# Editable in compat mode puts the package on sys.path, ahead of any folder named lifecycle: each install must say so again.
+INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --config-settings editable_mode=compat --editable
 
 # Tests start hundreds of programs: where nothing may be compiled ahead, each compiles the whole package again.
 export PYTHONDONTWRITEBYTECODE :=
@@ -31,7 +33,7 @@ help:
 $(STAMP): pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit("lifecycle needs CPython 3.10 to 3.13, this is " + sys.version.split()[0]) if not (3, 10) <= sys.version_info[:2] <= (3, 13) else None'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]' --config-settings editable_mode=compat
+	$(INSTALL) '.[dev]'
 	touch $(STAMP)
 
 demo: $(STAMP)
@@ -93,14 +95,14 @@ hostile: $(STAMP)
 # forgets all results.
 MUTANTS ?=
 mutate: $(STAMP)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[mutate]'
+	$(INSTALL) '.[mutate]'
 	CI=1 $(BIN)/python -m tests.mutation.run $(MUTANTS) > mutants.log 2>&1 || { tail -n 40 mutants.log; exit 1; }
 	$(BIN)/python -m tests.mutation.report --at-least 95
 
 # Offline once the extra is installed. The variable hides the theme's notice of its own end of life (May 2027), which it
 # prints at each build; Zensical, its successor, reads the same mkdocs.yml.
 $(VENV)/.docs: $(STAMP)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	$(INSTALL) '.[docs]'
 	touch $@
 
 docs: $(VENV)/.docs
