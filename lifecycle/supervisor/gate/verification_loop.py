@@ -62,6 +62,10 @@ have only just been asked for, or have just made in code, is seen 0.01–0.1 s l
 LEASE_S = 21.0
 """Fast DDS forgets a participant that left without notice after 20 s, by default."""
 
+DISCOVERED_S = 3.5
+"""A participant whose first announcements were lost is discovered with the next one, after 3 s by
+default: a node of ours may be matched with it for so long before our participant knows it."""
+
 _Key = tuple[str, str, str, EndpointKind | None]
 _Place = tuple[object, ...]
 
@@ -144,9 +148,8 @@ def _is_of_unknown_node(finding: Finding) -> bool:
         return not finding.node and finding.outcome is Outcome.UNVERIFIABLE
     if finding.rule == UNDECLARED_NODE.id:
         return is_hidden_node(finding.node)
-    # Who publishes the time begins to once it is active. A tool that comes or goes changes what is
-    # matched and what the graph shows at different moments.
-    return finding.rule in (UNATTRIBUTED_ENDPOINT.id, SILENT_CLOCK.id, UNKNOWN_PEER.id)
+    # Who publishes the time begins to once it is active.
+    return finding.rule in (UNATTRIBUTED_ENDPOINT.id, SILENT_CLOCK.id)
 
 
 def _key(finding: Finding) -> _Key:
@@ -319,6 +322,7 @@ class VerificationLoop:
         self._unsaid: dict[str, float] = {}
         self._asked_of: tuple[Plan, frozenset[str], Plan] | None = None
         self._left: dict[str, float] = {}  # topics of processes that ended, and until when
+        self._unknown_peers: dict[_Key, float] = {}  # since when each is found
         self._again: asyncio.TimerHandle | None = None
         self.ahead: frozenset[str] = frozenset()
 
@@ -348,24 +352,28 @@ class VerificationLoop:
             if (node := self._system.nodes.get(key)) is not None:
                 self._left.update({each.resolved: until_s for each in node.planned.endpoints})
 
-    def _without_left(self, verdict: Verdict) -> Verdict:
-        """Return a verdict that takes what a process of ours left for what it is, while it lasts.
+    def _without_passing_peers(self, verdict: Verdict, stage: Stage) -> Verdict:
+        """Return a verdict without peers that the graph cannot explain yet, or any longer.
 
         Over TCP an end counts a peer that was killed until its lease runs out, and nothing can
-        take it away before.
+        take it away before. Behind the gate a newcomer has DISCOVERED_S to be discovered.
         """
         loop = asyncio.get_running_loop()
-        self._left = {topic: at for topic, at in self._left.items() if at > loop.time()}
-        findings = tuple(
-            each
-            for each in verdict.findings
-            if each.rule != UNKNOWN_PEER.id or each.subject not in self._left
-        )
-        if len(findings) == len(verdict.findings):
+        now_s = loop.time()
+        self._left = {topic: at for topic, at in self._left.items() if at > now_s}
+        found = {_key(each): each for each in verdict.findings if each.rule == UNKNOWN_PEER.id}
+        self._unknown_peers = {key: self._unknown_peers.get(key, now_s) for key in found}
+        until_s = {}
+        for key, since_s in self._unknown_peers.items():
+            least_s = since_s + DISCOVERED_S if stage is Stage.ACTIVE else now_s
+            until_s[key] = max(least_s, self._left.get(found[key].subject, now_s))
+        passing = {key: at for key, at in until_s.items() if at > now_s}
+        if not passing:
             return verdict
         if self._again is not None:
             self._again.cancel()
-        self._again = loop.call_at(min(self._left.values()), self._system.touched.set)
+        self._again = loop.call_at(min(passing.values()), self._system.touched.set)
+        findings = tuple(each for each in verdict.findings if _key(each) not in passing)
         return with_only(verdict, findings, self._system.expected.policy)
 
     def close(self) -> None:
@@ -494,7 +502,7 @@ class VerificationLoop:
         verdict = judge(
             expected, observation, stage=stage, machines=machines, ahead=ahead, over=over
         )
-        verdict = self._without_left(verdict)
+        verdict = self._without_passing_peers(verdict, stage)
         policy = expected.policy
         if self._looker is not None:
             verdict = with_findings(verdict, self._looker.findings(), policy)

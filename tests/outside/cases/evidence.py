@@ -313,7 +313,7 @@ CASES = (
     Case(
         attack="a publisher that no graph shows feeds the listener after the gate",
         manifest=PAIR,
-        verb=("up", "--strict", "--stop-after", "6"),
+        verb=("up", "--strict", "--stop-after", "10"),
         story=hidden_publisher_when_active,
         exit_code=4,
         verdict=VIOLATED,
@@ -336,7 +336,7 @@ CASES = (
     Case(
         attack="a subscription that no graph shows listens to the talker",
         manifest=PAIR,
-        verb=("up", "--strict", "--stop-after", "6"),
+        verb=("up", "--strict", "--stop-after", "10"),
         story=hidden_subscription,
         exit_code=4,
         verdict=VIOLATED,
