@@ -120,10 +120,6 @@ def test_the_first_seven_systems_have_the_articles_names_and_marks() -> None:
     assert {each.name for each in README_ROWS} == {*ARTICLE, *OTHERS}
 
 
-def test_the_guide_has_the_same_table() -> None:
-    assert rows(GUIDE) == README_ROWS
-
-
 def test_every_manifest_but_the_two_introductions_is_one_of_these_systems() -> None:
     there = {each.name.split(".")[0] for each in (ROOT / "manifests").iterdir()}
     assert there - {"first_node", "teleop"} == {each.manifest for each in README_ROWS}
