@@ -32,6 +32,9 @@ def read(path: Path) -> str:
     return path.read_text(encoding="utf-8")
 
 
+README = read(ROOT / "README.md")
+
+
 def prose(path: Path) -> str:
     """A document without blocks of code, line by line."""
     text = re.sub(r"^ *```.*?^ *```$", _blank, read(path), flags=re.MULTILINE | re.DOTALL)
@@ -84,6 +87,31 @@ def test_a_link_between_documents_leads_to_a_file_and_a_heading(document: Path) 
         if not file.is_file() or (anchor and anchor not in anchors(file)):
             broken.append(target)
     assert broken == []
+
+
+NAMED = sorted(
+    set(
+        re.findall(
+            r"`((?:tests|lifecycle|benchmarks|manifests|examples)/[\w./-]+)(?:::(\w+))?`",
+            "\n".join(read(each) for each in DOCUMENTS),
+        )
+    )
+)
+
+
+@pytest.mark.parametrize(("path", "test"), NAMED)
+def test_a_file_that_is_named_is_there_and_has_the_test_that_is_named(path: str, test: str) -> None:
+    file = ROOT / path
+    assert file.exists()
+    if test:
+        assert re.search(rf"^(?:async )?def {test}\(", read(file), re.MULTILINE)
+
+
+@pytest.mark.parametrize(
+    ("name", "text"), re.findall(r"<!-- file: (\S+) -->\n```\w+\n(.*?)```", README, re.DOTALL)
+)
+def test_a_file_that_the_readme_shows_is_the_file_in_the_tree(name: str, text: str) -> None:
+    assert text == read(ROOT / name)
 
 
 @each_page
@@ -147,6 +175,23 @@ def test_every_key_of_the_manifest_is_in_the_prose_of_its_page() -> None:
 def blocks(page: str, language: str) -> list[str]:
     found = re.findall(rf"^```{language}\n(.*?)^```$", read(ROOT / page), re.DOTALL | re.MULTILINE)
     return [str(each) for each in found]
+
+
+def test_the_first_manifest_of_its_page_is_valid(tmp_path: Path) -> None:
+    path = tmp_path / "patrol.lifecycle.yaml"
+    path.write_text(blocks("docs/manifest.md", "yaml")[0], encoding="utf-8")
+    loaded = load(path)
+    assert loaded.warnings == ()
+    assert [node.key for node in loaded.manifest.nodes] == ["camera", "viewer"]
+
+
+def test_the_manifest_of_the_page_of_flows_is_valid(tmp_path: Path) -> None:
+    (manifest,) = blocks("docs/flows.md", "yaml")
+    path = tmp_path / "asks.lifecycle.yaml"
+    path.write_text(manifest, encoding="utf-8")
+    # The one warning is what the page explains: the video's frames do not fit a datagram.
+    warnings = load(path, environment={}).warnings
+    assert {each.rule for each in warnings} == {"check.flow-fragments"}
 
 
 def test_the_examples_of_the_manifest_s_page_are_valid(tmp_path: Path) -> None:
