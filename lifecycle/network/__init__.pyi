@@ -25,7 +25,9 @@ from .five_qi import parse_mapping as parse_mapping
 from .five_qi import propose as propose
 from .medium import BUILTIN_TRANSPORTS as BUILTIN_TRANSPORTS
 from .medium import CONNECTABLE as CONNECTABLE
+from .medium import DEFAULT_RMW as DEFAULT_RMW
 from .medium import DEFAULT_TCP as DEFAULT_TCP
+from .medium import FAST_DDS as FAST_DDS
 from .medium import LOOPBACK as LOOPBACK
 from .medium import LOOPBACK6 as LOOPBACK6
 from .medium import NETWORK_MEDIA as NETWORK_MEDIA
@@ -42,7 +44,6 @@ from .medium import is_fragmented as is_fragmented
 from .medium import max_unfragmented as max_unfragmented
 from .medium import medium_of as medium_of
 from .medium import udp_to as udp_to
-from .nfe import FlowIdentifier as FlowIdentifier
 from .nfe import FlowTuple as FlowTuple
 from .nfe import FlowUniqueness as FlowUniqueness
 from .nfe import InternetProtocol as InternetProtocol
@@ -57,14 +58,11 @@ from .nfe import flow_tuples as flow_tuples
 from .nfe import is_ip as is_ip
 from .nfe import is_loopback as is_loopback
 from .nfe import is_multicast as is_multicast
-from .nfe import is_unique as is_unique
-from .nfe import is_unique_endpoint as is_unique_endpoint
 from .nfe import is_wildcard as is_wildcard
 from .nfe import located as located
 from .nfe import may_be_same as may_be_same
 from .nfe import meets as meets
 from .nfe import socket_text as socket_text
-from .nfe import uniqueness as uniqueness
 from .ports import DG as DG
 from .ports import LOCALHOST_PARTICIPANTS as LOCALHOST_PARTICIPANTS
 from .ports import LOCALHOST_PEERS_RANGE as LOCALHOST_PEERS_RANGE
@@ -90,11 +88,3 @@ from .ports import read_ephemeral_range as read_ephemeral_range
 from .ports import safe_domains as safe_domains
 from .ports import unicast_pairs as unicast_pairs
 from .ports import unique_flow_ports as unique_flow_ports
-from .rmw_capabilities import DEFAULT_RMW as DEFAULT_RMW
-from .rmw_capabilities import Capability as Capability
-from .rmw_capabilities import Feasibility as Feasibility
-from .rmw_capabilities import FlowSide as FlowSide
-from .rmw_capabilities import RmwCapabilities as RmwCapabilities
-from .rmw_capabilities import capabilities as capabilities
-from .rmw_capabilities import dscp_feasibility as dscp_feasibility
-from .rmw_capabilities import feasibility as feasibility

@@ -145,23 +145,6 @@ def tos(dscp: int) -> int:
     return parse_dscp(dscp) << 2
 
 
-def dscp_of_tos(tos_byte: int) -> int:
-    """Return the DSCP, 0–63, in a TOS byte.
-
-    Raises:
-        ValueError: not 0–255, or the ECN bits are set: they belong to the transport (RFC 3168).
-    """
-    if not 0 <= tos_byte <= 0xFF:
-        raise ValueError(f"cannot use TOS {tos_byte}; use 0 to 255")
-    if tos_byte & ECN_MASK:
-        clear = tos_byte & ~ECN_MASK
-        raise ValueError(
-            f"cannot use TOS {tos_byte} (0x{tos_byte:02x}): its two lowest bits are ECN and "
-            f"belong to the transport; use {clear} (0x{clear:02x}), {describe(clear >> 2)}"
-        )
-    return tos_byte >> 2
-
-
 def describe(dscp: int) -> str:
     """Return DSCP and TOS side by side: `EF = DSCP 46 = TOS 184 (0xb8)`.
 
@@ -217,32 +200,6 @@ class MappedPriority:
     def sets_ecn(self) -> bool:
         """Whether the result would write the two ECN bits, which belong to the transport."""
         return self.tos is not None and bool(self.tos & ECN_MASK)
-
-    def dscp(self) -> int | None:
-        """Return the DSCP, 0–63; None if the TOS byte is not set.
-
-        Raises:
-            ValueError: the result sets ECN bits.
-        """
-        return None if self.tos is None else dscp_of_tos(self.tos)
-
-    def notes(self) -> tuple[str, ...]:
-        """Return what a user should know of this result, one sentence each; often nothing."""
-        found: list[str] = []
-        if self.tos is None:
-            found.append(f"transport priority {self.priority:#x} has no effect: the mask is 0")
-        elif self.ignored_bits:
-            found.append(
-                f"bits {self.ignored_bits:#x} of transport priority {self.priority:#x} vanish: "
-                f"mask {self.mapping.mask:#x} leaves TOS {self.tos:#04x}"
-            )
-        if self.tos is not None and self.sets_ecn:
-            clear = self.tos & ~ECN_MASK
-            found.append(
-                f"TOS {self.tos:#04x} sets ECN bits {self.tos & ECN_MASK:#04b}, which belong to "
-                f"the transport; without them it is {describe(clear >> 2)}"
-            )
-        return tuple(found)
 
 
 def map_priority(priority: int, mapping: TransportPriorityMapping) -> MappedPriority:

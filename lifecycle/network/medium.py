@@ -175,6 +175,12 @@ SCHEMES = tuple(sorted(CONNECTABLE, key=lambda each: not each.is_network))
 UDP_UNICAST = tuple(each for each in CONNECTABLE if each.is_udp and not each.is_group)
 """By what participants are probed, and found without a discovery server."""
 
+FAST_DDS = "rmw_fastrtps"
+"""What the names of the RMWs begin with that we know all of this about."""
+
+DEFAULT_RMW = "rmw_fastrtps_cpp"
+"""What ROS 2 Jazzy takes when RMW_IMPLEMENTATION is not set (REP 2000)."""
+
 RMW_DEFAULT = (Medium.SHM, Medium.UDPV4)
 """What a participant has by default (Fast DDS 2.14)."""
 

@@ -1,7 +1,7 @@
 """Network flow endpoints (NFEs), flow tuples, uniqueness, as *Unique Network Flows* defines them.
 
-Owns: the NFE tuple, the requirement enum and the predicates dissimilar, unique, weakly and
-strongly unique; which NFEs of a publisher (source) and a subscription (destination) form a flow: a
+Owns: the NFE tuple, the requirement enum, when two NFEs are dissimilar and a flow is as unique as
+demanded; which NFEs of a publisher (source) and a subscription (destination) form a flow: a
 5-tuple, on IPv6 a flow label beside it, and the DSCP; addresses as text: one spelling each, by the
 scope rules of RFC 4007 and RFC 6890. Pure.
 
@@ -108,8 +108,6 @@ def _equal(one: IpAddress, other: IpAddress) -> bool:
 class TransportProtocol(enum.Enum):
     """Transport protocol of an NFE (rmw_transport_protocol_t); UNKNOWN covers shared memory."""
 
-    __hash__ = object.__hash__  # members are single; Enum's own is Python, and in every dictionary
-
     UNKNOWN = "unknown"
     UDP = "udp"
     TCP = "tcp"
@@ -117,8 +115,6 @@ class TransportProtocol(enum.Enum):
 
 class InternetProtocol(enum.Enum):
     """Internet protocol of an NFE (rmw_internet_protocol_t); UNKNOWN covers shared memory."""
-
-    __hash__ = object.__hash__  # members are single; Enum's own is Python, and in every dictionary
 
     UNKNOWN = "unknown"
     IPV4 = "ipv4"
@@ -144,19 +140,6 @@ class UniqueRequirement(enum.Enum):
     def rmw_value(self) -> int:
         """The number in rmw_unique_network_flow_endpoints_requirement_t."""
         return list(UniqueRequirement).index(self)
-
-
-class FlowIdentifier(enum.Enum):
-    """Which resources distinguish flows; the article's background section names the first three.
-
-    ANY is its definition of dissimilar: a difference in one or more resources. The others are what
-    a given network looks at: a rule on ports does not see the DSCP.
-    """
-
-    FIVE_TUPLE = "5-tuple"  # protocols, addresses, ports
-    THREE_TUPLE = "3-tuple"  # IPv6 addresses and flow label (RFC 6437)
-    SIX_TUPLE = "6-tuple"  # the 5-tuple and the DSCP: a last resort, at most 64 values
-    ANY = "any"
 
 
 class FlowUniqueness(enum.Enum):
@@ -251,7 +234,7 @@ def is_ip(nfe: Nfe) -> bool:
     )
 
 
-def dissimilar(a: Nfe, b: Nfe, *, by: FlowIdentifier = FlowIdentifier.ANY) -> bool:
+def dissimilar(a: Nfe, b: Nfe) -> bool:
     """Return whether one or more networking resources of two NFEs differ.
 
     Addresses differ unless packets of both can carry the same one: a publisher that sends from
@@ -260,10 +243,9 @@ def dissimilar(a: Nfe, b: Nfe, *, by: FlowIdentifier = FlowIdentifier.ANY) -> bo
     Args:
         a: one NFE.
         b: the other; both of publishers or both of subscriptions.
-        by: the resources that count.
     """
     one, other = _plain(a), _plain(b)
-    if _exact_resources(one, by) != _exact_resources(other, by):
+    if _exact_resources(one) != _exact_resources(other):
         return True
     machines = _machine(a), _machine(b)
     return not may_be_same(
@@ -271,40 +253,6 @@ def dissimilar(a: Nfe, b: Nfe, *, by: FlowIdentifier = FlowIdentifier.ANY) -> bo
         other.internet_address,
         same_machine=machines[0] == machines[1] if all(machines) else None,
     )
-
-
-def is_unique(nfe: Nfe, others: Iterable[Nfe], *, by: FlowIdentifier = FlowIdentifier.ANY) -> bool:
-    """Return whether an NFE is dissimilar to all other NFEs."""
-    return all(dissimilar(nfe, other, by=by) for other in others)
-
-
-def is_unique_endpoint(
-    nfes: Sequence[Nfe] | None,
-    others: Iterable[Sequence[Nfe] | None],
-    *,
-    by: FlowIdentifier = FlowIdentifier.ANY,
-) -> bool | None:
-    """Return whether every IP NFE of an endpoint is unique; None when that is unknown.
-
-    An endpoint without an IP NFE is not unique: the network sees nothing of it that it could
-    distinguish.
-
-    Args:
-        nfes: of this endpoint; None when not known.
-        others: those of each other endpoint on the same side (publishers or subscriptions) in the
-            whole system; None for one whose NFEs are not known, which may hide an equal one.
-        by: the resources that count.
-    """
-    if nfes is None:
-        return None
-    own = [each for each in nfes if is_ip(each)]
-    if not own:
-        return False
-    every = list(others)
-    known = [each for other in every if other is not None for each in other if is_ip(each)]
-    if not all(is_unique(each, known, by=by) for each in own):
-        return False
-    return None if None in every else True
 
 
 def meets(
@@ -317,7 +265,7 @@ def meets(
 
     Args:
         demanded: what is asked; NOT is always met.
-        publisher: whether the publisher's NFEs are unique, as `is_unique_endpoint` returns.
+        publisher: whether the publisher's NFEs are unique.
         subscription: the same of the subscription.
     """
     ends = (publisher, subscription)
@@ -329,35 +277,6 @@ def meets(
     return None if None in ends else not decisive
 
 
-def uniqueness(
-    publisher: Sequence[Nfe] | None,
-    subscription: Sequence[Nfe] | None,
-    other_publishers: Iterable[Sequence[Nfe] | None],
-    other_subscriptions: Iterable[Sequence[Nfe] | None],
-    *,
-    by: FlowIdentifier = FlowIdentifier.ANY,
-) -> FlowUniqueness | None:
-    """Return how unique the flow from a publisher to a subscription is; None if unknown.
-
-    Strongly if both its NFEs are unique, weakly if one of them is. `meets` answers more where
-    only one end is known.
-
-    Args:
-        publisher: NFEs of the publisher.
-        subscription: NFEs of the subscription.
-        other_publishers: NFEs of each other publisher in the whole system, not of this process.
-        other_subscriptions: NFEs of each other subscription in the whole system.
-        by: the resources that count.
-    """
-    ends = (
-        is_unique_endpoint(publisher, other_publishers, by=by),
-        is_unique_endpoint(subscription, other_subscriptions, by=by),
-    )
-    if None in ends:
-        return None
-    return (FlowUniqueness.NOT, FlowUniqueness.WEAKLY, FlowUniqueness.STRONGLY)[ends.count(True)]
-
-
 def _plain(nfe: Nfe) -> NetworkFlowEndpoint:
     return nfe.nfe if isinstance(nfe, LocatedNfe) else nfe
 
@@ -366,22 +285,10 @@ def _machine(nfe: Nfe) -> str:
     return nfe.machine_id if isinstance(nfe, LocatedNfe) else ""
 
 
-def _exact_resources(nfe: NetworkFlowEndpoint, by: FlowIdentifier) -> tuple[object, ...]:
-    """The resources that count, but the address, which is compared by meaning."""
-    label: tuple[object, ...] = (nfe.internet_protocol, nfe.flow_label)
-    ports: tuple[object, ...] = (
-        nfe.internet_protocol,
-        nfe.transport_protocol,
-        nfe.transport_port,
-    )
-    if by is FlowIdentifier.THREE_TUPLE:
-        # RFC 6437 knows no label in IPv4: there, only the addresses are left.
-        return label if nfe.internet_protocol is InternetProtocol.IPV6 else label[:1]
-    if by is FlowIdentifier.FIVE_TUPLE:
-        return ports
-    if by is FlowIdentifier.SIX_TUPLE:
-        return (*ports, nfe.dscp)
-    return (*ports, nfe.dscp, nfe.flow_label)
+def _exact_resources(nfe: NetworkFlowEndpoint) -> tuple[object, ...]:
+    """The resources but the address, which is compared by meaning."""
+    protocols = (nfe.internet_protocol, nfe.transport_protocol)
+    return (*protocols, nfe.transport_port, nfe.dscp, nfe.flow_label)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

@@ -55,7 +55,6 @@ from .negotiation.data_layer import Party as Party
 from .negotiation.data_layer import PartyEndpoint as PartyEndpoint
 from .negotiation.data_layer import Terms as Terms
 from .negotiation.negotiate import negotiate as negotiate
-from .negotiation.parties import FAST_DDS as FAST_DDS
 from .negotiation.parties import endpoint_of as endpoint_of
 from .negotiation.parties import hosts_of as hosts_of
 from .negotiation.parties import party_of_node as party_of_node
@@ -68,9 +67,7 @@ from .parameters import DEFAULT as DEFAULT
 from .parameters import GIVEN as GIVEN
 from .parameters import NOT_FINITE as NOT_FINITE
 from .parameters import portable as portable
-from .participants import ParticipantCost as ParticipantCost
 from .participants import parameter_text as parameter_text
-from .participants import participants_cost as participants_cost
 from .programs import Resolution as Resolution
 from .programs import UnresolvedProgram as UnresolvedProgram
 from .programs import resolve_programs as resolve_programs

@@ -1,8 +1,8 @@
 """Extra DDS participants for endpoints that need a unique network flow or a DSCP of their own.
 
 Owns: naming and describing the participants that `manifest/flows.py` groups endpoints into, and
-what one costs. On Fast DDS a publisher's network flow endpoints are its participant's sender
-sockets, so only a participant of its own makes it unique, and only all publishers of one
+the command lines of processes. On Fast DDS a publisher sends from the sender sockets of its
+participant, so only one of its own makes it unique, and only all publishers of one
 participant together can carry a DSCP. From the same sockets subscriptions send their
 acknowledgements. Pure.
 """
@@ -84,43 +84,6 @@ def _reason(group: ParticipantGroup) -> str:
     if group.non_blocking_send:
         facts.append("sent without waiting")
     return " ".join(facts)
-
-
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class ParticipantCost:
-    """What DDS participants cost, as measured with Fast DDS 2.14 on 2 cores.
-
-    Attributes:
-        rss_mb: resident memory, megabytes.
-        threads: threads.
-        sockets: sockets.
-        start_ms: time to make them, milliseconds, from best to worst.
-        discovery_pairs: pairs of a participant and a peer that discovery keeps up because of them.
-    """
-
-    rss_mb: float
-    threads: int
-    sockets: int
-    start_ms: tuple[int, int]
-    discovery_pairs: int = 0
-
-
-def participants_cost(count: int, *, others: int = 0) -> ParticipantCost:
-    """Estimate what extra participants cost.
-
-    Args:
-        count: of the extra ones, >= 0.
-        others: participants of the domain besides them, >= 0. Each participant announces itself to
-            each other one, so discovery grows with participants x peers.
-    """
-    together = count + others
-    return ParticipantCost(
-        rss_mb=2.5 * count,
-        threads=7 * count,
-        sockets=6 * count,
-        start_ms=(6 * count, 10 * count),
-        discovery_pairs=together * (together - 1) - others * (others - 1),
-    )
 
 
 def command_line(nodes: Sequence[Node], environment: Mapping[str, str]) -> tuple[str, ...]:

@@ -138,7 +138,7 @@ class _Judged:
             ):
                 return False
         if not own:
-            return False  # as in `is_unique_endpoint`
+            return False  # the network sees nothing of it
         return None if (kind, entry.process) in self._unknown else True
 
 

@@ -31,23 +31,19 @@ from lifecycle.manifest.model import (
 from lifecycle.manifest.schema import did_you_mean
 from lifecycle.manifest.yaml.document import error, note, warning
 from lifecycle.network import (
+    DEFAULT_RMW,
     DEFAULT_TCP,
+    FAST_DDS,
     RMW_DISCOVERY,
     RTPS_OVERHEAD_BYTES,
     TRANSPORTS_VARIABLE,
-    Capability,
-    Feasibility,
-    FlowSide,
     UniqueRequirement,
-    capabilities,
     datagram_bytes,
-    dscp_feasibility,
-    feasibility,
     max_unfragmented,
 )
 
-FAST_DDS = "rmw_fastrtps"
-_FIXED = (DiscoveryMode.STATIC, DiscoveryMode.STATIC_ENDPOINTS)
+_OTHERS = ("rmw_cyclonedds", "rmw_zenoh", "rmw_connextdds")
+"""RMWs that are known to give no endpoint a network flow or a DSCP of its own."""
 
 
 def check_discovery(system: DeclaredSystem, environment: Mapping[str, str]) -> Iterator[Diagnostic]:
@@ -287,40 +283,28 @@ def _authority(system: DeclaredSystem) -> Iterator[Diagnostic]:
 def check_middleware(
     system: DeclaredSystem, needs: FlowNeeds, environment: Mapping[str, str]
 ) -> Iterator[Diagnostic]:
-    """Yield findings about what the RMW of a node cannot do.
+    """Yield findings about what the RMW of a node cannot do; Fast DDS does all of it.
 
-    An error where a need that must be met certainly is not; else a warning that names the source
-    of the answer. Without RMW_IMPLEMENTATION it is ROS 2's default.
+    An error where a need that must be met certainly is not, else a warning.
     """
     for node in system.manifest.nodes:
         rmw = rmw_of(node, environment)
+        if rmw.startswith(FAST_DDS):
+            continue
+        why = f"{rmw} cannot" if rmw.startswith(_OTHERS) else f"it is not known whether {rmw} can"
         for each in needs.of_node(node):
-            yield from _unique(rmw, node, each)
+            what = f"{each.need.kind.noun} {each.need.name!r} of {node.key!r}"
+            strictly = each.need.unique is UniqueRequirement.STRICTLY_REQUIRED
+            wishes = []
+            if strictly or each.need.unique is UniqueRequirement.OPTIONALLY_REQUIRED:
+                wishes.append(("give it a network flow of its own", strictly))
             if each.dscp is not None:
-                cell = capabilities(rmw).dscp
-                must = each.need.enforce
-                what = f"{each.need.kind.noun} {each.need.name!r} of {node.key!r}"
-                yield from _judge(each, what, dscp_feasibility(rmw), cell, must=must)
-
-
-def _unique(rmw: str, node: Node, each: ResolvedNeed) -> Iterator[Diagnostic]:
-    publishes = each.need.kind is EndpointKind.PUBLISHER
-    side = FlowSide.PUBLISHER if publishes else FlowSide.SUBSCRIPTION
-    answer = feasibility(rmw, side, each.need.unique)
-    must = each.need.unique is UniqueRequirement.STRICTLY_REQUIRED
-    what = f"{each.need.kind.noun} {each.need.name!r} of {node.key!r}"
-    yield from _judge(each, what, answer, capabilities(rmw).unique(side), must=must)
-
-
-def _judge(
-    each: ResolvedNeed, what: str, answer: Feasibility, cell: Capability, *, must: bool
-) -> Iterator[Diagnostic]:
-    if answer.feasible:
-        return
-    why, _, hint = answer.why.rpartition("; ")
-    message = f"cannot meet the need of {what}: {why} [{cell.source}]"
-    make = error if must and answer.feasible is False else warning
-    yield make("check.rmw", each.need.at, message, hint)
+                wishes.append(("mark its packets with a DSCP", each.need.enforce))
+            for wish, must in wishes:
+                make = error if must and rmw.startswith(_OTHERS) else warning
+                message = f"cannot meet the need of {what}: {why} {wish}"
+                hint = f"use RMW_IMPLEMENTATION={DEFAULT_RMW}"
+                yield make("check.rmw", each.need.at, message, hint)
 
 
 _RULE = "check.flow-transport"

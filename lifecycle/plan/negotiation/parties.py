@@ -25,6 +25,7 @@ from lifecycle.network import (
     CONNECTABLE,
     DEFAULT_TCP,
     DG,
+    FAST_DDS,
     RMW_DEFAULT,
     RMW_DISCOVERY,
     TRANSPORTS_VARIABLE,
@@ -53,8 +54,6 @@ from lifecycle.plan.negotiation.data_layer import (
 )
 
 _OWN_FLOW = (UniqueRequirement.STRICTLY_REQUIRED, UniqueRequirement.OPTIONALLY_REQUIRED)
-FAST_DDS = "rmw_fastrtps"
-"""What the identifiers of the RMWs begin with whose participants we can make."""
 
 
 def transports_of(urls: Iterable[str]) -> tuple[str, ...]:

@@ -16,9 +16,8 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 
 from lifecycle import dataclasses
 from lifecycle.manifest import Authority, DataLayerSource, EndpointKind, EndpointPolicy
-from lifecycle.network import CONNECTABLE, RMW_DEFAULT, UniqueRequirement, parse
+from lifecycle.network import CONNECTABLE, FAST_DDS, RMW_DEFAULT, UniqueRequirement, parse
 from lifecycle.plan import (
-    FAST_DDS,
     DataLayerGraph,
     NegotiatedConnection,
     NegotiationProblem,

@@ -10,7 +10,6 @@ from lifecycle.network.dscp import (
     code_points,
     describe,
     dscp_name,
-    dscp_of_tos,
     parse_dscp,
     tos,
 )
@@ -105,7 +104,7 @@ def test_what_is_no_dscp_is_refused_with_what_was_probably_meant(
 @given(st.integers(0, 63))
 def test_every_dscp_survives_its_name_and_its_tos_byte(dscp: int) -> None:
     assert parse_dscp(dscp_name(dscp)) == dscp
-    assert dscp_of_tos(tos(dscp)) == dscp
+    assert tos(dscp) == dscp << 2
     assert parse_dscp(str(dscp)) == parse_dscp(hex(dscp)) == dscp
 
 
@@ -119,24 +118,6 @@ def test_any_text_is_a_dscp_or_a_cannot_message(text: str) -> None:
         assert 0 <= dscp <= 63
         return
     assert message.startswith("cannot use ")
-
-
-@given(st.integers(0, 255).filter(lambda byte: byte & 3))
-def test_a_tos_byte_with_ecn_bits_is_refused(byte: int) -> None:
-    with pytest.raises(ValueError, match="its two lowest bits are ECN and belong to the transport"):
-        dscp_of_tos(byte)
-
-
-def test_the_refusal_of_ecn_bits_names_the_clean_byte() -> None:
-    with pytest.raises(ValueError) as caught:
-        dscp_of_tos(185)
-    assert str(caught.value) == (
-        "cannot use TOS 185 (0xb9): its two lowest bits are ECN and belong to the transport; "
-        "use 184 (0xb8), EF = DSCP 46 = TOS 184 (0xb8)"
-    )
-    with pytest.raises(ValueError) as caught:
-        dscp_of_tos(256)
-    assert str(caught.value) == "cannot use TOS 256; use 0 to 255"
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ from lifecycle.manifest.model import (
     UniqueHow,
 )
 from lifecycle.network.nfe import UniqueRequirement
-from lifecycle.plan import PlanError, participants_cost
+from lifecycle.plan import PlanError
 from lifecycle.plan.build import dependency_levels, planned_processes
 from lifecycle.plan.participants import command_line, parameter_text
 from tests.builders import link, need, node, planned, publisher, subscription
@@ -145,11 +145,6 @@ def test_a_publisher_that_asks_for_nothing_gets_nothing(unique: UniqueRequiremen
 def test_a_unique_subscription_needs_no_participant():
     (one,) = planned(node("v", subscription("a"), needs=[need(SUB, "a", STRICTLY)])).nodes
     assert one.participants == ()
-
-
-def test_cost_grows_with_the_number_of_participants():
-    cost = participants_cost(4)
-    assert (cost.rss_mb, cost.threads, cost.sockets, cost.start_ms) == (10.0, 28, 24, (24, 40))
 
 
 # --- processes

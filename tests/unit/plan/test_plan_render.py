@@ -66,41 +66,11 @@ nodes
 extra participants
   /robot/_camera_flow_0  unique publisher video marked EF = DSCP 46 = TOS 184 (0xb8)
   /robot/_camera_flow_1  publisher battery marked CS1 = DSCP 8 = TOS 32 (0x20)
-  cost
-    process camera  about 5 MB, 14 threads, 12 sockets, 12–20 ms to make
-    system          about 5 MB, 14 threads, 12 sockets, 12–20 ms to make; discovery between 6
-                    participants instead of 4, 18 pairs more
-  instead: 2 dedicated nodes in processes of their own, which cost more and break the node up, or
-  'flow_identification: dscp', for at most 64 publishers (docs/flows.md)
-
-middleware
-  rmw_fastrtps_cpp  unique subscription  supported: a UDP port of its own, the first free of
-                                         7000-7399 in every domain
-                    unique publisher     by us: a participant of its own; the RMW itself refuses
-                                         strictly_required on publishers and ignores
-                                         optionally_required
-                    DSCP                 by us: IP_TOS or IPV6_TCLASS on the sender sockets of a
-                                         participant of its own, read back; Fast DDS 2.14 has no
-                                         setting
-                    reading back         supported: publishers report their participant's sender
-                                         sockets; DSCP and flow label are always 0; shared memory
-                                         has no address
 
 flows
   /robot/video    /robot/camera → /viewer  udpv4 (other host); strongly unique, at most 5 ms
   /robot/battery  /robot/camera → /viewer  udpv4 (other host)
   /robot/status   /robot/camera → /viewer  udpv4 (other host)
-
-notes
-  /robot/camera /robot/video
-      how large its messages get is unknown: declare 'max_message_size' to learn whether IP
-      fragments them, of which only the first has ports
-  /robot/camera /robot/battery
-      how large its messages get is unknown: declare 'max_message_size' to learn whether IP
-      fragments them, of which only the first has ports
-  every unique or marked flow
-      changes nothing by itself: each router and switch on the way needs a rule that uses it
-      (docs/flows.md)
 
 ports, if participants start in this order and none is taken
   machine robot

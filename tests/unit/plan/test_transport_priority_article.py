@@ -12,7 +12,6 @@ from lifecycle.manifest.checks import check
 from lifecycle.manifest.model import EndpointKind, Machine, Manifest, Network
 from lifecycle.network.dscp import TransportPriorityMapping
 from lifecycle.plan import PlanError, build_plan
-from lifecycle.plan.render import render_text
 from lifecycle.verify import Outcome, Stage, verify
 from tests.builders import at, manifest, need, node, publisher
 from tests.unit.verify.edits import change_report
@@ -150,8 +149,3 @@ def test_section_3_24_5_one_set_of_send_sockets_per_distinct_priority(
 ):
     plan = build_plan(writers(*priorities), environment={})
     assert len(plan.nodes[0].participants) == sockets
-
-
-def test_section_3_24_the_network_must_use_the_mark_and_the_plan_says_so():
-    text = " ".join(render_text(build_plan(writers(0xB8), environment={})).split())
-    assert "each router and switch on the way needs a rule that uses it" in text
