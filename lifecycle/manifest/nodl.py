@@ -1,329 +1,156 @@
 """NoDL v2 documents as interfaces: references, includes, endpoints and parameter declarations.
 
 Owns: resolving references (`local://relative/path`, `nodl://package/name`) with the documents they
-include, and turning a document into an `Interface`. The format is nodl.schema.yaml of
-ros-tooling/nodl 2.0, with its field names and defaults, and parameter.schema.yaml (the shape of
-generate_parameter_library). What this package does not use of it is reported as a warning; what
-breaks it is an error. Writing NoDL (`to_nodl`) is left for later and belongs here as well.
+include, and what of NoDL differs from a manifest's inline interface: types without their kind,
+policies that must be written, types of generate_parameter_library. The format is nodl.schema.yaml
+of ros-tooling/nodl 2.0 and parameter.schema.yaml; beside these differences it is validated and
+built as an inline interface is. What this package does not use of it is reported as a warning;
+what breaks it is an error.
 """
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position
+from lifecycle import dataclasses
+from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position, Severity
 from lifecycle.manifest.installed_types import find_resource, list_resources, search_prefixes
-from lifecycle.manifest.model import (
-    Endpoint,
-    EndpointKind,
-    Interface,
-    ParameterDeclaration,
-    ParameterValue,
-)
-from lifecycle.manifest.qos import (
-    PRESETS,
-    Durability,
-    History,
-    Liveliness,
-    QosProfile,
-    Reliability,
-    not_written,
-    problems,
-)
-from lifecycle.manifest.schema import did_you_mean, nearest
-from lifecycle.manifest.yaml.document import Document, Place, error, warning
+from lifecycle.manifest.interface import build_inline
+from lifecycle.manifest.model import Endpoint, EndpointKind, Interface, ParameterDeclaration
+from lifecycle.manifest.qos import POLICIES
+from lifecycle.manifest.schema import did_you_mean, nearest, validate
+from lifecycle.manifest.yaml.document import Cursor, Document, Place, Value, error, warning
 from lifecycle.manifest.yaml.source import read_document
 from lifecycle.manifest.yaml.yaml_parser import quote
 
 NODL_VERSION = 2
 
-_TYPE_KINDS = {
-    EndpointKind.PUBLISHER: "msg",
-    EndpointKind.SUBSCRIPTION: "msg",
-    EndpointKind.SERVICE_SERVER: "srv",
-    EndpointKind.SERVICE_CLIENT: "srv",
-    EndpointKind.ACTION_SERVER: "action",
-    EndpointKind.ACTION_CLIENT: "action",
-}
-_TYPE = re.compile(r"([a-zA-Z][a-zA-Z0-9_]*)(?:/(msg|srv|action))?/([A-Za-z][a-zA-Z0-9_]*)")
-_TOP_KEYS = (
-    "nodl_version",
-    "description",
-    "codegen",
-    "include",
-    "parameters",
-    *(kind.value for kind in EndpointKind),
-)
-_POLICIES = {
-    "history": History,
-    "reliability": Reliability,
-    "durability": Durability,
-    "liveliness": Liveliness,
-}
-_DURATIONS = ("deadline_ns", "lifespan_ns", "liveliness_lease_duration_ns")
-_PARAMETER_KEYS = (
-    "type",
-    "default_value",
-    "description",
-    "read_only",
-    "additional_constraints",
-    "validation",
-)
-_PARAMETER_TYPES = (
-    "bool",
-    "int",
-    "double",
-    "string",
-    "none",
-    "bool_array",
-    "byte_array",
-    "int_array",
-    "double_array",
-    "string_array",
-)
+_NOT_OURS = ("nodl_version", "description", "codegen", "include")
+_UNCHECKED = ("additional_constraints", "validation")
+_PARAMETER_KEYS = ("type", "default_value", "description", "read_only")
 _FIXED_SIZE = re.compile(r"(string|int_array|double_array|string_array)_fixed_[1-9][0-9]*")
 
+_Entries = dict[str, Value]
 
-class NodlReader:
-    """Reads one document.
+
+class _Reader:
+    """Reads one document, its includes left out.
 
     Attributes:
-        endpoints: every endpoint that could be read, in the order of `EndpointKind`.
-        parameters: every parameter that could be read.
-        includes: (index, reference) of each include.
+        interface: empty after an error.
         found: errors and warnings, each at its place.
     """
 
     def __init__(self, document: Document) -> None:
         self._document = document
-        self.endpoints: list[Endpoint] = []
-        self.parameters: list[ParameterDeclaration] = []
-        self.includes: list[tuple[int, str]] = []
+        self.interface = Interface()
         self.found: list[Diagnostic] = []
-        root = self._mapping((), "a NoDL document")
-        self._version(root)
-        self._unknown((), root, _TOP_KEYS)
-        for index in range(len(self._items(("include",)))):
-            self._include(("include", index), index)
-        for kind in EndpointKind:
-            for index in range(len(self._items((kind.value,)))):
-                self._endpoint(kind, (kind.value, index))
-        if "parameters" in root:
-            for name in self._mapping(("parameters",), "parameters"):
-                self._parameter(name, ("parameters", name))
-
-    def _version(self, root: Mapping[str, object]) -> None:
-        if "nodl_version" not in root:
+        root = document.root
+        entries = self._entries((), root, [*_NOT_OURS, "parameters", *map(_key, EndpointKind)])
+        version = entries.get("nodl_version")
+        if version is None:
             self._error((), "cannot do without the key 'nodl_version'", "add 'nodl_version: 2'")
-        elif (value := self._data(("nodl_version",))) != NODL_VERSION:
-            message = f"cannot use nodl_version {quote(value)}; allowed: {NODL_VERSION}"
+        elif version.data != NODL_VERSION:
+            message = f"cannot use nodl_version {quote(version.data)}; allowed: {NODL_VERSION}"
             self._error(("nodl_version",), message)
+        for key in _NOT_OURS:
+            entries.pop(key, None)
+        for kind in EndpointKind:
+            if (each := entries.get(kind.value)) and isinstance(each.data, tuple):
+                items = enumerate(each.data)
+                data = tuple(self._endpoint(kind, (kind.value, i), item) for i, item in items)
+                entries[kind.value] = dataclasses.replace(each, data=data)
+        if (each := entries.get("parameters")) and isinstance(each.data, Mapping):
+            parameters = {
+                name: self._parameter(name, ("parameters", name), value)
+                for name, value in each.data.items()
+            }
+            known = {name: value for name, value in parameters.items() if value is not None}
+            entries["parameters"] = dataclasses.replace(each, data=known)
+        inline = dataclasses.replace(document, root=dataclasses.replace(root, data=entries))
+        found = [each for _, each in validate(inline, definition="interface")]
+        if not found:
+            self.interface = build_inline(Cursor.root(inline), found)
+        rules = {"manifest.duplicate-name": "nodl.duplicate"}
+        self.found += [
+            dataclasses.replace(each, rule=rules.get(each.rule, "nodl.invalid")) for each in found
+        ]
+        if any(each.severity is Severity.ERROR for each in self.found):
+            self.interface = Interface()
 
-    def _include(self, place: Place, index: int) -> None:
-        entry = self._mapping(place, "an include")
-        self._unknown(place, entry, ("ref",))
-        if reference := self._text((*place, "ref"), required=True):
-            self.includes.append((index, reference))
-
-    # -- endpoints
-
-    def _endpoint(self, kind: EndpointKind, place: Place) -> None:
-        entry = self._mapping(place, f"a {kind.noun}")
-        if not entry:
-            return
+    def _endpoint(self, kind: EndpointKind, place: Place, value: Value) -> Value:
+        if not isinstance(value.data, Mapping):
+            return value
         is_action = kind in (EndpointKind.ACTION_SERVER, EndpointKind.ACTION_CLIENT)
-        is_topic = kind in (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION)
-        self._unknown(
-            place, entry, ("name", "type", "description", *(() if is_action else ("qos",)))
-        )
-        name = self._text((*place, "name"), required=True)
-        type_ = self._type(kind, (*place, "type"))
-        qos: QosProfile | None = None
-        if "qos" in entry and not is_action:
-            qos = self._qos((*place, "qos"))
-        elif is_topic:
+        known = ("name", "type", "description", *(() if is_action else ("qos",)))
+        entries = self._entries(place, value, known)
+        if (type_ := entries.get("type")) and type_.text.count("/") == 1:
+            word = "msg" if kind.is_topic else "action" if is_action else "srv"
+            entries["type"] = _text(type_, type_.text.replace("/", f"/{word}/"))
+        if kind.is_topic and "qos" not in entries:
             self._error(place, f"cannot do without the key 'qos' in a {kind.noun}")
-        elif not is_action:
-            qos = PRESETS["services_default"]
-        if name and type_ and (qos or is_action):
-            self.endpoints.append(
-                Endpoint(
-                    kind=kind,
-                    name=name,
-                    type=type_,
-                    qos=qos,
-                    qos_defaults=() if is_action else not_written(self._keys((*place, "qos"))),
-                    at=self._document.at(place),
-                )
-            )
+        qos, at = entries.get("qos"), (*place, "qos")
+        if qos and not isinstance(qos.data, Mapping):
+            self._error(at, f"cannot use {quote(qos.plain())} as a QoS profile; write a mapping")
+        elif qos and isinstance(qos.data, Mapping):
+            entries["qos"] = dataclasses.replace(qos, data=self._entries(at, qos, POLICIES))
+            for name in ("history", "reliability"):
+                if name not in qos.data:
+                    self._error(at, f"cannot do without the key {name!r} in a QoS profile")
+            history = qos.data.get("history")
+            if history and history.data == "KEEP_LAST" and "depth" not in qos.data:
+                self._error(at, "cannot do without 'depth' under KEEP_LAST", "add 'depth: 10'")
+        return dataclasses.replace(value, data=entries)
 
-    def _type(self, kind: EndpointKind, place: Place) -> str:
-        text = self._text(place, required=True)
-        match = _TYPE.fullmatch(text)
-        wanted = _TYPE_KINDS[kind]
-        if text and (match is None or match[2] not in (None, wanted)):
-            allowed = f"a {kind.noun} has a type package/{wanted}/Type"
-            self._error(place, f"cannot use type {quote(text)}; {allowed}")
-        if match is None or match[2] not in (None, wanted):
-            return ""
-        return f"{match[1]}/{wanted}/{match[3]}"
-
-    def _qos(self, place: Place) -> QosProfile | None:
-        entry = self._mapping(place, "a QoS profile")
-        self._unknown(place, entry, (*_POLICIES, "depth", *_DURATIONS))
-        before = len(self.found)
-        fields: dict[str, object] = {}
-        for name in ("history", "reliability"):
-            if name not in entry:
-                self._error(place, f"cannot do without the key {name!r} in a QoS profile")
-        for name, policy in _POLICIES.items():
-            if name in entry:
-                allowed = [each.value for each in policy if each.value != "UNKNOWN"]
-                value = self._word((*place, name), allowed)
-                fields[name] = policy(value) if value else None
-        for name in ("depth", *_DURATIONS):
-            if name in entry:
-                number = self._number((*place, name))
-                # NoDL and rmw alike: a duration of zero is none.
-                fields[name] = number if name == "depth" else number or None
-        if fields.get("history") is not History.KEEP_LAST:
-            fields.setdefault("depth", 0)
-        elif "depth" not in entry:
-            self._error(place, "cannot do without 'depth' under KEEP_LAST", "add 'depth: 10'")
-        if len(self.found) > before:
-            return None
-        default = PRESETS["default"]
-        profile = QosProfile(
-            **{name: fields.get(name, getattr(default, name)) for name in QosProfile.__slots__}  # type: ignore[arg-type]
-        )
-        for problem in problems(profile):
-            self._error(place, f"cannot {problem}")
-        return profile
-
-    # -- parameters
-
-    def _parameter(self, name: str, place: Place) -> None:
-        entry = self._mapping(place, "a parameter")
-        if not entry:
-            return
-        self._unknown(place, entry, _PARAMETER_KEYS)
-        written = self._text((*place, "type"), required=True)
-        fixed = _FIXED_SIZE.fullmatch(written)
-        type_ = fixed[1] if fixed else written
-        if written and type_ not in _PARAMETER_TYPES:
-            hint = did_you_mean(written, _PARAMETER_TYPES)
-            allowed = ", ".join(_PARAMETER_TYPES)
-            message = f"cannot use type {quote(written)}; allowed: {allowed}"
-            self._error((*place, "type"), message, hint)
-            return
-        if fixed:
-            self._unused((*place, "type"), f"the size in type {written!r}")
-        for key in ("validation", "additional_constraints"):
-            if entry.get(key) is not None:
-                self._unused((*place, key), f"{key!r}")
+    def _parameter(self, name: str, place: Place, value: Value) -> Value | None:
+        """Return a declaration as a manifest has it; None for what declares no parameter."""
+        if not isinstance(value.data, Mapping):
+            return value
+        entries = self._entries(place, value, (*_PARAMETER_KEYS, *_UNCHECKED))
+        type_ = entries.get("type")
+        if type_ and (fixed := _FIXED_SIZE.fullmatch(type_.text)):
+            self._unchecked((*place, "type"), f"the size in type {type_.text!r}")
+            entries["type"] = _text(type_, fixed[1])
+        for key in _UNCHECKED:
+            if (unchecked := entries.pop(key, None)) and unchecked.data is not None:
+                self._unchecked((*place, key), f"{key!r}")
         if name.startswith("__map_") or ".__map_" in name:
-            self._unused(place, f"the parameter map {name!r}")
-            return
-        if type_ in ("", "none"):
-            return  # `none` means no parameter at all
-        default = self._document.find((*place, "default_value"))
-        self.parameters.append(
-            ParameterDeclaration(
-                name=name,
-                type=type_,
-                default=None if default is None else _value(default.plain()),
-                description=self._text((*place, "description")),
-                read_only=self._data((*place, "read_only")) is True,
-                at=self._document.at(place),
-            )
-        )
+            self._unchecked(place, f"the parameter map {name!r}")
+            return None
+        if type_ and type_.text == "none":
+            return None
+        return dataclasses.replace(value, data=entries)
 
-    # -- values
-
-    def _data(self, place: Place) -> object:
-        found = self._document.find(place)
-        return None if found is None else found.data
-
-    def _mapping(self, place: Place, what: str) -> Mapping[str, object]:
-        data = self._data(place)
-        if isinstance(data, Mapping) and (data or not place):
-            return data
-        self._error(place, f"cannot use {quote(data)} as {what}; it must be a mapping")
-        return {}
-
-    def _keys(self, place: Place) -> tuple[str, ...]:
-        data = self._data(place)
-        return tuple(data) if isinstance(data, Mapping) else ()
-
-    def _items(self, place: Place) -> tuple[object, ...]:
-        found = self._document.find(place)
-        if found is None:
-            return ()
-        if isinstance(found.data, tuple):
-            return found.data
-        self._error(place, f"cannot use {quote(found.plain())} here; it must be a list")
-        return ()
-
-    def _text(self, place: Place, *, required: bool = False) -> str:
-        found = self._document.find(place)
-        if found is None:
-            if required:
-                self._error(place, f"cannot do without the key {place[-1]!r}")
-            return ""
-        if isinstance(found.data, str) and (found.data or not required):
-            return found.data
-        self._error(place, f"cannot use {quote(found.plain())} here; it must be a string")
-        return ""
-
-    def _word(self, place: Place, allowed: list[str]) -> str:
-        data = self._data(place)
-        if isinstance(data, str) and data in allowed:
-            return data
-        message = f"cannot use {place[-1]} {quote(data)}; allowed: {', '.join(allowed)}"
-        self._error(place, message, did_you_mean(str(data), allowed))
-        return ""
-
-    def _number(self, place: Place) -> int:
-        data = self._data(place)
-        if isinstance(data, int) and not isinstance(data, bool):
-            return data
-        self._error(place, f"cannot use {place[-1]} {quote(data)}; it must be an integer")
-        return 0
-
-    # -- findings
-
-    def _unknown(self, place: Place, entry: Iterable[str], known: Iterable[str]) -> None:
+    def _entries(self, place: Place, value: Value, known: Iterable[str]) -> _Entries:
+        """Return the entries of a mapping that NoDL knows, and warn of the others."""
+        assert isinstance(value.data, Mapping)
         words = list(known)
-        for key in entry:
+        for key in value.data:
             if key not in words:
                 at = self._document.key_at((*place, key))
                 message = f"cannot use the key {key!r}: NoDL {NODL_VERSION} has none; it is ignored"
                 self.found.append(
                     warning("nodl.unknown-key", at, message, did_you_mean(key, words))
                 )
+        return {key: each for key, each in value.data.items() if key in words}
 
-    def _unused(self, place: Place, what: str) -> None:
-        at = self._document.at(place)
-        self.found.append(
-            warning(
-                "nodl.unchecked", at, f"cannot check {what}; parameters are checked by type only"
-            )
-        )
+    def _unchecked(self, place: Place, what: str) -> None:
+        message = f"cannot check {what}; parameters are checked by type only"
+        self.found.append(warning("nodl.unchecked", self._document.at(place), message))
 
     def _error(self, place: Place, message: str, hint: str = "") -> None:
         self.found.append(error("nodl.invalid", self._document.at(place), message, hint))
 
 
-def _value(plain: object) -> ParameterValue | None:
-    """Return a default as a parameter value; None for what no parameter can hold."""
-    if isinstance(plain, (bool, int, float, str)):
-        return plain
-    if isinstance(plain, list) and all(isinstance(each, (bool, int, float, str)) for each in plain):
-        return tuple(plain)
-    return None
+def _key(kind: EndpointKind) -> str:
+    return kind.value
+
+
+def _text(value: Value, text: str) -> Value:
+    return dataclasses.replace(value, data=text, text=text)
 
 
 MAX_DOCUMENTS = 100
@@ -395,12 +222,17 @@ class _NodlReading:
         except ManifestError as problem:
             self.found += problem.diagnostics
             return
-        reader = NodlReader(document)
-        self.endpoints += reader.endpoints
-        self.parameters += reader.parameters
+        reader = _Reader(document)
         self.found += reader.found
-        for included, where in _includes(document, reader):
-            self.follow(included, path.parent, where, (*chain, identity))
+        self.endpoints += reader.interface.endpoints
+        self.parameters += reader.interface.parameters
+        for index, each in enumerate(Cursor.root(document).items("include")):
+            place: Place = ("include", index, "ref")
+            ref = document.find(place)
+            if ref is not None and isinstance(ref.data, str) and ref.data:
+                self.follow(ref.data, path.parent, document.at(place), (*chain, identity))
+            else:
+                self._error("invalid", each.at, "cannot do without the key 'ref' in an include")
 
     def report_collisions(self) -> None:
         """Refuse a name that two entries of one list declare (nodl.schema.yaml, `include`)."""
@@ -450,11 +282,6 @@ class _NodlReading:
 
     def _error(self, rule: str, at: Position, message: str, hint: str = "") -> None:
         self.found.append(error(f"nodl.{rule}", at, message, hint))
-
-
-def _includes(document: Document, reader: NodlReader) -> Iterator[tuple[str, Position]]:
-    for index, reference in reader.includes:
-        yield reference, document.at(("include", index, "ref"))
 
 
 def nearest_file(path: Path) -> str:

@@ -1,0 +1,190 @@
+"""Validated interfaces → endpoints and parameter declarations, of manifests and NoDL documents.
+
+Owns: `build_inline`: what a QoS profile is with presets and defaults, declared defaults of
+parameters in their types; `scalar_tuple`, a ROS array of a document. Pure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from lifecycle.manifest.diagnostics import Diagnostic
+from lifecycle.manifest.model import (
+    Endpoint,
+    EndpointKind,
+    Interface,
+    ParameterDeclaration,
+    ParameterValue,
+)
+from lifecycle.manifest.qos import (
+    POLICIES,
+    PRESETS,
+    Durability,
+    History,
+    Liveliness,
+    QosProfile,
+    Reliability,
+    not_written,
+    problems,
+)
+from lifecycle.manifest.yaml.document import Cursor, Scalar, error
+from lifecycle.manifest.yaml.yaml_parser import quote
+
+Findings = list[Diagnostic]
+"""Findings in the order of detection; every builder appends and continues."""
+
+_DEFAULT_PRESET = {
+    EndpointKind.PUBLISHER: "default",
+    EndpointKind.SUBSCRIPTION: "default",
+    EndpointKind.SERVICE_SERVER: "services_default",
+    EndpointKind.SERVICE_CLIENT: "services_default",
+}
+
+
+def build_inline(cursor: Cursor, found: Findings) -> Interface:
+    """Build an interface that is written out.
+
+    Args:
+        cursor: a mapping that fits the schema's `interface`.
+        found: findings are appended here.
+    """
+    endpoints = []
+    for kind in EndpointKind:
+        first: dict[str, Cursor] = {}
+        for each in cursor.items(kind.value):
+            other = first.setdefault(each.text("name"), each)
+            if other is each:
+                endpoints.append(_endpoint(kind, each, found))
+            else:
+                at = each.document.at((*each.place, "name"))
+                message = f"cannot declare {quote(each.text('name'))} twice among {kind.value}"
+                hint = f"the first stands at {other.at.file}:{other.at.line}:{other.at.column}"
+                found.append(error("manifest.duplicate-name", at, message, hint))
+    parameters = [_declaration(name, each, found) for name, each in cursor.entries("parameters")]
+    return Interface(
+        endpoints=tuple(endpoints),
+        parameters=tuple(parameters),
+        has_all_parameters="parameters" in cursor,
+    )
+
+
+def _endpoint(kind: EndpointKind, cursor: Cursor, found: Findings) -> Endpoint:
+    preset = _DEFAULT_PRESET.get(kind)
+    qos = cursor.get("qos")
+    return Endpoint(
+        kind=kind,
+        name=cursor.text("name"),
+        type=cursor.text("type"),
+        qos=None if preset is None else _qos(cursor, PRESETS[preset], found),
+        qos_defaults=() if preset is None else _defaults(qos),
+        at=cursor.at,
+    )
+
+
+def _qos(endpoint: Cursor, default: QosProfile, found: Findings) -> QosProfile:
+    """Lay what is written over a preset, or over the default of the endpoint's kind."""
+    cursor = endpoint.get("qos")
+    if cursor is None:
+        return default
+    if not isinstance(cursor.value.data, Mapping):
+        return PRESETS[cursor.value.text]
+    start = PRESETS[cursor.text("preset")] if "preset" in cursor else default
+    history = cursor.choice("history", History, start.history)
+    depth = cursor.integer("depth")
+    profile = QosProfile(
+        history=history,
+        depth=_depth(history, start.depth if depth is None else depth),
+        reliability=cursor.choice("reliability", Reliability, start.reliability),
+        durability=cursor.choice("durability", Durability, start.durability),
+        deadline_ns=_duration(cursor, "deadline_ns", start.deadline_ns),
+        lifespan_ns=_duration(cursor, "lifespan_ns", start.lifespan_ns),
+        liveliness=cursor.choice("liveliness", Liveliness, start.liveliness),
+        liveliness_lease_duration_ns=_duration(
+            cursor, "liveliness_lease_duration_ns", start.liveliness_lease_duration_ns
+        ),
+    )
+    at = cursor.document.at((*cursor.place, "depth"))
+    found.extend(error("manifest.qos", at, f"cannot {each}") for each in problems(profile))
+    return profile
+
+
+def _defaults(qos: Cursor | None) -> tuple[str, ...]:
+    """Return the policies that are not written; naming a preset writes all of it."""
+    if qos is None:
+        return POLICIES
+    if not isinstance(qos.value.data, Mapping) or "preset" in qos:
+        return ()
+    return not_written([name for name, _ in qos.entries()])
+
+
+def _depth(history: History, depth: int) -> int:
+    return 0 if history is History.KEEP_ALL else depth  # rmw ignores it there
+
+
+def _duration(cursor: Cursor, key: str, default: int | None) -> int | None:
+    value = cursor.integer(key)
+    # rmw and NoDL alike: a duration of zero is none (RMW_DURATION_UNSPECIFIED).
+    return default if value is None else value or None
+
+
+def _declaration(name: str, cursor: Cursor, found: Findings) -> ParameterDeclaration:
+    type_ = cursor.text("type")
+    default = cursor.get("default_value")
+    return cursor.build(
+        ParameterDeclaration,
+        name=name,
+        default=None if default is None else _default(default, type_, found),
+        at=cursor.key_at,
+    )
+
+
+def _is_int(value: Scalar) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
+
+
+_FITS: Mapping[str, Callable[[Scalar], bool]] = {
+    "bool": lambda value: isinstance(value, bool),
+    "int": _is_int,
+    "double": lambda value: isinstance(value, float) or _is_int(value),
+    "string": lambda value: isinstance(value, str),
+    "byte": lambda value: _is_int(value) and isinstance(value, int) and 0 <= value <= 0xFF,
+}
+
+
+def _default(cursor: Cursor, type_: str, found: Findings) -> ParameterValue | None:
+    """Return a declared default in its declared type; None after reporting that it does not fit."""
+    one, is_array = type_.removesuffix("_array"), type_.endswith("_array")
+    if isinstance(cursor.value.data, tuple) == is_array:
+        values = _scalars(cursor) if is_array else [cursor.scalar]
+        if all(_FITS[one](each) for each in values):
+            known = [_known(each) for each in values]
+            typed = [float(each) for each in known] if one == "double" else known
+            return tuple(typed) if is_array else typed[0]
+    message = f"cannot use {quote(cursor.value.plain())} as default of a parameter of type {type_}"
+    found.append(error("manifest.parameter-default", cursor.at, message))
+    return None
+
+
+def scalar_tuple(cursor: Cursor, found: Findings) -> tuple[bool | int | float | str, ...] | None:
+    """Return a ROS array; None after reporting that its items differ in type."""
+    values = _scalars(cursor)
+    types = {type(each).__name__: each for each in values}
+    if len(types) > 1:
+        names = {"str": "string", "float": "double"}
+        spelled = " and ".join(
+            f"{names.get(name, name)} {quote(each)}" for name, each in types.items()
+        )
+        message = f"cannot mix {spelled} in one array; a ROS array holds one type"
+        hint = "write the integers as 1.0" if set(types) == {"int", "float"} else ""
+        found.append(error("manifest.parameter-array", cursor.at, message, hint))
+        return None
+    return tuple(_known(each) for each in values)
+
+
+def _scalars(cursor: Cursor) -> list[Scalar]:
+    return [each.scalar for each in cursor.items()]
+
+
+def _known(value: Scalar) -> bool | int | float | str:
+    assert value is not None  # the schema has no null in arrays
+    return value
