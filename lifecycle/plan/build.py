@@ -10,6 +10,7 @@ Pure but for the environment, for finding executables and for reading parameter 
 from __future__ import annotations
 
 import functools
+import graphlib
 import hashlib
 import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -18,7 +19,6 @@ from lifecycle import dataclasses
 from lifecycle.errors import UsageError
 from lifecycle.manifest import (
     SIM_TIME,
-    After,
     Diagnostic,
     Discovery,
     DiscoveryMode,
@@ -63,7 +63,6 @@ from lifecycle.plan.model import (
     declared,
     in_mode,
 )
-from lifecycle.plan.negotiation.parties import ANY, LinksByPair
 from lifecycle.plan.parameters import ParameterFiles, portable
 from lifecycle.plan.participants import command_line, place_flows
 
@@ -76,44 +75,29 @@ def dependency_levels(nodes: Sequence[Node]) -> tuple[tuple[str, ...], ...]:
     Raises:
         PlanError: a node waits for itself along some path, or for a node that does not exist.
     """
-    by_key = {node.key: node for node in nodes}
-    depth: dict[str, int] = {}
-    for node in nodes:
-        _settle(node, by_key, depth)
-    if not nodes:
-        return ()
-    levels: list[list[str]] = [[] for _ in range(max(depth.values()) + 1)]
-    for node in nodes:
-        levels[depth[node.key]].append(node.key)
-    return tuple(tuple(level) for level in levels)
-
-
-def _settle(root: Node, by_key: dict[str, Node], depth: dict[str, int]) -> None:
-    """Find the level of `root` and of all it waits for; iterative, so depth has no limit."""
-    path: dict[str, Iterator[After]] = {root.key: iter(root.after)}
-    while path:
-        key = next(reversed(path))
-        open_dependency = ""
-        for after in path[key]:
-            if after.node not in by_key:
-                raise PlanError(
-                    f"cannot wait for node {after.node!r}: the manifest declares no such node",
-                    at=after.at,
-                )
-            if after.node in path:
-                keys = [*path]
-                cycle = " → ".join([*keys[keys.index(after.node) :], after.node])
-                raise PlanError(
-                    f"cannot order the nodes: they wait for each other, {cycle}", at=after.at
-                )
-            if after.node not in depth:
-                open_dependency = after.node
-                break
-        if open_dependency:
-            path[open_dependency] = iter(by_key[open_dependency].after)
-            continue
-        depth[key] = 1 + max((depth[after.node] for after in by_key[key].after), default=-1)
-        del path[key]
+    order = {node.key: index for index, node in enumerate(nodes)}
+    for after in (each for node in nodes for each in node.after):
+        if after.node not in order:
+            raise PlanError(
+                f"cannot wait for node {after.node!r}: the manifest declares no such node",
+                at=after.at,
+            )
+    sorter = graphlib.TopologicalSorter(
+        {node.key: [each.node for each in node.after] for node in nodes}
+    )
+    try:
+        sorter.prepare()
+    except graphlib.CycleError as error:
+        cycle = error.args[1][::-1]
+        last = nodes[order[cycle[-2]]]
+        at = next(each.at for each in last.after if each.node == cycle[-1])
+        message = f"cannot order the nodes: they wait for each other, {' → '.join(cycle)}"
+        raise PlanError(message, at=at) from error
+    levels = []
+    while ready := sorter.get_ready():
+        levels.append(tuple(sorted(ready, key=order.__getitem__)))
+        sorter.done(*ready)
+    return tuple(levels)
 
 
 _STRENGTH = {UniqueHow.NOT: 0, UniqueHow.WEAKLY: 1, UniqueHow.STRONGLY: 2}
@@ -134,11 +118,10 @@ def planned_flows(nodes: Sequence[PlannedNode], links: Sequence[Link]) -> tuple[
         for topic in _topics(publisher, EndpointKind.PUBLISHER):
             for subscription in hearers.get(topic, ()):
                 pairs[topic, publisher.key, subscription] = None
+    named: dict[tuple[str, str, str], list[Link]] = {}
     for link in links:
-        if ANY not in (link.from_node, link.to_node):
-            pairs.setdefault((link.topic, link.from_node, link.to_node), None)
-    by_pair = LinksByPair(links)
-    return tuple(_flow(pair, by_pair.of(*pair)) for pair in pairs)
+        named.setdefault((link.topic, link.from_node, link.to_node), []).append(link)
+    return tuple(_flow(pair, named.get(pair, ())) for pair in {**pairs, **named})
 
 
 def _topics(node: PlannedNode, kind: EndpointKind) -> Iterable[str]:

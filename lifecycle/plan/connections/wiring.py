@@ -72,7 +72,6 @@ from lifecycle.plan.negotiation.data_layer import (
 from lifecycle.plan.negotiation.media import carried
 from lifecycle.plan.negotiation.negotiate import negotiate
 from lifecycle.plan.negotiation.parties import (
-    LinksByPair,
     endpoint_of,
     make_terms,
     party_of_node,
@@ -359,19 +358,18 @@ def _unconnectable(
 ) -> Iterator[Diagnostic]:
     """Yield what cannot be connected, at the link or else the publisher that asks."""
     start = Position(file=manifest.path, line=1, column=1)
-    links = LinksByPair(each for each in manifest.links if each.transport is not FlowTransport.ANY)
+    links: dict[tuple[str, str, str], Position] = {}
+    for each in manifest.links:
+        if each.transport is not FlowTransport.ANY:
+            links.setdefault((each.topic, each.from_node, each.to_node), each.at)
     endpoints: dict[tuple[str, str], Position] = {}
     for node in nodes:
-        for each in node.endpoints:
-            if each.kind is EndpointKind.PUBLISHER:
-                endpoints.setdefault((node.key, each.resolved), _at(node, each))
+        for endpoint in node.endpoints:
+            if endpoint.kind is EndpointKind.PUBLISHER:
+                endpoints.setdefault((node.key, endpoint.resolved), _at(node, endpoint))
     for problem in graph.problems:
-        asking = links.of(problem.topic, problem.publisher, problem.subscription)
-        if asking:
-            at: Position | None = asking[0].at
-        else:
-            at = endpoints.get((problem.publisher, problem.topic))
-        at = at or start
+        link = links.get((problem.topic, problem.publisher, problem.subscription))
+        at = link or endpoints.get((problem.publisher, problem.topic)) or start
         yield error("plan.unconnectable", at, problem.message, problem.hint)
 
 

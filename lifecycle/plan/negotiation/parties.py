@@ -17,7 +17,6 @@ from lifecycle.manifest import (
     DiscoveryMode,
     EndpointKind,
     FlowTransport,
-    Link,
     RunKind,
 )
 from lifecycle.network import (
@@ -74,36 +73,6 @@ def wishes_of(flows: Iterable[PlannedFlow]) -> Mapping[tuple[str, str, str], Flo
         for each in flows
         if each.transport is not FlowTransport.ANY
     }
-
-
-ANY = "*"
-"""A link's `from` or `to` that matches every node."""
-
-
-class LinksByPair:
-    """The links of a system, by what they can be about."""
-
-    def __init__(self, links: Iterable[Link]) -> None:
-        self._links: dict[tuple[str, str, str], list[tuple[int, Link]]] = {}
-        for index, link in enumerate(links):
-            place = (link.topic, link.from_node, link.to_node)
-            self._links.setdefault(place, []).append((index, link))
-
-    def of(self, topic: str, publisher: str, subscription: str) -> list[Link]:
-        """Return the links on a pair of nodes, in the manifest's order.
-
-        Args:
-            topic: fully qualified.
-            publisher: key of the publishing node.
-            subscription: key of the subscribing node.
-        """
-        places = {
-            (topic, from_node, to_node)
-            for from_node in (publisher, ANY)
-            for to_node in (subscription, ANY)
-        }
-        found = [each for place in places for each in self._links.get(place, ())]
-        return [link for _, link in sorted(found, key=lambda each: each[0])]
 
 
 _NO_VARIABLES: Mapping[str, str] = MappingProxyType({})
