@@ -297,7 +297,7 @@ def _verdict_of(error: BaseException) -> Verdict:
                     expected="",
                     observed="",
                     message=each.message,
-                    at=f"{each.at.file}:{each.at.line}:{each.at.column}",
+                    at=each.at.spelled,
                     hint=each.hint,
                 )
                 for each in found

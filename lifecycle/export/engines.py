@@ -221,7 +221,7 @@ def _refuse_resources(deployment: Deployment, machine: str) -> None:
     for process, resources in deployment.limited(machine):
         at = resources.at
         raise UsageError(
-            f"{at.file}:{at.line}:{at.column}: cannot give process {process.name!r} its "
+            f"{at.spelled}: cannot give process {process.name!r} its "
             "'run.resources' in a container of Kubernetes: systemd limits what a process may use, "
             "and does not run there",
             hint="leave 'resources' out and limit the whole container (resources.limits), or write "

@@ -420,7 +420,7 @@ def _flat(
         if name in flat:
             message = f"cannot set the parameter {name!r} twice"
             first = flat[name][1]
-            hint = f"the first value stands at {first.file}:{first.line}:{first.column}"
+            hint = f"the first value stands at {first.spelled}"
             found.append(error("manifest.duplicate-parameter", cursor.at, message, hint))
             continue
         value = _parameter(name, cursor, found)

@@ -43,6 +43,11 @@ class Position:
     column: Positive
     path: str = ""
 
+    @property
+    def spelled(self) -> str:
+        """As messages have it: `robot.lifecycle.yaml:14:7`."""
+        return f"{self.file}:{self.line}:{self.column}"
+
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Diagnostic:
@@ -66,7 +71,7 @@ class Diagnostic:
         return self.severity is Severity.WARNING and self.rule not in BY_POLICY
 
     def __str__(self) -> str:
-        place = f"{self.at.file}:{self.at.line}:{self.at.column}: "
+        place = f"{self.at.spelled}: "
         path = f"{self.at.path}: " if self.at.path else ""
         word = "" if self.severity is Severity.ERROR else f"{self.severity.value}: "
         return f"{place}{word}{path}{self.message}" + (f"; {self.hint}" if self.hint else "")

@@ -288,7 +288,6 @@ class FlowNeeds:
     def __init__(self, manifest: Manifest, prefixes: Sequence[Path]) -> None:
         self._manifest = manifest
         self._prefixes = prefixes
-        self._addresses = {each.name: each.address for each in manifest.machines}
         self._machines = {each.key: each.machine for each in manifest.nodes}
         self._delays: dict[tuple[str, str], float] = {}
         for link in manifest.links:
@@ -416,14 +415,14 @@ class FlowNeeds:
         )
 
     def _transports(self, node: Node) -> tuple[Medium, ...]:
-        return (udp_to(self._addresses.get(node.machine, "")),)
+        return (udp_to(self._manifest.address_of(node.machine)),)
 
     def _with_datagrams(self, node_key: str, each: ResolvedNeed) -> ResolvedNeed:
         """Return how small datagrams must be; only a flow that a network knows can be harmed."""
         if each.need.kind is not EndpointKind.PUBLISHER or not each.prioritised:
             return each
         declared = self._manifest.network.max_datagram_bytes
-        ipv6 = ":" in self._addresses.get(self._machines[node_key], "")
+        ipv6 = ":" in self._manifest.address_of(self._machines[node_key])
         limit = declared or max_unfragmented(ipv6=ipv6)
         size = each.max_message_size
         # The size of messages is not known; if the path is known to be narrow, be careful.

@@ -58,7 +58,7 @@ def build_inline(cursor: Cursor, found: Findings) -> Interface:
             else:
                 at = each.document.at((*each.place, "name"))
                 message = f"cannot declare {quote(each.text('name'))} twice among {kind.value}"
-                hint = f"the first stands at {other.at.file}:{other.at.line}:{other.at.column}"
+                hint = f"the first stands at {other.at.spelled}"
                 found.append(error("manifest.duplicate-name", at, message, hint))
     parameters = [_declaration(name, each, found) for name, each in cursor.entries("parameters")]
     return Interface(

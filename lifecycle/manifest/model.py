@@ -585,6 +585,11 @@ class NodeDeclaration:
     at: Position
 
     @property
+    def full_name(self) -> str:
+        """Fully qualified node name, `/robot/camera`."""
+        return f"{self.namespace.rstrip('/')}/{self.name}"
+
+    @property
     def holds(self) -> bool:
         """It waits for the gate: a managed node, or a plain one in a process of ours."""
         return self.managed or self.run.kind is RunKind.PYTHON
@@ -612,6 +617,11 @@ class Node(NodeDeclaration):
     positions: tuple[tuple[str, Position], ...] = ()
     written_paths: tuple[tuple[str, str], ...] = ()
     shared: frozenset[str] = frozenset()
+
+    @property
+    def process_name(self) -> str:
+        """The name of its process: as declared, else the node's key."""
+        return self.process or self.key
 
     def where(self, part: str) -> Position:
         """Return the position of a part of this node; the node's own if that is not known."""
@@ -864,6 +874,10 @@ class SystemDeclaration:
     policy: Policy = Policy()
     on_violation: OnViolation = ()
     modes: tuple[Mode, ...] = ()
+
+    def address_of(self, machine: str) -> str:
+        """Return the address of a machine; empty if it has none, or is not declared."""
+        return next((each.address for each in self.machines if each.name == machine), "")
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

@@ -242,7 +242,7 @@ class _NodlReading:
         for what, name, at in entries:
             other = first.setdefault((what, name), at)
             if other is not at:
-                place = f"{other.file}:{other.line}:{other.column}"
+                place = f"{other.spelled}"
                 message = f"cannot declare {what} {name!r} twice; the first stands at {place}"
                 self._error("duplicate", at, message, "remove one")
 

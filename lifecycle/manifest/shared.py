@@ -14,7 +14,6 @@ from collections.abc import Iterable, Iterator, Mapping
 from lifecycle import dataclasses
 from lifecycle.manifest.building import Findings, build_parameters
 from lifecycle.manifest.checks.parameters import is_implicit, read_sections, shown_path
-from lifecycle.manifest.checks.system import full_name
 from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.model import (
     SUPERVISION_KEYS,
@@ -181,7 +180,7 @@ def _settled(node: Node, manifest: str) -> Node:
     for path in node.parameter_files if kept else ():
         sections, _ = read_sections(path, shown=shown_path(path, manifest))
         for section in sections:
-            if section.matches(full_name(node)):
+            if section.matches(node.full_name):
                 kept -= {name for name, _, _ in section.parameters}
     gone = shared - kept
     return dataclasses.replace(

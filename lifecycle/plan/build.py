@@ -148,11 +148,6 @@ def _flow(pair: tuple[str, str, str], named: Sequence[Link]) -> PlannedFlow:
     )
 
 
-def process_name(node: Node) -> str:
-    """Return the name of the node's process: as declared, else the node's key."""
-    return node.process or node.key
-
-
 def planned_processes(
     nodes: Sequence[Node],
     *,
@@ -177,7 +172,7 @@ def planned_processes(
     """
     groups: dict[str, list[Node]] = {}
     for node in nodes:
-        groups.setdefault(process_name(node), []).append(node)
+        groups.setdefault(node.process_name, []).append(node)
 
     def graph_variables(kind: RunKind) -> tuple[tuple[str, str], ...]:
         near = discovery_range is DiscoveryRange.LOCALHOST and shared_memory
@@ -489,7 +484,7 @@ def _planned_node(
     given = tuple((name, portable(value)) for name, value in node.parameters)
     return PlannedNode(
         **{**declared(NodeDeclaration, node), "parameters": given},
-        process=process_name(node),
+        process=node.process_name,
         held_by=_held_by(node),
         endpoints=endpoints,
         declared_parameters=tuple(

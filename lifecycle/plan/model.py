@@ -299,11 +299,6 @@ class PlannedNode(NodeDeclaration):
         found = (each.parameters for each in self.mode_parameters if each.mode == name)
         return next(found, ())
 
-    @property
-    def full_name(self) -> str:
-        """Fully qualified node name, `/robot/camera`."""
-        return f"{self.namespace.rstrip('/')}/{self.name}"
-
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class PlannedProcess:
@@ -505,5 +500,5 @@ class PlanError(LifecycleError):
         )
 
     def __str__(self) -> str:
-        place = f"{self.at.file}:{self.at.line}:{self.at.column}: " if self.at else ""
+        place = f"{self.at.spelled}: " if self.at else ""
         return place + super().__str__()

@@ -117,7 +117,7 @@ class ParameterFiles:
     def _given(self, node: Node) -> dict[str, _Given]:
         from lifecycle.manifest import CommandParameter, command_line_parameters, given_value
 
-        name_of_node = f"{node.namespace.rstrip('/')}/{node.name}"
+        name_of_node = node.full_name
         sections: dict[str, dict[str, _Given]] = {}
         own = [each for each in command_line_parameters(node) if each.node in ("", node.name)]
         files = [CommandParameter(file=each) for each in node.parameter_files]

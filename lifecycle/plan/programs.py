@@ -67,7 +67,7 @@ class UnresolvedProgram:
     reason: str
 
     def __str__(self) -> str:
-        place = f"{self.at.file}:{self.at.line}:{self.at.column}: {self.at.path}: "
+        place = f"{self.at.spelled}: {self.at.path}: "
         return f"{place}could not resolve {self.subject}: {self.reason}"
 
 

@@ -103,7 +103,7 @@ def write_check(report: CheckReport, format_: str, *, strict: bool) -> str:
                 "error" if strict and each.is_unproven else _LEVELS[each.severity],
                 each.rule,
                 f"{each.message}; {each.hint}" if each.hint else each.message,
-                at=f"{each.at.file}:{each.at.line}:{each.at.column}",
+                at=each.at.spelled,
             )
             for each in report.diagnostics
         ]
@@ -191,7 +191,7 @@ _UNRESOLVED = "program.unresolved"
 
 
 def _result(rule: str, level: str, text: str, at: Position) -> Result:
-    where = f"{at.file}:{at.line}:{at.column}"
+    where = at.spelled
     return Result(rule=rule, level=level, text=text, subject=at.path, at=where)
 
 

@@ -10,7 +10,7 @@ import ipaddress
 from collections.abc import Iterator
 
 from lifecycle import dataclasses
-from lifecycle.manifest.checks.system import DeclaredSystem, spell
+from lifecycle.manifest.checks.system import DeclaredSystem
 from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.model import (
     ConnectionDeclaration,
@@ -83,11 +83,6 @@ def _urls(
                 )
 
 
-def _host(system: DeclaredSystem, node: Node) -> str:
-    found = (each.address for each in system.manifest.machines if each.name == node.machine)
-    return next(found, "")
-
-
 def _uses(
     system: DeclaredSystem,
     node: Node,
@@ -101,7 +96,7 @@ def _uses(
             continue
         group = url.transport.is_group
         yield _Use(
-            host=_host(system, node),
+            host=system.manifest.address_of(node.machine),
             tcp=url.transport.is_tcp,
             group=group and attribute == "port",
             address="" if group or attribute == "output_port" else url.address,
@@ -122,7 +117,7 @@ def _contacts(system: DeclaredSystem, node: Node, url: ConnectionUrl) -> set[tup
         {own}
         if own and not ipaddress.ip_address(own).is_unspecified
         else {
-            _host(system, node),
+            system.manifest.address_of(node.machine),
             "127.0.0.1",
             "::1",
             *url.interfaces,
@@ -134,7 +129,7 @@ def _contacts(system: DeclaredSystem, node: Node, url: ConnectionUrl) -> set[tup
 def _own_address(
     system: DeclaredSystem, node: Node, url: ConnectionUrl, at: Position
 ) -> Iterator[Diagnostic]:
-    host = _host(system, node)
+    host = system.manifest.address_of(node.machine)
     if not host or not url.address or url.transport.is_group:
         return
     own = ipaddress.ip_address(url.address)
@@ -161,7 +156,7 @@ def _collisions(uses: list[_Use]) -> Iterator[Diagnostic]:
                 protocol = "TCP" if use.tcp else "UDP"
                 message = (
                     f"cannot give {protocol} port {use.port} to the {use.what}: it is the "
-                    f"{other.what} ({spell(other.at)})"
+                    f"{other.what} ({other.at.spelled})"
                 )
                 yield error("check.connection-ports", use.at, message, "choose another port")
                 break
@@ -259,8 +254,9 @@ def _remote_nodes(
     ]
     if other is None or not mine:
         return
+    host = system.manifest.address_of(node.machine)
     for each in system.named(other, mine[0]):
-        if _host(system, each.node) != _host(system, node):
+        if system.manifest.address_of(each.node.machine) != host:
             yield each.node.key
 
 

@@ -16,9 +16,7 @@ from pathlib import Path
 from lifecycle.manifest.checks.system import (
     DeclaredSystem,
     Resolved,
-    full_name,
     implicit_names,
-    spell,
 )
 from lifecycle.manifest.diagnostics import Diagnostic, Position, Severity
 from lifecycle.manifest.flows import FlowNeeds, ResolvedNeed
@@ -156,7 +154,7 @@ def _endpoints(node: Node) -> Iterator[Diagnostic]:
             if there is not at:
                 message = (
                     f"cannot map {kind.noun} {name!r} onto {connection.name!r}: it is mapped "
-                    f"onto {other!r} ({spell(there)})"
+                    f"onto {other!r} ({there.spelled})"
                 )
                 hint = "one connection may have several URLs: put them together"
                 yield error("check.connection-endpoint", at, message, hint)
@@ -177,14 +175,14 @@ def _name(
     if reserved:
         message = f"cannot name a connection {connection.name!r}: {reserved}"
         yield error("check.connection-name", connection.at, message, "choose another name")
-    namespace, _, base = full_name(node).rpartition("/")
+    namespace, _, base = node.full_name.rpartition("/")
     name = f"{namespace}/_{base}_{connection.name}"
     owner, other = hidden.setdefault(name, (node, connection))
     if other is not connection:
         message = (
             f"cannot name a connection of {node.key!r} {connection.name!r}: its hidden node "
             f"{name!r} would have the name of that of {other.name!r} of {owner.key!r} "
-            f"({spell(other.at)})"
+            f"({other.at.spelled})"
         )
         yield error("check.connection-name", connection.at, message, "choose another name")
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from lifecycle.manifest.checks.system import DeclaredSystem, Resolved, spell
+from lifecycle.manifest.checks.system import DeclaredSystem, Resolved
 from lifecycle.manifest.diagnostics import Diagnostic
 from lifecycle.manifest.flows import OWN_FLOW, FlowNeeds, ResolvedNeed
 from lifecycle.manifest.model import (
@@ -238,7 +238,7 @@ def _repurposed(system: DeclaredSystem, needs: FlowNeeds) -> Iterator[Diagnostic
             message = (
                 f"cannot give {each.endpoint.kind.noun} {each.name!r} of {each.node.key!r} "
                 f"{describe(need.dscp)}: it identifies {other.name!r} of {other.node.key!r} "
-                f"({spell(other.at)})"
+                f"({other.at.spelled})"
             )
             yield error("check.dscp-not-unique", need.need.at, message, _OWN)
     at = system.manifest.network.at
@@ -276,7 +276,7 @@ def _relied_on(system: DeclaredSystem, needs: FlowNeeds) -> Iterator[Diagnostic]
             message = (
                 f"cannot tell publisher {each.name!r} of {each.node.key!r} apart by "
                 f"{describe(need.dscp)}: {other.name!r} of {other.node.key!r} has the same "
-                f"({spell(other.at)})"
+                f"({other.at.spelled})"
             )
             yield error("check.dscp-not-unique", need.need.at, message, _ASK)
 

@@ -13,9 +13,7 @@ from lifecycle.errors import LifecycleError
 from lifecycle.manifest.checks.system import (
     DeclaredSystem,
     Resolved,
-    full_name,
     read_rule,
-    spell,
     usable_rules,
 )
 from lifecycle.manifest.diagnostics import Diagnostic, Position, Severity
@@ -69,11 +67,11 @@ def _illegal_endpoints(system: DeclaredSystem) -> Iterator[Diagnostic]:
 def _duplicate_nodes(system: DeclaredSystem) -> Iterator[Diagnostic]:
     first: dict[str, Node] = {}
     for node in system.manifest.nodes:
-        other = first.setdefault(full_name(node), node)
+        other = first.setdefault(node.full_name, node)
         if other is not node:
             message = (
-                f"cannot run two nodes with the name {full_name(node)!r}: "
-                f"{other.key!r} has it as well ({spell(other.at)})"
+                f"cannot run two nodes with the name {node.full_name!r}: "
+                f"{other.key!r} has it as well ({other.at.spelled})"
             )
             hint = "give one of them another 'name:' or 'namespace:'"
             yield error("check.duplicate-node", node.at, message, hint)
@@ -88,7 +86,7 @@ def _duplicate_endpoints(group: tuple[Resolved, ...]) -> Iterator[Diagnostic]:
         if other is not each and not _remapped(each) and not _remapped(other):
             message = (
                 f"cannot have two {noun}s {each.name!r} in one node: "
-                f"{other.endpoint.name!r} is the same ({spell(other.at)})"
+                f"{other.endpoint.name!r} is the same ({other.at.spelled})"
             )
             yield error("check.duplicate-endpoint", each.at, message, "remove one")
     servers = list(first.values())
@@ -229,7 +227,7 @@ def _collisions(node: Node, resolved: list[Resolved]) -> Iterator[Diagnostic]:
         moved, stays = (each, other) if before[1] != each.name else (other, each)
         message = (
             f"cannot remap {each.endpoint.kind.noun} {moved.endpoint.name!r} onto {each.name!r}: "
-            f"{stays.endpoint.name!r} of the same node has that name ({spell(stays.at)})"
+            f"{stays.endpoint.name!r} of the same node has that name ({stays.at.spelled})"
         )
         yield error("check.remap-collision", _rule_place(moved), message, "remap only one of them")
 

@@ -14,7 +14,7 @@ import functools
 import shlex
 from collections.abc import Iterator, Mapping
 
-from lifecycle.manifest.checks.system import DeclaredSystem, rmw_of, spell
+from lifecycle.manifest.checks.system import DeclaredSystem, rmw_of
 from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.flows import FlowNeeds
 from lifecycle.manifest.model import (
@@ -86,7 +86,7 @@ def check_processes(system: DeclaredSystem) -> Iterator[Diagnostic]:
         if namesake is not None and namesake.process != node.process:
             message = (
                 f"cannot name a process {node.process!r}: node {namesake.key!r} runs in a process "
-                f"of that name ({spell(namesake.at)})"
+                f"of that name ({namesake.at.spelled})"
             )
             yield error("check.process-name", at, message, "choose another name")
         other = first.setdefault(node.process, node)
@@ -100,7 +100,7 @@ def _executor(run: Run) -> tuple[Executor, int]:
 
 def _apart(node: Node, other: Node, at: Position) -> Iterator[Diagnostic]:
     """Judge two nodes that share a process."""
-    together = f"cannot share process {node.process!r} with {other.key!r} ({spell(other.at)})"
+    together = f"cannot share process {node.process!r} with {other.key!r} ({other.at.spelled})"
     if node.machine != other.machine:
         message = (
             f"{together}: it runs on machine {other.machine!r}, {node.key!r} on {node.machine!r}"
@@ -139,7 +139,7 @@ def _apart(node: Node, other: Node, at: Position) -> Iterator[Diagnostic]:
 def check_supervision(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about what is to be done when processes fail."""
     restarted = {
-        node.process or node.key: None
+        node.process_name: None
         for node in system.manifest.nodes
         if node.supervision.restart is not Restart.NO
     }
@@ -153,7 +153,7 @@ def check_supervision(system: DeclaredSystem) -> Iterator[Diagnostic]:
                 hint = "set it at the container" if node.run.component else "remove it"
                 yield error("check.restart", places[key], message, hint)
             continue
-        if (node.process or node.key) not in restarted:
+        if node.process_name not in restarted:
             for key in own:
                 if key != "restart":
                     message = f"cannot use {key} of {node.key!r}: it is not started again"
@@ -241,7 +241,7 @@ def check_modes(system: DeclaredSystem) -> Iterator[Diagnostic]:
                 if beyond and after.node in mode.inactive:
                     message = (
                         f"cannot wait until {after.node!r} is {after.condition.value}: mode "
-                        f"{mode.name!r} ({spell(mode.at)}) keeps it inactive"
+                        f"{mode.name!r} ({mode.at.spelled}) keeps it inactive"
                     )
                     hint = f"write '{after.node}: connected', or remove it from the mode"
                     yield error("check.mode", after.at, message, hint)

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from lifecycle import dataclasses
-from lifecycle.manifest.checks.system import DeclaredSystem, full_name
+from lifecycle.manifest.checks.system import DeclaredSystem
 from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position, Severity
 from lifecycle.manifest.model import ModeParameter, Node, ParameterValue, RunKind
 from lifecycle.manifest.nodl import nearest_file
@@ -145,11 +145,11 @@ def check_parameters(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about the parameters of every node."""
     names: dict[str, set[str]] = {}
     for node in system.manifest.nodes:
-        names.setdefault(node.process or node.key, set()).add(node.name)
+        names.setdefault(node.process_name, set()).add(node.name)
     for node in system.manifest.nodes:
         yield from _given(node)
         yield from _no_effect(node)
-        yield from _for_no_node(node, names[node.process or node.key])
+        yield from _for_no_node(node, names[node.process_name])
         yield from _empty_arrays(node)
 
 
@@ -201,7 +201,7 @@ def _empty_arrays(node: Node) -> Iterator[Diagnostic]:
         for path in node.parameter_files
         if os.path.lexists(path)
         for section in read_sections(path, shown=shown_path(path, node.at.file))[0]
-        if section.matches(full_name(node))
+        if section.matches(node.full_name)
         for each in section.parameters
     ]
     for name, value, at in given:
@@ -266,7 +266,7 @@ def _is_given(node: Node, name: str) -> bool:
         for path in node.parameter_files
         if os.path.lexists(path)
         for section in read_sections(path, shown=path)[0]
-        if section.matches(full_name(node))
+        if section.matches(node.full_name)
         for found, _, _ in section.parameters
     )
 
@@ -531,7 +531,7 @@ def _read(path: str, file: _ParameterFile, node: Node, index: int) -> Iterator[D
 
 
 def _unmatched_node(path: str, file: _ParameterFile, node: Node) -> Iterator[Diagnostic]:
-    name = full_name(node)
+    name = node.full_name
     if any(section.matches(name) for section in file.sections):
         return
     at = node.where(f"parameter_files.{node.parameter_files.index(path)}")
@@ -547,9 +547,9 @@ def _unmatched_file_of_command(node: Node, system: DeclaredSystem) -> Iterator[D
     files = [each.file for each in command_line_parameters(node) if each.file]
     if not files:
         return
-    process = node.process or node.key
-    every = [full_name(each) for each in system.manifest.nodes]
-    names = [full_name(e) for e in system.manifest.nodes if process == (e.process or e.key)]
+    process = node.process_name
+    every = [each.full_name for each in system.manifest.nodes]
+    names = [e.full_name for e in system.manifest.nodes if process == e.process_name]
     for path in files:
         if not os.path.lexists(path):
             continue
@@ -570,7 +570,7 @@ def _unmatched_file_of_command(node: Node, system: DeclaredSystem) -> Iterator[D
 
 def _unmatched_sections(file: _ParameterFile, system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Warn of sections that match no node in a file of which others do: most are misspelt."""
-    names = [full_name(node) for node in system.manifest.nodes]
+    names = [node.full_name for node in system.manifest.nodes]
     dead = [each for each in file.sections if not any(each.matches(name) for name in names)]
     if len(dead) == len(file.sections):
         return  # reported where the file is named
@@ -583,18 +583,18 @@ def _unmatched_sections(file: _ParameterFile, system: DeclaredSystem) -> Iterato
 def _values(file: _ParameterFile, node: Node) -> Iterator[Diagnostic]:
     declared = {each.name: each for each in node.interface.parameters}
     for section in file.sections:
-        if not section.matches(full_name(node)):
+        if not section.matches(node.full_name):
             continue
         for name, value, at in section.parameters:
             declaration = declared.get(name)
             if declaration is not None:
                 if problem := misfit(value, declaration.type):
-                    message = f"cannot set parameter {name!r} of {full_name(node)!r} to {problem}"
+                    message = f"cannot set parameter {name!r} of {node.full_name!r} to {problem}"
                     hint = suggestion(value, declaration.type)
                     yield error("check.parameter-type", at, message, hint)
             elif declared and not section.is_wildcard and not is_implicit(name):
                 message = (
-                    f"cannot set parameter {name!r} of {full_name(node)!r}: "
+                    f"cannot set parameter {name!r} of {node.full_name!r}: "
                     f"its interface declares no such parameter"
                 )
                 hint = did_you_mean(name, declared)
@@ -604,7 +604,7 @@ def _values(file: _ParameterFile, node: Node) -> Iterator[Diagnostic]:
 def _unknown_to_all(file: _ParameterFile) -> Iterator[Diagnostic]:
     """Warn of a value for many nodes that none of them declares; some not declaring it is usual."""
     for section in file.sections:
-        nodes = [node for node in file.readers if section.matches(full_name(node))]
+        nodes = [node for node in file.readers if section.matches(node.full_name)]
         if not section.is_wildcard or not nodes:
             continue
         if not all(node.interface.parameters for node in nodes):

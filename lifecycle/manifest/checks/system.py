@@ -26,7 +26,6 @@ from lifecycle.manifest.model import (
 from lifecycle.manifest.names import (
     DIAGNOSTICS_TOPIC,
     RemapRule,
-    full_node_name,
     parse_rule,
     resolve,
     supervisor_prefix,
@@ -36,11 +35,6 @@ from lifecycle.manifest.names import (
 from lifecycle.network import DEFAULT_RMW
 
 _RMW_VARIABLE = "RMW_IMPLEMENTATION"
-
-
-def spell(at: Position) -> str:
-    """Spell a position inside a message: `robot.lifecycle.yaml:14:7`."""
-    return f"{at.file}:{at.line}:{at.column}"
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,7 +52,7 @@ class Resolved:
 
     def __str__(self) -> str:
         noun = self.endpoint.kind.noun
-        return f"{noun} {self.endpoint.name!r} of node {self.node.key!r} ({spell(self.at)})"
+        return f"{noun} {self.endpoint.name!r} of node {self.node.key!r} ({self.at.spelled})"
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -167,11 +161,6 @@ def read_rule(match: str, replacement: str) -> RemapRule | LifecycleError:
         return problem
 
 
-def full_name(node: Node) -> str:
-    """Return the node's fully qualified name."""
-    return full_node_name(node.name, node.namespace)
-
-
 _EVERY_NODE = (
     (EndpointKind.SERVICE_SERVER, "describe_parameters"),
     (EndpointKind.SERVICE_SERVER, "get_parameter_types"),
@@ -214,7 +203,7 @@ def implicit_names(system: DeclaredSystem) -> frozenset[tuple[EndpointKind, str]
     names.update(_of_supervisors(system.manifest))
     for node in system.manifest.nodes:
         own = (*_EVERY_NODE, *(_MANAGED_NODE if node.managed else ()), *_OWN_NODE)
-        names.update((kind, f"{full_name(node)}/{name}") for kind, name in own)
+        names.update((kind, f"{node.full_name}/{name}") for kind, name in own)
     return frozenset(names)
 
 

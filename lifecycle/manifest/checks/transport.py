@@ -406,14 +406,14 @@ def _pair(
 ) -> Iterator[Diagnostic]:
     """Judge what is asked for between two nodes by where they run."""
     node, end = ends
-    one, two = _address(system, node), _address(system, end)
-    if one == two and _process(end) == _process(node):
+    one, two = system.manifest.address_of(node.machine), system.manifest.address_of(end.machine)
+    if one == two and end.process_name == node.process_name:
         if transport.medium and transport.medium.stays_on_host:
             return
         by = "the network" if transport is FlowTransport.NETWORK else transport.value
         both = "it" if node is end else f"{node.key!r} and {end.key!r}"
         message = (
-            f"cannot send {topic!r} from process {_process(node)!r} to itself by {by}: {both} "
+            f"cannot send {topic!r} from process {node.process_name!r} to itself by {by}: {both} "
             f"{'is' if node is end else 'are'} in it, and inside a process no transport is used"
         )
         hint = f"give one of the two another 'process:', or drop 'transport: {transport.value}'"
@@ -443,22 +443,12 @@ def _pair(
             yield error(_RULE, at, message, hint)
 
 
-def _process(node: Node) -> str:
-    return node.process or node.key
-
-
-def _address(system: DeclaredSystem, node: Node) -> str:
-    return next(
-        (each.address for each in system.manifest.machines if each.name == node.machine), ""
-    )
-
-
 def _fragments(system: DeclaredSystem, node: Node, each: ResolvedNeed) -> Iterator[Diagnostic]:
     size = each.max_message_size
     if each.max_datagram_bytes is None or size is None:
         return
     limit = system.manifest.network.max_datagram_bytes or max_unfragmented(
-        ipv6=":" in _address(system, node)
+        ipv6=":" in system.manifest.address_of(node.machine)
     )
     declared = "declared" if each.need.max_message_size is not None else "the bound of its type"
     message = (

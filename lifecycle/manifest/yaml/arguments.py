@@ -140,7 +140,7 @@ class _Substitution:
             hint = f"give {name}:=VALUE on the command line, or a default here"
             if self._include:
                 at = self._include.at
-                hint = f"add it to the arguments of the include at {at.file}:{at.line}:{at.column}"
+                hint = f"add it to the arguments of the include at {at.spelled}"
             where = self._document.key_at(place)
             self.found.append(error("manifest.missing-argument", where, message, hint))
             return None

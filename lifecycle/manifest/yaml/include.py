@@ -182,7 +182,7 @@ def join(
         first = nodes.setdefault(node.key, node)
         if first is not node:
             message = (
-                f"cannot include the node {quote(node.key)}: {_place(first.at)} declares it too"
+                f"cannot include the node {quote(node.key)}: {first.at.spelled} declares it too"
             )
             hint = f"give the {what} a prefix"
             found.append(error("manifest.duplicate-node", at, message, hint))
@@ -202,10 +202,6 @@ def _join_machine(first: Machine, machine: Machine, found: Findings) -> None:
     if first.address != machine.address:
         message = (
             f"cannot give machine {quote(machine.name)} the address {quote(machine.address)}: "
-            f"it has {quote(first.address)} at {_place(first.at)}"
+            f"it has {quote(first.address)} at {first.at.spelled}"
         )
         found.append(error("manifest.machine", machine.at, message, "rename one of the two"))
-
-
-def _place(at: Position) -> str:
-    return f"{at.file}:{at.line}:{at.column}"

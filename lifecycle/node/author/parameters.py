@@ -230,7 +230,4 @@ def without_text(spec: PlannedNode) -> Iterator[tuple[str, ParameterValue]]:
 
 def _problem(declared: ParameterDeclaration, error: Exception) -> str:
     at = declared.at
-    return (
-        f"{at.file}:{at.line}:{at.column}: cannot declare parameter {declared.name!r} as "
-        f"{declared.type}: {error}"
-    )
+    return f"{at.spelled}: cannot declare parameter {declared.name!r} as {declared.type}: {error}"

@@ -492,7 +492,7 @@ def _lines(found: Iterable[PlanDifference]) -> tuple[str, ...]:
     every = tuple(found)
     lines = []
     for each in every[:_MOST]:
-        place = f"{each.at.file}:{each.at.line}:{each.at.column}: " if each.at else ""
+        place = f"{each.at.spelled}: " if each.at else ""
         lines.append(f"{place}{each.path}: was {each.old}, is {each.new}")
     if len(every) > _MOST:
         lines.append(f"and {len(every) - _MOST} more")

@@ -103,7 +103,7 @@ class Rule:
             expected=expected,
             observed=observed,
             message=message,
-            at=f"{at.file}:{at.line}:{at.column}" if at else "",
+            at=at.spelled if at else "",
             node=node,
             endpoint=endpoint,
             hint=hint or self.fix,
