@@ -16,12 +16,12 @@ the file system.
 from __future__ import annotations
 
 import enum
-import functools
 import json
 import os
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 from lifecycle import dataclasses
 from lifecycle.manifest.schema import nearest
@@ -146,97 +146,26 @@ def installed_hash(type_: str, prefixes: Sequence[Path]) -> str:
         type_: `package/msg/Type`, `package/srv/Type` or `package/action/Type`.
         prefixes: where to search, from `search_prefixes`.
     """
-    package, _, rest = type_.partition("/")
-    index = find_resource("rosidl_interfaces", package, prefixes) if rest else None
-    parts = _PARTS.get(rest.partition("/")[0])
-    if index is None or parts is None:
+    parts = _PARTS.get(type_.partition("/")[2].partition("/")[0], ())
+    try:
+        listed = _description(type_, prefixes)["type_hashes"]
+        known = {str(each["type_name"]): str(each["hash_string"]) for each in listed}
+    except (KeyError, TypeError):
         return ""
-    # <prefix>/share/ament_index/resource_index/rosidl_interfaces/<package>
-    known = _hashes(index.parents[3] / package / f"{rest}.json")
     return join([known.get(f"{type_}{part}", "") for part in parts])
 
 
-@functools.lru_cache(maxsize=512)
-def _hashes(path: Path) -> Mapping[str, str]:
-    """Return the hashes that a type description lists, by type name; none if it cannot be read."""
+def _description(type_: str, prefixes: Sequence[Path]) -> Any:
+    """Return what rosidl has installed of a type as JSON; None if it cannot be read."""
+    package, _, rest = type_.partition("/")
+    index = find_resource(_RESOURCE, package, prefixes) if rest else None
+    if index is None:
+        return None
     try:
-        listed = json.loads(path.read_text(encoding="utf-8"))["type_hashes"]
-        return {str(each["type_name"]): str(each["hash_string"]) for each in listed}
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return {}
-
-
-class DescriptionError(Exception):
-    """A type description does not have what type_description_interfaces/msg/FieldType says."""
-
-
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Field:
-    """One field of a message type.
-
-    Attributes:
-        type: a primitive's name in FieldType.msg, `string`, `wstring`, or a type `a/msg/B`.
-        length: number of items of a fixed array, 1 for a single value.
-        is_sequence: of variable length.
-        bound: most items of a sequence; None if it has no bound.
-        string_bound: most characters of a string; None if it has no bound.
-    """
-
-    type: str
-    length: int = 1
-    is_sequence: bool = False
-    bound: int | None = None
-    string_bound: int | None = None
-
-
-_NESTED = 1
-_NUMBERS = (
-    *("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64"),
-    *("float", "double", "long_double", "char", "wchar", "boolean", "byte"),
-)
-_PRIMITIVE_IDS = dict(enumerate(_NUMBERS, start=2))
-_STRINGS = {17: "string", 18: "wstring", 21: "string", 22: "wstring"}
-_BOUNDED_STRINGS = (21, 22)
-_ARRAY, _BOUNDED, _UNBOUNDED = 1, 2, 3
-_FORM = 48
-"""type_description_interfaces/msg/FieldType: a type, and in steps of 48 its array, its bounded and
-its unbounded sequence."""
-
-
-def described_fields(description: object) -> tuple[Field, ...]:
-    """Return the fields of an IndividualTypeDescription as rosidl installs it in JSON.
-
-    Raises:
-        DescriptionError: it is none, or has a kind of field that is not known here.
-    """
-    try:
-        return tuple(_described(each["type"]) for each in description["fields"])  # type: ignore[index]
-    except (KeyError, TypeError, ValueError) as error:
-        raise DescriptionError(f"cannot read the fields of a type: {error!r}") from error
-
-
-def _described(type_: Mapping[str, object]) -> Field:
-    number, capacity, string_capacity = (
-        _count(type_[each]) for each in ("type_id", "capacity", "string_capacity")
-    )
-    form, of = divmod(number, _FORM)
-    name = str(type_["nested_type_name"]) if of == _NESTED else _STRINGS.get(of)
-    name = name or _PRIMITIVE_IDS.get(of, "")
-    if not name or form > _UNBOUNDED:
-        raise DescriptionError(f"cannot read a field of type_id {number}")
-    return Field(
-        type=name,
-        length=capacity if form == _ARRAY else 1,
-        is_sequence=form in (_BOUNDED, _UNBOUNDED),
-        bound=capacity if form == _BOUNDED else None,
-        string_bound=string_capacity if of in _BOUNDED_STRINGS else None,
-    )
-
-
-def _count(value: object) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-        raise DescriptionError(f"cannot use {value!r} as a count")
-    return value
+        # <prefix>/share/ament_index/resource_index/rosidl_interfaces/<package>
+        return json.loads((index.parents[3] / package / f"{rest}.json").read_text("utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return None
 
 
 _ENCAPSULATION = 4
@@ -244,22 +173,19 @@ _ENCAPSULATION = 4
 
 _LENGTH = 4
 _WCHAR = 4
-_PRIMITIVES = {
-    "boolean": 1,
-    "byte": 1,
-    "char": 1,
-    "int8": 1,
-    "uint8": 1,
-    "int16": 2,
-    "uint16": 2,
-    "int32": 4,
-    "uint32": 4,
-    "float": 4,
-    "wchar": _WCHAR,
-    "int64": 8,
-    "uint64": 8,
-    "double": 8,
+_SIZES = {
+    **dict(enumerate((1, 1, 2, 2, 4, 4, 8, 8, 4, 8), start=2)),  # int8 … uint64, float, double
+    13: 1,
+    14: _WCHAR,
+    15: 1,
+    16: 1,  # char, wchar, boolean, byte
 }
+_CHARACTERS = {21: 1, 22: _WCHAR}
+_NESTED = 1
+_FORM, _ARRAY, _BOUNDED = 48, 1, 2
+"""type_description_interfaces/msg/FieldType: bytes by type id, bytes of a character by that of a
+bounded string, and in steps of 48 a type's array, its bounded and its unbounded sequence."""
+
 _MAX_DEPTH = 32
 _EXACT_ITEMS = 64  # items of an array that are laid out one by one before padding is estimated
 
@@ -281,7 +207,7 @@ def bounded_size(type_: str, prefixes: Sequence[Path]) -> int | None:
     layout = _Layout()
     try:
         _add(type_, layout, prefixes, 0)
-    except _UnboundedError:
+    except (_UnboundedError, KeyError, TypeError):  # or a description that is none
         return None
     return _ENCAPSULATION + layout.offset
 
@@ -303,32 +229,37 @@ class _Layout:
 
 
 def _add(type_: str, layout: _Layout, prefixes: Sequence[Path], depth: int) -> None:
-    fields = _fields(type_, prefixes) if depth < _MAX_DEPTH else None
-    if fields is None:
+    if depth == _MAX_DEPTH:
         raise _UnboundedError
-    for field in fields:
-        _add_field(field, layout, prefixes, depth)
+    fields = _description(type_, prefixes)["type_description_msg"]["type_description"]["fields"]
+    for each in fields:
+        _add_field(each["type"], layout, prefixes, depth)
     if not fields:
         layout.put(1)  # rosidl puts a member into an empty structure
 
 
-def _add_field(field: Field, layout: _Layout, prefixes: Sequence[Path], depth: int) -> None:
-    count = field.length
-    if field.is_sequence:
-        if field.bound is None:
-            raise _UnboundedError
+def _add_field(
+    field: Mapping[str, Any], layout: _Layout, prefixes: Sequence[Path], depth: int
+) -> None:
+    form, of = divmod(_count(field["type_id"]), _FORM)
+    if form > _BOUNDED:
+        raise _UnboundedError
+    count = _count(field["capacity"]) if form else 1
+    if form == _BOUNDED:
         layout.put(_LENGTH)
-        count = field.bound
-    if field.type in _PRIMITIVES:
-        layout.put(_PRIMITIVES[field.type], count)
-    elif field.type in ("string", "wstring"):
-        if field.string_bound is None:
-            raise _UnboundedError
-        width = 1 if field.type == "string" else _WCHAR
-        _repeat_text(layout, width * (field.string_bound + 1), count)
+    if of in _CHARACTERS:
+        _repeat_text(layout, _CHARACTERS[of] * (_count(field["string_capacity"]) + 1), count)
+    elif of == _NESTED:
+        _repeat(str(field["nested_type_name"]), layout, count, prefixes, depth)
     else:
-        _repeat(field.type, layout, count, prefixes, depth)
-    layout.exact = layout.exact and not field.is_sequence
+        layout.put(_SIZES[of], count)
+    layout.exact = layout.exact and form != _BOUNDED
+
+
+def _count(value: object) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+        raise _UnboundedError
+    return value
 
 
 def _repeat_text(layout: _Layout, content: int, count: int) -> None:
@@ -347,18 +278,3 @@ def _repeat(type_: str, layout: _Layout, count: int, prefixes: Sequence[Path], d
         _add(type_, one, prefixes, depth + 1)
         layout.offset += one.offset * (count - _EXACT_ITEMS)
         layout.exact = False
-
-
-def _fields(type_: str, prefixes: Sequence[Path]) -> tuple[Field, ...] | None:
-    """Return the fields of a type `a/msg/B`; None if its description cannot be read."""
-    package, _, rest = type_.partition("/")
-    index = find_resource("rosidl_interfaces", package, prefixes)
-    if index is None or not rest:
-        return None
-    # <prefix>/share/ament_index/resource_index/rosidl_interfaces/<package>
-    path = index.parents[3] / package / f"{rest}.json"
-    try:
-        described = json.loads(path.read_text(encoding="utf-8"))["type_description_msg"]
-        return described_fields(described["type_description"])
-    except (OSError, ValueError, KeyError, TypeError, RecursionError, DescriptionError):
-        return None

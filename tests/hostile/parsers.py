@@ -22,7 +22,7 @@ from lifecycle.graph.messages import GraphMessageError, Joined, encode
 from lifecycle.graph.messages import decode as decode_message
 from lifecycle.manifest import ManifestError, load
 from lifecycle.manifest.diagnostics import Position
-from lifecycle.manifest.installed_types import DescriptionError, _hashes, described_fields
+from lifecycle.manifest.installed_types import bounded_size, installed_hash
 from lifecycle.manifest.nodl import read_interface
 from lifecycle.node.host.control import Event
 from lifecycle.plan.comparison import PlanNoticeError, announced_plan, notice_of
@@ -77,9 +77,11 @@ def _file(name: str, read: Callable[[Path], object]) -> Callable[[bytes, Path], 
     return in_file
 
 
-def _hash(path: Path) -> object:
-    _hashes.cache_clear()
-    return _hashes(path)
+def _installed(data: bytes, folder: Path) -> object:
+    for name in ("share/ament_index/resource_index/rosidl_interfaces/a", "share/a/msg/B.json"):
+        (folder / name).parent.mkdir(parents=True)
+        (folder / name).write_bytes(data)
+    return bounded_size("a/msg/B", [folder]), installed_hash("a/msg/B", [folder])
 
 
 def _nodl(path: Path) -> object:
@@ -126,13 +128,12 @@ publishers:
 parameters:
   rate: {type: double, default_value: 1.0}
 """
+_FIELDS = [
+    {"type": {"type_id": 107, "capacity": 4, "string_capacity": 0, "nested_type_name": ""}},
+    {"type": {"type_id": 21, "capacity": 0, "string_capacity": 9, "nested_type_name": ""}},
+]
 _DESCRIPTION = json.dumps(
-    {
-        "fields": [
-            {"type": {"type_id": 107, "capacity": 4, "string_capacity": 0, "nested_type_name": ""}},
-            {"type": {"type_id": 21, "capacity": 0, "string_capacity": 9, "nested_type_name": ""}},
-        ]
-    }
+    {"type_description_msg": {"type_description": {"fields": _FIELDS}}}
 ).encode()
 _HASHES = json.dumps(
     {"type_hashes": [{"type_name": "a/msg/B", "hash_string": "RIHS01_ab"}]}
@@ -206,12 +207,8 @@ READERS: dict[str, Reader] = {
     ),
     "output of a tool": Reader(good=b"qdisc htb 1f10:", read=_printed, errors=()),
     "NoDL document": Reader(good=_NODL, read=_file("a.nodl.yaml", _nodl), errors=(ManifestError,)),
-    "installed type description": Reader(
-        good=_DESCRIPTION,
-        read=lambda data, _: described_fields(json.loads(data)),
-        errors=(DescriptionError, ValueError),
-    ),
-    "installed type hashes": Reader(good=_HASHES, read=_file("B.json", _hash), errors=()),
+    "installed type description": Reader(good=_DESCRIPTION, read=_installed, errors=()),
+    "installed type hashes": Reader(good=_HASHES, read=_installed, errors=()),
     "manifest": Reader(
         good=_MANIFEST, read=_file("m.lifecycle.yaml", load), errors=(ManifestError,)
     ),

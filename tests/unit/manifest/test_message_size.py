@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import struct
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from lifecycle.manifest.installed_types import (
-    DescriptionError,
-    Field,
-    bounded_size,
-    described_fields,
-    search_prefixes,
-)
+from lifecycle.manifest.installed_types import bounded_size, search_prefixes
 
 INSTALLED = search_prefixes({})
 
@@ -143,16 +136,6 @@ def test_what_is_not_understood_or_has_no_end_has_no_bound(package, fields) -> N
     assert bounded_size("p/msg/M", package(M=fields)) is None
 
 
-def test_every_installed_message_description_is_read() -> None:
-    files = [file for prefix in INSTALLED for file in (prefix / "share").glob("*/msg/*.json")]
-    if not files:
-        pytest.skip("no interface packages are installed")
-    for file in files:
-        described = json.loads(file.read_text(encoding="utf-8"))["type_description_msg"]
-        fields = described_fields(described["type_description"])
-        assert len(fields) == len(described["type_description"]["fields"])
-
-
 _KEYS = st.sampled_from(["fields", "type", "type_id", "capacity", "string_capacity"])
 _ANYTHING = st.recursive(
     st.none() | st.integers() | st.text(),
@@ -160,25 +143,19 @@ _ANYTHING = st.recursive(
 )
 
 
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(_ANYTHING)
-def test_anything_is_a_description_or_an_error(value: object) -> None:
-    with contextlib.suppress(DescriptionError):
-        assert all(isinstance(each, Field) for each in described_fields(value))
+def test_no_description_makes_it_raise(package, value: object) -> None:
+    size = bounded_size("p/msg/M", package(M=value))
+    assert size is None or size > 4
 
 
 _SCALARS = {"boolean": "?", "uint16": "H", "uint32": "I", "double": "d", "byte": "B"}
 
 
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(st.sampled_from(sorted(_SCALARS)), min_size=1, max_size=12))
-def test_scalars_take_what_a_c_compiler_gives_them(words: list[str]) -> None:
+def test_scalars_take_what_a_c_compiler_gives_them(package, words: list[str]) -> None:
     # Natural alignment up to 8 bytes: struct's native layout without the padding at the end.
-    assert layout(words) == struct.calcsize("@" + "".join(_SCALARS[each] for each in words))
-
-
-def layout(words: list[str]) -> int:
-    from lifecycle.manifest import installed_types
-
-    found = installed_types._Layout()
-    for word in words:
-        installed_types._add_field(Field(type=word), found, [], 0)
-    return found.offset
+    expected = struct.calcsize("@" + "".join(_SCALARS[each] for each in words))
+    assert bounded_size("p/msg/M", package(M=[field(each) for each in words])) == 4 + expected
