@@ -46,7 +46,6 @@ from lifecycle.node.lifecycle.machine import (
     NodeState,
     RefusedError,
     StateChange,
-    Transition,
     TransitionRequest,
 )
 from lifecycle.node.lifecycle.services import LifecycleServices, Turns
@@ -55,7 +54,6 @@ from lifecycle.verify import NodeConfiguration
 
 if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup
-    from rclpy.service import Service
 
 
 class GraphMember:
@@ -309,14 +307,6 @@ class Managed:
         state = self.state
         return HostedState(label=state.seen.label, connected=state.connected, steady=state.steady)
 
-    def available_transitions(self) -> tuple[Transition, ...]:
-        """Return the edges that may be taken from this state, as other tools see them."""
-        return self._controller.machine.available_transitions()
-
-    def service(self, name: str) -> Service | None:
-        """Return the lifecycle service `~/name`; None if the node has no such interface."""
-        return None if self._services is None else self._services.made[name]
-
     def add_listener(self, listener: Callable[[Managed], None]) -> None:
         """Call `listener(self)` after every change of state, whatever caused it."""
         self._listeners.append(listener)
@@ -520,9 +510,7 @@ class Managed:
         """Follow a change of the machine: the gate first, then notify the others."""
         if change.goal is NodeState.ACTIVE:
             self.gate.open()
-        elif change.goal is NodeState.ACTIVATING_CONNECTED:
-            self.gate.open_early()
-        elif change.start in (NodeState.ACTIVE, NodeState.ACTIVATING_CONNECTED):
+        elif change.start is NodeState.ACTIVE:
             self.gate.close()
         if self._supervisor and change.goal in _WITHOUT_DATA_LAYER:
             self._let_through = False

@@ -25,7 +25,7 @@ from rclpy.callback_groups import CallbackGroup
 from rclpy.client import Client
 from rclpy.clock import Clock
 from rclpy.context import Context
-from rclpy.lifecycle import LifecyclePublisher, LifecycleState, TransitionCallbackReturn
+from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.logging import LoggingSeverity
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -45,7 +45,6 @@ from lifecycle.node import configuration
 from lifecycle.node.author import parameters
 from lifecycle.node.author.declarations import Declarations
 from lifecycle.node.author.managed import Managed
-from lifecycle.node.author.rclpy_lifecycle import RclpyLifecycle
 from lifecycle.node.author.spec import (
     Mode,
     default_name,
@@ -130,8 +129,7 @@ class GatedFactories(Node):  # type: ignore[misc]  # rclpy is not typed
         publisher = super().create_publisher(msg_type, topic, qos_profile, **options)
         if self._gate is not None:
             self.lifecycle.undeclared.add(EndpointKind.PUBLISHER, publisher)
-            gated = GatedPublisher(publisher, self.get_logger().warning)
-            self._gate.add(publisher, gated, early=isinstance(publisher, LifecyclePublisher))
+            self._gate.add(publisher, GatedPublisher(publisher, self.get_logger().warning))
         return publisher
 
     def create_subscription(
@@ -339,7 +337,7 @@ def _any_signature(callback: Callable[..., CallbackReturn]) -> Callable[..., Cal
     return callback
 
 
-class LifecycleNode(Declarations, LocalInterface, RclpyLifecycle, GatedFactories):
+class LifecycleNode(Declarations, LocalInterface, GatedFactories):
     """A ROS 2 managed node whose endpoints are declared, not scattered through its code.
 
     From outside it is exactly a managed node (`ros2 lifecycle`, launch_ros and nav2 drive it),
@@ -418,7 +416,6 @@ class LifecycleNode(Declarations, LocalInterface, RclpyLifecycle, GatedFactories
                 f"cannot use enable_communication_interface={enable_communication_interface!r}; "
                 "allowed: True, False"
             )
-        self._managed_entities = {}
         name = node_name or default_name(type(self))
         construction = take_construction(name, namespace)
         planned = construction.spec if construction is not None else None
@@ -456,7 +453,6 @@ class LifecycleNode(Declarations, LocalInterface, RclpyLifecycle, GatedFactories
             serves_parameters=not later,
             health=None if type(self).health is LifecycleNode.health else self.health,
         )
-        self._take_rclpy_names()
         if construction is not None:
             construction.constructed()
         if construction is None and mode is Mode.AUTO:
@@ -546,7 +542,6 @@ class LifecycleNode(Declarations, LocalInterface, RclpyLifecycle, GatedFactories
     @_any_signature
     def on_configure(self, state: LifecycleState) -> CallbackReturn:
         """Read parameters, take resources. Endpoints are declared but do not exist yet."""
-        return self._call_managed("on_configure", state)
 
     @_any_signature
     def on_connect(self, state: LifecycleState) -> CallbackReturn:
@@ -555,12 +550,10 @@ class LifecycleNode(Declarations, LocalInterface, RclpyLifecycle, GatedFactories
     @_any_signature
     def on_activate(self, state: LifecycleState) -> CallbackReturn:
         """Start working; data flows once this has succeeded."""
-        return self._call_managed("on_activate", state)
 
     @_any_signature
     def on_deactivate(self, state: LifecycleState) -> CallbackReturn:
         """Stop working; data has stopped flowing already."""
-        return self._call_managed("on_deactivate", state)
 
     @_any_signature
     def on_disconnect(self, state: LifecycleState) -> CallbackReturn:
@@ -569,12 +562,10 @@ class LifecycleNode(Declarations, LocalInterface, RclpyLifecycle, GatedFactories
     @_any_signature
     def on_cleanup(self, state: LifecycleState) -> CallbackReturn:
         """Give back what on_configure took."""
-        return self._call_managed("on_cleanup", state)
 
     @_any_signature
     def on_shutdown(self, state: LifecycleState) -> CallbackReturn:
         """The last call, from any state; endpoints are removed after it."""
-        return self._call_managed("on_shutdown", state)
 
     @_any_signature
     def health(self) -> Any:
@@ -588,4 +579,3 @@ class LifecycleNode(Declarations, LocalInterface, RclpyLifecycle, GatedFactories
     @_any_signature
     def on_error(self, state: LifecycleState) -> CallbackReturn:
         """A callback ended in ERROR: SUCCESS says the node is as new, FAILURE finalizes it."""
-        return self._call_managed("on_error", state)

@@ -59,7 +59,7 @@ from lifecycle.node.host.control import (
     report_failure,
 )
 from lifecycle.node.host.foreign import Adoption, ForeignNode, Hosted, refuse_unmanaged
-from lifecycle.node.host.loop import NodeLoop, Prober, Watchdog, on_signal
+from lifecycle.node.host.loop import Heartbeat, NodeLoop, Watchdog, on_signal
 from lifecycle.node.lifecycle.machine import CallbackOutcome
 from lifecycle.plan import PlannedNode
 from lifecycle.verify import NodeConfiguration
@@ -309,11 +309,11 @@ class Host:
         self._context = context
         self._channel = channel
         run = spec.nodes[0].run
-        watchdog: Watchdog | Prober | None = None
+        watchdog: Watchdog | Heartbeat | None = None
         if channel.descriptors:
             sign = BusySign(*channel.descriptors)
             sign.show_stacks()
-            kind = Watchdog if run.executor is Executor.SINGLE else Prober
+            kind = Watchdog if run.executor is Executor.SINGLE else Heartbeat
             watchdog = kind(sign, lambda _: channel.write(Event(kind="beat")))
         self._loop = NodeLoop(context, watchdog, executor=run.executor, threads=run.threads)
         self._lock = threading.Lock()

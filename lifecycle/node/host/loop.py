@@ -22,19 +22,22 @@ import signal
 import socket
 import sys
 import threading
+import time
 import traceback
 import weakref
 from collections.abc import Callable, Coroutine, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, Protocol
 
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.context import Context
-from rclpy.exceptions import InvalidHandle
 from rclpy.executors import (
     ExternalShutdownException,
     MultiThreadedExecutor,
     ShutdownException,
 )
 from rclpy.node import Node
+from rclpy.timer import Timer
 
 from lifecycle.manifest import Executor
 from lifecycle.middleware import (
@@ -141,102 +144,84 @@ class Watchdog:
             self._on_overlong(busy_s)
 
 
-class Prober:
-    """Keeps the busy sign of an executor that runs callbacks in threads of its own.
+class Heartbeat:
+    """Keeps the busy sign of an `events` or `multi` executor, by a timer of each node.
 
-    It asks each node, once in a limit, to run an empty callback in its default group, which nothing
-    else of it is in: that waits as long as another callback of the group does, or as all threads
-    are busy. In the time between the sign is armed for the next, so that it does not depend on a
-    thread of ours which a callback may keep from running.
+    It is in the node's default callback group: it comes late by as long as another callback of that
+    group takes, or as all threads are busy. Callbacks of other groups may take as long as they like
+    while a thread is left.
 
     Args:
         sign: this process's side.
-        on_overlong: called with the seconds that an answer took beyond the limit.
+        on_overlong: called with the seconds that a beat came late by, beyond the limit.
     """
 
     def __init__(self, sign: BusySign, on_overlong: Callable[[float], None]) -> None:
         self._sign = sign
         self._on_overlong = on_overlong
+        self._period_s = sign.limit_s / _BEATS
         self._lock = threading.Lock()
-        self._asks: dict[Node, Callable[[], object]] = {}
-        self._made: dict[Node, Callable[[], object]] = {}
-        self._waiting: set[Node] = set()
+        self._timers: dict[Node, Timer] = {}
+        self._last_s: dict[Node, float] = {}
         self._changing: set[str] = set()
-        self._stopped = threading.Event()
+        self._stopped = False
         sign.speak_for_process()
-
-    def start(self) -> None:
-        """Ask from now on, in a thread of its own, until `stop`."""
-        threading.Thread(target=self._run, name="prober", daemon=True).start()
-
-    def stop(self) -> None:
-        """Ask no more; again is harmless."""
-        with self._lock:
-            self._stopped.set()
-            self._sign.end()
 
     def add(self, hosted: Hosted) -> None:
         """Leave the transitions of a node to their own deadlines."""
         hosted.add_listener(self._follow)
 
-    def spin(self, node: Node, executor: Any) -> None:
-        """Ask a node that its executor runs from now on."""
-        if node not in self._made:
-            if isinstance(executor, MultiThreadedExecutor):
-                guard = node.create_guard_condition(lambda: self._answered(node))
-                self._made[node] = guard.trigger
-            else:  # which knows no guard conditions, and has one thread
-                self._made[node] = lambda: executor.create_task(self._answered, node)
-        with self._lock:
-            self._asks[node] = self._made[node]
+    def spin(self, node: Node) -> None:
+        """Watch a node, once the executor that it was added to runs."""
+        if node not in self._timers:
+            clock = Clock(clock_type=ClockType.STEADY_TIME)
+            beat = functools.partial(self._beat, node)
+            self._timers[node] = Node.create_timer(node, self._period_s, beat, clock=clock)
 
     def rest(self, node: Node) -> None:
-        """Ask a node no more."""
+        """Watch a node no more."""
+        if (timer := self._timers.pop(node, None)) is not None:
+            Node.destroy_timer(node, timer)
         with self._lock:
-            self._asks.pop(node, None)
-            self._drop(node)
+            self._last_s.pop(node, None)
+            self._mark()
 
-    def _run(self) -> None:
-        while not self._stopped.wait(self._sign.limit_s):
-            with self._lock:
-                if self._waiting or self._changing or self._stopped.is_set():
-                    continue
-                self._waiting = set(self._asks)
-                if self._waiting:
-                    self._sign.begin()
-                asks = tuple(self._asks.values())
-            for ask in asks:
-                # One whose node is being destroyed is asked no more.
-                with contextlib.suppress(InvalidHandle):
-                    ask()
-
-    def _answered(self, node: Node) -> None:
+    def stop(self) -> None:
+        """Watch nothing any more; again is harmless."""
         with self._lock:
-            self._drop(node)
+            self._stopped = True
+            self._mark()
 
-    def _drop(self, node: Node) -> None:
-        if node not in self._waiting:
-            return
-        self._waiting.discard(node)
-        if self._waiting or self._changing:
-            return
-        busy_s = self._sign.end()
-        if busy_s is not None:
-            self._on_overlong(busy_s)
-        if self._asks and not self._stopped.is_set():
-            self._sign.begin(self._sign.limit_s)
+    def _beat(self, node: Node) -> None:
+        now = time.monotonic()
+        with self._lock:
+            late_s = now - self._last_s.get(node, now) - self._period_s
+            if node in self._timers:
+                self._last_s[node] = now
+                self._mark()
+        if late_s >= self._sign.limit_s:
+            self._on_overlong(late_s)
 
     def _follow(self, hosted: Hosted) -> None:
-        """A transition begins or ends."""
+        """A transition begins or ends: meanwhile nothing else of its group runs."""
         with self._lock:
             if not hosted.reported.steady:
                 self._changing.add(hosted.full_name)
-                self._sign.end()
-                return
-            self._changing.discard(hosted.full_name)
-            if self._waiting and not self._changing:
-                self._sign.begin()
+            else:
+                self._changing.discard(hosted.full_name)
+                self._last_s = dict.fromkeys(self._last_s, time.monotonic())
+            self._mark()
 
+    def _mark(self) -> None:
+        if self._stopped or self._changing or not self._last_s:
+            self._sign.end()
+        else:
+            due_s = min(self._last_s.values()) + self._period_s
+            self._sign.begin(due_s - time.monotonic())
+
+
+_BEATS = 5
+"""In a limit: a hang is noticed within six fifths of it."""
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _LEAVE_S = 2.0
@@ -251,7 +236,7 @@ class NodeLoop:
     Args:
         context: of the executor; nodes may have others.
         watchdog: notified when a callback begins and ends; for an executor that is not `single` a
-            Prober.
+            Heartbeat.
         executor: what runs the callbacks of nodes. One that is not `single` has a thread of its
             own, or several.
         threads: of a `multi` one; 0 is one for each processor, at least two.
@@ -268,14 +253,13 @@ class NodeLoop:
     def __init__(
         self,
         context: Context,
-        watchdog: Watchdog | Prober | None = None,
+        watchdog: Watchdog | Heartbeat | None = None,
         *,
         executor: Executor = Executor.SINGLE,
         threads: int = 0,
     ) -> None:
         self._context = context
-        self._watchdog = watchdog if isinstance(watchdog, Watchdog) else None
-        self._prober = watchdog if isinstance(watchdog, Prober) else None
+        self._watchdog = watchdog
         self._executor = NodeExecutor(context=context)
         self._own: Any = self._executor
         if executor is not Executor.SINGLE:
@@ -313,9 +297,8 @@ class NodeLoop:
         """Shut a node down in the end, in reverse order of addition; a managed one is spun now."""
         self._nodes.append(node)
         self._hosted.append(hosted)
-        for each in (self._watchdog, self._prober):
-            if each is not None:
-                each.add(hosted)
+        if self._watchdog is not None:
+            self._watchdog.add(hosted)
         if isinstance(node, LifecycleNode) and hosted is node.lifecycle:
             self.spin(node)
 
@@ -323,14 +306,14 @@ class NodeLoop:
         """Run a node's callbacks from now on, unless its own code has another executor do it."""
         if node.executor is None or node.executor is self._own:
             self._own.add_node(node)
-            if self._prober is not None:
-                self._prober.spin(node, self._own)
+            if isinstance(self._watchdog, Heartbeat):
+                self._watchdog.spin(node)
 
     def rest(self, node: Node) -> None:
         """Run no callback of a node that begins from now on."""
         if node.executor is self._own:
-            if self._prober is not None:
-                self._prober.rest(node)
+            if isinstance(self._watchdog, Heartbeat):
+                self._watchdog.rest(node)
             self._own.remove_node(node)
 
     def republish_names(self) -> None:
@@ -370,8 +353,8 @@ class NodeLoop:
             sum(each.spec.timeouts.shutdown_s for each in self._hosted if each.spec.managed)
             + _LEAVE_S
         )
-        if self._prober is not None:
-            self._prober.stop()
+        if isinstance(self._watchdog, Heartbeat):
+            self._watchdog.stop()
         guard = threading.Thread(
             target=self._give_up, args=(bound_s, reason), name="give-up", daemon=True
         )
@@ -391,8 +374,6 @@ class NodeLoop:
         """
         if self._own is not self._executor:
             threading.Thread(target=self._spin_own, name="executor", daemon=True).start()
-        if self._prober is not None:
-            self._prober.start()
         while not self._done:
             try:
                 self._turn()
@@ -422,7 +403,7 @@ class NodeLoop:
             callback = self._executor.next_callback()
         except ShutdownException:
             return
-        if self._watchdog is None:
+        if not isinstance(self._watchdog, Watchdog):
             callback()
             return
         self._watchdog.begin(callback)

@@ -42,7 +42,7 @@ from lifecycle.middleware import (
 from lifecycle.node.author.node import LifecycleNode
 from lifecycle.node.author.spec import Construction, Mode, constructing, parse_mode
 from lifecycle.node.host.foreign import Adoption, ForeignNode, Hosted, keywords
-from lifecycle.node.host.loop import NodeLoop, Prober, Watchdog, on_signal
+from lifecycle.node.host.loop import Heartbeat, NodeLoop, Watchdog, on_signal
 from lifecycle.node.lifecycle.machine import CallbackOutcome
 from lifecycle.plan import PlannedNode
 
@@ -73,7 +73,7 @@ class OwnLiveliness:
         self._silent: dict[str, str] = {}
         self._publisher: AlivePublisher | None = None
         self._name = ""
-        kind = Watchdog if executor is Executor.SINGLE else Prober
+        kind = Watchdog if executor is Executor.SINGLE else Heartbeat
         self.watchdog = kind(self._sign, lambda _: self._announce(""))
 
     def open(self, node: LifecycleNode, republish_names: Callable[[], None]) -> None:

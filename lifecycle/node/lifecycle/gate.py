@@ -39,7 +39,6 @@ class NodeGate:
     def __init__(self) -> None:
         self._entities: dict[int, Gated] = {}
         self._workers: dict[int, Gated] = {}
-        self._early: set[int] = set()
         self._is_open = False
 
     @property
@@ -47,17 +46,9 @@ class NodeGate:
         """Data may flow."""
         return self._is_open
 
-    def add(self, entity: object, gated: Gated, *, early: bool = False) -> None:
-        """Put `gated` in charge of `entity`, in the gate's present position.
-
-        Args:
-            entity: what is gated.
-            gated: opens and closes it.
-            early: it may work in on_activate already: rclpy's lifecycle publishers do.
-        """
+    def add(self, entity: object, gated: Gated) -> None:
+        """Put `gated` in charge of `entity`, in the gate's present position."""
         self._entities[id(entity)] = gated
-        if early:
-            self._early.add(id(entity))
         if self._is_open:
             gated.open()
         else:
@@ -94,13 +85,7 @@ class NodeGate:
     def remove(self, entity: object) -> None:
         """Forget an entity that is being destroyed."""
         self._entities.pop(id(entity), None)
-        self._early.discard(id(entity))
         self._workers.pop(id(entity), None)
-
-    def open_early(self) -> None:
-        """Open those that may work in on_activate already."""
-        for key in self._early:
-            self._entities[key].open()
 
     def open(self) -> None:
         """Open every entity; the node became active."""

@@ -31,11 +31,7 @@ _TRANSITION_EVENT_DEPTH = 10  # rmw_qos_profile_default
 
 
 class LifecycleServices:
-    """Serves one node's state machine to `ros2 lifecycle`, launch_ros, nav2 and all others.
-
-    Attributes:
-        made: the services by name.
-    """
+    """Serves one node's state machine to `ros2 lifecycle`, launch_ros, nav2 and all others."""
 
     def __init__(
         self,
@@ -65,7 +61,6 @@ class LifecycleServices:
         self._events = Node.create_publisher(
             node, msg.TransitionEvent, "~/transition_event", _TRANSITION_EVENT_DEPTH
         )
-        self.made: dict[str, Any] = {}
         for type_, name, callback in (
             (srv.ChangeState, "change_state", self._change_state),
             (srv.GetState, "get_state", self._get_state),
@@ -78,9 +73,7 @@ class LifecycleServices:
             (srv.GetAvailableTransitions, "get_transition_graph", self._get_transition_graph),
             (Trigger, "get_configuration", self._get_configuration),
         ):
-            self.made[name] = Node.create_service(
-                node, type_, f"~/{name}", callback, callback_group=group
-            )
+            Node.create_service(node, type_, f"~/{name}", callback, callback_group=group)
 
     def publish(self, transition: machine.Transition) -> None:
         """Publish a transition event, with the fields that rcl_lifecycle fills in.
