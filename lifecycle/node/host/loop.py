@@ -164,19 +164,28 @@ class Heartbeat:
         self._timers: dict[Node, Timer] = {}
         self._last_s: dict[Node, float] = {}
         self._changing: set[str] = set()
-        self._stopped = False
+        self._runs = False
         sign.speak_for_process()
+
+    def start(self) -> None:
+        """The executor runs from now on."""
+        with self._lock:
+            self._runs = True
+            self._last_s = dict.fromkeys(self._timers, time.monotonic())
+            self._mark()
 
     def add(self, hosted: Hosted) -> None:
         """Leave the transitions of a node to their own deadlines."""
         hosted.add_listener(self._follow)
 
     def spin(self, node: Node) -> None:
-        """Watch a node, once the executor that it was added to runs."""
+        """Watch a node that was added to the executor."""
         if node not in self._timers:
             clock = Clock(clock_type=ClockType.STEADY_TIME)
             beat = functools.partial(self._beat, node)
             self._timers[node] = Node.create_timer(node, self._period_s, beat, clock=clock)
+            if self._runs:
+                beat()
 
     def rest(self, node: Node) -> None:
         """Watch a node no more."""
@@ -189,7 +198,7 @@ class Heartbeat:
     def stop(self) -> None:
         """Watch nothing any more; again is harmless."""
         with self._lock:
-            self._stopped = True
+            self._runs = False
             self._mark()
 
     def _beat(self, node: Node) -> None:
@@ -213,7 +222,7 @@ class Heartbeat:
             self._mark()
 
     def _mark(self) -> None:
-        if self._stopped or self._changing or not self._last_s:
+        if self._changing or not (self._runs and self._last_s):
             self._sign.end()
         else:
             due_s = min(self._last_s.values()) + self._period_s
@@ -374,6 +383,8 @@ class NodeLoop:
         """
         if self._own is not self._executor:
             threading.Thread(target=self._spin_own, name="executor", daemon=True).start()
+            if isinstance(self._watchdog, Heartbeat):
+                self._watchdog.start()
         while not self._done:
             try:
                 self._turn()
