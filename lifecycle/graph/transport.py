@@ -268,8 +268,13 @@ class DdsTransport:
         remove = self._keep(self._callbacks, callback)
         with self._lock:
             if self._subscription is None and not self._closed:
-                self._subscription = self._node.create_subscription(
-                    String, GRAPH_TOPIC, self._arrived, self._qos, callback_group=self._group
+                self._subscription = Node.create_subscription(
+                    self._node,
+                    String,
+                    GRAPH_TOPIC,
+                    self._arrived,
+                    self._qos,
+                    callback_group=self._group,
                 )
         return remove
 
@@ -295,15 +300,16 @@ class DdsTransport:
             subscription, self._subscription = self._subscription, None
             publisher, self._publisher = self._publisher, None
         if publisher is not None:
-            self._node.destroy_publisher(publisher)
+            Node.destroy_publisher(self._node, publisher)
         if subscription is not None:
-            self._node.destroy_subscription(subscription)
+            Node.destroy_subscription(self._node, subscription)
 
     def _made_publisher(self) -> Publisher | None:
         """Return the publisher, made now if there was none; None after `close`."""
         with self._lock:
             if self._publisher is None and not self._closed:
-                self._publisher = self._node.create_publisher(
+                self._publisher = Node.create_publisher(
+                    self._node,
                     String,
                     GRAPH_TOPIC,
                     self._qos,
@@ -344,12 +350,13 @@ def steady_timer(node: Node) -> Callable[[float, Callable[[], None]], Remove]:
     clock = Clock(clock_type=ClockType.STEADY_TIME)
 
     def start(period_s: float, callback: Callable[[], None]) -> Remove:
-        timer = node.create_timer(
-            period_s, callback, callback_group=MutuallyExclusiveCallbackGroup(), clock=clock
+        # rclpy's own factory: that of a LifecycleNode makes timers that run while it is active.
+        timer = Node.create_timer(
+            node, period_s, callback, callback_group=MutuallyExclusiveCallbackGroup(), clock=clock
         )
 
         def stop() -> None:
-            node.destroy_timer(timer)
+            Node.destroy_timer(node, timer)
 
         return stop
 

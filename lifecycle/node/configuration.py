@@ -51,8 +51,8 @@ from lifecycle.node.author import parameters
 from lifecycle.node.author.declaring import interface_name
 from lifecycle.node.connections.connections import Connection, Connections
 from lifecycle.node.connections.data_layer import NodeDataLayer
-from lifecycle.node.endpoints.making import CLIENTS, wire_name
-from lifecycle.node.endpoints.mapping import Mapping, count_peers
+from lifecycle.node.endpoints.making import CLIENTS
+from lifecycle.node.endpoints.mapping import Mapping, count_peers, wire_name
 from lifecycle.node.lifecycle.machine import NodeState
 from lifecycle.plan import PARADIGMS, SERIALIZATIONS, PlannedEndpoint, PlannedNode
 from lifecycle.verify import (
@@ -315,7 +315,6 @@ def _report(node: Node, mapping: Mapping) -> EndpointReport:
         error=mapping.error,
         connection=connection.name if connection is not None else "",
         mapped=connection is not None,
-        aliases=mapping.aliases,
         lossy=mapping.lossy,
         size_bytes=mapping.size_bytes,
     )

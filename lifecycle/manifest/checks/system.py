@@ -180,7 +180,7 @@ _MANAGED_NODE = (
 )
 _OWN_NODE = tuple(
     (EndpointKind.SERVICE_SERVER, name)
-    for name in ("alias", "connect_to", "disconnect", "get_configuration", "map_to", "remap")
+    for name in ("connect_to", "disconnect", "get_configuration", "map_to", "remap")
 )
 
 _OF_THE_GRAPH = (

@@ -484,12 +484,6 @@ class NodeClients:
         """Have a node give an endpoint another topic or service name."""
         await self._set(node, "remap", endpoint, name, timeout_s)
 
-    async def alias(
-        self, node: str, endpoint: str, names: Sequence[str], *, timeout_s: float = TIMEOUT_S
-    ) -> None:
-        """Have a node give an endpoint these further names, and no others."""
-        await self._set(node, "alias", endpoint, tuple(names), timeout_s)
-
     async def _set(
         self, node: str, operation: str, name: str, value: str | tuple[str, ...], timeout_s: float
     ) -> None:

@@ -20,7 +20,7 @@ from lifecycle.node.author import declaring
 from lifecycle.node.author.handlers import ActionHandler
 from lifecycle.node.author.managed import Managed
 from lifecycle.node.author.spec import calling_position
-from lifecycle.node.endpoints.making import EndpointOptions
+from lifecycle.node.endpoints.mapping import EndpointOptions
 
 if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup

@@ -19,8 +19,7 @@ from lifecycle.manifest import EndpointKind, EndpointPolicy, Position, QosProfil
 from lifecycle.middleware import from_rclpy
 from lifecycle.node.author.handlers import Handlers, match, needs_handler
 from lifecycle.node.connections.data_layer import CONFIGURED, NodeDataLayer
-from lifecycle.node.endpoints.making import EndpointOptions
-from lifecycle.node.endpoints.mapping import Key, find_endpoint
+from lifecycle.node.endpoints.mapping import EndpointOptions, Key, find_endpoint
 from lifecycle.node.lifecycle.machine import NodeState
 from lifecycle.plan import PlannedEndpoint, PlannedNode
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 from typing import TYPE_CHECKING, Any
 
-from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.exceptions import InvalidHandle
 from rclpy.lifecycle import LifecycleState
 from rclpy.node import Node
@@ -34,8 +33,8 @@ from lifecycle.node.connections.connection_status import (
     ConnectionEventKind,
     ConnectionEvents,
 )
-from lifecycle.node.connections.data_layer import NodeDataLayer, NodeInterface, RemoteInterface
-from lifecycle.node.endpoints.making import wire_name
+from lifecycle.node.connections.data_layer import NodeDataLayer, RemoteInterface
+from lifecycle.node.endpoints.mapping import wire_name
 from lifecycle.node.host.control import INTERFACE_ON_DEMAND, Operation
 from lifecycle.node.lifecycle.controller import Controller
 from lifecycle.node.lifecycle.execution import SUCCESS, Result
@@ -62,74 +61,37 @@ class GraphMember:
     Args:
         node: to report; its executor sends the heartbeats.
         group: reentrant.
+
+    Attributes:
+        reporter: of its states and configurations.
     """
 
     def __init__(self, node: Node, group: CallbackGroup) -> None:
         # Late: most nodes report to their supervisor only.
         from lifecycle.graph import DdsTransport, GraphReporter, steady_timer
 
-        ungated: Any = _Ungated(node)
-        self._transport = DdsTransport(ungated, callback_group=group)
-        self._reporter = GraphReporter(
-            self._transport, str(node.get_fully_qualified_name()), every=steady_timer(ungated)
+        self._transport = DdsTransport(node, callback_group=group)
+        self.reporter = GraphReporter(
+            self._transport, str(node.get_fully_qualified_name()), every=steady_timer(node)
         )
-
-    def joined(self, state: NodeState, checksum: str) -> None:
-        """Become part of the graph."""
-        self._reporter.joined(state.seen.label, connected=state.connected, checksum=checksum)
-
-    def state_changed(self, state: NodeState) -> None:
-        """Report the state that the node is in now."""
-        self._reporter.state_changed(state.seen.label, connected=state.connected)
-
-    def configuration_changed(self, checksum: str) -> None:
-        """Report that the configuration is to be read again, if the checksum is another."""
-        self._reporter.configuration_changed(checksum)
 
     def connection_event(self, event: ConnectionEvent) -> None:
         """Report what became of a connection or mapping."""
-        kind = event.kind
+        kind, name = event.kind, event.connection
         if kind is ConnectionEventKind.CONNECTION_ESTABLISHED:
-            self._reporter.connection_established(event.connection, event.urls)
+            self.reporter.connection_established(name, event.urls)
         elif kind is ConnectionEventKind.CONNECTION_LOST:
             error = "" if event.unmade else "an endpoint on it has lost its last peer"
-            self._reporter.connection_lost(event.connection, event.urls, error)
+            self.reporter.connection_lost(name, event.urls, error)
         elif kind is ConnectionEventKind.MAPPING_ESTABLISHED:
-            self._reporter.mapping_established(
-                event.endpoint, event.connection, matched=event.peers
-            )
+            self.reporter.mapping_established(event.endpoint, name, matched=event.peers)
         else:
-            self._reporter.mapping_lost(event.endpoint, event.connection, matched=event.peers)
+            self.reporter.mapping_lost(event.endpoint, name, matched=event.peers)
 
     def close(self) -> None:
         """Say farewell."""
-        self._reporter.left()
+        self.reporter.left()
         self._transport.close()
-
-
-class _Ungated:
-    """The node's factories as rclpy has them, without the gate."""
-
-    def __init__(self, node: Node) -> None:
-        self._node = node
-
-    def create_publisher(self, *arguments: Any, **options: Any) -> Any:
-        return Node.create_publisher(self._node, *arguments, **options)
-
-    def create_subscription(self, *arguments: Any, **options: Any) -> Any:
-        return Node.create_subscription(self._node, *arguments, **options)
-
-    def create_timer(self, *arguments: Any, **options: Any) -> Any:
-        return Node.create_timer(self._node, *arguments, **options)
-
-    def destroy_publisher(self, publisher: Any) -> Any:
-        return Node.destroy_publisher(self._node, publisher)
-
-    def destroy_subscription(self, subscription: Any) -> Any:
-        return Node.destroy_subscription(self._node, subscription)
-
-    def destroy_timer(self, timer: Any) -> Any:
-        return Node.destroy_timer(self._node, timer)
 
 
 class Undeclared:
@@ -199,11 +161,10 @@ class Managed:
         gate: holds back what the node was made to send, receive and time.
         data_layer: its endpoints.
         declared: what its manifest and its code say of them.
-        interface: what may be asked of its data layer.
         connection_events: what becomes of its connections and mappings.
         configuration_changes: notifies of each change of its configuration.
         undeclared: endpoints that its code made with rclpy's factories.
-        client_group: reentrant callback group of its clients.
+        client_group: reentrant, of its clients.
         call_soon: runs a function, sync or async, in its executor; returns whether there is one.
     """
 
@@ -226,10 +187,8 @@ class Managed:
         self._let_through = not supervisor
         self.mode = mode
         self.gate = gate
-        # Reentrant: others may ask, and answers arrive, while a transition's callback runs.
-        self.client_group = ReentrantCallbackGroup()
-        self._infrastructure = ReentrantCallbackGroup()
-        self._turns = Turns(node, self._infrastructure)
+        self._turns = Turns(node)
+        self.client_group = self._turns.group
         self.call_soon = self._turns.call_soon
         self._listeners: list[Callable[[Managed], None]] = []
         self._method_timers: list[Timer] = []
@@ -249,11 +208,9 @@ class Managed:
         self.undeclared = Undeclared(self.configuration_changes.touch)
         self.data_layer = NodeDataLayer(
             node,
-            gate=gate,
-            client_group=self.client_group,
-            event_group=self._infrastructure,
-            later=self.call_soon,
-            after=self._turns.call_after,
+            gate,
+            self._turns,
+            state=lambda: self.state,
             changed=self.configuration_changes.touch,
             notify=self._report_connection,
         )
@@ -261,7 +218,6 @@ class Managed:
             spec, self.data_layer, node=self.full_name, state=lambda: self.state
         )
         self._controller = Controller(self, spec.timeouts, self._changed)
-        self.interface = NodeInterface(self.full_name, self.data_layer, lambda: self.state)
         self._services: LifecycleServices | None = None
         if served:
             self._services = LifecycleServices(
@@ -270,10 +226,10 @@ class Managed:
                 change=self._change_by_service,
                 refuse=node.get_logger().warning,
                 configuration=lambda: configuration.to_json(self.get_configuration()),
-                group=self._infrastructure,
+                group=self._turns.group,
             )
         self._remote = RemoteInterface(
-            node, self.interface, log=node.get_logger().error, group=self._infrastructure
+            node, self.data_layer, log=node.get_logger().error, group=self._turns.group
         )
         if served:
             # A supervisor sees who asks for the others, and has them made.
@@ -300,6 +256,11 @@ class Managed:
     def node(self) -> Node:
         """The rclpy node."""
         return self._node
+
+    @property
+    def interface(self) -> NodeDataLayer:
+        """What a supervisor may ask of its data layer."""
+        return self.data_layer
 
     @property
     def reported(self) -> HostedState:
@@ -391,7 +352,7 @@ class Managed:
     def close(self) -> None:
         """Leave the graph and take the data layer away: the node is being destroyed."""
         self._turns.close()
-        self.data_layer.disconnect()
+        self.data_layer.remove()
         if self._member is not None:
             self._member.close()
             self._member = None
@@ -442,11 +403,11 @@ class Managed:
 
     def make_data_layer(self) -> None:
         """Make every endpoint or none."""
-        self.data_layer.connect(self.spec)
+        self.data_layer.make(self.spec)
 
     def remove_data_layer(self) -> None:
         """Remove every endpoint."""
-        self.data_layer.disconnect()
+        self.data_layer.remove()
 
     def callback(self, name: str) -> Callable[..., Any]:
         """Return the author's `on_…` method."""
@@ -475,14 +436,18 @@ class Managed:
     # Inside.
 
     def _join(self) -> None:
-        self._member = GraphMember(self._node, self._infrastructure)
+        self._member = GraphMember(self._node, self._turns.group)
         now = self.configuration_changes.collect()
-        self._member.joined(self.state, now.checksum if now is not None else "")
+        self._member.reporter.joined(
+            self.state.seen.label,
+            connected=self.state.connected,
+            checksum=now.checksum if now is not None else "",
+        )
         self.configuration_changes.listen(self._report_checksum)
 
     def _report_checksum(self, now: NodeConfiguration) -> None:
         if self._member is not None:
-            self._member.configuration_changed(now.checksum)
+            self._member.reporter.configuration_changed(now.checksum)
 
     def _report_connection(self, event: ConnectionEvent) -> None:
         if self._member is not None and self.spec.events:
@@ -517,7 +482,9 @@ class Managed:
         if change.event is not None and self._services is not None:
             self._services.publish(change.event)
         if self._member is not None:
-            self._member.state_changed(change.goal)
+            self._member.reporter.state_changed(
+                change.goal.seen.label, connected=change.goal.connected
+            )
         self._health.follow(change.goal)
         for listener in self._listeners:
             listener(self)

@@ -1,12 +1,11 @@
 """LifecycleNode: the base class of managed nodes, its node interface and gated rclpy factories.
 
 Owns: the node as its author sees it: how it is constructed, its callbacks, and access to what is
-declared; the node interface's signatures for a node's own code (data_layer.py has the same for
-others, data_layer.py does the work; see *Topological Discovery and Communication Negotiation*,
-"Node Interface"); which of rclpy's factories are overridden, so that what they make is known and
-sends and receives only while active; and the guard that makes a blocking call of a service or
-action that would wait for ever an error at once. Declaring in code is in declarations.py; what all
-of it does is put together in managed.py.
+declared; the node interface's signatures for a node's own code (connections/data_layer.py does the
+work, and has the services for others); which of rclpy's factories are overridden, so that what they
+make is known and sends and receives only while active; and the guard that makes a blocking call of
+a service or action that would wait for ever an error at once. Declaring in code is in
+declarations.py; what all of it does is put together in managed.py.
 
 rclpy's blocking `Client.call` and its like, called from a callback, wait for an answer that only
 the executor can bring, and the executor waits for the callback (rclcpp#2213 and its like are the
@@ -247,13 +246,14 @@ class LocalInterface(Node):  # type: ignore[misc]  # rclpy is not typed
             >>> net = self.connect_to("udpv4://10.77.0.1:7911", name="net")
             >>> self.map_to("video", net)
         """
-        return self.lifecycle.interface.connect_to(name, connections_of(urls))
+        return self.lifecycle.data_layer.connect_to(name, connections_of(urls))
 
     def map_to(self, endpoint: str, connection: Connection | str) -> Future:
         """Map a declared endpoint onto a connection, or hand it over from where it is.
 
         A handover makes before it breaks: an endpoint that has peers lives on both connections
-        until the new one has as many, at most 4 s; nothing is lost and nothing is delivered twice.
+        until the new one has as many, at most 4 s. What reaches a subscription both ways meanwhile
+        is delivered twice, and a TRANSIENT_LOCAL publisher sends its last messages again.
         `self.publisher(name)` stays the same handle; ask for clients anew with `self.client(name)`.
 
         Args:
@@ -269,7 +269,7 @@ class LocalInterface(Node):  # type: ignore[misc]  # rclpy is not typed
             ConnectError: it cannot be made there; where it was it still is.
             NotConfiguredError: not in this state.
         """
-        return self.lifecycle.interface.map_to(endpoint, connection)
+        return self.lifecycle.data_layer.map_to(endpoint, connection)
 
     def disconnect(self, connection: Connection | str) -> None:
         """Unmake a connection; endpoints that are still mapped onto it are then mapped nowhere.
@@ -279,7 +279,7 @@ class LocalInterface(Node):  # type: ignore[misc]  # rclpy is not typed
             ConnectError: it is the node's own participant.
             NotConfiguredError: not in this state.
         """
-        self.lifecycle.interface.disconnect(connection)
+        self.lifecycle.data_layer.disconnect(connection)
 
     def remap(self, endpoint: str, name: str) -> None:
         """Give a declared endpoint another topic or service name; "" gives back its own.
@@ -288,16 +288,7 @@ class LocalInterface(Node):  # type: ignore[misc]  # rclpy is not typed
             UnknownEndpointError: nothing, or more than one thing, is declared so.
             LifecycleError: not a name; the endpoint is as it was.
         """
-        self.lifecycle.interface.remap(endpoint, name)
-
-    def alias(self, endpoint: str, *names: str) -> None:
-        """Give a publisher, subscription or service server these further names, and no others.
-
-        Raises:
-            UnknownEndpointError: nothing, or more than one thing, is declared so.
-            LifecycleError: not a name, or of a kind with one name only; it is as it was.
-        """
-        self.lifecycle.interface.alias(endpoint, names)
+        self.lifecycle.data_layer.remap(endpoint, name)
 
     @property
     def connections(self) -> tuple[ConnectionReport, ...]:

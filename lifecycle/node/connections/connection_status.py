@@ -8,10 +8,8 @@ which it happened. See *Topological Discovery and Communication Negotiation*, "N
 
 from __future__ import annotations
 
-import collections
 import enum
 import functools
-import inspect
 from collections.abc import Callable
 from collections.abc import Mapping as AbstractMapping
 from typing import TYPE_CHECKING, Any
@@ -68,8 +66,6 @@ class ConnectionEvents:
     def __init__(self, later: Later) -> None:
         self._later = later
         self._listeners: dict[object, Listener] = {}
-        self._waiting: collections.deque[ConnectionEvent] = collections.deque()
-        self._scheduled = False
 
     def listen(self, listener: Listener) -> Callable[[], None]:
         """Call `listener`, sync or async, with each event from now on; returns what ends that."""
@@ -83,21 +79,8 @@ class ConnectionEvents:
 
     def notify(self, event: ConnectionEvent) -> None:
         """Have the listeners called soon."""
-        if not self._listeners:
-            return
-        self._waiting.append(event)
-        if not self._scheduled:
-            self._scheduled = bool(self._later(self._deliver))
-
-    def _deliver(self) -> None:
-        self._scheduled = False
-        while self._waiting:
-            event = self._waiting.popleft()
-            for listener in tuple(self._listeners.values()):
-                if inspect.iscoroutinefunction(listener):
-                    self._later(functools.partial(listener, event))
-                else:
-                    listener(event)
+        for listener in tuple(self._listeners.values()):
+            self._later(functools.partial(listener, event))
 
 
 class ConnectionStatus:
@@ -141,33 +124,18 @@ class ConnectionStatus:
     def closed(self, connection: Connection) -> None:
         """A connection with a name was removed."""
         self._established.discard(connection)
-        self._notify(
-            ConnectionEvent(
-                kind=ConnectionEventKind.CONNECTION_LOST,
-                connection=connection.name,
-                urls=connection.urls,
-                unmade=True,
-            )
-        )
+        self._report(ConnectionEventKind.CONNECTION_LOST, connection, unmade=True)
 
     def mapped(self, mapping: Mapping) -> None:
         """An endpoint was mapped."""
-        self._count(mapping)
-        self._notify_mapping(mapping, ConnectionEventKind.MAPPING_ESTABLISHED)
         assert mapping.connection is not None
+        self._count(mapping)
+        self._report(ConnectionEventKind.MAPPING_ESTABLISHED, mapping.connection, mapping)
         self._judge(mapping.connection, lost=False)
 
     def unmapped(self, mapping: Mapping, connection: Connection) -> None:
         """An endpoint was taken off a connection."""
-        self._notify(
-            ConnectionEvent(
-                kind=ConnectionEventKind.MAPPING_LOST,
-                connection=connection.name,
-                urls=connection.urls,
-                endpoint=mapping.spelling,
-                unmade=True,
-            )
-        )
+        self._report(ConnectionEventKind.MAPPING_LOST, connection, mapping, unmade=True)
 
     def matched(self, mapping: Mapping) -> None:
         """Count the peers of a mapping again, and notify if they are more or fewer."""
@@ -179,7 +147,7 @@ class ConnectionStatus:
         kind = ConnectionEventKind.MAPPING_ESTABLISHED
         if now < before:
             kind = ConnectionEventKind.MAPPING_LOST
-        self._notify_mapping(mapping, kind)
+        self._report(kind, mapping.connection, mapping)
         self._judge(mapping.connection, lost=now < before)
 
     def _known(self, connection: Connection) -> Connection:
@@ -188,18 +156,24 @@ class ConnectionStatus:
 
     def _count(self, mapping: Mapping) -> None:
         if mapping.endpoint.kind.is_topic and mapping.placement is not None:
-            mapping.peers = sum(count_peers(each) for each in mapping.placement.entities)
+            mapping.peers = count_peers(mapping.placement.entity)
 
-    def _notify_mapping(self, mapping: Mapping, kind: ConnectionEventKind) -> None:
-        connection = mapping.connection
-        assert connection is not None
+    def _report(
+        self,
+        kind: ConnectionEventKind,
+        connection: Connection,
+        mapping: Mapping | None = None,
+        *,
+        unmade: bool = False,
+    ) -> None:
         self._notify(
             ConnectionEvent(
                 kind=kind,
                 connection=connection.name,
                 urls=connection.urls,
-                endpoint=mapping.spelling,
-                peers=mapping.peers,
+                endpoint="" if mapping is None else mapping.spelling,
+                peers=None if mapping is None or unmade else mapping.peers,
+                unmade=unmade,
             )
         )
 
@@ -220,4 +194,4 @@ class ConnectionStatus:
             self._established.discard(known)
             kind = ConnectionEventKind.CONNECTION_LOST
         if established or lost:
-            self._notify(ConnectionEvent(kind=kind, connection=known.name, urls=known.urls))
+            self._report(kind, known)

@@ -1,4 +1,4 @@
-"""The node interface (connect_to, map_to, disconnect, remap, alias) and the data layer behind it.
+"""The node interface (connect_to, map_to, disconnect, remap) and the data layer behind it.
 
 Owns: which connection each declared endpoint is mapped onto, the order in which connections and
 mappings are made and removed, when that is allowed, and what is notified of it: one implementation
@@ -6,8 +6,8 @@ behind the local API, the ROS services and the control channel.
 
 *configure* declares endpoints, *connect* maps those that are not mapped yet onto the connection
 that the plan says, *disconnect* takes everything away. In between `connect_to`, `map_to`,
-`disconnect_from`, `remap` and `alias` change single ones. See *Topological Discovery and
-Communication Negotiation*, "Node Interface".
+`disconnect` and `remap` change single ones. See *Topological Discovery and Communication
+Negotiation*, "Node Interface".
 
 `RemoteInterface` offers it as ROS services: a request is a list of names and values, the answer
 says of each whether it succeeded and why not:
@@ -28,7 +28,7 @@ from rclpy.node import Node
 from rclpy.task import Future
 
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest import Authority, EndpointKind
+from lifecycle.manifest import Authority
 from lifecycle.node.connections.connection_status import ConnectionEvent, ConnectionStatus
 from lifecycle.node.connections.connections import (
     ConnectError,
@@ -36,23 +36,43 @@ from lifecycle.node.connections.connections import (
     Connections,
     connections_of,
 )
-from lifecycle.node.endpoints.endpoint_table import EndpointTable, PlannedPlaces
+from lifecycle.node.endpoints.endpoint_table import EndpointTable
 from lifecycle.node.endpoints.making import Maker
 from lifecycle.node.endpoints.mapper import Mapper
 from lifecycle.node.endpoints.mapping import Mapping
-from lifecycle.node.endpoints.placing import After, Placer
 from lifecycle.node.lifecycle.machine import NodeState
-from lifecycle.plan import ParticipantConnections, PlannedEndpoint, PlannedNode
+from lifecycle.plan import (
+    ParticipantConnections,
+    PlannedEndpoint,
+    PlannedNode,
+    PlannedParticipant,
+)
 
 if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup
 
-    from lifecycle.node.lifecycle.gate import Later, NodeGate
-
-
-_ALIASED = (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION, EndpointKind.SERVICE_SERVER)
+    from lifecycle.node.lifecycle.gate import NodeGate
+    from lifecycle.node.lifecycle.services import Turns
 
 HandlerOf = Callable[[PlannedEndpoint], Callable[..., Any] | None]
+
+CONFIGURED = frozenset(
+    {
+        NodeState.CONFIGURING,  # in on_configure everything is declared already
+        NodeState.INACTIVE_DISCONNECTED,
+        NodeState.CONNECTING,
+        NodeState.INACTIVE_CONNECTED,
+        NodeState.ACTIVATING_DISCONNECTED,
+        NodeState.ACTIVATING_CONNECTED,
+        NodeState.ACTIVE,
+        NodeState.DEACTIVATING,
+    }
+)
+"""Where endpoints are declared and not being taken away."""
+
+
+class NotConfiguredError(LifecycleError):
+    """The node interface was used in a state in which nothing is declared."""
 
 
 class NodeDataLayer:
@@ -61,10 +81,8 @@ class NodeDataLayer:
     Args:
         node: whose endpoints these are.
         gate: holds back its publishers and subscriptions.
-        client_group: reentrant, so that an answer can arrive while a callback awaits it.
-        event_group: reentrant, of matched events.
-        later: runs a coroutine function in the node's executor.
-        after: calls back once in the node's executor.
+        turns: of the node's executor.
+        state: of the node, now.
         changed: called when the node configuration has changed, match counts included.
         notify: called with each connection event.
 
@@ -77,39 +95,29 @@ class NodeDataLayer:
     def __init__(
         self,
         node: Node,
-        *,
         gate: NodeGate,
-        client_group: CallbackGroup,
-        event_group: CallbackGroup,
-        later: Later,
-        after: After,
+        turns: Turns,
+        *,
+        state: Callable[[], NodeState],
         changed: Callable[[], None],
         notify: Callable[[ConnectionEvent], None],
     ) -> None:
         self._name = node.get_fully_qualified_name()
+        self._state = state
         self._changed = changed
-        self._maker = Maker(node, gate=gate, client_group=client_group, later=later)
+        self._maker = Maker(node, gate, turns)
+        self._spec: PlannedNode | None = None  # before anything is declared
         self._is_made = False
         self.endpoints = EndpointTable(node, gate, changed)
-        mappings = self.endpoints.mappings
         self.connections = Connections(node)
-        self.status = ConnectionStatus(self.connections, mappings, notify)
+        self.status = ConnectionStatus(self.connections, self.endpoints.mappings, notify)
         self._mapper = Mapper(
             node,
-            Placer(node, self._maker, gate=gate, event_group=event_group, later=later, after=after),
-            mappings=mappings,
-            handles=self.endpoints.handles,
+            self._maker,
+            self.endpoints,
             connections=self.connections,
             status=self.status,
-            after=after,
-            changed=changed,
-        )
-        self._places = PlannedPlaces(
-            self._name,
-            mappings=mappings,
-            connections=self.connections,
-            mapper=self._mapper,
-            status=self.status,
+            turns=turns,
         )
 
     @property
@@ -130,7 +138,7 @@ class NodeDataLayer:
         Raises:
             LifecycleError: types that are not installed, all of them at once.
         """
-        self._places.spec = spec
+        self._spec = spec
         problems: list[str] = []
         for endpoint in spec.endpoints:
             try:
@@ -148,24 +156,24 @@ class NodeDataLayer:
             LifecycleError: declared already, its type is not installed, or it cannot be made.
         """
         mapping = self.endpoints.add(endpoint, handler)
-        if not self._is_made or self._places.mapped_by_others:
+        if not self._is_made or self._is_mapped_by_others:
             return
         try:
-            self._mapper.map(mapping, self._places.default(endpoint))
+            self._mapper.map(mapping, self._default(endpoint))
         except BaseException:
             self.endpoints.remove(mapping)
             raise
 
     def undeclare(self) -> None:
         """Forget the declarations, and unmap what was mapped before a connect."""
-        self.disconnect()
-        for mapping in tuple(self.endpoints.mappings.values()):
+        self.remove()
+        for mapping in self.mappings:
             self.endpoints.remove(mapping)
         self._changed()
 
     # The transitions.
 
-    def connect(self, spec: PlannedNode) -> None:
+    def make(self, spec: PlannedNode) -> None:
         """Map every endpoint that is mapped nowhere onto what the plan says, or none.
 
         Under an authority nothing is mapped here: it must have been done.
@@ -174,39 +182,116 @@ class NodeDataLayer:
             ConnectError: the first endpoint that could not be made, with the RMW's reason; or all
                 that are not mapped.
         """
-        for mapping in self.endpoints.mappings.values():
+        for mapping in self.mappings:
             mapping.error = ""
-        if spec.authority is Authority.SUPERVISOR:
-            self._places.refuse_unmapped()
+        if self._is_mapped_by_others:
+            self._refuse_unmapped()
         else:
-            self._places.map_all(spec)
+            self._map_all(spec)
             self._changed()
         # Last, because a subscription of the node saves making one to find out.
         self.connections.look_at_shared_memory()
         self._is_made = True
 
-    def disconnect(self) -> None:
+    def remove(self) -> None:
         """Remove every endpoint and every connection but the node's own participant."""
-        for mapping in reversed(tuple(self.endpoints.mappings.values())):
+        for mapping in reversed(self.mappings):
             self._mapper.unmap(mapping)
         for handle in self.endpoints.handles.values():
             handle.forget()
         for connection in reversed(self.connections.named):
-            self._mapper.close(connection)
+            self._close(connection)
         self.connections.close_all()
         self._is_made = False
         self._changed()
+
+    @property
+    def _is_mapped_by_others(self) -> bool:
+        return self._spec is not None and self._spec.authority is Authority.SUPERVISOR
+
+    def _map_all(self, spec: PlannedNode) -> None:
+        before = {mapping.key for mapping in self.mappings if mapping.placement}
+        names_before = {each.name for each in self.connections.named}
+        current: Mapping | None = None
+        try:
+            for planned in spec.participants:
+                if planned.connection:
+                    self.status.opened(self.connections.carrier(planned))
+            for current in self.mappings:
+                if current.placement is None:
+                    self._mapper.map(current, self._default(current.endpoint))
+        except Exception as error:
+            for each in reversed(self.mappings):
+                if each.placement is not None and each.key not in before:
+                    self._mapper.unmap(each)
+            for connection in self.connections.named:
+                if connection.name not in names_before:
+                    self._close(connection)
+            if current is None:
+                raise ConnectError(str(error)) from error
+            endpoint = current.endpoint
+            current.error = str(error)
+            raise ConnectError(
+                f"cannot connect {endpoint.kind.noun} {endpoint.name!r} of {spec.full_name}: "
+                f"{error}"
+            ) from error
+
+    def _default(self, endpoint: PlannedEndpoint) -> Connection:
+        """Return the connection that the plan says; make its participant at first use."""
+        if not endpoint.participant or self._spec is None:
+            return self.connections.own
+        for planned in self._spec.participants:
+            if planned.name == endpoint.participant:
+                connection = self.connections.carrier(planned)
+                if connection.warning and endpoint.enforce_dscp:
+                    key = (endpoint.kind, endpoint.name)
+                    self.endpoints.mappings[key].error = connection.warning
+                return connection
+        raise ConnectError(
+            f"cannot find participant {endpoint.participant!r} in the plan of {self._name}"
+        )
+
+    def _own_flow(self, endpoint: PlannedEndpoint) -> Connection:
+        """Return the participant that gives a publisher its own flow, or the node's own."""
+        participants = self._spec.participants if self._spec else ()
+        named = {each.name for each in participants if each.connection}
+        return self.connections.own if endpoint.participant in named else self._default(endpoint)
+
+    def _refuse_unmapped(self) -> None:
+        missing = [each.spelling for each in self.mappings if each.placement is None]
+        if missing:
+            names = [repr(each.name) for each in self.connections.named]
+            raise ConnectError(
+                f"cannot connect {self._name}: nobody has mapped "
+                f"{', '.join(map(repr, missing))}; its authority is the supervisor, which "
+                f"connected it to {', '.join(names) or 'nothing'}",
+                hint=f"call {self._name}/map_to for each, or write data_layer.authority: nodes",
+            )
+
+    def _close(self, connection: Connection) -> None:
+        self.connections.close(connection)
+        self.status.closed(connection)
 
     # The node interface.
 
     def connect_to(self, name: str, how: ParticipantConnections) -> Connection:
         """Make a connection, or return the one of that name and those URLs.
 
+        Args:
+            name: an empty one lets one be made up.
+            how: at least one URL.
+
         Raises:
             ConnectError: it cannot be made; nothing is left but the report of it.
+            NotConfiguredError: not in this state.
         """
+        where = ", ".join(how.urls) or repr(name)
+        self._refuse_unconfigured(f"connect {self._name} to {where}")
+        name = name or self.connections.free_name()
+        participants: tuple[PlannedParticipant, ...] = self._spec.participants if self._spec else ()
+        planned = next((each for each in participants if each.connection == name), None)
         try:
-            connection = self.connections.connect_to(name, how, self._places.planned(name))
+            connection = self.connections.connect_to(name, how, planned)
         finally:
             self._changed()
         self.status.opened(connection)
@@ -228,13 +313,15 @@ class NodeDataLayer:
             UnknownEndpointError: no such declaration.
             UnknownConnectionError: no such connection.
             ConnectError: it cannot be made there; where it was it still is.
+            NotConfiguredError: not in this state.
         """
+        self._refuse_unconfigured(f"map {spelling!r} of {self._name}")
         mapping = self.endpoints.find(spelling)
         target = self.connections.find(connection)
         noun = mapping.endpoint.kind.noun
         try:
             if target is self.connections.own:
-                target = self._places.own_flow(mapping.endpoint) or target
+                target = self._own_flow(mapping.endpoint)
             return self._mapper.move(mapping, target)
         except LifecycleError as error:
             message = (
@@ -248,14 +335,16 @@ class NodeDataLayer:
             self._mapper.tidy()
             self._changed()
 
-    def disconnect_from(self, connection: Connection | str) -> None:
+    def disconnect(self, connection: Connection | str) -> None:
         """Unmake a connection; what was mapped onto it is then mapped nowhere.
 
         Raises:
             UnknownConnectionError: no such connection.
             ConnectError: it is the node's own participant.
+            NotConfiguredError: not in this state.
         """
         name = connection if isinstance(connection, str) else connection.name
+        self._refuse_unconfigured(f"disconnect {self._name} from {name!r}")
         if self.connections.forget(name):
             self._changed()
             return
@@ -265,9 +354,9 @@ class NodeDataLayer:
                 f"cannot disconnect {self._name} from its own participant: its services are on it",
                 hint="map its endpoints onto another connection, or take transition 'disconnect'",
             )
-        for mapping in self.endpoints.mappings.values():
+        for mapping in self.mappings:
             self._mapper.take_off(mapping, found)
-        self._mapper.close(found)
+        self._close(found)
         self._changed()
 
     def remap(self, spelling: str, name: str) -> None:
@@ -276,106 +365,12 @@ class NodeDataLayer:
         Raises:
             UnknownEndpointError: no such declaration.
             LifecycleError: not a name, or the endpoint cannot be made so; it is as it was.
+            NotConfiguredError: not in this state.
         """
+        self._refuse_unconfigured(f"remap {spelling!r} of {self._name}")
         mapping = self.endpoints.find(spelling)
         expanded = self._maker.expand(mapping.endpoint, name) if name else ""
         self._mapper.rename(mapping, expanded)
-
-    def alias(self, spelling: str, names: Sequence[str]) -> None:
-        """Give an endpoint these further names, instead of those that it has.
-
-        A publisher publishes on all of them, a subscription's or service server's handler is given
-        what arrives on any.
-
-        Raises:
-            UnknownEndpointError: no such declaration.
-            LifecycleError: not a name, a kind that can have one name only, or the endpoint cannot
-                be made so; it is as it was.
-        """
-        mapping = self.endpoints.find(spelling)
-        endpoint = mapping.endpoint
-        if endpoint.kind not in _ALIASED:
-            kinds = ", ".join(kind.noun + "s" for kind in _ALIASED)
-            raise LifecycleError(
-                f"cannot give {endpoint.kind.noun} {endpoint.name!r} of {self._name} an alias: "
-                f"it can have one name only; allowed: {kinds}"
-            )
-        expanded = tuple(dict.fromkeys(self._maker.expand(endpoint, name) for name in names))
-        own = mapping.name or self._maker.resolve(endpoint)
-        if own in expanded:
-            raise LifecycleError(
-                f"cannot give {endpoint.kind.noun} {endpoint.name!r} of {self._name} the alias "
-                f"{own!r}: it is its name"
-            )
-        self._mapper.realias(mapping, expanded)
-
-
-CONFIGURED = frozenset(
-    {
-        NodeState.CONFIGURING,  # in on_configure everything is declared already
-        NodeState.INACTIVE_DISCONNECTED,
-        NodeState.CONNECTING,
-        NodeState.INACTIVE_CONNECTED,
-        NodeState.ACTIVATING_DISCONNECTED,
-        NodeState.ACTIVATING_CONNECTED,
-        NodeState.ACTIVE,
-        NodeState.DEACTIVATING,
-    }
-)
-"""Where endpoints are declared and not being taken away."""
-
-
-class NotConfiguredError(LifecycleError):
-    """The node interface was used in a state in which nothing is declared."""
-
-
-class NodeInterface:
-    """What may be asked of one node's data layer.
-
-    Args:
-        node: fully qualified name, for messages.
-        data_layer: does it.
-        state: of the node, now.
-    """
-
-    def __init__(
-        self, node: str, data_layer: NodeDataLayer, state: Callable[[], NodeState]
-    ) -> None:
-        self._node = node
-        self._data_layer = data_layer
-        self._state = state
-
-    def connect_to(self, name: str, how: ParticipantConnections) -> Connection:
-        """Make a connection; an empty name lets one be made up.
-
-        Raises:
-            ConnectError: it cannot be made; nothing is left.
-            NotConfiguredError: not in this state.
-        """
-        where = ", ".join(how.urls) or repr(name)
-        self._refuse_unconfigured(f"connect {self._node} to {where}")
-        return self._data_layer.connect_to(name or self._data_layer.connections.free_name(), how)
-
-    def map_to(self, endpoint: str, connection: Connection | str) -> Future:
-        """Map an endpoint onto a connection, or hand it over; see `DataLayer.map_to`."""
-        self._refuse_unconfigured(f"map {endpoint!r} of {self._node}")
-        return self._data_layer.map_to(endpoint, connection)
-
-    def disconnect(self, connection: Connection | str) -> None:
-        """Unmake a connection and the mappings onto it; see `DataLayer.disconnect_from`."""
-        name = connection if isinstance(connection, str) else connection.name
-        self._refuse_unconfigured(f"disconnect {self._node} from {name!r}")
-        self._data_layer.disconnect_from(connection)
-
-    def remap(self, endpoint: str, name: str) -> None:
-        """Give an endpoint another topic or service name; see `DataLayer.remap`."""
-        self._refuse_unconfigured(f"remap {endpoint!r} of {self._node}")
-        self._data_layer.remap(endpoint, name)
-
-    def alias(self, endpoint: str, names: Sequence[str]) -> None:
-        """Give an endpoint these further names and no others; see `DataLayer.alias`."""
-        self._refuse_unconfigured(f"alias {endpoint!r} of {self._node}")
-        self._data_layer.alias(endpoint, names)
 
     def _refuse_unconfigured(self, what: str) -> None:
         state = self._state()
@@ -399,7 +394,7 @@ class RemoteInterface:
     def __init__(
         self,
         node: Node,
-        interface: NodeInterface,
+        interface: NodeDataLayer,
         *,
         log: Callable[[str], None],
         group: CallbackGroup,
@@ -413,7 +408,6 @@ class RemoteInterface:
             "map_to": self._map_to,
             "disconnect": self._disconnect,
             "remap": self._remap,
-            "alias": self._alias,
         }
 
     def serve(self, *, but: Collection[str] = ()) -> None:
@@ -462,9 +456,6 @@ class RemoteInterface:
 
     def _remap(self, parameter: Parameter) -> None:
         self._interface.remap(parameter.name, _text(parameter, "the new name"))
-
-    def _alias(self, parameter: Parameter) -> None:
-        self._interface.alias(parameter.name, _texts(parameter, "the further names"))
 
 
 def _text(parameter: Parameter, what: str) -> str:

@@ -1,7 +1,7 @@
 """Make and destroy the rclpy entity of a declared endpoint on a connection.
 
 Owns: which factory makes which kind, with which QoS, callback group and gate. It keeps nothing:
-what exists where is data_layer.py's.
+what exists where is mapper.py's.
 """
 
 from __future__ import annotations
@@ -14,64 +14,21 @@ from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 from rclpy.qos import qos_profile_system_default
 
-from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest import EndpointKind, QosProfile
 from lifecycle.middleware import create_publisher, create_subscription, to_rclpy
 from lifecycle.node.actions import ActionWords, Goals, resolve_action_name
+from lifecycle.node.endpoints.mapping import Mapping, wire_name
 from lifecycle.node.lifecycle.execution import positional_count
 from lifecycle.plan import PlannedEndpoint
 
 if TYPE_CHECKING:
-    from rclpy.callback_groups import CallbackGroup
-    from rclpy.service_introspection import ServiceIntrospectionState
-
     from lifecycle.node.connections.connections import Connection
-    from lifecycle.node.lifecycle.gate import Later, NodeGate
+    from lifecycle.node.lifecycle.gate import NodeGate
+    from lifecycle.node.lifecycle.services import Turns
 
 CLIENTS = frozenset({EndpointKind.SERVICE_CLIENT, EndpointKind.ACTION_CLIENT})
 _ACTIONS = frozenset({EndpointKind.ACTION_SERVER, EndpointKind.ACTION_CLIENT})
-
-
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class EndpointOptions:
-    """What only code can say of how an endpoint is made; as in rclpy's factories.
-
-    Attributes:
-        callback_group: of its callback and its events; None for the node's own choice.
-        event_callbacks: rclpy's PublisherEventCallbacks or SubscriptionEventCallbacks.
-        raw: a subscription's handler is given serialized bytes.
-        content_filter: expression of a subscription, and the values of its parameters.
-        introspection: of a service server or client (REP-2012).
-    """
-
-    callback_group: CallbackGroup | None = None
-    event_callbacks: Any = None
-    raw: bool = False
-    content_filter: tuple[str, tuple[str, ...]] | None = None
-    introspection: ServiceIntrospectionState | None = None
-
-    def refuse_unfit(self, kind: EndpointKind) -> None:
-        """Raise LifecycleError for what endpoints of a kind cannot have."""
-        given = {
-            "raw": self.raw,
-            "content_filter": self.content_filter is not None,
-            "event_callbacks": self.event_callbacks is not None,
-            "introspection": self.introspection is not None,
-        }
-        for name, is_given in given.items():
-            if is_given and kind not in _FITTING[name]:
-                fitting = ", ".join(f"{each.noun}s" for each in _FITTING[name])
-                raise LifecycleError(f"cannot set {name} of a {kind.noun}; only of {fitting}")
-
-
-_FITTING = {
-    "raw": (EndpointKind.SUBSCRIPTION,),
-    "content_filter": (EndpointKind.SUBSCRIPTION,),
-    "event_callbacks": (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION),
-    "introspection": (EndpointKind.SERVICE_SERVER, EndpointKind.SERVICE_CLIENT),
-}
-NO_OPTIONS = EndpointOptions()
 
 
 class Maker:
@@ -80,48 +37,23 @@ class Maker:
     Args:
         node: whose endpoints they are, and whose executor runs their callbacks.
         gate: holds subscriptions back; publishers are held back by their handles.
-        client_group: reentrant, so that an answer can arrive while a callback awaits it.
-        later: runs a coroutine function in the node's executor.
+        turns: of the node's executor.
     """
 
-    def __init__(
-        self,
-        node: Node,
-        *,
-        gate: NodeGate,
-        client_group: CallbackGroup,
-        later: Later,
-    ) -> None:
+    def __init__(self, node: Node, gate: NodeGate, turns: Turns) -> None:
         self._node = node
         self._gate = gate
-        self._client_group = client_group
-        self._later = later
+        self._turns = turns
         self._goals: dict[int, Goals] = {}  # by id of the action server
 
-    def make(
-        self,
-        endpoint: PlannedEndpoint,
-        interface: type[Any],
-        connection: Connection,
-        *,
-        handler: Callable[..., Any] | None,
-        name: str = "",
-        options: EndpointOptions = NO_OPTIONS,
-    ) -> Any:
-        """Return a new rclpy entity for `endpoint` on `connection`.
-
-        Args:
-            endpoint: as declared.
-            interface: its message, service or action class.
-            connection: that carries it.
-            handler: takes messages, requests or goals; None where the kind has no handler.
-            name: fully qualified name instead of the declared one.
-            options: what code says of it.
+    def make(self, mapping: Mapping, connection: Connection) -> Any:
+        """Return a new rclpy entity of an endpoint on a connection.
 
         Raises:
             LifecycleError: the RMW refused, with its reason; nothing is left.
         """
-        makes: dict[EndpointKind, Callable[..., Any]] = {
+        endpoint, introspection = mapping.endpoint, mapping.options.introspection
+        makes: dict[EndpointKind, Callable[[Mapping, Connection], Any]] = {
             EndpointKind.PUBLISHER: self._publisher,
             EndpointKind.SUBSCRIPTION: self._subscription,
             EndpointKind.SERVICE_SERVER: self._service,
@@ -129,22 +61,21 @@ class Maker:
             EndpointKind.ACTION_SERVER: self._action_server,
             EndpointKind.ACTION_CLIENT: self._action_client,
         }
-        make = makes[endpoint.kind]
-        entity = make(endpoint, interface, connection, handler, name=name, options=options)
+        entity = makes[endpoint.kind](mapping, connection)
         if connection.participant is not None:
             # The hidden node is not spun: its events are handled where the node's own are.
             for event in getattr(entity, "event_handlers", ()):
                 self._node.add_waitable(event)
-        if options.introspection is not None:
+        if introspection is not None:
             entity.configure_introspection(
-                self._node.get_clock(), qos_profile_system_default, options.introspection
+                self._node.get_clock(), qos_profile_system_default, introspection
             )
         made = wire_name(entity)
-        if name and made and made != name:
+        if mapping.name and made and made != mapping.name:
             self.unmake(endpoint, entity, connection)
             raise LifecycleError(
-                f"cannot call {endpoint.kind.noun} {endpoint.name!r} {name!r}: a remapping rule "
-                f"that the node was started with makes it {made!r}",
+                f"cannot call {endpoint.kind.noun} {endpoint.name!r} {mapping.name!r}: a remapping "
+                f"rule that the node was started with makes it {made!r}",
                 hint="take the rule out of the manifest's `remap:`, or choose another name",
             )
         return entity
@@ -172,20 +103,6 @@ class Maker:
         else:
             self._node.destroy_client(entity)
 
-    def resolve(self, endpoint: PlannedEndpoint) -> str:
-        """Return the fully qualified name of an endpoint after namespace and remapping rules.
-
-        The hidden nodes of other participants resolve nothing: remaps belong to our node.
-
-        Raises:
-            LifecycleError: rules tear an action apart.
-        """
-        if endpoint.kind.is_topic:
-            return str(self._node.resolve_topic_name(endpoint.name))
-        if endpoint.kind in _ACTIONS:
-            return resolve_action_name(self._node, endpoint.name)
-        return str(self._node.resolve_service_name(endpoint.name))
-
     def expand(self, endpoint: PlannedEndpoint, name: str) -> str:
         """Return a new name for an endpoint fully qualified; no remapping rule applies.
 
@@ -203,213 +120,144 @@ class Maker:
                 f"cannot call {endpoint.kind.noun} {endpoint.name!r} {name!r}: {reason}"
             ) from error
 
-    def _publisher(
-        self,
-        endpoint: PlannedEndpoint,
-        interface: type[Any],
-        connection: Connection,
-        handler: Callable[..., Any] | None,  # noqa: ARG002 - it has none
-        *,
-        name: str,
-        options: EndpointOptions,
-    ) -> Any:
-        qos = endpoint.qos or QosProfile()
+    def _publisher(self, mapping: Mapping, connection: Connection) -> Any:
+        endpoint = mapping.endpoint
+        name, qos = self._name(mapping, connection), endpoint.qos or QosProfile()
+        options = {
+            "callback_group": mapping.options.callback_group,
+            "event_callbacks": mapping.options.event_callbacks,
+        }
         if connection.participant is not None:
-            topic = name or self.resolve(endpoint)
-            return connection.participant.create_publisher(
-                interface,
-                topic,
-                qos,
-                callback_group=options.callback_group,
-                event_callbacks=options.event_callbacks,
-            )
+            return connection.participant.create_publisher(mapping.interface, name, qos, **options)
         entity = create_publisher(
-            self._node,
-            interface,
-            name or endpoint.name,
-            qos,
-            unique=endpoint.unique,
-            callback_group=options.callback_group,
-            event_callbacks=options.event_callbacks,
+            self._node, mapping.interface, name, qos, unique=endpoint.unique, **options
         )
         self._gate.release(entity)  # the handle is the gate
         return entity
 
-    def _subscription(
-        self,
-        endpoint: PlannedEndpoint,
-        interface: type[Any],
-        connection: Connection,
-        handler: Callable[..., Any] | None,
-        *,
-        name: str,
-        options: EndpointOptions,
-    ) -> Any:
-        assert handler is not None
-        qos = endpoint.qos or QosProfile()
-        further: dict[str, Any] = {
-            "unique": endpoint.unique,
-            "callback_group": options.callback_group,
-            "event_callbacks": options.event_callbacks,
-            "raw": options.raw,
-            "content_filter": options.content_filter,
-        }
+    def _subscription(self, mapping: Mapping, connection: Connection) -> Any:
+        endpoint, options = mapping.endpoint, mapping.options
+        make: Callable[..., Any] = functools.partial(create_subscription, self._node)
         if connection.participant is not None:
-            entity = connection.participant.create_subscription(
-                interface, name or self.resolve(endpoint), handler, qos, **further
-            )
-        else:
-            entity = create_subscription(
-                self._node,
-                interface,
-                name or endpoint.name,
-                handler,
-                qos,
-                **further,
-            )
-        self._gate.add_subscription(entity, self._later)
+            make = connection.participant.create_subscription
+        entity = make(
+            mapping.interface,
+            self._name(mapping, connection),
+            mapping.handler,
+            endpoint.qos or QosProfile(),
+            unique=endpoint.unique,
+            callback_group=options.callback_group,
+            event_callbacks=options.event_callbacks,
+            raw=options.raw,
+            content_filter=options.content_filter,
+        )
+        self._gate.add_subscription(entity, self._turns.call_soon)
         return entity
 
-    def _service(
-        self,
-        endpoint: PlannedEndpoint,
-        interface: type[Any],
-        connection: Connection,
-        handler: Callable[..., Any] | None,
-        *,
-        name: str,
-        options: EndpointOptions,
-    ) -> Any:
-        assert handler is not None
+    def _service(self, mapping: Mapping, connection: Connection) -> Any:
+        assert mapping.handler is not None
+        make: Callable[..., Any] = self._node.create_service
         if connection.participant is not None:
-            entity = connection.participant.create_service(
-                interface,
-                name or self.resolve(endpoint),
-                _answering(handler),
-                callback_group=options.callback_group,
-                **_qos(endpoint),
-            )
-        else:
-            entity = self._node.create_service(
-                interface,
-                name or endpoint.name,
-                _answering(handler),
-                callback_group=options.callback_group,
-                **_qos_profile(endpoint),
-            )
-        self._survive_late_answers(entity, endpoint)
+            make = connection.participant.create_service
+        entity = make(
+            mapping.interface,
+            self._name(mapping, connection),
+            _answering(mapping.handler),
+            callback_group=mapping.options.callback_group,
+            **_qos(mapping, connection),
+        )
+        self._survive_late_answers(entity, mapping.endpoint)
         return entity
 
-    def _client(
-        self,
-        endpoint: PlannedEndpoint,
-        interface: type[Any],
-        connection: Connection,
-        handler: Callable[..., Any] | None,  # noqa: ARG002 - it has none
-        *,
-        name: str,
-        options: EndpointOptions,
-    ) -> Any:
-        group = options.callback_group or self._client_group
-        if connection.participant is None:
-            return self._node.create_client(
-                interface, name or endpoint.name, callback_group=group, **_qos_profile(endpoint)
-            )
+    def _client(self, mapping: Mapping, connection: Connection) -> Any:
         from lifecycle.node.author.node import refuse_to_deadlock
 
-        client = connection.participant.create_client(
-            interface,
-            name or self.resolve(endpoint),
-            callback_group=group,
-            **_qos(endpoint),
+        make: Callable[..., Any] = self._node.create_client
+        if connection.participant is not None:
+            make = connection.participant.create_client
+        client = make(
+            mapping.interface,
+            self._name(mapping, connection),
+            callback_group=mapping.options.callback_group or self._turns.group,
+            **_qos(mapping, connection),
         )
-        refuse_to_deadlock(client)
+        if connection.participant is not None:  # the node's own factory has done it
+            refuse_to_deadlock(client)
         return client
 
-    def _action_server(
-        self,
-        endpoint: PlannedEndpoint,
-        interface: type[Any],
-        connection: Connection,
-        handler: Callable[..., Any] | None,
-        *,
-        name: str,
-        options: EndpointOptions,
-    ) -> Any:
+    def _action_server(self, mapping: Mapping, connection: Connection) -> Any:
         from lifecycle.middleware import GoalServer  # late: numpy, 100 ms
 
-        assert handler is not None
+        assert mapping.handler is not None
         logger = self._node.get_logger()
         words = ActionWords(
-            action=endpoint.name,
+            action=mapping.endpoint.name,
             node=self._node.get_fully_qualified_name(),
             error=logger.error,
             warn=logger.warning,
         )
-        goals = Goals(handler, interface, words, is_open=lambda: self._gate.is_open)
+        goals = Goals(mapping.handler, mapping.interface, words, is_open=lambda: self._gate.is_open)
 
-        server = goals.server = self._action(
-            endpoint,
-            connection,
-            name,
-            lambda node, called: GoalServer(
+        def make(node: Node, name: str) -> Any:
+            return GoalServer(
                 node,
-                interface,
-                called,
+                mapping.interface,
+                name,
                 goals.execute,
                 accept=goals.accept,
-                group=options.callback_group or self._node.default_callback_group,
-            ),
-        )
+                group=mapping.options.callback_group or self._node.default_callback_group,
+            )
+
+        server = goals.server = self._action(mapping, connection, make)
         self._goals[id(server)] = goals
         self._gate.add_worker(server, goals)
         return server
 
-    def _action_client(
-        self,
-        endpoint: PlannedEndpoint,
-        interface: type[Any],
-        connection: Connection,
-        handler: Callable[..., Any] | None,  # noqa: ARG002 - it has none
-        *,
-        name: str,
-        options: EndpointOptions,
-    ) -> Any:
+    def _action_client(self, mapping: Mapping, connection: Connection) -> Any:
         from lifecycle.middleware import GoalClient
         from lifecycle.node.author.node import refuse_to_block
 
-        return self._action(
-            endpoint,
-            connection,
-            name,
-            lambda node, called: GoalClient(
+        def make(node: Node, name: str) -> Any:
+            return GoalClient(
                 node,
-                interface,
-                called,
-                group=options.callback_group or self._client_group,
+                mapping.interface,
+                name,
+                group=mapping.options.callback_group or self._turns.group,
                 refuse_to_block=refuse_to_block,
-            ),
-        )
+            )
+
+        return self._action(mapping, connection, make)
 
     def _action(
-        self,
-        endpoint: PlannedEndpoint,
-        connection: Connection,
-        name: str,
-        make: Callable[[Node, str], Any],
+        self, mapping: Mapping, connection: Connection, make: Callable[[Node, str], Any]
     ) -> Any:
         """Make an action server or client where it belongs, and have it know its name."""
-        participant = connection.participant
-        if participant is None:
+        name = self._name(mapping, connection)
+        if connection.participant is None:
             # rcl applies rules to the hidden names itself; torn apart, the action is not made.
-            resolved = resolve_action_name(self._node, name or endpoint.name)
-            action = make(self._node, name or endpoint.name)
+            resolved = resolve_action_name(self._node, name)
+            action = make(self._node, name)
         else:
-            resolved = name or self.resolve(endpoint)
-            noun = endpoint.kind.noun
-            action = participant.create_action(lambda node: make(node, resolved), noun, resolved)
+            resolved, noun = name, mapping.endpoint.kind.noun
+            action = connection.participant.create_action(
+                lambda node: make(node, resolved), noun, resolved
+            )
         action.action_name = resolved
         return action
+
+    def _name(self, mapping: Mapping, connection: Connection) -> str:
+        """Return what an endpoint is called where it is made.
+
+        The hidden nodes of other participants resolve nothing: remaps belong to our node.
+        """
+        endpoint = mapping.endpoint
+        if mapping.name or connection.participant is None:
+            return mapping.name or endpoint.name
+        if endpoint.kind.is_topic:
+            return str(self._node.resolve_topic_name(endpoint.name))
+        if endpoint.kind in _ACTIONS:
+            return resolve_action_name(self._node, endpoint.name)
+        return str(self._node.resolve_service_name(endpoint.name))
 
     def _survive_late_answers(self, service: Any, endpoint: PlannedEndpoint) -> None:
         """Let an answer after its server was destroyed be lost, not end the process."""
@@ -429,23 +277,13 @@ class Maker:
         service.send_response = send_response
 
 
-def wire_name(entity: Any) -> str:
-    """Return an entity's name on the wire, as rcl resolved it; empty if it is unknown."""
-    for attribute in ("topic_name", "service_name", "action_name"):
-        name = getattr(entity, attribute, None)
-        if name is not None:
-            return str(name)
-    return ""
-
-
-def _qos(endpoint: PlannedEndpoint) -> dict[str, Any]:
+def _qos(mapping: Mapping, connection: Connection) -> dict[str, Any]:
     """Return the keyword for a declared QoS; nothing keeps the default for services."""
-    return {} if endpoint.qos is None else {"qos": endpoint.qos}
-
-
-def _qos_profile(endpoint: PlannedEndpoint) -> dict[str, Any]:
-    """Return `_qos` as rclpy wants it."""
-    return {} if endpoint.qos is None else {"qos_profile": to_rclpy(endpoint.qos)}
+    if mapping.endpoint.qos is None:
+        return {}
+    if connection.participant is not None:
+        return {"qos": mapping.endpoint.qos}
+    return {"qos_profile": to_rclpy(mapping.endpoint.qos)}
 
 
 def _answering(handler: Callable[..., Any]) -> Callable[[Any, Any], Any]:

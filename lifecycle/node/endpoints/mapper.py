@@ -1,28 +1,88 @@
-"""Map, unmap, hand over and rename the endpoints of a node between its connections.
+"""Make endpoints on connections: map, unmap, hand over (make before break) and rename.
 
-Owns: these changes of single endpoints, and the handovers that are under way. Where an endpoint
-belongs is up to data_layer.py.
+Owns: these changes of single endpoints, how long an endpoint lives on two connections while it is
+handed over, and that a strictly unique flow is not shared. Where an endpoint belongs is up to
+data_layer.py.
+
+Both ends of a flow learn of each other at different moments, so a match seen here does not prove
+that the other side has seen it: the old one stays a little longer than that. Meanwhile a publisher
+publishes by the old one, and a subscription receives by both: what reaches it both ways is
+delivered twice.
 """
 
 from __future__ import annotations
 
+import typing
 from collections.abc import Callable
-from collections.abc import Mapping as AbstractMapping
 from typing import TYPE_CHECKING, Any
 
+from rclpy.duration import Duration
 from rclpy.task import Future
 
 from lifecycle.manifest import EndpointKind
-from lifecycle.node.connections.connection_status import ConnectionStatus
-from lifecycle.node.connections.connections import Connection, Connections
+from lifecycle.middleware import ServerWatch
+from lifecycle.network import UniqueRequirement
+from lifecycle.node.connections.connections import ConnectError, Connection, Connections
 from lifecycle.node.endpoints.making import CLIENTS
-from lifecycle.node.endpoints.mapping import Key, Mapping, Placement
-from lifecycle.node.endpoints.placing import After, Handover, Overlap, Placer
+from lifecycle.node.endpoints.mapping import Key, Mapping, MatchWatch, Placement
 
 if TYPE_CHECKING:
     from rclpy.node import Node
 
+    from lifecycle.node.connections.connection_status import ConnectionStatus
+    from lifecycle.node.endpoints.endpoint_table import EndpointTable
+    from lifecycle.node.endpoints.making import Maker
     from lifecycle.node.endpoints.publisher import DeclaredPublisher
+    from lifecycle.node.lifecycle.services import Turns
+
+SETTLE_S = 0.25
+"""The old one lives on after the new one has matched as many peers as it had."""
+
+PATIENCE_S = 4.0
+"""Both live at most so long, if the new one never matches as many.
+
+A participant that others have not noticed at once is announced again after 3 s.
+"""
+
+_ACKNOWLEDGED = Duration(seconds=0.1)
+"""How long a reliable publisher that is handed over is waited for; on one network a millisecond."""
+
+After = Callable[[float, Callable[[], None]], Callable[[], None]]
+"""Calls back once, so many seconds later, in the executor; returns what calls that off."""
+
+
+@typing.final
+class Handover:
+    """The time in which an endpoint is on two connections.
+
+    Args:
+        peers_before: how many peers the old one had.
+        after: the timer.
+        finish: destroys the old one; called exactly once.
+    """
+
+    def __init__(self, *, peers_before: int, after: After, finish: Callable[[], None]) -> None:
+        self.done: Future = Future()
+        self._peers_before = peers_before
+        self._after = after
+        self._finish = finish
+        self._settles = False
+        self._call_off = after(PATIENCE_S, self.end)
+
+    def peers_changed(self, peers: int) -> None:
+        """The new one has so many peers now."""
+        if peers >= self._peers_before and not self._settles and not self.done.done():
+            self._settles = True
+            self._call_off()
+            self._call_off = self._after(SETTLE_S, self.end)
+
+    def end(self) -> None:
+        """Break now; again is harmless."""
+        if self.done.done():
+            return
+        self._call_off()
+        self.done.set_result(None)
+        self._finish()
 
 
 class Mapper:
@@ -30,50 +90,48 @@ class Mapper:
 
     Args:
         node: whose endpoints they are.
-        placer: makes and destroys their entities.
-        mappings: every declared endpoint, as it is at any time.
-        handles: of its publishers, likewise.
+        maker: makes and destroys their rclpy objects.
+        table: every declared endpoint, as it is at any time.
         connections: of the node.
         status: notified of each change.
-        after: calls back once in the node's executor.
-        changed: called when the node configuration has changed.
+        turns: of the node's executor.
     """
 
     def __init__(
         self,
         node: Node,
-        placer: Placer,
+        maker: Maker,
+        table: EndpointTable,
         *,
-        mappings: AbstractMapping[Key, Mapping],
-        handles: AbstractMapping[str, DeclaredPublisher],
         connections: Connections,
         status: ConnectionStatus,
-        after: After,
-        changed: Callable[[], None],
+        turns: Turns,
     ) -> None:
         self._node = node
-        self._placer = placer
-        self._mappings = mappings
-        self._handles = handles
+        self._maker = maker
+        self._table = table
         self._connections = connections
         self._status = status
-        self._after = after
-        self._changed = changed
+        self._turns = turns
         self._handovers: dict[Key, tuple[Handover, Placement]] = {}
+
+    @property
+    def _placements(self) -> tuple[Placement, ...]:
+        placements = [each.placement for each in self._table.mappings.values()]
+        placements += [old for _, old in self._handovers.values()]
+        return tuple(each for each in placements if each is not None)
 
     @property
     def entities(self) -> tuple[Any, ...]:
         """Every rclpy object of a declared endpoint."""
-        placements = [each.placement for each in self._mappings.values()]
-        placements += [old for _, old in self._handovers.values()]
-        return tuple(entity for each in placements if each for entity in each.entities)
+        return tuple(each.entity for each in self._placements)
 
     def map(self, mapping: Mapping, connection: Connection) -> None:
         """Map an endpoint that is mapped nowhere; raises LifecycleError."""
-        placement = mapping.placement = self._place(mapping, connection)
-        self._attach(mapping, placement)
+        mapping.placement = self._place(mapping, connection)
+        self._attach(mapping)
         self._status.mapped(mapping)
-        self._changed()
+        self._table.changed()
 
     def unmap(self, mapping: Mapping) -> None:
         """Take an endpoint off where it is; harmless if it is nowhere."""
@@ -85,8 +143,7 @@ class Mapper:
         if handle is not None:
             handle.detach()
         mapping.placement = mapping.peers = None
-        self._placer.unplace(mapping, placement)
-        self._status.unmapped(mapping, placement.connection)
+        self._unplace(mapping, placement)
 
     def take_off(self, mapping: Mapping, connection: Connection) -> None:
         """Take an endpoint off a connection, on which it may be no longer alone."""
@@ -122,52 +179,66 @@ class Mapper:
         old = mapping.placement
         if old is not None:
             try:
-                new = self._place(mapping, old.connection)
+                mapping.placement = self._place(mapping, old.connection)
             except BaseException:
                 mapping.name = before
                 raise
-            overlap = self._placer.overlap(mapping, old, new)
-            mapping.placement = new
-            self._take_over(mapping, old, new, overlap)
+            self._take_over(mapping, old)
             self._status.mapped(mapping)
-        self._changed()
-
-    def realias(self, mapping: Mapping, aliases: tuple[str, ...]) -> None:
-        """Give an endpoint these further names and no others; raises LifecycleError."""
-        self._end_handover(mapping)
-        if mapping.placement is not None:
-            self._placer.realias(mapping, mapping.placement, aliases, matched=self._match)
-            mapping.aliases = aliases
-            self._attach(mapping, mapping.placement)
-            self._status.matched(mapping)
-        mapping.aliases = aliases
-        self._changed()
-
-    def close(self, connection: Connection) -> None:
-        """Unmake a connection that nothing is mapped onto."""
-        self._connections.close(connection)
-        self._status.closed(connection)
+        self._table.changed()
 
     def tidy(self) -> None:
         """Unmake participants of single flows that carry nothing any more."""
-        used = [each.connection for each in self._mappings.values()]
-        used += [old.connection for _, old in self._handovers.values()]
+        used = [each.connection for each in self._placements]
         for connection in self._connections.unnamed:
             if connection not in used:
                 self._connections.close(connection)
 
     def _place(self, mapping: Mapping, connection: Connection) -> Placement:
-        beside = self._mappings.values()
-        return self._placer.place(mapping, connection, beside=beside, matched=self._match)
+        """Make an endpoint on a connection; where it is now is left alone."""
+        self._refuse_shared_flow(mapping, connection)
+        entity = self._maker.make(mapping, connection)
+        return Placement(
+            connection=connection, entity=entity, watch=self._watch(mapping, connection, entity)
+        )
+
+    def _unplace(self, mapping: Mapping, placement: Placement) -> None:
+        if placement.watch is not None:
+            placement.watch.stop()
+        self._maker.unmake(mapping.endpoint, placement.entity, placement.connection)
+        self._status.unmapped(mapping, placement.connection)
+
+    def _watch(
+        self, mapping: Mapping, connection: Connection, entity: Any
+    ) -> MatchWatch | ServerWatch | None:
+        kind = mapping.endpoint.kind
+        if kind.is_topic:
+            return MatchWatch(
+                self._node, entity, self._turns.group, lambda _: self._matched(mapping)
+            )
+        if kind not in CLIENTS:
+            return None
+
+        hidden = connection.participant
+        node = self._node if hidden is None else hidden.node
+        return ServerWatch(node, entity, self._table.changed)  # their peers are not counted
+
+    def _matched(self, mapping: Mapping) -> None:
+        """Some entity of a mapping has been matched or unmatched."""
+        self._status.matched(mapping)
+        running = self._handovers.get(mapping.key)
+        if running is not None:
+            running[0].peers_changed(mapping.peers or 0)
+        self._table.changed()  # as many peers as before may be others
 
     def _handle(self, mapping: Mapping) -> DeclaredPublisher | None:
         publishes = mapping.endpoint.kind is EndpointKind.PUBLISHER
-        return self._handles[mapping.endpoint.name] if publishes else None
+        return self._table.handles[mapping.endpoint.name] if publishes else None
 
-    def _attach(self, mapping: Mapping, placement: Placement) -> None:
+    def _attach(self, mapping: Mapping) -> None:
         handle = self._handle(mapping)
         if handle is not None:
-            handle.attach(placement.entity, placement.entities[1:])
+            handle.attach(mapping.entity)
 
     def _end_handover(self, mapping: Mapping) -> None:
         running = self._handovers.get(mapping.key)
@@ -177,24 +248,19 @@ class Mapper:
     def _hand_over(self, mapping: Mapping, old: Placement, connection: Connection) -> Future:
         """Make an endpoint anew, live on both sides for a while, then destroy the old one."""
         peers = mapping.peers
-        new = self._place(mapping, connection)
-        handle = self._handle(mapping)
-        if handle is not None:
-            handle.prepare(new.entities)
-        mapping.placement = new
+        mapping.placement = self._place(mapping, connection)
         mapping.error = ""
-        overlap = self._placer.overlap(mapping, old, new)
 
         def finish() -> None:
             del self._handovers[mapping.key]
-            self._take_over(mapping, old, new, overlap)
+            self._take_over(mapping, old)
             self.tidy()
-            self._changed()
+            self._table.changed()
 
         # Two servers would both answer; and a client's answers may still be under way.
         kind = mapping.endpoint.kind
         lives_on = bool(peers) if kind.is_topic else kind in CLIENTS
-        handover = Handover(peers_before=peers or 1, after=self._after, finish=finish)
+        handover = Handover(peers_before=peers or 1, after=self._turns.call_after, finish=finish)
         self._handovers[mapping.key] = (handover, old)
         self._status.mapped(mapping)
         if not lives_on or self._node.executor is None:
@@ -203,24 +269,37 @@ class Mapper:
             handover.peers_changed(mapping.peers or 0)
         return handover.done
 
-    def _take_over(
-        self, mapping: Mapping, old: Placement, new: Placement, overlap: Overlap | None
-    ) -> None:
-        self._placer.switch(mapping, old, new, overlap)
-        self._attach(mapping, new)
-        self._placer.unplace(mapping, old)
-        self._status.unmapped(mapping, old.connection)
+    def _take_over(self, mapping: Mapping, old: Placement) -> None:
+        """Let the new one do what the old one did until now, which is destroyed."""
+        qos = mapping.endpoint.qos
+        if mapping.endpoint.kind is EndpointKind.PUBLISHER and (
+            qos is None or qos.reliability.name != "BEST_EFFORT"
+        ):
+            old.entity.wait_for_all_acked(_ACKNOWLEDGED)
+        self._attach(mapping)
+        self._unplace(mapping, old)
 
-    def _match(self, mapping: Mapping) -> None:
-        """Some entity of a mapping has been matched or unmatched."""
-        if mapping.endpoint.kind in CLIENTS:
-            self._changed()  # their peers are not counted
+    def _refuse_shared_flow(self, mapping: Mapping, connection: Connection) -> None:
+        """Keep a strictly unique publisher alone: a participant's publishers share its sockets.
+
+        On the node's own participant the RMW refuses such a publisher itself.
+        """
+        publisher, strict = EndpointKind.PUBLISHER, UniqueRequirement.STRICTLY_REQUIRED
+        if connection.participant is None or mapping.endpoint.kind is not publisher:
             return
-        self._status.matched(mapping)
-        running = self._handovers.get(mapping.key)
-        if running is not None:
-            running[0].peers_changed(mapping.peers or 0)
-        self._changed()  # as many peers as before may be others
+        for other in self._table.mappings.values():
+            if other is mapping or other.endpoint.kind is not publisher:
+                continue
+            if other.connection is not connection:
+                continue
+            for one, two in ((mapping, other), (other, mapping)):
+                if one.endpoint.unique is strict:
+                    raise ConnectError(
+                        f"publisher {one.endpoint.name!r} must have a network flow for itself "
+                        f"(strictly_required), and would share it with publisher "
+                        f"{two.endpoint.name!r}",
+                        hint="give each a connection of its own",
+                    )
 
 
 def _done() -> Future:

@@ -1,6 +1,7 @@
-"""One declared endpoint and its entities now: its mapping, its spellings, its matched peers.
+"""One declared endpoint and where it is now: its mapping, its spellings, its matched peers.
 
-Owns: the types of a mapping, without behaviour of their own; the meaning of a spelling in requests
+Owns: the types of a mapping, without behaviour of their own; what code says of how an endpoint is
+made; the meaning of a spelling in requests
 and messages (`video`, or `publishers/video`), and the error when it names nothing or too much;
 rclpy's matched events on our executor. Such an event is handled in a group of the framework's: an
 author's callback that awaits something must not delay the event of a peer that appeared or left.
@@ -25,12 +26,12 @@ from lifecycle.errors import LifecycleError
 from lifecycle.manifest import EndpointKind
 from lifecycle.node.author.handlers import nearest
 from lifecycle.node.connections.connections import Connection
-from lifecycle.node.endpoints.making import NO_OPTIONS, EndpointOptions, wire_name
 from lifecycle.plan import PlannedEndpoint
 
 if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup
     from rclpy.node import Node
+    from rclpy.service_introspection import ServiceIntrospectionState
     from rclpy.subscription import Subscription
 
     from lifecycle.middleware import ServerWatch
@@ -138,46 +139,72 @@ class MatchWatch:
             self._handler = None
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Part:
-    """One entity of an endpoint: the one of its own name, or of an alias.
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class EndpointOptions:
+    """What only code can say of how an endpoint is made; as in rclpy's factories.
 
     Attributes:
-        name: fully qualified; empty for the one of the declared name.
-        entity: the rclpy object.
+        callback_group: of its callback and its events; None for the node's own choice.
+        event_callbacks: rclpy's PublisherEventCallbacks or SubscriptionEventCallbacks.
+        raw: a subscription's handler is given serialized bytes.
+        content_filter: expression of a subscription, and the values of its parameters.
+        introspection: of a service server or client (REP-2012).
+    """
+
+    callback_group: CallbackGroup | None = None
+    event_callbacks: Any = None
+    raw: bool = False
+    content_filter: tuple[str, tuple[str, ...]] | None = None
+    introspection: ServiceIntrospectionState | None = None
+
+    def refuse_unfit(self, kind: EndpointKind) -> None:
+        """Raise LifecycleError for what endpoints of a kind cannot have."""
+        given = {
+            "raw": self.raw,
+            "content_filter": self.content_filter is not None,
+            "event_callbacks": self.event_callbacks is not None,
+            "introspection": self.introspection is not None,
+        }
+        for name, is_given in given.items():
+            if is_given and kind not in _FITTING[name]:
+                fitting = ", ".join(f"{each.noun}s" for each in _FITTING[name])
+                raise LifecycleError(f"cannot set {name} of a {kind.noun}; only of {fitting}")
+
+
+_FITTING = {
+    "raw": (EndpointKind.SUBSCRIPTION,),
+    "content_filter": (EndpointKind.SUBSCRIPTION,),
+    "event_callbacks": (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION),
+    "introspection": (EndpointKind.SERVICE_SERVER, EndpointKind.SERVICE_CLIENT),
+}
+NO_OPTIONS = EndpointOptions()
+
+
+def wire_name(entity: Any) -> str:
+    """Return an entity's name on the wire, as rcl resolved it; empty if it is unknown."""
+    for attribute in ("topic_name", "service_name", "action_name"):
+        name = getattr(entity, attribute, None)
+        if name is not None:
+            return str(name)
+    return ""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Placement:
+    """The rclpy object of an endpoint on one connection.
+
+    Attributes:
         watch: notifies of its peers or its server; None for service and action servers.
     """
 
-    name: str
+    connection: Connection
     entity: Any
     watch: MatchWatch | ServerWatch | None = None
 
 
 @dataclasses.dataclass(slots=True, kw_only=True, eq=False)
-class Placement:
-    """The entities of an endpoint on one connection.
-
-    Attributes:
-        parts: the one of its own name first.
-    """
-
-    connection: Connection
-    parts: tuple[Part, ...]
-
-    @property
-    def entity(self) -> Any:
-        """The rclpy object of its own name."""
-        return self.parts[0].entity
-
-    @property
-    def entities(self) -> tuple[Any, ...]:
-        """All of them, the one of the endpoint's own name first."""
-        return tuple(part.entity for part in self.parts)
-
-
-@dataclasses.dataclass(slots=True, kw_only=True, eq=False)
 class Mapping:
-    """One declared endpoint and its entities now.
+    """One declared endpoint and where it is now.
 
     Attributes:
         interface: the message, service or action class.
@@ -185,11 +212,10 @@ class Mapping:
         placement: where it is; None while it is mapped nowhere.
         error: why it could not be made as asked; empty if it was.
         name: fully qualified, given by `remap`; empty for the name that was declared.
-        aliases: fully qualified, given by `alias`.
         peers: matched remote endpoints; None while mapped nowhere, and for services and actions.
         lossy: the author's hint: the data bear an unreliable transport; None without one.
         size_bytes: the author's hint: its largest serialized message; None without one.
-        options: how its entities are made, as far as code says it.
+        options: how it is made, as far as code says it.
     """
 
     endpoint: PlannedEndpoint
@@ -198,7 +224,6 @@ class Mapping:
     placement: Placement | None = None
     error: str = ""
     name: str = ""
-    aliases: tuple[str, ...] = ()
     peers: int | None = None
     lossy: bool | None = None
     size_bytes: int | None = None

@@ -11,9 +11,7 @@ from __future__ import annotations
 
 import collections
 import time
-import typing
-import weakref
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from rclpy.duration import Duration
@@ -30,9 +28,8 @@ _SYSTEM_DEFAULT_DEPTH = 1
 """Fast DDS 2.14's own, for a profile that leaves history to the middleware."""
 
 
-@typing.final
 class Kept:
-    """The last messages of one publisher, serialized, and which writers have them.
+    """The last messages of one publisher, serialized.
 
     Args:
         depth: how many, > 0.
@@ -40,10 +37,8 @@ class Kept:
     """
 
     def __init__(self, depth: int, lifespan_ns: int | None = None) -> None:
-        self._samples: collections.deque[tuple[int, int, bytes]] = collections.deque(maxlen=depth)
+        self._samples: collections.deque[tuple[int, bytes]] = collections.deque(maxlen=depth)
         self._lifespan_ns = lifespan_ns
-        self._count = 0
-        self._had: weakref.WeakKeyDictionary[Publisher, int] = weakref.WeakKeyDictionary()
 
     @classmethod
     def of(cls, qos: QosProfile | None) -> Kept | None:
@@ -58,33 +53,24 @@ class Kept:
         depth = qos.depth if qos.history is History.KEEP_LAST else 0
         return cls(depth or _SYSTEM_DEFAULT_DEPTH, qos.lifespan_ns)
 
-    def publish(self, msg: Any, publishers: Iterable[Publisher]) -> None:
-        """Publish a message, or serialized bytes, on all of `publishers`, and keep it.
+    def publish(self, msg: Any, publisher: Publisher) -> None:
+        """Publish a message, or serialized bytes, and keep it as it is now.
 
         Raises:
             TypeError: it is of another type, as rclpy says it.
         """
-        data: Any = msg
-        for each in publishers:
-            if data is msg and isinstance(msg, each.msg_type):
-                # Once for all, and as it is now: its author may change the message later.
-                data = serialize_message(msg)
-            each.publish(data)
-            self._had[each] = self._count + 1
-        self._count += 1
-        self._samples.append((self._count, time.monotonic_ns(), data))
+        data = serialize_message(msg) if isinstance(msg, publisher.msg_type) else msg
+        publisher.publish(data)
+        self._samples.append((time.monotonic_ns(), data))
 
-    def catch_up(self, publishers: Iterable[Publisher]) -> None:
-        """Publish on each of `publishers` what it has not published yet."""
+    def send_again(self, publisher: Publisher) -> None:
+        """Publish what is kept by another publisher."""
         oldest_ns = 0
         if self._lifespan_ns:
             oldest_ns = time.monotonic_ns() - self._lifespan_ns
-        for each in publishers:
-            had = self._had.get(each, 0)
-            for number, said_ns, data in tuple(self._samples):
-                if number > had and said_ns >= oldest_ns:
-                    each.publish(data)
-            self._had[each] = self._count
+        for said_ns, data in self._samples:
+            if said_ns >= oldest_ns:
+                publisher.publish(data)
 
     def forget(self) -> None:
         """Nothing was said."""
@@ -123,7 +109,7 @@ class DeclaredPublisher:
         self._warned = False
         self._is_open = False
         self._entity: Publisher | None = None
-        self._further: tuple[Publisher, ...] = ()
+        self._owes = False  # it has not sent what is kept
         self.publish = self._drop
 
     @property
@@ -157,8 +143,7 @@ class DeclaredPublisher:
     def assert_liveliness(self) -> None:
         """Say that the author is alive, where its QoS has MANUAL_BY_TOPIC; nothing else."""
         if self._entity is not None:
-            for each in (self._entity, *self._further):
-                each.assert_liveliness()
+            self._entity.assert_liveliness()
 
     def wait_for_all_acked(self, timeout: Duration | None = None) -> bool:
         """Return whether all that was published is acknowledged, at the latest after `timeout`.
@@ -168,20 +153,12 @@ class DeclaredPublisher:
         if self._entity is None:
             return True
         limit = Duration(seconds=-1) if timeout is None else timeout
-        return all(each.wait_for_all_acked(limit) for each in (self._entity, *self._further))
+        return bool(self._entity.wait_for_all_acked(limit))
 
-    def prepare(self, entities: Sequence[Publisher]) -> None:
-        """Give entities that this will publish by what was sent, before any peer is matched.
-
-        Not while the gate is closed: what is inactive stays silent until it is opened.
-        """
-        if self._kept is not None and self._is_open:
-            self._kept.catch_up(entities)
-
-    def attach(self, entity: Publisher, further: Sequence[Publisher] = ()) -> None:
-        """Publish by `entity`, and by those of its aliases, from now on."""
+    def attach(self, entity: Publisher) -> None:
+        """Publish by `entity` from now on; it is another one than before."""
         self._entity = entity
-        self._further = tuple(further)
+        self._owes = True
         self._warned = False
         if self._is_open:
             self.open()
@@ -189,7 +166,6 @@ class DeclaredPublisher:
     def detach(self) -> None:
         """The rclpy publisher is being destroyed."""
         self._entity = None
-        self._further = ()
         self.publish = self._drop
 
     def forget(self) -> None:
@@ -203,11 +179,13 @@ class DeclaredPublisher:
         self._warned = False
         if self._entity is None:
             return
-        if self._kept is not None:
-            self._kept.catch_up((self._entity, *self._further))
-            self.publish = self._publish_and_keep
-        else:
-            self.publish = self._publish_all if self._further else self._entity.publish
+        if self._kept is None:
+            self.publish = self._entity.publish
+            return
+        if self._owes:
+            self._owes = False
+            self._kept.send_again(self._entity)
+        self.publish = self._publish_and_keep
 
     def close(self) -> None:
         """Drop what is published; say so once until the gate has been open again."""
@@ -215,16 +193,10 @@ class DeclaredPublisher:
         self._warned = False
         self.publish = self._drop
 
-    def _publish_all(self, msg: Any) -> None:
-        assert self._entity is not None
-        self._entity.publish(msg)
-        for each in self._further:
-            each.publish(msg)
-
     def _publish_and_keep(self, msg: Any) -> None:
         assert self._entity is not None
         assert self._kept is not None
-        self._kept.publish(msg, (self._entity, *self._further))
+        self._kept.publish(msg, self._entity)
 
     def _drop(self, msg: Any) -> None:  # noqa: ARG002 - the signature of Publisher.publish
         if not self._warned:

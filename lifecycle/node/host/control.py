@@ -65,7 +65,7 @@ class Operation(enum.Enum):
     END = "end"
 
 
-INTERFACE_ON_DEMAND = ("alias", "connect_to", "disconnect", "remap")
+INTERFACE_ON_DEMAND = ("connect_to", "disconnect", "remap")
 """`map_to` is always there: with it a node is known to be one of ours."""
 
 PARAMETERS_ON_DEMAND = (

@@ -48,7 +48,7 @@ from lifecycle.middleware import (
     widen_discovery_buffers,
 )
 from lifecycle.node.author.spec import load_nodes
-from lifecycle.node.connections.data_layer import NodeInterface
+from lifecycle.node.connections.data_layer import NodeDataLayer
 from lifecycle.node.host.control import (
     SERVED_ON_DEMAND,
     Command,
@@ -275,15 +275,15 @@ class HostCommands:
         )
 
 
-async def _connect_to(interface: NodeInterface, command: Command) -> None:
+async def _connect_to(interface: NodeDataLayer, command: Command) -> None:
     interface.connect_to(command.connection, command.connections)
 
 
-async def _map_to(interface: NodeInterface, command: Command) -> None:
+async def _map_to(interface: NodeDataLayer, command: Command) -> None:
     await interface.map_to(command.endpoint, command.connection)
 
 
-async def _disconnect_from(interface: NodeInterface, command: Command) -> None:
+async def _disconnect_from(interface: NodeDataLayer, command: Command) -> None:
     interface.disconnect(command.connection)
 
 

@@ -63,19 +63,6 @@ class NodeGate:
         if id(subscription) not in self._entities:
             self.add(subscription, GatedSubscription(subscription, later))
 
-    def hand_to(self, subscription: Subscription, callback: Callable[..., Any]) -> None:
-        """Let another callback have a gated subscription's messages from now on."""
-        gated = self._entities.get(id(subscription))
-        if isinstance(gated, GatedSubscription):
-            gated.hand_to(callback)
-
-    def callback_of(self, subscription: Subscription) -> Callable[..., Any] | None:
-        """Return what receives a gated subscription's messages while the gate is open."""
-        gated = self._entities.get(id(subscription))
-        if not isinstance(gated, GatedSubscription):
-            return None
-        return gated.callback
-
     def release(self, entity: object) -> None:
         """Ungate an entity: something else gates it."""
         gated = self._entities.pop(id(entity), None)
@@ -144,13 +131,8 @@ class GatedSubscription:
         )
         # The same number of arguments as the user's: rclpy decides by signature, once per message,
         # whether to pass the message info, and a swap in between must not change the answer.
-        self._takes = 1 if takes_one(self._callback) else 2
-        self._drop = self._take_message if self._takes == 1 else self._take_message_with_info
-
-    @property
-    def callback(self) -> Callable[..., Any]:
-        """Who has the messages while open."""
-        return self._callback
+        is_one = _takes_one(self._callback)
+        self._drop = self._take_message if is_one else self._take_message_with_info
 
     def open(self) -> None:
         """Give messages to the user's callback, those first that were kept."""
@@ -161,16 +143,6 @@ class GatedSubscription:
     def close(self) -> None:
         """Drop messages."""
         self._subscription.callback = self._drop
-
-    def hand_to(self, callback: Callable[..., Any]) -> None:
-        """Let `callback` have the messages from now on, those first that were kept."""
-        was_open = self._subscription.callback == self._callback
-        takes = 1 if takes_one(callback) else 2
-        if takes > self._takes:
-            self._kept.clear()  # without the info that it wants
-        self._callback, self._takes = callback, takes
-        self._drop = self._take_message if takes == 1 else self._take_message_with_info
-        self._subscription.callback = callback if was_open else self._drop
 
     def _take_message(self, message: object) -> None:
         if self._keeps:
@@ -183,7 +155,7 @@ class GatedSubscription:
     async def _deliver(self) -> None:
         # Closed again before this ran: then what was kept stays kept.
         while self._kept and self._subscription.callback == self._callback:
-            returned = self._callback(*self._kept.popleft()[: self._takes])
+            returned = self._callback(*self._kept.popleft())
             if inspect.isawaitable(returned):
                 await returned
 
@@ -224,7 +196,7 @@ class GatedTimer:
             self._reset()
 
 
-def takes_one(callback: Callable[..., Any]) -> bool:
+def _takes_one(callback: Callable[..., Any]) -> bool:
     """Return whether rclpy gives a subscription's callback the message alone."""
     try:
         inspect.signature(callback).bind(object())

@@ -14,6 +14,7 @@ from collections.abc import Callable, Coroutine, Iterable
 from typing import TYPE_CHECKING, Any
 
 from lifecycle_msgs import msg, srv
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
@@ -172,12 +173,15 @@ class Turns:
 
     Args:
         node: whose executor it is, once it has one.
-        group: reentrant, of the timers.
+
+    Attributes:
+        group: reentrant, of the timers, the node's services and its clients: others may ask, and
+            answers arrive, while a callback runs.
     """
 
-    def __init__(self, node: Node, group: CallbackGroup) -> None:
+    def __init__(self, node: Node) -> None:
         self._node = node
-        self._group = group
+        self.group = ReentrantCallbackGroup()
         self._clock = Clock(clock_type=ClockType.STEADY_TIME)
         self._closed = False
 
@@ -210,7 +214,7 @@ class Turns:
 
     def timer(self, period_s: float, callback: Callable[[], Any]) -> Timer:
         """Call back every `period_s` seconds, in every state, also while time is simulated."""
-        return Node.create_timer(self._node, period_s, callback, self._group, clock=self._clock)
+        return Node.create_timer(self._node, period_s, callback, self.group, clock=self._clock)
 
     def end(self, timer: Timer) -> None:
         """Have a timer call back no more."""

@@ -270,18 +270,18 @@ def test_of_a_node_that_leaves_the_services_of_the_node_interface_stay_its_own(
     """It is known as ours by two of them, which may leave first."""
     node, another = make_node("leaving"), make_node("another")
     known_by = node.create_service(Trigger, "~/get_configuration", lambda _, reply: reply)
-    for name in ("map_to", "alias"):
+    for name in ("map_to", "remap"):
         node.create_service(SetParameters, f"~/{name}", lambda _, reply: reply)
-    another.create_service(SetParameters, "~/alias", lambda _, reply: reply)
-    alias = (EndpointKind.SERVICE_SERVER, "/another", "/another/alias", SET_PARAMETERS)
-    wait_until(lambda: endpoints(observer) == [alias])
+    another.create_service(SetParameters, "~/remap", lambda _, reply: reply)
+    remap = (EndpointKind.SERVICE_SERVER, "/another", "/another/remap", SET_PARAMETERS)
+    wait_until(lambda: endpoints(observer) == [remap])
 
     node.destroy_service(known_by)
     node.create_publisher(String, "last", 10)
     last = (EndpointKind.PUBLISHER, "/leaving", "/last", "std_msgs/msg/String")
     wait_until(lambda: last in endpoints(observer))
     wait_until(lambda: "/leaving/get_configuration" not in observer.service_names())
-    assert sorted(endpoints(observer), key=lambda each: each[1]) == [alias, last]
+    assert sorted(endpoints(observer), key=lambda each: each[1]) == [remap, last]
 
 
 def test_the_parts_of_an_action_server_show_as_one_endpoint(

@@ -119,13 +119,6 @@ def test_a_renamed_subscription_hears_what_is_said_under_its_new_name(
     assert endpoint(clients, "in").resolved == "/in"
 
 
-def test_further_names_replace_those_there_were(clients: NodeClients, it: It) -> None:
-    run(clients.alias("/it", "out", ["/copy", "/more"], timeout_s=BOUND_S))
-    assert endpoint(clients, "out").aliases == ("/copy", "/more")
-    run(clients.alias("/it", "out", [], timeout_s=BOUND_S))
-    assert endpoint(clients, "out").aliases == ()
-
-
 NO_ENDPOINT = "cannot find endpoint 'vidoe' of /it; declared: 'publishers/out', 'subscriptions/in'"
 NO_CONNECTION = (
     "cannot find connection 'nowhere' of /it; connected: none but its own participant, ''"
@@ -144,7 +137,6 @@ NO_URL = (
         ("map_to", "out", "nowhere", NO_CONNECTION),
         ("disconnect", "nowhere", None, NO_CONNECTION),
         ("remap", "vidoe", "/x", NO_ENDPOINT),
-        ("alias", "vidoe", ["/x"], NO_ENDPOINT),
     ],
 )
 def test_what_the_node_refuses_is_raised_with_its_reason(

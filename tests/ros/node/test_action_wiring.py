@@ -20,7 +20,6 @@ from std_msgs.msg import String
 from test_msgs.action import Fibonacci
 
 from lifecycle import LifecycleNode, on_message
-from lifecycle.errors import LifecycleError
 from lifecycle.middleware.services.actions import ActionClientGoneError
 from lifecycle.node.author.node import DeadlockError
 
@@ -293,18 +292,10 @@ def test_a_client_that_is_handed_over_keeps_its_old_place_for_answers(
     driver.spin_until(lambda: (SUCCEEDED, [8, 8]) in node.got)
 
 
-def test_an_action_is_renamed_while_it_is_active_and_has_no_alias(
-    driver: Driver, active: Active, ask: Ask
-) -> None:
+def test_an_action_is_renamed_while_it_is_active(driver: Driver, active: Active, ask: Ask) -> None:
     node = active(Counting, server(), publisher("stop"))
     node.remap("action_servers/count", "/tally")
     asking = ask("/tally", node)
     goal = asking.goal()
     step(driver, node)
     assert asking.result(goal) == (SUCCEEDED, [0])
-    with pytest.raises(LifecycleError) as error:
-        node.alias("action_servers/count", "/third")
-    assert str(error.value) == (
-        "cannot give action server 'count' of /it an alias: it can have one name only; allowed: "
-        "publishers, subscriptions, service servers"
-    )

@@ -1,13 +1,15 @@
-"""What a TRANSIENT_LOCAL publisher keeps to take along, and what not."""
+"""What a TRANSIENT_LOCAL publisher keeps to send again, and what not."""
 
 from __future__ import annotations
 
 import time
+from typing import Any
 
 import pytest
 from rclpy.serialization import deserialize_message
 from std_msgs.msg import Header, String
 
+from lifecycle import dataclasses
 from lifecycle.manifest.qos import Durability, History, QosProfile
 from lifecycle.node.endpoints.publisher import Kept
 
@@ -35,55 +37,49 @@ def kept(qos: QosProfile = LATCHED) -> Kept:
     return found
 
 
-def test_the_last_messages_are_given_once_to_each_publisher_that_has_not_had_them() -> None:
-    keeps, old, new = kept(), FakePublisher(), FakePublisher()
-    for each in ("one", "two", "three"):
-        keeps.publish(String(data=each), (old,))
-    keeps.catch_up((new,))
-    keeps.publish(String(data="four"), (old,))
-    keeps.catch_up((old, new))
-    keeps.catch_up((old, new))
-    assert old.sent == ["one", "two", "three", "four"]
-    assert new.sent == ["two", "three", "four"]
+def sent_again(keeps: Kept) -> list[str]:
+    new: Any = FakePublisher()
+    keeps.send_again(new)
+    sent: list[str] = new.sent
+    return sent
+
+
+def say(keeps: Kept, *messages: object) -> None:
+    publisher: Any = FakePublisher()
+    for each in messages:
+        keeps.publish(each, publisher)
+
+
+def test_the_last_messages_are_sent_again_until_they_are_forgotten() -> None:
+    keeps = kept()
+    say(keeps, *(String(data=each) for each in ("one", "two", "three")))
+    assert sent_again(keeps) == ["two", "three"]
+    keeps.forget()
+    assert sent_again(keeps) == []
 
 
 def test_a_message_is_kept_as_it_was_when_it_was_sent() -> None:
-    keeps, message, new = kept(), String(data="then"), FakePublisher()
-    keeps.publish(message, (FakePublisher(),))
+    keeps, message = kept(), String(data="then")
+    say(keeps, message)
     message.data = "now"
-    keeps.catch_up((new,))
-    assert new.sent == ["then"]
+    assert sent_again(keeps) == ["then"]
 
 
-def test_what_was_forgotten_is_not_given() -> None:
-    keeps, new = kept(), FakePublisher()
-    keeps.publish(String(data="old"), (FakePublisher(),))
-    keeps.forget()
-    keeps.catch_up((new,))
-    assert new.sent == []
-
-
-def test_what_has_outlived_its_lifespan_is_not_given(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_has_outlived_its_lifespan_is_not_sent_again(monkeypatch: pytest.MonkeyPatch) -> None:
     now_ns = [1_000]
     monkeypatch.setattr(time, "monotonic_ns", lambda: now_ns[0])
-    qos = QosProfile(
-        durability=Durability.TRANSIENT_LOCAL, history=History.KEEP_LAST, depth=2, lifespan_ns=50
-    )
-    keeps, new = kept(qos), FakePublisher()
-    keeps.publish(String(data="dead"), (FakePublisher(),))
-    now_ns[0] += 30
-    keeps.publish(String(data="alive"), (FakePublisher(),))
-    now_ns[0] += 30
-    keeps.catch_up((new,))
-    assert new.sent == ["alive"]
+    keeps = kept(dataclasses.replace(LATCHED, lifespan_ns=50))
+    for each in ("dead", "alive"):
+        say(keeps, String(data=each))
+        now_ns[0] += 30
+    assert sent_again(keeps) == ["alive"]
 
 
 def test_a_message_of_another_type_is_refused_and_not_kept() -> None:
-    keeps, new = kept(), FakePublisher()
+    keeps = kept()
     with pytest.raises(TypeError, match="Expected"):
-        keeps.publish(Header(), (FakePublisher(),))
-    keeps.catch_up((new,))
-    assert new.sent == []
+        say(keeps, Header())
+    assert sent_again(keeps) == []
 
 
 @pytest.mark.parametrize(

@@ -222,7 +222,6 @@ def test_names_types_and_qos_of_the_interface_are_rcls(pair: Pair) -> None:
         ("~/map_to", set_parameters),
         ("~/disconnect", set_parameters),
         ("~/remap", set_parameters),
-        ("~/alias", set_parameters),
         ("/lifecycle/graph", ("std_msgs/msg/String",)),
     }
     assert offered["theirs"] - offered["ours"] == set()

@@ -69,11 +69,10 @@ def test_a_plain_client_connects_maps_renames_and_disconnects(
     both = (("publishers/out", text("net")), ("in", text("net")))
     assert ask(driver, "map_to", *both) == done * 2
     assert ask(driver, "remap", ("in", text("/there"))) == done
-    assert ask(driver, "alias", ("out", texts("/copy", "/more"))) == done
     configuration = codec.from_json(driver.configuration("/it"), NodeConfiguration)
     in_, out = configuration.endpoints
     assert (in_.connection, in_.resolved) == ("net", "/there")
-    assert (out.connection, out.aliases) == ("net", ("/copy", "/more"))
+    assert out.connection == "net"
     assert [(each.name, each.urls, each.mappings) for each in configuration.connections] == [
         ("", (), ()),
         ("net", (UDP,), ("subscriptions/in", "publishers/out")),
