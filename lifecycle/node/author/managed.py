@@ -384,7 +384,7 @@ class Managed:
             health=self._health.report,
         )
 
-    # What the controller asks for (controller.Node).
+    # What the controller asks for.
 
     def prepare(self) -> None:
         """Declare parameters and endpoints, and make the timers of `@on_timer` methods."""

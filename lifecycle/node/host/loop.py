@@ -26,7 +26,7 @@ import time
 import traceback
 import weakref
 from collections.abc import Callable, Coroutine, Iterator, Mapping
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
@@ -57,35 +57,7 @@ from lifecycle.node.author.node import LifecycleNode
 from lifecycle.node.lifecycle.execution import hint
 
 if TYPE_CHECKING:
-    from lifecycle.node.author.managed import HostedState
-    from lifecycle.node.configuration import ConfigurationChanges
-    from lifecycle.plan import PlannedNode
-
-
-class Hosted(Protocol):
-    """What a loop knows of a node beside its callbacks; `node.lifecycle` of ours."""
-
-    @property
-    def full_name(self) -> str:
-        """Fully qualified node name."""
-
-    @property
-    def spec(self) -> PlannedNode:
-        """What it was planned to be."""
-
-    @property
-    def reported(self) -> HostedState:
-        """Its state now."""
-
-    @property
-    def configuration_changes(self) -> ConfigurationChanges:
-        """Notifies of each change of its configuration."""
-
-    def add_listener(self, listener: Callable[[Any], None]) -> None:
-        """Call `listener(self)` after every change of state."""
-
-    async def shut_down(self, reason: str) -> object:
-        """Bring it to finalized, if it has states."""
+    from lifecycle.node.host.foreign import Hosted
 
 
 class Watchdog:

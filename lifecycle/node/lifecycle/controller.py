@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 import traceback
 from collections.abc import Callable, Coroutine, Generator
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest import Timeouts
@@ -23,53 +23,26 @@ from lifecycle.node.lifecycle.machine import (
     TransitionRequest,
 )
 
-
-class ControlledNode(Protocol):
-    """What the controller needs of a node; `LifecycleNode` provides it."""
-
-    @property
-    def full_name(self) -> str:
-        """Fully qualified name, for messages."""
-
-    def prepare(self) -> None:
-        """Declare parameters and endpoints; raises LifecycleError."""
-
-    def unprepare(self) -> None:
-        """Undo `prepare`."""
-
-    def make_data_layer(self) -> None:
-        """Make every endpoint or none; raises LifecycleError."""
-
-    def remove_data_layer(self) -> None:
-        """Remove every endpoint."""
-
-    def callback(self, name: str) -> Callable[..., Any]:
-        """Return the user's `on_…` method."""
-
-    def callback_argument(self, state: NodeState) -> object:
-        """Return the `state` that callbacks are given."""
-
-    def wake_at_deadline(self, deadline_s: float) -> Callable[[], None]:
-        """Wake the executor in `deadline_s`; returns what calls that off."""
-
-    def wake(self) -> None:
-        """Make the executor look at its waiting tasks again."""
-
-    def report(self, result: Result) -> None:
-        """Log why a step did not succeed."""
+if TYPE_CHECKING:
+    from lifecycle.node.author.managed import Managed
 
 
 class Controller:
     """One node's transitions, run one at a time.
 
+    Args:
+        node: does what is the framework's part of each, and has the author's callbacks.
+        timeouts: deadlines of the callbacks.
+        on_change: called after each change of state.
+
     Example:
-        >>> result = await controller.change(Request.CONFIGURE)
+        >>> result = await controller.change(TransitionRequest.CONFIGURE)
         >>> result.outcome
-        <Outcome.SUCCESS: 'transition_success'>
+        <CallbackOutcome.SUCCESS: 'transition_success'>
     """
 
     def __init__(
-        self, node: ControlledNode, timeouts: Timeouts, on_change: Callable[[StateChange], None]
+        self, node: Managed, timeouts: Timeouts, on_change: Callable[[StateChange], None]
     ) -> None:
         self.machine = LifecycleMachine(on_change)
         self._node = node
@@ -119,22 +92,13 @@ class Controller:
         A running async callback is cancelled first; each step keeps its own deadline.
         """
         if not self.machine.state.steady:
-            self.cancel(reason)
-            self._node.wake()
+            if self._running is not None:
+                self._running.cancel(reason)
+            self._node.wake()  # which resumes the callback for the last time
             await _Steady(self.machine)
         if self.machine.state is NodeState.FINALIZED:
             return SUCCESS
         return await self.change(TransitionRequest.SHUTDOWN)
-
-    def cancel(self, reason: str) -> bool:
-        """Make a running async callback fail; returns whether one was running.
-
-        The caller wakes the executor, which resumes the callback for the last time.
-        """
-        running = self._running
-        if running is not None:
-            running.cancel(reason)
-        return running is not None
 
     async def _step(self, argument: object) -> Result:
         """Run the step of the present state; a fault of ours is an ERROR too, not a stuck node."""

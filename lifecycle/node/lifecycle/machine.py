@@ -277,8 +277,8 @@ class LifecycleMachine:
 
     Example:
         >>> machine = LifecycleMachine()
-        >>> machine.request(Request.CONFIGURE)
-        >>> machine.finish(Outcome.SUCCESS)
+        >>> machine.request(TransitionRequest.CONFIGURE)
+        >>> machine.finish(CallbackOutcome.SUCCESS)
         >>> machine.state.value
         'inactive/disconnected'
     """
