@@ -7,7 +7,7 @@ an endpoint. Pure: knows no rclpy.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TypeVar
 
 from lifecycle import dataclasses
@@ -68,23 +68,16 @@ class Handlers:
         deciders: action → method that decides on its goals, where there is one.
     """
 
-    methods: tuple[tuple[EndpointKind, str, str], ...]
+    methods: Mapping[tuple[EndpointKind, str], str]
     timers: tuple[TimerHandler, ...]
-    deciders: tuple[tuple[str, str], ...] = ()
-
-    def method(self, endpoint: PlannedEndpoint) -> str:
-        """Return the name of the method that handles `endpoint`, which must be a matched one."""
-        for kind, name, method in self.methods:
-            if kind is endpoint.kind and name == endpoint.name:
-                return method
-        raise KeyError(endpoint.name)
+    deciders: Mapping[str, str]
 
     def bound(self, node: object, endpoint: PlannedEndpoint) -> Callable[..., Any]:
         """Return what handles `endpoint`, a matched one, as methods of `node`."""
-        method: Callable[..., Any] = getattr(node, self.method(endpoint))
+        method: Callable[..., Any] = getattr(node, self.methods[endpoint.kind, endpoint.name])
         if endpoint.kind is not EndpointKind.ACTION_SERVER:
             return method
-        decider = dict(self.deciders).get(endpoint.name)
+        decider = self.deciders.get(endpoint.name)
         return ActionHandler(execute=method, accept=getattr(node, decider) if decider else None)
 
 
@@ -205,27 +198,11 @@ def _marks(node_class: type) -> list[tuple[str, _Mark]]:
     """Return (method name, mark) of a class; an override inherits what it overrides."""
     found: dict[str, tuple[_Mark, ...]] = {}
     for base in node_class.__mro__:
-        for name, marks in _own_marks(base):
-            found.setdefault(name, marks)
+        for name, value in vars(base).items():
+            marks = getattr(value, _ATTRIBUTE, None) if callable(value) else None
+            if marks:
+                found.setdefault(name, marks)
     return [(name, mark) for name, marks in found.items() for mark in marks]
-
-
-_UNMARKED: set[type] = set()
-"""Classes of this package and of rclpy: what they have is looked through once, and forked."""
-
-
-def note_unmarked(node_class: type) -> None:
-    """Note that neither a class nor any of its bases has decorated methods."""
-    _UNMARKED.update(each for each in node_class.__mro__ if not tuple(_own_marks(each)))
-
-
-def _own_marks(node_class: type) -> Iterator[tuple[str, tuple[_Mark, ...]]]:
-    if node_class in _UNMARKED:
-        return
-    for name, value in vars(node_class).items():
-        marks = getattr(value, _ATTRIBUTE, None) if callable(value) else None
-        if marks:
-            yield name, marks
 
 
 def needs_handler(kind: EndpointKind) -> bool:
@@ -280,9 +257,9 @@ def match(node_class: type, endpoints: Iterable[PlannedEndpoint], *, node: str) 
     if problems:
         raise LifecycleError("\n".join(problems))
     return Handlers(
-        methods=tuple((kind, name, method) for (kind, name), method in methods.items()),
+        methods=methods,
         timers=tuple(timers),
-        deciders=tuple((name, method) for (_, name), method in deciders.items()),
+        deciders={name: method for (_, name), method in deciders.items()},
     )
 
 

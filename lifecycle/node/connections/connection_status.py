@@ -8,8 +8,10 @@ which it happened. See *Topological Discovery and Communication Negotiation*, "N
 
 from __future__ import annotations
 
+import collections
 import enum
 import functools
+import inspect
 from collections.abc import Callable
 from collections.abc import Mapping as AbstractMapping
 from typing import TYPE_CHECKING, Any
@@ -66,6 +68,7 @@ class ConnectionEvents:
     def __init__(self, later: Later) -> None:
         self._later = later
         self._listeners: dict[object, Listener] = {}
+        self._waiting: collections.deque[ConnectionEvent] = collections.deque()
 
     def listen(self, listener: Listener) -> Callable[[], None]:
         """Call `listener`, sync or async, with each event from now on; returns what ends that."""
@@ -79,8 +82,18 @@ class ConnectionEvents:
 
     def notify(self, event: ConnectionEvent) -> None:
         """Have the listeners called soon."""
-        for listener in tuple(self._listeners.values()):
-            self._later(functools.partial(listener, event))
+        if self._listeners:
+            self._waiting.append(event)  # rclpy's executor runs the newest task first
+            self._later(self._deliver)
+
+    def _deliver(self) -> None:
+        while self._waiting:
+            event = self._waiting.popleft()
+            for listener in tuple(self._listeners.values()):
+                if inspect.iscoroutinefunction(listener):
+                    self._later(functools.partial(listener, event))
+                else:
+                    listener(event)
 
 
 class ConnectionStatus:

@@ -12,7 +12,6 @@ import contextlib
 import inspect
 import time
 import traceback
-import types
 from collections.abc import Callable, Coroutine, Generator
 from typing import Any
 
@@ -176,12 +175,6 @@ def judge(returned: object, *, what: str) -> Result:
 
 def positional_count(callback: Callable[..., Any], available: int) -> int:
     """Return how many of `available` positional arguments a callback takes."""
-    function = callback.__func__ if isinstance(callback, types.MethodType) else callback
-    if type(function) is types.FunctionType and not vars(function):
-        # What a signature says, without making one: nothing is wrapped.
-        taken = function.__code__.co_argcount - (function is not callback)
-        is_any = function.__code__.co_flags & inspect.CO_VARARGS
-        return available if is_any else min(available, taken)
     kinds = [parameter.kind for parameter in inspect.signature(callback).parameters.values()]
     if inspect.Parameter.VAR_POSITIONAL in kinds:
         return available

@@ -8,7 +8,6 @@ from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.node.author.handlers import (
     match,
-    note_unmarked,
     on_action,
     on_message,
     on_service,
@@ -38,7 +37,8 @@ class Base:
 
 def test_each_endpoint_finds_its_method() -> None:
     handlers = match(Base, [SCAN, RESET, DOCK, VIDEO], node="/base")
-    assert [handlers.method(each) for each in (SCAN, RESET, DOCK)] == ["see", "reset", "dock"]
+    assert [handlers.bound(Base, each) for each in (SCAN, RESET)] == [Base.see, Base.reset]
+    assert handlers.bound(Base, DOCK).execute is Base.dock
     assert [(timer.method, timer.period_s) for timer in handlers.timers] == [("tick", 0.5)]
 
 
@@ -46,25 +46,8 @@ def test_an_override_without_the_decorator_still_handles() -> None:
     class Special(Base):
         def see(self, message: object) -> None: ...
 
-    assert match(Special, [SCAN, RESET, DOCK], node="/base").method(SCAN) == "see"
-
-
-def test_a_class_that_derives_from_one_without_methods_has_its_own() -> None:
-    class Plain:
-        def heard(self, message: object) -> None:
-            """Of no endpoint."""
-
-    note_unmarked(Plain)
-
-    class Handling(Plain):
-        @on_message("in")
-        def heard(self, message: object) -> None:
-            """Of one."""
-
-    note_unmarked(Handling)  # which it is not
-    endpoint = planned_endpoint(EndpointKind.SUBSCRIPTION, "in")
-    handlers = match(Handling, [endpoint], node="/node")
-    assert [method for _, _, method in handlers.methods] == ["heard"]
+    handlers = match(Special, [SCAN, RESET, DOCK], node="/base")
+    assert handlers.bound(Special, SCAN) is Special.see
 
 
 def test_one_method_may_handle_two_subscriptions() -> None:
@@ -76,7 +59,7 @@ def test_one_method_may_handle_two_subscriptions() -> None:
     front = planned_endpoint(EndpointKind.SUBSCRIPTION, "front")
     rear = planned_endpoint(EndpointKind.SUBSCRIPTION, "rear")
     handlers = match(Both, [front, rear], node="/both")
-    assert [handlers.method(front), handlers.method(rear)] == ["see", "see"]
+    assert [handlers.bound(Both, each) for each in (front, rear)] == [Both.see, Both.see]
 
 
 def test_a_misspelt_handler_is_told_from_both_sides_with_the_nearest_spelling() -> None:
