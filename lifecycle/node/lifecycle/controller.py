@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 import traceback
 from collections.abc import Callable, Coroutine, Generator
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest import Timeouts
@@ -23,8 +23,40 @@ from lifecycle.node.lifecycle.machine import (
     TransitionRequest,
 )
 
-if TYPE_CHECKING:
-    from lifecycle.node.author.managed import Managed
+
+class ControlledNode(Protocol):
+    """What the controller needs of a node: managed.Managed has it, and what tests drive."""
+
+    @property
+    def full_name(self) -> str:
+        """Fully qualified name, for messages."""
+
+    def prepare(self) -> None:
+        """Declare parameters and endpoints; raises LifecycleError."""
+
+    def unprepare(self) -> None:
+        """Undo `prepare`."""
+
+    def make_data_layer(self) -> None:
+        """Make every endpoint or none; raises LifecycleError."""
+
+    def remove_data_layer(self) -> None:
+        """Remove every endpoint."""
+
+    def callback(self, name: str) -> Callable[..., Any]:
+        """Return the user's `on_…` method."""
+
+    def callback_argument(self, state: NodeState) -> object:
+        """Return the `state` that callbacks are given."""
+
+    def wake_at_deadline(self, deadline_s: float) -> Callable[[], None]:
+        """Wake the executor in `deadline_s`; returns what calls that off."""
+
+    def wake(self) -> None:
+        """Make the executor look at its waiting tasks again."""
+
+    def report(self, result: Result) -> None:
+        """Log why a step did not succeed."""
 
 
 class Controller:
@@ -42,7 +74,7 @@ class Controller:
     """
 
     def __init__(
-        self, node: Managed, timeouts: Timeouts, on_change: Callable[[StateChange], None]
+        self, node: ControlledNode, timeouts: Timeouts, on_change: Callable[[StateChange], None]
     ) -> None:
         self.machine = LifecycleMachine(on_change)
         self._node = node
