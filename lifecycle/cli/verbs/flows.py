@@ -270,19 +270,16 @@ def apply(
     from lifecycle.programming import PartlyError
 
     programmer = _open(plan, options, treatment)
-    try:
-        if dry_run:
-            click.echo(programmer.dry_run(flows), nl=False)
-        else:
-            try:
-                _show_changes(programmer.update(flows), done=True)
-            except PartlyError as error:
-                if error.done:
-                    error.hint = f"take back what was done: lifecycle flows remove {_spell(plan)}"
-                raise
-        _show_left_out(programmer)
-    finally:
-        programmer.release()
+    if dry_run:
+        click.echo(programmer.dry_run(flows), nl=False)
+    else:
+        try:
+            _show_changes(programmer.update(flows), done=True)
+        except PartlyError as error:
+            if error.done:
+                error.hint = f"take back what was done: lifecycle flows remove {_spell(plan)}"
+            raise
+    _show_left_out(programmer)
     return ExitCode.OK
 
 
@@ -299,12 +296,9 @@ def diff(
         VIOLATED if a network is not as the verified flows want it.
     """
     programmer = _open(plan, options, treatment)
-    try:
-        changes = programmer.diff(flows)
-        _show_changes(changes, done=False)
-        _show_left_out(programmer)
-    finally:
-        programmer.release()
+    changes = programmer.diff(flows)
+    _show_changes(changes, done=False)
+    _show_left_out(programmer)
     return ExitCode.VIOLATED if any(each.pending for each in changes) else ExitCode.OK
 
 

@@ -8,16 +8,16 @@ of what is asked for.
 
 from __future__ import annotations
 
-import contextlib
+import asyncio
 import email.utils
 import json
-import socket
+import os
 import ssl
 import threading
 import time
 import zlib
 from collections.abc import Collection, Mapping
-from typing import Any, NoReturn, Protocol
+from typing import Any, NoReturn
 from urllib.parse import quote, unquote, urlsplit
 
 from lifecycle import dataclasses
@@ -46,30 +46,12 @@ was lost."""
 _LONGEST_ID = 512
 """Characters of the id of a subscription or a session; CAMARA's are UUIDs."""
 
-_SPARE_S = 1.0
-
 _GZIP_OR_ZLIB = 32 + zlib.MAX_WBITS
 """zlib finds out by itself which of the two headers there is."""
 
 
-class Clock(Protocol):
-    """Time, so that tests need not wait."""
-
-    def now_s(self) -> float:
-        """Return seconds since the epoch."""
-        ...
-
-    def steady_s(self) -> float:
-        """Return seconds, on a clock that only goes forward."""
-        ...
-
-    def sleep(self, seconds: float, woken: threading.Event) -> None:
-        """Wait, or until `woken` is set."""
-        ...
-
-
-class SystemClock:
-    """The machine's clock."""
+class Clock:
+    """The machine's clock; tests have one that need not wait."""
 
     def now_s(self) -> float:
         """Return seconds since the epoch."""
@@ -198,20 +180,29 @@ class Fields:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Reply:
-    """An answer of status 2xx, or 404 and 410 where those are asked for.
+    """An answer.
 
     Attributes:
         asked: the request, "GET http://nef.example.net/…".
+        reason: beside the status.
         body: decoded JSON object or array; None if there was none.
         flaw: why there is no body that can be used; empty if there is one, or was none.
         location: of what was created; empty if there was none.
+        retry_after: as it was sent; empty if it was not.
     """
 
     asked: str
     status: int
+    reason: str
     body: object
     flaw: str
     location: str
+    retry_after: str
+
+    @property
+    def is_success(self) -> bool:
+        """Whether it was done."""
+        return 200 <= self.status < 300
 
     @property
     def gone(self) -> bool:
@@ -311,131 +302,6 @@ def _is_identifier(text: str) -> bool:
     return 0 < len(text) <= _LONGEST_ID and text.isprintable() and text not in (".", "..")
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class _Sent:
-    """A request.
-
-    Attributes:
-        body: None for none.
-        type: media type of the body.
-    """
-
-    method: str
-    url: str
-    body: bytes | None
-    type: str
-
-    @property
-    def what(self) -> str:
-        """For messages."""
-        return f"{self.method} {self.url}"
-
-
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class _Answer:
-    """An answer as bytes.
-
-    Attributes:
-        headers: by lower-case name; bytes that are no ASCII are taken for Latin-1 (RFC 9110 §5.5).
-        flaw: why `body` is not all of it; empty if it is.
-    """
-
-    status: int
-    reason: str
-    headers: Mapping[str, str]
-    body: bytes
-    flaw: str = ""
-
-    @property
-    def is_success(self) -> bool:
-        return 200 <= self.status < 300
-
-
-class _Connection:
-    """An HTTP client that another thread can cut off in the middle of a request.
-
-    httpx bounds each read and write, never all of them together: a server that sends a byte a
-    second would hold a request up for as long as it likes. So a request is made in a thread, and
-    the waiting thread shuts the socket down at the deadline.
-    """
-
-    def __init__(self, client: httpx.Client) -> None:
-        self._client = client
-        self._lock = threading.Lock()
-        self._socket: socket.socket | None = None
-        self._is_cut = False
-        self.sent = False
-
-    def close(self) -> None:
-        """Close it; only while no request is under way."""
-        self._client.close()
-        self._hold(None)
-
-    def cut(self) -> None:
-        """End a request that is under way; its thread then closes the connection."""
-        with self._lock:
-            self._is_cut = True
-            _shut(self._socket)
-
-    def send(self, sent: _Sent, headers: Mapping[str, str], limit_s: float) -> _Answer:
-        """Send one request and read the answer.
-
-        Raises:
-            httpx.HTTPError: there is none.
-        """
-        self.sent = False
-        try:
-            with self._client.stream(
-                sent.method,
-                sent.url,
-                headers=headers,
-                content=sent.body,
-                # A little more: the waiting thread keeps the deadline of the whole.
-                timeout=limit_s + _SPARE_S,
-                extensions={"trace": self._trace},
-            ) as response:
-                return _read(response)
-        finally:
-            if self._is_cut:
-                self.close()
-
-    def _trace(self, event: str, info: Mapping[str, Any]) -> None:
-        """Follow a request, as httpx documents its `trace` extension."""
-        if event.endswith("send_request_headers.started"):
-            self.sent = True
-        elif event.endswith("connect_tcp.complete"):
-            # A copy: TLS takes the descriptor of the socket that it is put on.
-            self._hold(info["return_value"].get_extra_info("socket").dup())
-        if event.endswith(("connect_tcp.complete", "start_tls.complete")):
-            self._check_reads(info["return_value"])
-
-    def _check_reads(self, stream: Any) -> None:
-        """Have no read begin once it is cut: Linux lets a socket that was shut down receive."""
-        read = stream.read
-
-        def checked(*arguments: Any, **named: Any) -> bytes:
-            if self._is_cut:
-                raise httpx.ReadTimeout("cut off")
-            received: bytes = read(*arguments, **named)
-            return received
-
-        stream.read = checked
-
-    def _hold(self, connected: socket.socket | None) -> None:
-        with self._lock:
-            if self._socket is not None:
-                self._socket.close()
-            self._socket = connected
-            if self._is_cut:
-                _shut(connected)
-
-
-def _shut(connected: socket.socket | None) -> None:
-    if connected is not None:
-        with contextlib.suppress(OSError):  # it is closed already
-            connected.shutdown(socket.SHUT_RDWR)
-
-
 class Api:
     """One server's interface.
 
@@ -470,24 +336,18 @@ class Api:
                 f"cannot reach {self.url}: httpx is not installed",
                 hint="install it: pip install 'ros-lifecycle-manifests[networks]'",
             )
-        self.clock = clock or SystemClock()
+        self.clock = clock or Clock()
         self._token = token
         self._timeout_s = timeout_s
         self._patience = patience or Patience()
         self._deadline = deadline or Deadline()
         self._certificates = _certificates(ca_file)
-        self._connection: _Connection | None = self._connect()
+        self._client()  # so that a proxy that cannot be used is an error at once
 
-    def close(self) -> None:
-        """Close the connections."""
-        if self._connection is not None:
-            self._connection.close()
-            self._connection = None
-
-    def _connect(self) -> _Connection:
+    def _client(self) -> httpx.AsyncClient:
         host = urlsplit(self.url).hostname or ""
         try:
-            client = httpx.Client(
+            return httpx.AsyncClient(
                 # A redirect could carry the token elsewhere, so none is followed.
                 follow_redirects=False,
                 verify=self._certificates,
@@ -502,7 +362,6 @@ class Api:
                 "http:// or https:// with a host",
                 hint="see HTTPS_PROXY, HTTP_PROXY, ALL_PROXY and NO_PROXY",
             ) from None
-        return _Connection(client)
 
     def pause(self, seconds: float) -> None:
         """Wait, unless the deadline comes first or is cancelled.
@@ -513,7 +372,7 @@ class Api:
         if seconds > self._deadline.left_s():
             raise HttpError(f"cannot wait for {self.url}: {self._why_late()}", uncertain=True)
         woken = threading.Event()
-        with self._deadline.waking(woken):
+        with self._deadline.waking(woken.set):
             self.clock.sleep(seconds, woken)
 
     def request(
@@ -541,28 +400,39 @@ class Api:
         Raises:
             HttpError: refused, or still not done after all patience.
         """
-        content = None if body is None else json.dumps(body).encode()
-        sent = _Sent(method=method, url=f"{self.url}{path}", body=content, type=content_type)
+        headers = {
+            "accept": "application/json, application/problem+json",
+            # A few bytes packed well may be as many gigabytes unpacked.
+            "accept-encoding": "identity",
+        }
+        if body is not None:
+            headers["content-type"] = content_type
+        request = httpx.Request(
+            method,
+            f"{self.url}{path}",
+            headers=headers,
+            content=None if body is None else json.dumps(body).encode(),
+        )
         with self._deadline.within(self._patience.total_s):
-            return self._patiently(sent, may_be_gone=may_be_gone)
+            return self._patiently(request, may_be_gone=may_be_gone)
 
-    def _patiently(self, sent: _Sent, *, may_be_gone: bool) -> Reply:
-        what, method = sent.what, sent.method
+    def _patiently(self, request: httpx.Request, *, may_be_gone: bool) -> Reply:
+        method = request.method
         waited_s = 0.0
         wait_s = self._patience.first_s
         for attempt in range(1, self._patience.attempts + 1):
             last = attempt == self._patience.attempts
             asked_s = None
-            found = self._attempt(sent)
+            found = self._attempt(request)
             if isinstance(found, HttpError):
                 failed = found
                 if last or (failed.uncertain and method not in _IDEMPOTENT):
                     raise failed
             else:
-                if found.is_success or (may_be_gone and found.status in (404, 410)):
-                    return _reply(what, found)
-                failed = self._refusal(what, found, method)
-                asked_s = _retry_after_s(found, self.clock.now_s())
+                if found.is_success or (may_be_gone and found.gone):
+                    return found
+                failed = self._refusal(found, method)
+                asked_s = _retry_after_s(found.retry_after, self.clock.now_s())
                 if last or not _again(found.status, method):
                     raise failed
                 if waited_s + (asked_s or 0.0) > self._patience.total_s:
@@ -577,85 +447,89 @@ class Api:
             wait_s *= 2
         raise AssertionError("the last attempt returns or raises")
 
-    def _attempt(self, sent: _Sent) -> _Answer | HttpError:
+    def _attempt(self, request: httpx.Request) -> Reply | HttpError:
         """Ask once; return the error if there was no answer, which may be worth another try.
 
         Raises:
             HttpError: there is no answer that another try could make better.
         """
-        what = sent.what
+        what = f"{request.method} {request.url}"
         limit_s = min(self._timeout_s, self._deadline.left_s())
         if limit_s <= 0:
             raise HttpError(f"cannot {what}: {self._why_late()}")
-        if self._connection is None:
-            self._connection = self._connect()
-        connection = self._connection
-        found = self._in_thread(connection, sent, limit_s)
-        if isinstance(found, _Answer):
-            return found
-        uncertain = connection.sent
-        if found is None:
-            reason = self._why_late() if self._deadline.is_cancelled else ""
-            reason = reason or f"no {'whole answer' if uncertain else 'connection'} in time"
-            return HttpError(f"cannot {what}: {reason} ({limit_s:.3g} s)", uncertain=uncertain)
-        if isinstance(found, httpx.TransportError):
-            reason = _transport_reason(found)
-            return HttpError(f"cannot {what}: {reason}", uncertain=uncertain)
-        # What a library makes of bytes that it did not expect; never its own message, which may
-        # quote the request.
-        raise HttpError(
-            f"cannot {what}: its answer is no HTTP that can be read ({type(found).__name__})",
-            uncertain=uncertain,
-            hint="check that the url is that of such a server",
-        )
+        sent = False
 
-    def _in_thread(
-        self, connection: _Connection, sent: _Sent, limit_s: float
-    ) -> _Answer | Exception | None:
-        """Return the answer, or what kept it from being read; None if it did not come in time."""
-        headers = self._headers(sent.type if sent.body is not None else "")
-        found: list[_Answer | Exception] = []
-        over = threading.Event()
+        async def trace(event: str, _: Mapping[str, Any]) -> None:
+            """Note that the server may have taken the request, by httpx's extension `trace`."""
+            nonlocal sent
+            sent = sent or event.endswith("send_request_headers.started")
 
-        def work() -> None:
-            try:
-                found.append(connection.send(sent, headers, limit_s))
-            except Exception as error:  # noqa: BLE001 - handled by the thread that waits
-                found.append(error)
-            finally:
-                over.set()
-
-        # Never joined: looking a name up cannot be ended from outside.
-        threading.Thread(target=work, name="lifecycle-http", daemon=True).start()
-        try:
-            with self._deadline.waking(over):
-                over.wait(limit_s)
-        finally:
-            if not found:
-                self._connection = None
-                connection.cut()
-        return found[0] if found else None
-
-    def _headers(self, content_type: str) -> dict[str, str]:
-        headers = {
-            "accept": "application/json, application/problem+json",
-            # A few bytes packed well may be as many gigabytes unpacked.
-            "accept-encoding": "identity",
-        }
-        if content_type:
-            headers["content-type"] = content_type
+        request.extensions = {"trace": trace}
+        # Revealed for this attempt only: a token that is changed meanwhile is taken up.
         if self._token is not None:
-            # Revealed for this request only; the client keeps no copy in its defaults.
-            headers["authorization"] = f"Bearer {self._token.reveal()}"
-        return headers
+            request.headers["authorization"] = f"Bearer {self._token.reveal()}"
+        # Not asyncio.run, which waits for names that are still looked up.
+        loop = asyncio.new_event_loop()
+        asking = loop.create_task(asyncio.wait_for(self._ask(request), limit_s))
+        try:
+            with self._deadline.waking(lambda: loop.call_soon_threadsafe(asking.cancel)):
+                return loop.run_until_complete(asking)
+        except (asyncio.TimeoutError, asyncio.CancelledError):
+            reason = self._why_late() if self._deadline.is_cancelled else ""
+            reason = reason or f"no {'whole answer' if sent else 'connection'} in time"
+            return HttpError(f"cannot {what}: {reason} ({limit_s:.3g} s)", uncertain=sent)
+        except httpx.TransportError as error:
+            return HttpError(f"cannot {what}: {_why(error)}", uncertain=sent)
+        except Exception as error:  # noqa: BLE001 - whatever a library raises
+            # What a library makes of bytes that it did not expect; never its own message, which
+            # may quote the request.
+            raise HttpError(
+                f"cannot {what}: its answer is no HTTP that can be read ({type(error).__name__})",
+                uncertain=sent,
+                hint="check that the url is that of such a server",
+            ) from None
+        finally:
+            if asking.cancel():  # whatever ended this, such as Ctrl-C, before it was done
+                loop.run_until_complete(asyncio.wait([asking]))
+            loop.close()
+
+    async def _ask(self, request: httpx.Request) -> Reply:
+        """Send a request and read its answer, of which no more than can be of use.
+
+        Raises:
+            httpx.HTTPError: there is none.
+        """
+        packed = bytearray()
+        async with self._client() as client:
+            answer = await client.send(request, stream=True)
+            try:
+                async for chunk in answer.aiter_raw():
+                    packed += chunk
+                    if len(packed) > _LARGEST_ANSWER:
+                        break
+            finally:
+                await answer.aclose()
+        flaw = _TOO_LARGE if len(packed) > _LARGEST_ANSWER else ""
+        body = bytes(packed)
+        if not flaw:
+            body, flaw = _unpacked(body, answer.headers.get("content-encoding", ""))
+        decoded, flaw = _decoded(body) if body and not flaw else (None, flaw)
+        return Reply(
+            asked=f"{request.method} {request.url}",
+            status=answer.status_code,
+            reason=answer.reason_phrase,
+            body=decoded,
+            flaw=flaw,
+            location=answer.headers.get("location", ""),
+            retry_after=answer.headers.get("retry-after", ""),
+        )
 
     def _why_late(self) -> str:
         return "it was ended before it was done" if self._deadline.is_cancelled else "no time left"
 
-    def _refusal(self, what: str, answer: _Answer, method: str) -> HttpError:
+    def _refusal(self, answer: Reply, method: str) -> HttpError:
         """Read problem+json (RFC 7807; `cause`: TS 29.122) or CAMARA's {status, code, message}."""
-        body = _reply(what, answer).body
-        found = body if isinstance(body, dict) else {}
+        found = answer.body if isinstance(answer.body, dict) else {}
         # Some servers quote the credentials that they refuse.
         secret = "" if self._token is None else self._token.reveal()
         cause = text_of(found.get("cause"), secret) or text_of(found.get("code"), secret)
@@ -673,37 +547,12 @@ class Api:
         if answer.status in (401, 403):
             hint = "check the token and what it is allowed to do"
         return HttpError(
-            f"cannot {what}: {': '.join(word for word in words if word)}",
+            f"cannot {answer.asked}: {': '.join(word for word in words if word)}",
             status=answer.status,
             cause=cause,
             uncertain=answer.status in _PASSING - {503} and method == "POST",
             hint=hint,
         )
-
-
-def _read(response: httpx.Response) -> _Answer:
-    """Return status, headers and unpacked body, of which no more is read than can be of use."""
-    whole = bytearray()
-    flaw = ""
-    for chunk in response.iter_raw():
-        whole += chunk
-        if len(whole) > _LARGEST_ANSWER:
-            flaw = _TOO_LARGE
-            break
-    headers = {
-        name.decode("latin-1").lower(): value.decode("latin-1")
-        for name, value in response.headers.raw
-    }
-    body = bytes(whole)
-    if not flaw:
-        body, flaw = _unpacked(body, headers.get("content-encoding", ""))
-    return _Answer(
-        status=response.status_code,
-        reason=response.reason_phrase,
-        headers=headers,
-        body=body,
-        flaw=flaw,
-    )
 
 
 _TOO_LARGE = f"is larger than {_LARGEST_ANSWER} bytes"
@@ -741,9 +590,9 @@ def as_segment(identifier: str) -> str:
     return quote(identifier, safe="")
 
 
-def _certificates(ca_file: str) -> ssl.SSLContext | bool:
+def _certificates(ca_file: str) -> ssl.SSLContext:
     if not ca_file:
-        return True
+        return httpx.create_ssl_context()
     try:
         return ssl.create_default_context(cafile=ca_file)
     except (OSError, ssl.SSLError) as error:
@@ -756,22 +605,14 @@ def _again(status: int, method: str) -> bool:
     return status in _PASSING and method in _IDEMPOTENT
 
 
-def _reply(what: str, answer: _Answer) -> Reply:
-    body, flaw = None, answer.flaw
-    if answer.body and not flaw:
-        try:
-            body = json.loads(answer.body, parse_constant=_no_number)
-        except RecursionError:
-            flaw = "is JSON that is nested too deeply"
-        except ValueError:  # no JSON, no UTF-8, or a number of thousands of digits
-            flaw = "is no JSON"
-    return Reply(
-        asked=what,
-        status=answer.status,
-        body=body,
-        flaw=flaw,
-        location=answer.headers.get("location", ""),
-    )
+def _decoded(body: bytes) -> tuple[object, str]:
+    """Return what JSON says, and what is wrong with it."""
+    try:
+        return json.loads(body, parse_constant=_no_number), ""
+    except RecursionError:
+        return None, "is JSON that is nested too deeply"
+    except ValueError:  # no JSON, no UTF-8, or a number of thousands of digits
+        return None, "is no JSON"
 
 
 def _no_number(text: str) -> NoReturn:
@@ -799,9 +640,9 @@ def text_of(value: object, secret: str = "") -> str:
     return plain[:_MAX_QUOTED].strip()
 
 
-def _retry_after_s(response: _Answer, now_s: float) -> float | None:
+def _retry_after_s(text: str, now_s: float) -> float | None:
     """Retry-After as seconds from now (RFC 9110 §10.2.3); None if there is none to be read."""
-    text = response.headers.get("retry-after", "").strip()
+    text = text.strip()
     if text.isascii() and text.isdigit():
         return float(text[:9])
     try:
@@ -811,9 +652,11 @@ def _retry_after_s(response: _Answer, now_s: float) -> float | None:
     return max(0.0, ends_s - now_s)
 
 
-def _transport_reason(error: httpx.TransportError) -> str:
-    if isinstance(error, httpx.ConnectTimeout):
-        return "no connection in time"
-    if isinstance(error, httpx.TimeoutException):
-        return "no whole answer in time"
+def _why(error: httpx.TransportError) -> str:
+    """Return the kernel's reason where there is one: "Connection refused"."""
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, OSError) and (cause.errno or 0) > 0:
+            return os.strerror(cause.errno or 0)
+        cause = cause.__cause__ or cause.__context__
     return text_of(str(error)) or type(error).__name__

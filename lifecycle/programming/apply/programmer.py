@@ -121,7 +121,7 @@ class Programmer:
         ledger: of the system, which the targets write to.
         source_address: observes where publishers send from; None believes the manifest only.
         treatment: what flows get beyond what the manifest says.
-        made_by: what to close in the end, and holds the deadline.
+        made_by: holds the deadline.
     """
 
     def __init__(
@@ -234,10 +234,8 @@ class Programmer:
         Raises:
             PartlyError: something could not be removed, or not in time; it stays listed.
         """
-        try:
-            return remove_all(self._ledger, self._made_by, within_s=within_s)
-        finally:
-            self.release()
+        self._applied, self._programmed = None, {}
+        return remove_all(self._ledger, self._made_by, within_s=within_s)
 
     def cancel(self) -> None:
         """From another thread: have what servers are asked fail at once, until `resume`."""
@@ -246,12 +244,6 @@ class Programmer:
     def resume(self) -> None:
         """Ask servers again after a `cancel`."""
         self._deadline.renew()
-
-    def release(self) -> None:
-        """Close connections and leave in the networks what was made."""
-        self._applied, self._programmed = None, {}
-        if self._made_by is not None:
-            self._made_by.close()
 
     def _take(self, flows: Iterable[FlowReport]) -> tuple[FlowRule, ...]:
         found = self.rules(flows)
@@ -291,14 +283,9 @@ def open_programmer(
     """
     ledger = ledger_of(plan, environment, machine=machine, owned=owned)
     targets = Targets(ledger)
-    try:
-        made = [each.open(targets) for each in options]
-    except LifecycleError:
-        targets.close()
-        raise
     return Programmer(
         plan,
-        made,
+        [each.open(targets) for each in options],
         ledger,
         source_address=RouteSources(plan, machine),
         treatment=treatment,
@@ -320,13 +307,9 @@ def remove_all(
         PartlyError: something could not be removed; it stays listed.
     """
     own = targets or Targets(ledger)
-    try:
-        with own.deadline.within(within_s), ledger.locked():
-            records = ledger.read().targets
-            return _each(records, lambda each: target_kind(each.target).restore(each, own).remove())
-    finally:
-        if targets is None:
-            own.close()
+    with own.deadline.within(within_s), ledger.locked():
+        records = ledger.read().targets
+        return _each(records, lambda each: target_kind(each.target).restore(each, own).remove())
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -400,10 +383,7 @@ class Removal:
         Raises:
             ProgrammingError: something could not be removed; it stays listed.
         """
-        try:
-            return remove_all(self._ledger, self._targets, within_s=within_s)
-        finally:
-            self._targets.close()
+        return remove_all(self._ledger, self._targets, within_s=within_s)
 
     def cancel(self) -> None:
         """Have what servers are asked fail at once."""

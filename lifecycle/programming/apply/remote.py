@@ -429,5 +429,4 @@ class ServerOptions(TargetOptions, Generic[_S]):
             clock=means.clock,
             deadline=means.deadline,
         )
-        means.keep(api)
         return RemoteTarget(cls.service(own, api), means.ledger, settings.path)

@@ -192,8 +192,8 @@ class Deadline:
         self._now_s = now_s
         self._until_s = math.inf
         self._cancelled = False
-        self._lock = threading.Lock()
-        self._waits: set[threading.Event] = set()
+        self._lock = threading.RLock()  # a signal may cancel whoever holds it
+        self._waits: set[Callable[[], object]] = set()
 
     @contextlib.contextmanager
     def within(self, seconds: float | None) -> Iterator[None]:
@@ -223,23 +223,22 @@ class Deadline:
         """Leave no time, and wake whatever waits; holds until `renew`."""
         with self._lock:
             self._cancelled = True
-            waits = tuple(self._waits)
-        for each in waits:
-            each.set()
+            for wake in tuple(self._waits):
+                wake()
 
     def renew(self) -> None:
         """Forget a `cancel`: what comes next is other work."""
         self._cancelled = False
 
     @contextlib.contextmanager
-    def waking(self, event: threading.Event) -> Iterator[None]:
-        """Have `cancel` set an event that is waited for inside."""
+    def waking(self, wake: Callable[[], object]) -> Iterator[None]:
+        """Have `cancel` call something that ends a wait inside."""
         with self._lock:
-            self._waits.add(event)
+            self._waits.add(wake)
             if self._cancelled:
-                event.set()
+                wake()
         try:
             yield
         finally:
             with self._lock:
-                self._waits.discard(event)
+                self._waits.discard(wake)

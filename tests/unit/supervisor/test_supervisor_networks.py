@@ -207,7 +207,6 @@ class Applied:
             plan(), [self.options], environment=self.environment, owned=owned
         )
         programmer.update([report()])
-        programmer.release()
         return self.root / run_name(plan())
 
 

@@ -16,7 +16,7 @@ from lifecycle import dataclasses
 from lifecycle.errors import UsageError
 
 if TYPE_CHECKING:
-    from lifecycle.programming.apply.http import Api, Clock, Patience
+    from lifecycle.programming.apply.http import Clock, Patience
     from lifecycle.programming.apply.ledger import Ledger, TargetRecord
     from lifecycle.programming.apply.settings import ServerSettings
     from lifecycle.programming.apply.target import Target
@@ -105,7 +105,7 @@ class TargetOptions(abc.ABC):
 
 
 class Targets:
-    """What targets are opened with; closes what they hold.
+    """What targets are opened with.
 
     Args:
         ledger: of the system.
@@ -132,17 +132,6 @@ class Targets:
         self.patience = patience
         self.clock = clock
         self.deadline = Deadline()
-        self._open: list[Api] = []
-
-    def keep(self, api: Api) -> None:
-        """Close a connection with everything else."""
-        self._open.append(api)
-
-    def close(self) -> None:
-        """Close every connection."""
-        for each in self._open:
-            each.close()
-        self._open.clear()
 
 
 def target_kind(name: str) -> type[TargetOptions]:

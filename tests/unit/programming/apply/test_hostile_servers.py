@@ -307,10 +307,7 @@ def target_at(
         server.url, timeout_s=_TIMEOUT_S
     )
     file = settings_file(path, **{kind: settings})
-    try:
-        yield target_kind(kind).read({"config": file}).open(targets), targets
-    finally:
-        targets.close()
+    yield target_kind(kind).read({"config": file}).open(targets), targets
 
 
 @pytest.mark.parametrize("name", HOSTILE)
@@ -439,7 +436,6 @@ def test_cancelling_a_bring_up_ends_a_request_at_once(tmp_path: Path) -> None:
         beginning.cancel()
         with contextlib.suppress(asyncio.CancelledError):
             await asyncio.wait_for(beginning, _BOUND_S)
-        programmer.release()
 
     with HostileServer(drips(b"HTTP/1.1 201 ")) as server:
         asyncio.run(run())
@@ -505,7 +501,6 @@ class TestProxies:
             file = settings_file(tmp_path, nef=nef_settings("https://nef.invalid", timeout_s=5))
             with pytest.raises(PartlyError):
                 target_kind("nef").read({"config": file}).open(targets).apply([rule()])
-            targets.close()
 
         assert proxy.asked[0].startswith("CONNECT nef.invalid:443 ")
         assert TOKEN not in "".join(proxy.asked)

@@ -296,7 +296,6 @@ def orphan(tmp_path: Path, server: NefServer, *, dead: bool) -> Path:
     owned = Ledger(directory, "robot", owned=dead)
     targets = Targets(owned)
     target_kind("nef").read({"config": file}).open(targets).apply([rule()])
-    targets.close()
     if dead:
         written = ledger.read()
         assert written.owner is not None

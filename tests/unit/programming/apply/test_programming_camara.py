@@ -48,7 +48,6 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
             return target_kind("camara").read({"config": file}).open(targets)
 
         yield Bench(make, server, ledger, clock)
-        targets.close()
 
 
 def only(changes: TargetChanges) -> FlowChange:

@@ -53,7 +53,6 @@ def _bench(tmp_path: Path, server: NefServer, **settings: object) -> Iterator[Be
         return target_kind("nef").read({"config": file}).open(targets)
 
     yield Bench(make(), server, ledger, clock, make)
-    targets.close()
 
 
 def kinds(changes: TargetChanges) -> list[str]:

@@ -196,7 +196,6 @@ def test_what_a_ledger_lists_is_not_looked_for_at_another_server(tmp_path: Path)
     Path(file).write_text(json.dumps({"nef": nef_settings("https://two.example")}))
     with pytest.raises(SettingsError) as caught:
         target_kind("nef").restore(record, targets)
-    targets.close()
 
     assert str(caught.value) == (
         f"cannot remove what is at {there}: settings {file!r} are "
