@@ -41,8 +41,6 @@ DRAIN_S = 2.0
 """In the end, a reader that takes nothing for so long is not waited for."""
 
 _LONGEST_DRAIN_S = 20.0
-_AGAIN_S = 1.0
-"""How often a full disk is tried with log lines; with everything else each time."""
 
 _CHUNK_BYTES = 2**16
 _BEHIND_BYTES = 2**16
@@ -201,7 +199,7 @@ class Writer:
     """Writes texts in a thread of its own: who prints never waits, and never fails.
 
     What is not read in time is lost as LINE_BYTES and EVENT_BYTES say, what a full disk does not
-    take is lost, and both are counted and said in the stream where they are missing.
+    take is lost, and both are counted and said in the stream once there is room again.
 
     Args:
         descriptor: where to.
@@ -209,6 +207,9 @@ class Writer:
         marker: makes the note in the stream from a message about the loss.
         say: takes messages that the stream itself cannot take, from any thread.
         encoding: of the texts.
+
+    Attributes:
+        on_room: called from the thread when everything was taken.
 
     Raises:
         MiddlewareError: there is no room for another thread.
@@ -232,18 +233,13 @@ class Writer:
         self._changed = threading.Condition()
         self._queue: collections.deque[tuple[bytes, _Lost]] = collections.deque()
         self._bytes = 0
-        self._dropped = _NOTHING  # behind the last of the queue
-        self._lost = _NOTHING  # before its first
-        self._telling = _NOTHING  # what a text that is being written says of them
-        self._why = ""
-        self._reported = False
-        self._full = False
-        self._torn = False
+        self._lost = _NOTHING
+        self._noting = _NOTHING  # what the note that is being written says
+        self._full = ""  # why the disk takes nothing
+        self._said_full = False
         self._gone = False
         self._closing = False
-        self._ended = False
         self._progress = 0
-        self._tried_s = 0.0
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         try:
             self._thread.start()
@@ -260,15 +256,16 @@ class Writer:
             kept: False for a log line.
         """
         data = text.encode(self._encoding, "backslashreplace")
+        weight = _Lost(events=1) if kept else _Lost(lines=1)
         with self._changed:
             if self._gone or self._closing:
                 return
-            if not kept and (self._dropped.lines or self._bytes + len(data) > LINE_BYTES):
-                self._dropped += _Lost(lines=1)
+            self._note_lost()
+            if not kept and (self._lost.lines or self._bytes + len(data) > LINE_BYTES):
+                self._lost += weight
                 return
-            self._append(data, _Lost(events=1) if kept else _Lost(lines=1))
+            self._append(data, weight)
             while self._bytes > EVENT_BYTES and len(self._queue) > 1:
-                self._why = self._unread
                 self._lost += self._take()[1]
             self._changed.notify_all()
 
@@ -299,23 +296,19 @@ class Writer:
         with self._changed:
             self._closing = True
             self._changed.notify_all()
-            while not self._ended and time.monotonic() < deadline:
-                seen = self._progress
-                if not self._changed.wait_for(
-                    lambda seen=seen: self._ended or self._progress != seen,  # type: ignore[misc]
-                    DRAIN_S,
-                ):
-                    break
+        seen = -1
+        while self._thread.is_alive() and seen != self._progress and time.monotonic() < deadline:
+            seen = self._progress
+            self._thread.join(DRAIN_S)
+        with self._changed:
             gone, self._gone = self._gone, True
-            why = self._why if self._full else self._unread
-            missing = self._telling + self._lost + self._dropped
-            lost = sum((each for _, each in self._queue), missing)
+            lost = sum((each for _, each in self._queue), self._noting + self._lost)
         if any(lost) and not gone:
-            self._say(f"{lost} missing at the end of {self._name}: {why}")
+            self._say(f"{lost} missing at the end of {self._name}: {self._why}")
 
     @property
-    def _unread(self) -> str:
-        return f"nobody read {self._name} in time"
+    def _why(self) -> str:
+        return self._full or f"nobody read {self._name} in time"
 
     def _append(self, data: bytes, weight: _Lost) -> None:
         self._queue.append((data, weight))
@@ -326,73 +319,56 @@ class Writer:
         self._bytes -= len(data)
         return data, weight
 
+    def _note_lost(self) -> None:
+        """Queue a note on what is lost, once there is room."""
+        if any(self._lost) and self._bytes <= LINE_BYTES // 2:
+            note = self._marker(f"{self._lost} missing here: {self._why}")
+            lost, self._lost = self._lost, _NOTHING
+            self._append(note.encode(self._encoding, "backslashreplace"), lost)
+
     def _run(self) -> None:
-        while self._wait():
-            self._step()
-        with self._changed:
-            self._ended = True
-            self._changed.notify_all()
-
-    def _wait(self) -> bool:
-        """Wait until there is something to write; False once there will be nothing more."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._gone or self._closing or self._queue)
-            return not self._gone and bool(self._queue)
-
-    def _step(self) -> None:
-        """Write the first text of the queue, and before it what is missing there."""
-        with self._changed:
-            text, weight = self._take()
-            if any(self._dropped) and self._bytes <= LINE_BYTES // 2:
-                dropped, self._dropped = self._dropped, _NOTHING
-                self._append(self._marked(dropped, self._unread), dropped)
-            now_s = time.monotonic()
-            if self._full and not weight.events and now_s - self._tried_s < _AGAIN_S:
-                self._lost += weight
-                return
-            self._tried_s = now_s
-            before, self._lost = self._lost, _NOTHING
-            self._telling = before
-            if any(before):
-                text = self._marked(before, self._why) + text
-            left = memoryview(b"\n" + text if self._torn else text)
-        try:
-            while left:
-                left = left[_write_some(self._descriptor, left[:_CHUNK_BYTES]) :]
-                with self._changed:
-                    self._torn = bool(left)
+        torn = b""
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._gone or self._closing or self._queue)
+                if self._gone or not self._queue:
+                    return
+                text, weight = self._take()
+                self._noting = weight if sum(weight) > 1 else _NOTHING
+                if not self._full:
+                    self._note_lost()
+            left = memoryview(torn + text)
+            try:
+                while left:
+                    left = left[_write_some(self._descriptor, left[:_CHUNK_BYTES]) :]
+                    torn = b"\n" if left else b""
                     self._progress += 1
-                    self._changed.notify_all()
-        except OSError as error:
-            self._telling = _NOTHING
-            self._failed(error, before + weight)
-            return
-        self._telling = _NOTHING
-        self._full = False
-        if not self._queue:
-            self.on_room()
+            except OSError as error:
+                self._failed(error, weight)
+            else:
+                self._full = ""
+            self._noting = _NOTHING
+            if not self._queue:
+                self.on_room()
 
     def _failed(self, error: OSError, lost: _Lost) -> None:
-        message = f"{self._name} was closed by its reader; the run goes on without it"
-        reported, self._reported = self._reported, True
         with self._changed:
-            if error.errno in _FULL:
-                self._full, self._why = True, error.strerror or "the disk is full"
-                self._lost = lost + self._lost
-                message = (
-                    f"cannot write {self._name}: {self._why}; the run goes on, and what is lost "
-                    "is counted"
-                )
-            else:
-                reported, self._gone = False, True
+            if error.errno not in _FULL:
+                self._gone = True
                 self._queue.clear()
                 self._bytes = 0
-        if not reported:
-            self._say(message)
-
-    def _marked(self, lost: _Lost, why: str) -> bytes:
-        text = self._marker(f"{lost} missing here: {why}")
-        return text.encode(self._encoding, "backslashreplace")
+                message = f"{self._name} was closed by its reader; the run goes on without it"
+            else:
+                self._full = error.strerror or "the disk is full"
+                self._lost += lost
+                if self._said_full:
+                    return
+                self._said_full = True
+                message = (
+                    f"cannot write {self._name}: {self._full}; the run goes on, and what is lost "
+                    "is counted"
+                )
+        self._say(message)
 
 
 class _Lost(NamedTuple):
