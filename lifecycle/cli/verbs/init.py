@@ -6,7 +6,6 @@ and where schemas are copied to. Needs no ROS.
 
 from __future__ import annotations
 
-import json
 import keyword
 import os
 import re
@@ -15,7 +14,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -150,8 +149,7 @@ def _schemas() -> dict[str, str]:
     flag_value="",
     type=str,
     metavar="[DIRECTORY]",
-    help="Copy all schemas to DIRECTORY (default: the user's data directory, where --url points), "
-    "and associate *.lifecycle.yaml with the manifest's in ./.vscode, where that is.",
+    help="Copy all schemas to DIRECTORY (default: the user's data directory, where --url points).",
 )
 def schema_command(name: str, *, url: bool, to: str | None) -> int:
     """Print a JSON Schema: of the manifest, or NAME: check, graph, plan or verdict.
@@ -199,25 +197,4 @@ def _install(schemas: Mapping[str, str], to: Path | None) -> ExitCode:
         f"copied {len(schemas)} schemas to {str(folder)!r}; a manifest begins with\n"
         f"# yaml-language-server: $schema={reference}"
     )
-    if Path(".vscode").is_dir():
-        _associate(Path(".vscode/settings.json"), reference)
     return ExitCode.OK
-
-
-def _associate(settings: Path, reference: str) -> None:
-    """Associate every manifest of a VS Code workspace with a schema, as its YAML extension does."""
-    entry = {reference: "*.lifecycle.yaml"}
-    try:
-        text = settings.read_text(encoding="utf-8") if settings.exists() else "{}"
-        document: Any = json.loads(text)
-    except (OSError, ValueError):
-        document = None
-    if not isinstance(document, dict) or not isinstance(document.get("yaml.schemas", {}), dict):
-        click.echo(f'add to {settings}: "yaml.schemas": {json.dumps(entry)}')
-        return
-    associated = document.setdefault("yaml.schemas", {})
-    for each in [each for each, globs in associated.items() if globs == "*.lifecycle.yaml"]:
-        del associated[each]
-    associated.update(entry)
-    _write(settings, json.dumps(document, indent=2) + "\n")
-    click.echo(f"associated *.lifecycle.yaml with it in {settings}")

@@ -1,19 +1,16 @@
 """`lifecycle logs`: what the processes of a run have written, and what they write now.
 
-Owns: which run and which files are meant, and following them (tail(1), which waits for events of
-the file system and survives rotation).
+Owns: which run and which files are meant, and following them, rotated ones too.
 """
 
 from __future__ import annotations
 
-import contextlib
+import collections
 import os
-import queue
-import re
-import subprocess
-import threading
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 import click
 
@@ -21,10 +18,8 @@ from lifecycle.cli.standard_streams import echo_while_read
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.printable import log_line
 
-_LOOK_S = 0.5
-"""So often files are looked for that have begun since."""
-
-_HEAD = re.compile(r"==> (.*) <==\n")
+_LOOK_S = 0.2
+"""So often is looked for new lines and files."""
 
 
 @click.command("logs")
@@ -84,9 +79,10 @@ def _files(run: Path, node: str | None) -> list[Path]:
 
 def _written(run: Path, node: str | None, count: int | None) -> Iterator[str]:
     """Yield the lines that are there."""
-    if files := _files(run, node):
-        with _tail(files, count) as reading:
-            yield from _lines(reading, several=len(files) > 1)
+    files = _files(run, node)
+    for path in files:
+        with path.open("rb") as file:
+            yield from _shown(path, collections.deque(file, count), several=len(files) > 1)
 
 
 def _followed(run: Path, node: str | None, count: int | None) -> Iterator[str]:
@@ -97,65 +93,47 @@ def _followed(run: Path, node: str | None, count: int | None) -> Iterator[str]:
     """
     from lifecycle.supervisor import is_running
 
-    lines: queue.SimpleQueue[str] = queue.SimpleQueue()
-    followed: set[Path] = set()
-    with contextlib.ExitStack() as tails:
-        while True:
-            runs = is_running(run)
-            try:
-                files = [each for each in _files(run, node) if each not in followed]
-            except UsageError:
-                if not runs:
-                    raise
-                files = []
-            if files:
-                last = None if followed else count
-                reading = tails.enter_context(_tail(files, last, "-F"))
-                tails.callback(reading.terminate)
-                several = node is None or len(files) > 1
-                threading.Thread(
-                    target=_put, args=(lines, reading), kwargs={"several": several}, daemon=True
-                ).start()
-                followed.update(files)
-            elif not runs and not followed:
-                return
-            with contextlib.suppress(queue.Empty):
-                yield lines.get(timeout=_LOOK_S)
+    followed: dict[Path, BinaryIO] = {}
+    first = True
+    while True:
+        runs = is_running(run)
+        try:
+            files = _files(run, node)
+        except UsageError:
+            if not runs:
+                raise
+            files = []
+        if not files and not runs:
+            return
+        several = node is None or len(files) > 1
+        for path in files:
+            file = followed.get(path)
+            lines = [] if file is None else list(_whole_lines(file))
+            if file is None or _is_another(file, path):  # it is new, or was rotated
+                file = followed[path] = path.open("rb")
+                new = _whole_lines(file)
+                lines += collections.deque(new, count) if first else new
+            yield from _shown(path, lines, several=several)
+        first = first and not files
+        time.sleep(_LOOK_S)
 
 
-def _put(lines: queue.SimpleQueue[str], reading: subprocess.Popen[str], *, several: bool) -> None:
-    for line in _lines(reading, several=several):
-        lines.put(line)
+def _whole_lines(file: BinaryIO) -> Iterator[bytes]:
+    """Yield lines up to the last that is complete."""
+    while (line := file.readline()).endswith(b"\n"):
+        yield line
+    file.seek(-len(line), os.SEEK_CUR)
 
 
-def _tail(files: Sequence[Path], count: int | None, *options: str) -> subprocess.Popen[str]:
-    last = "+1" if count is None else str(count)
-    return subprocess.Popen(
-        ["tail", "-v", "-n", last, *options, "--", *map(str, files)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        encoding="utf-8",
-        errors="replace",
-    )
+def _is_another(file: BinaryIO, path: Path) -> bool:
+    try:
+        return not os.path.samestat(os.fstat(file.fileno()), path.stat())
+    except OSError:
+        return False
 
 
-def _lines(reading: subprocess.Popen[str], *, several: bool) -> Iterator[str]:
-    """Yield lines of a tail, with the process before each where there are several."""
-    assert reading.stdout is not None
-    name, blank = "", False
-    for line in reading.stdout:
-        if head := _HEAD.fullmatch(line):
-            name, blank = Path(head[1]).stem, False
-            continue
-        if blank:
-            yield _shown(name, "", several=several)
-        blank = line == "\n"  # tail puts one before each head but the first
-        if not blank:
-            yield _shown(name, line.rstrip("\n"), several=several)
-    if blank:
-        yield _shown(name, "", several=several)
-
-
-def _shown(name: str, line: str, *, several: bool) -> str:
-    text = log_line(line)
-    return f"{name} | {text}" if several else text
+def _shown(path: Path, lines: Iterable[bytes], *, several: bool) -> Iterator[str]:
+    """Yield lines as text, with the process before each where there are several."""
+    for line in lines:
+        text = log_line(line.decode("utf-8", "replace").rstrip("\n"))
+        yield f"{path.stem} | {text}" if several else text
