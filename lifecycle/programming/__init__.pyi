@@ -12,7 +12,4 @@ from .apply.targets.registry import TargetOptions as TargetOptions
 from .apply.targets.registry import read_targets as read_targets
 from .apply.targets.registry import target_kind as target_kind
 from .apply.targets.registry import target_options as target_options
-from .rules.registry import EXPORTS as EXPORTS
-from .rules.registry import ExportInput as ExportInput
-from .rules.registry import ExportSettings as ExportSettings
-from .rules.registry import flows_to_csv as flows_to_csv
+from .rules.flows_csv import flows_to_csv as flows_to_csv

@@ -23,7 +23,7 @@ PURE_ROOMS = (
     "verify",
     "export",
     "run_directory",
-    "programming.rules.registry",
+    "programming.rules.flows_csv",
     "codec",
     "dataclasses",
     "doors",

@@ -135,22 +135,11 @@ class Export:
     """
 
     def __init__(self, name: str, *, mapping: str, flow_labels: bool, **given: Any) -> None:
-        from lifecycle.programming import (
-            TARGETS,
-            ExportSettings,
-            read_targets,
-            read_treatment,
-            target_kind,
-        )
+        from lifecycle.programming import read_targets, read_treatment
 
-        self._name = name
-        # Such an export takes what programming that network takes; it says itself if it needs any.
-        kind = target_kind(name) if name in TARGETS else None
-        self._hint = "" if kind is None else kind.hint
-        takes = kind is not None and kind.takes and any(given.values())
-        options = read_targets((name,) if takes else (), given, option="--export")
-        exported = [each.exported() for each in options]
-        self._settings = ExportSettings(**(exported[0] if exported else {}))
+        # What is exported for a network takes what programming it takes.
+        names = () if name == "csv" else (name,)
+        self._network = next(iter(read_targets(names, given, option="--export")), None)
         self._treatment = read_treatment(mapping, label_flows=flow_labels)
 
     def write(self, plan: Plan, flows: Sequence[FlowReport]) -> None:
@@ -159,23 +148,17 @@ class Export:
         Raises:
             UsageError: it cannot be exported so.
         """
-        from lifecycle.programming import EXPORTS, ExportInput, open_programmer
-
-        programmer = open_programmer(plan, (), environment=os.environ, treatment=self._treatment)
-        given = ExportInput(
-            flows=tuple(flows),
-            plan=plan,
-            rules=programmer.rules(flows),
-            settings=self._settings,
-        )
+        if self._network is None:
+            click.echo(flows_to_csv(flows), nl=False)
+            return
+        rules = _open(plan, (), self._treatment).rules(flows)
         try:
-            text = EXPORTS[self._name](given)
+            text = self._network.export(rules, plan.system)
         except ValueError as error:
-            raise UsageError(str(error), hint=self._hint) from error
-        click.echo(text, nl=not text.endswith("\n"))
-        if self._name != "csv":
-            for each in given.rules.left_out:
-                click.echo(lines(f"left out: {each}"), err=True)
+            raise UsageError(str(error), hint=self._network.hint) from error
+        click.echo(text, nl=False)
+        for each in rules.left_out:
+            click.echo(lines(f"left out: {each}"), err=True)
 
 
 _EMPTY_GRAPH_S = 1.5
@@ -418,7 +401,7 @@ def _show_left_out(programmer: Programmer) -> None:
         click.echo(lines(f"left out: {each}"), err=True)
 
 
-class _WithSubcommands(click.Group):
+class WithSubcommands(click.Group):
     """`flows apply …` is a subcommand, `flows MANIFEST …` is the command itself."""
 
     def __init__(self, show: click.Command, subcommands: Sequence[click.Command]) -> None:
@@ -454,9 +437,4 @@ class _WithSubcommands(click.Group):
         return super().invoke(ctx) if ctx.command is self else ctx.command.invoke(ctx)
 
 
-def with_subcommands(show: click.Command) -> click.Group:
-    """Return `lifecycle flows`: `show`, and beside it apply, diff and remove."""
-    return _WithSubcommands(show, (apply_command, diff_command, remove_command))
-
-
-command = _WithSubcommands(_show, (apply_command, diff_command, remove_command))
+command = WithSubcommands(_show, (apply_command, diff_command, remove_command))

@@ -11,17 +11,17 @@ import abc
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Generic, Protocol, TypeVar, cast
+from typing import Any, ClassVar, Generic, TypeVar
 
 from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError, UsageError
-from lifecycle.programming.apply.http import Api
+from lifecycle.programming.apply.http import Api, as_segment
 from lifecycle.programming.apply.ledger import (
     Entry,
     Ledger,
     TargetRecord,
 )
-from lifecycle.programming.apply.settings import ServerSettings, Settings, load_settings
+from lifecycle.programming.apply.settings import ServerSettings, load_settings
 from lifecycle.programming.apply.target import (
     ChangeKind,
     FlowChange,
@@ -37,10 +37,8 @@ from lifecycle.programming.apply.targets.registry import (
     Targets,
     settings_types,
 )
-from lifecycle.programming.rules.mobile import B, Requests
-from lifecycle.programming.rules.rules import FlowRule
-
-Body = dict[str, object]
+from lifecycle.programming.rules.mobile import Body, Requests, document
+from lifecycle.programming.rules.rules import FlowRule, RuleSet
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,88 +58,86 @@ class Made:
     differs: str = ""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class RemoteRequest:
-    """One thing to ask for.
+_S = TypeVar("_S", bound=ServerSettings)
+
+
+class Service(abc.ABC, Generic[_S]):
+    """One kind of thing at one server.
+
+    Args:
+        settings: of the server.
+        api: at `settings.scope`.
 
     Attributes:
-        key: names it for as long as the manifest does.
-        what: for people.
+        kind: name of the target: "nef", "camara".
+        collection: path of all things, "/sessions"; without the slash, what an export calls them.
     """
 
-    key: str
-    what: str
-    body: Body
+    kind: ClassVar[str]
+    collection: ClassVar[str]
 
-
-def asks_of(found: Requests[B]) -> tuple[tuple[RemoteRequest, ...], tuple[str, ...]]:
-    """Return what `Service.asks` does, of the requests that rules became."""
-    asks = tuple(
-        RemoteRequest(key=each.key, what=describe_rule(each.rule), body=each.content.body())
-        for each in found.requests
-    )
-    return asks, tuple(map(str, found.left_out))
-
-
-class Service(Protocol):
-    """One kind of thing at one server."""
-
-    @property
-    def kind(self) -> str:
-        """Name of the target: "nef", "camara"."""
-        ...
+    def __init__(self, settings: _S, api: Api) -> None:
+        self._settings = settings
+        self._api = api
 
     @property
     def scope(self) -> str:
         """URL of the server."""
-        ...
+        return self._api.url
 
-    def asks(self, rules: Sequence[FlowRule]) -> tuple[tuple[RemoteRequest, ...], tuple[str, ...]]:
-        """Return what is to be asked for, and each flow this interface cannot express, and why."""
-        ...
+    def path(self, id_: str) -> str:
+        """Return the path of one thing."""
+        return f"{self.collection}/{as_segment(id_)}"
 
+    @staticmethod
+    @abc.abstractmethod
+    def requests(settings: _S, rules: Sequence[FlowRule]) -> Requests:
+        """Return one request per flow and device, and each flow that cannot be asked for."""
+
+    @abc.abstractmethod
     def create(self, body: Body) -> Made:
         """Ask for it."""
-        ...
 
+    @abc.abstractmethod
     def find(self, body: Body) -> Made | None:
         """Look for one that was asked for with this body; None if there is none."""
-        ...
 
+    @abc.abstractmethod
     def see(self, id_: str, body: Body) -> Made | None:
         """Look at one, and compare it with what was asked for; None if it is gone."""
-        ...
 
+    @abc.abstractmethod
     def update(self, id_: str, before: Body, body: Body) -> Made:
         """Change one; the id may become another."""
-        ...
 
     def delete(self, id_: str) -> None:
         """Delete one; that it is gone already is no error."""
-        ...
+        self._api.request("DELETE", self.path(id_), may_be_gone=True)
 
-    def prolong(self, entry: Entry, body: Body) -> Made | None:
-        """Prolong one that is due; None if it is not."""
-        ...
+    def prolong(self, entry: Entry, body: Body) -> Made | None:  # noqa: ARG002 - what expires has it
+        """Prolong one that is due; None if it is not, or never expires."""
+        return None
 
-    def due_in_s(self, entry: Entry) -> float | None:
+    def due_in_s(self, entry: Entry) -> float | None:  # noqa: ARG002 - likewise
         """Return seconds until it must be prolonged; None if never."""
-        ...
+        return None
 
 
 class RemoteTarget:
-    """A server, see changes.Target.
+    """A server, see Target.
 
     Args:
-        service: see Service.
+        service: asks it.
+        settings: of the server.
         ledger: of the system.
-        settings: path of the settings file, so that a later run can remove what this one leaves.
+        path: of the settings file, so that a later run can remove what this one leaves.
     """
 
-    def __init__(self, service: Service, ledger: Ledger, settings: str = "") -> None:
-        self._service = service
-        self._ledger = ledger
+    def __init__(self, service: Service[_S], settings: _S, ledger: Ledger, path: str = "") -> None:
+        self._service: Service[Any] = service
         self._settings = settings
+        self._ledger = ledger
+        self._path = path
 
     @property
     def name(self) -> str:
@@ -150,17 +146,20 @@ class RemoteTarget:
 
     def plan(self, rules: Sequence[FlowRule]) -> TargetChanges:
         """Compare rules, ledger and server; asks the server about each thing of ours."""
-        asks, left_out = self._service.asks(rules)
-        wanted = {each.key for each in asks}
+        found = self._asked(rules)
+        wanted = {each.key for each in found.requests}
         changes = [
             FlowChange(kind=ChangeKind.DELETE, key=each.key, what=each.what)
             for each in self._record().entries
             if each.key not in wanted
         ]
-        for ask in asks:
-            kind, detail = self._compare(self._record().entry(ask.key), ask.body)
-            changes.append(FlowChange(kind=kind, key=ask.key, what=ask.what, detail=detail))
-        return TargetChanges(target=self.name, changes=tuple(changes), left_out=left_out)
+        for each in found.requests:
+            kind, detail = self._compare(self._record().entry(each.key), each.body)
+            what = describe_rule(each.rule)
+            changes.append(FlowChange(kind=kind, key=each.key, what=what, detail=detail))
+        return TargetChanges(
+            target=self.name, changes=tuple(changes), left_out=tuple(map(str, found.left_out))
+        )
 
     def apply(self, rules: Sequence[FlowRule]) -> TargetChanges:
         """Make it so, one flow after the other.
@@ -169,7 +168,7 @@ class RemoteTarget:
             PartlyError: for some flows it failed; the others are done.
         """
         planned = self.plan(rules)
-        bodies = {each.key: each.body for each in self._service.asks(rules)[0]}
+        bodies = {each.key: each.body for each in self._asked(rules).requests}
         done: list[FlowChange] = []
         errors: list[tuple[str, LifecycleError]] = []
         # Deletions come first in the plan: what is in the way of something new goes before it.
@@ -184,6 +183,9 @@ class RemoteTarget:
             raise self._partly(len(planned.changes), errors, done)
         return dataclasses.replace(planned, changes=tuple(done))
 
+    def _asked(self, rules: Sequence[FlowRule]) -> Requests:
+        return self._service.requests(self._settings, rules)
+
     def _partly(
         self, total: int, errors: Sequence[tuple[str, LifecycleError]], done: Sequence[FlowChange]
     ) -> PartlyError:
@@ -194,8 +196,10 @@ class RemoteTarget:
 
     def dry_run(self, rules: Sequence[FlowRule]) -> str:
         """Return the bodies as JSON, one per flow; asks no server."""
-        asks, _ = self._service.asks(rules)
-        shown = [{"key": each.key, "flow": each.what, "body": each.body} for each in asks]
+        shown = [
+            {"key": each.key, "flow": describe_rule(each.rule), "body": each.body}
+            for each in self._asked(rules).requests
+        ]
         return json.dumps(shown, indent=2, ensure_ascii=False) + "\n"
 
     def remove(self) -> TargetChanges:
@@ -309,15 +313,13 @@ class RemoteTarget:
     def _record(self) -> TargetRecord:
         record = self._ledger.record(self._service.kind, self._service.scope)
         return record or TargetRecord(
-            target=self._service.kind, scope=self._service.scope, settings=self._settings
+            target=self._service.kind, scope=self._service.scope, settings=self._path
         )
 
     def _note(self, entry: Entry) -> None:
         record = self._record()
         others = tuple(each for each in record.entries if each.key != entry.key)
-        self._ledger.put(
-            dataclasses.replace(record, settings=self._settings, entries=(*others, entry))
-        )
+        self._ledger.put(dataclasses.replace(record, settings=self._path, entries=(*others, entry)))
 
     def _forget(self, key: str) -> None:
         record = self._record()
@@ -338,14 +340,14 @@ def _entry(change: FlowChange, body: Body, made: Made | None) -> Entry:
     )
 
 
-_S = TypeVar("_S", bound=ServerSettings)
-
-
-class ServerOptions(TargetOptions, Generic[_S]):
+class ServerOptions(TargetOptions):
     """The options of one server: a settings file, in which its kind is a key.
 
     Args:
         path: of the file.
+
+    Attributes:
+        service: asks it.
     """
 
     hint = "give --config FILE"
@@ -356,22 +358,13 @@ class ServerOptions(TargetOptions, Generic[_S]):
             help="nef, camara: where the server is and where the token is.",
         ),
     )
+    service: ClassVar[type[Service[Any]]]
 
     def __init__(self, path: str) -> None:
-        self.path = path
+        self._path = path
 
     @classmethod
-    @abc.abstractmethod
-    def url(cls, settings: _S) -> str:
-        """Return what the server is told apart from others by, and where it is asked."""
-
-    @classmethod
-    @abc.abstractmethod
-    def service(cls, settings: _S, api: Api) -> Service:
-        """Return what asks it."""
-
-    @classmethod
-    def read(cls, given: Mapping[str, Any]) -> ServerOptions[_S]:
+    def read(cls, given: Mapping[str, Any]) -> ServerOptions:
         """Take the path."""
         if not given.get("config"):
             raise UsageError(
@@ -383,50 +376,45 @@ class ServerOptions(TargetOptions, Generic[_S]):
     @classmethod
     def restore(cls, record: TargetRecord, means: Targets) -> RemoteTarget:
         """Return the server of a record, if it is still that of the settings file."""
-        settings = load_settings(record.settings, settings_types())
-        own = cls._of(settings)
-        scope = "" if own is None else cls.url(own)
+        own = load_settings(record.settings, settings_types()).servers.get(cls.kind)
+        scope = "" if own is None else own.scope
         if scope != record.scope:
             raise SettingsError(
                 f"cannot remove what is at {record.scope}: settings {record.settings!r} are "
                 f"{f'of {scope}' if scope else f'without {record.target}'} now"
             )
-        return cls._open(settings, means)
+        return cls(record.settings).open(means)
 
     def open(self, means: Targets) -> RemoteTarget:
         """Return the server."""
-        return self._open(load_settings(self.path, settings_types()), means)
-
-    def exported(self) -> Mapping[str, Any]:
-        """Return what goes into bodies."""
-        servers = load_settings(self.path, settings_types()).servers
-        return {name: each.asked() for name, each in servers.items()}
-
-    def token_variables(self) -> frozenset[str]:
-        """Return those of every server of the file."""
-        tokens = [
-            each.token for each in load_settings(self.path, settings_types()).servers.values()
-        ]
-        return frozenset(each.env for each in tokens if each is not None and each.env)
-
-    @classmethod
-    def _of(cls, settings: Settings) -> _S | None:
-        return cast("_S | None", settings.servers.get(cls.kind))
-
-    @classmethod
-    def _open(cls, settings: Settings, means: Targets) -> RemoteTarget:
-        own = cls._of(settings)
-        if own is None:
-            raise SettingsError(
-                f"cannot program {cls.kind}: settings {settings.path!r} have no key {cls.kind!r}"
-            )
+        path, own = self._own()
         api = Api(
-            cls.url(own),
+            own.scope,
             token=own.token,
             timeout_s=own.timeout_s,
-            ca_file=own.ca_file and str(Path(settings.path).parent / own.ca_file),
+            ca_file=own.ca_file and str(Path(path).parent / own.ca_file),
             patience=means.patience,
             clock=means.clock,
             deadline=means.deadline,
         )
-        return RemoteTarget(cls.service(own, api), means.ledger, settings.path)
+        return RemoteTarget(self.service(own, api), own, means.ledger, path)
+
+    def export(self, rules: RuleSet, system: str) -> str:  # noqa: ARG002 - TargetOptions
+        """Return the bodies as JSON: `{"subscriptions": [{key, flow, asks, body}], …}`."""
+        found = self.service.requests(self._own()[1], rules.rules)
+        return document(self.service.collection[1:], found, rules.left_out) + "\n"
+
+    def token_variables(self) -> frozenset[str]:
+        """Return those of every server of the file."""
+        servers = load_settings(self._path, settings_types()).servers.values()
+        return frozenset(each.token.env for each in servers if each.token and each.token.env)
+
+    def _own(self) -> tuple[str, ServerSettings]:
+        """The absolute path of the file, and what it says of this server."""
+        settings = load_settings(self._path, settings_types())
+        own = settings.servers.get(self.kind)
+        if own is None:
+            raise SettingsError(
+                f"cannot program {self.kind}: settings {settings.path!r} have no key {self.kind!r}"
+            )
+        return settings.path, own

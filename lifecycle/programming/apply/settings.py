@@ -27,7 +27,6 @@ import os
 import stat
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 from urllib.parse import urlsplit
 
 import msgspec
@@ -116,7 +115,6 @@ class ServerSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
         _check_url(self.url, token=self.token)
         _check_positive(self.timeout_s, "timeout_s")
         self.check()
-        self.asked()
 
     def check(self) -> None:
         """Refuse what is not allowed of the target's own keys.
@@ -125,18 +123,10 @@ class ServerSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
             ValueError: a value is not allowed.
         """
 
-    def asked(self) -> object:
-        """Return what goes into bodies.
-
-        Raises:
-            ValueError: a value is not allowed.
-        """
-        raise NotImplementedError
-
-    def part(self, type_: Any) -> Any:
-        """Return the fields of a dataclass that these settings have, under the same names."""
-        names = {each.name for each in dataclasses.fields(type_)} & {*self.__struct_fields__}
-        return type_(**{name: getattr(self, name) for name in names})
+    @property
+    def scope(self) -> str:
+        """What the server is told apart from others by, and where it is asked: a URL."""
+        return self.url.rstrip("/")
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

@@ -8,16 +8,17 @@ from __future__ import annotations
 
 import ipaddress
 from collections.abc import Callable, Iterable, Mapping
-from typing import Generic, Protocol, TypeVar
 
 from lifecycle import dataclasses
 from lifecycle.codec import to_json
-from lifecycle.programming.rules.packet_filter import Direction, check_address
 from lifecycle.programming.rules.rules import FlowRule, LeftOut, asks
 
 _ENDS = ("source", "destination")
 
 IpNetwork = ipaddress.IPv4Network | ipaddress.IPv6Network
+
+Body = dict[str, object]
+"""Of a request, JSON-able."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -25,53 +26,44 @@ class DeviceEnd:
     """One end of a flow that is a device of the mobile network, and the other end.
 
     Attributes:
-        direction: of the flow's packets, as seen from the device.
+        sends: the device is the sender.
         device: address of the device.
         device_port: 1–65535.
         server: address of the other end, a device or not.
         server_port: 1–65535.
     """
 
-    direction: Direction
+    sends: bool
     device: str
     device_port: int
     server: str
     server_port: int
 
-
-class Content(Protocol):
-    """A validated request that knows its body."""
-
-    def body(self) -> dict[str, object]:
-        """Return the body, JSON-able."""
-
-
-T = TypeVar("T")
-B = TypeVar("B", bound=Content)
+    @property
+    def is_ipv6(self) -> bool:
+        """Whether its addresses are of IPv6."""
+        return ":" in self.device
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class NetworkRequest(Generic[T]):
+class NetworkRequest:
     """What to ask the network for one flow and one of its ends.
 
     Attributes:
         key: of the FlowRule, with the direction behind it: unique.
         rule: that it is made from.
-        end: that it is made for.
-        content: the validated body.
     """
 
     key: str
     rule: FlowRule
-    end: DeviceEnd
-    content: T
+    body: Body
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Requests(Generic[T]):
+class Requests:
     """Everything to ask the network for, and what cannot be asked."""
 
-    requests: tuple[NetworkRequest[T], ...]
+    requests: tuple[NetworkRequest, ...]
     left_out: tuple[LeftOut, ...]
 
 
@@ -83,25 +75,28 @@ class Devices:
         networks: that devices have their addresses from.
         source: the sender of every flow is one.
         destination: the receiver of every flow is one.
-        address: of the device as the mobile network knows it; empty for that of the flow.
     """
 
     networks: tuple[IpNetwork, ...]
     source: bool = False
     destination: bool = False
-    address: str = ""
 
     def __str__(self) -> str:
         return ", ".join(map(str, self.networks))
 
+    def has(self, address: str) -> bool:
+        """Whether an address, known or not, is that of a device."""
+        return bool(address) and any(
+            ipaddress.ip_address(address) in network for network in self.networks
+        )
 
-def parse_devices(texts: Iterable[str], *, address: str = "") -> Devices:
+
+def parse_devices(texts: Iterable[str]) -> Devices:
     """Parse which ends of flows are devices.
 
     Args:
         texts: `10.45.0.0/16`, `2001:db8:45::/48`, single addresses, or `source` and `destination`
             for that end of every flow.
-        address: of the one device as the mobile network knows it, where flows show another.
 
     Raises:
         ValueError: not a network, or none at all: without it no end is known to be a device.
@@ -112,21 +107,26 @@ def parse_devices(texts: Iterable[str], *, address: str = "") -> Devices:
             "cannot tell which ends of flows are devices: devices is empty; name the addresses or "
             "networks of the devices, such as 10.45.0.0/16, or 'source' or 'destination'"
         )
-    if address:
-        check_address(address)
     return Devices(
         networks=tuple(_network(each) for each in every if each not in _ENDS),
         source="source" in every,
         destination="destination" in every,
-        address=address,
     )
 
 
+def _network(text: str) -> IpNetwork:
+    try:
+        return ipaddress.ip_network(text, strict=False)
+    except ValueError:
+        raise ValueError(
+            f"cannot use {text!r} as a network of devices; "
+            f"use an address or a network, such as 10.45.0.0/16"
+        ) from None
+
+
 def requests_of(
-    rules: Iterable[FlowRule],
-    devices: Devices,
-    make: Callable[[FlowRule, DeviceEnd], T],
-) -> Requests[T]:
+    rules: Iterable[FlowRule], devices: Devices, make: Callable[[FlowRule, DeviceEnd], Body]
+) -> Requests:
     """Return one request per flow and device, and the flows that none can be made for.
 
     Args:
@@ -134,60 +134,65 @@ def requests_of(
         devices: which ends are devices.
         make: the body for one flow and one of its ends; a ValueError leaves the flow out.
     """
-    requests: list[NetworkRequest[T]] = []
+    requests: list[NetworkRequest] = []
     left: list[LeftOut] = []
     for rule in rules:
-        made = _made(rule, devices, make)
-        if isinstance(made, str):
+        try:
+            requests += [
+                NetworkRequest(
+                    # As stable as the rule's own key: a manifest keeps it whatever the ports are.
+                    key=f"{rule.key} {'from' if end.sends else 'to'} device",
+                    rule=rule,
+                    body=make(rule, end),
+                )
+                for end in device_ends(rule, devices)
+            ]
+        except ValueError as error:  # noqa: PERF203 - the other flows are asked for
             left += [
-                LeftOut(topic=topic, publisher=publisher, subscription=subscription, reason=made)
+                LeftOut(
+                    topic=topic, publisher=publisher, subscription=subscription, reason=str(error)
+                )
                 for topic, publisher, subscription in rule.names
             ]
-        else:
-            requests += made
     return Requests(requests=tuple(requests), left_out=tuple(left))
 
 
 def device_ends(rule: FlowRule, devices: Devices) -> tuple[DeviceEnd, ...]:
-    """Return the ends of a flow that are devices: none, one or both.
+    """Return the ends of a flow that are devices: one or both.
 
     Raises:
-        ValueError: an end that has to be known is not.
+        ValueError: none is, or an end that has to be known is not.
     """
     source, destination = rule.source_address, rule.destination_address
     if ipaddress.ip_address(destination).is_loopback:
         raise ValueError("it never leaves its machine")
-    sends = devices.source or _is_in(source, devices.networks)
-    takes = devices.destination or _is_in(destination, devices.networks)
-    sender = (devices.address if sends else "") or source
-    receiver = (devices.address if takes else "") or destination
-    if not sender:
+    if not source:
         raise ValueError(
             "the address it is sent from is not known; give its machine an address in the manifest"
         )
-    if not sends and not takes:
-        raise ValueError(f"neither end is a device of the mobile network ({devices})")
     found: list[DeviceEnd] = []
-    if takes:
+    if devices.destination or devices.has(destination):
         found.append(
             DeviceEnd(
-                direction=Direction.OUT,
-                device=receiver,
+                sends=False,
+                device=destination,
                 device_port=rule.destination_port,
-                server=source or sender,
+                server=source,
                 server_port=rule.source_port,
             )
         )
-    if sends:
+    if devices.source or devices.has(source):
         found.append(
             DeviceEnd(
-                direction=Direction.IN,
-                device=sender,
+                sends=True,
+                device=source,
                 device_port=rule.source_port,
                 server=destination,
                 server_port=rule.destination_port,
             )
         )
+    if not found:
+        raise ValueError(f"neither end is a device of the mobile network ({devices})")
     return tuple(found)
 
 
@@ -214,7 +219,7 @@ def class_name(rule: FlowRule, names: Mapping[int, str], default: str, *, settin
     )
 
 
-def document(name: str, found: Requests[B], left_out: Iterable[LeftOut]) -> str:
+def document(name: str, found: Requests, left_out: Iterable[LeftOut]) -> str:
     """Return requests as JSON for people and scripts: each body beside what it is for.
 
     Args:
@@ -229,46 +234,10 @@ def document(name: str, found: Requests[B], left_out: Iterable[LeftOut]) -> str:
                     "key": request.key,
                     "flow": request.rule.describe(),
                     "asks": asks(request.rule),
-                    "body": request.content.body(),
+                    "body": request.body,
                 }
                 for request in found.requests
             ],
             "left_out": [str(each) for each in (*left_out, *found.left_out)],
         }
     ).decode()
-
-
-def _made(
-    rule: FlowRule, devices: Devices, make: Callable[[FlowRule, DeviceEnd], T]
-) -> list[NetworkRequest[T]] | str:
-    """A rule's requests, or why there are none."""
-    try:
-        return [
-            NetworkRequest(
-                # As stable as the rule's own key: a manifest keeps it whatever the ports are.
-                key=f"{rule.key} {'to' if end.direction is Direction.OUT else 'from'} device",
-                rule=rule,
-                end=end,
-                content=make(rule, end),
-            )
-            for end in device_ends(rule, devices)
-        ]
-    except ValueError as error:
-        return str(error)
-
-
-def _network(text: str) -> IpNetwork:
-    try:
-        return ipaddress.ip_network(text, strict=False)
-    except ValueError:
-        raise ValueError(
-            f"cannot use {text!r} as a network of devices; "
-            f"use an address or a network, such as 10.45.0.0/16"
-        ) from None
-
-
-def _is_in(address: str, networks: Iterable[IpNetwork]) -> bool:
-    if not address:
-        return False
-    parsed = ipaddress.ip_address(address)
-    return any(parsed in network for network in networks)

@@ -10,6 +10,7 @@ for. Pure.
 from __future__ import annotations
 
 import hashlib
+import ipaddress
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from lifecycle import dataclasses
@@ -19,6 +20,7 @@ from lifecycle.network import (
     DscpMapping,
     FlowTuple,
     InternetProtocol,
+    IpAddress,
     Medium,
     TransportProtocol,
     canonical,
@@ -31,13 +33,10 @@ from lifecycle.network import (
     socket_text,
 )
 from lifecycle.plan import Plan, PlannedEndpoint, PlannedNode
-from lifecycle.programming.rules.packet_filter import (
-    PROTOCOL_NUMBERS,
-    check_address,
-    check_port,
-    check_same_family,
-)
 from lifecycle.verify import UNKNOWN, FlowReport, Outcome
+
+PROTOCOL_NUMBERS = {"udp": 17, "tcp": 6}
+"""The two that carry flows here (IANA Assigned Internet Protocol Numbers)."""
 
 MAX_FLOW_LABEL = 0xFFFFF
 """Twenty bits (RFC 6437)."""
@@ -92,11 +91,15 @@ class FlowRule:
             raise ValueError(
                 f"cannot match protocol {self.transport_protocol.value!r}; use udp or tcp"
             )
-        check_port(self.source_port)
-        check_port(self.destination_port)
-        check_address(self.destination_address)
-        if self.source_address:
-            check_same_family(self.source_address, self.destination_address)
+        for port in (self.source_port, self.destination_port):
+            if not 1 <= port <= 65535:
+                raise ValueError(f"cannot use port {port}; use 1 to 65535")
+        to = _address(self.destination_address).version
+        if self.source_address and (of := _address(self.source_address).version) != to:
+            raise ValueError(
+                f"cannot filter packets from {self.source_address} to {self.destination_address}: "
+                f"one is IPv{of}, the other IPv{to}; use two addresses of one family"
+            )
         if self.dscp is not None:
             parse_dscp(self.dscp)
         if not 0 <= self.flow_label <= MAX_FLOW_LABEL:
@@ -123,6 +126,29 @@ class FlowRule:
         source = socket_text(self.source_address or "*", self.source_port)
         destination = socket_text(self.destination_address, self.destination_port)
         return f"{self.transport_protocol.value} {source} → {destination}"
+
+
+def _address(text: str) -> IpAddress:
+    """Return the address that `text` spells.
+
+    Raises:
+        ValueError: not one unicast address: a name, a zone, a wildcard or a group.
+    """
+    try:
+        address = ipaddress.ip_address(text)
+    except ValueError:
+        raise ValueError(
+            f"cannot use address {text!r}; use one IPv4 or IPv6 address, such as 10.77.0.1"
+        ) from None
+    if "%" in text:
+        raise ValueError(
+            f"cannot use address {text!r}: its zone means something on its own host only; "
+            f"use {text.partition('%')[0]}"
+        )
+    if address.is_unspecified or address.is_multicast:
+        kind = "a group" if address.is_multicast else "every address of its host"
+        raise ValueError(f"cannot use address {text!r}: it is {kind}; use one unicast address")
+    return address
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

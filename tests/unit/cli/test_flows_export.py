@@ -11,8 +11,7 @@ from click.testing import CliRunner
 from lifecycle.cli.verbs import flows, up
 from lifecycle.cli.verbs.flows import NAMES, Export
 from lifecycle.errors import UsageError
-from lifecycle.programming.rules.registry import EXPORTS
-from tests.unit.programming.apply.samples import nef_settings, settings_file
+from tests.unit.programming.apply.samples import camara_settings, nef_settings, settings_file
 from tests.unit.programming.rules.samples import plan, report
 
 
@@ -20,8 +19,28 @@ def export(name: str, *, mapping: str = "", **given: object) -> Export:
     return Export(name, mapping=mapping, flow_labels=False, **given)
 
 
-def test_every_export_can_be_asked_for() -> None:
-    assert tuple(EXPORTS) == NAMES
+@pytest.mark.parametrize("name", NAMES)
+def test_every_export_shows_the_flow_and_names_what_it_left_out(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    devices = ["10.77.0.2"]
+    file = settings_file(
+        tmp_path,
+        nef=nef_settings("https://nef.test", devices=devices),
+        camara=camara_settings("https://camara.test", devices=devices),
+    )
+    needs = {"tc": {"device": "eth0", "rate": "10mbit"}}
+    given = needs.get(name, {"config": file} if name in ("nef", "camara") else {})
+    export(name, **given).write(
+        plan(), [report(), report("/robot/status", source=(), destination=())]
+    )
+    text = capsys.readouterr().out
+    assert text.endswith("\n")
+    assert "/robot/video" in text
+    assert "/robot/status" in text
+    if name != "csv":
+        assert "its network flow endpoints are not known" in text
+        assert "EF = DSCP 46 = TOS 184 (0xb8)" in text
 
 
 def test_verified_flows_are_exported_as_nft_takes_them(capsys: pytest.CaptureFixture[str]) -> None:
@@ -53,16 +72,13 @@ def test_bodies_take_the_settings_of_their_server(
         (
             "tc",
             (
-                "cannot export tc: nothing says the network device; give tc its settings; "
+                "cannot program tc without a device; only devices that are named are touched; "
                 "give --device eth0 --rate 20mbit"
             ),
         ),
         (
             "nef",
-            (
-                "cannot export nef: nothing says devices and a notification destination; "
-                "give nef its settings; give --config FILE"
-            ),
+            ("cannot program nef without settings: where it is and who we are; give --config FILE"),
         ),
     ],
 )

@@ -17,6 +17,8 @@ from tests.unit.programming.apply.samples import nef_settings, settings_file
 from tests.unit.programming.apply.servers import TOKEN, NefServer
 from tests.unit.programming.rules.samples import nfe, plan, report
 
+SUBCOMMANDS = (flows_verb.apply_command, flows_verb.diff_command, flows_verb.remove_command)
+
 
 @pytest.fixture
 def options(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[TargetOptions, ...]:
@@ -42,7 +44,7 @@ def show(manifest: str, watch: bool) -> int:
 
 
 def test_flows_of_a_manifest_are_shown_and_a_subcommand_is_a_subcommand() -> None:
-    flows = flows_verb.with_subcommands(show)
+    flows = flows_verb.WithSubcommands(show, SUBCOMMANDS)
     run = CliRunner()
 
     assert run.invoke(flows, ["a.yaml", "--watch"], standalone_mode=False).return_value == 5
@@ -58,7 +60,7 @@ def test_flows_of_a_manifest_are_shown_and_a_subcommand_is_a_subcommand() -> Non
 
 
 def test_it_can_be_mounted_below_other_groups() -> None:
-    group = click.Group("lifecycle", commands=[flows_verb.with_subcommands(show)])
+    group = click.Group("lifecycle", commands=[flows_verb.WithSubcommands(show, SUBCOMMANDS)])
 
     result = CliRunner().invoke(group, ["flows", "a.yaml"], standalone_mode=False)
 
@@ -69,7 +71,7 @@ def test_options_of_tc_are_read_with_their_units() -> None:
     given = {"device": "e0", "rate": "20mbit", "guarantee": ("ef=2mbit",)}
     (options,) = read_targets(["tc"], given)
 
-    settings = options.exported()["tc"]
+    settings = options.settings
     assert (settings.device, settings.link_kbit) == ("e0", 20_000)
     assert settings.guaranteed_kbit == {"ef": 2_000}
 

@@ -1,22 +1,30 @@
 """CAMARA QualityOnDemand over HTTP: one session per flow and device, renewed before it expires.
 
-Owns: the paths of QualityOnDemand 1.1.0, the states of a session and when it is prolonged. Bodies
-are `rules.camara`.
+Owns: the paths of QualityOnDemand 1.1.0, its bodies, the states of a session and when it is
+prolonged.
 """
 
 from __future__ import annotations
 
 import datetime as dt
+import re
 from collections.abc import Sequence
 
 import msgspec
 
-from lifecycle.programming.apply.http import Api, Fields, as_segment, show, text_of
+from lifecycle.programming.apply.http import Api, Fields, show, text_of
 from lifecycle.programming.apply.ledger import Entry
-from lifecycle.programming.apply.remote import Body, Made, RemoteRequest, ServerOptions, asks_of
+from lifecycle.programming.apply.remote import Made, ServerOptions, Service
 from lifecycle.programming.apply.settings import ServerSettings
 from lifecycle.programming.apply.target import HttpError
-from lifecycle.programming.rules.camara import CamaraSettings, camara_sessions
+from lifecycle.programming.rules.mobile import (
+    Body,
+    DeviceEnd,
+    Requests,
+    class_name,
+    parse_devices,
+    requests_of,
+)
 from lifecycle.programming.rules.rules import FlowRule
 
 KIND = "camara"
@@ -38,13 +46,20 @@ _LONGEST_S = 2**31 - 1
 """Largest `duration`, an int32."""
 
 
-class CamaraTargetSettings(ServerSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class CamaraSettings(ServerSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How to reach a CAMARA QualityOnDemand 1.1.0 interface and what to ask it for.
 
     Attributes:
         url: everything before `/sessions`.
-        devices, qos_profiles, default_qos_profile, duration_s, sink, public_addresses,
-            device_by_token: see rules.camara.CamaraSettings.
+        devices: addresses or networks of the network's devices, `10.45.0.0/16`, or `source` or
+            `destination` for that end of every flow.
+        qos_profiles: the provider's names of profiles, by 5QI.
+        default_qos_profile: for flows whose 5QI is not named; empty leaves them out.
+        duration_s: 1–2147483647; sessions are renewed, or they expire.
+        sink: https URL that the network reports to; empty for none.
+        public_addresses: of devices behind a translation, by private address.
+        device_by_token: the access token names the device (three-legged), so that the body must
+            not: a server answers 422 UNNECESSARY_IDENTIFIER otherwise.
         wait_s: how long a session may take to become available; 0 does not wait.
     """
 
@@ -57,40 +72,67 @@ class CamaraTargetSettings(ServerSettings, frozen=True, kw_only=True, forbid_unk
     device_by_token: bool = False
     wait_s: float = 10.0
 
-    def asked(self) -> CamaraSettings:
-        """Return what goes into bodies.
+    def check(self) -> None:
+        """Refuse what a server would refuse."""
+        parse_devices(self.devices)
+        for profile in filter(None, (*self.qos_profiles.values(), self.default_qos_profile)):
+            if not re.fullmatch(r"[a-zA-Z0-9_.-]{3,256}", profile):
+                raise ValueError(
+                    f"cannot use qosProfile {profile!r}; "
+                    "use 3 to 256 letters, digits, '_', '.' and '-', such as QOS_E"
+                )
+        for address in self.public_addresses.values():
+            if not re.fullmatch(r"[0-9]{1,3}(\.[0-9]{1,3}){3}", address):
+                raise ValueError(f"cannot use public address {address!r}; use an IPv4 address")
+        if not 1 <= self.duration_s <= _LONGEST_S:
+            raise ValueError(f"cannot use a duration of {self.duration_s} s; use 1 to {_LONGEST_S}")
+        if self.sink and not re.fullmatch(r"https://[^\s/]+\S*", self.sink):
+            raise ValueError(f"cannot use sink {self.sink!r}; use an https URL, or none")
 
-        Raises:
-            ValueError: a value is not allowed.
-        """
-        asked: CamaraSettings = self.part(CamaraSettings)
-        return asked
 
+def session(rule: FlowRule, end: DeviceEnd, settings: CamaraSettings) -> Body:
+    """Return the body of a CreateSession (QualityOnDemand 1.1.0).
 
-class CamaraService:
-    """One QualityOnDemand interface, see remote.Service.
-
-    Args:
-        settings: see CamaraTargetSettings.
-        api: at `settings.url`.
+    It has no protocol and no direction: it treats what goes between a device's ports and a
+    server's ports, both ways, UDP and TCP alike.
     """
+    profile = class_name(
+        rule, settings.qos_profiles, settings.default_qos_profile, setting="qos_profiles"
+    )
+    public = settings.public_addresses.get(end.device, end.device)
+    device: Body = {"ipv4Address": {"publicAddress": public, "privateAddress": end.device}}
+    if end.is_ipv6:
+        device = {"ipv6Address": end.device}
+    return {
+        **({} if settings.device_by_token else {"device": device}),
+        "applicationServer": {"ipv6Address" if end.is_ipv6 else "ipv4Address": end.server},
+        "devicePorts": {"ports": [end.device_port]},
+        "applicationServerPorts": {"ports": [end.server_port]},
+        "qosProfile": profile,
+        **({"sink": settings.sink} if settings.sink else {}),
+        "duration": settings.duration_s,
+    }
+
+
+class CamaraService(Service[CamaraSettings]):
+    """One QualityOnDemand interface."""
 
     kind = KIND
+    collection = "/sessions"
 
-    def __init__(self, settings: CamaraTargetSettings, api: Api) -> None:
-        self._settings = settings
-        self._api = api
+    def __init__(self, settings: CamaraSettings, api: Api) -> None:
+        super().__init__(settings, api)
         self._expires: dict[str, tuple[float, float]] = {}
         """By key, when a session expires: since the epoch, and on the clock that goes forward."""
 
-    @property
-    def scope(self) -> str:
-        """URL of the server."""
-        return self._api.url
-
-    def asks(self, rules: Sequence[FlowRule]) -> tuple[tuple[RemoteRequest, ...], tuple[str, ...]]:
+    @staticmethod
+    def requests(settings: CamaraSettings, rules: Sequence[FlowRule]) -> Requests:
         """Return one session per flow and device."""
-        return asks_of(camara_sessions(rules, self._settings.asked()))
+        return requests_of(
+            rules,
+            parse_devices(settings.devices),
+            lambda rule, end: session(rule, end, settings),
+        )
 
     def create(self, body: Body) -> Made:
         """POST it and wait a little until it is available.
@@ -98,7 +140,7 @@ class CamaraService:
         Raises:
             HttpError: refused, or the network cannot provide it.
         """
-        reply = self._api.request("POST", "/sessions", body)
+        reply = self._api.request("POST", self.collection, body)
         session = reply.object()
         id_ = session.identifier("sessionId")
         if not id_:
@@ -133,17 +175,13 @@ class CamaraService:
 
     def see(self, id_: str, body: Body) -> Made | None:
         """GET it; one that has ended counts as different, for it has to be deleted first."""
-        reply = self._api.request("GET", _path(id_), may_be_gone=True)
+        reply = self._api.request("GET", self.path(id_), may_be_gone=True)
         return None if reply.gone else self._made(id_, reply.object(), body)
 
     def update(self, id_: str, before: Body, body: Body) -> Made:  # noqa: ARG002 - Service
         """Delete and create: a session cannot be changed, and two for one flow are a conflict."""
         self.delete(id_)
         return self.create(body)
-
-    def delete(self, id_: str) -> None:
-        """DELETE it."""
-        self._api.request("DELETE", _path(id_), may_be_gone=True)
 
     def prolong(self, entry: Entry, body: Body) -> Made | None:
         """Extend a session that is due; make a new one where it cannot be extended any further."""
@@ -153,7 +191,7 @@ class CamaraService:
         try:
             reply = self._api.request(
                 "POST",
-                f"{_path(entry.id)}/extend",
+                f"{self.path(entry.id)}/extend",
                 {"requestedAdditionalDuration": self._settings.duration_s},
                 may_be_gone=True,
             )
@@ -192,7 +230,7 @@ class CamaraService:
                 break
             self._api.pause(min(wait_s, left_s))
             wait_s *= 2
-            session = self._api.request("GET", _path(id_)).object()
+            session = self._api.request("GET", self.path(id_)).object()
         return session
 
     def _made(self, id_: str, session: Fields, body: Body) -> Made:
@@ -219,10 +257,6 @@ class CamaraService:
                 session.refuse("expiresAt", "a date and time with a time zone (RFC 3339)", text)
             return when
         return None if granted_s is None else self._api.clock.now_s() + granted_s
-
-
-def _path(id_: str) -> str:
-    return f"/sessions/{as_segment(id_)}"
 
 
 def _status(session: Fields) -> str:
@@ -258,21 +292,12 @@ def _plain_fraction(text: str) -> str:
     return f"{head}.{rest[:digits][:6]:0<6}{rest[digits:]}" if dot else text
 
 
-class CamaraOptions(ServerOptions[CamaraTargetSettings]):
+class CamaraOptions(ServerOptions):
     """A QualityOnDemand interface."""
 
     kind = KIND
-    settings_type = CamaraTargetSettings
-
-    @classmethod
-    def url(cls, settings: CamaraTargetSettings) -> str:
-        """Return what precedes `/sessions`."""
-        return settings.url.rstrip("/")
-
-    @classmethod
-    def service(cls, settings: CamaraTargetSettings, api: Api) -> CamaraService:
-        """Return what asks it."""
-        return CamaraService(settings, api)
+    settings_type = CamaraSettings
+    service = CamaraService
 
 
 TARGET = CamaraOptions

@@ -1,32 +1,34 @@
 """3GPP NEF AsSessionWithQoS over HTTP: one subscription per flow and device.
 
 Owns: the paths, methods and media types of TS 29.122 (release 17, API version 1.2.3) and how a
-server's view of a subscription is compared with ours. Bodies are `rules.nef`.
+server's view of a subscription is compared with ours; and our own model of the body, written from
+the specification's facts. Its schema does not look inside filter strings.
 """
 
 from __future__ import annotations
 
+import contextlib
+import enum
+import ipaddress
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import msgspec
 
-from lifecycle.programming.apply.http import (
-    MERGE_PATCH,
-    Api,
-    Fields,
-    as_segment,
-    show,
-    text_of,
-)
-from lifecycle.programming.apply.ledger import Entry
-from lifecycle.programming.apply.remote import Body, Made, RemoteRequest, ServerOptions, asks_of
+from lifecycle.programming.apply.http import MERGE_PATCH, Fields, as_segment, show, text_of
+from lifecycle.programming.apply.remote import Made, ServerOptions, Service
 from lifecycle.programming.apply.settings import ServerSettings
 from lifecycle.programming.apply.target import HttpError
-from lifecycle.programming.rules.nef import NefSettings, UplinkFilter, nef_subscriptions
-from lifecycle.programming.rules.packet_filter import parse_filter
-from lifecycle.programming.rules.rules import FlowRule
+from lifecycle.programming.rules.mobile import (
+    Body,
+    DeviceEnd,
+    Requests,
+    class_name,
+    parse_devices,
+    requests_of,
+)
+from lifecycle.programming.rules.rules import PROTOCOL_NUMBERS, FlowRule
 
 KIND = "nef"
 
@@ -35,18 +37,33 @@ _PATCHABLE = ("notificationDestination", "flowInfo", "qosReference")
 
 _COMPARED = ("ueIpv4Addr", "ueIpv6Addr", "qosReference", "notificationDestination")
 
+_PROTOCOLS = {name: str(number) for name, number in PROTOCOL_NUMBERS.items()}
+
 _NO_PATCH = (404, 405, 415, 501)
 """Statuses of servers without PATCH."""
 
 
-class NefTargetSettings(ServerSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class UplinkFilter(enum.Enum):
+    """How a server wants the filter of packets that a device sends."""
+
+    IN = "in"  # `permit in 17 from DEVICE to SERVER`, as TS 29.214 §5.3.8 says
+    OUT_REVERSED = "out_reversed"  # `permit out 17 from SERVER to DEVICE`, which it turns round
+
+
+class NefSettings(ServerSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How to reach a 3GPP NEF and what to ask it for (TS 29.122, release 17).
 
     Attributes:
         url: API root, before `/3gpp-as-session-with-qos/v1`.
         scs_as_id: who we are to the operator.
-        notification_destination, devices, qos_references, default_qos_reference,
-            supported_features, protocol_by_name, uplink: see rules.nef.NefSettings.
+        notification_destination: http or https URL that the network reports to.
+        devices: addresses or networks of the network's devices, `10.45.0.0/16`, or `source` or
+            `destination` for that end of every flow.
+        qos_references: the operator's names of classes, by 5QI.
+        default_qos_reference: for flows whose 5QI is not named; empty leaves them out.
+        supported_features: hexadecimal text (TS 29.571 SupportedFeatures), "0" for none.
+        protocol_by_name: write `udp` instead of `17`, as some servers want it.
+        uplink: how the server wants filters of what devices send.
     """
 
     scs_as_id: str
@@ -59,50 +76,71 @@ class NefTargetSettings(ServerSettings, frozen=True, kw_only=True, forbid_unknow
     uplink: UplinkFilter = UplinkFilter.IN
 
     def check(self) -> None:
-        """Refuse an id that is no segment of a path."""
+        """Refuse what a server would refuse, or could not use."""
         if not re.fullmatch(r"[A-Za-z0-9._~-]+", self.scs_as_id):
             raise ValueError(
                 f"cannot use scs_as_id {self.scs_as_id!r}; use letters, digits and . _ ~ -"
             )
-
-    def asked(self) -> NefSettings:
-        """Return what goes into bodies.
-
-        Raises:
-            ValueError: a value is not allowed.
-        """
-        asked: NefSettings = self.part(NefSettings)
-        return asked
-
-
-def nef_scope(settings: NefTargetSettings) -> str:
-    """Return the URL of our collection of subscriptions, without the last path segment."""
-    root = settings.url.rstrip("/")
-    return f"{root}/3gpp-as-session-with-qos/v1/{as_segment(settings.scs_as_id)}"
-
-
-class NefService:
-    """One NEF, see remote.Service.
-
-    Args:
-        settings: see NefTargetSettings.
-        api: at `nef_scope(settings)`.
-    """
-
-    kind = KIND
-
-    def __init__(self, settings: NefTargetSettings, api: Api) -> None:
-        self._settings = settings
-        self._api = api
+        if not re.fullmatch(r"https?://[^\s/]+\S*", self.notification_destination):
+            raise ValueError(
+                f"cannot use notificationDestination {self.notification_destination!r}; "
+                "use an http or https URL that the network can reach"
+            )
+        if not re.fullmatch(r"[0-9A-Fa-f]+", self.supported_features):
+            raise ValueError(
+                f"cannot use supportedFeatures {self.supported_features!r}; "
+                "use hexadecimal digits, 0 for none"
+            )
+        parse_devices(self.devices)
 
     @property
     def scope(self) -> str:
-        """URL of the server."""
-        return self._api.url
+        """Our collection of subscriptions, without the last path segment."""
+        return f"{self.url.rstrip('/')}/3gpp-as-session-with-qos/v1/{as_segment(self.scs_as_id)}"
 
-    def asks(self, rules: Sequence[FlowRule]) -> tuple[tuple[RemoteRequest, ...], tuple[str, ...]]:
+
+def subscription(rule: FlowRule, end: DeviceEnd, settings: NefSettings) -> Body:
+    """Return the body of an AsSessionWithQoSSubscription (3GPP TS 29.122 §5.14).
+
+    One flow each: a known open implementation passes on only the last of several.
+    """
+    reference = class_name(
+        rule, settings.qos_references, settings.default_qos_reference, setting="qos_references"
+    )
+    return {
+        "supportedFeatures": settings.supported_features,
+        "notificationDestination": settings.notification_destination,
+        "ueIpv6Addr" if end.is_ipv6 else "ueIpv4Addr": end.device,
+        "flowInfo": [{"flowId": 1, "flowDescriptions": [_filter(rule, end, settings)]}],
+        "qosReference": reference,
+    }
+
+
+def _filter(rule: FlowRule, end: DeviceEnd, settings: NefSettings) -> str:
+    """Return IPFilterRule text (RFC 6733 §4.3.1) in the shape of 3GPP TS 29.214 §5.3.8."""
+    towards = not end.sends or settings.uplink is UplinkFilter.OUT_REVERSED
+    device, server = f"{end.device} {end.device_port}", f"{end.server} {end.server_port}"
+    source, destination = (server, device) if towards else (device, server)
+    by_name = settings.protocol_by_name
+    protocol = rule.transport_protocol.value if by_name else rule.protocol_number
+    direction = "out" if towards else "in"
+    return f"permit {direction} {protocol} from {source} to {destination}"
+
+
+class NefService(Service[NefSettings]):
+    """One NEF."""
+
+    kind = KIND
+    collection = "/subscriptions"
+
+    @staticmethod
+    def requests(settings: NefSettings, rules: Sequence[FlowRule]) -> Requests:
         """Return one subscription per flow and device."""
-        return asks_of(nef_subscriptions(rules, self._settings.asked()))
+        return requests_of(
+            rules,
+            parse_devices(settings.devices),
+            lambda rule, end: subscription(rule, end, settings),
+        )
 
     def create(self, body: Body) -> Made:
         """POST it.
@@ -110,13 +148,13 @@ class NefService:
         Raises:
             HttpError: refused, or the answer does not say what was made.
         """
-        reply = self._api.request("POST", "/subscriptions", body)
+        reply = self._api.request("POST", self.collection, body)
         subscription = reply.object(may_be_empty=True)
         made = reply.created() or subscription.link("self")
         if not made:
             raise HttpError(
-                f"cannot tell what {self._api.url}/subscriptions has made: its answer has neither "
-                "a Location nor a self",
+                f"cannot tell what {self._api.url}{self.collection} has made: its answer has "
+                "neither a Location nor a self",
                 status=reply.status,
                 uncertain=True,
             )
@@ -124,7 +162,7 @@ class NefService:
 
     def find(self, body: Body) -> Made | None:
         """Look through our subscriptions for one that asks for the same."""
-        reply = self._api.request("GET", "/subscriptions", may_be_gone=True)
+        reply = self._api.request("GET", self.collection, may_be_gone=True)
         for each in reply.objects():
             id_ = each.link("self")
             if id_ and not _differs(body, each, missing=True):
@@ -133,7 +171,7 @@ class NefService:
 
     def see(self, id_: str, body: Body) -> Made | None:
         """GET it."""
-        reply = self._api.request("GET", _path(id_), may_be_gone=True)
+        reply = self._api.request("GET", self.path(id_), may_be_gone=True)
         if reply.gone:
             return None
         return Made(id=id_, differs=_differs(body, reply.object()))
@@ -146,30 +184,14 @@ class NefService:
             return self.create(body)
         patch = {key: body[key] for key in _PATCHABLE if key in body}
         try:
-            reply = self._api.request("PATCH", _path(id_), patch, content_type=MERGE_PATCH)
+            reply = self._api.request("PATCH", self.path(id_), patch, content_type=MERGE_PATCH)
         except HttpError as error:
             if error.status not in _NO_PATCH:
                 raise
-            reply = self._api.request("PUT", _path(id_), body, may_be_gone=True)
+            reply = self._api.request("PUT", self.path(id_), body, may_be_gone=True)
         if reply.gone:
             return self.create(body)
         return Made(id=id_, detail=_refused(reply.object(may_be_empty=True)))
-
-    def delete(self, id_: str) -> None:
-        """DELETE it; 204, and 200 as some servers answer."""
-        self._api.request("DELETE", _path(id_), may_be_gone=True)
-
-    def prolong(self, entry: Entry, body: Body) -> Made | None:  # noqa: ARG002 - Service
-        """Subscriptions do not expire."""
-        return None
-
-    def due_in_s(self, entry: Entry) -> float | None:  # noqa: ARG002 - Service
-        """Subscriptions do not expire."""
-        return None
-
-
-def _path(id_: str) -> str:
-    return f"/subscriptions/{as_segment(id_)}"
 
 
 def _refused(subscription: Fields) -> str:
@@ -226,27 +248,19 @@ def _filters(subscription: Mapping[str, Any]) -> list[str]:
 
 
 def _spelled(text: str) -> str:
-    try:
-        return parse_filter(" ".join(text.split())).text()
-    except ValueError:
-        return text
+    words = [_PROTOCOLS.get(each.lower(), each) for each in text.split()]
+    for index, each in enumerate(words):
+        with contextlib.suppress(ValueError):
+            words[index] = str(ipaddress.ip_address(each))
+    return " ".join(words)
 
 
-class NefOptions(ServerOptions[NefTargetSettings]):
+class NefOptions(ServerOptions):
     """A NEF."""
 
     kind = KIND
-    settings_type = NefTargetSettings
-
-    @classmethod
-    def url(cls, settings: NefTargetSettings) -> str:
-        """Return the URL of our collection of subscriptions."""
-        return nef_scope(settings)
-
-    @classmethod
-    def service(cls, settings: NefTargetSettings, api: Api) -> NefService:
-        """Return what asks it."""
-        return NefService(settings, api)
+    settings_type = NefSettings
+    service = NefService
 
 
 TARGET = NefOptions

@@ -32,7 +32,7 @@ from lifecycle.programming.rules.nftables import (
     render_nft_removal,
     table_name,
 )
-from lifecycle.programming.rules.rules import FlowRule, named, rules_digest
+from lifecycle.programming.rules.rules import FlowRule, RuleSet, named, rules_digest
 
 KIND = "nft"
 
@@ -303,6 +303,11 @@ class NftOptions(TargetOptions):
             return NftTarget(means.ledger.system, means.ledger, means.tool)
         except ValueError as error:
             raise UsageError(str(error)) from error
+
+    def export(self, rules: RuleSet, system: str) -> str:
+        """Return the ruleset."""
+        digest = rules_digest(rules.rules)
+        return render_nft(rules.rules, system=system, digest=digest, left_out=rules.left_out)
 
 
 TARGET = NftOptions

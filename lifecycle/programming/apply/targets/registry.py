@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from lifecycle.programming.apply.settings import ServerSettings
     from lifecycle.programming.apply.target import Target
     from lifecycle.programming.apply.tool import Tool
+    from lifecycle.programming.rules.rules import RuleSet
 
 TARGETS = ("nft", "tc", "nef", "camara")
 
@@ -95,9 +96,13 @@ class TargetOptions(abc.ABC):
             SettingsError: the settings file cannot be used.
         """
 
-    def exported(self) -> Mapping[str, Any]:
-        """Return what these options are to `lifecycle flows --export`, see ExportSettings."""
-        return {}
+    @abc.abstractmethod
+    def export(self, rules: RuleSet, system: str) -> str:
+        """Return what the network would be given, as text, and what is left out of it.
+
+        Raises:
+            ValueError: the rates of a device do not fit.
+        """
 
     def token_variables(self) -> frozenset[str]:
         """Return the environment variables that hold tokens."""

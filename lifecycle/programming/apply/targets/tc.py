@@ -25,7 +25,7 @@ from lifecycle.programming.apply.target import (
 from lifecycle.programming.apply.targets.nft import NftTable, compare
 from lifecycle.programming.apply.targets.registry import TargetOption, TargetOptions, Targets
 from lifecycle.programming.apply.tool import HostTool, Tool, demand, failure, qdiscs_of
-from lifecycle.programming.rules.rules import FlowRule
+from lifecycle.programming.rules.rules import FlowRule, RuleSet
 from lifecycle.programming.rules.tc import (
     OWNED_HANDLE,
     Queues,
@@ -331,9 +331,9 @@ class TcOptions(TargetOptions):
         """Return the device."""
         return TcTarget(means.ledger.system, self.settings, means.ledger, means.tool)
 
-    def exported(self) -> Mapping[str, Any]:
-        """Return the settings of the device."""
-        return {self.kind: self.settings}
+    def export(self, rules: RuleSet, system: str) -> str:
+        """Return the lines for tc and nft."""
+        return render_tc(rules.rules, self.settings, system=system, left_out=rules.left_out)
 
 
 def _guarantee(text: str) -> tuple[str, str]:

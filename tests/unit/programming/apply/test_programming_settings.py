@@ -11,7 +11,7 @@ from lifecycle.errors import UsageError
 from lifecycle.programming.apply.ledger import TargetRecord
 from lifecycle.programming.apply.settings import Token, load_settings
 from lifecycle.programming.apply.target import SettingsError
-from lifecycle.programming.apply.targets.nef import NefTargetSettings
+from lifecycle.programming.apply.targets.nef import NefSettings
 from lifecycle.programming.apply.targets.registry import (
     Targets,
     read_targets,
@@ -44,7 +44,7 @@ def test_yaml_and_json_are_read_alike(tmp_path: Path) -> None:
     of_json = load_settings(settings_file(tmp_path, nef=same), settings_types()).servers["nef"]
 
     assert of_yaml == of_json
-    assert isinstance(of_yaml, NefTargetSettings)
+    assert isinstance(of_yaml, NefSettings)
     assert of_yaml.qos_references == {85: "robot-control"}
     assert of_yaml.token == Token(file=str(tmp_path / "token.txt"))
 

@@ -13,7 +13,7 @@ from lifecycle.network.nfe import (
     TransportProtocol,
     UniqueRequirement,
 )
-from lifecycle.programming.rules.registry import COLUMNS, flows_to_csv
+from lifecycle.programming.rules.flows_csv import COLUMNS, flows_to_csv
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import FlowReport
 

@@ -191,6 +191,24 @@ def test_flow_labels_are_given_to_ipv6_only_and_stay_with_the_5_tuple() -> None:
         ),
         ({"source_port": 0}, "cannot use port 0; use 1 to 65535"),
         (
+            {"destination_address": "viewer"},
+            "cannot use address 'viewer'; use one IPv4 or IPv6 address, such as 10.77.0.1",
+        ),
+        (
+            {"destination_address": "0.0.0.0"},
+            (
+                "cannot use address '0.0.0.0': it is every address of its host; use one unicast "
+                "address"
+            ),
+        ),
+        (
+            {"destination_address": "fe80::1%eth0"},
+            (
+                "cannot use address 'fe80::1%eth0': its zone means something on its own host only; "
+                "use fe80::1"
+            ),
+        ),
+        (
             {"source_address": "fd00::1"},
             (
                 "cannot filter packets from fd00::1 to 10.9.0.2: one is IPv6, the other IPv4; "
