@@ -96,10 +96,6 @@ def _check_ros(verb: str) -> None:
             f"cannot run 'lifecycle {verb}': it needs ROS 2, and this Python has no rclpy",
             hint=_NEEDS_ROS,
         )
-    from lifecycle.cli.common import import_without
-
-    if sys.version_info >= (3, 11):  # from which on typing has what msgspec takes of it
-        import_without("msgspec", "typing_extensions")
     from lifecycle.middleware import check_rmw, check_room_to_load
 
     check_room_to_load()

@@ -7,15 +7,12 @@ Owns: `MANIFEST [name:=value …]`, `TARGET [name:=value …]` of the verbs abou
 from __future__ import annotations
 
 import contextlib
-import importlib
 import os
-import sys
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
-from click.core import ParameterSource
 
 from lifecycle.cli.completion import completing
 from lifecycle.errors import UsageError
@@ -27,19 +24,6 @@ if TYPE_CHECKING:
 
 F = TypeVar("F", bound=Callable[..., Any])
 Completer = Callable[[click.Context, click.Parameter, str], list[Any]]
-
-
-def import_without(module: str, absent: str) -> None:
-    """Import a module as if another one were not installed, which it does without then.
-
-    Only while this process has one thread: no other may import that meanwhile.
-    """
-    if not {module, absent} & sys.modules.keys():
-        sys.modules[absent] = None  # type: ignore[assignment]
-        try:
-            importlib.import_module(module)
-        finally:
-            del sys.modules[absent]
 
 
 def manifest_arguments(function: F) -> F:
@@ -245,68 +229,66 @@ def target_plan(
     return find_run(root, run_name(plan, machine)), plan
 
 
-def targets_option(flag: str, help_: str) -> Callable[[F], F]:
-    """Add the option that chooses networks to program; what each needs is NetworkCommand's."""
-    from lifecycle.programming import TARGETS
+def network_options(flag: str, help_: str) -> Callable[[F], F]:
+    """Add the option that chooses networks to program, and those that say what each needs."""
+    return _network(
+        click.option(flag, "targets", type=click.Choice(NETWORKS), multiple=True, help=help_)
+    )
 
-    return click.option(flag, "targets", type=click.Choice(TARGETS), multiple=True, help=help_)
 
-
-class NetworkCommand(click.Command):
-    """A command that also takes every option of every network target, see programming.TARGETS.
-
-    What programs networks takes long to import, so they are looked up only for a command line that
-    has an option which is none of the command's own. Only those that were given are passed on.
-    """
-
-    _looks_up = True
-
-    def get_params(self, ctx: click.Context) -> list[click.Parameter]:
-        """Insert them behind the option that says which networks."""
-        params = super().get_params(ctx)
-        if self._looks_up:
-            behind = next(
-                index for index, each in enumerate(params, 1) if each.name in ("targets", "export")
-            )
-            params[behind:behind] = _network_options()
-        return params
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Look the options up if there are any."""
-        own = {flag for each in self.params for flag in each.opts}
-        self._looks_up = any(
-            each.startswith("-") and each.partition("=")[0] not in own for each in args
+def export_option(function: F) -> F:
+    """Add `--export`, and what exporting for a network needs."""
+    return _network(
+        click.option(
+            "--export",
+            type=click.Choice((*NETWORKS, "csv")),
+            help="Print the verified flows as rules, settings or request bodies of another system "
+            "instead.",
         )
-        try:
-            rest = super().parse_args(ctx, args)
-            others = {each.name for each in self.params}
-            for name in [*ctx.params]:
-                is_given = ctx.get_parameter_source(name) is not ParameterSource.DEFAULT
-                if name not in others and not is_given:
-                    del ctx.params[name]
-        finally:
-            self._looks_up = True
-        return rest
+    )(function)
 
 
-def _network_options() -> list[click.Option]:
-    from lifecycle.programming import target_options
-
-    return [
-        click.Option(
-            [each.flag, each.name],
-            metavar=each.metavar or None,
-            type=click.Choice(each.choices) if each.choices else None,
-            default=None if each.multiple else each.default,
-            show_default=bool(each.default),
-            multiple=each.multiple,
-            help=each.help,
-        )
-        for each in target_options()
-    ]
+NETWORKS = ("nft", "tc", "nef", "camara")
 
 
-def treatment_options(function: F) -> F:
+def _network(first: Callable[[F], F]) -> Callable[[F], F]:
+    options = (
+        first,
+        click.option("--device", metavar="DEV", help="tc: the device, eth0."),
+        click.option("--rate", metavar="RATE", help="tc: rate of the link behind it, 20mbit."),
+        click.option(
+            "--guarantee",
+            metavar="CLASS=RATE",
+            multiple=True,
+            help="tc: rate of a class, ef=2mbit; above its burst peak.",
+        ),
+        click.option(
+            "--queue",
+            metavar="TIME",
+            help="tc: how long the queue of a class may become at that rate.  [default: 50ms]",
+        ),
+        click.option(
+            "--match",
+            type=click.Choice(("flow", "mark")),
+            help="tc: look at 5-tuples, or at what is marked.  [default: flow]",
+        ),
+        click.option(
+            "--config",
+            metavar="FILE",
+            help="nef, camara: where the server is and where the token is.",
+        ),
+    )
+
+    def add(function: F) -> F:
+        function = _treatment_options(function)
+        for each in reversed(options):
+            function = each(function)
+        return function
+
+    return add
+
+
+def _treatment_options(function: F) -> F:
     """Add what flows get beyond the manifest; collect with `read_treatment`."""
     function = click.option(
         "--flow-labels", is_flag=True, help="Give each IPv6 flow a flow label of its own."

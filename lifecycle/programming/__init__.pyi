@@ -11,5 +11,4 @@ from .apply.targets.registry import TARGETS as TARGETS
 from .apply.targets.registry import TargetOptions as TargetOptions
 from .apply.targets.registry import read_targets as read_targets
 from .apply.targets.registry import target_kind as target_kind
-from .apply.targets.registry import target_options as target_options
 from .rules.flows_csv import flows_to_csv as flows_to_csv

@@ -63,8 +63,8 @@ def test_networks_are_programmed_without_ros_and_loaded_without_httpx() -> None:
         "import sys\n"
         "sys.modules['rclpy'] = sys.modules['httpx'] = None\n"
         "import lifecycle.programming.apply.programmer\n"
-        "from lifecycle.programming import target_options\n"
-        "assert target_options()\n"
+        "from lifecycle.programming import read_targets\n"
+        "assert read_targets(['nft'], {})\n"
     )
     result = subprocess.run(
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False

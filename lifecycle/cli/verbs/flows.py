@@ -15,17 +15,17 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lifecycle.cli.common import (
-    NetworkCommand,
+    NETWORKS,
     assignments_argument,
+    export_option,
     format_option,
     is_manifest,
     load_manifest,
     manifest_arguments,
+    network_options,
     target_argument,
     target_plan,
-    targets_option,
     timeout_option,
-    treatment_options,
 )
 from lifecycle.cli.verbs.verify import exit_code
 from lifecycle.cli.watched import Watched
@@ -119,16 +119,13 @@ def _ends(nfes: Sequence[NetworkFlowEndpoint]) -> str:
     return " ".join(dict.fromkeys(each.describe() for each in nfes)) or "unknown"
 
 
-NAMES = ("nft", "tc", "nef", "camara", "csv")
-
-
 class Export:
     """One export, with its options checked before anything is looked at.
 
     Args:
-        name: of NAMES.
-        mapping, flow_labels: see common.treatment_options.
-        given: see common.NetworkCommand.
+        name: of NETWORKS, or csv.
+        mapping, flow_labels: see read_treatment.
+        given: what the network needs, by option.
 
     Raises:
         UsageError: the options do not fit.
@@ -165,18 +162,13 @@ _EMPTY_GRAPH_S = 1.5
 """Some node of what runs is seen within so long; a system without any is waited for if asked."""
 
 
-@click.command("flows", cls=NetworkCommand)
+@click.command("flows")
 @target_argument
 @assignments_argument
 @format_option("text", "json", "csv")
 @click.option("--watch", is_flag=True, help="Show them again whenever they change; Ctrl-C ends.")
 @timeout_option(5.0, "How long flows that are not complete may still become so.")
-@click.option(
-    "--export",
-    type=click.Choice(NAMES),
-    help="Print the verified flows as rules, settings or request bodies of another system instead.",
-)
-@treatment_options
+@export_option
 def _show(
     *,
     target: str,
@@ -295,10 +287,9 @@ def remove(plan: Plan) -> int:
     return ExitCode.OK
 
 
-@click.command("apply", cls=NetworkCommand)
+@click.command("apply")
 @manifest_arguments
-@targets_option("--target", "Network to program; may be given several times.")
-@treatment_options
+@network_options("--target", "Network to program; may be given several times.")
 @click.option("--dry-run", is_flag=True, help="Print what would be sent; check it if possible.")
 @timeout_option(5.0, "How long flows that are not complete may still become so.")
 def apply_command(
@@ -322,10 +313,9 @@ def apply_command(
     return done or exit_code(verdict, strict=False)
 
 
-@click.command("diff", cls=NetworkCommand)
+@click.command("diff")
 @manifest_arguments
-@targets_option("--target", "Network to program; may be given several times.")
-@treatment_options
+@network_options("--target", "Network to program; may be given several times.")
 @timeout_option(5.0, "How long flows that are not complete may still become so.")
 def diff_command(
     *,
@@ -355,11 +345,11 @@ def remove_command(manifest: str, assignments: tuple[str, ...]) -> int:
 def _asked(
     targets: tuple[str, ...], given: Mapping[str, Any], mapping: str, *, flow_labels: bool
 ) -> tuple[tuple[TargetOptions, ...], Treatment]:
-    from lifecycle.programming import TARGETS, read_targets, read_treatment
+    from lifecycle.programming import read_targets, read_treatment
 
     options = read_targets(targets, given)
     if not options:
-        raise UsageError(f"cannot program no network; give --target {'|'.join(TARGETS)}")
+        raise UsageError(f"cannot program no network; give --target {'|'.join(NETWORKS)}")
     return options, read_treatment(mapping, label_flows=flow_labels)
 
 

@@ -2,38 +2,32 @@
 
 from __future__ import annotations
 
-import contextlib
-import gc
 import importlib
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from lifecycle.cli.common import (
-    NetworkCommand,
     format_option,
-    import_without,
     load_manifest,
     machine_option,
     manifest_arguments,
-    targets_option,
+    network_options,
     timeout_option,
-    treatment_options,
 )
 from lifecycle.cli.completion import completing
 from lifecycle.cli.report import ReportFile, report_option, written_or_said
 from lifecycle.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from lifecycle.cli.up_output import RunOutput
     from lifecycle.programming import TargetOptions, Treatment
-    from lifecycle.supervisor import ForkServerProcess, SystemStatus, UpResult
+    from lifecycle.supervisor import ForkServerProcess, UpResult
 
 
-@click.command("up", cls=NetworkCommand)
+@click.command("up")
 @manifest_arguments
 @format_option("text", "json")
 @click.option(
@@ -88,11 +82,10 @@ if TYPE_CHECKING:
     metavar="ID",
     help="The domain, in the place of the manifest's.",
 )
-@targets_option(
+@network_options(
     "--program",
     "Program this network with the verified flows while active; may be given several times.",
 )
-@treatment_options
 def command(
     *,
     manifest: str,
@@ -127,7 +120,6 @@ def command(
 
     try:
         with (
-            _collecting_later() as collect,
             Ending() as ending,
             ReportFile(report, strict=strict) as written,
             ending.unmasked(),
@@ -136,8 +128,6 @@ def command(
             # It imports while we do and read the manifest.
             process = _fork_server(program)
             try:
-                # ssl takes 6 ms, and a supervisor's loop has no connections with TLS.
-                import_without("asyncio", "ssl")
                 _load_rclpy()
                 from lifecycle.plan import build_plan, started_by_others
 
@@ -163,10 +153,6 @@ def command(
                 timed = until if timings else ""
                 with output(format_, timings_until=timed) as listener, ending.noted():
 
-                    def on_start(status: Callable[[], SystemStatus]) -> None:
-                        collect()
-                        listener.watch(status)
-
                     def conclude(result: UpResult) -> ExitCode:
                         return _finished(result, listener, written)
 
@@ -177,7 +163,7 @@ def command(
                             [listener],
                             process=process,
                             ending=ending,
-                            on_start=on_start,
+                            on_start=listener.watch,
                             conclude=conclude,
                         ).exit_code
                     except Ended as ended:
@@ -206,24 +192,6 @@ def _fork_server(program: tuple[TargetOptions, ...]) -> ForkServerProcess:
     from lifecycle.supervisor import ForkServerProcess
 
     return ForkServerProcess(without=_tokens(program), programs=bool(program))
-
-
-@contextlib.contextmanager
-def _collecting_later() -> Iterator[Callable[[], None]]:
-    """Collect no garbage until told to: importing makes next to none, and a lot to look through.
-
-    What is there by then stays until the end, and is not looked through any more.
-    """
-
-    def collect() -> None:
-        gc.freeze()
-        gc.enable()
-
-    gc.disable()
-    try:
-        yield collect
-    finally:
-        gc.enable()
 
 
 def _finished(result: UpResult, listener: RunOutput, written: ReportFile) -> ExitCode:

@@ -32,7 +32,6 @@ from lifecycle.programming.apply.target import (
     describe_rule,
 )
 from lifecycle.programming.apply.targets.registry import (
-    TargetOption,
     TargetOptions,
     Targets,
     settings_types,
@@ -351,13 +350,6 @@ class ServerOptions(TargetOptions):
     """
 
     hint = "give --config FILE"
-    takes = (
-        TargetOption(
-            flag="--config",
-            metavar="FILE",
-            help="nef, camara: where the server is and where the token is.",
-        ),
-    )
     service: ClassVar[type[Service[Any]]]
 
     def __init__(self, path: str) -> None:

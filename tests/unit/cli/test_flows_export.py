@@ -8,9 +8,11 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
+from lifecycle.cli.common import NETWORKS
 from lifecycle.cli.verbs import flows, up
-from lifecycle.cli.verbs.flows import NAMES, Export
+from lifecycle.cli.verbs.flows import Export
 from lifecycle.errors import UsageError
+from lifecycle.programming import TARGETS
 from tests.unit.programming.apply.samples import camara_settings, nef_settings, settings_file
 from tests.unit.programming.rules.samples import plan, report
 
@@ -19,7 +21,7 @@ def export(name: str, *, mapping: str = "", **given: object) -> Export:
     return Export(name, mapping=mapping, flow_labels=False, **given)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [*NETWORKS, "csv"])
 def test_every_export_shows_the_flow_and_names_what_it_left_out(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -134,15 +136,5 @@ def test_up_refuses_options_that_do_not_fit(options: list[str], message: str) ->
     assert str(result.exception) == message
 
 
-def test_what_networks_need_is_looked_up_only_for_an_option_that_is_no_verbs_own(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    given = up.command.make_context("up", ["m.yaml", "--match", "mark", "--queue=5ms"]).params
-    monkeypatch.setattr("lifecycle.cli.common._network_options", None)
-    light = up.command.make_context("up", ["m.yaml", "a:=b", "--program", "nft", "--strict"]).params
-
-    assert (given["match"], given["queue"]) == ("mark", "5ms")
-    assert not {"device", "rate", "config"} & given.keys()
-    assert given.keys() - light.keys() == {"match", "queue"}
-    with pytest.raises(TypeError):
-        up.command.make_context("up", ["m.yaml", "--rate", "1mbit"])
+def test_networks_have_the_names_of_what_programs_them() -> None:
+    assert NETWORKS == TARGETS

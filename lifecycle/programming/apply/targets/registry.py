@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import abc
 import importlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from lifecycle import dataclasses
 from lifecycle.errors import UsageError
 
 if TYPE_CHECKING:
@@ -26,51 +25,23 @@ if TYPE_CHECKING:
 TARGETS = ("nft", "tc", "nef", "camara")
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class TargetOption:
-    """A command line option that a target takes.
-
-    Attributes:
-        flag: `--device`; without the dashes it is the option's name.
-        help: one line.
-        metavar: of its value; empty where there are choices.
-        choices: all values that it may have; empty for any.
-        default: its value where it is not given.
-        multiple: it may be given several times, and its value is a tuple.
-    """
-
-    flag: str
-    help: str
-    metavar: str = ""
-    choices: tuple[str, ...] = ()
-    default: str = ""
-    multiple: bool = False
-
-    @property
-    def name(self) -> str:
-        """Key of its value."""
-        return self.flag.removeprefix("--")
-
-
 class TargetOptions(abc.ABC):
     """What a person said of one target, and how it is opened from that.
 
     Attributes:
         kind: name of the target.
-        takes: options beside the flows.
         hint: how to give what it cannot do without; empty if there is nothing such.
         settings_type: of its key in the settings file of servers; None if it is no server.
     """
 
     kind: ClassVar[str]
-    takes: ClassVar[tuple[TargetOption, ...]] = ()
     hint: ClassVar[str] = ""
     settings_type: ClassVar[type[ServerSettings] | None] = None
 
     @classmethod
     @abc.abstractmethod
     def read(cls, given: Mapping[str, Any]) -> TargetOptions:
-        """Read the values of what it takes; what is missing was not given.
+        """Read the values of what it takes; what is missing, None or empty was not given.
 
         Raises:
             UsageError: something is missing, or they do not fit together.
@@ -157,15 +128,6 @@ def settings_types() -> dict[str, type[ServerSettings]]:
     return {name: type_ for name, type_ in types.items() if type_ is not None}
 
 
-def target_options() -> dict[TargetOption, tuple[str, ...]]:
-    """Return every option that a target takes, with the names of all targets that take it."""
-    takers: dict[TargetOption, tuple[str, ...]] = {}
-    for name in TARGETS:
-        for each in target_kind(name).takes:
-            takers[each] = (*takers.get(each, ()), name)
-    return takers
-
-
 def read_targets(
     names: Iterable[str], given: Mapping[str, Any], *, option: str = "--target"
 ) -> tuple[TargetOptions, ...]:
@@ -173,23 +135,24 @@ def read_targets(
 
     Args:
         names: of TARGETS.
-        given: values of `target_options` by name; what is missing was not given.
+        given: values of options by name; what is missing, None or empty was not given.
         option: what chose the targets, for messages.
 
     Raises:
         UsageError: they do not fit together.
     """
     chosen = tuple(dict.fromkeys(names))
-    takers = target_options()
-    for those in dict.fromkeys(takers.values()):
-        of_those = [each for each, names in takers.items() if names == those]
-        bound = [each for each in of_those if not each.default]
-        if not {*those} & {*chosen} and any(given.get(each.name) for each in bound):
-            flags = _either([each.flag for each in bound])
-            raise UsageError(f"cannot use {flags} without {option} {_either(those)}")
+    for those, flags in _TAKEN.items():
+        if not {*those} & {*chosen} and any(given.get(each) for each in flags):
+            needs = _either([f"--{each}" for each in flags])
+            raise UsageError(f"cannot use {needs} without {option} {_either(those)}")
     return tuple(target_kind(each).read(given) for each in chosen)
 
 
-def _either(words: Iterable[str]) -> str:
+_TAKEN = {("tc",): ("device", "rate", "guarantee"), ("nef", "camara"): ("config",)}
+"""Targets → options that only they take."""
+
+
+def _either(words: Sequence[str]) -> str:
     *most, last = words
     return f"{', '.join(most)} or {last}" if most else last

@@ -23,7 +23,7 @@ from lifecycle.programming.apply.target import (
     deletions,
 )
 from lifecycle.programming.apply.targets.nft import NftTable, compare
-from lifecycle.programming.apply.targets.registry import TargetOption, TargetOptions, Targets
+from lifecycle.programming.apply.targets.registry import TargetOptions, Targets
 from lifecycle.programming.apply.tool import HostTool, Tool, demand, failure, qdiscs_of
 from lifecycle.programming.rules.rules import FlowRule, RuleSet
 from lifecycle.programming.rules.tc import (
@@ -266,28 +266,6 @@ class TcOptions(TargetOptions):
 
     kind = KIND
     hint = "give --device eth0 --rate 20mbit"
-    takes = (
-        TargetOption(flag="--device", metavar="DEV", help="tc: the device, eth0."),
-        TargetOption(flag="--rate", metavar="RATE", help="tc: rate of the link behind it, 20mbit."),
-        TargetOption(
-            flag="--guarantee",
-            metavar="CLASS=RATE",
-            multiple=True,
-            help="tc: rate of a class, ef=2mbit; above its burst peak.",
-        ),
-        TargetOption(
-            flag="--queue",
-            metavar="TIME",
-            default="50ms",
-            help="tc: how long the queue of a class may become at that rate.",
-        ),
-        TargetOption(
-            flag="--match",
-            choices=("flow", "mark"),
-            default="flow",
-            help="tc: look at 5-tuples, or at what is marked.",
-        ),
-    )
 
     def __init__(self, settings: TcSettings) -> None:
         self.settings = settings
@@ -297,8 +275,8 @@ class TcOptions(TargetOptions):
         """Read rates, times and classes."""
         rate = given.get("rate")
         try:
-            queue_ms = parse_queue(given.get("queue", "50ms"))
-            guaranteed = map(_guarantee, given.get("guarantee", ()))
+            queue_ms = parse_queue(given.get("queue") or "50ms")
+            guaranteed = map(_guarantee, given.get("guarantee") or ())
             guaranteed_kbit = {name: parse_rate(text) for name, text in guaranteed}
             device = given.get("device")
             if not device:
@@ -315,7 +293,7 @@ class TcOptions(TargetOptions):
                 device=device,
                 link_kbit=parse_rate(rate),
                 guaranteed_kbit=guaranteed_kbit,
-                match=TcMatch(given.get("match", TcMatch.FLOW.value)),
+                match=TcMatch(given.get("match") or TcMatch.FLOW.value),
                 queue_ms=queue_ms,
             )
         except ValueError as error:
