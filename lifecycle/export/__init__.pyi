@@ -20,4 +20,5 @@ from .picture.model import PicturedNodeState as PicturedNodeState
 from .programs import CapturedProgram as CapturedProgram
 from .sros2 import OVERRIDE as OVERRIDE
 from .sros2 import Enclave as Enclave
-from .sros2 import documents as documents
+from .sros2 import enclaves_of as enclaves_of
+from .sros2 import render_policy as render_policy

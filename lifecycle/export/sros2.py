@@ -1,21 +1,18 @@
-"""SROS 2 access control from a plan: policy.xml, and DDS-Security permissions and governance.
+"""SROS 2 access control from a plan: policy.xml, of which `ros2 security` makes all the rest.
 
-Owns: which topics, services and actions each process of a plan and each supervisor needs, and how
-the three kinds of document say so. Nothing is signed here: that takes the keys of a keystore. Pure.
+Owns: which topics, services and actions each process of a plan and each supervisor needs. Nothing
+is signed here: that takes the keys of a keystore. Pure.
 
-Sources: the policy format of SROS 2 (design.ros2.org/articles/ros2_access_control_policies.html),
-version 0.2.0; DDS Security 1.1 §9.4.1.2 (governance) and §9.4.1.3 (permissions), grant by subject
-name; how names become DDS topics, `rt/`, `rq/…Request`, `rr/…Reply`
-(design.ros2.org/articles/topic_and_service_names.html).
+Source: the policy format of SROS 2 (design.ros2.org/articles/ros2_access_control_policies.html),
+version 0.2.0.
 """
 
 from __future__ import annotations
 
-import datetime as dt
 import itertools
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 
 from lifecycle import dataclasses
 from lifecycle.manifest import (
@@ -40,8 +37,6 @@ PLANS_TOPIC = "/_lifecycle/plans"
 """Where supervisors announce their plans (lifecycle.middleware.discovery.liveliness)."""
 
 _MANAGED = frozenset(name for name, type_ in NODE_SERVICES.items() if "lifecycle_msgs" in type_)
-_ACTION_SERVICES = ("cancel_goal", "get_result", "send_goal")
-_ACTION_TOPICS = ("feedback", "status")
 
 _GRANTS = {
     EndpointKind.PUBLISHER: ("topic", "publish"),
@@ -126,91 +121,8 @@ def render_policy(enclaves: Iterable[Enclave]) -> str:
                     group = ET.SubElement(element, f"{what}s", {verb: "ALLOW"})
                     for name in names:
                         ET.SubElement(group, what).text = name
-    return _text(root)
-
-
-def render_permissions(
-    enclave: Enclave, *, domain_id: int, not_before: dt.datetime, not_after: dt.datetime
-) -> str:
-    """Return the permissions document of one enclave, unsigned.
-
-    Args:
-        enclave: its path is the subject's common name, as sros2 makes certificates.
-        domain_id: the one domain that it may join.
-        not_before: UTC; before it nothing is allowed.
-        not_after: UTC; nor after it.
-    """
-    root = ET.Element("dds")
-    grant = ET.SubElement(ET.SubElement(root, "permissions"), "grant", name=enclave.path)
-    ET.SubElement(grant, "subject_name").text = f"CN={enclave.path}"
-    validity = ET.SubElement(grant, "validity")
-    for name, time in (("not_before", not_before), ("not_after", not_after)):
-        ET.SubElement(validity, name).text = time.strftime("%Y-%m-%dT%H:%M:%S")
-    rule = ET.SubElement(grant, "allow_rule")
-    ET.SubElement(ET.SubElement(rule, "domains"), "id").text = str(domain_id)
-    allowed = {each for profile in enclave.profiles for each in profile.allowed}
-    for verb, topics in _dds_topics(allowed).items():
-        criteria = ET.SubElement(ET.SubElement(rule, verb), "topics")
-        for topic in sorted(topics):
-            ET.SubElement(criteria, "topic").text = topic
-    ET.SubElement(grant, "default").text = "DENY"
-    return _text(root)
-
-
-def render_governance(domain_id: int) -> str:
-    """Return the governance document of a domain, unsigned.
-
-    Only who has a key joins; announcements, liveliness and data are encrypted, RTPS messages are
-    signed, and every topic is subject to permissions.
-    """
-    root = ET.Element("dds")
-    rule = ET.SubElement(ET.SubElement(root, "domain_access_rules"), "domain_rule")
-    ET.SubElement(ET.SubElement(rule, "domains"), "id").text = str(domain_id)
-    _leaves(
-        rule,
-        {
-            "allow_unauthenticated_participants": "false",
-            "enable_join_access_control": "true",
-            "discovery_protection_kind": "ENCRYPT",
-            "liveliness_protection_kind": "ENCRYPT",
-            "rtps_protection_kind": "SIGN",
-        },
-    )
-    _leaves(
-        ET.SubElement(ET.SubElement(rule, "topic_access_rules"), "topic_rule"),
-        {
-            "topic_expression": "*",
-            "enable_discovery_protection": "true",
-            "enable_liveliness_protection": "true",
-            "enable_read_access_control": "true",
-            "enable_write_access_control": "true",
-            "metadata_protection_kind": "ENCRYPT",
-            "data_protection_kind": "ENCRYPT",
-        },
-    )
-    return _text(root)
-
-
-def documents(
-    plan: Plan, *, not_before: dt.datetime, not_after: dt.datetime
-) -> tuple[tuple[Enclave, ...], Mapping[str, str]]:
-    """Return the enclaves of a plan and every document, by its path below a keystore.
-
-    Args:
-        plan: of the whole system.
-        not_before: see `render_permissions`.
-        not_after: likewise.
-    """
-    enclaves = enclaves_of(plan)
-    files = {
-        "policy.xml": render_policy(enclaves),
-        "enclaves/governance.xml": render_governance(plan.domain_id),
-    }
-    for each in enclaves:
-        files[f"enclaves{each.path}/permissions.xml"] = render_permissions(
-            each, domain_id=plan.domain_id, not_before=not_before, not_after=not_after
-        )
-    return enclaves, files
+    ET.indent(root)
+    return f'<?xml version="1.0" encoding="UTF-8"?>\n{ET.tostring(root, encoding="unicode")}\n'
 
 
 def _node_profile(node: PlannedNode) -> Profile:
@@ -271,28 +183,6 @@ def _node_topics(node: PlannedNode) -> tuple[str, ...]:
     return tuple(f"{node.full_name}/{name}" for name in names)
 
 
-def _dds_topics(allowed: Iterable[tuple[EndpointKind, str]]) -> dict[str, set[str]]:
-    """Return the DDS topics that may be written and read; rmw's own is among them."""
-    publish = {"ros_discovery_info"}
-    subscribe = {"ros_discovery_info"}
-    for kind, name in allowed:
-        if kind is EndpointKind.PUBLISHER:
-            publish.add(f"rt{name}")
-        elif kind is EndpointKind.SUBSCRIPTION:
-            subscribe.add(f"rt{name}")
-        else:
-            # Who serves writes replies and feedback, and reads requests; who asks does the reverse.
-            serves = kind in {EndpointKind.SERVICE_SERVER, EndpointKind.ACTION_SERVER}
-            out, in_ = (publish, subscribe) if serves else (subscribe, publish)
-            is_action = kind in {EndpointKind.ACTION_SERVER, EndpointKind.ACTION_CLIENT}
-            parts = [f"{name}/_action/{each}" for each in _ACTION_SERVICES] if is_action else [name]
-            out |= {f"rr{each}Reply" for each in parts}
-            in_ |= {f"rq{each}Request" for each in parts}
-            if is_action:
-                out |= {f"rt{name}/_action/{each}" for each in _ACTION_TOPICS}
-    return {"publish": publish, "subscribe": subscribe}
-
-
 def _chosen(process: PlannedProcess) -> str:
     """Return the enclave that a process is given by its manifest; empty if by none."""
     if path := dict(process.environment).get(OVERRIDE, ""):
@@ -322,13 +212,3 @@ def _free(path: str, taken: Iterable[str]) -> str:
     while free in every:
         free, number = f"{path}_{number}", number + 1
     return free
-
-
-def _leaves(parent: ET.Element, values: Mapping[str, str]) -> None:
-    for name, value in values.items():
-        ET.SubElement(parent, name).text = value
-
-
-def _text(root: ET.Element) -> str:
-    ET.indent(root)
-    return f'<?xml version="1.0" encoding="UTF-8"?>\n{ET.tostring(root, encoding="unicode")}\n'

@@ -5,7 +5,6 @@ Owns: access control for SROS 2, and units or manifests of the engines that star
 
 from __future__ import annotations
 
-import datetime as dt
 import re
 import shlex
 from pathlib import Path
@@ -38,32 +37,21 @@ def command() -> None:
     type=click.Path(path_type=Path),
     required=True,
     metavar="DIR",
-    help="Write policy.xml and enclaves/… there; files of these names are replaced.",
+    help="Write policy.xml there; one that is there is replaced.",
 )
-@click.option(
-    "--days",
-    type=click.IntRange(1, 36500),
-    default=365,
-    show_default=True,
-    metavar="N",
-    help="How long the permissions hold, from today, 00:00 UTC.",
-)
-def sros2(manifest: str, assignments: tuple[str, ...], output: Path, days: int) -> int:
+def sros2(manifest: str, assignments: tuple[str, ...], output: Path) -> int:
     """Write access control for ROS 2 security: only what the manifest declares is allowed.
 
-    One enclave for each process, and one for each supervisor. policy.xml is what `ros2 security`
-    takes; permissions.xml and governance.xml are for whoever signs without it. Nothing is signed:
-    the commands that are printed do that.
+    One enclave for each process, and one for each supervisor, in policy.xml, of which `ros2
+    security create_permission` makes signed permissions; the commands that are printed do that.
     """
-    from lifecycle.export import documents
+    from lifecycle.export import enclaves_of, render_policy
     from lifecycle.plan import build_plan
 
     plan = build_plan(load_manifest(manifest, assignments).manifest)
-    today = dt.datetime.now(dt.timezone.utc).replace(hour=0, minute=0, second=0, microsecond=0)
-    enclaves, files = documents(plan, not_before=today, not_after=today + dt.timedelta(days=days))
+    enclaves = enclaves_of(plan)
     _check_paths(enclaves)
-    for name, text in files.items():
-        _write(output / name, text)
+    _write(output / "policy.xml", render_policy(enclaves))
     for node in plan.nodes:
         if node.endpoint_policy is EndpointPolicy.OPEN:
             click.echo(
