@@ -103,7 +103,7 @@ def runtime_root(environment: Mapping[str, str]) -> Path:
         UsageError: another user can put things there, or it is no directory.
     """
     base = environment.get("XDG_RUNTIME_DIR")
-    if base and os.path.isdir(base):  # noqa: PTH112 - Path.is_dir() raises for a name too long
+    if base and os.path.isdir(base):
         root = Path(base) / "lifecycle"
     else:
         import tempfile

@@ -95,7 +95,7 @@ def evaluate(path: Path, arguments: Mapping[str, str]) -> Launched:
     """
     launch = _package("launch")
     sources = importlib.import_module("launch.launch_description_sources")
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise UsageError(f"cannot import {str(path)!r}: there is no such file")
     before = dict(os.environ)
     # launch_ros looks nowhere without it; wheels of ROS packages are below sys.prefix.

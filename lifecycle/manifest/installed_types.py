@@ -40,7 +40,7 @@ def find_resource(kind: str, name: str, prefixes: Sequence[Path]) -> Path | None
     """Return the file of resource `name` of type `kind` in the first prefix that has it."""
     for prefix in prefixes:
         path = prefix / _INDEX / kind / name
-        if path.is_file():
+        if os.path.isfile(path):
             return path
     return None
 
@@ -50,7 +50,7 @@ def list_resources(kind: str, prefixes: Sequence[Path]) -> tuple[str, ...]:
     names: set[str] = set()
     for prefix in prefixes:
         folder = prefix / _INDEX / kind
-        if folder.is_dir():
+        if os.path.isdir(folder):
             # A leading dot marks files that are no resources.
             names.update(each.name for each in folder.iterdir() if not each.name.startswith("."))
     return tuple(sorted(names))

@@ -250,7 +250,7 @@ class _NodlReading:
         scheme, _, body = reference.partition("://")
         if scheme == "local" and body:
             path = base / body
-            if not os.path.exists(path):  # noqa: PTH110 - Path.exists() raises for a name too long
+            if not os.path.exists(path):
                 message = f"cannot find {reference!r}: there is no file {str(path)!r}"
                 hint = nearest_file(path)
                 self._error("not-found", at, message, hint)

@@ -156,9 +156,9 @@ def find_executable(run: Run, environment: Mapping[str, str], *, at: Position) -
     for prefix in prefixes:
         folder = Path(prefix) / "lib" / run.package
         candidate = folder / run.executable
-        if candidate.is_file() and os.access(candidate, os.X_OK):
+        if os.path.isfile(candidate) and os.access(candidate, os.X_OK):
             return str(candidate)
-        if folder.is_dir():
+        if os.path.isdir(folder):
             found += [each.name for each in folder.iterdir() if os.access(each, os.X_OK)]
     if found:
         raise PlanError(

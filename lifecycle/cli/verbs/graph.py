@@ -154,7 +154,7 @@ def write_picture(path: Path, text: str) -> None:
     """
     part = None
     try:
-        if path.exists() and not path.is_file():
+        if os.path.exists(path) and not os.path.isfile(path):
             path.write_text(text.rstrip("\n") + "\n", encoding="utf-8")
             return
         with tempfile.NamedTemporaryFile(

@@ -62,7 +62,7 @@ def _recorded(run: str | None, system: str) -> RecordedRun:
         path = there[0]
     else:
         path = Path(run)
-        if not path.exists() and (ros_log_root(os.environ) / run).exists():
+        if not os.path.exists(path) and os.path.exists(ros_log_root(os.environ) / run):
             path = ros_log_root(os.environ) / run
     recorded = read_run(journal_files(path))
     for place, why in recorded.unreadable:

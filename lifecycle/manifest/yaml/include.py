@@ -74,7 +74,7 @@ def locate(entry: Cursor, chain: tuple[Origin, ...], found: Findings) -> Origin 
         message = f"cannot include {quote(name)}: it would include itself, {names}"
     elif len(chain) == MAX_DEPTH:
         message = f"cannot include {quote(name)}: at most {MAX_DEPTH} manifests in a row"
-    elif not os.path.exists(path):  # noqa: PTH110 - Path.exists() raises for a name too long
+    elif not os.path.exists(path):
         message = f"cannot include {quote(name)}: there is no file {quote(str(path), limit=200)}"
         hint = did_you_mean(path.name, _siblings(path))
     elif path.is_dir():

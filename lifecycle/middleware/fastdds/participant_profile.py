@@ -339,7 +339,7 @@ def default_profile(environment: Mapping[str, str] | None = None) -> DefaultProf
 
 def _has_default_file() -> bool:
     # Not by pathlib: what each host calls is copied into its own memory (docs/performance.md).
-    return os.path.exists(DEFAULT_FILE)  # noqa: PTH110
+    return os.path.exists(DEFAULT_FILE)
 
 
 def profile(

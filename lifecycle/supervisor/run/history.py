@@ -6,6 +6,7 @@ Owns: `read_run`, and what a person means by a time of it (`moment_of`).
 from __future__ import annotations
 
 import datetime as dt
+import os
 import re
 from collections.abc import Iterable
 from pathlib import Path
@@ -59,10 +60,10 @@ def journal_files(path: Path) -> tuple[Path, ...]:
     Raises:
         UsageError: there is none.
     """
-    newest = path / JOURNAL_NAME if path.is_dir() else path
+    newest = path / JOURNAL_NAME if os.path.isdir(path) else path
     older = newest.with_name(f"{newest.name}.1")
-    found = [each for each in (older, newest) if each.is_file()]
-    if not path.is_dir() and path not in found:
+    found = [each for each in (older, newest) if os.path.isfile(each)]
+    if not os.path.isdir(path) and path not in found:
         found = []
     if not found:
         raise UsageError(
