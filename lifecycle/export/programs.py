@@ -168,7 +168,7 @@ def _is_kept(file: str) -> bool:
     """Whether a parameter file is there, and is none that launch makes and removes."""
     of_launch = Path(file).name.startswith("launch_params_")
     in_temporary = file.startswith(f"{tempfile.gettempdir()}/")
-    return Path(file).is_file() and not (of_launch and in_temporary)
+    return os.path.isfile(file) and not (of_launch and in_temporary)
 
 
 def _resolves(run: CapturedRun, node: str, endpoints: Iterable[tuple[EndpointKind, str]]) -> bool:

@@ -326,16 +326,16 @@ def _without_health(node: Node, found: NodeClass) -> Iterator[Diagnostic]:
 
 def _find_program(word: str, folder: Path, variables: Mapping[str, str]) -> None:
     """Find a program as execvp(3) would, started in `folder`; raises NotThereError."""
-    if not folder.is_dir():
+    if not os.path.isdir(folder):
         raise NotThereError(f"cannot find the working directory {str(folder)!r}")
     if "/" in word:
         file = folder / word
-        if not file.exists():
+        if not os.path.exists(file):
             near = did_you_mean(file.name, _names(file.parent))
             where = "" if Path(word).is_absolute() else f" in {str(folder)!r}"
             raise NotThereError(f"cannot find program {word!r}{where}", hint=near)
-        if not file.is_file() or not os.access(file, os.X_OK):
-            hint = f"chmod +x {word}" if file.is_file() else ""
+        if not os.path.isfile(file) or not os.access(file, os.X_OK):
+            hint = f"chmod +x {word}" if os.path.isfile(file) else ""
             raise NotThereError(f"cannot run {word!r}: it is not executable", hint=hint)
         return
     path = variables.get("PATH", os.defpath)
@@ -352,7 +352,7 @@ def _find_script(words: tuple[str, ...], folder: Path) -> None:
     if len(words) < 2 or not _PYTHON.fullmatch(Path(words[0]).name) or words[1].startswith("-"):
         return
     file = folder / words[1]
-    if not file.exists():
+    if not os.path.exists(file):
         near = did_you_mean(file.name, _names(file.parent))
         raise NotThereError(f"cannot find script {words[1]!r} in {str(folder)!r}", hint=near)
 
