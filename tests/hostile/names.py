@@ -1,7 +1,7 @@
 """Names of topics and nodes that ROS would refuse, announced by a bare DDS participant.
 
 One active system sees them all; every verb that looks at it runs once, and each name must be in
-what the supervisor finds, escaped.
+what the supervisor finds, escaped. The real verbs say what they always say.
 """
 
 from __future__ import annotations
@@ -15,21 +15,59 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 from lifecycle.errors import ExitCode
 from tests.hostile.attack import (
-    CODES,
     Attack,
+    Done,
     HostileClass,
     Place,
     Unhandled,
     check,
     check_text,
-    in_a_process,
 )
 from tests.ros.faults.system import BARE_DDS
-from tests.ros.faults.test_hostile_names import NODES, STRING, TOPICS, raw
-from tests.ros.supervisor.running import Up, pair
+from tests.ros.supervisor.running import Up, pair, verb
+
+STRING = b":std_msgs::msg::dds_::String_"
+TOPICS = {
+    b"foo-bar": "/foo-bar",
+    b"foo.bar": "/foo.bar",
+    b"foo bar": "/foo bar",
+    b"1foo": "/1foo",
+    b"f\xffo": "/f\\xffo",
+    b"": "/",
+    b"/": "//",
+    b"a/": "/a/",
+    b"a__b": "/a__b",
+    b"a\x1b[2Jb": "/a\\x1b[2Jb",
+    b"a\nb": "/a\\nb",
+    b"a\rb": "/a\\rb",
+    b"a\tb": "/a\\tb",
+    b"a\xc2\x9b2Jb": "/a\\x9b2Jb",
+    b"a\xe2\x80\xaeb": "/a\\u202eb",
+    b"[red]b": "/[red]b",
+    "é".encode(): "/é",
+    b"{x}": "/{x}",
+    b"$(x)": "/$(x)",
+}
+"""Bytes after `rt/` → how they are shown."""
+
+NODES = {
+    (b"/", b"foo-bar"): "/foo-bar",
+    (b"/", b""): "/",
+    (b"/", b"a\x1b[31mb"): "/a\\x1b[31mb",
+    (b"/", b"1foo"): "/1foo",
+    (b"/", "é".encode()): "/é",
+    (b"/", b"\xff\xfe"): "/\\xff\\xfe",
+    (b"/", b"x\nverdict: ok"): "/x\\nverdict: ok",
+    (b"bad", b"x"): "bad/x",
+    (b"/a-b", b"x"): "/a-b/x",
+    (b"", b"y"): "/y",
+    (b"//", b"z"): "/z",
+}
+"""Namespace and name → how they are shown."""
 
 MANY = 60
 """Generated names of topics; half as many of nodes."""
@@ -37,7 +75,18 @@ MANY = 60
 PER_PARTICIPANT = 30
 WAIT_S = 40.0
 
-VERBS = ("verify", "flows", "graph", "status", "capture")
+VERBS = {
+    "verify": (ExitCode.VIOLATED, "/foo-bar"),
+    "flows": (ExitCode.VIOLATED, "/chatter"),
+    "graph": (ExitCode.OK, "/foo-bar"),
+    "status": (ExitCode.VIOLATED, "/talker"),
+    "capture": (ExitCode.OK, "node /foo-bar is left out"),
+}
+"""Verbs that look → exit code, and what they show."""
+
+
+def raw(name: bytes) -> str:
+    return name.decode(errors="backslashreplace")
 
 
 def _name(rng: random.Random) -> bytes:
@@ -104,7 +153,7 @@ class Seen:
 
     def __init__(self) -> None:
         self.subjects: set[str] = set()
-        self.verbs: dict[str, BaseException | None] = {}
+        self.verbs: dict[str, Exception | None] = {}
 
 
 @contextlib.contextmanager
@@ -137,8 +186,8 @@ def stage(place: Place, attacks: Sequence[Attack]) -> Iterator[Seen]:
             for each in run.of_kind("verdict"):
                 seen.subjects |= {found["subject"] for found in each["verdict"]["findings"]}
             time.sleep(0.2)
-        for verb in VERBS:
-            seen.verbs[verb] = _ended(verb, str(manifest), place)
+        for each in VERBS:
+            seen.verbs[each] = _ended(each, str(manifest), place, folder)
         if run.process.poll() is not None:
             raise Unhandled(f"the supervisor ended: {run.events[-2:]}")
         for each in intruders:
@@ -157,26 +206,29 @@ def stage(place: Place, attacks: Sequence[Attack]) -> Iterator[Seen]:
         run.close()
 
 
-def _ended(verb: str, manifest: str, place: Place) -> BaseException | None:
-    words = {
-        "capture": ("capture", "--domain", str(place.domain), "--wait", "1"),
-        "graph": ("graph", manifest),
-        "status": ("status", manifest),
-    }.get(verb, (verb, manifest, "--timeout", "1"))
+def _ended(name: str, manifest: str, place: Place, runtime: Path) -> Exception | None:
     try:
-        check(in_a_process_beside(*words, place=place), *CODES)
+        _shows(name, manifest, place, runtime)
     except Exception as error:  # noqa: BLE001 - it is what the attack did
         return error
     return None
 
 
-def in_a_process_beside(*words: str, place: Place):
-    """Run a verb in a runtime directory of its own: it sees the run by DDS alone."""
-    return in_a_process(*words, runtime=place.folder(), limit_s=40.0)
+def _shows(name: str, manifest: str, place: Place, runtime: Path) -> None:
+    words = {
+        "capture": ("--domain", str(place.domain), "--wait", "1"),
+        "graph": (manifest,),
+        "status": (manifest,),
+    }.get(name, (manifest, "--timeout", "1"))
+    code, shown = VERBS[name]
+    done = verb(name, *words, runtime=runtime)
+    check(Done(code=done.returncode, out=done.stdout, err=done.stderr), code)
+    if shown not in done.stdout + done.stderr or "\nverdict: ok" in done.stdout:
+        raise Unhandled(f"it does not show {shown!r}, or is fooled: {done.stdout[-300:]}")
 
 
-def _looks(verb: str, seen: Seen) -> None:
-    if error := seen.verbs[verb]:
+def _looks(name: str, seen: Seen) -> None:
+    if error := seen.verbs[name]:
         raise error
 
 

@@ -12,7 +12,7 @@ import pytest
 pytestmark = pytest.mark.thorough
 
 ROOT = Path(__file__).parents[2]
-EVERY = {"files": 15, "servers": 16, "control": 5, "parsers": 10}
+EVERY = {"files": 15, "names": 1, "servers": 16, "control": 5, "parsers": 10}
 """Which of a class's attacks are tried here: each so manieth."""
 
 LATER = ("up and SIG", "flows apply and remove")
