@@ -273,6 +273,7 @@ def test_distributed_system_with_intelligent_multicast(hosts: Hosts, tmp_path: P
     local = [each for each in system.inside["left"].packets() if b"hello " in each.payload]
     sent = [each for each in local if each.outgoing]
     assert {(each.protocol, each.multicast, each.ttl) for each in sent} == {("udp", True, 0)}
+    assert len({(each.destination, each.destination_port) for each in sent}) == 1
     # One datagram for both: no message is sent twice.
     said = [_said(each.payload) for each in sent]
     assert len(said) == len(set(said))
