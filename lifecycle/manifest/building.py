@@ -214,8 +214,6 @@ def build_interface(
     return interface
 
 
-__all__ = ["Findings", "build_node", "build_parameters", "quantities"]
-
 _PROGRAMS = ("python", "command", "package", "executable", "component", "container", "ros_args")
 _POSITIONED = (
     *("machine", "namespace", "name", "process", "run", "interface", "log_level"),

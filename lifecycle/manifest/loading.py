@@ -18,7 +18,6 @@ from types import MappingProxyType
 
 from lifecycle import dataclasses
 from lifecycle.manifest.building import (
-    Findings,
     build_data_layer,
     build_discovery,
     build_modes,
@@ -29,6 +28,7 @@ from lifecycle.manifest.building import (
 )
 from lifecycle.manifest.checks import check
 from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position, Severity
+from lifecycle.manifest.interface import Findings
 from lifecycle.manifest.model import (
     Link,
     Machine,

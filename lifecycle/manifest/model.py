@@ -17,16 +17,14 @@ from lifecycle.manifest.qos import POLICIES, QosProfile
 from lifecycle.network import (
     ConnectionUrl,
     DscpMapping,
-    FlowTransport,
     TransportPriorityMapping,
     UniqueRequirement,
 )
+from lifecycle.network import FlowTransport as FlowTransport  # noqa: PLC0414 - others ask here
 
 
 class EndpointKind(enum.Enum):
     """The six kinds of endpoint; values are NoDL v2's list names."""
-
-    __hash__ = object.__hash__  # members are single; Enum's own is Python, and in every dictionary
 
     PUBLISHER = "publishers"
     SUBSCRIPTION = "subscriptions"
@@ -636,58 +634,6 @@ class Node(NodeDeclaration):
 
 def _path(entry: tuple[str, Position]) -> str:
     return entry[0]
-
-
-__all__ = [
-    "BY_DEFAULT",
-    "SUPERVISION_KEYS",
-    "TOLERATED_NODES",
-    "After",
-    "Authority",
-    "Condition",
-    "ConnectionDeclaration",
-    "Consequence",
-    "DataLayer",
-    "DataLayerSource",
-    "Discovery",
-    "DiscoveryMode",
-    "DiscoveryRange",
-    "Endpoint",
-    "EndpointKind",
-    "EndpointPolicy",
-    "Executor",
-    "FlowIdentification",
-    "FlowNeed",
-    "FlowTransport",
-    "Health",
-    "Interface",
-    "Limits",
-    "Link",
-    "Machine",
-    "Manifest",
-    "Mode",
-    "ModeParameter",
-    "Network",
-    "Node",
-    "OnFailure",
-    "OnViolation",
-    "Output",
-    "ParameterDeclaration",
-    "ParameterValue",
-    "Policy",
-    "Quantity",
-    "Reaction",
-    "Resources",
-    "Restart",
-    "RosArguments",
-    "RosInterfaceAccess",
-    "Run",
-    "RunKind",
-    "Supervision",
-    "TargetState",
-    "Timeouts",
-    "UniqueHow",
-]
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

@@ -12,9 +12,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 
 from lifecycle import dataclasses
-from lifecycle.manifest.building import Findings, build_parameters
+from lifecycle.manifest.building import build_parameters
 from lifecycle.manifest.checks.parameters import is_implicit, read_sections, shown_path
 from lifecycle.manifest.diagnostics import Diagnostic, Position
+from lifecycle.manifest.interface import Findings
 from lifecycle.manifest.model import (
     SUPERVISION_KEYS,
     Manifest,

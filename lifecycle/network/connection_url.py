@@ -172,8 +172,6 @@ def read_options(transport: Medium, query: str) -> dict[str, Any]:
     return read
 
 
-__all__ = ["ConnectionUrl", "ConnectionUrlError", "Peer", "parse"]
-
 _HOW = "write TRANSPORT://[ADDRESS][:PORT][?OPTION=VALUE&…], udpv4://10.77.0.1:7911"
 
 

@@ -52,8 +52,6 @@ from lifecycle.manifest.flows import FlowNeeds
 from lifecycle.manifest.installed_types import search_prefixes
 from lifecycle.manifest.model import Manifest
 
-__all__ = ["CHECKS", "Scope", "check"]
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Scope:

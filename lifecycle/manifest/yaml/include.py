@@ -12,8 +12,8 @@ from pathlib import Path
 
 from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest.building import Findings
 from lifecycle.manifest.diagnostics import Position
+from lifecycle.manifest.interface import Findings
 from lifecycle.manifest.model import EndpointKind, Link, Machine, Manifest, Node, Run
 from lifecycle.manifest.names import resolve
 from lifecycle.manifest.schema import did_you_mean

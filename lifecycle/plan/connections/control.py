@@ -11,7 +11,7 @@ fixed, not shared memory beside UDP. Pure.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from lifecycle import dataclasses
 from lifecycle.manifest import Discovery, DiscoveryMode, FlowTransport, RunKind
@@ -116,9 +116,9 @@ def connect_control(
     (kind,) = transport.media
     if discovery.mode is DiscoveryMode.DYNAMIC or not kind.is_network:
         same = ParticipantConnections(urls=(str(ConnectionUrl(transport=kind)),))
-        return _everywhere(nodes, same, extra=extra), dataclasses.replace(
-            control, observers=tuple((host, same) for host in hosts.used)
-        )
+        connected = _connected(nodes, lambda _: same, lambda *_: same if extra else None)
+        observers = tuple((host, same) for host in hosts.used)
+        return connected, dataclasses.replace(control, observers=observers)
     return _with_ports(nodes, control, kind, hosts, pool, extra=extra)
 
 
@@ -134,21 +134,28 @@ def _server(discovery: Discovery, hosts: Hosts, pool: PortPool, *, tcp: bool) ->
     )
 
 
-def _everywhere(
-    nodes: Sequence[PlannedNode], connections: ParticipantConnections, *, extra: bool
+def _connected(
+    nodes: Sequence[PlannedNode],
+    own: Callable[[PlannedNode], ParticipantConnections],
+    extra: Callable[[PlannedNode, PlannedParticipant], ParticipantConnections | None],
 ) -> tuple[PlannedNode, ...]:
-    """Connect all own participants and the extra ones without a connection alike."""
+    """Connect own participants of our nodes, and their extra ones where there is something for them.
+
+    What is connected no longer has transports of its own.
+    """
+
+    def participant(node: PlannedNode, each: PlannedParticipant) -> PlannedParticipant:
+        given = None if each.connections.urls else extra(node, each)
+        return (
+            each if given is None else dataclasses.replace(each, transports=(), connections=given)
+        )
+
     return tuple(
         dataclasses.replace(
             node,
             transports=(),
-            connections=connections,
-            participants=tuple(
-                each
-                if each.connections.urls or not extra
-                else dataclasses.replace(each, transports=(), connections=connections)
-                for each in node.participants
-            ),
+            connections=own(node),
+            participants=tuple(participant(node, each) for each in node.participants),
         )
         if node.run.kind is RunKind.PYTHON
         else node
@@ -188,23 +195,12 @@ def _with_ports(
             urls=(urls[key],), super_client=control.server is not None and key[0] == "observer"
         )
 
-    def connect_extra(node: PlannedNode, each: PlannedParticipant) -> PlannedParticipant:
-        if ("extra", node.key, each.name) not in slots:
-            return each
-        return dataclasses.replace(
-            each, transports=(), connections=connected(("extra", node.key, each.name))
-        )
+    def of_extra(node: PlannedNode, each: PlannedParticipant) -> ParticipantConnections | None:
+        key = ("extra", node.key, each.name)
+        return connected(key) if key in slots else None
 
-    connected_nodes = tuple(
-        dataclasses.replace(
-            node,
-            transports=(),
-            connections=connected(("process", node.process, "")),
-            participants=tuple(connect_extra(node, each) for each in node.participants),
-        )
-        if node.run.kind is RunKind.PYTHON
-        else node
-        for node in nodes
+    connected_nodes = _connected(
+        nodes, lambda node: connected(("process", node.process, "")), of_extra
     )
     observers = tuple((host, connected(("observer", host, ""))) for host in hosts.used)
     return connected_nodes, dataclasses.replace(control, observers=observers)

@@ -99,23 +99,17 @@ def infeasible(
         parties: the nodes as negotiation sees them, by key.
         negotiated: topics are where they will be; else only those on declared connections are.
     """
-    carriers = _Carriers(parties)
+
+    def carriers(node: PlannedNode, each: PlannedEndpoint) -> tuple[str, ...]:
+        """Return by what an endpoint is reached; nothing where that is not known."""
+        return endpoint_of(node, each).by or parties[node.key].own
+
     found = [*_services(nodes, parties, carriers)]
     for node in nodes:
         for each in node.endpoints:
             if negotiated or _on_connection(node, each):
                 found += _without_udp(node, each, carriers(node, each))
     return tuple(found)
-
-
-class _Carriers:
-    """Knows by which transports an endpoint can be reached; nothing where that is unknown."""
-
-    def __init__(self, parties: Mapping[str, Party]) -> None:
-        self._parties = parties
-
-    def __call__(self, node: PlannedNode, each: PlannedEndpoint) -> tuple[str, ...]:
-        return endpoint_of(node, each).by or self._parties[node.key].own
 
 
 _By = Callable[[PlannedNode, PlannedEndpoint], tuple[str, ...]]
@@ -470,35 +464,22 @@ def place_static(
     }
     contacts = {key: contacts_of(ports[key][0], (str(url),))[0] for key, url in bare.items()}
     table = tuple(_table(placed))
+
+    def connected(node: PlannedNode, each: PlannedParticipant) -> PlannedParticipant:
+        own = (node.key, each.name)
+        if own not in bare:
+            return each
+        peers = tuple(sorted(contact.peer for key, contact in contacts.items() if key != own))
+        connections = ParticipantConnections(
+            urls=(str(dataclasses.replace(bare[own], peers=peers)),),
+            static_name=_enclave(node, each),
+            static_participants=table,
+        )
+        return dataclasses.replace(each, connections=connections)
+
     return tuple(
         dataclasses.replace(
-            node,
-            participants=tuple(
-                dataclasses.replace(
-                    each,
-                    connections=ParticipantConnections(
-                        urls=(
-                            str(
-                                dataclasses.replace(
-                                    bare[node.key, each.name],
-                                    peers=tuple(
-                                        sorted(
-                                            contact.peer
-                                            for key, contact in contacts.items()
-                                            if key != (node.key, each.name)
-                                        )
-                                    ),
-                                )
-                            ),
-                        ),
-                        static_name=_enclave(node, each),
-                        static_participants=table,
-                    ),
-                )
-                if _is_static(each)
-                else each
-                for each in node.participants
-            ),
+            node, participants=tuple(connected(node, each) for each in node.participants)
         )
         for node in placed
     )
