@@ -139,7 +139,7 @@ def _connected(
     own: Callable[[PlannedNode], ParticipantConnections],
     extra: Callable[[PlannedNode, PlannedParticipant], ParticipantConnections | None],
 ) -> tuple[PlannedNode, ...]:
-    """Connect own participants of our nodes, and their extra ones where there is something for them.
+    """Connect own participants of our nodes, and extra ones that something is given for.
 
     What is connected no longer has transports of its own.
     """
