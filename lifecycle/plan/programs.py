@@ -15,14 +15,15 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 from lifecycle import dataclasses
+from lifecycle.errors import LifecycleError
 from lifecycle.manifest import (
     Authority,
     Diagnostic,
-    Endpoint,
     EndpointKind,
     Manifest,
     Node,
     Position,
+    Run,
     RunKind,
     did_you_mean,
     error,
@@ -104,38 +105,60 @@ def resolve_programs(
     return Resolution(diagnostics=tuple(looking.found), unresolved=tuple(looking.unresolved))
 
 
-_Key = tuple[tuple[str, ...], str]
-"""Where modules are looked for, and `module:Class`."""
-
-
 class _Looking:
+    """One run over the nodes of a manifest."""
+
     def __init__(self, environment: Mapping[str, str], authority: Authority) -> None:
         self.found: list[Diagnostic] = []
         self.unresolved: list[UnresolvedProgram] = []
         self._environment = environment
         self._authority = authority
         self._sources: dict[tuple[str, ...], Sources] = {}
-        self._classes: dict[_Key, NodeClass | NotThereError | UnknownError] = {}
+        self._classes: dict[tuple[tuple[str, ...], str], NodeClass | LifecycleError] = {}
 
     def look(self, node: Node, *, is_ours: bool) -> None:
-        if node.run.kind is RunKind.PYTHON:
+        """Look for what one node runs.
+
+        Args:
+            node: the node.
+            is_ours: its machine is this host.
+        """
+        run = node.run
+        if run.kind is RunKind.PYTHON:
             self._python(node, is_ours=is_ours)
-        elif node.run.kind is RunKind.COMMAND and node.run.command:
-            self._command(node, is_ours=is_ours)
-        elif node.run.kind is RunKind.COMMAND:
+        elif run.kind is RunKind.COMMAND and run.command:
+            subject = f"program {run.command[0]!r}"
+            try:
+                _find_command(run, self._environment)
+            except NotThereError as problem:
+                self._missing(node, "run.command", subject, problem, is_ours=is_ours)
+        elif run.kind is RunKind.COMMAND:
             self._package(node, is_ours=is_ours)
 
+    def _unresolved(self, at: Position, subject: str, reason: str) -> None:
+        self.unresolved.append(UnresolvedProgram(at=at, subject=subject, reason=reason))
+
     def _missing(
-        self, node: Node, part: str, subject: str, problem: NotThereError, *, is_ours: bool
+        self, node: Node, part: str, subject: str, problem: LifecycleError, *, is_ours: bool
     ) -> None:
         at = _at(node, part)
         if is_ours:
             self.found.append(error(RULE, at, problem.message, problem.hint))
         else:
-            reason = f"it is for machine {node.machine!r}; here, {_half(problem.message)}"
-            self.unresolved.append(UnresolvedProgram(at=at, subject=subject, reason=reason))
+            here = problem.message.replace("cannot find", "there is no", 1)
+            self._unresolved(at, subject, f"it is for machine {node.machine!r}; here, {here}")
 
-    # Python
+    def _package(self, node: Node, *, is_ours: bool) -> None:
+        run = node.run
+        subject = f"executable {run.executable!r} of package {run.package!r}"
+        if not self._environment.get("AMENT_PREFIX_PATH"):
+            reason = "AMENT_PREFIX_PATH is empty; source the setup file of its workspace"
+            self._unresolved(_at(node, "run.package"), subject, reason)
+            return
+        try:
+            find_executable(run, self._environment, at=node.at)
+        except PlanError as problem:
+            self._missing(node, "run.executable", subject, problem, is_ours=is_ours)
 
     def _python(self, node: Node, *, is_ours: bool) -> None:
         subject = f"class {node.run.python!r}"
@@ -148,10 +171,10 @@ class _Looking:
         found = self._class(node)
         if isinstance(found, NotThereError):
             # A module that is not here may be there; one that is here lacks the class there, too.
-            remote_nodes = not is_ours and found.message.startswith("cannot find module")
-            self._missing(node, "run.python", subject, found, is_ours=not remote_nodes)
-        elif isinstance(found, UnknownError):
-            self.unresolved.append(UnresolvedProgram(at=at, subject=subject, reason=found.message))
+            may_be_there = not is_ours and found.message.startswith("cannot find module")
+            self._missing(node, "run.python", subject, found, is_ours=not may_be_there)
+        elif isinstance(found, LifecycleError):
+            self._unresolved(at, subject, found.message)
         elif found.is_node is False:
             message = (
                 f"cannot use {name!r} of {module} ({found.file}) as a node: it is no node class"
@@ -163,9 +186,9 @@ class _Looking:
             if found.is_managed is not None and not found.is_ours and found.is_node:
                 self.found += _immovable(node, found, at, self._authority)
             self.found += _without_health(node, found)
-            self._interface(node, found, subject)
+            self._interface(node, found, at, subject)
 
-    def _class(self, node: Node) -> NodeClass | NotThereError | UnknownError:
+    def _class(self, node: Node) -> NodeClass | LifecycleError:
         folders = _folders(node)
         key = (folders, node.run.python)
         if key not in self._classes:
@@ -177,54 +200,23 @@ class _Looking:
                 self._classes[key] = problem
         return self._classes[key]
 
-    def _interface(self, node: Node, found: NodeClass, subject: str) -> None:
+    def _interface(self, node: Node, found: NodeClass, at: Position, subject: str) -> None:
         """Compare what a class handles and asks for with what the node declares."""
-        at = _at(node, "run.python")
         problems = [*_pairs(node, found, at)] if found.is_ours else []
         accesses = [*_undeclared(node, found, at)] if found.is_ours else []
         if found.unknown:
             of = "handlers" if found.is_ours else "node class"
-            self.unresolved.append(
-                UnresolvedProgram(at=at, subject=f"{of} of {subject}", reason=found.unknown)
-            )
+            self._unresolved(at, f"{of} of {subject}", found.unknown)
             # What is there is there, whatever else may be.
             problems = [each for each in problems if each.message.startswith("cannot use")]
         if found.declares and (problems or accesses):
-            reason = f"its code declares endpoints itself; {problems and problems[0].message}"
-            reason = reason if problems else "its code declares endpoints itself"
-            self.unresolved.append(
-                UnresolvedProgram(at=at, subject=f"endpoints of {subject}", reason=reason)
+            reason = "; ".join(
+                ["its code declares endpoints itself", *(each.message for each in problems[:1])]
             )
+            self._unresolved(at, f"endpoints of {subject}", reason)
             return
         self.found += problems
         self.found += accesses
-
-    # Programs
-
-    def _command(self, node: Node, *, is_ours: bool) -> None:
-        words = node.run.command
-        variables = {**self._environment, **dict(node.run.environment)}
-        folder = Path(node.run.working_directory or Path.cwd())
-        subject = f"program {words[0]!r}"
-        try:
-            _find_program(words[0], folder, variables)
-            _find_script(words, folder)
-        except NotThereError as problem:
-            self._missing(node, "run.command", subject, problem, is_ours=is_ours)
-
-    def _package(self, node: Node, *, is_ours: bool) -> None:
-        run = node.run
-        subject = f"executable {run.executable!r} of package {run.package!r}"
-        if not self._environment.get("AMENT_PREFIX_PATH"):
-            reason = "AMENT_PREFIX_PATH is empty; source the setup file of its workspace"
-            at = _at(node, "run.package")
-            self.unresolved.append(UnresolvedProgram(at=at, subject=subject, reason=reason))
-            return
-        try:
-            find_executable(run, self._environment, at=node.at)
-        except PlanError as problem:
-            missing = NotThereError(problem.message, hint=problem.hint)
-            self._missing(node, "run.executable", subject, missing, is_ours=is_ours)
 
 
 def _folders(node: Node) -> tuple[str, ...]:
@@ -324,8 +316,14 @@ def _without_health(node: Node, found: NodeClass) -> Iterator[Diagnostic]:
         )
 
 
-def _find_program(word: str, folder: Path, variables: Mapping[str, str]) -> None:
-    """Find a program as execvp(3) would, started in `folder`; raises NotThereError."""
+def _find_command(run: Run, environment: Mapping[str, str]) -> None:
+    """Find a program, and the script of a Python one, as execvp(3) would in its folder.
+
+    Raises:
+        NotThereError: it is not there.
+    """
+    word, *arguments = run.command
+    folder = Path(run.working_directory or Path.cwd())
     if not os.path.isdir(folder):
         raise NotThereError(f"cannot find the working directory {str(folder)!r}")
     if "/" in word:
@@ -337,24 +335,21 @@ def _find_program(word: str, folder: Path, variables: Mapping[str, str]) -> None
         if not os.path.isfile(file) or not os.access(file, os.X_OK):
             hint = f"chmod +x {word}" if os.path.isfile(file) else ""
             raise NotThereError(f"cannot run {word!r}: it is not executable", hint=hint)
-        return
-    path = variables.get("PATH", os.defpath)
-    folders = os.pathsep.join(str(folder / each) for each in path.split(os.pathsep))
-    if shutil.which(word, path=folders) is None:
-        raise NotThereError(
-            f"cannot find program {word!r} on PATH",
-            hint=f"install it, name its path, or set PATH in run.environment; PATH is {path[:200]}",
-        )
-
-
-def _find_script(words: tuple[str, ...], folder: Path) -> None:
-    """Find the script of a command line that is Python's; raises NotThereError."""
-    if len(words) < 2 or not _PYTHON.fullmatch(Path(words[0]).name) or words[1].startswith("-"):
-        return
-    file = folder / words[1]
-    if not os.path.exists(file):
-        near = did_you_mean(file.name, _names(file.parent))
-        raise NotThereError(f"cannot find script {words[1]!r} in {str(folder)!r}", hint=near)
+    else:
+        path = {**environment, **dict(run.environment)}.get("PATH", os.defpath)
+        folders = os.pathsep.join(str(folder / each) for each in path.split(os.pathsep))
+        if shutil.which(word, path=folders) is None:
+            raise NotThereError(
+                f"cannot find program {word!r} on PATH",
+                hint="install it, name its path, or set PATH in run.environment; PATH is "
+                f"{path[:200]}",
+            )
+    script = next(iter(arguments), "-")
+    if _PYTHON.fullmatch(Path(word).name) and not script.startswith("-"):
+        file = folder / script
+        if not os.path.exists(file):
+            near = did_you_mean(file.name, _names(file.parent))
+            raise NotThereError(f"cannot find script {script!r} in {str(folder)!r}", hint=near)
 
 
 def _names(folder: Path) -> tuple[str, ...]:
@@ -389,17 +384,13 @@ def _pairs(node: Node, found: NodeClass, at: Position) -> Iterator[Diagnostic]:
         taken.setdefault((each.kind, each.name, each.decides), each)
     for (kind, name), endpoint in wanted.items():
         if (kind, name, False) not in taken:
-            yield _unhandled(found, endpoint)
-
-
-def _unhandled(found: NodeClass, endpoint: Endpoint) -> Diagnostic:
-    noun, decorator = _WORDS[endpoint.kind]
-    return error(
-        UNHANDLED,
-        endpoint.at,
-        f"cannot serve {noun} {endpoint.name!r}: no method of {found.name} ({found.file}) is "
-        f"decorated with {decorator}({endpoint.name!r})",
-    )
+            noun, decorator = _WORDS[kind]
+            yield error(
+                UNHANDLED,
+                endpoint.at,
+                f"cannot serve {noun} {name!r}: no method of {found.name} ({found.file}) is "
+                f"decorated with {decorator}({name!r})",
+            )
 
 
 def _undeclared(node: Node, found: NodeClass, at: Position) -> Iterator[Diagnostic]:
@@ -426,7 +417,3 @@ def _at(node: Node, part: str) -> Position:
     at = node.where("run") if at == node.at else at
     known = at.path.endswith(part)
     return at if known else dataclasses.replace(at, path=f"nodes.{node.key}.{part}")
-
-
-def _half(message: str) -> str:
-    return message.replace("cannot find", "there is no", 1)
