@@ -6,14 +6,13 @@ Owns: that text. JSON is written by `lifecycle.codec`, pictures by export/. Pure
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 from lifecycle.manifest import (
     BEST_AVAILABLE_NS,
     DataLayer,
     DataLayerSource,
     DiscoveryMode,
-    EndpointKind,
     FlowTransport,
     History,
     Liveliness,
@@ -32,7 +31,6 @@ from lifecycle.plan.model import (
     ParticipantConnections,
     Plan,
     PlannedEndpoint,
-    PlannedFlow,
     PlannedNode,
     PlannedProcess,
 )
@@ -55,12 +53,8 @@ def data_layer(plan: Plan, width: int) -> list[str]:
         where = f" on machine {plan.server.machine}" if plan.server.machine else ""
         at = f"{plan.server.address}:{plan.server.port}"
         rows.append(("discovery server", f"{protocol} {at}{where}"))
-    layer = plan.data_layer
-    if (layer.authority, layer.source, layer.events) != (
-        DataLayer().authority,
-        DataLayer().source,
-        DataLayer().events,
-    ):
+    layer, usual = plan.data_layer, DataLayer()
+    if (layer.authority, layer.source) != (usual.authority, usual.source) or layer.events:
         source = "the manifest" if layer.source is DataLayerSource.STATIC else "node configurations"
         again = "; what is lost is made again" if layer.events else ""
         rows.append(("authority", f"{layer.authority.value}, from {source}{again}"))
@@ -76,30 +70,21 @@ def connections(plan: Plan, width: int) -> list[str]:
     """List each node's participants with their URLs and what they carry."""
     lines: list[str] = []
     for node in plan.nodes:
-        rows = list(_rows(node))
-        if rows:
-            lines += [f"  {node.full_name}", *columns(rows, indent=4, width=width)]
+        extra = [each for each in node.participants if each.connection or each.connections.urls]
+        entries = [(each.connection or each.name, each.connections, each.name) for each in extra]
+        if not extra and not node.connections.urls:
+            continue
+        rows: list[tuple[str, str]] = []
+        for name, each, participant in (("own participant", node.connections, ""), *entries):
+            carried = [
+                f"{endpoint.kind.noun} {endpoint.resolved}"
+                for endpoint in node.endpoints
+                if endpoint.participant == participant
+            ]
+            texts = _spelled(each) + [f"carries {', '.join(carried)}"] * bool(carried)
+            rows += [("" if index else name, text) for index, text in enumerate(texts)]
+        lines += [f"  {node.full_name}", *columns(rows, indent=4, width=width)]
     return lines
-
-
-def _rows(node: PlannedNode) -> Iterator[tuple[str, str, str]]:
-    connected = [each for each in node.participants if each.connection or each.connections.urls]
-    if not connected and not node.connections.urls:
-        return
-    entries = [("own participant", node.connections, "")]
-    entries += [(each.connection or each.name, each.connections, each.name) for each in connected]
-    for name, each, participant in entries:
-        carried = [
-            f"{_WORDS.get(endpoint.kind, endpoint.kind.value)} {endpoint.resolved}"
-            for endpoint in node.endpoints
-            if endpoint.participant == participant
-        ]
-        texts = (*_spelled(each), *([f"carries {', '.join(carried)}"] if carried else []))
-        for index, text in enumerate(texts):
-            yield ("" if index else name, "", text)
-
-
-_WORDS = {EndpointKind.PUBLISHER: "publisher", EndpointKind.SUBSCRIPTION: "subscription"}
 
 
 def _spelled(each: ParticipantConnections) -> list[str]:
@@ -109,13 +94,6 @@ def _spelled(each: ParticipantConnections) -> list[str]:
     if each.super_client:
         texts.append("is told of everything that the server knows")
     return texts
-
-
-def medium(flow: PlannedFlow) -> str:
-    """Describe what carries a flow and why; empty if that is not known yet."""
-    if not flow.medium:
-        return flow.medium_reason
-    return f"{flow.medium} ({flow.medium_reason})"
 
 
 def participants(plan: Plan, width: int) -> list[str]:
@@ -128,20 +106,8 @@ def participants(plan: Plan, width: int) -> list[str]:
     return columns(rows, indent=2, width=width)
 
 
-def notes(plan: Plan, width: int) -> list[str]:
-    """Describe why DSCPs and 5QIs are what they are, where they follow from something else."""
-    lines: list[str] = []
-    for node in plan.nodes:
-        for each in node.endpoints:
-            dscp = f"DSCP {each.dscp}: {each.dscp_reason}" if each.dscp_reason else ""
-            for text in filter(None, (dscp, each.five_qi_reason)):
-                lines += columns([(f"{node.full_name} {each.resolved}",)], indent=2, width=width)
-                lines += columns([(text,)], indent=6, width=width)
-    return lines
-
-
 def render_text(plan: Plan, *, width: int = 100) -> str:
-    """Print processes, order, nodes with endpoints, extra participants, flows, notes and ports.
+    """Print processes, order, nodes with endpoints, extra participants, flows and ports.
 
     Args:
         plan: what to print.
@@ -159,7 +125,6 @@ def render_text(plan: Plan, *, width: int = 100) -> str:
         ("connections", connections),
         ("extra participants", participants),
         ("flows", _flows),
-        ("notes", notes),
         ("ports, if participants start in this order and none is taken", _ports),
     )
     lines = [_headline(plan)]
@@ -261,9 +226,11 @@ def _endpoint_facts(endpoint: PlannedEndpoint) -> str:
     if endpoint.unique is not UniqueRequirement.NOT_REQUIRED:
         facts.append(f"unique {endpoint.unique.value}")
     if endpoint.dscp is not None:
-        facts.append(describe(endpoint.dscp) + ("" if endpoint.enforce_dscp else ", not enforced"))
+        why = f", {endpoint.dscp_reason}" if endpoint.dscp_reason else ""
+        kept = "" if endpoint.enforce_dscp else ", not enforced"
+        facts.append(f"{describe(endpoint.dscp)}{why}{kept}")
     if endpoint.five_qi is not None:
-        facts.append(f"5QI {endpoint.five_qi}" + (" (auto)" if endpoint.five_qi_reason else ""))
+        facts.append(endpoint.five_qi_reason or f"5QI {endpoint.five_qi}")
     if endpoint.transport is FlowTransport.NETWORK:
         facts.append("by the network only")
     facts += [
@@ -316,7 +283,8 @@ def _flows(plan: Plan, width: int) -> list[str]:
         if flow.linked and not needs:
             needs.append("linked")
         ends = f"{plan.node(flow.publisher).full_name} → {plan.node(flow.subscription).full_name}"
-        told = filter(None, (medium(flow), ", ".join(needs)))
+        by = f"{flow.medium} ({flow.medium_reason})" if flow.medium else flow.medium_reason
+        told = filter(None, (by, ", ".join(needs)))
         rows.append((flow.topic, ends, "; ".join(told)))
     return columns(rows, indent=2, width=width)
 
