@@ -101,13 +101,9 @@ def _table() -> _FiveQiTable:
     return read_table("five_qi", _FiveQiTable)
 
 
-def five_qis(*, include_flagged: bool = False) -> tuple[FiveQi, ...]:
-    """Return the standardized 5QIs by rising value.
-
-    Args:
-        include_flagged: also those with a doubtful cell, which are not offered by default.
-    """
-    return tuple(each for each in _table().values if include_flagged or not each.flagged)
+def five_qis() -> tuple[FiveQi, ...]:
+    """Return the standardized 5QIs by rising value."""
+    return _table().values
 
 
 def five_qi_of(value: int) -> FiveQi:
@@ -195,13 +191,12 @@ def propose(
     *,
     message_bytes: int | None = None,
     rate_bps: float | None = None,
-    include_flagged: bool = False,
 ) -> Proposal:
     """Propose the least demanding class that keeps a delay and a loss, with the reason.
 
     Least demanding, because a better class than needed wastes what the network has. Classes of
     Release 16 come first, as every network knows them; then the longest delay budget, the highest
-    error rate, the least important priority.
+    error rate, the least important priority. One with a doubtful cell is never proposed.
 
     Args:
         max_delay_ms: bound of the delay, > 0.
@@ -209,7 +204,6 @@ def propose(
         gbr: True asks for a guaranteed bit rate, False for none, None for either.
         message_bytes: largest message that must arrive within the delay, > 0.
         rate_bps: bits per second that must be guaranteed, > 0; then only GBR classes fit.
-        include_flagged: offer classes with a doubtful cell too.
 
     Raises:
         ValueError: a bound is out of range.
@@ -220,8 +214,8 @@ def propose(
         raise ValueError(f"cannot use loss {loss:g}; use more than 0, at most 1")
     offered = [
         each
-        for each in five_qis(include_flagged=include_flagged)
-        if gbr in (None, each.resource_type.guarantees_rate)
+        for each in five_qis()
+        if not each.flagged and gbr in (None, each.resource_type.guarantees_rate)
     ]
     fitting = [
         each

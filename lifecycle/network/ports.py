@@ -222,16 +222,12 @@ def ephemeral_range(platform: Platform | EphemeralRange) -> EphemeralRange:
     return DEFAULT_EPHEMERAL_RANGE[platform] if isinstance(platform, Platform) else platform
 
 
-def max_participants(
-    domain_id: int, ephemeral: Platform | EphemeralRange, *, only_domain: bool = False
-) -> Capacity:
+def max_participants(domain_id: int, ephemeral: Platform | EphemeralRange) -> Capacity:
     """Return how many participants of a domain fit on one host, each process being at least one.
 
     Args:
         domain_id: 0–232.
         ephemeral: the host's ephemeral range, or a platform for its default.
-        only_domain: the host takes part in this domain alone, so that running into the ports of
-            the next one does no harm.
 
     Raises:
         ValueError: the domain is not 0–232.
@@ -244,7 +240,7 @@ def max_participants(
             limit=f"the highest port, {MAX_PORT}",
         )
     ]
-    if domain_id < MAX_DOMAIN_ID and not only_domain:
+    if domain_id < MAX_DOMAIN_ID:
         found.append(
             Capacity(
                 participants=PARTICIPANTS_PER_DOMAIN,
@@ -303,19 +299,6 @@ def unique_flow_ports() -> range:
     return range(PB - 400, PB)
 
 
-def max_unique_subscriptions(participants: int) -> int:
-    """Return how many unique subscriptions fit on one host beside so many participants of its own.
-
-    Counts all domains of the host together, see `unique_flow_ports`. Never negative.
-
-    Raises:
-        ValueError: negative number of participants.
-    """
-    if participants < 0:
-        raise ValueError(f"cannot use {participants} participants; use 0 or more")
-    return max(0, len(unique_flow_ports()) - participants)
-
-
 def overflows(
     domain_id: int,
     *,
@@ -352,9 +335,9 @@ def overflows(
             f"or give fewer publishers a flow of their own"
             + ("" if every else f" (safe domains: {describe_domains(safe)})")
         )
-    places = max_unique_subscriptions(participants)
+    ports = unique_flow_ports()
+    places = max(0, len(ports) - participants)  # each participant takes one
     if unique_subscriptions > places:
-        ports = unique_flow_ports()
         found.append(
             f"cannot give {count(unique_subscriptions, 'subscription')} a port of their own on "
             f"{host}: {places} fit, because Fast DDS takes them from {ports[0]}–{ports[-1]} in "

@@ -20,7 +20,7 @@ from lifecycle.network.five_qi import (
 
 GBR, NON_GBR = ResourceType.GBR, ResourceType.NON_GBR
 DELAY_CRITICAL = ResourceType.DELAY_CRITICAL_GBR
-ALL = five_qis(include_flagged=True)
+ALL = five_qis()
 
 
 def test_release_16_has_the_26_values_that_the_article_counts() -> None:
@@ -37,9 +37,8 @@ def test_later_and_withdrawn_values_are_there_too() -> None:
     assert len(ALL) == 32
 
 
-def test_values_with_a_doubtful_cell_are_not_offered_by_default() -> None:
-    offered = {each.value for each in five_qis()}
-    assert {each.value for each in ALL} - offered == {10, 75, 79, 83}
+def test_what_is_doubtful_about_a_value_is_said() -> None:
+    assert {each.value for each in ALL if each.flagged} == {10, 75, 79, 83}
     assert all(each.note for each in ALL if each.flagged)
 
 
@@ -169,9 +168,8 @@ def test_a_later_release_is_proposed_where_release_16_has_nothing() -> None:
     assert "the least demanding class of Release 17 that fits" in proposal.why
 
 
-def test_flagged_classes_are_proposed_only_on_request() -> None:
-    assert propose(50, 1e-2, False).five_qi is five_qi_of(80)
-    assert propose(50, 1e-2, False, include_flagged=True).five_qi is five_qi_of(79)
+def test_classes_with_a_doubtful_cell_are_not_proposed() -> None:
+    assert propose(50, 1e-2, False).five_qi is five_qi_of(80)  # and not 79
 
 
 @pytest.mark.parametrize(
@@ -245,8 +243,9 @@ def test_a_proposed_class_keeps_what_was_asked_and_a_refusal_means_that_none_doe
     found = propose(max_delay_ms, loss, gbr, message_bytes=message_bytes).five_qi
     keeping = [
         each
-        for each in five_qis()
-        if gbr in (None, each.resource_type.guarantees_rate)
+        for each in ALL
+        if not each.flagged
+        and gbr in (None, each.resource_type.guarantees_rate)
         and each.packet_delay_budget_ms <= max_delay_ms
         and each.packet_error_rate <= loss
         and (
@@ -266,20 +265,8 @@ def test_a_rate_beyond_the_burst_of_every_fast_class_is_refused_with_the_highest
     )
 
 
-def test_a_rate_alone_rules_out_classes_that_guarantee_none() -> None:
-    found = propose(300, 1, None, rate_bps=1000).five_qi
-    assert found is not None
-    assert found.resource_type.guarantees_rate
-
-
 def test_of_equal_classes_the_one_with_the_lowest_number_is_proposed() -> None:
     # 5QI 1 and 66 differ in nothing that is compared.
     found = propose(100, 1e-2, True).five_qi
     assert found is not None
     assert found.value == 1
-
-
-def test_a_message_too_large_for_every_fast_class_is_told_the_largest_burst() -> None:
-    assert propose(5, 1e-3, None, message_bytes=5000).why.endswith(
-        "the largest burst is 1354 bytes, of 5QI 86 (Delay-critical GBR)"
-    )

@@ -19,7 +19,6 @@ from lifecycle.network.ports import (
     domain_base,
     domain_of,
     max_participants,
-    max_unique_subscriptions,
     overlaps,
     owner_of,
     participant_ports,
@@ -101,11 +100,6 @@ class TestTheArticle:
     def test_one_host_may_run_120_processes_per_domain(self) -> None:
         assert max_participants(1, LINUX) == Capacity(
             participants=120, limit="the ports of domain 2, from 7900"
-        )
-
-    def test_more_than_120_fit_a_small_domain_if_it_is_the_only_one_of_the_host(self) -> None:
-        assert max_participants(1, LINUX, only_domain=True) == Capacity(
-            participants=(32768 - 7661) // 2 + 1, limit="the ephemeral ports 32768–60999"
         )
 
     @pytest.mark.parametrize(
@@ -192,15 +186,6 @@ def test_unique_subscriptions_share_ports_7000_to_7399_in_every_domain() -> None
     assert all(owner_of(port) is None for port in unique_flow_ports())
 
 
-def test_each_participant_takes_one_of_the_400_unique_ports_for_ros_discovery_info() -> None:
-    assert max_unique_subscriptions(0) == 400
-    assert max_unique_subscriptions(3) == 397
-    assert max_unique_subscriptions(401) == 0
-    with pytest.raises(ValueError) as caught:
-        max_unique_subscriptions(-1)
-    assert str(caught.value) == "cannot use -1 participants; use 0 or more"
-
-
 @given(domain_id=DOMAINS, participant_id=st.integers(0, 119))
 def test_a_port_leads_back_to_the_domain_participant_and_role_that_own_it(
     domain_id: int, participant_id: int
@@ -220,9 +205,7 @@ def test_a_port_leads_back_to_the_domain_participant_and_role_that_own_it(
         )
 
 
-def fits(
-    domain_id: int, participant_id: int, ephemeral: EphemeralRange, *, only_domain: bool
-) -> bool:
+def fits(domain_id: int, participant_id: int, ephemeral: EphemeralRange) -> bool:
     """The rule of the article, said without arithmetic."""
     try:
         ports = participant_ports(domain_id, participant_id)
@@ -234,42 +217,38 @@ def fits(
         ports.discovery_unicast,
         ports.user_unicast,
     )
-    foreign = bool(overlaps(domain_id, participant_id)) and not only_domain
-    return not foreign and not any(port in ephemeral for port in used)
+    return not overlaps(domain_id, participant_id) and not any(port in ephemeral for port in used)
 
 
-@given(
-    domain_id=DOMAINS,
-    ends=st.tuples(st.integers(1, 65535), st.integers(1, 65535)),
-    only_domain=st.booleans(),
+CLOSE = st.builds(
+    lambda domain_id, offset, width: (
+        domain_id,
+        EphemeralRange(
+            first=min(domain_base(domain_id) + offset, 65535),
+            last=min(domain_base(domain_id) + offset + width, 65535),
+        ),
+    ),
+    DOMAINS,
+    st.integers(-3, 14),
+    st.integers(0, 3),
 )
+ANYWHERE = st.builds(
+    lambda domain_id, ends: (domain_id, EphemeralRange(first=min(ends), last=max(ends))),
+    DOMAINS,
+    st.tuples(st.integers(1, 65535), st.integers(1, 65535)),
+)
+
+
+@given(CLOSE | ANYWHERE)
 def test_the_capacity_is_where_the_first_participant_does_not_fit(
-    domain_id: int, ends: tuple[int, int], *, only_domain: bool
+    case: tuple[int, EphemeralRange],
 ) -> None:
-    ephemeral = EphemeralRange(first=min(ends), last=max(ends))
-    count = max_participants(domain_id, ephemeral, only_domain=only_domain).participants
+    domain_id, ephemeral = case
+    count = max_participants(domain_id, ephemeral).participants
     for participant_id in {0, 1, count // 2, count - 1}:
         if 0 <= participant_id < count:
-            assert fits(domain_id, participant_id, ephemeral, only_domain=only_domain)
-    assert not fits(domain_id, count, ephemeral, only_domain=only_domain)
-
-
-@given(
-    domain_id=DOMAINS,
-    offset=st.integers(-3, 14),
-    width=st.integers(0, 3),
-    only_domain=st.booleans(),
-)
-def test_the_capacity_holds_for_narrow_ranges_close_to_the_domains_own_ports(
-    domain_id: int, offset: int, width: int, *, only_domain: bool
-) -> None:
-    first = min(domain_base(domain_id) + offset, 65535)
-    ephemeral = EphemeralRange(first=first, last=min(first + width, 65535))
-    count = max_participants(domain_id, ephemeral, only_domain=only_domain).participants
-    if count:
-        assert fits(domain_id, 0, ephemeral, only_domain=only_domain)
-        assert fits(domain_id, count - 1, ephemeral, only_domain=only_domain)
-    assert not fits(domain_id, count, ephemeral, only_domain=only_domain)
+            assert fits(domain_id, participant_id, ephemeral)
+    assert not fits(domain_id, count, ephemeral)
 
 
 @pytest.mark.parametrize(
