@@ -17,15 +17,12 @@ from lifecycle.manifest.checks.connection_urls import check_urls
 from lifecycle.manifest.checks.connections import (
     check_connections,
     check_counterparts,
-    check_mapped_endpoints,
     check_qos,
     check_types,
 )
 from lifecycle.manifest.checks.flows import (
-    check_flow_endpoints,
     check_flows,
     check_identifiers,
-    check_link_uniqueness,
     check_links,
 )
 from lifecycle.manifest.checks.names import check_names, check_remaps
@@ -95,16 +92,13 @@ CHECKS: tuple[Callable[[Scope], Iterator[Diagnostic]], ...] = (
     lambda scope: check_mode_parameters(scope.system),
     lambda scope: check_ports(scope.system, scope.needs, scope.environment),
     lambda scope: check_discovery(scope.system, scope.environment),
-    lambda scope: check_mapped_endpoints(scope.system),
     lambda scope: check_connections(scope.system, scope.needs),
     lambda scope: check_urls(scope.system),
-    lambda scope: check_flow_endpoints(scope.system),
     lambda scope: check_flows(scope.system, scope.needs),
     lambda scope: check_transport(scope.system, scope.needs, scope.environment),
     lambda scope: check_identifiers(scope.system, scope.needs),
     lambda scope: check_middleware(scope.system, scope.needs, scope.environment),
-    lambda scope: check_links(scope.system),
-    lambda scope: check_link_uniqueness(scope.system, scope.needs),
+    lambda scope: check_links(scope.system, scope.needs),
 )
 
 

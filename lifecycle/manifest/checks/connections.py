@@ -93,20 +93,15 @@ _FLOW_NAME = re.compile(r"flow_[0-9]+\Z")
 
 
 def check_connections(system: DeclaredSystem, needs: FlowNeeds) -> Iterator[Diagnostic]:
-    """Yield findings about every declared connection, but for `check_mapped_endpoints`."""
+    """Yield findings about every declared connection, but for its URLs."""
     hidden: dict[str, tuple[Node, ConnectionDeclaration]] = {}
     for node in system.manifest.nodes:
+        yield from _endpoints(node)
         if node.connections:
             yield from _foreign(system, node)
         for each in node.connections:
             yield from _name(system, node, each, hidden)
             yield from _flows(node, each, needs)
-
-
-def check_mapped_endpoints(system: DeclaredSystem) -> Iterator[Diagnostic]:
-    """Yield findings about what connections carry, whatever their URLs are."""
-    for node in system.manifest.nodes:
-        yield from _endpoints(node)
 
 
 def _foreign(system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:

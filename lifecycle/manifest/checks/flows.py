@@ -37,17 +37,11 @@ _KEPT_BY_CLASS = ("max_delay_ms", "loss")
 """What a class promises whatever the rate; the others depend on what an operator configures."""
 
 
-def check_flow_endpoints(system: DeclaredSystem) -> Iterator[Diagnostic]:
-    """Yield findings about flow needs of endpoints that are not declared."""
-    for node in system.manifest.nodes:
-        for need in node.flows:
-            yield from _endpoint(node, need)
-
-
 def check_flows(system: DeclaredSystem, needs: FlowNeeds) -> Iterator[Diagnostic]:
-    """Yield findings about flow needs, but for `check_flow_endpoints`."""
+    """Yield findings about flow needs, but for transports."""
     for node in system.manifest.nodes:
         for each in needs.of_node(node):
+            yield from _endpoint(node, each.need)
             yield from _marking(node, each)
             yield from _class(each)
             if node.run.kind is not RunKind.PYTHON:
@@ -198,31 +192,23 @@ def check_identifiers(system: DeclaredSystem, needs: FlowNeeds) -> Iterator[Diag
         yield from _relied_on(system, needs)
 
 
-def _publishers(
-    system: DeclaredSystem, needs: FlowNeeds
+def _needy(
+    system: DeclaredSystem, needs: FlowNeeds, kind: EndpointKind
 ) -> Iterator[tuple[Resolved, ResolvedNeed]]:
+    """Yield the endpoints of a kind that ask something of their flows."""
     for each in system.endpoints:
         need = needs.of(each.node.key, each.endpoint.kind, each.endpoint.name)
-        if need is not None and each.endpoint.kind is EndpointKind.PUBLISHER:
-            yield each, need
-
-
-def _subscriptions(
-    system: DeclaredSystem, needs: FlowNeeds
-) -> Iterator[tuple[Resolved, ResolvedNeed]]:
-    for each in system.endpoints:
-        need = needs.of(each.node.key, each.endpoint.kind, each.endpoint.name)
-        if need is not None and each.endpoint.kind is EndpointKind.SUBSCRIPTION:
+        if need is not None and each.endpoint.kind is kind:
             yield each, need
 
 
 def _repurposed(system: DeclaredSystem, needs: FlowNeeds) -> Iterator[Diagnostic]:
-    publishers = list(_publishers(system, needs))
+    publishers = list(_needy(system, needs, EndpointKind.PUBLISHER))
     relying = {id(need) for _, need in _relying(system, needs)}
     asking = [each for each in publishers if each[1].unique or id(each[1]) in relying]
     others = [
         *(each for each in publishers if not (each[1].unique or id(each[1]) in relying)),
-        *_subscriptions(system, needs),
+        *_needy(system, needs, EndpointKind.SUBSCRIPTION),
     ]
     for _, need in asking:
         message, hint = need.marking.problem
@@ -287,7 +273,7 @@ def _relying(system: DeclaredSystem, needs: FlowNeeds) -> Iterator[tuple[Resolve
         for link in system.manifest.links
         if link.unique is not UniqueHow.NOT
     }
-    for each, need in _publishers(system, needs):
+    for each, need in _needy(system, needs, EndpointKind.PUBLISHER):
         if need.dscp is None or need.need.unique in ASKS_UNIQUE:
             continue
         if (each.node.key, each.name) in demanded and 0 <= need.dscp <= MAX_DSCP:
@@ -297,8 +283,8 @@ def _relying(system: DeclaredSystem, needs: FlowNeeds) -> Iterator[tuple[Resolve
 _VERBS = {EndpointKind.PUBLISHER: "publish", EndpointKind.SUBSCRIPTION: "subscribe to"}
 
 
-def check_links(system: DeclaredSystem) -> Iterator[Diagnostic]:
-    """Yield findings about the topic and the ends of every link."""
+def check_links(system: DeclaredSystem, needs: FlowNeeds) -> Iterator[Diagnostic]:
+    """Yield findings about the topic and the ends of every link, and what it demands of them."""
     for link in system.manifest.links:
         if problem := full_name_problem(link.topic):
             message = f"cannot use {link.topic!r} as the topic of a link: {problem}"
@@ -309,21 +295,9 @@ def check_links(system: DeclaredSystem) -> Iterator[Diagnostic]:
             *_end(system, link, link.from_node, EndpointKind.PUBLISHER),
             *_end(system, link, link.to_node, EndpointKind.SUBSCRIPTION),
         ]
-        yield from (each for each in ends if isinstance(each, Diagnostic))
-
-
-def check_link_uniqueness(system: DeclaredSystem, needs: FlowNeeds) -> Iterator[Diagnostic]:
-    """Yield findings about links that demand of flows what their ends do not ask for."""
-    for link in system.manifest.links:
-        if full_name_problem(link.topic) or not {link.from_node, link.to_node} <= {*system.nodes}:
-            continue
-        ends = [
-            *_end(system, link, link.from_node, EndpointKind.PUBLISHER),
-            *_end(system, link, link.to_node, EndpointKind.SUBSCRIPTION),
-        ]
+        problems = [each for each in ends if isinstance(each, Diagnostic)]
         resolved = [each for each in ends if isinstance(each, Resolved)]
-        if len(resolved) == len(ends):
-            yield from _uniqueness(link, resolved, needs)
+        yield from problems or _uniqueness(link, resolved, needs)
 
 
 def _end(
