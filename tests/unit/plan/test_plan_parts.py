@@ -114,34 +114,6 @@ def test_each_unique_publisher_gets_a_participant_of_its_own():
     assert placed == {"a": "_camera_flow_0", "b": "_camera_flow_1", "plain": ""}
 
 
-def test_publishers_that_only_need_a_dscp_share_a_participant_per_value():
-    made, placed = participants(
-        need(PUB, "a", dscp=46), need(PUB, "b", dscp=8), need(PUB, "c", dscp=46)
-    )
-    assert made == [
-        ("_camera_flow_0", 46, "publishers a, c marked EF = DSCP 46 = TOS 184 (0xb8)"),
-        ("_camera_flow_1", 8, "publisher b marked CS1 = DSCP 8 = TOS 32 (0x20)"),
-    ]
-    assert placed == {
-        "a": "_camera_flow_0",
-        "b": "_camera_flow_1",
-        "c": "_camera_flow_0",
-        "plain": "",
-    }
-
-
-def test_a_unique_publisher_does_not_share_even_with_its_own_dscp():
-    made, _ = participants(need(PUB, "a", dscp=46), need(PUB, "b", STRICTLY, dscp=46))
-    assert [name for name, _, _ in made] == ["_camera_flow_0", "_camera_flow_1"]
-
-
-@pytest.mark.parametrize(
-    "unique", [UniqueRequirement.NOT_REQUIRED, UniqueRequirement.SYSTEM_DEFAULT]
-)
-def test_a_publisher_that_asks_for_nothing_gets_nothing(unique: UniqueRequirement):
-    assert participants(need(PUB, "a", unique)) == ([], {"a": "", "plain": ""})
-
-
 def test_a_unique_subscription_needs_no_participant():
     (one,) = planned(node("v", subscription("a"), needs=[need(SUB, "a", STRICTLY)])).nodes
     assert one.participants == ()
