@@ -4,8 +4,7 @@ Systems of 100, 300 and 1,000 nodes with ten endpoints each, as a chain (each no
 one before it), as a star (all nodes with one), and with one topic that all nodes publish and
 subscribe, like /tf. Measured is the CPU time, in seconds, of reading and checking the manifest
 (`check`), of planning it (`plan`), of verifying it against an observation of a faultless system
-(`verify`), of judging it again after one endpoint changed, as a supervisor does that has judged it
-before (`change`), and of the plan's text, JSON and pictures. The exponent is that of the growth
+(`verify`), and of the plan's text, JSON and pictures. The exponent is that of the growth
 from the smallest to the largest system: 1 is linear; on the one topic of all, where the pairs
 themselves are the square of the nodes, it is by pairs. Then, for each stage, the function whose own
 time grows most. Needs neither ROS nor a network.
@@ -15,9 +14,7 @@ from __future__ import annotations
 
 import argparse
 import cProfile
-import dataclasses
 import gc
-import itertools
 import math
 import os
 import pstats
@@ -33,8 +30,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # as a script, only its own 
 from lifecycle.cli.verbs.check import check
 from lifecycle.cli.verbs.plan import render
 from lifecycle.manifest import load
-from lifecycle.plan import Plan, build_plan
-from lifecycle.verify import Observation, Stage, Verifier, verify
+from lifecycle.plan import build_plan
+from lifecycle.verify import Stage, verify
 from tests.unit.verify.perfect import perfect
 
 SIZES = (100, 300, 1_000)
@@ -81,21 +78,6 @@ def _topics(shape: str, number: int, nodes: int) -> tuple[list[str], list[str]]:
     return own, [f"/t{other}_{each}" for other in others for each in range(PER_SIDE)]
 
 
-def changed(plan: Plan, seen: Observation) -> Observation:
-    """Return what is seen once one endpoint, and its node's report with it, is another object."""
-    name = plan.nodes[-1].full_name
-    index = next(i for i, each in enumerate(seen.endpoints) if each.node == name)
-    endpoints = list(seen.endpoints)
-    endpoints[index] = dataclasses.replace(endpoints[index], type="std_msgs/msg/Int32")
-    return dataclasses.replace(
-        seen,
-        endpoints=tuple(endpoints),
-        configurations=tuple(
-            dataclasses.replace(each) if each.name == name else each for each in seen.configurations
-        ),
-    )
-
-
 def stages(shape: str, nodes: int, folder: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
     """Yield each stage's name and what does it."""
     path = folder / "scale.lifecycle.yaml"
@@ -106,10 +88,6 @@ def stages(shape: str, nodes: int, folder: Path) -> Iterator[tuple[str, Callable
     plan = build_plan(loaded, environment=os.environ)
     seen = perfect(plan)
     yield "verify", lambda: verify(plan, seen, stage=Stage.CONNECTED)
-    verifier = Verifier()
-    moments = itertools.cycle((seen, changed(plan, seen)))
-    verifier.verify(plan, next(moments), stage=Stage.CONNECTED)
-    yield "change", lambda: verifier.verify(plan, next(moments), stage=Stage.CONNECTED)
     for format_ in ("text", "json", *PICTURES):
         yield format_, lambda format_=format_: render(plan, format_)
 

@@ -24,13 +24,12 @@ from lifecycle.manifest import EndpointKind
 from lifecycle.network import NETWORK_MEDIA, FlowTuple, flow_tuples
 from lifecycle.verify import (
     NONE,
-    UNKNOWN_QOS,
     ConnectionReport,
     EndpointReport,
     Identity,
-    MatchEnd,
     NodeConfiguration,
     Outcome,
+    SeenEndpoint,
     carrier,
     match,
     obstacle,
@@ -410,8 +409,8 @@ def link(
     publisher: End,
     subscription: End,
     *,
-    publishers: Sequence[MatchEnd],
-    subscriptions: Sequence[MatchEnd],
+    publishers: Sequence[SeenEndpoint],
+    subscriptions: Sequence[SeenEndpoint],
 ) -> Link:
     """Judge one pair.
 
@@ -440,8 +439,8 @@ def _judged(
     publisher: End,
     subscription: End,
     transport: str,
-    publishers: Sequence[MatchEnd],
-    subscriptions: Sequence[MatchEnd],
+    publishers: Sequence[SeenEndpoint],
+    subscriptions: Sequence[SeenEndpoint],
 ) -> tuple[Outcome, str]:
     source, destination = _match_end(publisher), _match_end(subscription)
     cause = _missing(publisher) or _missing(subscription) or obstacle(source, destination)
@@ -453,19 +452,21 @@ def _judged(
     return found or (Outcome.UNVERIFIABLE, "neither end reports whom it is matched with")
 
 
-def _match_end(end: End) -> MatchEnd:
+def _match_end(end: End) -> SeenEndpoint:
     """Return an end as the rules of matching take it; the state holds no tools."""
     endpoint = end.endpoint
-    return MatchEnd(
+    return SeenEndpoint(
         kind=endpoint.kind,
+        node=end.node.name,
+        name=endpoint.resolved,
         type=endpoint.type,
-        qos=endpoint.qos or UNKNOWN_QOS,
+        qos=endpoint.qos,
         gid=endpoint.gid,
         report=endpoint,
     )
 
 
-def match_ends(ends: Sequence[End]) -> tuple[MatchEnd, ...]:
+def match_ends(ends: Sequence[End]) -> tuple[SeenEndpoint, ...]:
     """Return the ends that can be matched; DDS forgets a silent one in time."""
     return tuple(
         _match_end(each) for each in ends if each.node.liveliness is not NodeLiveliness.SILENT

@@ -1,4 +1,3 @@
-from .judge import Verifier as Verifier
 from .judge import missing as missing
 from .judge import not_ok as not_ok
 from .judge import taken_on_trust as taken_on_trust
@@ -35,7 +34,6 @@ from .rules.health import UNHEALTHY as UNHEALTHY
 from .rules.health import health_of as health_of
 from .rules.matching import SERVER_OF as SERVER_OF
 from .rules.matching import UNKNOWN_PEER as UNKNOWN_PEER
-from .rules.matching import MatchEnd as MatchEnd
 from .rules.matching import match as match
 from .rules.matching import obstacle as obstacle
 from .rules.nodes import DUPLICATE_NODE as DUPLICATE_NODE

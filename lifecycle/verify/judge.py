@@ -8,7 +8,7 @@ its arguments. Pure.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 from lifecycle import dataclasses
 from lifecycle.manifest import EndpointKind, EndpointPolicy, Policy, UniqueHow
@@ -30,31 +30,15 @@ from lifecycle.verify.verdict import (
     ToleratedNode,
     Verdict,
 )
-from lifecycle.verify.view import Actual, FlowView, Frame, View, once, subject_of
+from lifecycle.verify.view import Actual, FlowView, View
 
 _HOW = (UniqueHow.NOT, UniqueHow.WEAKLY, UniqueHow.STRONGLY)
 
 
 def flow_reports(view: View, findings: Sequence[Finding]) -> tuple[FlowReport, ...]:
     """Report every planned flow, in plan order."""
-    uniqueness = view.uniqueness
-
-    def unspoiled(flow: FlowView) -> Iterator[FlowReport]:
-        outcome = Outcome.UNVERIFIABLE if is_unreported(flow) else Outcome.OK
-        yield _reported(flow, uniqueness, outcome)
-
-    reports = list(view.by_flow.each(unspoiled, name=_reported, terms=uniqueness.judged))
     spoiled = _spoiled(findings)
-    if spoiled:
-        (places,) = once(view.frame, _flows_by_place)
-        for index in {index for place in spoiled for index in places.get(place, ())}:
-            reports[index] = dataclasses.replace(
-                reports[index],
-                outcome=Outcome.worst(
-                    (reports[index].outcome, _outcome(view.frame, index, spoiled))
-                ),
-            )
-    return tuple(reports)
+    return tuple(_reported(flow, view.uniqueness, spoiled) for flow in view.flows)
 
 
 _Place = tuple[str, str, EndpointKind | None]
@@ -79,32 +63,20 @@ def _spoiled(findings: Iterable[Finding]) -> dict[_Place, Outcome]:
     return worst
 
 
-def _flows_by_place(frame: Frame) -> Iterator[dict[_Place, list[int]]]:
-    """Yield the indices of the flows that a finding at a place spoils."""
-    found: dict[_Place, list[int]] = {}
-    for index in range(len(frame.plan.flows)):
-        for place in _places(frame, index):
-            found.setdefault(place, []).append(index)
-    yield found
-
-
-def _places(frame: Frame, index: int) -> tuple[_Place, ...]:
-    flow = frame.plan.flows[index]
-    publisher, subscription = frame.by_key[flow.publisher], frame.by_key[flow.subscription]
-    return (
-        (subject_of(flow.topic, publisher, subscription), "", None),
+def _outcome(flow: FlowView, spoiled: dict[_Place, Outcome]) -> Outcome:
+    publisher, subscription = flow.ends
+    places: tuple[_Place, ...] = (
+        (flow.subject, "", None),
         (publisher, publisher, None),
         (subscription, subscription, None),
-        (flow.topic, publisher, EndpointKind.PUBLISHER),
-        (flow.topic, subscription, EndpointKind.SUBSCRIPTION),
+        (flow.planned.topic, publisher, EndpointKind.PUBLISHER),
+        (flow.planned.topic, subscription, EndpointKind.SUBSCRIPTION),
     )
+    unreported = (Outcome.UNVERIFIABLE,) if is_unreported(flow) else ()
+    return Outcome.worst((*unreported, *(spoiled[each] for each in places if each in spoiled)))
 
 
-def _outcome(frame: Frame, index: int, spoiled: dict[_Place, Outcome]) -> Outcome:
-    return Outcome.worst(spoiled[place] for place in _places(frame, index) if place in spoiled)
-
-
-def _reported(flow: FlowView, uniqueness: Uniqueness, outcome: Outcome) -> FlowReport:
+def _reported(flow: FlowView, uniqueness: Uniqueness, spoiled: dict[_Place, Outcome]) -> FlowReport:
     ends = (uniqueness.all_unique(flow.publishers), uniqueness.all_unique(flow.subscriptions))
     source = uniqueness.nfes(flow.publishers)
     destination = uniqueness.nfes(flow.subscriptions)
@@ -121,7 +93,7 @@ def _reported(flow: FlowView, uniqueness: Uniqueness, outcome: Outcome) -> FlowR
         requirement=flow.requirement,
         demanded=flow.planned.unique,
         transport=_transport(flow, source, destination),
-        outcome=outcome,
+        outcome=_outcome(flow, spoiled),
         max_delay_ms=flow.planned.max_delay_ms,
         five_qi=flow.five_qi,
         five_qi_reason="; ".join(
@@ -200,39 +172,7 @@ def verify(
         over: how the process ended of nodes that may end by themselves, by fully qualified name;
             empty where it is not known whether it has.
     """
-    return _verdict(lay_out(plan, observation, stage, machines=machines, ahead=ahead, over=over))
-
-
-class Verifier:
-    """Judges one system again and again: what has not changed since the last time is not redone.
-
-    `verify` gives what the function of that name gives for the same arguments, whatever it was
-    asked before. It recognises what has not changed by the identity of the parts of the observation
-    (`ObservedNode`, `ObservedEndpoint`, `NodeConfiguration`, `NodeParameters`): who observes keeps
-    those. It holds what it was asked last, and no more.
-    """
-
-    def __init__(self) -> None:
-        self._last: View | None = None
-
-    def verify(
-        self,
-        plan: Plan,
-        observation: Observation,
-        *,
-        stage: Stage,
-        machines: frozenset[str] | None = None,
-        ahead: frozenset[str] = frozenset(),
-        over: Mapping[str, str] | None = None,
-    ) -> Verdict:
-        """Judge what was seen of a system; see the function of this name."""
-        self._last = view = lay_out(
-            plan, observation, stage, machines=machines, ahead=ahead, over=over, last=self._last
-        )
-        return _verdict(view)
-
-
-def _verdict(view: View) -> Verdict:
+    view = lay_out(plan, observation, stage, machines=machines, ahead=ahead, over=over)
     findings = tuple(finding for check in CHECKS for finding in check(view))
     return Verdict(
         verdict=Outcome.worst(

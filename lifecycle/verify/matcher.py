@@ -7,21 +7,20 @@ what is left over. All rules read the result, so that they agree on what is the 
 from __future__ import annotations
 
 import itertools
-import operator
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
 from lifecycle import dataclasses
 from lifecycle.manifest import EndpointKind
-from lifecycle.plan import Plan, PlannedEndpoint, PlannedFlow, PlannedNode
+from lifecycle.plan import Plan, PlannedEndpoint, PlannedNode
 from lifecycle.verify.observation import (
     EndpointReport,
     NodeConfiguration,
-    NodeParameters,
     Observation,
     ObservedEndpoint,
     ObservedNode,
 )
 from lifecycle.verify.tool_filter import (
+    DeclaredNames,
     action_part,
     fold_actions,
     is_noise_endpoint,
@@ -34,18 +33,14 @@ from lifecycle.verify.uniqueness import Uniqueness
 from lifecycle.verify.verdict import Stage
 from lifecycle.verify.view import (
     Actual,
-    Attributed,
     FlowView,
-    Frame,
-    NodeEndpoints,
     NodeFacts,
-    Parts,
     SeenEndpoint,
-    TopicFacts,
     View,
     actual_qos,
+    declared_addresses,
+    is_beyond,
     may_hide,
-    once,
 )
 
 _Pools = dict[tuple[EndpointKind, str], list[ObservedEndpoint]]
@@ -68,7 +63,6 @@ def lay_out(
     machines: frozenset[str] | None = None,
     ahead: frozenset[str] = frozenset(),
     over: Mapping[str, str] | None = None,
-    last: View | None = None,
 ) -> View:
     """Match everything observed to everything planned; deterministic for any input order.
 
@@ -76,22 +70,16 @@ def lay_out(
         plan: what must be.
         observation: what was seen.
         stage: which moment it is judged against.
-        machines: as `Frame` has them, and `ahead`, and `over`.
+        machines: as `View` has them, and `ahead`, and `over`.
         ahead: see there.
         over: see there.
-        last: the view of an earlier moment, whose parts are taken over where all that they are
-            made of is the same: the same object, not an equal one. The result does not depend on
-            it but for what it costs.
     """
-    over = over or {}
-    if last is not None and not last.frame.is_of(plan, stage, machines, ahead, over):
-        last = None
-    frame = last.frame if last is not None else Frame.of(plan, stage, machines, ahead, over)
-    planned = frame.planned
+    planned = {node.full_name: node for node in plan.nodes}
+    names = DeclaredNames.of(plan)
     reported = _by_identity(observation)
     configurations = {each.name: each for each in reversed(reported)}
+    groups = _attributed(observation, names, reported, configurations)
     duplicated = {each.full_name for each in observation.nodes if each.count > 1}
-    attributed, groups = _attributed(observation, frame, reported, configurations, last)
     # Of two of one name, or where an endpoint is not its owner's, one is somebody else's.
     hidden = owners(planned, reported).keys() - planned.keys() - groups.keys() - duplicated
     tools = _tools(observation, groups, planned, hidden, plan.policy.tolerated_nodes)
@@ -99,72 +87,49 @@ def lay_out(
     parameters = {each.node: each for each in observation.parameters}
     nodes: dict[str, NodeFacts] = {}
     left_over: list[ObservedEndpoint] = []
-    for node in plan.nodes:
-        name = node.full_name
-        group = groups.get(name)
-        facts = nodes[name] = _facts(
-            frame,
-            node,
-            configurations.get(name),
-            observed.get(name),
-            parameters.get(name),
-            () if group is None else group.endpoints,
-            last.nodes.get(name) if last is not None else None,
+    for name, node in planned.items():
+        configuration = configurations.get(name)
+        matched, rest = _match_node(
+            node, configuration, groups.get(name, ()), beyond=is_beyond(node, machines)
+        )
+        nodes[name] = NodeFacts(
+            node=node,
+            observed=observed.get(name),
+            configuration=configuration,
+            parameters=parameters.get(name),
+            actual=tuple(matched),
+            ends=_by_place(matched),
+            absent=name not in observed and all(each.observed is None for each in matched),
         )
         # A second node of the same name has the same endpoints again; that is one finding.
-        left_over += () if name in duplicated else facts.rest
-    by_node = Parts(
-        nodes, order=frame.order.__getitem__, last=last.by_node if last is not None else None
-    )
+        left_over += () if name in duplicated else rest
     actual = tuple(itertools.chain.from_iterable(facts.actual for facts in nodes.values()))
     strangers = [name for name in groups if name and name not in planned and name not in tools]
-    of_tools = tuple(
-        each for name, group in groups.items() if name in tools for each in group.endpoints
-    )
-    seen = _seen(groups, nodes, tools)
-    topics, retold = _topics(frame, seen, of_tools, last)
-    flows, moved = _flows(frame, nodes, topics, last, changed=(*by_node.changed, *retold))
+    of_tools = tuple(each for name in groups if name in tools for each in groups[name])
     return View(
-        frame=frame,
+        plan=plan,
+        stage=stage,
+        machines=machines,
+        ahead=ahead,
+        over=over or {},
+        planned=planned,
+        names=names,
         observed=observed,
         reported=reported,
         configurations=configurations,
-        parameters=parameters,
+        nodes=nodes,
         actual=actual,
-        actual_by_node={name: facts.actual for name, facts in nodes.items()},
         undeclared=_undeclared(left_over, groups, actual),
-        unattributed=groups[""].endpoints if "" in groups else (),
-        foreign=tuple(each for name in strangers for each in groups[name].endpoints),
+        unattributed=groups.get("", ()),
+        foreign=tuple(each for name in strangers for each in groups[name]),
         tools=tools,
         of_tools=of_tools,
-        seen=seen,
-        flows=flows,
-        uniqueness=Uniqueness.of(
-            reported, frame.addresses, last.uniqueness if last is not None else None
-        ),
-        nodes=nodes,
-        topics=topics,
-        by_node=by_node,
-        by_topic=Parts(
-            topics,
-            order=str,
-            last=last.by_topic if last is not None else None,
-            changed=retold,
-        ),
-        by_flow=Parts(
-            dict(enumerate(flows)),
-            order=int,
-            last=last.by_flow if last is not None else None,
-            changed=moved,
-        ),
-        attributed=attributed,
         groups=groups,
+        seen=_seen(groups, actual, tools),
+        seen_of_tools=tuple(_seen_endpoint(each, None) for each in _topical(of_tools)),
+        flows=_flows(plan, nodes),
+        uniqueness=Uniqueness(reported, declared_addresses(plan)),
     )
-
-
-def _same(one: Sequence[object], other: Sequence[object]) -> bool:
-    """Return whether two sequences hold the same objects: equal ones may have other identities."""
-    return one is other or (len(one) == len(other) and all(map(operator.is_, one, other)))
 
 
 def _by_identity(observation: Observation) -> tuple[NodeConfiguration, ...]:
@@ -176,11 +141,10 @@ def _by_identity(observation: Observation) -> tuple[NodeConfiguration, ...]:
 
 def _attributed(
     observation: Observation,
-    frame: Frame,
+    names: DeclaredNames,
     reported: Iterable[NodeConfiguration],
     configurations: dict[str, NodeConfiguration],
-    last: View | None,
-) -> tuple[dict[str, Attributed], dict[str, NodeEndpoints]]:
+) -> dict[str, tuple[ObservedEndpoint, ...]]:
     """Give each endpoint to its node: by hidden participant, or by the GID that a node reported.
 
     Services have no GID of their own in reports: one whose node is not known is that of the node on
@@ -188,58 +152,29 @@ def _attributed(
     is declared; under a declared name, unless it is a declared node's.
 
     Returns:
-        The endpoints by the name that discovery shows, but for those without one; and all by the
-        name of the node whose they are, sorted by it.
+        The endpoints by the name of the node whose they are, sorted by it.
     """
-    hidden = owners(frame.planned, reported)
-    shown: dict[str, list[ObservedEndpoint]] = {}
-    for name, of_node in itertools.groupby(observation.endpoints, operator.attrgetter("node")):
-        shown.setdefault(name, []).extend(of_node)
-    attributed: dict[str, Attributed] = {}
-    by_node: dict[str, list[Sequence[ObservedEndpoint]]] = {}
-    for name, endpoints in shown.items():
-        node = known_node(name)
+    hidden = owners(names.nodes, reported)
+    unknown: list[ObservedEndpoint] = []
+    by_node: dict[str, list[ObservedEndpoint]] = {}
+    for each in observation.endpoints:
+        node = known_node(each.node)
         if not node:
-            for each in _unknown(endpoints, frame, configurations):
-                by_node.setdefault(each.node, []).append((each,))
+            unknown.append(each)
             continue
-        owner = hidden.get(node) if node not in frame.planned else None
+        owner = hidden.get(node) if node not in names.nodes else None
         ours = (owner.node if owner is not None else node) in configurations
-        known = last.attributed.get(name) if last is not None else None
-        if (
-            known is None
-            or known.owner != owner
-            or known.ours is not ours
-            or not _same(known.shown, endpoints)
-        ):
-            judged: dict[str, list[ObservedEndpoint]] = {}
-            for each in endpoints:
-                whose = owner.node if owner is not None and owner.has(each) else node
-                if _counts(each, whose, frame, ours=ours):
-                    judged.setdefault(whose, []).append(_as_of(each, whose))
-            known = Attributed(
-                shown=tuple(endpoints),
-                owner=owner,
-                ours=ours,
-                judged={whose: tuple(found) for whose, found in judged.items()},
-            )
-        attributed[name] = known
-        for whose, found in known.judged.items():
-            by_node.setdefault(whose, []).append(found)
-    groups = {
-        name: _group(
-            by_node[name],
-            last.groups.get(name) if last is not None else None,
-            declared=name in frame.planned,
-        )
-        for name in sorted(by_node)
-    }
-    return attributed, groups
+        whose = owner.node if owner is not None and owner.has(each) else node
+        if _counts(each, whose, names, ours=ours):
+            by_node.setdefault(whose, []).append(_as_of(each, whose))
+    for each in _unknown(unknown, names, configurations):
+        by_node.setdefault(each.node, []).append(each)
+    return {name: _sorted(fold_actions(_sorted(by_node[name]))) for name in sorted(by_node)}
 
 
 def _unknown(
     endpoints: Iterable[ObservedEndpoint],
-    frame: Frame,
+    names: DeclaredNames,
     configurations: dict[str, NodeConfiguration],
 ) -> Iterator[ObservedEndpoint]:
     """Yield the endpoints whose node discovery does not show, as far as they count."""
@@ -260,21 +195,21 @@ def _unknown(
                     each
                     for each in by_participant.get(endpoint.gid[:_PREFIX_DIGITS], ())
                     if (each, *(action_part(endpoint.kind, endpoint.name) or _place(endpoint)))
-                    in frame.declared
+                    in names.ends
                 ),
                 "",
             )
-        if _counts(endpoint, node, frame, ours=node in configurations):
+        if _counts(endpoint, node, names, ours=node in configurations):
             # Half of a service may be seen before its node is: it is no second one.
             known = node and not endpoint.kind.is_topic
             yield _as_of(dataclasses.replace(endpoint, gid="") if known else endpoint, node)
 
 
-def _counts(endpoint: ObservedEndpoint, node: str, frame: Frame, *, ours: bool) -> bool:
+def _counts(endpoint: ObservedEndpoint, node: str, names: DeclaredNames, *, ours: bool) -> bool:
     """Return whether an endpoint of a node is declared, feeds what is, or was made on purpose."""
     return (
-        (node, endpoint.kind, endpoint.name) in frame.declared
-        or (node not in frame.planned and frame.names.looks_for(endpoint.kind, endpoint.name))
+        (node, endpoint.kind, endpoint.name) in names.ends
+        or (node not in names.nodes and names.looks_for(endpoint.kind, endpoint.name))
         or not is_noise_endpoint(
             endpoint.kind, known_node(endpoint.node), endpoint.name, endpoint.type, ours=ours
         )
@@ -285,20 +220,6 @@ def _as_of(endpoint: ObservedEndpoint, node: str) -> ObservedEndpoint:
     if node == endpoint.node:
         return endpoint
     return dataclasses.replace(endpoint, node=node)
-
-
-def _group(
-    parts: Sequence[Sequence[ObservedEndpoint]], last: NodeEndpoints | None, *, declared: bool
-) -> NodeEndpoints:
-    judged = parts[0] if len(parts) == 1 else [each for part in parts for each in part]
-    if last is not None and _same(last.judged, judged):
-        return last
-    endpoints = _sorted(fold_actions(_sorted(judged)))
-    return NodeEndpoints(
-        judged=tuple(judged),
-        endpoints=endpoints,
-        seen=() if declared else tuple(_seen_endpoint(each, None) for each in _topical(endpoints)),
-    )
 
 
 def _place(endpoint: ObservedEndpoint) -> tuple[EndpointKind, str]:
@@ -322,73 +243,31 @@ def _tools(
     return {name: pattern for name, pattern in found.items() if pattern}
 
 
-def _facts(  # noqa: PLR0917 - all that is known of one node
-    frame: Frame,
-    node: PlannedNode,
-    configuration: NodeConfiguration | None,
-    observed: ObservedNode | None,
-    parameters: NodeParameters | None,
-    endpoints: tuple[ObservedEndpoint, ...],
-    last: NodeFacts | None,
-) -> NodeFacts:
-    """Match one node's declarations to what is seen of it."""
-    if (
-        last is not None
-        and last.node is node
-        and last.configuration is configuration
-        and last.observed is observed
-        and last.parameters is parameters
-        and last.endpoints is endpoints
-    ):
-        return last
-    places: _Pools = {}
-    for endpoint in endpoints:
-        places.setdefault((endpoint.kind, endpoint.name), []).append(endpoint)
-    matched, rest = _match_node(node, configuration, places, beyond=frame.is_beyond(node))
+def _by_place(matched: Iterable[Actual]) -> dict[tuple[EndpointKind, str], tuple[Actual, ...]]:
     ends: dict[tuple[EndpointKind, str], tuple[Actual, ...]] = {}
     for each in matched:
         place = (each.planned.kind, each.planned.resolved)
         ends[place] = (*ends.get(place, ()), each)
-    by_observed = {id(each.observed): each for each in matched if each.observed is not None}
-    unseen = [each.observed for each in matched if each.unseen and each.observed is not None]
-    return NodeFacts(
-        frame=frame,
-        node=node,
-        observed=observed,
-        configuration=configuration,
-        parameters=parameters,
-        endpoints=endpoints,
-        actual=tuple(matched),
-        ends=ends,
-        rest=tuple(rest),
-        seen=tuple(_seen_endpoint(each, by_observed.get(id(each))) for each in _topical(endpoints)),
-        beyond=tuple(
-            _planned_endpoint(each) for each in matched if each.beyond and _is_topic(each)
-        ),
-        unseen=tuple(_seen_endpoint(each, by_observed[id(each)]) for each in _topical(unseen)),
-        absent=observed is None and not by_observed,
-        may_hide=any(each.unseen for each in matched),
-    )
+    return ends
 
 
 def _topical(endpoints: Iterable[ObservedEndpoint]) -> Iterator[ObservedEndpoint]:
     return (each for each in endpoints if each.kind.is_topic)
 
 
-def _is_topic(actual: Actual) -> bool:
-    return actual.planned.kind.is_topic
-
-
 def _match_node(
     node: PlannedNode,
     configuration: NodeConfiguration | None,
-    places: _Pools,
+    endpoints: Iterable[ObservedEndpoint],
     *,
     beyond: bool,
 ) -> tuple[list[Actual], list[ObservedEndpoint]]:
     """Match one node's declarations to what is seen of it; return them and what is left over."""
     reports = _Reports(configuration.endpoints if configuration else ())
-    pools = {place: list(endpoints) for place, endpoints in places.items()}
+    pools: _Pools = {}
+    for each in endpoints:
+        pools.setdefault(_place(each), []).append(each)
+    places = pools.keys()
     matched: dict[int, Actual] = {}
     used: set[tuple[EndpointKind, str]] = set()
     for exact_report, exact_observed in _TURNS:
@@ -513,7 +392,7 @@ def _as_observed(node: PlannedNode, report: EndpointReport, name: str) -> Observ
 
 def _undeclared(
     left_over: Sequence[ObservedEndpoint],
-    groups: Mapping[str, NodeEndpoints],
+    groups: Mapping[str, tuple[ObservedEndpoint, ...]],
     actual: Iterable[Actual],
 ) -> tuple[ObservedEndpoint, ...]:
     """Leave out of what no declaration covers the parts of declared actions that are half seen."""
@@ -522,7 +401,7 @@ def _undeclared(
     seen = {
         (each.node, each.kind, each.name)
         for group in groups.values()
-        for each in group.endpoints
+        for each in group
         if not each.kind.is_topic
     }
     declared = {
@@ -562,18 +441,26 @@ def _graph_nodes(
 
 
 def _seen(
-    groups: Mapping[str, NodeEndpoints], nodes: Mapping[str, NodeFacts], tools: Collection[str]
+    groups: Mapping[str, tuple[ObservedEndpoint, ...]],
+    actual: Sequence[Actual],
+    tools: Collection[str],
 ) -> tuple[SeenEndpoint, ...]:
     """Collect publishers and subscriptions with all that is known of them."""
+    topical = [each for each in actual if each.planned.kind.is_topic]
     # Not visible here, but the endpoints that match them count them.
-    found = [each for facts in nodes.values() for each in facts.beyond]
-    for name, group in groups.items():
-        facts = nodes.get(name)
-        if facts is not None:
-            found += facts.seen
-        elif name not in tools:
-            found += group.seen
-    found += [each for facts in nodes.values() for each in facts.unseen]
+    found = [_planned_endpoint(each) for each in topical if each.beyond]
+    declared = {id(each.observed): each for each in topical if each.observed is not None}
+    found += [
+        _seen_endpoint(each, declared.get(id(each)))
+        for name, group in groups.items()
+        if name not in tools
+        for each in _topical(group)
+    ]
+    found += [
+        _seen_endpoint(each.observed, each)
+        for each in topical
+        if each.unseen and each.observed is not None
+    ]
     return tuple(found)
 
 
@@ -584,7 +471,6 @@ def _planned_endpoint(actual: Actual) -> SeenEndpoint:
         name=actual.planned.resolved,
         type=actual.planned.type,
         qos=actual.planned.qos,
-        report=None,
         planned=actual.planned,
     )
 
@@ -600,46 +486,8 @@ def _seen_endpoint(endpoint: ObservedEndpoint, match: Actual | None) -> SeenEndp
         report=report,
         planned=match.planned if match else None,
         type_hash=_type_hash(endpoint, report),
+        expected=match is not None,
     )
-
-
-def _topics(
-    frame: Frame,
-    seen: Iterable[SeenEndpoint],
-    of_tools: Iterable[ObservedEndpoint],
-    last: View | None,
-) -> tuple[dict[str, TopicFacts], Collection[str]]:
-    """Return what is seen of every topic, and of which of them another thing than last."""
-    tools: dict[str, list[SeenEndpoint]] = {}
-    for endpoint in _topical(of_tools):
-        tools.setdefault(endpoint.name, []).append(_seen_endpoint(endpoint, None))
-    ends: dict[str, list[SeenEndpoint]] = {}
-    if last is None:
-        for each in seen:
-            ends.setdefault(each.name, []).append(each)
-        found: dict[str, TopicFacts] = {}
-        touched: Collection[str] = ends.keys() | tools.keys()
-    else:
-        # Ends that are there in both moments are in the same order: nodes have theirs.
-        now, before = set(map(id, seen)), set(map(id, last.seen))
-        touched = {each.name for each in seen if id(each) not in before}
-        touched |= {each.name for each in last.seen if id(each) not in now}
-        touched |= tools.keys() | {each.name for each in last.of_tools}
-        for each in seen:
-            if each.name in touched:
-                ends.setdefault(each.name, []).append(each)
-        found = dict(last.topics)
-    changed: set[str] = set()
-    for name in touched:
-        here, beside = tuple(ends.get(name, ())), tuple(tools.get(name, ()))
-        known = found.get(name)
-        if not here and not beside:
-            if found.pop(name, None) is not None:
-                changed.add(name)
-        elif known is None or not _same(known.ends, here) or known.of_tools != beside:
-            found[name] = TopicFacts(frame=frame, ends=here, of_tools=beside)
-            changed.add(name)
-    return found, changed
 
 
 def _type_hash(endpoint: ObservedEndpoint, report: EndpointReport | None) -> str | None:
@@ -649,57 +497,24 @@ def _type_hash(endpoint: ObservedEndpoint, report: EndpointReport | None) -> str
     return report.type_hash
 
 
-def _flows(
-    frame: Frame,
-    nodes: Mapping[str, NodeFacts],
-    topics: Mapping[str, TopicFacts],
-    last: View | None,
-    changed: Iterable[str],
-) -> tuple[tuple[FlowView, ...], Collection[int]]:
-    """Return every flow, and the indices of those that have another node or topic than last."""
-
-    def flow(planned: PlannedFlow) -> FlowView:
-        return _flow(
-            planned,
-            nodes[frame.by_key[planned.publisher]],
-            nodes[frame.by_key[planned.subscription]],
-            topics.get(planned.topic),
+def _flows(plan: Plan, nodes: Mapping[str, NodeFacts]) -> tuple[FlowView, ...]:
+    by_key = {node.key: nodes[node.full_name] for node in reversed(plan.nodes)}
+    found = []
+    for planned in plan.flows:
+        source, destination = by_key[planned.publisher], by_key[planned.subscription]
+        publishers = source.ends.get((EndpointKind.PUBLISHER, planned.topic), ())
+        subscriptions = destination.ends.get((EndpointKind.SUBSCRIPTION, planned.topic), ())
+        flow = FlowView(
+            planned=planned,
+            publisher=source.name,
+            subscription=destination.name,
+            publishers=publishers,
+            subscriptions=subscriptions,
+            at=next((each.planned.at for each in (*subscriptions, *publishers)), None),
+            nodes=(source, destination),
         )
-
-    if last is None:
-        return tuple(map(flow, frame.plan.flows)), ()
-    (concerned,) = once(frame, _flows_by_name)
-    moved = {index for name in changed for index in concerned.get(name, ())}
-    found = list(last.flows)
-    for index in moved:
-        found[index] = flow(frame.plan.flows[index])
-    return tuple(found), moved
-
-
-def _flows_by_name(frame: Frame) -> Iterator[dict[str, list[int]]]:
-    """Yield the indices of the flows that a node or a topic is of; names may be of both."""
-    found: dict[str, list[int]] = {}
-    for index, each in enumerate(frame.plan.flows):
-        for name in {frame.by_key[each.publisher], frame.by_key[each.subscription], each.topic}:
-            found.setdefault(name, []).append(index)
-    yield found
-
-
-def _flow(
-    planned: PlannedFlow, source: NodeFacts, destination: NodeFacts, topic: TopicFacts | None
-) -> FlowView:
-    publishers = source.ends.get((EndpointKind.PUBLISHER, planned.topic), ())
-    subscriptions = destination.ends.get((EndpointKind.SUBSCRIPTION, planned.topic), ())
-    return FlowView(
-        planned=planned,
-        publisher=source.name,
-        subscription=destination.name,
-        publishers=publishers,
-        subscriptions=subscriptions,
-        at=next((each.planned.at for each in (*subscriptions, *publishers)), None),
-        nodes=(source, destination),
-        ends_of_topic=topic,
-    )
+        found.append(flow)
+    return tuple(found)
 
 
 def _sorted(endpoints: Iterable[ObservedEndpoint]) -> tuple[ObservedEndpoint, ...]:

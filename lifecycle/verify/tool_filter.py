@@ -39,7 +39,7 @@ from lifecycle.manifest import (
     supervisor_status_topic,
 )
 from lifecycle.network import UniqueRequirement
-from lifecycle.plan import Plan, PlannedNode, uses_sim_time
+from lifecycle.plan import Plan, uses_sim_time
 from lifecycle.verify.observation import NodeConfiguration, ObservedEndpoint
 
 OUR_NODES = "_lifecycle_*"
@@ -212,9 +212,10 @@ class DeclaredNames:
     """The topics, services and actions that a plan declares.
 
     Attributes:
+        nodes: full names of the declared nodes. Each has its lifecycle and parameter services,
+            `~/transition_event` and the like under its own name.
+        ends: node, kind and name of every declared endpoint.
         names: by the kind that offers, fully qualified, those that endpoints declare.
-        own: likewise, those that every declared node has under its own name: its lifecycle and
-            parameter services, `~/transition_event` and the like.
         of_supervisors: likewise, those that only supervisors of the plan may have, whatever
             `policy.ros_interface` says.
         alive: names of the topics by which its supervisors assert their liveliness to each other.
@@ -223,8 +224,9 @@ class DeclaredNames:
             supervisors, those of other systems too.
     """
 
+    nodes: frozenset[str] = frozenset()
+    ends: frozenset[tuple[str, EndpointKind, str]] = frozenset()
     names: frozenset[tuple[EndpointKind, str]] = frozenset()
-    own: frozenset[tuple[EndpointKind, str]] = frozenset()
     of_supervisors: frozenset[tuple[EndpointKind, str]] = frozenset()
     alive: frozenset[str] = frozenset()
     simulated: bool = False
@@ -232,39 +234,22 @@ class DeclaredNames:
 
     @classmethod
     def of(cls, plan: Plan) -> DeclaredNames:
-        """Collect those of a plan; those of the last few plans are remembered."""
-        known = _DECLARED.get(id(plan.nodes))
-        if known is None or known[0] is not plan.nodes:
-            if len(_DECLARED) >= _MOST_DECLARED:
-                _DECLARED.clear()
-            known = _DECLARED[id(plan.nodes)] = (plan.nodes, cls._of(plan))
-        return known[1]
-
-    @classmethod
-    def _of(cls, plan: Plan) -> DeclaredNames:
-        services = (*NODE_SERVICES, *OUR_SERVICES)
-        names = frozenset(
-            (_NAMESPACES[each.kind], each.resolved)
+        """Collect those of a plan."""
+        ends = frozenset(
+            (node.full_name, each.kind, each.resolved)
             for node in plan.nodes
             for each in node.endpoints
         )
-        own = frozenset(
-            (kind, f"{node.full_name}/{name}")
-            for node in plan.nodes
-            for kind, found in (
-                (EndpointKind.SERVICE_SERVER, services),
-                (EndpointKind.PUBLISHER, NODE_TOPICS),
-            )
-            for name in found
-        )
+        names = frozenset((_NAMESPACES[kind], name) for _, kind, name in ends)
         of_supervisors = frozenset(
             (kind, name)
             for prefix in supervisor_prefixes(plan)
             for kind, name in _below(prefix, plan, RosInterfaceAccess.FULL)
         )
         return cls(
+            nodes=frozenset(node.full_name for node in plan.nodes),
+            ends=ends,
             names=names,
-            own=own,
             # A manifest may declare a node of its own that has them.
             of_supervisors=of_supervisors - names,
             alive=frozenset(topic for topic, _ in _alive(plan)),
@@ -286,8 +271,13 @@ class DeclaredNames:
         if kind not in OFFERS or (kind, name) in NOISE_TOPICS:
             return False
         return (
-            self.has(kind, name) or (kind, name) in self.own or self.is_of_supervisors(kind, name)
+            self.has(kind, name) or self._is_own(kind, name) or self.is_of_supervisors(kind, name)
         )
+
+    def _is_own(self, kind: EndpointKind, name: str) -> bool:
+        """Return whether every node offers this under its own name, and it is a declared node's."""
+        node, _, base = name.rpartition("/")
+        return node in self.nodes and base in _OWN.get(kind, ())
 
     def is_of_supervisors(self, kind: EndpointKind, name: str) -> bool:
         """Return whether only a supervisor of the plan may offer an endpoint."""
@@ -300,9 +290,10 @@ class DeclaredNames:
         return self.fed_by(kind, name) or (self.diagnosed and _is_status(kind, name))
 
 
-_DECLARED: dict[int, tuple[tuple[PlannedNode, ...], DeclaredNames]] = {}
-"""By the identity of a plan's nodes, which are frozen; kept with them, so that it stays theirs."""
-_MOST_DECLARED = 4
+_OWN: Mapping[EndpointKind, Collection[str]] = {
+    EndpointKind.SERVICE_SERVER: NODE_SERVICES.keys() | OUR_SERVICES.keys(),
+    EndpointKind.PUBLISHER: NODE_TOPICS.keys(),
+}
 
 
 def known_node(full_name: str) -> str:

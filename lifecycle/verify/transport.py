@@ -26,7 +26,7 @@ from lifecycle.network import (
     parse,
 )
 from lifecycle.verify.observation import Identity, NodeConfiguration
-from lifecycle.verify.view import Actual, FlowView, once
+from lifecycle.verify.view import Actual, FlowView
 
 NONE = "none"
 UNKNOWN = "unknown"
@@ -37,19 +37,12 @@ _ANY_PORT = 0
 
 def effective_transport(flow: FlowView) -> str:
     """Return what carries a planned flow, as `carrier` says."""
-    (found,) = once(flow, _effective)
-    return found
-
-
-def _effective(flow: FlowView) -> tuple[str]:
-    source, destination = flow.nodes
-    return (
-        carrier(
-            _ways(source.configuration, flow.publishers),
-            _ways(destination.configuration, flow.subscriptions),
-            None if source.configuration is None else source.configuration.identity,
-            None if destination.configuration is None else destination.configuration.identity,
-        ),
+    source, destination = (each.configuration for each in flow.nodes)
+    return carrier(
+        _ways(source, flow.publishers),
+        _ways(destination, flow.subscriptions),
+        None if source is None else source.identity,
+        None if destination is None else destination.identity,
     )
 
 

@@ -9,7 +9,6 @@ NFEs on that address are judged: it is by this one that flows between machines g
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Protocol
@@ -52,29 +51,6 @@ class _Entry:
     judged: tuple[LocatedNfe, ...] | None
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class _Reported:
-    """What one node reports, kept so that the identities of its reports stay theirs."""
-
-    configuration: NodeConfiguration
-    entries: tuple[_Entry, ...]
-    by_report: dict[int, _Entry]
-
-    @classmethod
-    def of(
-        cls, configuration: NodeConfiguration, address: str, last: _Reported | None
-    ) -> _Reported:
-        """Read one configuration; entries that equal those of the node's last one are these."""
-        reports = [
-            each for each in configuration.endpoints if each.kind in _SIDES and not each.error
-        ]
-        entries = tuple(_entry(configuration, each, address) for each in reports)
-        if last is not None and last.entries == entries:
-            entries = last.entries
-        by_report = {id(each): entry for each, entry in zip(reports, entries, strict=True)}
-        return cls(configuration, entries, by_report)
-
-
 def _entry(configuration: NodeConfiguration, report: EndpointReport, address: str) -> _Entry:
     identity = configuration.identity
     nfes = located(
@@ -90,31 +66,44 @@ def _entry(configuration: NodeConfiguration, report: EndpointReport, address: st
     )
 
 
-class _Judged:
-    """Compares the endpoints of all nodes."""
+class ReportedEnd(Protocol):
+    """An endpoint with what its node reports of it."""
 
-    def __init__(self, entries: list[tuple[_Entry, ...]]) -> None:
-        self._of = entries
+    @property
+    def report(self) -> EndpointReport | None:
+        """The report; None if there is none."""
+
+
+class Uniqueness:
+    """Answers for every reported endpoint whether it is unique.
+
+    Args:
+        configurations: of every node.
+        addresses: declared address of each node's machine, by full node name.
+    """
+
+    def __init__(
+        self,
+        configurations: Iterable[NodeConfiguration],
+        addresses: Mapping[str, str] = MappingProxyType({}),
+    ) -> None:
+        self._configurations = tuple(configurations)
+        """Kept, so that the identities of its reports stay theirs: equal ones may be of two."""
+        self._entries: dict[int, _Entry] = {}
         self._answers: dict[int, bool | None] = {}
         # NFEs with another port or protocol are dissimilar whatever else they hold, so only those
         # of one bucket are ever compared: judging grows with the endpoints, not with their square.
         # Endpoints of one participant have the same NFEs, so each is kept once, with whose it is.
         self._buckets: dict[_Bucket, dict[LocatedNfe, int]] = {}
         self._unknown: set[tuple[EndpointKind, tuple[str, int]]] = set()
-        for reported in entries:
-            for entry in reported:
-                self._add(entry)
-
-    def is_of(self, entries: list[tuple[_Entry, ...]]) -> bool:
-        """Whether these are the endpoints that are compared: the same objects."""
-        return len(entries) == len(self._of) and all(map(operator.is_, entries, self._of))
-
-    def is_unique(self, entry: _Entry) -> bool | None:
-        """Return whether one of them is unique; None when its NFEs are not known."""
-        key = id(entry)
-        if key not in self._answers:
-            self._answers[key] = self._judge(entry)
-        return self._answers[key]
+        self._all: list[_Entry] = []
+        for configuration in self._configurations:
+            address = addresses.get(configuration.name, "")
+            for report in configuration.endpoints:
+                if report.kind in _SIDES and not report.error:
+                    entry = self._entries[id(report)] = _entry(configuration, report, address)
+                    self._all.append(entry)
+                    self._add(entry)
 
     def _add(self, entry: _Entry) -> None:
         if entry.judged is None:
@@ -125,6 +114,21 @@ class _Judged:
                 owners = self._buckets.setdefault(_bucket(entry.kind, each), {})
                 if owners.setdefault(each, id(entry)) != id(entry):
                     owners[each] = _SEVERAL
+
+    def nfes(self, ends: Sequence[ReportedEnd]) -> tuple[NetworkFlowEndpoint, ...]:
+        """Return the NFEs of endpoints, each once, with the DSCP that was read back."""
+        entries = (self._entries.get(id(end.report)) for end in ends)
+        found = (each.nfe for entry in entries if entry for each in entry.nfes or ())
+        return tuple(dict.fromkeys(found))
+
+    def is_unique(self, end: ReportedEnd) -> bool | None:
+        """Return whether an endpoint is unique; None when its NFEs are not known."""
+        entry = self._entries.get(id(end.report))
+        if entry is None:
+            return None
+        if id(entry) not in self._answers:
+            self._answers[id(entry)] = self._judge(entry)
+        return self._answers[id(entry)]
 
     def _judge(self, entry: _Entry) -> bool | None:
         if entry.judged is None:
@@ -140,84 +144,6 @@ class _Judged:
         if not own:
             return False  # the network sees nothing of it
         return None if (kind, entry.process) in self._unknown else True
-
-
-class ReportedEnd(Protocol):
-    """An endpoint with what its node reports of it."""
-
-    @property
-    def report(self) -> EndpointReport | None:
-        """The report; None if there is none."""
-
-
-class Uniqueness:
-    """Answers for every reported endpoint whether it is unique."""
-
-    def __init__(
-        self,
-        configurations: Iterable[NodeConfiguration],
-        addresses: Mapping[str, str] = MappingProxyType({}),
-        last: Uniqueness | None = None,
-    ) -> None:
-        """Collect what nodes report.
-
-        Args:
-            configurations: of every node.
-            addresses: declared address of each node's machine, by full node name.
-            last: of an earlier moment, with the same addresses; what it read of configurations
-                that are still the same objects is taken over. It changes the cost alone.
-
-        Attributes:
-            judged: stays the same object while every answer does.
-        """
-        configurations = tuple(configurations)
-        self.read: list[_Reported] = []
-        self._entries: dict[int, _Entry] = {}
-        before = {id(each.configuration): each for each in last.read} if last is not None else {}
-        staying = set(map(id, configurations))
-        replaced = {
-            each.configuration.name: each for key, each in before.items() if key not in staying
-        }
-        for configuration in configurations:
-            # Taken once: what is reported twice, be it by one object, has two owners.
-            read = before.pop(id(configuration), None)
-            if read is None:
-                name = configuration.name
-                read = _Reported.of(
-                    configuration, addresses.get(name, ""), replaced.pop(name, None)
-                )
-            self.read.append(read)
-            self._entries.update(read.by_report)
-        entries = [each.entries for each in self.read]
-        same = last is not None and last.judged.is_of(entries)
-        self.judged: _Judged = last.judged if last is not None and same else _Judged(entries)
-
-    @classmethod
-    def of(
-        cls,
-        configurations: tuple[NodeConfiguration, ...],
-        addresses: Mapping[str, str],
-        last: Uniqueness | None,
-    ) -> Uniqueness:
-        """Return what is to be said of configurations: `last` if they are the same objects."""
-        if last is not None and len(last.read) == len(configurations):
-            read = (each.configuration for each in last.read)
-            if all(map(operator.is_, read, configurations)):
-                return last
-        return cls(configurations, addresses, last)
-
-    def nfes(self, ends: Sequence[ReportedEnd]) -> tuple[NetworkFlowEndpoint, ...]:
-        """Return the NFEs of endpoints, each once, with the DSCP that was read back."""
-        entries = (self._entries.get(id(end.report)) for end in ends)
-        found = (each.nfe for entry in entries if entry for each in entry.nfes or ())
-        return tuple(dict.fromkeys(found))
-
-    def is_unique(self, end: ReportedEnd) -> bool | None:
-        """Return whether an endpoint is unique; None when its NFEs are not known."""
-        entry = self._entries.get(id(end.report))
-        if entry is None:
-            return None
-        return self.judged.is_unique(entry)
 
     def all_unique(self, ends: Sequence[ReportedEnd]) -> bool | None:
         """Return whether each of several endpoints is unique; False if one is certainly not."""

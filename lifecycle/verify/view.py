@@ -1,15 +1,12 @@
 """The view that every verification rule reads: declared beside observed endpoints and flows.
 
 Owns: the types of the view and the one way to combine announced and reported QoS. `matcher.lay_out`
-fills it. Its parts, `NodeFacts`, `TopicFacts` and `FlowView`, stay the same objects from one
-judgement to the next while all that they are made of does, and what was found of them is taken over
-(`Parts`). So a change costs work in proportion to what changed. Pure.
+fills it, anew for each verdict. Pure.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping
-from typing import Any, Generic, TypeVar
+from collections.abc import Iterable, Mapping
 
 from lifecycle import dataclasses
 from lifecycle.manifest import (
@@ -26,13 +23,12 @@ from lifecycle.network import Medium, UniqueRequirement
 from lifecycle.plan import ParticipantConnections, Plan, PlannedEndpoint, PlannedFlow, PlannedNode
 from lifecycle.verify.observation import (
     EndpointReport,
-    Identity,
     NodeConfiguration,
     NodeParameters,
     ObservedEndpoint,
     ObservedNode,
 )
-from lifecycle.verify.tool_filter import DeclaredNames, Owner
+from lifecycle.verify.tool_filter import DeclaredNames
 from lifecycle.verify.uniqueness import Uniqueness
 from lifecycle.verify.verdict import Stage
 
@@ -80,8 +76,13 @@ class SeenEndpoint:
     Attributes:
         node: fully qualified name of the node it belongs to, hidden participants resolved to
             their node; empty while unknown.
+        qos: as announced or reported; None where neither is known.
+        report: what its node says; None if it says nothing.
         planned: its declaration; None if there is none.
         type_hash: as `ObservedEndpoint` has it.
+        gid: hex; empty where it is not known.
+        expected: it is one that the system has for good, so that whatever can match it must; a
+            tool's may be matched or not.
     """
 
     kind: EndpointKind
@@ -89,99 +90,11 @@ class SeenEndpoint:
     name: str
     type: str
     qos: QosProfile | None
-    report: EndpointReport | None
-    planned: PlannedEndpoint | None
+    report: EndpointReport | None = None
+    planned: PlannedEndpoint | None = None
     type_hash: str | None = None
-
-
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Frame:
-    """What a system is judged against, which stays while it is watched.
-
-    Attributes:
-        machines: names of the machines whose nodes the caller brings up; None: all.
-        ahead: full names of the nodes that an earlier gate let through.
-        over: how they ended, of the nodes whose process has ended as it may, by full name; empty
-            where it may have.
-        planned: nodes of the plan by full name, in plan order.
-        order: their places in it.
-        by_key: full names of nodes by their keys.
-        addresses: see `declared_addresses`.
-        names: what the plan declares, by name.
-        declared: node, kind and name of every declared endpoint.
-        found: see `once`.
-    """
-
-    plan: Plan
-    stage: Stage
-    machines: frozenset[str] | None
-    ahead: frozenset[str]
-    over: Mapping[str, str]
-    planned: dict[str, PlannedNode]
-    order: dict[str, int]
-    by_key: dict[str, str]
-    addresses: dict[str, str]
-    names: DeclaredNames
-    declared: frozenset[tuple[str, EndpointKind, str]]
-    found: dict[Any, Any] = dataclasses.field(default_factory=dict)
-
-    @classmethod
-    def of(
-        cls,
-        plan: Plan,
-        stage: Stage,
-        machines: frozenset[str] | None,
-        ahead: frozenset[str],
-        over: Mapping[str, str],
-    ) -> Frame:
-        """Collect what a plan declares."""
-        planned = {node.full_name: node for node in plan.nodes}
-        return cls(
-            plan=plan,
-            stage=stage,
-            machines=machines,
-            ahead=ahead,
-            over=dict(over),
-            planned=planned,
-            order={name: place for place, name in enumerate(planned)},
-            by_key={node.key: node.full_name for node in reversed(plan.nodes)},
-            addresses=declared_addresses(plan),
-            names=DeclaredNames.of(plan),
-            declared=frozenset(
-                (name, each.kind, each.resolved)
-                for name, node in planned.items()
-                for each in node.endpoints
-            ),
-        )
-
-    def is_of(
-        self,
-        plan: Plan,
-        stage: Stage,
-        machines: frozenset[str] | None,
-        ahead: frozenset[str],
-        over: Mapping[str, str],
-    ) -> bool:
-        """Return whether these make the same frame: then what was found in it still holds."""
-        return (
-            self.plan is plan
-            and self.stage is stage
-            and self.machines == machines
-            and self.ahead == ahead
-            and self.over == over
-        )
-
-    def is_beyond(self, node: PlannedNode) -> bool:
-        """Return whether a node is out of reach: it uses the memory of a host that is not ours."""
-        return not self.brings_up(node) and only_shared_memory(node.connections)
-
-    def ours(self, node: PlannedNode) -> bool:
-        """Return whether a node runs in our host, and so must report its configuration."""
-        return node.run.kind is RunKind.PYTHON
-
-    def brings_up(self, node: PlannedNode) -> bool:
-        """Return whether the caller brings this node up, and so knows the state it must be in."""
-        return self.machines is None or node.machine in self.machines
+    gid: str = ""
+    expected: bool = True
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -192,159 +105,28 @@ class NodeFacts:
         observed: its name in the graph; None if it is not there.
         configuration: what it reports; None if it reports nothing.
         parameters: what its parameter services returned; None if they were not asked.
-        endpoints: its endpoints that discovery shows, sorted.
         actual: its declared endpoints.
         ends: the same by kind and name.
-        rest: endpoints that no declaration covers.
-        seen: its publishers and subscriptions as far as discovery shows them, in the order of
-            `endpoints`.
-        beyond: its declared ones, if it is out of reach.
-        unseen: those that only its report shows.
         absent: nothing at all is seen of it: then one finding says it all.
-        may_hide: some of its declared endpoints need not be shown by discovery, and are not.
     """
 
-    frame: Frame
     node: PlannedNode
     observed: ObservedNode | None
     configuration: NodeConfiguration | None
     parameters: NodeParameters | None
-    endpoints: tuple[ObservedEndpoint, ...]
     actual: tuple[Actual, ...]
     ends: Mapping[tuple[EndpointKind, str], tuple[Actual, ...]]
-    rest: tuple[ObservedEndpoint, ...]
-    seen: tuple[SeenEndpoint, ...]
-    beyond: tuple[SeenEndpoint, ...]
-    unseen: tuple[SeenEndpoint, ...]
     absent: bool
-    may_hide: bool
 
     @property
     def name(self) -> str:
         """Fully qualified."""
         return self.node.full_name
 
-
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class TopicFacts:
-    """All publishers and subscriptions of one topic.
-
-    Attributes:
-        ends: all but those of tools, in the order of `View.seen`.
-        of_tools: those of tools.
-        found: see `once`.
-    """
-
-    frame: Frame
-    ends: tuple[SeenEndpoint, ...]
-    of_tools: tuple[SeenEndpoint, ...]
-    found: dict[Any, Any] = dataclasses.field(default_factory=dict)
-
-
-_Part = TypeVar("_Part", Frame, TopicFacts, "FlowView")
-_Found = TypeVar("_Found")
-
-
-def once(part: _Part, work: Callable[[_Part], Iterable[_Found]]) -> tuple[_Found, ...]:
-    """Return what `work` yields of a part of the view; it is done once in the life of the part.
-
-    Args:
-        part: frozen, so that what is found of it does not change.
-        work: a function of a module that looks at nothing else.
-    """
-    found: tuple[_Found, ...] | None = part.found.get(work)
-    if found is None:
-        found = part.found[work] = tuple(work(part))
-    return found
-
-
-_Key = TypeVar("_Key", bound=Hashable)
-_Of = TypeVar("_Of")
-
-
-class Parts(Generic[_Key, _Of]):
-    """The parts of a view of one kind by key, and what was found of each.
-
-    Args:
-        parts: all of them.
-        order: of a key, by which they come.
-        last: those of the last view in the same frame, from which is taken over what was found.
-        changed: keys of those that are not the same object there, and of those that were there
-            and are not here, if not more; without it they are compared.
-    """
-
-    def __init__(
-        self,
-        parts: Mapping[_Key, _Of],
-        *,
-        order: Callable[[_Key], Any],
-        last: Parts[_Key, _Of] | None = None,
-        changed: Collection[_Key] | None = None,
-    ) -> None:
-        self.parts = parts
-        self.results: dict[object, tuple[object, dict[_Key, tuple[Any, ...]]]] = {}
-        self.changed: frozenset[_Key] = frozenset()
-        self._order = order
-        self._before = last.results if last is not None else {}
-        if last is not None and changed is None:
-            before = last.parts
-            keys = parts.keys() | before.keys()
-            changed = [each for each in keys if parts.get(each) is not before.get(each)]
-        if last is not None and changed is not None:
-            self.changed = frozenset(changed)
-
-    def found(
-        self,
-        work: Callable[[_Of], Iterable[_Found]],
-        *,
-        name: object = None,
-        terms: object = None,
-    ) -> Mapping[_Key, tuple[_Found, ...]]:
-        """Return what `work` yields of each part, without those of which it yields nothing.
-
-        Args:
-            work: looks at nothing but the part and its frame, and `terms`.
-            name: of the work, where it is not always the same function.
-            terms: what else it looks at; what was found on the same object is taken over.
-        """
-        name = name or work
-        if name not in self.results:
-            asked, before = self._before.get(name, (None, None))
-            keys: Iterable[_Key] = self.parts
-            found: dict[_Key, tuple[_Found, ...]] = {}
-            if before is not None and asked is terms:
-                keys, changed = self.changed, self.changed
-                found = {key: each for key, each in before.items() if key not in changed}
-            for key in keys:
-                part = self.parts.get(key)
-                yielded = () if part is None else tuple(work(part))
-                if yielded:
-                    found[key] = yielded
-            self.results[name] = terms, found
-        return self.results[name][1]
-
-    def each(
-        self,
-        work: Callable[[_Of], Iterable[_Found]],
-        *,
-        name: object = None,
-        terms: object = None,
-    ) -> Iterator[_Found]:
-        """Yield what `work` yields of each part in turn; see `found`."""
-        for _, yielded in self.items(work, name=name, terms=terms):
-            yield from yielded
-
-    def items(
-        self,
-        work: Callable[[_Of], Iterable[_Found]],
-        *,
-        name: object = None,
-        terms: object = None,
-    ) -> Iterator[tuple[_Key, tuple[_Found, ...]]]:
-        """Yield with its key what `work` yields of each part in turn; see `found`."""
-        found = self.found(work, name=name, terms=terms)
-        for key in sorted(found, key=self._order):
-            yield key, found[key]
+    @property
+    def is_ours(self) -> bool:
+        """Whether it runs in our host, and so must report its configuration."""
+        return self.node.run.kind is RunKind.PYTHON
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -358,8 +140,6 @@ class FlowView:
         subscriptions: likewise.
         at: the subscription's declaration, else the publisher's.
         nodes: what is known of the two nodes.
-        ends_of_topic: what is seen of the topic; None if nothing is.
-        found: see `once`.
     """
 
     planned: PlannedFlow
@@ -369,13 +149,11 @@ class FlowView:
     subscriptions: tuple[Actual, ...]
     at: Position | None
     nodes: tuple[NodeFacts, NodeFacts]
-    ends_of_topic: TopicFacts | None
-    found: dict[Any, Any] = dataclasses.field(default_factory=dict)
 
     @property
     def subject(self) -> str:
         """What findings call this flow."""
-        return subject_of(self.planned.topic, self.publisher, self.subscription)
+        return f"{self.planned.topic}: {self.publisher} → {self.subscription}"
 
     @property
     def ends(self) -> tuple[str, str]:
@@ -394,46 +172,9 @@ class FlowView:
         return declared.pop() if len(declared) == 1 else None
 
 
-def subject_of(topic: str, publisher: str, subscription: str) -> str:
-    """Return what findings call a flow."""
-    return f"{topic}: {publisher} → {subscription}"
-
-
 def _strongest(ends: Iterable[Actual]) -> UniqueRequirement:
     asked = {end.planned.unique for end in ends} or {UniqueRequirement.NOT_REQUIRED}
     return next(each for each in _BY_STRENGTH if each in asked)
-
-
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Attributed:
-    """The endpoints that discovery shows under one node name, and what is judged of them.
-
-    Attributes:
-        shown: as discovery shows them.
-        owner: whose they may be, if it is a hidden node of one that reports; None for its own.
-        ours: that node reports its configuration.
-        judged: without what client libraries bring along, by the node whose they are.
-    """
-
-    shown: tuple[ObservedEndpoint, ...]
-    owner: Owner | None
-    ours: bool
-    judged: Mapping[str, tuple[ObservedEndpoint, ...]]
-
-
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class NodeEndpoints:
-    """The endpoints of one node.
-
-    Attributes:
-        judged: of all node names that are this node's.
-        endpoints: the same with the parts of actions folded, sorted.
-        seen: publishers and subscriptions of a node that no plan declares.
-    """
-
-    judged: tuple[ObservedEndpoint, ...]
-    endpoints: tuple[ObservedEndpoint, ...]
-    seen: tuple[SeenEndpoint, ...]
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -441,122 +182,69 @@ class View:
     """The input of every rule.
 
     Attributes:
+        machines: names of the machines whose nodes the caller brings up; None: all.
+        ahead: full names of the nodes that an earlier gate let through.
+        over: how they ended, of the nodes whose process has ended as it may, by full name; empty
+            where it may have.
+        planned: nodes of the plan by full name, in plan order.
+        names: what the plan declares, by name.
         observed: nodes of the graph by full name, tools and hidden participants left out, sorted.
         reported: every report, sorted by name.
         configurations: reports by full node name; the first of several.
-        parameters: what parameter services returned, by full node name.
+        nodes: what is known of every declared node, by full name, in plan order.
         actual: every declared endpoint, in plan order.
-        actual_by_node: the same by full node name.
         undeclared: endpoints of declared nodes that no declaration covers, sorted.
         unattributed: endpoints whose node is not known, sorted.
         foreign: endpoints of nodes that are not in the plan and no tools, sorted.
         tools: undeclared nodes that the policy tolerates, and the pattern that says so, sorted.
         of_tools: their endpoints, housekeeping left out, sorted.
+        groups: all endpoints that are judged by full node name, sorted by it.
         seen: every publisher and subscription of the graph, tools left out, sorted.
+        seen_of_tools: those of tools, which others may be matched with too.
         flows: every planned flow, in plan order.
         uniqueness: which of the reported endpoints have a flow of their own.
-        nodes: what is known of every declared node, by full name, in plan order.
-        topics: what is seen of every topic.
-        by_node: `nodes` with what was found of them, and `by_topic`; `by_flow`, by their index.
-        attributed: the endpoints by the name of the node that discovery shows, as they are judged.
-        groups: all endpoints that are judged by full node name, sorted by it.
     """
 
-    frame: Frame
+    plan: Plan
+    stage: Stage
+    machines: frozenset[str] | None
+    ahead: frozenset[str]
+    over: Mapping[str, str]
+    planned: dict[str, PlannedNode]
+    names: DeclaredNames
     observed: dict[str, ObservedNode]
     reported: tuple[NodeConfiguration, ...]
     configurations: dict[str, NodeConfiguration]
-    parameters: dict[str, NodeParameters]
+    nodes: dict[str, NodeFacts]
     actual: tuple[Actual, ...]
-    actual_by_node: dict[str, tuple[Actual, ...]]
     undeclared: tuple[ObservedEndpoint, ...]
     unattributed: tuple[ObservedEndpoint, ...]
     foreign: tuple[ObservedEndpoint, ...]
     tools: dict[str, str]
     of_tools: tuple[ObservedEndpoint, ...]
+    groups: dict[str, tuple[ObservedEndpoint, ...]]
     seen: tuple[SeenEndpoint, ...]
+    seen_of_tools: tuple[SeenEndpoint, ...]
     flows: tuple[FlowView, ...]
     uniqueness: Uniqueness
-    nodes: dict[str, NodeFacts]
-    topics: dict[str, TopicFacts]
-    by_node: Parts[str, NodeFacts]
-    by_topic: Parts[str, TopicFacts]
-    by_flow: Parts[int, FlowView]
-    attributed: dict[str, Attributed]
-    groups: dict[str, NodeEndpoints]
-
-    @property
-    def plan(self) -> Plan:
-        """What the system is judged against."""
-        return self.frame.plan
-
-    @property
-    def stage(self) -> Stage:
-        """Which moment it is judged against."""
-        return self.frame.stage
-
-    @property
-    def machines(self) -> frozenset[str] | None:
-        """As `Frame` has them."""
-        return self.frame.machines
-
-    @property
-    def ahead(self) -> frozenset[str]:
-        """As `Frame` has them."""
-        return self.frame.ahead
-
-    @property
-    def over(self) -> Mapping[str, str]:
-        """As `Frame` has them."""
-        return self.frame.over
-
-    @property
-    def planned(self) -> dict[str, PlannedNode]:
-        """Nodes of the plan by full name, in plan order."""
-        return self.frame.planned
-
-    @property
-    def names(self) -> DeclaredNames:
-        """What the plan declares, by name."""
-        return self.frame.names
-
-    @property
-    def seen_of_tools(self) -> tuple[SeenEndpoint, ...]:
-        """Publishers and subscriptions of tools, which others may be matched with too."""
-        return tuple(
-            SeenEndpoint(
-                kind=each.kind,
-                node=each.node,
-                name=each.name,
-                type=each.type,
-                qos=each.qos,
-                report=None,
-                planned=None,
-            )
-            for each in self.of_tools
-            if each.kind.is_topic
-        )
-
-    def is_absent(self, node: PlannedNode) -> bool:
-        """Return whether nothing at all is seen of a node: then one finding says it all."""
-        return self.nodes[node.full_name].absent
-
-    def is_beyond(self, node: PlannedNode) -> bool:
-        """As `Frame.is_beyond`."""
-        return self.frame.is_beyond(node)
-
-    def ours(self, node: PlannedNode) -> bool:
-        """As `Frame.ours`."""
-        return self.frame.ours(node)
 
     def brings_up(self, node: PlannedNode) -> bool:
-        """As `Frame.brings_up`."""
-        return self.frame.brings_up(node)
+        """Return whether the caller brings this node up, and so knows the state it must be in."""
+        return brings_up(node, self.machines)
 
-    def identity(self, full_name: str) -> Identity | None:
-        """Return the identity that a node reports; None if it reports none."""
-        configuration = self.configurations.get(full_name)
-        return configuration.identity if configuration else None
+    def is_beyond(self, node: PlannedNode) -> bool:
+        """Return whether a node is out of reach: it uses the memory of a host that is not ours."""
+        return is_beyond(node, self.machines)
+
+
+def brings_up(node: PlannedNode, machines: frozenset[str] | None) -> bool:
+    """Return whether a node is on one of the machines whose nodes the caller brings up."""
+    return machines is None or node.machine in machines
+
+
+def is_beyond(node: PlannedNode, machines: frozenset[str] | None) -> bool:
+    """Return whether a node is out of reach: it uses the memory of a host that is not ours."""
+    return not brings_up(node, machines) and only_shared_memory(node.connections)
 
 
 def declared_addresses(plan: Plan) -> dict[str, str]:

@@ -130,7 +130,7 @@ class _Builder:
         supervised = self._supervised.get(name, Supervised())
         presence = Presence.UNDECLARED
         if planned is not None:
-            presence = self._absent if self._view.is_absent(planned) else Presence.PRESENT
+            presence = self._absent if self._view.nodes[name].absent else Presence.PRESENT
         pid = supervised.pid or (configuration.identity.process_id if configuration else None)
         addresses = {each.name: each.address for each in self._view.plan.machines}
         address = addresses.get(planned.machine if planned else "", "")

@@ -47,7 +47,6 @@ from lifecycle.verify import (
     Outcome,
     Stage,
     Verdict,
-    Verifier,
     is_hidden_node,
     rule,
     verify,
@@ -307,7 +306,6 @@ class VerificationLoop:
         self._emit = emit
         self._strict = strict
         self._verify = verify_ or verify
-        self._watch = verify_ or Verifier().verify
         self._looker = looker
         self._agreement = agreement
         self._guard = guard
@@ -497,9 +495,7 @@ class VerificationLoop:
             self._guard.look(observation)
         expected, machines = self._system.expected, self._system.machines
         ahead, over = self.ahead, self._system.over()
-        # What opens the gate is judged from scratch; what is watched, where it has changed.
-        judge = self._watch if stage is Stage.ACTIVE else self._verify
-        verdict = judge(
+        verdict = self._verify(
             expected, observation, stage=stage, machines=machines, ahead=ahead, over=over
         )
         verdict = self._without_passing_peers(verdict, stage)

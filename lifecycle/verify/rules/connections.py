@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from lifecycle.network import ConnectionUrl, ConnectionUrlError, parse
-from lifecycle.plan import ParticipantConnections, is_restarted_url
+from lifecycle.plan import ParticipantConnections, PlannedNode, is_restarted_url
 from lifecycle.verify.outcome import ConnectionReport, Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.verdict import Finding
@@ -56,32 +56,38 @@ RULES = (MISSING, FAILED, DIFFERS, WRONG_MAPPING)
 
 def check(view: View) -> Iterator[Finding]:
     """Judge every planned connection and mapping."""
-    yield from view.by_node.each(_judge)
+    first_port = view.plan.discovery.first_port
+    for facts in view.nodes.values():
+        yield from _judge(facts, first_port)
 
 
-def _judge(facts: NodeFacts) -> Iterator[Finding]:
+def _judge(facts: NodeFacts, first_port: int) -> Iterator[Finding]:
     if facts.absent:
         return
-    yield from _own(facts)
+    yield from _own(facts, first_port)
     for participant in facts.node.participants:
         if participant.connection:
-            yield from _connection(facts, participant.connection, participant.connections)
+            yield from _connection(
+                facts, participant.connection, participant.connections, first_port
+            )
     for actual in facts.actual:
         yield from _mapping(actual)
 
 
-def _own(facts: NodeFacts) -> Iterator[Finding]:
+def _own(facts: NodeFacts, first_port: int) -> Iterator[Finding]:
     """The node's own participant: it is always there, but may be connected otherwise."""
     node, configuration = facts.node, facts.configuration
     for report in configuration.connections if configuration else ():
         if not report.name and report.urls and node.connections.urls:
-            yield from _urls(facts, report, node.connections)
+            yield from _urls(node, report, node.connections, first_port)
 
 
-def _connection(facts: NodeFacts, name: str, planned: ParticipantConnections) -> Iterator[Finding]:
+def _connection(
+    facts: NodeFacts, name: str, planned: ParticipantConnections, first_port: int
+) -> Iterator[Finding]:
     node, configuration = facts.node, facts.configuration
     if configuration is None:
-        if facts.frame.ours(node):
+        if facts.is_ours:
             return  # that it does not report is said
         yield MISSING.on_node(
             Outcome.UNVERIFIABLE,
@@ -112,16 +118,14 @@ def _connection(facts: NodeFacts, name: str, planned: ParticipantConnections) ->
             f" ({', '.join(report.urls or planned.urls)}): {report.error}",
         )
     else:
-        yield from _urls(facts, report, planned)
+        yield from _urls(node, report, planned, first_port)
 
 
 def _urls(
-    facts: NodeFacts, report: ConnectionReport, planned: ParticipantConnections
+    node: PlannedNode, report: ConnectionReport, planned: ParticipantConnections, first_port: int
 ) -> Iterator[Finding]:
-    first_port = facts.frame.plan.discovery.first_port
     if _as_planned(report.urls, planned.urls, first_port=first_port):
         return
-    node = facts.node
     what = f"connection {report.name!r}" if report.name else "the own participant"
     yield DIFFERS.on_node(
         Outcome.VIOLATED,

@@ -14,7 +14,7 @@ from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import Rule
 from lifecycle.verify.rules.parameters import REACHED_NONE
 from lifecycle.verify.verdict import Finding
-from lifecycle.verify.view import Frame, View, once
+from lifecycle.verify.view import View
 
 UNPROVEN = Rule(
     id="declaration.unproven",
@@ -43,11 +43,7 @@ _JUDGED = frozenset(
 
 def check(view: View) -> Iterator[Finding]:
     """Repeat the warnings that stay true whatever is seen."""
-    yield from once(view.frame, _warned)
-
-
-def _warned(frame: Frame) -> Iterator[Finding]:
-    for each in frame.plan.unproven:
+    for each in view.plan.unproven:
         if each.rule not in _JUDGED:
             yield _finding(each)
 

@@ -7,24 +7,17 @@ end announces the hash of its definition (REP-2016), and rosidl installs the has
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
+from typing import NamedTuple
 
-from lifecycle import dataclasses
 from lifecycle.manifest import EndpointKind, EndpointPolicy, Position
+from lifecycle.plan import PlannedEndpoint
 from lifecycle.verify.observation import ObservedEndpoint
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.tool_filter import OFFERS, action_part, part_type
 from lifecycle.verify.verdict import Finding
-from lifecycle.verify.view import (
-    Actual,
-    Frame,
-    NodeFacts,
-    SeenEndpoint,
-    TopicFacts,
-    View,
-    once,
-)
+from lifecycle.verify.view import Actual, SeenEndpoint, View
 
 MISSING_ENDPOINT = Rule(
     id="graph.missing-endpoint",
@@ -97,30 +90,15 @@ RULES = (
 def check(view: View) -> Iterator[Finding]:
     """Judge the existence and the type of endpoints."""
     known: Counter[tuple[str, EndpointKind | None]] = Counter()
-    hiding = view.by_node.found(_hiding)
-    if hiding:
+    if any(actual.unseen for actual in view.actual):
         known.update((seen.name, seen.kind) for seen in (*view.seen, *view.seen_of_tools))
-    declared = view.by_node.found(_all_declared)
-    for name, facts in view.nodes.items():
-        if name not in hiding or facts.absent:
-            yield from declared.get(name, ())
-            continue
+    for facts in view.nodes.values():
         for actual in facts.actual:
-            yield from _declared(actual, absent=False)
-            if actual.unseen:
+            yield from _declared(actual, absent=facts.absent)
+            if actual.unseen and not facts.absent:
                 yield from _unseen(view, actual, known)
     yield from _undeclared(view)
     yield from _conflicts(view)
-
-
-def _hiding(facts: NodeFacts) -> Iterator[NodeFacts]:
-    if facts.may_hide:
-        yield facts
-
-
-def _all_declared(facts: NodeFacts) -> Iterator[Finding]:
-    for actual in facts.actual:
-        yield from _declared(actual, absent=facts.absent)
 
 
 def _declared(actual: Actual, *, absent: bool) -> Iterator[Finding]:
@@ -211,7 +189,7 @@ def _undeclared(view: View) -> Iterator[Finding]:
         word = endpoint.kind.noun
         similar = [
             each.planned
-            for each in view.actual_by_node[endpoint.node]
+            for each in view.nodes[endpoint.node].actual
             if each.planned.kind is endpoint.kind
             and each.planned.type == endpoint.type
             and each.observed is None
@@ -238,7 +216,7 @@ def _wrong_part(view: View, endpoint: ObservedEndpoint) -> Finding | None:
     part = action_part(endpoint.kind, endpoint.name)
     if part is None:
         return None
-    for actual in view.actual_by_node[endpoint.node]:
+    for actual in view.nodes[endpoint.node].actual:
         planned = actual.planned
         if (planned.kind, planned.resolved) != part:
             continue
@@ -258,7 +236,7 @@ def _wrong_part(view: View, endpoint: ObservedEndpoint) -> Finding | None:
 
 def _given_name(view: View, endpoint: ObservedEndpoint) -> str:
     """Explain a name that a declared endpoint was given while it ran; empty if it was not."""
-    for actual in view.actual_by_node[endpoint.node]:
+    for actual in view.nodes[endpoint.node].actual:
         report = actual.report
         if report is None or report.kind is not endpoint.kind:
             continue
@@ -275,7 +253,10 @@ def _given_name(view: View, endpoint: ObservedEndpoint) -> str:
 
 def _conflicts(view: View) -> Iterator[Finding]:
     """A topic, service or action of ours that an undeclared node uses with another type."""
-    (types,) = once(view.frame, _declared_types)
+    types: dict[tuple[str, str], dict[str, None]] = {}  # in plan order
+    for actual in view.actual:
+        planned = actual.planned
+        types.setdefault((MEETS[planned.kind], planned.resolved), {})[planned.type] = None
     others = (*view.undeclared, *view.foreign, *view.unattributed)
     undeclared: tuple[SeenEndpoint | ObservedEndpoint, ...] = (
         *(each for each in view.seen if each.planned is None),
@@ -301,15 +282,6 @@ def _conflicts(view: View) -> Iterator[Finding]:
         )
 
 
-def _declared_types(frame: Frame) -> Iterator[dict[tuple[str, str], dict[str, None]]]:
-    """Yield the types of every declared topic, service and action, in plan order."""
-    types: dict[tuple[str, str], dict[str, None]] = {}
-    for node in frame.planned.values():
-        for each in node.endpoints:
-            types.setdefault((MEETS[each.kind], each.resolved), {})[each.type] = None
-    yield types
-
-
 DEFINITION_DIFFERS = Rule(
     id="graph.type-definition-differs",
     meaning="an endpoint's type has the declared name and another definition",
@@ -320,14 +292,36 @@ DEFINITION_DIFFERS = Rule(
 DEFINITION_RULES = (DEFINITION_DIFFERS,)
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class _TypedEnd:
-    """One end of a topic, service or action.
+_Place = tuple[str, str, str]
+"""What ends meet in, its name, and their type."""
 
-    Attributes:
-        type_hash: as announced or reported; empty if there is none, None if that was not seen.
-        at: its declaration; None if there is none.
-    """
+
+def check_definitions(view: View) -> Iterator[Finding]:
+    """Compare the ends of everything that is declared, with what is installed or each other."""
+    installed = {_place(each.planned): each.planned.type_hash for each in view.actual}
+    unknown: dict[str, list[tuple[_Place, _End]]] = {}
+    for place, ends in _ends(view).items():
+        if place not in installed:
+            continue  # nothing of the plan meets there, or its type is wrong: that is said
+        expected, source = installed[place], "the definition installed here"
+        if not expected:
+            # A stranger that differs is at fault itself, so declared ends come first.
+            by_right = sorted(ends, key=lambda end: end.at is None)
+            first = next((end for end in by_right if end.type_hash), None)
+            if first is None:
+                continue  # nothing to compare with
+            expected, source = first.type_hash or "", first.node or "an unknown node"
+        for end in dict.fromkeys(ends):
+            if end.type_hash == "":
+                unknown.setdefault(end.node, []).append((place, end))
+            elif end.type_hash is not None and differ(end.type_hash, expected):
+                yield _differs(place, end, expected, source)
+    for node in sorted(unknown):
+        yield _unverifiable(node, unknown[node])
+
+
+class _End(NamedTuple):
+    """What counts of an end: `type_hash` as `ObservedEndpoint` has it; its declaration, if any."""
 
     kind: EndpointKind
     node: str
@@ -335,83 +329,26 @@ class _TypedEnd:
     at: Position | None
 
 
-_Place = tuple[str, str, str]
-"""What ends meet in, its name, and their type."""
+def _ends(view: View) -> dict[_Place, list[_End]]:
+    """Return the ends of all topics, services and actions by where they meet.
 
+    Those of topics come first, by topic, then those of services and actions.
+    """
+    found: dict[_Place, list[_End]] = {}
 
-def check_definitions(view: View) -> Iterator[Finding]:
-    """Compare the ends of everything that is declared, with what is installed or each other."""
-    unknown: dict[str, list[tuple[_Place, _TypedEnd]]] = {}
-    for judged in _judged_places(view):
-        yield from judged.differing
-        for end in judged.unknown:
-            unknown.setdefault(end.node, []).append((judged.place, end))
-    for node in sorted(unknown):
-        yield _unverifiable(node, unknown[node])
+    def add(end: SeenEndpoint | ObservedEndpoint, planned: PlannedEndpoint | None) -> None:
+        at = planned.at if planned else None
+        found.setdefault(_place(end), []).append(_End(end.kind, end.node, end.type_hash, at))
 
-
-@dataclasses.dataclass(frozen=True, slots=True)
-class _JudgedPlace:
-    """What is wrong where ends of one type meet, and the ends that announce no hash."""
-
-    place: _Place
-    differing: tuple[Finding, ...]
-    unknown: tuple[_TypedEnd, ...]
-
-
-def _judged_places(view: View) -> Iterator[_JudgedPlace]:
-    """Yield the places of which there is something to report, in the order of what is seen."""
-    found = list(view.by_topic.each(_of_topic))
-    if len(found) > 1:
-        order: dict[_Place, int] = {}
-        for seen in view.seen:
-            order.setdefault(_place(seen.kind, seen.name, seen.type), len(order))
-        found.sort(key=lambda each: order[each.place])
-    yield from found
-    yield from _judge_places(view.frame, _other_ends(view))
-
-
-def _of_topic(topic: TopicFacts) -> Iterator[_JudgedPlace]:
-    ends: dict[_Place, list[_TypedEnd]] = {}
-    for seen in topic.ends:
-        at = seen.planned.at if seen.planned else None
-        end = _TypedEnd(kind=seen.kind, node=seen.node, type_hash=seen.type_hash, at=at)
-        ends.setdefault(_place(seen.kind, seen.name, seen.type), []).append(end)
-    return _judge_places(topic.frame, ends)
-
-
-def _judge_places(frame: Frame, places: Mapping[_Place, list[_TypedEnd]]) -> Iterator[_JudgedPlace]:
-    (installed,) = once(frame, _installed)
-    for place, ends in places.items():
-        if place not in installed:
-            continue  # nothing of the plan meets there, or its type is wrong: that is said
-        expected = installed[place]
-        source = "the definition installed here"
-        if not expected:
-            # A stranger that differs is at fault itself, so declared ends come first.
-            by_right = sorted(ends, key=lambda end: end.at is None)
-            first = next(((end.type_hash, end.node) for end in by_right if end.type_hash), None)
-            if first is None:
-                continue  # nothing to compare with
-            expected, source = first[0], first[1] or "an unknown node"
-        differing: list[Finding] = []
-        unknown: list[_TypedEnd] = []
-        for end in dict.fromkeys(ends):
-            if end.type_hash == "":
-                unknown.append(end)
-            elif end.type_hash is not None and differ(end.type_hash, expected):
-                differing.append(_differs(place, end, expected, source))
-        if differing or unknown:
-            yield _JudgedPlace(place, tuple(differing), tuple(unknown))
-
-
-def _installed(frame: Frame) -> Iterator[dict[_Place, str]]:
-    """Yield the hashes of the declared types as they are installed, by place."""
-    yield {
-        _place(each.kind, each.resolved, each.type): each.type_hash
-        for node in frame.planned.values()
-        for each in node.endpoints
-    }
+    for seen in view.seen:
+        add(seen, seen.planned)
+    for actual in view.actual:
+        if actual.observed is not None and not actual.observed.kind.is_topic:
+            add(actual.observed, actual.planned)
+    for each in (*view.undeclared, *view.foreign, *view.of_tools, *view.unattributed):
+        if not each.kind.is_topic:
+            add(each, None)
+    return found
 
 
 def differ(one: str, other: str) -> bool:
@@ -427,38 +364,12 @@ def differ(one: str, other: str) -> bool:
     )
 
 
-def _other_ends(view: View) -> dict[_Place, list[_TypedEnd]]:
-    """Return the ends of services and actions."""
-    found: dict[_Place, list[_TypedEnd]] = {}
-    for place, end in view.by_node.each(_declared_ends):
-        found.setdefault(place, []).append(end)
-    for each in (*view.undeclared, *view.foreign, *view.of_tools, *view.unattributed):
-        if not each.kind.is_topic:
-            end = _TypedEnd(kind=each.kind, node=each.node, type_hash=each.type_hash, at=None)
-            found.setdefault(_place(each.kind, each.name, each.type), []).append(end)
-    return found
+def _place(end: SeenEndpoint | ObservedEndpoint | PlannedEndpoint) -> _Place:
+    name = end.resolved if isinstance(end, PlannedEndpoint) else end.name
+    return MEETS[end.kind], name, end.type
 
 
-def _declared_ends(facts: NodeFacts) -> Iterator[tuple[_Place, _TypedEnd]]:
-    for actual in facts.actual:
-        each = actual.observed
-        if each is not None and not each.kind.is_topic:
-            yield (
-                _place(each.kind, each.name, each.type),
-                _TypedEnd(
-                    kind=each.kind,
-                    node=each.node,
-                    type_hash=each.type_hash,
-                    at=actual.planned.at,
-                ),
-            )
-
-
-def _place(kind: EndpointKind, name: str, type_: str) -> _Place:
-    return MEETS[kind], name, type_
-
-
-def _differs(place: _Place, end: _TypedEnd, expected: str, source: str) -> Finding:
+def _differs(place: _Place, end: _End, expected: str, source: str) -> Finding:
     what, name, type_ = place
     node = end.node or "an unknown node"
     return DEFINITION_DIFFERS.finding(
@@ -475,7 +386,7 @@ def _differs(place: _Place, end: _TypedEnd, expected: str, source: str) -> Findi
     )
 
 
-def _unverifiable(node: str, ends: list[tuple[_Place, _TypedEnd]]) -> Finding:
+def _unverifiable(node: str, ends: list[tuple[_Place, _End]]) -> Finding:
     """One finding for a node: who announces no hash announces none for any of its endpoints."""
     who = node or "an unknown node"
     listed = ", ".join(dict.fromkeys(f"{name} ({end.kind.noun})" for (_, name, _), end in ends))

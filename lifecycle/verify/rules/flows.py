@@ -37,7 +37,7 @@ from lifecycle.verify.transport import (
 )
 from lifecycle.verify.uniqueness import Uniqueness
 from lifecycle.verify.verdict import Finding
-from lifecycle.verify.view import Actual, FlowView, Frame, NodeFacts, View, connection_of, once
+from lifecycle.verify.view import Actual, FlowView, View, connection_of
 
 NOT_UNIQUE = Rule(
     id="flow.not-unique",
@@ -79,52 +79,20 @@ RULES = (NOT_UNIQUE, UNVERIFIABLE, BROKEN_ENDPOINT, NOT_MEASURED)
 
 def check(view: View) -> Iterator[Finding]:
     """Judge every strict endpoint, then every link's demand, then name what is not measured."""
-    uniqueness = view.uniqueness
-    strict = view.by_node.found(_strict_ends)
-    broken = view.by_node.found(_all_broken)
-    for name, facts in view.nodes.items():
-        if name not in strict:
-            yield from broken.get(name, ())
-            continue
-        for actual in facts.actual:
-            yield from _broken(actual)
-            if _is_strict(actual):
-                yield from _strict(actual, uniqueness)
-    for index in once(view.frame, _demanding):
-        yield from _demanded(view.flows[index], uniqueness)
+    for actual in view.actual:
+        yield from _broken(actual)
+        if actual.planned.unique is UniqueRequirement.STRICTLY_REQUIRED:
+            yield from _strict(actual, view.uniqueness)
+    for flow in view.flows:
+        if flow.planned.unique is not UniqueHow.NOT:
+            yield from _demanded(flow, view.uniqueness)
     yield from _not_measured(view)
 
 
 def _not_measured(view: View) -> Iterator[Finding]:
     """One finding per declared number: it reports that the number was not compared."""
-    yield from view.by_node.each(_not_measured_of)
-    for index in once(view.frame, _numbered):
-        flow = view.flows[index]
-        ends = (*flow.publishers, *flow.subscriptions)
-        if any(end.observed is None and end.report is None for end in ends):
-            continue
-        for each in flow.planned.quantities:
-            where = f"the flow {flow.publisher} → {flow.subscription} on {flow.planned.topic}"
-            yield _unmeasured(each, where, subject=flow.subject, ends=flow.ends)
-
-
-def _demanding(frame: Frame) -> Iterator[int]:
-    """Yield the index of each flow whose link demands that it be unique."""
-    for index, each in enumerate(frame.plan.flows):
-        if each.unique is not UniqueHow.NOT:
-            yield index
-
-
-def _numbered(frame: Frame) -> Iterator[int]:
-    """Yield the index of each flow of which numbers are declared."""
-    for index, each in enumerate(frame.plan.flows):
-        if each.quantities:
-            yield index
-
-
-def _not_measured_of(facts: NodeFacts) -> Iterator[Finding]:
-    for actual in facts.actual:
-        planned, node = actual.planned, facts.name
+    for actual in view.actual:
+        planned, node = actual.planned, actual.node.full_name
         if actual.observed is None and actual.report is None:
             continue  # it is missing, and that is said
         for each in planned.quantities:
@@ -132,6 +100,18 @@ def _not_measured_of(facts: NodeFacts) -> Iterator[Finding]:
             yield _unmeasured(
                 each, where, subject=planned.resolved, node=node, endpoint=planned.kind
             )
+    for flow in view.flows:
+        if not flow.planned.quantities or _is_missing(flow):
+            continue
+        for each in flow.planned.quantities:
+            where = f"the flow {flow.publisher} → {flow.subscription} on {flow.planned.topic}"
+            yield _unmeasured(each, where, subject=flow.subject, ends=flow.ends)
+
+
+def _is_missing(flow: FlowView) -> bool:
+    """Return whether nothing is seen of one end: it is missing, and that is said."""
+    ends = (*flow.publishers, *flow.subscriptions)
+    return any(end.observed is None and end.report is None for end in ends)
 
 
 def _unmeasured(
@@ -154,19 +134,6 @@ def _unmeasured(
         endpoint=endpoint,
         ends=ends,
     )
-
-
-def _is_strict(actual: Actual) -> bool:
-    return actual.planned.unique is UniqueRequirement.STRICTLY_REQUIRED
-
-
-def _strict_ends(facts: NodeFacts) -> Iterator[Actual]:
-    return filter(_is_strict, facts.actual)
-
-
-def _all_broken(facts: NodeFacts) -> Iterator[Finding]:
-    for actual in facts.actual:
-        yield from _broken(actual)
 
 
 def _broken(actual: Actual) -> Iterator[Finding]:
@@ -215,10 +182,9 @@ def _strict(actual: Actual, uniqueness: Uniqueness) -> Iterator[Finding]:
 
 
 def _demanded(flow: FlowView, uniqueness: Uniqueness) -> Iterator[Finding]:
-    ends = (*flow.publishers, *flow.subscriptions)
     if not flow.publishers or not flow.subscriptions:
         return  # the link is unmatched, and says so
-    if any(end.observed is None and end.report is None for end in ends):
+    if _is_missing(flow):
         return
     how = flow.planned.unique.value
     publisher = uniqueness.all_unique(flow.publishers)
@@ -297,26 +263,24 @@ _WORDS = {
 
 def check_transport(view: View) -> Iterator[Finding]:
     """Judge every flow that must be carried by something."""
-    yield from view.by_flow.each(_judge_transport)
+    for flow in view.flows:
+        if flow.publishers and flow.subscriptions and not _is_missing(flow):
+            yield from _judge_transport(view, flow)
 
 
-def _judge_transport(flow: FlowView) -> Iterator[Finding]:
+def _judge_transport(view: View, flow: FlowView) -> Iterator[Finding]:
     ends = (*flow.publishers, *flow.subscriptions)
-    if not flow.publishers or not flow.subscriptions:
-        return
-    if any(end.observed is None and end.report is None for end in ends):
-        return  # it is missing, and that is said
     used = effective_transport(flow)
     demanding = [end for end in ends if end.planned.transport is FlowTransport.NETWORK]
     if demanding and used not in NETWORK_MEDIA:
         yield _not_by_network(flow, demanding[0], used)
-    elif flow.planned.medium not in ("", used) and _is_decided(flow):
+    elif flow.planned.medium not in ("", used) and _is_decided(view, flow):
         yield _otherwise(flow, used)
 
 
-def _is_decided(flow: FlowView) -> bool:
+def _is_decided(view: View, flow: FlowView) -> bool:
     """Return whether the medium was asked for; else the plan only has what is expected."""
-    if flow.nodes[0].frame.plan.data_layer.at is not None:
+    if view.plan.data_layer.at is not None:
         return True
     return any(
         end.planned.transport not in (FlowTransport.ANY, FlowTransport.NETWORK)
@@ -381,11 +345,7 @@ def check_dscp(view: View) -> Iterator[Finding]:
 
     A subscription's is that of its acknowledgements.
     """
-    yield from view.by_node.each(_judge_dscp)
-
-
-def _judge_dscp(facts: NodeFacts) -> Iterator[Finding]:
-    for actual in facts.actual:
+    for actual in view.actual:
         planned, node, report = actual.planned, actual.node, actual.report
         wanted = planned.dscp
         if wanted is None:

@@ -60,11 +60,12 @@ def health_of(
 
 def check(view: View) -> Iterator[Finding]:
     """Judge the health of every node of which the manifest asks it."""
-    yield from view.by_node.each(_judge)
+    for facts in view.nodes.values():
+        yield from _judge(view, facts)
 
 
-def _judge(facts: NodeFacts) -> Iterator[Finding]:
-    node, frame, report = facts.node, facts.frame, facts.configuration
+def _judge(view: View, facts: NodeFacts) -> Iterator[Finding]:
+    node, report = facts.node, facts.configuration
     if node.health is None or facts.absent:
         return
     # One that has the method reports what it returned, or that it has not returned, at once.
@@ -80,8 +81,8 @@ def _judge(facts: NodeFacts) -> Iterator[Finding]:
         )
     # A method is asked from when its node is connected, and a held node publishes nothing before it
     # is active; until then its state, or the lack of a report, says enough.
-    asks = not frame.ours(node) or (report is not None and report.connected)
-    works = not node.holds or frame.stage is Stage.ACTIVE or facts.name in frame.ahead
+    asks = not facts.is_ours or (report is not None and report.connected)
+    works = not node.holds or view.stage is Stage.ACTIVE or facts.name in view.ahead
     asked = dataclasses.replace(
         node.health,
         check=node.health.check and asks and not lacks,

@@ -16,9 +16,8 @@ reports nothing about its clients.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-from lifecycle import dataclasses
 from lifecycle.manifest import (
     DIAGNOSTICS_TOPIC,
     Certainty,
@@ -27,7 +26,7 @@ from lifecycle.manifest import (
     QosProfile,
     incompatibilities,
 )
-from lifecycle.verify.observation import EndpointReport, ObservedEndpoint
+from lifecycle.verify.observation import ObservedEndpoint
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.tool_filter import NOISE_TOPICS
@@ -36,12 +35,9 @@ from lifecycle.verify.view import (
     UNKNOWN_QOS,
     Actual,
     FlowView,
-    NodeFacts,
     SeenEndpoint,
-    TopicFacts,
     View,
     actual_qos,
-    once,
 )
 
 UNMATCHED_LINK = Rule(
@@ -91,40 +87,26 @@ Match = tuple[Outcome, str]
 _OK: Match = (Outcome.OK, "")
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class MatchEnd:
-    """A publisher or a subscription, with all that is known of it.
+_Ends = tuple[list[SeenEndpoint], list[SeenEndpoint]]
+"""All publishers and all subscriptions of a topic, tools' included."""
 
-    Attributes:
-        qos: as announced or reported, `UNKNOWN_QOS` where neither is known.
-        gid: hex; empty where it is not known.
-        report: what its node says; None if it says nothing.
-        expected: it is one that the system has for good, so that whatever can match it must; a
-            tool's may be matched or not.
-    """
-
-    kind: EndpointKind
-    type: str
-    qos: QosProfile
-    gid: str = ""
-    report: EndpointReport | None = None
-    expected: bool = True
+_NO_ENDS: _Ends = ([], [])
 
 
-def obstacle(publisher: MatchEnd, subscription: MatchEnd) -> str:
+def obstacle(publisher: SeenEndpoint, subscription: SeenEndpoint) -> str:
     """Return why two ends cannot match at all (DDS 1.4 §2.2.2.5, §2.2.3); empty if they can."""
     if publisher.type != subscription.type:
         return f"the types differ, {publisher.type} and {subscription.type}"
-    if not _compatible(publisher.qos, subscription.qos):
+    if not _compatible(publisher.qos or UNKNOWN_QOS, subscription.qos or UNKNOWN_QOS):
         return "the QoS is incompatible"
     return ""
 
 
 def match(
-    publisher: MatchEnd,
-    subscription: MatchEnd,
-    publishers: Sequence[MatchEnd],
-    subscriptions: Sequence[MatchEnd],
+    publisher: SeenEndpoint,
+    subscription: SeenEndpoint,
+    publishers: Sequence[SeenEndpoint],
+    subscriptions: Sequence[SeenEndpoint],
 ) -> Match | None:
     """Judge whether two ends that can match are matched, by what both say of each other.
 
@@ -150,12 +132,17 @@ def match(
 
 def check(view: View) -> Iterator[Finding]:
     """Judge every planned flow, then every end that reports how many peers it has."""
-    yield from view.by_flow.each(_judge_flow)
-    yield from _unknown_peers(view)
+    topics: dict[str, _Ends] = {}
+    for each in (*view.seen, *view.seen_of_tools):
+        publishers, subscriptions = topics.setdefault(each.name, ([], []))
+        (publishers if each.kind is EndpointKind.PUBLISHER else subscriptions).append(each)
+    for flow in view.flows:
+        yield from _judge_flow(flow, topics.get(flow.planned.topic, _NO_ENDS))
+    yield from _unknown_peers(view, topics)
     yield from _unreported_flows(view)
 
 
-def _unknown_peers(view: View) -> Iterator[Finding]:
+def _unknown_peers(view: View, topics: Mapping[str, _Ends]) -> Iterator[Finding]:
     """Find declared ends that are matched with more than all that can match them.
 
     That is what the graph shows, and what is declared and not seen (yet), which has a finding of
@@ -176,8 +163,7 @@ def _unknown_peers(view: View) -> Iterator[Finding]:
             continue
         if not view.brings_up(actual.node):
             continue
-        topic = view.topics.get(actual.planned.resolved)
-        publishers, subscriptions = ([], []) if topic is None else once(topic, _ends_of_graph)
+        publishers, subscriptions = topics.get(actual.planned.resolved, _NO_ENDS)
         end = _end(actual)
         publishes = end.kind is EndpointKind.PUBLISHER
         possible = len(_possible(end, subscriptions if publishes else publishers))
@@ -227,11 +213,11 @@ def is_unreported(flow: FlowView) -> bool:
     return all(end.report is None or end.report.matched is None for end in ends)
 
 
-def _judge_flow(flow: FlowView) -> Iterator[Finding]:
+def _judge_flow(flow: FlowView, ends: _Ends) -> Iterator[Finding]:
     cause = _cause(flow)
     if cause and not flow.planned.linked:
         return  # the cause has its own finding already
-    outcome, reason = (Outcome.VIOLATED, cause) if cause else _judge(flow)
+    outcome, reason = (Outcome.VIOLATED, cause) if cause else _judge(flow, ends)
     if outcome is Outcome.OK:
         return
     rule = UNMATCHED_LINK if flow.planned.linked else UNMATCHED_FLOW
@@ -267,12 +253,10 @@ def _cause(flow: FlowView) -> str:
     return ""
 
 
-def _judge(flow: FlowView) -> Match:
+def _judge(flow: FlowView, ends: _Ends) -> Match:
     """Return the worst that is known of any of the flow's pairs, whose ends are all seen."""
-    assert flow.ends_of_topic is not None
-    publishers, subscriptions = once(flow.ends_of_topic, _ends_of_graph)
     answers = [
-        match(_end(publisher), _end(subscription), publishers, subscriptions)
+        match(_end(publisher), _end(subscription), *ends)
         for publisher in flow.publishers
         for subscription in flow.subscriptions
     ]
@@ -289,7 +273,9 @@ def _worst(answers: Iterable[Match]) -> Match:
     return outcome, ", ".join(reasons)
 
 
-def _of_one_end(end: MatchEnd, other: MatchEnd, others: Sequence[MatchEnd]) -> Match | None:
+def _of_one_end(
+    end: SeenEndpoint, other: SeenEndpoint, others: Sequence[SeenEndpoint]
+) -> Match | None:
     """Return what one end says of the other; None if it does not report its matches."""
     report = end.report
     if report is None or report.matched is None:
@@ -310,7 +296,7 @@ def _of_one_end(end: MatchEnd, other: MatchEnd, others: Sequence[MatchEnd]) -> M
     return Outcome.VIOLATED, f"{word} matched {report.matched} others, not this one"
 
 
-def _by_count(word: str, matched: int, end: MatchEnd, others: Sequence[MatchEnd]) -> Match:
+def _by_count(word: str, matched: int, end: SeenEndpoint, others: Sequence[SeenEndpoint]) -> Match:
     """Conclude from a number alone: it proves the pair only if it is that of all who can match."""
     possible = _possible(end, others)
     reason = f"{word} matched {matched} of {len(possible)}"
@@ -321,7 +307,7 @@ def _by_count(word: str, matched: int, end: MatchEnd, others: Sequence[MatchEnd]
     return Outcome.UNVERIFIABLE, f"{reason}, and does not tell which"
 
 
-def _possible(end: MatchEnd, others: Sequence[MatchEnd]) -> list[MatchEnd]:
+def _possible(end: SeenEndpoint, others: Sequence[SeenEndpoint]) -> list[SeenEndpoint]:
     """Return the ends that can match one."""
     publishes = end.kind is EndpointKind.PUBLISHER
     return [
@@ -338,34 +324,18 @@ def _compatible(offered: QosProfile, requested: QosProfile) -> bool:
     )
 
 
-def _end(actual: Actual) -> MatchEnd:
+def _end(actual: Actual) -> SeenEndpoint:
     """Return a declared end: as discovery shows it, else as its node says."""
     shown, report = actual.observed, actual.report
-    return MatchEnd(
+    return SeenEndpoint(
         kind=actual.planned.kind,
+        node=actual.node.full_name,
+        name=actual.planned.resolved,
         type=shown.type if shown else actual.planned.type,
-        qos=actual_qos(shown.qos if shown else None, report.qos if report else None) or UNKNOWN_QOS,
+        qos=actual_qos(shown.qos if shown else None, report.qos if report else None),
         gid=(shown.gid if shown else "") or (report.gid if report else ""),
         report=report,
-    )
-
-
-def _ends_of_graph(topic: TopicFacts) -> tuple[list[MatchEnd], list[MatchEnd]]:
-    """Return all publishers and all subscriptions of a topic, tools' included."""
-    ends = (*topic.ends, *topic.of_tools)
-    return (
-        [_end_of_graph(each) for each in ends if each.kind is EndpointKind.PUBLISHER],
-        [_end_of_graph(each) for each in ends if each.kind is EndpointKind.SUBSCRIPTION],
-    )
-
-
-def _end_of_graph(seen: SeenEndpoint) -> MatchEnd:
-    """Return an end as one of all that others can match: it is not asked whom it matches."""
-    return MatchEnd(
-        kind=seen.kind,
-        type=seen.type,
-        qos=seen.qos or UNKNOWN_QOS,
-        expected=seen.planned is not None,
+        planned=actual.planned,
     )
 
 
@@ -394,33 +364,24 @@ _SERVERS = frozenset(SERVER_OF.values())
 def check_clients(view: View) -> Iterator[Finding]:
     """Judge every declared client that reports and of which declared servers are there."""
     servers: dict[_Place, list[str]] = {}
-    for name, places in view.by_node.items(_servers):
-        for place in places:
-            servers.setdefault(place, []).append(name)
+    for actual in view.actual:
+        if actual.observed is not None and actual.observed.kind in _SERVERS:
+            servers.setdefault(_place(actual.observed), []).append(actual.node.full_name)
     if not servers:
         return
     others = Counter(
         map(_place, (*view.undeclared, *view.foreign, *view.of_tools, *view.unattributed))
     )
-    for client, place in view.by_node.each(_clients):
-        found = servers.get(place, ())
-        for server in dict.fromkeys(found):
-            yield from _judge_client(client, server, count=len(found) + others[place])
-
-
-def _servers(facts: NodeFacts) -> Iterator[_Place]:
-    for actual in facts.actual:
-        if actual.observed is not None and actual.observed.kind in _SERVERS:
-            yield _place(actual.observed)
-
-
-def _clients(facts: NodeFacts) -> Iterator[tuple[Actual, _Place]]:
-    for client in facts.actual:
+    for client in view.actual:
         kind = SERVER_OF.get(client.planned.kind)
         # A client without a report has its own finding if it is ours; of others no more can be seen
         # than that both ends are there and of one type, as of their topics.
-        if kind is not None and client.observed is not None and client.report is not None:
-            yield client, (kind, client.observed.name, client.observed.type)
+        if kind is None or client.observed is None or client.report is None:
+            continue
+        place = kind, client.observed.name, client.observed.type
+        found = servers.get(place, ())
+        for server in dict.fromkeys(found):
+            yield from _judge_client(client, server, count=len(found) + others[place])
 
 
 def _place(seen: ObservedEndpoint) -> _Place:

@@ -73,7 +73,8 @@ _SHOWN_TEXT = 60
 
 def check(view: View) -> Iterator[Finding]:
     """Judge the parameters of every node that is there."""
-    yield from view.by_node.each(_judge_node)
+    for facts in view.nodes.values():
+        yield from _judge_node(facts)
     yield from _reached_none(view)
 
 
@@ -93,7 +94,7 @@ def _judge_node(facts: NodeFacts) -> Iterator[Finding]:
             yield from _undeclared(node, known)
     elif not node.expected_parameters and known == f"it {SERVES_NONE}":
         return  # it has none that anybody could know of, and none are declared
-    elif known or facts.configuration is not None or not facts.frame.ours(node):
+    elif known or facts.configuration is not None or not facts.is_ours:
         # Of a node of ours without a report config.missing-report says it all.
         yield _unknown(node, known or "they were not read")
 

@@ -25,7 +25,6 @@ from lifecycle.verify.view import (
     Actual,
     NodeFacts,
     SeenEndpoint,
-    TopicFacts,
     View,
     actual_qos,
 )
@@ -62,8 +61,13 @@ _Unknown = list[tuple[Actual, list[tuple[str, str]]]]
 
 def check(view: View) -> Iterator[Finding]:
     """Judge the QoS of every declared endpoint as far as it is written, then of every pair."""
-    yield from view.by_node.each(_of_node)
-    yield from view.by_topic.each(_pairs)
+    for facts in view.nodes.values():
+        yield from _of_node(facts)
+    topics: dict[str, list[SeenEndpoint]] = {}
+    for each in view.seen:
+        topics.setdefault(each.name, []).append(each)
+    for name in sorted(topics):
+        yield from _pairs(view, topics[name])
 
 
 def _of_node(facts: NodeFacts) -> Iterator[Finding]:
@@ -175,15 +179,14 @@ def spell(profile: QosProfile, policy: str) -> str:
     return "infinite" if value in (None, 0, INFINITE_NS) else f"{value} ns"
 
 
-def _pairs(topic: TopicFacts) -> Iterator[Finding]:
+def _pairs(view: View, ends: list[SeenEndpoint]) -> Iterator[Finding]:
     """Every publisher against every subscription of a topic, at least one of them ours."""
-    planned = topic.frame.planned
-    publishers = [each for each in topic.ends if each.kind is EndpointKind.PUBLISHER]
-    subscriptions = [each for each in topic.ends if each.kind is not EndpointKind.PUBLISHER]
+    publishers = [each for each in ends if each.kind is EndpointKind.PUBLISHER]
+    subscriptions = [each for each in ends if each.kind is not EndpointKind.PUBLISHER]
     done: set[tuple[str, str, str, str, str]] = set()
     for publisher in publishers:
         for subscription in subscriptions:
-            if publisher.node not in planned and subscription.node not in planned:
+            if publisher.node not in view.planned and subscription.node not in view.planned:
                 continue
             if publisher.type != subscription.type:
                 continue

@@ -52,17 +52,18 @@ def _wanted(stage: Stage, node: PlannedNode) -> str:
 
 def check(view: View) -> Iterator[Finding]:
     """Judge the state of every managed node that is there."""
-    yield from view.by_node.each(_judge)
+    for facts in view.nodes.values():
+        yield from _judge(view, facts)
 
 
-def _judge(facts: NodeFacts) -> Iterator[Finding]:
-    frame, node, name = facts.frame, facts.node, facts.name
+def _judge(view: View, facts: NodeFacts) -> Iterator[Finding]:
+    node, name = facts.node, facts.name
     if not node.managed or facts.absent:
         return
-    wanted = _wanted(frame.stage, node)
+    wanted = _wanted(view.stage, node)
     allowed = {wanted}
-    ahead = frame.stage is Stage.CONNECTED and name in frame.ahead
-    if ahead or (frame.stage is Stage.CONNECTED and not frame.brings_up(node)):
+    ahead = view.stage is Stage.CONNECTED and name in view.ahead
+    if ahead or (view.stage is Stage.CONNECTED and not view.brings_up(node)):
         # Another supervisor brings it up, and its gate opens on the same proof, maybe before ours;
         # or an earlier gate let it through, and only others have to pass again.
         allowed.add(node.state.value)
@@ -77,7 +78,7 @@ def _judge(facts: NodeFacts) -> Iterator[Finding]:
     passing = {"activating"} if ahead else set()
     wrong = [state for state in states if state not in allowed | passing]
     expected = wanted
-    if frame.stage is Stage.CONNECTED and frame.ours(node) and wanted == _INACTIVE:
+    if view.stage is Stage.CONNECTED and facts.is_ours and wanted == _INACTIVE:
         expected = "inactive, connected"
         if not wrong and report is not None and not report.connected:
             wrong = ["inactive, disconnected"]
@@ -116,7 +117,7 @@ def _reports_state(facts: NodeFacts) -> bool:
     shows a node before all of its endpoints.
     """
     report = facts.configuration
-    return facts.frame.ours(facts.node) and report is not None and bool(report.state)
+    return facts.is_ours and report is not None and bool(report.state)
 
 
 MISSING_REPORT = Rule(
@@ -144,12 +145,13 @@ REPORT_RULES = (MISSING_REPORT, INCOMPLETE_REPORT)
 
 def check_reports(view: View) -> Iterator[Finding]:
     """Judge that our own nodes report all that only they can report."""
-    yield from view.by_node.each(_judge_report)
+    for facts in view.nodes.values():
+        yield from _judge_report(facts)
 
 
 def _judge_report(facts: NodeFacts) -> Iterator[Finding]:
     name = facts.name
-    if not facts.frame.ours(facts.node) or facts.absent:
+    if not facts.is_ours or facts.absent:
         return
     if facts.configuration is None:
         yield MISSING_REPORT.on_node(

@@ -52,7 +52,7 @@ def check(view: View) -> Iterator[Finding]:
     publishers = [
         each
         for group in view.groups.values()
-        for each in group.endpoints
+        for each in group
         if (each.kind, each.name, each.type) == (EndpointKind.PUBLISHER, topic, type_)
     ]
     if len(publishers) > 1:
@@ -80,7 +80,7 @@ def check(view: View) -> Iterator[Finding]:
 
 def _of_one(view: View, users: list[PlannedNode], publisher: ObservedEndpoint) -> Iterator[Finding]:
     who = publisher.node or "an unknown node"
-    if (publisher.node, publisher.kind, publisher.name) not in view.frame.declared:
+    if (publisher.node, publisher.kind, publisher.name) not in view.names.ends:
         yield _finding(
             UNDECLARED_CLOCK,
             users,

@@ -20,7 +20,6 @@ from lifecycle.verify import (
     verify,
 )
 from lifecycle.verify.matcher import lay_out
-from lifecycle.verify.observation import NodeParameters
 from lifecycle.verify.outcome import ConnectionReport
 from lifecycle.verify.view import Actual, SeenEndpoint, View
 from tests.builders import (
@@ -70,29 +69,6 @@ def actual(view: View, kind: EndpointKind, name: str) -> Actual:
         each for each in view.actual if (each.planned.kind, each.planned.resolved) == (kind, name)
     )
     return found
-
-
-def test_a_view_has_what_it_was_asked_with() -> None:
-    parameters = NodeParameters(node="/viewer", parameters=())
-    seen = dataclasses.replace(perfect(PLAN), parameters=(parameters,))
-    view = lay_out(
-        PLAN,
-        seen,
-        Stage.ACTIVE,
-        machines=frozenset({"robot"}),
-        ahead=frozenset({"/viewer"}),
-    )
-    assert (view.plan, view.stage) == (PLAN, Stage.ACTIVE)
-    assert (view.machines, view.ahead) == ({"robot"}, {"/viewer"})
-    assert view.parameters == {"/viewer": parameters}
-    assert view.planned == {each.full_name: each for each in PLAN.nodes}
-    assert list(view.actual_by_node) == ["/robot/camera", "/viewer"]
-    assert view.actual == tuple(each for ends in view.actual_by_node.values() for each in ends)
-    assert [each.planned for each in view.actual] == [
-        each for node in PLAN.nodes for each in node.endpoints
-    ]
-    nobody = lay_out(PLAN, Observation(), Stage.CONNECTED)
-    assert (nobody.machines, nobody.ahead, nobody.parameters) == (None, frozenset(), {})
 
 
 def test_of_a_perfect_system_nothing_is_left_over() -> None:
@@ -690,7 +666,7 @@ def test_a_flow_has_all_declared_ends_of_its_two_nodes_and_no_others() -> None:
         for each in view.flows
         if (each.planned.topic, each.publisher, each.subscription) == ("/a", "/one", "/two")
     )
-    one, two = view.actual_by_node["/one"], view.actual_by_node["/two"]
+    one, two = view.nodes["/one"].actual, view.nodes["/two"].actual
     assert (flow.publishers, flow.subscriptions) == (one[:2], two[:2])
     assert flow.at == at(8, 9)
     assert flow.subject == "/a: /one → /two"

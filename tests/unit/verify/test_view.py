@@ -71,12 +71,12 @@ def view_of(
     ],
 )
 def test_a_node_of_which_nothing_is_seen_is_absent(edit: Edit, absent: bool) -> None:
-    assert view_of(edit(perfect(PLAN))).is_absent(ONE) is absent
+    assert view_of(edit(perfect(PLAN))).nodes["/one"].absent is absent
 
 
 def test_who_is_ours_and_whom_the_caller_brings_up() -> None:
     everywhere, here = view_of(), view_of(machines=frozenset({"m1"}))
-    assert [everywhere.ours(each) for each in PLAN.nodes] == [True, False, True]
+    assert [each.is_ours for each in everywhere.nodes.values()] == [True, False, True]
     assert [everywhere.brings_up(each) for each in PLAN.nodes] == [True, True, True]
     assert [here.brings_up(each) for each in PLAN.nodes] == [True, False, False]
 
@@ -97,13 +97,6 @@ def test_a_node_that_has_only_memory_of_another_host_is_beyond_reach(
     assert view_of(machines=machines).is_beyond(two) is beyond
 
 
-def test_nodes_have_the_declared_addresses_of_their_machines_and_the_reported_identities() -> None:
-    view = view_of()
-    assert view.frame.addresses == {"/one": "10.0.0.1"}
-    assert view.identity("/one") == view.configurations["/one"].identity
-    assert view.identity("/two") is None
-
-
 def test_publishers_and_subscriptions_of_tools_are_seen_as_they_are_announced() -> None:
     shown = ObservedEndpoint(
         kind=SUB, node="/rviz2", name="/a", type="a/msg/A", qos=QosProfile(depth=3), gid="99"
@@ -118,8 +111,7 @@ def test_publishers_and_subscriptions_of_tools_are_seen_as_they_are_announced() 
             name="/a",
             type="a/msg/A",
             qos=QosProfile(depth=3),
-            report=None,
-            planned=None,
+            expected=False,
         ),
     )
 
