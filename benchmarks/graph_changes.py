@@ -34,9 +34,7 @@ from lifecycle.graph import (
     GraphMessage,
     GraphState,
     Heartbeat,
-    InMemoryNetwork,
     Joined,
-    ManualScheduler,
     MappingEstablished,
     StateChanged,
     encode,
@@ -54,6 +52,7 @@ from lifecycle.verify.observation import (
     ObservedEndpoint,
     ObservedNode,
 )
+from tests.unit.graph.simulated import ManualScheduler, Network
 from tests.unit.supervisor.fakes import World
 from tests.unit.verify.perfect import perfect
 
@@ -69,7 +68,7 @@ class System:
 
     def __init__(self, endpoints: int) -> None:
         self.scheduler = ManualScheduler()
-        network = InMemoryNetwork(self.scheduler)
+        network = Network(self.scheduler)
         self.wire = network.transport()
         self.configurations: dict[str, NodeConfiguration] = {}
         self.sequences: dict[str, int] = {}
@@ -224,7 +223,7 @@ class Supervised:
         self.shown: Any = Shown(seen)
         self._configurations = seen.configurations
         scheduler = ManualScheduler()
-        events = GraphEvents(InMemoryNetwork(scheduler).transport(), scheduler)
+        events = GraphEvents(Network(scheduler).transport(), scheduler)
         self._graph = Observer(self.shown, None, events)  # type: ignore[arg-type]
         self.changes = 0
         world = World(plan, folder)

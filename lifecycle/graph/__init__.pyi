@@ -2,7 +2,6 @@ from .events import FORGET_AFTER_S as FORGET_AFTER_S
 from .events import SILENT_AFTER_S as SILENT_AFTER_S
 from .events import GraphEvents as GraphEvents
 from .graph import Graph as Graph
-from .messages import AliveNotice as AliveNotice
 from .messages import ConfigurationChanged as ConfigurationChanged
 from .messages import ConnectionEstablished as ConnectionEstablished
 from .messages import ConnectionLost as ConnectionLost
@@ -14,9 +13,7 @@ from .messages import Joined as Joined
 from .messages import Left as Left
 from .messages import MappingEstablished as MappingEstablished
 from .messages import MappingLost as MappingLost
-from .messages import SilentNotice as SilentNotice
 from .messages import StateChanged as StateChanged
-from .messages import StuckNotice as StuckNotice
 from .messages import decode as decode
 from .messages import encode as encode
 from .messages import new_incarnation as new_incarnation
@@ -30,14 +27,11 @@ from .model import Member as Member
 from .model import NodeLiveliness as NodeLiveliness
 from .model import NodeView as NodeView
 from .reporter import HEARTBEAT_PERIOD_S as HEARTBEAT_PERIOD_S
-from .reporter import Every as Every
 from .reporter import GraphReporter as GraphReporter
 from .scheduler import LoopScheduler as LoopScheduler
-from .scheduler import ManualScheduler as ManualScheduler
 from .scheduler import Remove as Remove
 from .scheduler import Scheduler as Scheduler
 from .scheduler import ThreadScheduler as ThreadScheduler
-from .scheduler import every as every
 from .scheduler import set_within as set_within
 from .state import Fetch as Fetch
 from .state import GraphState as GraphState
@@ -45,6 +39,4 @@ from .state import Look as Look
 from .transport import GRAPH_QOS as GRAPH_QOS
 from .transport import DdsTransport as DdsTransport
 from .transport import GraphTransport as GraphTransport
-from .transport import InMemoryNetwork as InMemoryNetwork
-from .transport import InMemoryTransport as InMemoryTransport
 from .transport import steady_timer as steady_timer

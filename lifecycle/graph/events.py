@@ -18,16 +18,12 @@ import threading
 import typing
 from collections.abc import Callable, Iterable, Iterator
 
-from lifecycle.graph.membership import Notices, Sender, liveliness_event
+from lifecycle.graph.membership import Sender, liveliness_event
 from lifecycle.graph.messages import (
-    AliveNotice,
     GraphMessage,
     GraphMessageError,
-    Heartbeat,
     Joined,
     Left,
-    SilentNotice,
-    StuckNotice,
     decode,
 )
 from lifecycle.graph.model import (
@@ -36,7 +32,6 @@ from lifecycle.graph.model import (
     EventKind,
     GraphEvent,
     Member,
-    NodeLiveliness,
     names_of,
 )
 from lifecycle.graph.scheduler import Deadlines, Remove, Scheduler
@@ -127,10 +122,6 @@ FORGET_AFTER_S = 600.0
 """A node that sent nothing for so long has left."""
 
 
-_HERE = ""
-_BEATS = "heartbeats"
-
-
 @typing.final
 class GraphEvents:
     """The events of one graph.
@@ -166,7 +157,6 @@ class GraphEvents:
         self._silent_after_s = silent_after_s
         self._subscribers = Subscribers()
         self._senders: dict[str, Sender] = {}
-        self._notices = Notices(self._senders)
         self._beats = Deadlines(scheduler, silent_after_s, self._fell_silent)
         self._gone = Deadlines(scheduler, forget_after_s, self._forget)
         self._message_callbacks: tuple[Callable[[GraphMessage], None], ...] = ()
@@ -221,15 +211,6 @@ class GraphEvents:
         """
         return self.on_endpoint(EndpointKind.PUBLISHER, topic, appeared, vanished)
 
-    def on_subscription(
-        self,
-        topic: str,
-        appeared: Callable[[GraphEvent], None],
-        vanished: Callable[[GraphEvent], None] | None = None,
-    ) -> Remove:
-        """Have `appeared` called with each subscription of a topic; as `on_publisher`."""
-        return self.on_endpoint(EndpointKind.SUBSCRIPTION, topic, appeared, vanished)
-
     def on_endpoint(
         self,
         kind: EndpointKind,
@@ -278,23 +259,7 @@ class GraphEvents:
             sender = self._senders.get(node)
             return sender is not None and sender.present and bool(sender.incarnation)
 
-    # -- what is noticed otherwise
-
-    def report_silent(self, node: str, reason: str = "") -> None:
-        """Take `node` for silent, until a message of it comes or `report_alive`.
-
-        For what notices sooner than by missing heartbeats: DDS liveliness, a pidfd. A
-        node that is not a member is passed over.
-        """
-        self._report(node, NodeLiveliness.SILENT, reason)
-
-    def report_stuck(self, node: str, reason: str = "") -> None:
-        """Take it that `node` is there and does not do its work, until `report_alive`."""
-        self._report(node, NodeLiveliness.STUCK, reason)
-
-    def report_alive(self, node: str, reason: str = "") -> None:
-        """Take back what was reported here of `node`."""
-        self._report(node, NodeLiveliness.ALIVE, reason)
+    # -- what discovery shows
 
     def report_seen(self, node: str) -> None:
         """Take it that `node` is there although it sends no messages: discovery shows it."""
@@ -347,19 +312,10 @@ class GraphEvents:
             callback(message)
         self._message(message)
 
-    def _report(self, node: str, liveliness: NodeLiveliness, reason: str) -> None:
-        self.scheduler.post(functools.partial(self._noticed, node, liveliness, reason))
-
     def _message(self, message: GraphMessage) -> None:
         """Take a message that arrived."""
         with self.lock:
             events = self._take(message)
-        self._subscribers.notify(events)
-
-    def _noticed(self, node: str, liveliness: NodeLiveliness, reason: str) -> None:
-        """Take what was noticed here, without a message, of how alive a member is."""
-        with self.lock:
-            events = self._notices.hold(node, _HERE, liveliness, reason)
         self._subscribers.notify(events)
 
     def _seen(self, node: str) -> None:
@@ -414,7 +370,8 @@ class GraphEvents:
             return events
         self._beats.touch(sender.node)
         self._gone.drop(sender.node)
-        if sender.received():
+        if sender.silent:
+            sender.silent = ""
             events.append(liveliness_event(sender))
         for each in ready:
             # JOINED was an event already, whatever the first message was.
@@ -437,11 +394,8 @@ class GraphEvents:
         sender.learn(message)
         if joined:
             return []
-        if isinstance(message, SilentNotice | StuckNotice | AliveNotice):
-            return self._notices.take(sender.node, message)
-        events = self._notices.renew(sender.node, message) if isinstance(message, Heartbeat) else []
         kind = EventKind.HEARTBEAT if isinstance(message, Joined) else EventKind(message.kind.value)
-        return [*events, _event(kind, sender, message)]
+        return [_event(kind, sender, message)]
 
     def _wait_for_missing(self, sender: Sender) -> list[GraphEvent]:
         if not sender.present or sender.order is None:
@@ -476,12 +430,11 @@ class GraphEvents:
     def _end_of(
         self, sender: Sender, reason: str, message: GraphMessage | None = None
     ) -> list[GraphEvent]:
-        """Take a member out, with its endpoints and with what it noticed of others."""
-        events = self._notices.end(sender.node)
-        events += (
+        """Take a member out, with its endpoints."""
+        events = [
             endpoint_event(EventKind.ENDPOINT_REMOVED, sender.node, each)
             for each in self.endpoints.update(sender.node, ()).removed
-        )
+        ]
         events.append(_event(EventKind.LEFT, sender, message, reason))
         sender.end(for_good=message is not None)
         self._beats.drop(sender.node)
@@ -493,9 +446,9 @@ class GraphEvents:
     def _fell_silent(self, node: str) -> None:
         with self.lock:
             self._gone.touch(node)
-            reason = f"no message for {self._silent_after_s:g} s"
-            events = self._notices.hold(node, _BEATS, NodeLiveliness.SILENT, reason)
-        self._subscribers.notify(events)
+            sender = self._senders[node]
+            sender.silent = f"no message for {self._silent_after_s:g} s"
+        self._subscribers.notify([liveliness_event(sender)])
 
     def _forget(self, node: str) -> None:
         """Drop a node that left or fell silent long ago."""

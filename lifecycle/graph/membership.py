@@ -1,25 +1,21 @@
-"""State of one member of the graph: message order, incarnation, liveliness as members report it.
+"""State of one member of the graph: message order, incarnation, liveliness.
 
 Owns: the order in which the messages of a node count, what is a duplicate and what is missing;
-which of two instances is the current one; its state and its troubles; and which members report
-others as silent or stuck, until they take it back. Pure; not thread-safe.
+which of two instances is the current one; its state, and whether it is silent. Pure; not
+thread-safe.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
 
 from lifecycle.graph.messages import (
-    AliveNotice,
     ConfigurationChanged,
     GraphMessage,
     Heartbeat,
     Joined,
     Left,
-    SilentNotice,
     StateChanged,
-    StuckNotice,
 )
 from lifecycle.graph.model import EventKind, GraphEvent, Member, NodeLiveliness
 from lifecycle.graph.scheduler import Remove
@@ -114,8 +110,8 @@ class Sender:
         self._state: str | None = None
         self._connected: bool | None = None
         self._checksum: str | None = None
-        self._troubles: dict[str, tuple[NodeLiveliness, str]] = {}
-        self._overruled: set[str] = set()
+        self.silent = ""
+        """Why it is silent; empty if it is alive."""
 
     def begin(self, incarnation: str = "", first: GraphMessage | None = None) -> None:
         """Be another instance from now on, or the first one; without a message, as discovered."""
@@ -124,7 +120,7 @@ class Sender:
         self.present = True
         self.order = None if first is None else Sequencer(first)
         self._state = self._connected = self._checksum = None
-        self._troubles, self._overruled = {}, set()
+        self.silent = ""
 
     def adopt(self, incarnation: str, first: GraphMessage) -> None:
         """Send messages from now on, having been seen by discovery only."""
@@ -135,7 +131,7 @@ class Sender:
         """Be no member any more. `for_good`: this incarnation said so, and does not come back."""
         self.cancel_wait()
         self.present = False
-        self._troubles, self._overruled = {}, set()
+        self.silent = ""
         if for_good and self.incarnation:
             self.departed.append(self.incarnation)
 
@@ -161,57 +157,10 @@ class Sender:
         if isinstance(message, Joined | Heartbeat | ConfigurationChanged):
             self._checksum = message.checksum
 
-    def trouble(
-        self, source: str, liveliness: NodeLiveliness, reason: str, *, again: bool = False
-    ) -> bool:
-        """Hold what `source` reports of us; ALIVE takes it back. Return whether our state changed.
-
-        Args:
-            source: the node that reports it.
-            liveliness: what it reports.
-            reason: for people.
-            again: it repeats a report: then it counts only if no message of ours came meanwhile.
-        """
-        before = self.liveliness
-        if again and source in self._overruled and liveliness is NodeLiveliness.SILENT:
-            return False
-        self._overruled.discard(source)
-        if liveliness is NodeLiveliness.ALIVE:
-            self._troubles.pop(source, None)
-        else:
-            held, text = self._troubles.get(source, (None, ""))
-            self._troubles[source] = (liveliness, reason or (text if held is liveliness else ""))
-        return self.liveliness is not before
-
-    def received(self) -> bool:
-        """Be silent no more, whatever others say: a message came. Return whether it was."""
-        before = self.liveliness
-        if before is not NodeLiveliness.SILENT:
-            return False
-        silent = {
-            source
-            for source, (liveliness, _) in self._troubles.items()
-            if liveliness is NodeLiveliness.SILENT
-        }
-        self._overruled |= silent
-        for source in silent:
-            del self._troubles[source]
-        return True
-
     @property
     def liveliness(self) -> NodeLiveliness:
-        """The worst that is reported of it."""
-        if not self._troubles:
-            return NodeLiveliness.ALIVE
-        held = {liveliness for liveliness, _ in self._troubles.values()}
-        return NodeLiveliness.SILENT if NodeLiveliness.SILENT in held else NodeLiveliness.STUCK
-
-    @property
-    def reason(self) -> str:
-        """Why it is not alive; empty if it is."""
-        worst = self.liveliness
-        reasons = (text for held, text in self._troubles.values() if held is worst and text)
-        return ", ".join(dict.fromkeys(reasons))
+        """Whether messages of it come."""
+        return NodeLiveliness.SILENT if self.silent else NodeLiveliness.ALIVE
 
     @property
     def member(self) -> Member:
@@ -223,7 +172,7 @@ class Sender:
             connected=self._connected,
             checksum=self._checksum,
             liveliness=self.liveliness,
-            reason=self.reason,
+            reason=self.silent,
         )
 
     def cancel_wait(self) -> None:
@@ -233,70 +182,11 @@ class Sender:
             self.stop_waiting = None
 
 
-class Notices:
-    """The troubles of the members of one graph.
-
-    Args:
-        senders: every member by name, as they are now.
-    """
-
-    def __init__(self, senders: Mapping[str, Sender]) -> None:
-        self._senders = senders
-        self._given: dict[str, set[str]] = {}
-        """Sender of notices → the node that they are about."""
-
-    def hold(
-        self,
-        node: str,
-        source: str,
-        liveliness: NodeLiveliness,
-        reason: str,
-        *,
-        again: bool = False,
-    ) -> list[GraphEvent]:
-        """Hold what `source` reports of `node`, as `Sender.trouble`; return what that changes."""
-        sender = self._senders.get(node)
-        if sender is None or not sender.present:
-            return []
-        changed = sender.trouble(source, liveliness, reason, again=again)
-        return [liveliness_event(sender)] if changed else []
-
-    def take(
-        self, source: str, message: SilentNotice | StuckNotice | AliveNotice
-    ) -> list[GraphEvent]:
-        """Take a notice that a member gives of another."""
-        self._given.setdefault(source, set()).add(message.about)
-        return self.hold(message.about, source, NodeLiveliness(message.kind.value), message.reason)
-
-    def renew(self, source: str, beat: Heartbeat) -> list[GraphEvent]:
-        """Hold exactly what a member says in its heartbeat."""
-        held = self._given.get(source, set())
-        says = {
-            **dict.fromkeys(beat.stuck, NodeLiveliness.STUCK),
-            **dict.fromkeys(beat.silent, NodeLiveliness.SILENT),
-        }
-        if not held and not says:
-            return []
-        self._given[source] = set(says)
-        events: list[GraphEvent] = []
-        for about in (*says, *(each for each in sorted(held) if each not in says)):
-            liveliness = says.get(about, NodeLiveliness.ALIVE)
-            events += self.hold(about, source, liveliness, "", again=about in held)
-        return events
-
-    def end(self, source: str) -> list[GraphEvent]:
-        """Take back all that a member reported of others."""
-        events: list[GraphEvent] = []
-        for about in sorted(self._given.pop(source, ())):
-            events += self.hold(about, source, NodeLiveliness.ALIVE, "")
-        return events
-
-
 def liveliness_event(sender: Sender) -> GraphEvent:
     """Return the event of how alive a member is now."""
     return GraphEvent(
         kind=EventKind(sender.liveliness.value),
         node=sender.node,
         incarnation=sender.incarnation,
-        reason=sender.reason,
+        reason=sender.silent,
     )

@@ -42,9 +42,6 @@ class GraphKind(enum.Enum):
     CONNECTION_LOST = "connection_lost"
     MAPPING_ESTABLISHED = "mapping_established"
     MAPPING_LOST = "mapping_lost"
-    SILENT = "silent"
-    STUCK = "stuck"
-    ALIVE = "alive"
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -115,10 +112,6 @@ class Heartbeat(GraphMessage):
 
     `sequence` is that of the sender's last other message. The rest is as in `Joined`, as it is
     after that message.
-
-    Attributes:
-        silent: nodes of which the sender noticed that they are silent, and still holds so.
-        stuck: likewise, stuck.
     """
 
     kind: ClassVar[GraphKind] = GraphKind.HEARTBEAT
@@ -126,8 +119,6 @@ class Heartbeat(GraphMessage):
     state: str = ""
     connected: bool = False
     checksum: str = ""
-    silent: tuple[str, ...] = ()
-    stuck: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -191,36 +182,6 @@ class MappingLost(GraphMessage):
     error: str = ""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class SilentNotice(GraphMessage):
-    """The sender noticed that node `about` is silent."""
-
-    kind: ClassVar[GraphKind] = GraphKind.SILENT
-
-    about: str
-    reason: str = ""
-
-
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class StuckNotice(GraphMessage):
-    """The sender noticed that node `about` is there and does not do its work."""
-
-    kind: ClassVar[GraphKind] = GraphKind.STUCK
-
-    about: str
-    reason: str = ""
-
-
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class AliveNotice(GraphMessage):
-    """The sender takes back what it noticed of node `about`."""
-
-    kind: ClassVar[GraphKind] = GraphKind.ALIVE
-
-    about: str
-    reason: str = ""
-
-
 MESSAGES: tuple[type[GraphMessage], ...] = (
     Joined,
     Left,
@@ -231,9 +192,6 @@ MESSAGES: tuple[type[GraphMessage], ...] = (
     ConnectionLost,
     MappingEstablished,
     MappingLost,
-    SilentNotice,
-    StuckNotice,
-    AliveNotice,
 )
 """Every kind of message."""
 

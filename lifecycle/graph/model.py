@@ -49,8 +49,7 @@ class EventKind(enum.Enum):
     MAPPING_ESTABLISHED = "mapping_established"
     MAPPING_LOST = "mapping_lost"
     SILENT = "silent"  # no message of the node comes any more
-    STUCK = "stuck"  # the node is there and does not do its work
-    ALIVE = "alive"  # neither of the two any more
+    ALIVE = "alive"  # they come again
     GAP = "gap"  # messages of the node were lost: read its configuration again
     ENDPOINT_ADDED = "endpoint_added"
     ENDPOINT_REMOVED = "endpoint_removed"
@@ -58,10 +57,9 @@ class EventKind(enum.Enum):
 
 
 class NodeLiveliness(enum.Enum):
-    """Whether a member of the graph is there and does its work."""
+    """Whether messages of a member of the graph come."""
 
     ALIVE = "alive"
-    STUCK = "stuck"
     SILENT = "silent"
 
 
@@ -94,7 +92,7 @@ class Member:
         state: lifecycle_msgs/State label; None while unknown.
         connected: its data layer is made; None while unknown.
         checksum: of its node configuration; None while unknown, empty if it serves none.
-        reason: why it is silent or stuck; empty if it is alive.
+        reason: why it is silent; empty if it is alive.
     """
 
     node: str
@@ -197,7 +195,7 @@ class NodeView:
     Attributes:
         name: fully qualified.
         incarnation: which instance; empty if it sends no graph messages.
-        liveliness: whether it is there and does its work.
+        liveliness: whether messages of it come.
         reason: why it is not alive; empty if it is.
         state: lifecycle_msgs/State label, empty for a node that is not managed; None while unknown.
         connected: its data layer is made; None while unknown.
@@ -265,15 +263,6 @@ class GraphChange:
     def state_changed(self) -> bool:
         """Its lifecycle state is another one, or is known only now."""
         return self._state(self.before) != self._state(self.after)
-
-    @property
-    def liveliness_changed(self) -> bool:
-        """It fell silent, got stuck, or is alive again."""
-        return (
-            self.before is not None
-            and self.after is not None
-            and self.before.liveliness is not self.after.liveliness
-        )
 
     @staticmethod
     def _state(view: NodeView | None) -> tuple[str | None, bool | None]:

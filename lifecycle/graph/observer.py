@@ -16,18 +16,17 @@ import threading
 import time
 import typing
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError
 from lifecycle.graph.events import GraphEvents
 from lifecycle.graph.messages import GraphMessage, Heartbeat
-from lifecycle.graph.parameters import ParameterReadings, ParameterServices
+from lifecycle.graph.parameters import ParameterReadings
 from lifecycle.graph.scheduler import Remove, set_within
 from lifecycle.graph.state import Answer, GraphState, Look
 from lifecycle.plan import Plan
 from lifecycle.verify import (
-    NO_NAMES,
     DeclaredNames,
     EndpointReport,
     HealthReport,
@@ -41,6 +40,9 @@ from lifecycle.verify import (
     matches,
     tolerating_pattern,
 )
+
+if TYPE_CHECKING:  # it imports rclpy
+    from lifecycle.middleware import GraphObserver, NodeClients
 
 _logger = logging.getLogger(__name__)
 
@@ -59,57 +61,6 @@ _TOGETHER_S = 0.05
 
 Diagnostic = tuple[str, int, str]
 """Name, level and message of a diagnostic_msgs/DiagnosticStatus."""
-
-
-class DiscoveredGraph(Protocol):
-    """What discovery shows, see lifecycle.middleware.GraphObserver."""
-
-    def snapshot(
-        self, *, declared: Collection[str] = (), names: DeclaredNames = NO_NAMES
-    ) -> tuple[tuple[ObservedNode, ...], tuple[ObservedEndpoint, ...]]:
-        """Return the nodes and endpoints that discovery shows now."""
-
-    def settling_s(self) -> float:
-        """Return for how long the last snapshot may miss who is there; 0 if it cannot."""
-
-    def expect_newcomers(self, *, everybody: bool = False) -> bool:
-        """Have `settling_s` wait for who came lately; return whether there may be anybody."""
-
-    def offers(self, node: str, service: str) -> bool:
-        """Return whether discovery shows a service on a node."""
-
-    def hosted(self, nodes: Iterable[str]) -> Mapping[str, bool]:
-        """Return which nodes of this machine are in hosts of ours; others are left out."""
-
-    def on_change(self, callback: Callable[[], None]) -> Remove:
-        """Call `callback` from any thread after each change; return what takes it away."""
-
-    def destroy(self) -> None:
-        """Leave the graph."""
-
-
-class NodeServices(ParameterServices, Protocol):
-    """Nodes' services, see lifecycle.middleware.NodeClients."""
-
-    async def get_state(self, node: str, *, timeout_s: float) -> str:
-        """Return the label of the node's state."""
-
-    async def get_configuration(
-        self, node: str, *, timeout_s: float, expected: bool
-    ) -> NodeConfiguration | None:
-        """Return the node's configuration; None where it is shown to have no such interface."""
-
-    def on_diagnostics(self, callback: Callable[[Sequence[Diagnostic]], None]) -> None:
-        """Call `callback` from any thread with entries of /diagnostics, and each second without."""
-
-    def on_transition(self, node: str, callback: Callable[[], None]) -> None:
-        """Call `callback` from any thread after each transition of the node, until `forget`."""
-
-    def forget(self, node: str) -> None:
-        """Drop what is held for a node that left."""
-
-    def destroy(self) -> None:
-        """Drop everything."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -149,7 +100,7 @@ class DiagnosticReadings:
 
     def __init__(
         self,
-        clients: NodeServices,
+        clients: NodeClients,
         wake: Callable[[], None],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -245,8 +196,8 @@ class Observer:
 
     def __init__(
         self,
-        discovery: DiscoveredGraph,
-        clients: NodeServices,
+        discovery: GraphObserver,
+        clients: NodeClients,
         events: GraphEvents,
         *,
         quiet_s: float = QUIET_S,

@@ -11,11 +11,14 @@ import asyncio
 import logging
 import threading
 from collections.abc import Callable, Collection, Mapping
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.graph.scheduler import set_within
 from lifecycle.verify import SERVES_NONE, NodeParameters, ParameterReport
+
+if TYPE_CHECKING:  # it imports rclpy
+    from lifecycle.middleware import NodeClients
 
 _logger = logging.getLogger(__name__)
 
@@ -41,21 +44,6 @@ Names = frozenset[str] | None
 """Of those parameters of a node that are read; None for all that it has."""
 
 
-class ParameterServices(Protocol):
-    """Nodes' parameter services, see lifecycle.middleware.NodeClients."""
-
-    def serves_parameters(self, node: str) -> bool | None:
-        """Return whether a node has them; None while discovery may not show them yet."""
-
-    async def report_parameters(
-        self, node: str, names: Collection[str] | None, *, timeout_s: float
-    ) -> tuple[ParameterReport, ...]:
-        """Return those parameters that are named and that the node has; None returns all."""
-
-    def on_parameters(self, callback: Callable[[str, frozenset[str]], None]) -> None:
-        """Call `callback` from any thread with each change of parameters, by node and names."""
-
-
 class ParameterReadings:
     """The parameters of some nodes, kept as they are. To be used in one asyncio loop.
 
@@ -64,7 +52,7 @@ class ParameterReadings:
         wake: called, in any thread, when they are others than before.
     """
 
-    def __init__(self, clients: ParameterServices, wake: Callable[[], None]) -> None:
+    def __init__(self, clients: NodeClients, wake: Callable[[], None]) -> None:
         self._clients = clients
         self._wake = wake
         self._nodes: dict[str, _Node] = {}
@@ -165,7 +153,7 @@ class _Node:
     """The parameters of one node, read again and again by a task."""
 
     def __init__(
-        self, name: str, names: Names, clients: ParameterServices, wake: Callable[[], None]
+        self, name: str, names: Names, clients: NodeClients, wake: Callable[[], None]
     ) -> None:
         self.names = names
         self.latest: NodeParameters | None = None

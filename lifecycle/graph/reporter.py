@@ -10,11 +10,10 @@ import logging
 import threading
 import typing
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from lifecycle.errors import LifecycleError
 from lifecycle.graph.messages import (
-    AliveNotice,
     ConfigurationChanged,
     ConnectionEstablished,
     ConnectionLost,
@@ -24,9 +23,7 @@ from lifecycle.graph.messages import (
     Left,
     MappingEstablished,
     MappingLost,
-    SilentNotice,
     StateChanged,
-    StuckNotice,
     encode,
     new_incarnation,
 )
@@ -41,13 +38,6 @@ HEARTBEAT_PERIOD_S = 2.0
 """Heartbeats repair what was lost; what must notice a death sooner has other means."""
 
 
-class Every(Protocol):
-    """A timer: calls back periodically until what it returned is called."""
-
-    def __call__(self, period_s: float, callback: Callable[[], None], /) -> Remove:
-        """Call `callback` every `period_s` seconds, first after one period."""
-
-
 @typing.final
 class GraphReporter:
     """Reports to the graph what becomes of one node instance. Every method: any thread.
@@ -58,7 +48,8 @@ class GraphReporter:
     Args:
         transport: where to send; it is not closed by the reporter.
         node: fully qualified name.
-        every: the heartbeats' timer.
+        every: starts the heartbeats' timer, which calls back each so many seconds, first after one
+            period, until what `every` returned is called.
         period_s: of the heartbeats, > 0.
         incarnation: of this node instance; by default a new one.
     """
@@ -68,7 +59,7 @@ class GraphReporter:
         transport: GraphTransport,
         node: str,
         *,
-        every: Every,
+        every: Callable[[float, Callable[[], None]], Remove],
         period_s: float = HEARTBEAT_PERIOD_S,
         incarnation: str | None = None,
     ) -> None:
@@ -80,7 +71,6 @@ class GraphReporter:
         self._lock = threading.RLock()
         self._sequence = 0
         self._state, self._connected, self._checksum = "", False, ""
-        self._notices: dict[str, type[GraphMessage]] = {}
         self._stop: tuple[Remove, ...] = ()
         self._left = False
 
@@ -172,21 +162,6 @@ class GraphReporter:
             MappingLost, endpoint=endpoint, connection=connection, matched=matched, error=error
         )
 
-    def silent(self, about: str, reason: str = "") -> None:
-        """Report to all that another node (fully qualified) is silent.
-
-        The heartbeats repeat it until `alive`.
-        """
-        self._notice(SilentNotice, about, reason)
-
-    def stuck(self, about: str, reason: str = "") -> None:
-        """Report to all that another node is there and does not do its work."""
-        self._notice(StuckNotice, about, reason)
-
-    def alive(self, about: str, reason: str = "") -> None:
-        """Take back what `silent` or `stuck` reported of another node."""
-        self._notice(AliveNotice, about, reason)
-
     def announce(self) -> None:
         """Send a heartbeat now, besides those of the timer."""
         with self._lock:
@@ -199,26 +174,8 @@ class GraphReporter:
                         state=self._state,
                         connected=self._connected,
                         checksum=self._checksum,
-                        silent=self._noticed(SilentNotice),
-                        stuck=self._noticed(StuckNotice),
                     )
                 )
-
-    def _notice(
-        self,
-        type_: type[SilentNotice | StuckNotice | AliveNotice],
-        about: str,
-        reason: str,
-    ) -> None:
-        with self._lock:
-            if type_ is AliveNotice:
-                self._notices.pop(about, None)
-            else:
-                self._notices[about] = type_
-            self._report(type_, about=about, reason=reason)
-
-    def _noticed(self, type_: type[GraphMessage]) -> tuple[str, ...]:
-        return tuple(about for about, kind in self._notices.items() if kind is type_)
 
     def _report(self, type_: type[GraphMessage], **fields: Any) -> None:
         # Under the lock until it is sent: what leaves first has the lower number.

@@ -1,6 +1,6 @@
 """Schedulers, deadlines and timers of the graph interface: one place for all that runs.
 
-Owns: the Scheduler Protocol and its three kinds, many deadlines of equal length with one timer, and
+Owns: the Scheduler Protocol and its two kinds, many deadlines of equal length with one timer, and
 a wait for an event that loses no cancellation. Whatever a layer does, and every callback that it
 calls, runs in its scheduler, one after another and never two at once; so a subscriber needs no lock
 against another. A scheduler sleeps until it is given something or something is due. Pure.
@@ -10,12 +10,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import heapq
-import itertools
 import logging
 import threading
 import typing
-from collections import OrderedDict, deque
+from collections import OrderedDict
 from collections.abc import Callable
 from typing import Protocol
 
@@ -38,82 +36,6 @@ class Scheduler(Protocol):
 
     def call_at(self, when_s: float, work: Work) -> Remove:
         """Run `work` at `when_s` or soon after, unless what is returned is called before."""
-
-
-def every(scheduler: Scheduler) -> Callable[[float, Work], Remove]:
-    """Return a periodic timer (`lifecycle.graph.Every`) that runs in `scheduler`.
-
-    A period that was missed is not made up for.
-    """
-
-    def start(period_s: float, work: Work) -> Remove:
-        cancel: list[Remove] = []
-        stopped = False
-
-        def run() -> None:
-            if stopped:
-                return
-            cancel[:] = [scheduler.call_at(scheduler.now_s() + period_s, run)]
-            work()
-
-        def stop() -> None:
-            nonlocal stopped
-            stopped = True
-            for each in cancel:
-                each()
-
-        cancel.append(scheduler.call_at(scheduler.now_s() + period_s, run))
-        return stop
-
-    return start
-
-
-@typing.final
-class ManualScheduler:
-    """Time that moves only by `advance`: for tests and simulations. One thread.
-
-    What is posted runs at once, unless something runs already: then after that.
-    """
-
-    def __init__(self) -> None:
-        self._now_s = 0.0
-        self._timers: list[tuple[float, int, list[Work]]] = []
-        self._count = itertools.count()
-        self._posted: deque[Work] = deque()
-        self._running = False
-
-    def now_s(self) -> float:
-        """Return the seconds that `advance` has added up."""
-        return self._now_s
-
-    def post(self, work: Work) -> None:
-        """Run `work` now, or after what runs now."""
-        self._posted.append(work)
-        if self._running:
-            return
-        self._running = True
-        try:
-            while self._posted:
-                self._posted.popleft()()
-        finally:
-            self._running = False
-            self._posted.clear()
-
-    def call_at(self, when_s: float, work: Work) -> Remove:
-        """Run `work` when `advance` gets there."""
-        entry = [work]
-        heapq.heappush(self._timers, (when_s, next(self._count), entry))
-        return entry.clear
-
-    def advance(self, seconds: float) -> None:
-        """Let time pass, >= 0, and run what comes due in its order. An exception ends it."""
-        end_s = self._now_s + seconds
-        while self._timers and self._timers[0][0] <= end_s:
-            due_s, _, entry = heapq.heappop(self._timers)
-            if entry:
-                self._now_s = max(self._now_s, due_s)
-                self.post(entry.pop())
-        self._now_s = end_s
 
 
 @typing.final

@@ -58,7 +58,6 @@ _logger = logging.getLogger(__name__)
 
 _LIVELINESS = {
     EventKind.SILENT: NodeLiveliness.SILENT,
-    EventKind.STUCK: NodeLiveliness.STUCK,
     EventKind.ALIVE: NodeLiveliness.ALIVE,
 }
 
@@ -101,10 +100,10 @@ class Record:
             self._again = True
 
     def holds(self, configuration: NodeConfiguration) -> bool:
-        """Whether this object was taken last, and nothing changed since."""
+        """Whether this was taken last, and nothing changed since."""
         return (
             self._taken is not None
-            and self._taken[0] is configuration
+            and self._taken[0] == configuration
             and self._taken[1] is self.view
             and self.reading is None
             and not self._doubtful
@@ -235,7 +234,6 @@ class GraphState:
         self._records: dict[str, Record] = {}
         self._given: Mapping[str, NodeConfiguration] = {}
         self._look = Look()
-        self._stated: dict[str, tuple[ObservedNode, ObservedNode]] = {}
         self._fetch = fetch
         self._callbacks: tuple[Callable[[GraphChange], None], ...] = ()
         self._unread: set[str] = set()
@@ -270,14 +268,6 @@ class GraphState:
     def subscriptions_of(self, topic: str) -> tuple[End, ...]:
         """Return who subscribes to a topic."""
         return self.endpoints(EndpointKind.SUBSCRIPTION, topic)
-
-    def servers_of(self, service: str) -> tuple[End, ...]:
-        """Return who offers a service."""
-        return self.endpoints(EndpointKind.SERVICE_SERVER, service)
-
-    def clients_of(self, service: str) -> tuple[End, ...]:
-        """Return who uses a service."""
-        return self.endpoints(EndpointKind.SERVICE_CLIENT, service)
 
     def endpoints(self, kind: EndpointKind, name: str) -> tuple[End, ...]:
         """Return the endpoints of a kind and name (fully qualified), by node name."""
@@ -342,14 +332,10 @@ class GraphState:
         """
         name = configuration.name
         with self._lock:
-            held = self._given.get(name)
-            record = self._records.get(name)
-            if held is configuration or held == configuration:
-                if record is not None and record.holds(held):
-                    return  # it is known already, and nothing came after it
-                configuration = held
-            else:
+            if self._given.get(name) != configuration:
                 self._given = {**self._given, name: configuration}
+            elif (record := self._records.get(name)) is not None and record.holds(configuration):
+                return  # it is known already, and nothing came after it
         self.events.report_seen(name)
         self.events.scheduler.post(functools.partial(self._put, configuration))
 
@@ -395,45 +381,28 @@ class GraphState:
     # -- what is judged
 
     def put_look(self, look: Look) -> None:
-        """Give what discovery and the nodes that were asked say now.
-
-        An answer that equals the last one is this: who judges knows by it that nothing changed.
-        """
-        answers = dict(look.answers)
-        for name, (state, configuration) in look.answers.items():
-            _, held = self._look.answers.get(name, (None, None))
-            if held is configuration or held == configuration:
-                answers[name] = state, held
-        self._look = dataclasses.replace(look, answers=answers)
+        """Give what discovery and the nodes that were asked say now."""
+        self._look = look
 
     def learn(self, configuration: NodeConfiguration) -> None:
         """Show what a member answered, where no reading of this state would bring it."""
         self.events.scheduler.post(functools.partial(self._put, configuration))
 
     def observation(self) -> Observation:
-        """Return what `lifecycle.verify` judges: the last look, and what is given of nodes now.
-
-        What is as in the last observation is the same object.
-        """
+        """Return what `lifecycle.verify` judges: the last look, and what is given of nodes now."""
         look, given = self._look, self._given
         asked = {name: configuration for name, (_, configuration) in look.answers.items()}
-        configurations = {**given, **asked}
-        before, self._stated = self._stated, {}
-        nodes = []
-        for each in look.nodes:
-            name = each.full_name
-            state = _state(name, look.answers, given)
-            known = before.get(name)
-            health = look.health.get(name)
-            said = state, health
-            if known is None or known[0] is not each or (known[1].state, known[1].health) != said:
-                known = each, dataclasses.replace(each, state=state, health=health)
-            self._stated[name] = known
-            nodes.append(known[1])
         return Observation(
-            nodes=tuple(nodes),
+            nodes=tuple(
+                dataclasses.replace(
+                    each,
+                    state=_state(each.full_name, look.answers, given),
+                    health=look.health.get(each.full_name),
+                )
+                for each in look.nodes
+            ),
             endpoints=look.endpoints,
-            configurations=tuple(each for each in configurations.values() if each is not None),
+            configurations=tuple(each for each in {**given, **asked}.values() if each is not None),
             parameters=look.parameters,
         )
 

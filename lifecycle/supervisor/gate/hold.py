@@ -41,7 +41,6 @@ from lifecycle.supervisor.gate.verification_loop import (
     ChangeCounter,
     VerificationLoop,
 )
-from lifecycle.supervisor.gate.violations import without_nodes_of
 from lifecycle.supervisor.health.process_monitor import ProcessMonitor
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.policy.consequences import Consequences, Due
@@ -92,7 +91,7 @@ class Watch:
             whole, again_s = await self._judge.settled(self._stage)
             if again_s is None and self._opens(whole):
                 return
-            verdict = without_nodes_of(whole, self._away())
+            verdict = self._judge.without_nodes_of(whole, self._away())
             waits_s = [again_s]
             if self._judge.asks_again(whole):
                 waits_s.append(ASK_AGAIN_AT_MOST_S)

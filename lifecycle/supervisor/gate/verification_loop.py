@@ -23,7 +23,7 @@ from lifecycle.supervisor.control.protocol import ProcessState
 from lifecycle.supervisor.gate.activation_guard import ActivationGuard
 from lifecycle.supervisor.gate.gate import behind_s, closes
 from lifecycle.supervisor.gate.standstill import Standstill
-from lifecycle.supervisor.gate.violations import Violations, without_nodes_of
+from lifecycle.supervisor.gate.violations import Violations
 from lifecycle.supervisor.health.agreement import Agreement
 from lifecycle.supervisor.health.liveliness import NodeArrivals
 from lifecycle.supervisor.nodes.system import ObservedGraph, System
@@ -149,6 +149,10 @@ def _is_of_unknown_node(finding: Finding) -> bool:
         return is_hidden_node(finding.node)
     # Who publishes the time begins to once it is active.
     return finding.rule in (UNATTRIBUTED_ENDPOINT.id, SILENT_CLOCK.id)
+
+
+def _is_of(finding: Finding, names: Collection[str]) -> bool:
+    return any(each in names for each in (*finding.nodes, finding.subject))
 
 
 def _key(finding: Finding) -> _Key:
@@ -457,12 +461,22 @@ class VerificationLoop:
         if self._agreement is not None:
             away |= self._agreement.left()
         now_s = asyncio.get_running_loop().time()
-        return self.violations.see(without_nodes_of(verdict, away), now_s)
+        return self.violations.see(self.without_nodes_of(verdict, away), now_s)
+
+    def without_nodes_of(self, verdict: Verdict, names: Collection[str]) -> Verdict:
+        """Return a verdict without what is found of these nodes: they are away, or not let through.
+
+        Args:
+            verdict: of all nodes.
+            names: fully qualified.
+        """
+        findings = tuple(each for each in verdict.findings if not _is_of(each, names))
+        return with_only(verdict, findings, self._system.expected.policy) if names else verdict
 
     def _is_worse(self, found: Verdict, away: frozenset[str]) -> bool:
         known = () if self.latest is None else self.latest.findings
         return any(
-            each.outcome is Outcome.VIOLATED and away.isdisjoint((*each.nodes, each.subject))
+            each.outcome is Outcome.VIOLATED and not _is_of(each, away)
             for each in found.findings
             if _key(each) not in {_key(one) for one in known}
         )

@@ -6,8 +6,6 @@ changes meanwhile; a shorter one does not, and is named when the run ends. Pure.
 
 from __future__ import annotations
 
-from collections.abc import Collection
-
 from lifecycle import dataclasses
 from lifecycle.manifest import EndpointKind
 from lifecycle.verify import Finding, Outcome, Verdict, not_ok
@@ -38,7 +36,7 @@ class Violations:
         """Take what was judged now of nodes that are to be as planned.
 
         Args:
-            verdict: that holds, see `without_nodes_of`.
+            verdict: that holds, of those nodes alone.
             now_s: on any clock that only goes forward.
 
         Returns:
@@ -75,18 +73,6 @@ class Violations:
         more = f" and {len(found) - _NAMED} more" if len(found) > _NAMED else ""
         named = f"{', '.join(found[:_NAMED])}{more}"
         return f"violated for no longer than {LASTS_S:g} s, and not counted: {named}"
-
-
-def without_nodes_of(verdict: Verdict, names: Collection[str]) -> Verdict:
-    """Return a verdict without what is found of these nodes: they are away, or not let through."""
-    if not names:
-        return verdict
-    away = frozenset(names)
-    findings = tuple(
-        each for each in verdict.findings if away.isdisjoint((*each.nodes, each.subject))
-    )
-    outcome = Outcome.worst(each.outcome for each in findings)
-    return dataclasses.replace(verdict, verdict=outcome, findings=findings)
 
 
 def _key(finding: Finding) -> _Key:

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import heapq
+import itertools
 import random
+from collections import deque
+from collections.abc import Callable, Iterable
 
-from lifecycle.graph import (
-    GraphEvents,
-    GraphReporter,
-    GraphState,
-    InMemoryNetwork,
-    InMemoryTransport,
-    ManualScheduler,
-    every,
-)
+from lifecycle.graph import GraphEvents, GraphReporter, GraphState, Remove, Scheduler
 from lifecycle.graph.state import Fetch
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.node.configuration import checksum
@@ -25,6 +21,139 @@ SILENT_AFTER_S = 7.0
 ANSWER_S = 0.03
 TIMEOUT_S = 1.0
 KINDS = (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION, EndpointKind.SERVICE_SERVER)
+
+
+class ManualScheduler:
+    """Time that moves only by `advance`; what is posted runs at once, or after what runs now."""
+
+    def __init__(self) -> None:
+        self._now_s = 0.0
+        self._timers: list[tuple[float, int, list[Callable[[], None]]]] = []
+        self._count = itertools.count()
+        self._posted: deque[Callable[[], None]] = deque()
+        self._running = False
+
+    def now_s(self) -> float:
+        return self._now_s
+
+    def post(self, work: Callable[[], None]) -> None:
+        self._posted.append(work)
+        if self._running:
+            return
+        self._running = True
+        try:
+            while self._posted:
+                self._posted.popleft()()
+        finally:
+            self._running = False
+            self._posted.clear()
+
+    def call_at(self, when_s: float, work: Callable[[], None]) -> Remove:
+        entry = [work]
+        heapq.heappush(self._timers, (when_s, next(self._count), entry))
+        return entry.clear
+
+    def advance(self, seconds: float) -> None:
+        end_s = self._now_s + seconds
+        while self._timers and self._timers[0][0] <= end_s:
+            due_s, _, entry = heapq.heappop(self._timers)
+            if entry:
+                self._now_s = max(self._now_s, due_s)
+                self.post(entry.pop())
+        self._now_s = end_s
+
+
+def every(scheduler: Scheduler) -> Callable[[float, Callable[[], None]], Remove]:
+    """Return a periodic timer that runs in `scheduler`."""
+
+    def start(period_s: float, work: Callable[[], None]) -> Remove:
+        cancel: list[Remove] = []
+
+        def run() -> None:
+            cancel[:] = [scheduler.call_at(scheduler.now_s() + period_s, run)]
+            work()
+
+        cancel.append(scheduler.call_at(scheduler.now_s() + period_s, run))
+        return lambda: [each() for each in cancel] and None
+
+    return start
+
+
+class Network:
+    """Carries messages between its transports; it can lose, double, delay and part them."""
+
+    def __init__(self, scheduler: Scheduler, seed: int = 0) -> None:
+        self.scheduler = scheduler
+        self.loss = self.duplication = 0.0
+        self.delay_s = (0.0, 0.0)
+        self.transports: list[Transport] = []
+        self.islands: dict[Transport, int] = {}
+        self.chance = random.Random(seed)
+
+    def transport(self) -> Transport:
+        self.transports.append(Transport(self))
+        return self.transports[-1]
+
+    def partition(self, *groups: Iterable[Transport]) -> None:
+        self.islands = {each: number for number, group in enumerate(groups, 1) for each in group}
+
+    def heal(self) -> None:
+        parted, self.islands = self.islands, {}
+        if parted:
+            self.meet(self.transports)
+
+    def together(self, one: Transport, other: Transport) -> bool:
+        return self.islands.get(one) == self.islands.get(other)
+
+    def meet(self, transports: Iterable[Transport]) -> None:
+        for each in tuple(transports):
+            self.scheduler.post(lambda each=each: [call() for call in tuple(each.met)] and None)
+
+    def carry(self, sender: Transport, message: bytes) -> None:
+        for receiver in [each for each in self.transports if self.together(each, sender)]:
+            for _ in range(1 + (self.chance.random() < self.duplication)):
+                if not receiver.calls or self.chance.random() < self.loss:
+                    continue
+                arrive = lambda receiver=receiver: receiver.arrive(message)  # noqa: E731
+                due_s = self.scheduler.now_s() + self.chance.uniform(*self.delay_s)
+                if self.delay_s[1]:
+                    self.scheduler.call_at(due_s, arrive)
+                else:
+                    self.scheduler.post(arrive)
+
+
+class Transport:
+    """A `GraphTransport`."""
+
+    def __init__(self, network: Network) -> None:
+        self.network = network
+        self.calls: list[Callable[[bytes], None]] = []
+        self.met: list[Callable[[], None]] = []
+
+    def send(self, message: bytes) -> None:
+        if self in self.network.transports:
+            self.network.carry(self, message)
+
+    def receive(self, callback: Callable[[bytes], None]) -> Remove:
+        self.calls.append(callback)
+        self.network.meet(
+            each
+            for each in self.network.transports
+            if each is not self and self.network.together(each, self)
+        )
+        return lambda: self.calls.remove(callback)
+
+    def on_peer(self, callback: Callable[[], None]) -> Remove:
+        self.met.append(callback)
+        return lambda: self.met.remove(callback) if callback in self.met else None
+
+    def arrive(self, message: bytes) -> None:
+        for call in tuple(self.calls):
+            call(message)
+
+    def close(self) -> None:
+        self.calls.clear()
+        self.network.transports.remove(self)
 
 
 def endpoint(number: int, topic: str, kind: EndpointKind = KINDS[0]) -> EndpointReport:
@@ -168,9 +297,8 @@ class System:
 
     def __init__(self, seed: int = 0) -> None:
         self.scheduler = ManualScheduler()
-        self.network = InMemoryNetwork(self.scheduler, seed=seed)
+        self.network = Network(self.scheduler, seed)
         self.nodes: dict[str, SimulatedNode] = {}
-        self.islands: tuple[tuple[InMemoryTransport, ...], ...] = ()
         self._random = random.Random(seed)
         self._instances = 0
 
@@ -190,15 +318,7 @@ class System:
         if name in self.nodes:
             self.nodes.pop(name).leave()
 
-    def partition(self, *groups: tuple[InMemoryTransport, ...]) -> None:
-        self.islands = groups
-        self.network.partition(*groups)
-
-    def heal(self) -> None:
-        self.islands = ()
-        self.network.heal()
-
-    def fetch_from(self, reader: InMemoryTransport) -> Fetch:
+    def fetch_from(self, reader: Transport) -> Fetch:
         """Return how `reader` asks nodes: a while later, from the instance that is there then."""
 
         def fetch(name: str, done: object) -> None:
@@ -208,7 +328,7 @@ class System:
             def answer() -> None:
                 node = self.nodes.get(name)
                 lost = self._random.random() < self.network.loss
-                if node is None or lost or not self._together(node.transport, reader):
+                if node is None or lost or not self.network.together(node.transport, reader):
                     self.scheduler.call_at(now_s + TIMEOUT_S, lambda: done(None))
                     return
                 document = node.truth
@@ -221,15 +341,6 @@ class System:
 
     def calm(self) -> None:
         """No more accidents, and time for heartbeats to tell what was lost."""
-        self.heal()
+        self.network.heal()
         self.network.loss = self.network.duplication = 0.0
         self.scheduler.advance(SILENT_AFTER_S + 2 * PERIOD_S + TIMEOUT_S)
-
-    def _together(self, one: InMemoryTransport, other: InMemoryTransport) -> bool:
-        def island(transport: InMemoryTransport) -> int:
-            for number, group in enumerate(self.islands):
-                if transport in group:
-                    return number
-            return -1
-
-        return island(one) == island(other)

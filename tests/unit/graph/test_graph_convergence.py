@@ -68,9 +68,9 @@ def disturb(system: System, operation: str, name: str, number: int) -> None:
         system.leave(name)
     elif operation == "part":
         cut = tuple(each.transport for each in system.nodes.values())
-        system.partition(cut[number % (len(cut) + 1) :])
+        system.network.partition(cut[number % (len(cut) + 1) :])
     elif operation == "heal":
-        system.heal()
+        system.network.heal()
     elif node is not None:
         {
             "state": lambda: node.change_state(STATES[number % 3]),
@@ -160,9 +160,9 @@ def test_200_nodes_with_2000_endpoints_converge(seed: int) -> None:
         if accidents.random() < 0.3:
             transports = [each.transport for each in system.nodes.values()]
             accidents.shuffle(transports)
-            system.partition(tuple(transports[:100]))
+            system.network.partition(tuple(transports[:100]))
         elif accidents.random() < 0.4:
-            system.heal()
+            system.network.heal()
     for name in accidents.sample(names, 5):
         system.kill(name)
     for name in accidents.sample(names, 5):

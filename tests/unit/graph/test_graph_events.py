@@ -6,23 +6,18 @@ import logging
 from typing import Any
 
 import pytest
-from simulated import configuration, endpoint
+from simulated import ManualScheduler, Network, configuration, endpoint
 
 from lifecycle.graph import (
-    AliveNotice,
     EventKind,
     GraphEvent,
     GraphEvents,
     GraphMessage,
     Heartbeat,
-    InMemoryNetwork,
     Joined,
     Left,
-    ManualScheduler,
     NodeLiveliness,
-    SilentNotice,
     StateChanged,
-    StuckNotice,
     encode,
 )
 from lifecycle.graph.membership import WINDOW
@@ -33,7 +28,7 @@ class Stage:
 
     def __init__(self) -> None:
         self.scheduler = ManualScheduler()
-        network = InMemoryNetwork(self.scheduler)
+        network = Network(self.scheduler)
         self._wire = network.transport()
         self.events = GraphEvents(network.transport(), self.scheduler)
         self.told: list[GraphEvent] = []
@@ -208,53 +203,6 @@ def test_a_node_that_is_not_heard_is_silent_then_alive_or_gone(stage: Stage) -> 
     assert stage.told[-1].reason == "not heard any more"
 
 
-def test_what_is_reported_here_counts_until_it_is_taken_back(stage: Stage) -> None:
-    stage.events.report_stuck("/a", "nobody knows it")
-    stage.say(Joined, 1)
-    stage.events.report_stuck("/a", "its executor hangs")
-    stage.say(Heartbeat, 1)
-    assert stage.liveliness() == (NodeLiveliness.STUCK, "its executor hangs")
-    stage.events.report_silent("/a", "its process stopped")
-    assert stage.liveliness() == (NodeLiveliness.SILENT, "its process stopped")
-    stage.events.report_alive("/a")
-    assert stage.liveliness() == (NodeLiveliness.ALIVE, "")
-
-
-def test_a_notice_counts_until_its_sender_takes_it_back_or_leaves(stage: Stage) -> None:
-    stage.say(Joined, 1)
-    stage.say(Joined, 1, node="/b")
-    stage.say(StuckNotice, 2, node="/b", about="/a", reason="hangs")
-    assert stage.liveliness() == (NodeLiveliness.STUCK, "hangs")
-    stage.say(AliveNotice, 3, node="/b", about="/a")
-    assert stage.liveliness() == (NodeLiveliness.ALIVE, "")
-    stage.say(StuckNotice, 4, node="/b", about="/a", reason="hangs again")
-    stage.say(Left, 5, node="/b")
-    assert stage.liveliness() == (NodeLiveliness.ALIVE, "")
-
-
-def test_a_notice_whose_end_was_lost_ends_with_the_next_heartbeat(stage: Stage) -> None:
-    stage.say(Joined, 1)
-    stage.say(Joined, 1, node="/b")
-    stage.say(StuckNotice, 2, node="/b", about="/a", reason="hangs")
-    stage.say(Heartbeat, 2, node="/b", stuck=("/a",))
-    assert stage.liveliness() == (NodeLiveliness.STUCK, "hangs")
-    stage.say(Heartbeat, 3, node="/b")
-    stage.scheduler.advance(0.2)
-    assert stage.liveliness() == (NodeLiveliness.ALIVE, "")
-
-
-def test_who_hears_a_node_overrules_who_does_not(stage: Stage) -> None:
-    stage.say(Joined, 1)
-    stage.say(Joined, 1, node="/b")
-    stage.say(SilentNotice, 2, node="/b", about="/a", reason="not heard")
-    assert stage.liveliness() == (NodeLiveliness.SILENT, "not heard")
-    stage.say(Heartbeat, 1)
-    stage.say(Heartbeat, 2, node="/b", silent=("/a",))
-    assert stage.liveliness() == (NodeLiveliness.ALIVE, "")
-    stage.say(SilentNotice, 3, node="/b", about="/a", reason="again")
-    assert stage.liveliness() == (NodeLiveliness.SILENT, "again")
-
-
 def test_a_node_that_discovery_shows_is_a_member_and_may_speak_later(stage: Stage) -> None:
     stage.events.report_seen("/a")
     stage.events.report_seen("/a")
@@ -329,10 +277,10 @@ def test_an_exception_of_one_subscriber_spoils_nothing_for_the_next(
 
 def test_what_a_subscriber_causes_is_told_after_all_have_heard_the_event(stage: Stage) -> None:
     told: list[EventKind] = []
-    stage.events.on(EventKind.JOINED, lambda event: stage.events.report_stuck(event.node, "x"))
-    stage.events.on([EventKind.JOINED, EventKind.STUCK], lambda event: told.append(event.kind))
-    stage.say(Joined, 1)
-    assert told == [EventKind.JOINED, EventKind.STUCK]
+    stage.events.on(EventKind.JOINED, lambda event: stage.events.report_gone("/seen"), node="/seen")
+    stage.events.on([EventKind.JOINED, EventKind.LEFT], lambda event: told.append(event.kind))
+    stage.events.report_seen("/seen")
+    assert told == [EventKind.JOINED, EventKind.LEFT]
 
 
 def test_after_closing_nothing_is_told_and_no_timer_is_left(stage: Stage) -> None:

@@ -10,9 +10,9 @@ import jsonschema
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from simulated import ManualScheduler, Network
 
 from lifecycle.graph import (
-    AliveNotice,
     ConfigurationChanged,
     ConnectionEstablished,
     ConnectionLost,
@@ -20,15 +20,11 @@ from lifecycle.graph import (
     GraphMessage,
     GraphMessageError,
     Heartbeat,
-    InMemoryNetwork,
     Joined,
     Left,
-    ManualScheduler,
     MappingEstablished,
     MappingLost,
-    SilentNotice,
     StateChanged,
-    StuckNotice,
     decode,
     encode,
     new_incarnation,
@@ -43,15 +39,12 @@ SAMPLES: list[GraphMessage] = [
     Joined(**HEADER, state="inactive", connected=True, checksum="ab"),
     Left(**HEADER, reason="shutdown"),
     StateChanged(**HEADER, state="active", connected=True),
-    Heartbeat(**HEADER, state="active", connected=True, checksum="ab", silent=("/a",)),
+    Heartbeat(**HEADER, state="active", connected=True, checksum="ab"),
     ConfigurationChanged(**HEADER, checksum="cd"),
     ConnectionEstablished(**HEADER, connection="net", urls=("shm://",)),
     ConnectionLost(**HEADER, connection="net", urls=("shm://",), error="unplugged"),
     MappingEstablished(**HEADER, endpoint="publishers/video", connection="net", matched=2),
     MappingLost(**HEADER, endpoint="publishers/video", connection="net", error="gone"),
-    SilentNotice(**HEADER, about="/viewer", reason="no heartbeat"),
-    StuckNotice(**HEADER, about="/viewer", reason="executor"),
-    AliveNotice(**HEADER, about="/viewer"),
 ]
 
 
@@ -90,8 +83,7 @@ def test_fields_that_nobody_knows_are_passed_over() -> None:
             (
                 "cannot read a graph message of version 2 and kind 'joined'; known are version 1"
                 " and joined, left, state_changed, heartbeat, configuration_changed,"
-                " connection_established, connection_lost, mapping_established, mapping_lost,"
-                " silent, stuck, alive"
+                " connection_established, connection_lost, mapping_established, mapping_lost"
             ),
         ),
         (
@@ -121,7 +113,7 @@ def test_no_bytes_make_decoding_crash(data: bytes) -> None:
 
 def test_what_is_no_message_is_counted_and_ignored() -> None:
     scheduler = ManualScheduler()
-    network = InMemoryNetwork(scheduler)
+    network = Network(scheduler)
     events = GraphEvents(network.transport(), scheduler)
     sender = network.transport()
     sender.send(b"hello")

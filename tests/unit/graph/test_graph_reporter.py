@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 
 import pytest
+from simulated import ManualScheduler, Network, Transport, every
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.graph import (
@@ -12,22 +13,18 @@ from lifecycle.graph import (
     GraphMessage,
     GraphReporter,
     Heartbeat,
-    InMemoryNetwork,
-    InMemoryTransport,
-    ManualScheduler,
     decode,
-    every,
 )
 
 
 class Listener:
     def __init__(self) -> None:
         self.scheduler = ManualScheduler()
-        self.network = InMemoryNetwork(self.scheduler)
+        self.network = Network(self.scheduler)
         self.heard: list[GraphMessage] = []
         self.network.transport().receive(lambda data: self.heard.append(decode(data)))
 
-    def reporter(self, transport: InMemoryTransport | None = None) -> GraphReporter:
+    def reporter(self, transport: Transport | None = None) -> GraphReporter:
         return GraphReporter(
             transport or self.network.transport(),
             "/camera",
@@ -84,21 +81,8 @@ def test_nothing_is_told_before_joining_or_after_leaving() -> None:
     reporter.left()
     reporter.left()
     reporter.joined("inactive")
-    reporter.silent("/viewer")
+    reporter.configuration_changed("b")
     assert listener.kinds == [(GraphKind.JOINED, 1), (GraphKind.LEFT, 2)]
-
-
-def test_a_notice_is_repeated_by_heartbeats_until_it_is_taken_back() -> None:
-    listener = Listener()
-    reporter = listener.reporter()
-    reporter.joined()
-    reporter.silent("/a", "gone")
-    reporter.stuck("/b", "hangs")
-    reporter.announce()
-    reporter.alive("/a")
-    reporter.announce()
-    beats = [each for each in listener.heard if isinstance(each, Heartbeat)]
-    assert [(each.silent, each.stuck) for each in beats] == [(("/a",), ("/b",)), ((), ("/b",))]
 
 
 def test_somebody_who_comes_later_is_told_at_once() -> None:

@@ -7,45 +7,12 @@ import logging
 import threading
 
 import pytest
+from simulated import ManualScheduler
 
-from lifecycle.graph import LoopScheduler, ManualScheduler, ThreadScheduler, every, set_within
+from lifecycle.graph import LoopScheduler, ThreadScheduler, set_within
 from lifecycle.graph.scheduler import Deadlines
 
 LIMIT_S = 5.0
-
-
-def test_manual_time_runs_what_is_due_in_its_order() -> None:
-    scheduler, ran = ManualScheduler(), []
-    scheduler.call_at(2.0, lambda: ran.append(("late", scheduler.now_s())))
-    scheduler.call_at(1.0, lambda: ran.append(("early", scheduler.now_s())))
-    scheduler.call_at(1.5, lambda: ran.append(("never", 0.0)))()
-    scheduler.advance(3.0)
-    assert ran == [("early", 1.0), ("late", 2.0)]
-    assert scheduler.now_s() == 3.0
-
-
-def test_what_is_posted_while_something_runs_runs_after_it() -> None:
-    scheduler, ran = ManualScheduler(), []
-
-    def outer() -> None:
-        scheduler.post(lambda: ran.append("inner"))
-        ran.append("outer")
-
-    scheduler.post(outer)
-    assert ran == ["outer", "inner"]
-
-
-def test_a_periodic_timer_runs_until_it_is_stopped_even_by_itself() -> None:
-    scheduler, ran = ManualScheduler(), []
-    stop = every(scheduler)(1.0, lambda: ran.append(scheduler.now_s()))
-    scheduler.advance(3.5)
-    stop()
-    scheduler.advance(10.0)
-    assert ran == [1.0, 2.0, 3.0]
-    stops = []
-    stops.append(every(scheduler)(1.0, lambda: (ran.append("once"), stops[0]())))
-    scheduler.advance(10.0)
-    assert ran[3:] == ["once"]
 
 
 def test_a_thread_runs_posts_and_timers_and_survives_an_exception(

@@ -7,7 +7,15 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from simulated import ANSWER_S, Reader, System, configuration, endpoint
+from simulated import (
+    ANSWER_S,
+    ManualScheduler,
+    Network,
+    Reader,
+    System,
+    configuration,
+    endpoint,
+)
 
 from lifecycle.graph import (
     End,
@@ -16,9 +24,7 @@ from lifecycle.graph import (
     GraphMessage,
     GraphState,
     Heartbeat,
-    InMemoryNetwork,
     Joined,
-    ManualScheduler,
     MappingLost,
     NodeLiveliness,
     NodeView,
@@ -85,7 +91,7 @@ def test_an_endpoint_more_is_told_as_exactly_that(followed: Followed) -> None:
     change = followed.change()
     assert change.endpoints.added == (node.truth.endpoints[-1],)
     assert (change.endpoints.removed, change.endpoints.changed) == ((), ())
-    assert (change.state_changed, change.liveliness_changed) == (False, False)
+    assert not change.state_changed
     assert [end.node.name for end in followed.state.publishers_of("/new")] == ["/a"]
 
 
@@ -162,7 +168,7 @@ class Asked:
 
     def __init__(self) -> None:
         self.scheduler = ManualScheduler()
-        network = InMemoryNetwork(self.scheduler)
+        network = Network(self.scheduler)
         self._wire = network.transport()
         self.questions: list[Callable[[NodeConfiguration | None], None]] = []
         events = GraphEvents(network.transport(), self.scheduler)
@@ -218,14 +224,14 @@ def test_a_node_that_could_not_be_read_is_read_at_the_next_heartbeat_or_retry() 
     followed.system.start("/a", endpoints=2)
     followed.system.network.loss = 0.0
     node = followed.system.nodes["/a"]
-    followed.system.partition((node.transport, followed.reader.transport))
+    followed.system.network.partition((node.transport, followed.reader.transport))
     node.reporter.announce()
     assert followed.state.node("/a") is not None
-    followed.system.islands = ((node.transport,),)  # messages come, answers do not
+    followed.system.network.partition((node.transport,))  # messages come, answers do not
     followed.system.scheduler.advance(1.5)
     assert followed.state.connections_of("/a") == ()
     assert followed.state.node("/a").configuration is None  # type: ignore[union-attr]
-    followed.system.heal()
+    followed.system.network.heal()
     followed.state.retry()
     followed.settle()
     assert followed.state.node("/a").configuration == node.truth  # type: ignore[union-attr]

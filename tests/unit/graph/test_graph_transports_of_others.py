@@ -10,17 +10,22 @@ from collections import deque
 from collections.abc import Callable
 
 import pytest
-from simulated import PERIOD_S, SILENT_AFTER_S, configuration, endpoint
+from simulated import (
+    PERIOD_S,
+    SILENT_AFTER_S,
+    ManualScheduler,
+    Network,
+    configuration,
+    endpoint,
+    every,
+)
 
 from lifecycle.graph import (
     GraphEvents,
     GraphReporter,
     GraphState,
     GraphTransport,
-    InMemoryNetwork,
-    ManualScheduler,
     Remove,
-    every,
 )
 from lifecycle.verify.observation import NodeConfiguration
 
@@ -115,7 +120,7 @@ class Ways:
     @classmethod
     def without_a_master(cls) -> Ways:
         ways = cls()
-        ways.left = ways.right = InMemoryNetwork(ways.scheduler).transport
+        ways.left = ways.right = Network(ways.scheduler).transport
         return ways
 
     @classmethod
@@ -127,7 +132,7 @@ class Ways:
     @classmethod
     def over_a_bridge(cls) -> Ways:
         ways = cls()
-        networks = [InMemoryNetwork(ways.scheduler) for _ in range(2)]
+        networks = [Network(ways.scheduler) for _ in range(2)]
         bridge(*(each.transport() for each in networks))
         ways.left, ways.right = (each.transport for each in networks)
         return ways

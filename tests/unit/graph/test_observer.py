@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import pytest
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.graph import GraphEvents, ManualScheduler
+from lifecycle.graph import GraphEvents
 from lifecycle.graph.observer import Diagnostic, DiagnosticReadings, Observer
 from lifecycle.manifest.model import (
     EndpointKind,
@@ -30,6 +30,7 @@ from lifecycle.verify.observation import (
 )
 from lifecycle.verify.tool_filter import NO_NAMES, DeclaredNames
 from tests.builders import configuration, plan_of, planned_node
+from tests.unit.graph.simulated import ManualScheduler
 from tests.unit.supervisor.fakes import run as run_jumping
 
 T = TypeVar("T")

@@ -14,14 +14,13 @@ import pytest
 from lifecycle.graph import (
     GraphEvents,
     GraphReporter,
-    InMemoryNetwork,
     LoopScheduler,
-    every,
 )
 from lifecycle.graph.observer import Observer
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.verify import Stage, verify
 from lifecycle.verify.observation import EndpointReport, ObservedEndpoint, ObservedNode
+from tests.unit.graph.simulated import Network, every
 from tests.unit.graph.test_observer import FakeClients, FakeGraph, configuration, plan
 from tests.unit.supervisor.fakes import run
 
@@ -38,7 +37,7 @@ class World:
     def __init__(self, *, follows: bool = True) -> None:
         self.graph, self.clients = FakeGraph(), FakeClients()
         self.scheduler = LoopScheduler()
-        self.network = InMemoryNetwork(self.scheduler)
+        self.network = Network(self.scheduler)
         events = GraphEvents(self.network.transport(), self.scheduler)
         self.observer = Observer(self.graph, self.clients, events, follows=follows)
         self.state = self.observer.state
@@ -185,7 +184,7 @@ class _Ahead(LoopScheduler):
 def test_a_node_that_is_there_at_once_may_be_read_before_the_observer_is_made_to_its_end() -> None:
     async def main() -> None:
         scheduler = _Ahead()
-        network = InMemoryNetwork(scheduler)
+        network = Network(scheduler)
         events = GraphEvents(network.transport(), scheduler)
         events.report_seen("/it")
         clients = FakeClients()

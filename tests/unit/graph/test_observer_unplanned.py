@@ -9,14 +9,13 @@ from lifecycle.graph import (
     GraphEvents,
     GraphMessage,
     Heartbeat,
-    InMemoryNetwork,
-    ManualScheduler,
     StateChanged,
     encode,
     set_within,
 )
 from lifecycle.graph.observer import Observer
 from lifecycle.verify.observation import ObservedNode
+from tests.unit.graph.simulated import ManualScheduler, Network
 from tests.unit.graph.test_observer import FakeClients, FakeGraph, configuration, observing, plan
 from tests.unit.supervisor.fakes import run
 
@@ -72,7 +71,7 @@ def test_a_message_is_worth_a_look_and_a_heartbeat_only_with_a_new_checksum() ->
 
     async def main() -> None:
         graph, clients, _ = world(unplanned=True)
-        network = InMemoryNetwork(scheduler := ManualScheduler())
+        network = Network(scheduler := ManualScheduler())
         events = GraphEvents(network.transport(), scheduler)
         observer = Observer(graph, clients, events, unplanned=True)
         sender = network.transport()
