@@ -9,13 +9,12 @@ rmw_cyclonedds announce hashes since Iron.
 from __future__ import annotations
 
 import contextlib
-import operator
 import os
 import re
 import threading
 import time
 import typing
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 
 import rclpy
 from rclpy.node import Node
@@ -136,55 +135,6 @@ class _Service:
         return tuple(sorted(found)) or ("",)
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class _ShownNode:
-    """What one snapshot made of the endpoints of one node.
-
-    Attributes:
-        shown: all of them.
-        ours: the services of the node interface are its own.
-        meant: without what client libraries bring along.
-        hashed: the same with the type hashes of services.
-        endpoints: the same with the parts of actions folded, in the order of a snapshot.
-    """
-
-    shown: Sequence[ObservedEndpoint]
-    ours: bool
-    meant: tuple[ObservedEndpoint, ...]
-    hashed: Sequence[ObservedEndpoint]
-    endpoints: tuple[ObservedEndpoint, ...]
-
-
-class _Kept:
-    """The parts of one snapshot, which the next one takes over where rcl gives the same.
-
-    rcl does not say what changed, so all is asked each time; what is made of the answers is not
-    made again, and is the same object.
-
-    Attributes:
-        topical: by kind, topic and identity of the info that they come from, which is kept with
-            them; None for an endpoint that is left out.
-        services: of each node, by what rcl listed.
-        hashed: services by the identity of what they had no hash as, which is kept with them.
-        nodes: of the graph, by name.
-        shown: by node name.
-    """
-
-    def __init__(self, declared: frozenset[str], names: DeclaredNames) -> None:
-        self.declared = declared
-        self.names = names
-        self.topical: dict[
-            tuple[EndpointKind, str, int], tuple[EndpointInfo, ObservedEndpoint | None]
-        ] = {}
-        self.services: dict[str, tuple[_Listed, tuple[ObservedEndpoint, ...], bool]] = {}
-        self.hashed: dict[
-            tuple[int, str | None, tuple[str, ...]],
-            tuple[ObservedEndpoint, tuple[ObservedEndpoint, ...]],
-        ] = {}
-        self.nodes: dict[str, ObservedNode] = {}
-        self.shown: dict[str, _ShownNode] = {}
-
-
 _Listed = tuple[tuple[EndpointKind, tuple[tuple[str, str], ...]], ...]
 """Name and type of what rcl lists of a node, by kind."""
 
@@ -266,7 +216,7 @@ class GraphObserver:
         self._callbacks: tuple[Callable[[], None], ...] = ()
         self._destroyed = False
         self._known: frozenset[str] = frozenset()
-        self._last: _Kept | None = None
+        self._ours: frozenset[str] = frozenset()
         self._asked_for: set[str] = set()
         self._nameless_since_s: dict[str, float] = {}
         self._clock: Subscription[Clock] | None = None
@@ -334,8 +284,6 @@ class GraphObserver:
     ) -> Snapshot:
         """Return the nodes and the endpoints that discovery shows now, in a stable order.
 
-        A part that is shown as in the last snapshot for the same names is the same object.
-
         All but its own node, of which there is only what it publishes under `names`. The
         housekeeping of client libraries is left out. Services are known by their nodes, so those
         of no known node are looked for by name.
@@ -350,16 +298,12 @@ class GraphObserver:
         """
         if self._guard is not None and self._guard.failure is not None:
             raise self._guard.failure
-        last, self._last = self._last, None
-        if last is None or last.declared != frozenset(declared) or last.names is not names:
-            last = _Kept(frozenset(declared), names)
-        kept = _Kept(last.declared, names)
         if names.simulated and self.owns_node:
             self._watch_clock()
         counts = self._stale_node_filter.count()
         ourselves = self._name if self.owns_node and counts[self._name] == 1 else None
         shown: dict[str, list[ObservedEndpoint]] = {}
-        for each in self._topic_endpoints(kept, last):
+        for each in self._topic_endpoints(declared, names):
             shown.setdefault(each.node, []).append(each)
         if ourselves is not None:
             # Others match what a supervisor offers under names that are looked for.
@@ -367,24 +311,27 @@ class GraphObserver:
             if own := [each for each in own if names.looks_for(each.kind, each.name)]:
                 shown[ourselves] = own
         unreported = {""}
+        nodes: list[ObservedNode] = []
         for name in sorted(name for name in counts if known_node(name) and name != ourselves):
-            services, managed = self._services_of(name, kept, last)
-            known = last.nodes.get(name)
-            if known is None or (known.count, known.managed) != (counts[name], managed):
-                known = ObservedNode(full_name=name, count=counts[name], managed=managed)
-            kept.nodes[name] = known
+            services = self._services_of(name)
+            managed = None if services is None else _managed(name, services)
+            nodes.append(ObservedNode(full_name=name, count=counts[name], managed=managed))
             if services is None:
                 unreported.add(name)
             elif services:
                 shown.setdefault(name, []).extend(services)
         for each in self._services_of_others(names, unreported):
             shown.setdefault(each.node, []).append(each)
+        # One that leaves, endpoint by endpoint, stays ours.
+        self._ours = self._ours.intersection(shown).union(
+            *(our_nodes(endpoints) for endpoints in shown.values())
+        )
         queried: dict[str, _Service] = {}
+        endpoints: list[ObservedEndpoint] = []
         for name in sorted(shown):
-            kept.shown[name] = self._shown(name, shown[name], queried, kept, last)
-        self._last = kept
-        endpoints = tuple(each for node in kept.shown.values() for each in node.endpoints)
-        return tuple(kept.nodes.values()), endpoints
+            but = NO_NAMES if name in declared else names
+            endpoints += self._hashed(name, shown[name], but, queried)
+        return tuple(nodes), tuple(endpoints)
 
     def settling_s(self) -> float:
         """Return for how many seconds a snapshot may still miss nodes; 0 once it cannot.
@@ -655,78 +602,53 @@ class GraphObserver:
         for callback in self._callbacks:
             callback()
 
-    def _topic_endpoints(self, kept: _Kept, last: _Kept) -> Iterator[ObservedEndpoint]:
+    def _topic_endpoints(
+        self, declared: Collection[str], names: DeclaredNames
+    ) -> Iterator[ObservedEndpoint]:
         known: set[str] = set()
         for kind, topic, info in topic_endpoints(self.node):
             if self._stale_node_filter.ignores(info.gid):
                 continue
             if info.node:
                 known.add(info.gid[:_PREFIX_DIGITS])
-            place = (kind, topic, id(info))
-            silent = kind is EndpointKind.PUBLISHER and topic == CLOCK[0] and self._is_silent
-            made = last.topical.get(place)
-            if made is None or made[0] is not info or (made[1] and made[1].silent) != silent:
-                endpoint = _topic_endpoint(kind, topic, info, kept.declared, kept.names)
-                if endpoint is not None and silent:
-                    endpoint = dataclasses.replace(endpoint, silent=True)
-                made = info, endpoint
-            kept.topical[place] = made
-            if made[1] is not None:
-                yield made[1]
+            endpoint = _topic_endpoint(kind, topic, info, declared, names)
+            if endpoint is None:
+                continue
+            if kind is EndpointKind.PUBLISHER and topic == CLOCK[0] and self._is_silent:
+                endpoint = dataclasses.replace(endpoint, silent=True)
+            yield endpoint
         # Who was known and left is not on the way into the graph.
         self._known |= known
         self._named = frozenset(known)
 
-    def _shown(
+    def _hashed(
         self,
         name: str,
-        shown: Sequence[ObservedEndpoint],
+        shown: Iterable[ObservedEndpoint],
+        but: DeclaredNames,
         queried: dict[str, _Service],
-        kept: _Kept,
-        last: _Kept,
-    ) -> _ShownNode:
+    ) -> Iterable[ObservedEndpoint]:
         """Return what is judged of one node's endpoints; `queried` are services asked for so far.
 
         The graph lists services by name and type only; their requests and replies are DDS topics
         like all others, `rq/NAMERequest` and `rr/NAMEReply`, whose endpoints announce the hashes.
         """
-        known = last.shown.get(name)
-        if known is not None and _same(known.shown, shown):
-            ours, meant = known.ours, known.meant
-        else:
-            # One that leaves, endpoint by endpoint, stays ours.
-            ours = (known is not None and known.ours) or name in our_nodes(shown)
-            meant = without_noise(
-                shown,
-                but=NO_NAMES if name in kept.declared else kept.names,
-                ours={name} if ours else (),
-            )
         hashed: list[ObservedEndpoint] = []
         ignores = self._stale_node_filter.ignores
-        for each in meant:
+        for each in without_noise(shown, but=but, ours=self._ours):
             if each.kind not in (EndpointKind.SERVICE_SERVER, EndpointKind.SERVICE_CLIENT):
                 hashed.append(each)
                 continue
             if each.name not in queried:
                 queried[each.name] = _Service.of(self.node, each.name)
             service = queried[each.name]
-            place = (id(each), service.hash_of(each), service.servers_of(each, ignores))
-            made = last.hashed.get(place)
-            if made is None or made[0] is not each:
-                made = (
-                    each,
-                    tuple(
-                        dataclasses.replace(each, type_hash=place[1], gid=gid) for gid in place[2]
-                    ),
-                )
-            kept.hashed[place] = made
-            hashed += made[1]
-        if name and known is not None and _same(known.hashed, hashed):
-            endpoints = known.endpoints
-        else:
-            folded = fold_actions(hashed)
-            endpoints = tuple(sorted(folded if name else self._located(folded), key=_order))
-        return _ShownNode(shown, ours, meant, hashed, endpoints)
+            type_hash = service.hash_of(each)
+            hashed += (
+                dataclasses.replace(each, type_hash=type_hash, gid=gid)
+                for gid in service.servers_of(each, ignores)
+            )
+        folded = fold_actions(hashed)
+        return sorted(folded if name else self._located(folded), key=_order)
 
     def _services_of_others(
         self, names: DeclaredNames, unreported: Collection[str]
@@ -820,28 +742,16 @@ class GraphObserver:
                 found[kind] += [(service, each) for each in sorted(types)]
         return tuple((kind, tuple(found[kind])) for kind, _ in sides)
 
-    def _services_of(
-        self, full_name: str, kept: _Kept, last: _Kept
-    ) -> tuple[tuple[ObservedEndpoint, ...] | None, bool | None]:
-        """Return the service endpoints of a node, and whether it is driven by such services."""
+    def _services_of(self, full_name: str) -> tuple[ObservedEndpoint, ...] | None:
+        """Return the service endpoints of a node; None if rcl does not show them."""
         listed = self._services(full_name)
         if listed is None:
-            return None, None
-        made = last.services.get(full_name)
-        if made is None or made[0] != listed:
-            endpoints = tuple(
-                ObservedEndpoint(kind=kind, node=full_name, name=service, type=type_)
-                for kind, services in listed
-                for service, type_ in services
-            )
-            made = listed, endpoints, _managed(full_name, endpoints)
-        kept.services[full_name] = made
-        return made[1], made[2]
-
-
-def _same(one: Sequence[object], other: Sequence[object]) -> bool:
-    """Return whether two sequences hold the same objects."""
-    return len(one) == len(other) and all(map(operator.is_, one, other))
+            return None
+        return tuple(
+            ObservedEndpoint(kind=kind, node=full_name, name=service, type=type_)
+            for kind, services in listed
+            for service, type_ in services
+        )
 
 
 def _observing_node(

@@ -108,8 +108,6 @@ class _Infos(ctypes.Structure):
 class EndpointInfo:
     """A DDS endpoint as discovery shows it.
 
-    Queries return the same object for as long as discovery shows the same.
-
     Attributes:
         node: fully qualified name of its node; empty while that is not known.
         type: `std_msgs/msg/String`; that of DDS where it was asked for by a DDS name.
@@ -245,7 +243,7 @@ def endpoints_of_node(
 
 @functools.lru_cache(maxsize=1 << 10)
 def _as_text(found: _Named) -> tuple[tuple[str, str], ...]:
-    """Return name and type as text; the same object for the same bytes."""
+    """Return name and type as text; graphs are read again and again, and hardly change."""
     return tuple((_text(each), _text(type_)) for each, types in found for type_ in types)
 
 
@@ -306,7 +304,7 @@ _MOST_KEPT = 1 << 14
 
 @functools.lru_cache(maxsize=_MOST_KEPT)
 def _endpoint(name: bytes, namespace: bytes, type_: bytes, announced: bytes) -> EndpointInfo:
-    """Read an info; the same object for the same bytes, so that what has not changed is known."""
+    """Read an info; graphs are read again and again, and hardly change."""
     info = _Announced.from_buffer_copy(announced)
     base, version = _text(name), info.hash_version
     return EndpointInfo(
