@@ -54,12 +54,6 @@ class Counting(LifecycleNode):
         return Fibonacci.Result(sequence=counted)
 
 
-def change(driver: Driver, node: LifecycleNode, label: str) -> Any:
-    future = driver.executor.create_task(node.lifecycle.change, label)
-    driver.spin_until(future.done)
-    return future.result()
-
-
 def step(driver: Driver, node: Counting) -> None:
     driver.spin_until(lambda: node.go_on is not None and not node.go_on.done())
     assert node.go_on is not None

@@ -115,6 +115,12 @@ class Driver:
         self.spin_until(answered)
         return next(each for each in sent if each.done()).result()
 
+    def run(self, function: Callable[..., Any], *arguments: object) -> Any:
+        """Run a coroutine function in the executor; returns its result once it has ended."""
+        future = self.executor.create_task(function, *arguments)
+        self.spin_until(future.done)
+        return future.result()
+
     def change(self, node: str, *, id_: int = 0, label: str = "") -> bool:
         """Ask for a transition; rclpy's own nodes raise on an invalid one, which counts as no."""
         request = ChangeState.Request(transition=Transition(id=id_, label=label))

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 from asking import Asking, knows_a_client
-from counting import ABORTED, SUCCEEDED, TYPE, Counting, change, client, server, step
+from counting import ABORTED, SUCCEEDED, TYPE, Counting, client, server, step
 from lifecycle_driver import Driver
 from planning import publisher, subscription
 from rclpy.action import ActionServer
@@ -163,7 +163,7 @@ def test_a_blocking_call_in_a_callback_is_an_error_and_not_a_deadlock(
         "get_result": ("a result of action 'count'", "goal_handle.get_result_async()"),
         "cancel_goal": ("action 'count' to cancel a goal", "goal_handle.cancel_goal_async()"),
     }[way]
-    assert change(driver, node, "activate").error == str(
+    assert driver.run(node.lifecycle.change, "activate").error == str(
         DeadlockError(
             f"cannot wait for {what} in a callback: the answer comes by the executor that waits "
             "for this callback",
@@ -214,7 +214,7 @@ def test_remapping_all_hidden_names_renames_the_action(
 def test_remapping_some_hidden_names_is_refused_at_connect(driver: Driver, active: Active) -> None:
     remap = (("count/_action/send_goal", "tally/_action/send_goal"),)
     node = active(Counting, server(), publisher("stop"), remap=remap, to="configure")
-    error = change(driver, node, "connect").error
+    error = driver.run(node.lifecycle.change, "connect").error
     assert error.startswith(
         "cannot connect action server 'count' of /it: cannot remap only some of action 'count'"
     )

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 from asking import Asking
-from counting import ABORTED, CANCELED, SUCCEEDED, Counting, change, server, step
+from counting import ABORTED, CANCELED, SUCCEEDED, Counting, server, step
 from lifecycle_driver import Driver
 from planning import publisher
 from rclpy.task import Future
@@ -288,7 +288,7 @@ def test_a_missing_handler_and_one_too_many_are_told_at_configure(
     driver: Driver, active: Active
 ) -> None:
     node = active(Choosy, server("cuont"), publisher("stop"), to="")
-    assert change(driver, node, "configure").error.splitlines() == [
+    assert driver.run(node.lifecycle.change, "configure").error.splitlines() == [
         (
             "cannot use handler Choosy.may_count: @on_goal('count') names no action server that "
             "/it declares; did you mean 'cuont'? declared: 'cuont'"

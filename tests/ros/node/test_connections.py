@@ -29,7 +29,7 @@ from lifecycle.node.endpoints.mapping import UnknownEndpointError
 from lifecycle.plan.model import ParticipantConnections, PlannedParticipant
 from lifecycle.verify.observation import NodeConfiguration
 
-Build = Callable[..., Any]
+Active = Callable[..., Any]
 STRICT = UniqueRequirement.STRICTLY_REQUIRED
 UDP = "udpv4://127.0.0.1"
 OTHER_UDP = "udpv4://127.0.0.1?max_datagram_bytes=1400"
@@ -44,7 +44,9 @@ class Talking(LifecycleNode):
 class Hearing(LifecycleNode):
     """Receives on `in` and on whatever it is called."""
 
-    heard: list[str]
+    def __init__(self) -> None:
+        super().__init__()
+        self.heard: list[str] = []
 
     @on_message("in")
     def receive(self, message: String) -> None:
@@ -59,43 +61,9 @@ class Everything(Hearing):
 
 
 @pytest.fixture
-def build(driver: Driver, context: rclpy.Context) -> Build:
-    """Construct a class from a plan, spin it and bring it to a state."""
-
-    def build(
-        node_class: type[LifecycleNode], *endpoints: Any, to: str = "activate", **plan: Any
-    ) -> Any:
-        with built_with(planned("it", *endpoints, **plan), context):
-            node = node_class()
-        node.heard = []
-        driver.add(node)
-        for label in ("configure", "connect", "activate"):
-            assert driver.set("/it", label)
-            if label == to:
-                break
-        return node
-
-    return build
-
-
-@pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     """A client that is handed over has no peers that could end its patience."""
     monkeypatch.setattr(mapper, "PATIENCE_S", 0.1)
-
-
-@pytest.fixture
-def configured(driver: Driver, build: Build) -> Build:
-    def configured(node_class: type[LifecycleNode], *endpoints: Any, **plan: Any) -> Any:
-        return build(node_class, *endpoints, to="configure", **plan)
-
-    return configured
-
-
-def change(driver: Driver, node: LifecycleNode, label: str) -> Any:
-    future = driver.executor.create_task(node.lifecycle.change, label)
-    driver.spin_until(future.done)
-    return future.result()
 
 
 def configuration(driver: Driver) -> NodeConfiguration:
@@ -112,8 +80,10 @@ def numbers(first: int, count: int) -> list[str]:
 
 
 @pytest.mark.usefixtures("impatient")
-def test_one_connection_carries_many_mappings_of_every_kind(driver: Driver, build: Build) -> None:
-    node = build(Everything, subscription("in"), publisher("out"), server("reset"), client("reset"))
+def test_one_connection_carries_many_mappings_of_every_kind(driver: Driver, active: Active) -> None:
+    node = active(
+        Everything, subscription("in"), publisher("out"), server("reset"), client("reset")
+    )
     net = node.connect_to(UDP, name="net")
     mapped = (
         "subscriptions/in",
@@ -156,9 +126,9 @@ def test_one_connection_carries_many_mappings_of_every_kind(driver: Driver, buil
 
 
 def test_a_subscription_is_handed_over_under_traffic_and_nothing_is_lost(
-    driver: Driver, build: Build
+    driver: Driver, active: Active
 ) -> None:
-    node = build(Hearing, reliable(subscription, "in"))
+    node = active(Hearing, reliable(subscription, "in"))
     sender = driver.node.create_publisher(String, "/in", RELIABLE)
     driver.spin_until(lambda: sender.get_subscription_count() == 1)
     sent = [0]
@@ -187,9 +157,9 @@ def test_a_subscription_is_handed_over_under_traffic_and_nothing_is_lost(
 
 
 def test_a_publisher_is_handed_over_under_traffic_and_its_handle_stays(
-    driver: Driver, build: Build
+    driver: Driver, active: Active
 ) -> None:
-    node = build(Talking, reliable(publisher, "out"))
+    node = active(Talking, reliable(publisher, "out"))
     heard: list[str] = []
     driver.node.create_subscription(String, "/out", lambda m: heard.append(m.data), RELIABLE)
     out = node.publisher("out")
@@ -227,9 +197,9 @@ def latecomer(driver: Driver, topic: str) -> list[str]:
 
 
 def test_what_a_transient_local_publisher_has_said_goes_along_with_it(
-    driver: Driver, build: Build
+    driver: Driver, active: Active
 ) -> None:
-    node = build(Talking, latched("map"))
+    node = active(Talking, latched("map"))
     for each in ("one", "two", "three"):
         node.publisher("map").publish(String(data=each))
     net = node.connect_to(UDP, name="net")
@@ -247,9 +217,9 @@ def test_what_a_transient_local_publisher_has_said_goes_along_with_it(
 
 
 def test_what_a_transient_local_publisher_has_said_waits_for_an_inactive_node(
-    driver: Driver, build: Build
+    driver: Driver, active: Active
 ) -> None:
-    node = build(Talking, latched("map"))
+    node = active(Talking, latched("map"))
     node.publisher("map").publish(String(data="old"))
     assert driver.set("/it", "deactivate")
     driver.spin_until(node.map_to("map", node.connect_to(UDP, name="net")).done)
@@ -262,9 +232,9 @@ def test_what_a_transient_local_publisher_has_said_waits_for_an_inactive_node(
 
 
 def test_a_disconnect_forgets_what_a_transient_local_publisher_has_said(
-    driver: Driver, build: Build
+    driver: Driver, active: Active
 ) -> None:
-    node = build(Talking, latched("map"))
+    node = active(Talking, latched("map"))
     node.publisher("map").publish(String(data="old"))
     for label in ("deactivate", "disconnect", "connect", "activate"):
         assert driver.set("/it", label)
@@ -275,8 +245,8 @@ def test_a_disconnect_forgets_what_a_transient_local_publisher_has_said(
     assert told == ["new"]
 
 
-def test_the_gate_holds_through_a_handover(driver: Driver, build: Build) -> None:
-    node = build(Hearing, subscription("in"), publisher("out"), to="connect")
+def test_the_gate_holds_through_a_handover(driver: Driver, active: Active) -> None:
+    node = active(Hearing, subscription("in"), publisher("out"), to="connect")
     got: list[str] = []
     driver.node.create_subscription(String, "/out", lambda m: got.append(m.data), 10)
     sender = driver.node.create_publisher(String, "/in", 10)
@@ -295,8 +265,10 @@ def test_the_gate_holds_through_a_handover(driver: Driver, build: Build) -> None
     assert (node.heard, got) == (["now"], ["now"])
 
 
-def test_where_the_new_connection_fails_the_old_mapping_stays(driver: Driver, build: Build) -> None:
-    node = build(Talking, publisher("map"), publisher("video", unique=STRICT), to="configure")
+def test_where_the_new_connection_fails_the_old_mapping_stays(
+    driver: Driver, active: Active
+) -> None:
+    node = active(Talking, publisher("map"), publisher("video", unique=STRICT), to="configure")
     net = node.connect_to(UDP, name="net")
     own = node.connect_to(OTHER_UDP, name="own")
     node.map_to("map", net)
@@ -323,9 +295,9 @@ def test_where_the_new_connection_fails_the_old_mapping_stays(driver: Driver, bu
 
 
 def test_a_strictly_unique_subscription_has_a_port_of_its_own_on_a_connection(
-    driver: Driver, build: Build
+    driver: Driver, active: Active
 ) -> None:
-    node = build(Hearing, subscription("in", unique=STRICT))
+    node = active(Hearing, subscription("in", unique=STRICT))
     driver.spin_until(node.map_to("in", node.connect_to(UDP, name="net")).done)
     (report,) = configuration(driver).endpoints
     assert report.nfes
@@ -334,9 +306,9 @@ def test_a_strictly_unique_subscription_has_a_port_of_its_own_on_a_connection(
 
 @pytest.mark.usefixtures("impatient")
 def test_what_is_disconnected_is_mapped_nowhere_and_can_be_mapped_again(
-    driver: Driver, build: Build
+    driver: Driver, active: Active
 ) -> None:
-    node = build(Talking, publisher("out"), client("reset"))
+    node = active(Talking, publisher("out"), client("reset"))
     net = node.connect_to(UDP, name="net")
     assert node.connect_to(UDP, name="net") is net
     for name in ("out", "reset"):
@@ -361,9 +333,9 @@ def test_what_is_disconnected_is_mapped_nowhere_and_can_be_mapped_again(
 
 
 def test_events_tell_of_connections_and_mappings_with_their_peers(
-    driver: Driver, build: Build
+    driver: Driver, active: Active
 ) -> None:
-    node = build(Talking, publisher("out"), to="configure")
+    node = active(Talking, publisher("out"), to="configure")
     events: list[ConnectionEvent] = []
     remove = node.on_connection_event(events.append)
     node.connect_to(UDP, name="net")
@@ -460,18 +432,19 @@ def test_what_is_asked_wrongly_is_refused_with_what_is_allowed(
 
 
 def test_under_an_authority_connect_fails_until_everything_was_mapped(
-    driver: Driver, configured: Build
+    driver: Driver, active: Active
 ) -> None:
-    node = configured(
+    node = active(
         Hearing,
         publisher("out"),
         publisher("map"),
         subscription("in"),
+        to="configure",
         authority=Authority.SUPERVISOR,
     )
     node.connect_to(UDP, name="net")
     node.map_to("map", "net")
-    result = change(driver, node, "connect")
+    result = driver.run(node.lifecycle.change, "connect")
     assert result.error == (
         "cannot connect /it: nobody has mapped 'publishers/out', 'subscriptions/in'; its authority "
         "is the supervisor, which connected it to 'net'; call /it/map_to for each, or write "
@@ -494,9 +467,9 @@ def test_under_an_authority_connect_fails_until_everything_was_mapped(
 
 
 def test_what_was_mapped_before_connect_stays_and_goes_with_cleanup(
-    driver: Driver, configured: Build
+    driver: Driver, active: Active
 ) -> None:
-    node = configured(Hearing, publisher("out"), subscription("in"))
+    node = active(Hearing, publisher("out"), subscription("in"), to="configure")
     node.map_to("in", node.connect_to(UDP, name="net"))
     assert driver.set("/it", "connect")
     assert node.mappings == (("publishers/out", ""), ("subscriptions/in", "net"))
@@ -517,9 +490,9 @@ def planned_connection(name: str, *urls: str) -> PlannedParticipant:
     )
 
 
-def test_planned_connections_are_made_at_connect(driver: Driver, build: Build) -> None:
+def test_planned_connections_are_made_at_connect(driver: Driver, active: Active) -> None:
     net = planned_connection("net", UDP)
-    node = build(
+    node = active(
         Hearing,
         subscription("in", participant=net.name),
         publisher("out", participant=net.name),
@@ -534,18 +507,19 @@ def test_planned_connections_are_made_at_connect(driver: Driver, build: Build) -
 
 
 def test_a_planned_connection_that_cannot_be_made_fails_connect_and_leaves_none(
-    driver: Driver, configured: Build
+    driver: Driver, active: Active
 ) -> None:
-    node = configured(
+    node = active(
         Talking,
         publisher("map"),
         publisher("out", participant="_it_net"),
+        to="configure",
         participants=(
             planned_connection("first", OTHER_UDP),
             planned_connection("net", "udpv4://192.0.2.1"),
         ),
     )
-    result = change(driver, node, "connect")
+    result = driver.run(node.lifecycle.change, "connect")
     assert result.error.startswith("cannot connect /it to 'net' (udpv4://192.0.2.1): ")
     assert "192.0.2.1" in result.error
     assert {each for _, each in node.mappings} == {None}
@@ -599,8 +573,8 @@ def test_a_node_in_a_terminal_is_connected_as_its_plan_says(fresh_domain: int) -
     assert lines == [" shm:// publishers/map\n", f"net {UDP} publishers/out\n"]
 
 
-def test_endpoints_are_remapped_while_the_node_runs(driver: Driver, build: Build) -> None:
-    node = build(Everything, subscription("in"), publisher("out"), server("reset"))
+def test_endpoints_are_remapped_while_the_node_runs(driver: Driver, active: Active) -> None:
+    node = active(Everything, subscription("in"), publisher("out"), server("reset"))
     got: list[str] = []
     driver.node.create_subscription(String, "/elsewhere", lambda m: got.append(m.data), 10)
     node.remap("out", "elsewhere")
@@ -621,8 +595,8 @@ def test_endpoints_are_remapped_while_the_node_runs(driver: Driver, build: Build
     driver.spin_until(lambda: driver.node.count_publishers("/out") == 1)
 
 
-def test_a_name_that_cannot_be_is_refused(build: Build) -> None:
-    node = build(Talking, publisher("out"))
+def test_a_name_that_cannot_be_is_refused(active: Active) -> None:
+    node = active(Talking, publisher("out"))
     with pytest.raises(Exception, match="cannot ") as error:
         node.remap("out", "not a name")
     assert str(error.value) == (
@@ -632,8 +606,8 @@ def test_a_name_that_cannot_be_is_refused(build: Build) -> None:
     assert node.mappings == (("publishers/out", ""),)
 
 
-def test_a_remap_that_a_rule_of_the_plan_would_undo_is_refused(build: Build) -> None:
-    node = build(Talking, publisher("out"), remap=(("chatter", "/there"),))
+def test_a_remap_that_a_rule_of_the_plan_would_undo_is_refused(active: Active) -> None:
+    node = active(Talking, publisher("out"), remap=(("chatter", "/there"),))
     with pytest.raises(Exception, match="cannot ") as error:
         node.remap("out", "/chatter")
     assert str(error.value) == (

@@ -8,19 +8,18 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-import rclpy
 from lifecycle_driver import Driver
-from planning import built_with, planned, publisher, server, subscription
+from planning import publisher, server, subscription
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from lifecycle import LifecycleNode, codec, on_message, on_service
 from lifecycle.middleware import get_network_flow_endpoints
 from lifecycle.network.nfe import TransportProtocol, UniqueRequirement
-from lifecycle.plan.model import PlannedNode, PlannedParticipant
+from lifecycle.plan.model import PlannedParticipant
 from lifecycle.verify.observation import NodeConfiguration
 
-Build = Callable[..., Any]
+Active = Callable[..., Any]
 STRICT = UniqueRequirement.STRICTLY_REQUIRED
 FLOW = PlannedParticipant(name="_it_flow_0", dscp=46, reason="unique publisher video")
 
@@ -30,24 +29,13 @@ class It(LifecycleNode):
 
 
 class Hearing(LifecycleNode):
-    heard: list[str]
+    def __init__(self) -> None:
+        super().__init__()
+        self.heard: list[str] = []
 
     @on_message("in")
     def receive(self, message: String) -> None:
         self.heard.append(message.data)
-
-
-@pytest.fixture
-def build(driver: Driver, context: rclpy.Context) -> Build:
-    """Construct a class from a plan and spin it."""
-
-    def build(node_class: type[LifecycleNode], spec: PlannedNode) -> LifecycleNode:
-        with built_with(spec, context):
-            node = node_class()
-        driver.add(node)
-        return node
-
-    return build
 
 
 def configuration(driver: Driver) -> NodeConfiguration:
@@ -59,13 +47,10 @@ def ports(nfes: Any) -> set[int]:
 
 
 def test_a_strict_requirement_that_the_rmw_refuses_fails_connect_and_leaves_nothing(
-    driver: Driver, build: Build
+    driver: Driver, active: Active
 ) -> None:
-    node = build(It, planned("it", publisher("first"), publisher("video", unique=STRICT)))
-    assert driver.set("/it", "configure")
-    future = driver.executor.create_task(node.lifecycle.change, "connect")
-    driver.spin_until(future.done)
-    error = future.result().error
+    node = active(It, publisher("first"), publisher("video", unique=STRICT), to="configure")
+    error = driver.run(node.lifecycle.change, "connect").error
     assert error.startswith("cannot connect publisher 'video' of /it: cannot create publisher ")
     assert "not supported on publishers" in error
     assert driver.state("/it") == (2, "inactive")
@@ -76,19 +61,17 @@ def test_a_strict_requirement_that_the_rmw_refuses_fails_connect_and_leaves_noth
 
 
 def test_a_strict_requirement_is_met_by_a_participant_of_its_own_with_its_dscp(
-    driver: Driver, build: Build
+    driver: Driver, active: Active
 ) -> None:
-    spec = planned(
-        "it",
+    received: list[str] = []
+    driver.node.create_subscription(String, "/video", lambda m: received.append(m.data), 10)
+    node = active(
+        It,
         publisher("video", unique=STRICT, participant=FLOW.name, dscp=46),
         publisher("battery"),
         participants=(FLOW,),
+        to="connect",
     )
-    received: list[str] = []
-    driver.node.create_subscription(String, "/video", lambda m: received.append(m.data), 10)
-    node = build(It, spec)
-    assert driver.set("/it", "configure")
-    assert driver.set("/it", "connect")
     video, battery = configuration(driver).endpoints
     assert (video.participant, video.dscp, battery.dscp) == (FLOW.name, 46, None)
     assert video.nfes is not None
@@ -107,13 +90,10 @@ def test_a_strict_requirement_is_met_by_a_participant_of_its_own_with_its_dscp(
     driver.spin_until(lambda: FLOW.name not in driver.node.get_node_names())
 
 
-def test_a_unique_subscription_listens_on_a_port_of_its_own(driver: Driver, build: Build) -> None:
-    node = build(Hearing, planned("it", subscription("in", unique=STRICT)))
-    node.heard = []
+def test_a_unique_subscription_listens_on_a_port_of_its_own(driver: Driver, active: Active) -> None:
     sender = driver.node.create_publisher(String, "/in", 10)
     other = driver.node.create_subscription(String, "/else", lambda m: None, 10)
-    assert driver.set("/it", "configure")
-    assert driver.set("/it", "connect")
+    node = active(Hearing, subscription("in", unique=STRICT), to="connect")
     (report,) = configuration(driver).endpoints
     assert report.unique is STRICT
     assert ports(report.nfes)
@@ -129,19 +109,15 @@ def test_a_unique_subscription_listens_on_a_port_of_its_own(driver: Driver, buil
 
 @pytest.mark.parametrize("unique", UniqueRequirement)
 def test_every_requirement_of_a_subscription_connects_with_fast_dds(
-    driver: Driver, build: Build, unique: UniqueRequirement
+    driver: Driver, active: Active, unique: UniqueRequirement
 ) -> None:
-    build(Hearing, planned("it", subscription("in", unique=unique)))
-    assert driver.set("/it", "configure")
-    assert driver.set("/it", "connect")
+    active(Hearing, subscription("in", unique=unique), to="connect")
     (report,) = configuration(driver).endpoints
     assert (report.unique, report.error) == (unique, "")
 
 
-def test_connect_and_disconnect_again_and_again(driver: Driver, build: Build) -> None:
-    node = build(Hearing, planned("it", subscription("in"), publisher("in")))
-    node.heard = []
-    assert driver.set("/it", "configure")
+def test_connect_and_disconnect_again_and_again(driver: Driver, active: Active) -> None:
+    node = active(Hearing, subscription("in"), publisher("in"), to="configure")
     for turn in range(5):
         assert driver.set("/it", "connect")
         assert driver.set("/it", "activate")
@@ -161,10 +137,9 @@ class Reporting(LifecycleNode):
     def reset(self, request: Trigger.Request, response: Trigger.Response) -> None: ...
 
 
-def test_the_configuration_tells_each_endpoint_as_it_is(driver: Driver, build: Build) -> None:
+def test_the_configuration_tells_each_endpoint_as_it_is(driver: Driver, active: Active) -> None:
     qos = dataclasses.replace(publisher("x").qos, depth=3)  # type: ignore[type-var]
-    spec = planned("it", publisher("out", qos=qos), subscription("in"), server("reset"))
-    build(Reporting, spec)
+    active(Reporting, publisher("out", qos=qos), subscription("in"), server("reset"), to="")
     document = json.loads(driver.configuration("/it"))
     assert (document["name"], document["state"], document["connected"]) == (
         "/it",
@@ -190,13 +165,13 @@ def test_the_configuration_tells_each_endpoint_as_it_is(driver: Driver, build: B
 
 
 def test_a_node_that_cannot_be_described_says_so_and_lives(
-    driver: Driver, build: Build, monkeypatch: pytest.MonkeyPatch
+    driver: Driver, active: Active, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken() -> str:
         raise OSError("no such file")
 
     monkeypatch.setattr("lifecycle.node.configuration.machine_id", broken)
-    build(It, planned("it"))
+    active(It, to="")
     answer = driver.call(Trigger, "/it/get_configuration", Trigger.Request())
     assert (answer.success, answer.message) == (
         False,
@@ -206,9 +181,9 @@ def test_a_node_that_cannot_be_described_says_so_and_lives(
 
 
 def test_the_checksum_changes_exactly_when_a_reader_must_read_again(
-    driver: Driver, build: Build
+    driver: Driver, active: Active
 ) -> None:
-    build(Reporting, planned("it", publisher("out"), subscription("in"), server("reset")))
+    active(Reporting, publisher("out"), subscription("in"), server("reset"), to="")
     seen = [configuration(driver).checksum]
     assert driver.set("/it", "configure")
     seen.append(configuration(driver).checksum)

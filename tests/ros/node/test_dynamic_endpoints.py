@@ -9,9 +9,8 @@ from typing import Any
 
 import jsonschema
 import pytest
-import rclpy
 from lifecycle_driver import Driver
-from planning import built_with, planned, publisher, subscription
+from planning import publisher, subscription
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
@@ -21,28 +20,12 @@ from lifecycle.manifest.model import Authority, EndpointKind, EndpointPolicy
 from lifecycle.plan.model import PlannedParticipant
 from lifecycle.verify.observation import EndpointReport, NodeConfiguration
 
-Build = Callable[..., Any]
+Active = Callable[..., Any]
 SCHEMA = Path(__file__).parents[3] / "schemas" / "node_configuration.v1.schema.json"
 
 
 class It(LifecycleNode):
     """Grows."""
-
-
-@pytest.fixture
-def build(driver: Driver, context: rclpy.Context) -> Build:
-    def build(*endpoints: Any, upto: str = "activate", node_class: Any = It, **plan: Any) -> Any:
-        with built_with(planned("it", *endpoints, **plan), context):
-            node = node_class()
-        driver.add(node)
-        for label in ("configure", "connect", "activate"):
-            if upto:
-                assert driver.set("/it", label)
-            if label == upto:
-                break
-        return node
-
-    return build
 
 
 def configuration(driver: Driver) -> NodeConfiguration:
@@ -56,8 +39,8 @@ def endpoints(driver: Driver) -> list[tuple[EndpointKind, str, str, bool]]:
     ]
 
 
-def test_an_open_node_declares_more_while_it_is_active(driver: Driver, build: Build) -> None:
-    node = build(publisher("out"))
+def test_an_open_node_declares_more_while_it_is_active(driver: Driver, active: Active) -> None:
+    node = active(It, publisher("out"))
     before = configuration(driver).checksum
     heard: list[str] = []
     node.declare_publisher("news", String, lossy=True, size_bytes=200)
@@ -95,29 +78,31 @@ def answer(request: Trigger.Request, response: Trigger.Response) -> None:
     response.message = "answered"
 
 
-def test_what_is_declared_in_on_configure_is_made_by_connect(driver: Driver, build: Build) -> None:
+def test_what_is_declared_in_on_configure_is_made_by_connect(
+    driver: Driver, active: Active
+) -> None:
     class Configuring(LifecycleNode):
         def on_configure(self) -> None:
             self.declare_publisher("late", String)
 
-    build(upto="configure", node_class=Configuring)
+    active(Configuring, to="configure")
     assert endpoints(driver) == [(EndpointKind.PUBLISHER, "late", "/late", False)]
     assert driver.set("/it", "connect")
     assert endpoints(driver) == [(EndpointKind.PUBLISHER, "late", "/late", True)]
 
 
 def test_under_an_authority_what_is_declared_later_waits_to_be_mapped(
-    driver: Driver, build: Build
+    driver: Driver, active: Active
 ) -> None:
-    node = build(authority=Authority.SUPERVISOR)
+    node = active(It, authority=Authority.SUPERVISOR)
     node.declare_publisher("news", String)
     assert endpoints(driver) == [(EndpointKind.PUBLISHER, "news", "/news", False)]
     node.map_to("news", "")
     assert endpoints(driver) == [(EndpointKind.PUBLISHER, "news", "/news", True)]
 
 
-def test_a_node_whose_endpoints_are_declared_refuses_more(driver: Driver, build: Build) -> None:
-    node = build(publisher("out"), endpoint_policy=EndpointPolicy.DECLARED)
+def test_a_node_whose_endpoints_are_declared_refuses_more(driver: Driver, active: Active) -> None:
+    node = active(It, publisher("out"), endpoint_policy=EndpointPolicy.DECLARED)
     with pytest.raises(LifecycleError) as error:
         node.declare_publisher("news", String)
     assert str(error.value) == (
@@ -133,8 +118,8 @@ def test_a_node_whose_endpoints_are_declared_refuses_more(driver: Driver, build:
     ]
 
 
-def test_a_subscription_that_is_declared_later_needs_its_callback(build: Build) -> None:
-    node = build()
+def test_a_subscription_that_is_declared_later_needs_its_callback(active: Active) -> None:
+    node = active(It)
     with pytest.raises(LifecycleError) as error:
         node.declare_subscription("news", String)
     assert str(error.value) == (
@@ -145,9 +130,9 @@ def test_a_subscription_that_is_declared_later_needs_its_callback(build: Build) 
 
 
 def test_what_is_declared_twice_or_made_impossible_leaves_the_node_as_it_was(
-    driver: Driver, build: Build
+    driver: Driver, active: Active
 ) -> None:
-    node = build(publisher("out"))
+    node = active(It, publisher("out"))
     node.declare_publisher("news", String)
     with pytest.raises(LifecycleError, match=r"declares it as std_msgs/msg/String already$"):
         node.declare_publisher("news", String)
@@ -156,8 +141,8 @@ def test_what_is_declared_twice_or_made_impossible_leaves_the_node_as_it_was(
     assert [name for name, _ in node.mappings] == ["publishers/out", "publishers/news"]
 
 
-def test_after_the_end_nothing_is_declared(driver: Driver, build: Build) -> None:
-    node = build()
+def test_after_the_end_nothing_is_declared(driver: Driver, active: Active) -> None:
+    node = active(It)
     assert driver.set("/it", "shutdown")
     with pytest.raises(LifecycleError) as error:
         node.declare_publisher("news", String)
@@ -168,9 +153,9 @@ def test_after_the_end_nothing_is_declared(driver: Driver, build: Build) -> None
 
 
 def test_what_rclpys_factories_make_is_in_the_configuration_of_an_open_node(
-    driver: Driver, build: Build
+    driver: Driver, active: Active
 ) -> None:
-    node = build(publisher("out"))
+    node = active(It, publisher("out"))
     news = node.create_publisher(String, "news", 7)
     node.create_subscription(String, "news", lambda m: None, 10)
     node.create_service(Trigger, "ask", answer)
@@ -198,7 +183,7 @@ def test_what_rclpys_factories_make_is_in_the_configuration_of_an_open_node(
     ]
 
 
-def test_hints_of_a_manifests_endpoint_are_reported(driver: Driver, build: Build) -> None:
+def test_hints_of_a_manifests_endpoint_are_reported(driver: Driver, active: Active) -> None:
     class Hinting(LifecycleNode):
         def __init__(self) -> None:
             super().__init__()
@@ -210,21 +195,22 @@ def test_hints_of_a_manifests_endpoint_are_reported(driver: Driver, build: Build
         @on_message("in")
         def hear(self, message: String) -> None: ...
 
-    build(publisher("out"), subscription("in"), node_class=Hinting)
+    active(Hinting, publisher("out"), subscription("in"))
     out, in_ = configuration(driver).endpoints
     assert (out.lossy, out.size_bytes, in_.lossy, in_.size_bytes) == (False, 70_000, None, None)
 
 
-def test_the_document_fits_its_schema_in_every_state(driver: Driver, build: Build) -> None:
+def test_the_document_fits_its_schema_in_every_state(driver: Driver, active: Active) -> None:
     validator = jsonschema.Draft202012Validator(json.loads(SCHEMA.read_text(encoding="utf-8")))
     flow = PlannedParticipant(name="_it_flow_0", dscp=46, reason="publisher video")
-    node = build(
+    node = active(
+        It,
         publisher("video", participant=flow.name),
         publisher(
             "out",
         ),
         participants=(flow,),
-        upto="",
+        to="",
     )
     for label in ("configure", "connect", "activate"):
         validator.validate(json.loads(driver.configuration("/it")))
@@ -253,9 +239,9 @@ class Activating(LifecycleNode):
 
 
 def test_what_on_activate_declares_is_there_when_it_is_active_again(
-    driver: Driver, build: Build
+    driver: Driver, active: Active
 ) -> None:
-    node = build(publisher("out"), node_class=Activating, endpoint_policy=EndpointPolicy.OPEN)
+    node = active(Activating, publisher("out"), endpoint_policy=EndpointPolicy.OPEN)
     assert driver.set("/it", "deactivate")
     assert driver.set("/it", "activate")
     assert [name for name, _ in node.mappings] == ["publishers/out", "publishers/news"]

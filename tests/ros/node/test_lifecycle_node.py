@@ -23,7 +23,7 @@ from std_srvs.srv import Trigger
 
 from lifecycle import ERROR, FAILURE, LifecycleNode, on_message, on_service, on_timer
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest.model import EndpointPolicy, ParameterDeclaration, Timeouts
+from lifecycle.manifest.model import ParameterDeclaration, Timeouts
 from lifecycle.manifest.qos import Durability, QosProfile
 from lifecycle.middleware import to_rclpy
 from lifecycle.node.endpoints.mapping import UnknownEndpointError
@@ -264,16 +264,8 @@ def test_a_node_that_does_not_fit_its_interface_fails_to_configure(
     driver: Driver, build: Build, spec: PlannedNode, error: str
 ) -> None:
     node = build(Chatty, spec)
-    results = run_task(driver, node.lifecycle.change, "configure")
-    assert results[0].error == error
+    assert driver.run(node.lifecycle.change, "configure").error == error
     assert driver.state("/chatty") == (1, "unconfigured")
-
-
-def run_task(driver: Driver, function: Callable[..., Any], *arguments: object) -> list[Any]:
-    """Run a coroutine function in the executor; returns its result once it has ended."""
-    future = driver.executor.create_task(function, *arguments)
-    driver.spin_until(future.done)
-    return [future.result()]
 
 
 class Server(Node):
@@ -345,7 +337,7 @@ def test_a_blocking_call_in_a_callback_is_an_error_and_not_a_deadlock(
 
     node = build(Blocking, planned("it", client("other")))
     up(driver, "configure", "connect", node="/it")
-    (result,) = run_task(driver, node.lifecycle.change, "activate")
+    result = driver.run(node.lifecycle.change, "activate")
     assert result.error == (
         "cannot wait for service 'other' in a callback: the answer comes by the executor that "
         "waits for this callback; write `async def` and `await client.call_async(request)`"
@@ -375,22 +367,6 @@ class Latching(LifecycleNode):
         self.heard.append(message.data)
 
 
-def test_an_endpoint_declared_after_configure_is_refused_where_the_manifest_fixes_them(
-    driver: Driver, build: Build
-) -> None:
-    class Late(LifecycleNode):
-        def on_configure(self) -> None:
-            self.declare_publisher("late", String)
-
-    node = build(Late, planned("it", endpoint_policy=EndpointPolicy.DECLARED))
-    (result,) = run_task(driver, node.lifecycle.change, "configure")
-    assert result.error == (
-        "cannot declare publisher 'late' while /it is 'configuring': nodes.it.endpoints is "
-        "'declared' in its manifest, which fixes them at configure; write nodes.it.endpoints: "
-        "open, or declare it in the manifest"
-    )
-
-
 class Waiting(LifecycleNode):
     """Waits in on_configure for a service that nobody serves."""
 
@@ -401,7 +377,7 @@ class Waiting(LifecycleNode):
 def test_an_async_callback_beyond_its_deadline_is_an_error(driver: Driver, build: Build) -> None:
     spec = planned("waiting", timeouts=Timeouts(configure_s=0.2))
     node = build(Waiting, spec)
-    (result,) = run_task(driver, node.lifecycle.change, "configure")
+    result = driver.run(node.lifecycle.change, "configure")
     assert result.error == ("cannot finish /waiting: on_configure within its deadline of 0.2 s")
     driver.settle()
     assert [goal for _, _, _, goal in driver.heard("/waiting")] == [
@@ -500,7 +476,7 @@ def test_parameters_are_declared_with_the_plans_values(driver: Driver, build: Bu
 def test_a_parameter_of_the_wrong_type_fails_to_configure(driver: Driver, build: Build) -> None:
     spec = planned("it", declared_parameters=PARAMETERS, parameters=(("width", "wide"),))
     node = build(LifecycleNode, spec)
-    (result,) = run_task(driver, node.lifecycle.change, "configure")
+    result = driver.run(node.lifecycle.change, "configure")
     assert result.error.startswith(
         "test.lifecycle.yaml:7:5: cannot declare parameter 'width' as int: "
     )
