@@ -17,7 +17,6 @@ import contextlib
 import inspect
 import time
 import traceback
-import types
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NoReturn, Protocol
 
@@ -797,22 +796,9 @@ def keywords(planned: PlannedNode, what: Callable[..., Any]) -> dict[str, Any]:
 
 def _needs(what: Callable[..., Any], name: str) -> bool:
     """Return whether what is called so has a parameter of this name without a default."""
-    function: Any = what
-    if type(what) is type and getattr(what, "__new__") is object.__new__:  # noqa: B009
-        function = getattr(what, "__init__")  # noqa: B009 - of an instance it may be another
-    says_otherwise = any(hasattr(each, "__signature__") for each in (what, function))
-    if (
-        type(function) is types.FunctionType
-        and not says_otherwise
-        and not hasattr(function, "__wrapped__")
-    ):
-        # As of most nodes: what each host calls of inspect is copied into its own memory.
-        code, optional = function.__code__, function.__kwdefaults__ or {}
-        positional = code.co_varnames[: code.co_argcount - len(function.__defaults__ or ())]
-        by_name = code.co_varnames[code.co_argcount :][: code.co_kwonlyargcount]
-        return name in positional or (name in by_name and name not in optional)
     wanted = inspect.signature(what).parameters.get(name)
-    return wanted is not None and wanted.default is wanted.empty
+    named = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+    return wanted is not None and wanted.default is wanted.empty and wanted.kind in named
 
 
 def _each(returned: object) -> Iterable[object]:

@@ -48,7 +48,6 @@ from lifecycle.middleware import (
     widen_discovery_buffers,
 )
 from lifecycle.node.author.spec import load_nodes
-from lifecycle.node.connections.data_layer import NodeDataLayer
 from lifecycle.node.host.control import (
     SERVED_ON_DEMAND,
     Command,
@@ -228,23 +227,23 @@ class HostCommands:
         if node is None:
             known = ", ".join(self._nodes) or "no node"
             raise LifecycleError(f"cannot find node {command.node!r}; this process hosts {known}")
-        if command.operation is Operation.GET_CONFIGURATION:
-            return self._reply(command, ok=True)
-        if command.operation in self._of_process:
-            self._of_process[command.operation]()
-            return self._reply(command, ok=True)
-        if command.operation in SERVED_ON_DEMAND:
-            node.serve(command.operation)
-            return self._reply(command, ok=True)
-        if command.operation in _NODE_INTERFACE:
-            await _NODE_INTERFACE[command.operation](node.interface, command)
-            return self._reply(command, ok=True)
-        if command.operation is Operation.ACTIVATE:
-            self.marks.check(node)
-        result = await node.change_for_supervisor(command.operation.value)
-        return self._reply(
-            command, ok=result.outcome is CallbackOutcome.SUCCESS, error=result.error
-        )
+        operation, ok, error = command.operation, True, ""
+        if operation in self._of_process:
+            self._of_process[operation]()
+        elif operation in SERVED_ON_DEMAND:
+            node.serve(operation)
+        elif operation is Operation.CONNECT_TO:
+            node.interface.connect_to(command.connection, command.connections)
+        elif operation is Operation.MAP_TO:
+            await node.interface.map_to(command.endpoint, command.connection)
+        elif operation is Operation.DISCONNECT_FROM:
+            node.interface.disconnect(command.connection)
+        elif operation is not Operation.GET_CONFIGURATION:
+            if operation is Operation.ACTIVATE:
+                self.marks.check(node)
+            result = await node.change_for_supervisor(operation.value)
+            ok, error = result.outcome is CallbackOutcome.SUCCESS, result.error
+        return self._reply(command, ok=ok, error=error)
 
     def _reply(
         self, command: Command, *, ok: bool, error: str = "", describe: bool = True
@@ -273,25 +272,6 @@ class HostCommands:
             configuration=configuration,
             reports=reports,
         )
-
-
-async def _connect_to(interface: NodeDataLayer, command: Command) -> None:
-    interface.connect_to(command.connection, command.connections)
-
-
-async def _map_to(interface: NodeDataLayer, command: Command) -> None:
-    await interface.map_to(command.endpoint, command.connection)
-
-
-async def _disconnect_from(interface: NodeDataLayer, command: Command) -> None:
-    interface.disconnect(command.connection)
-
-
-_NODE_INTERFACE = {
-    Operation.CONNECT_TO: _connect_to,
-    Operation.MAP_TO: _map_to,
-    Operation.DISCONNECT_FROM: _disconnect_from,
-}
 
 
 _GATHER_S = 15.0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -12,14 +11,6 @@ import pytest
 from host_process import hosted
 
 from lifecycle.node.host.foreign import keywords
-
-
-def _wrapped(function: Callable[..., Any]) -> Callable[..., Any]:
-    @functools.wraps(function)
-    def call(*args: Any, **named: Any) -> Any:
-        return function(*args, **named)
-
-    return call
 
 
 class _Needs:
@@ -34,27 +25,12 @@ class _NeedsByName:
     def __init__(self, *args: Any, depth: int = 1, node_name: str, **named: Any) -> None: ...
 
 
-class _HasByName:
-    def __init__(self, *, node_name: str = "mine") -> None: ...
-
-
 class _Takes:
     def __init__(self, *node_name: str, **named: Any) -> None: ...
 
 
-class _Uses:
-    def __init__(self) -> None:
-        node_name = "mine"
-        del node_name
-
-
 class _Inherits(_Needs):
     pass
-
-
-class _Decorated:
-    @_wrapped
-    def __init__(self, node_name: str) -> None: ...
 
 
 class _MadeOtherwise:
@@ -62,36 +38,17 @@ class _MadeOtherwise:
         return super().__new__(cls)
 
 
-class _Meta(type):
-    def __call__(cls, depth: int) -> object:
-        return object()
-
-
-class _CalledOtherwise(metaclass=_Meta):
-    def __init__(self, node_name: str) -> None: ...
-
-
-class _Says:
-    __signature__ = inspect.Signature()
-
-    def __init__(self, node_name: str) -> None: ...
-
-
 class _Plain:
     pass
-
-
-class _Callable:
-    def __call__(self, node_name: str) -> object:
-        return object()
 
 
 def _function(node_name: str) -> object:
     return object()
 
 
-async def _coroutine(*, node_name: str) -> object:
-    return object()
+@functools.wraps(_function)
+def _wrapped(*args: Any, **named: Any) -> Any:
+    return _function(*args, **named)
 
 
 @pytest.mark.parametrize(
@@ -100,19 +57,12 @@ async def _coroutine(*, node_name: str) -> object:
         (_Needs, True),
         (_Has, False),
         (_NeedsByName, True),
-        (_HasByName, False),
         (_Takes, False),
-        (_Uses, False),
         (_Inherits, True),
-        (_Decorated, True),
         (_MadeOtherwise, True),
-        (_CalledOtherwise, False),
-        (_Says, False),
         (_Plain, False),
-        (_Callable(), True),
         (_function, True),
-        (_wrapped(_function), True),
-        (_coroutine, True),
+        (_wrapped, True),
         (functools.partial(_function, node_name="given"), False),
         (functools.partial(_function), True),
         (lambda: None, False),
