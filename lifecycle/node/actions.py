@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Any
 
 from rclpy.node import Node
 
-from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest import action_of, hidden_names
 from lifecycle.node.author.handlers import ActionHandler
@@ -129,35 +128,14 @@ class GoalRun:
         self.failure, self.trace, self.done = error, traceback.format_exc(), True
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class ActionWords:
-    """How messages name an action server.
-
-    Attributes:
-        action: as declared.
-        node: fully qualified.
-        error: the node's logger.
-        warn: the node's logger.
-    """
-
-    action: str
-    node: str
-    error: Callable[[str], object]
-    warn: Callable[[str], object]
-
-    @property
-    def subject(self) -> str:
-        """`action server 'dock' of /base`."""
-        return f"action server {self.action!r} of {self.node}"
-
-
 class Goals:
     """The goals of one action server. Closing it ends them all; that is what makes it `Gated`.
 
     Args:
-        handler: the author's methods.
+        node: whose it is.
+        action: as declared.
         action_type: the action class.
-        words: names for messages.
+        handler: the author's methods.
         is_open: the node is active.
 
     Attributes:
@@ -166,17 +144,21 @@ class Goals:
 
     def __init__(
         self,
-        handler: Callable[..., Any],
+        node: Node,
+        action: str,
         action_type: type[Any],
-        words: ActionWords,
+        handler: Callable[..., Any],
         *,
         is_open: Callable[[], bool],
     ) -> None:
+        self._node = str(node.get_fully_qualified_name())
+        self._what = f"action server {action!r} of {self._node}"
+        self._error = node.get_logger().error
+        self._warn = node.get_logger().warning
         self._handler = handler
         self._accept = handler.accept if isinstance(handler, ActionHandler) else None
         self._is_open = is_open
         self._type = action_type
-        self._words = words
         self._runs: dict[bytes, GoalRun] = {}
         self.server: GoalServer | None = None
 
@@ -185,7 +167,7 @@ class Goals:
 
     def close(self) -> None:
         """End what is left: the node is no longer active."""
-        self.interrupt(f"{self._words.node} is no longer active")
+        self.interrupt(f"{self._node} is no longer active")
 
     def interrupt(self, reason: str) -> None:
         """Take every goal from its handler, and answer those that wait for its result.
@@ -199,9 +181,7 @@ class Goals:
             if run is None:
                 self.server.finish(goal, None)  # accepted, and not begun
                 continue
-            error = GoalInterruptedError(
-                f"cannot go on with a goal of {self._words.subject}: {reason}"
-            )
+            error = GoalInterruptedError(f"cannot go on with a goal of {self._what}: {reason}")
             if run.interrupt(error):
                 self.server.finish(goal, self._outcome(goal, run) if run.done else None)
 
@@ -213,22 +193,22 @@ class Goals:
                 if inspect.isawaitable(answer):
                     answer = await answer
             except Exception as error:  # noqa: BLE001 - the author's code: reported, and no
-                self._words.error(traceback.format_exc())
-                self._words.error(
-                    f"cannot decide on a goal of {self._words.subject}, so it is rejected: "
+                self._error(traceback.format_exc())
+                self._error(
+                    f"cannot decide on a goal of {self._what}, so it is rejected: "
                     f"{_error_text(error)}"
                 )
                 return False
             if not isinstance(answer, bool):
-                self._words.error(
-                    f"cannot use {answer!r} as a decision on a goal of {self._words.subject}, so "
+                self._error(
+                    f"cannot use {answer!r} as a decision on a goal of {self._what}, so "
                     "it is rejected: return True or False"
                 )
                 return False
             if not answer:
                 return False
         if not self._is_open():
-            self._words.warn(f"cannot accept a goal of {self._words.subject}: it is not active")
+            self._warn(f"cannot accept a goal of {self._what}: it is not active")
         return self._is_open()
 
     async def execute(self, goal: ServerGoalHandle) -> Any | None:
@@ -248,22 +228,22 @@ class Goals:
         run.judged = True
         if run.failure is not None:
             if run.interruption is None or not isinstance(run.failure, GoalInterruptedError):
-                self._words.error(run.trace)
-                self._words.error(
-                    f"cannot go on with a goal of {self._words.subject}: its handler raised "
+                self._error(run.trace)
+                self._error(
+                    f"cannot go on with a goal of {self._what}: its handler raised "
                     f"{_error_text(run.failure)}"
                 )
             return None
         returned = run.returned
         if returned is not None and not isinstance(returned, self._type.Result):
-            self._words.error(
-                f"cannot send {returned!r} as a result of {self._words.subject}: return a "
+            self._error(
+                f"cannot send {returned!r} as a result of {self._what}: return a "
                 f"{self._type.__name__}.Result, or None for an empty one"
             )
             return None
         if goal.is_active and run.interruption is None:
-            self._words.error(
-                f"cannot tell what a goal of {self._words.subject} came to, so it is aborted: its "
+            self._error(
+                f"cannot tell what a goal of {self._what} came to, so it is aborted: its "
                 "handler returned without succeed(), abort() or canceled()"
             )
         return returned

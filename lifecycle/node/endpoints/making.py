@@ -17,7 +17,7 @@ from rclpy.qos import qos_profile_system_default
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest import EndpointKind, QosProfile
 from lifecycle.middleware import create_publisher, create_subscription, to_rclpy
-from lifecycle.node.actions import ActionWords, Goals, resolve_action_name
+from lifecycle.node.actions import Goals, resolve_action_name
 from lifecycle.node.endpoints.mapping import Mapping, wire_name
 from lifecycle.node.lifecycle.execution import positional_count
 from lifecycle.plan import PlannedEndpoint
@@ -189,14 +189,13 @@ class Maker:
         from lifecycle.middleware import GoalServer  # late: numpy, 100 ms
 
         assert mapping.handler is not None
-        logger = self._node.get_logger()
-        words = ActionWords(
-            action=mapping.endpoint.name,
-            node=self._node.get_fully_qualified_name(),
-            error=logger.error,
-            warn=logger.warning,
+        goals = Goals(
+            self._node,
+            mapping.endpoint.name,
+            mapping.interface,
+            mapping.handler,
+            is_open=lambda: self._gate.is_open,
         )
-        goals = Goals(mapping.handler, mapping.interface, words, is_open=lambda: self._gate.is_open)
 
         def make(node: Node, name: str) -> Any:
             return GoalServer(

@@ -332,7 +332,7 @@ class LifecycleMachine:
         if request not in self.allowed():
             raise RefusedError(self._refusal(request))
         before = self.state
-        self._trigger(request.value)
+        _MACHINE.events[request.value].trigger(self._model)
         connecting = request in {TransitionRequest.CONNECT, TransitionRequest.DISCONNECT}
         self._announce(before, None if connecting else request.value)
 
@@ -348,7 +348,7 @@ class LifecycleMachine:
                 f"cannot finish a transition with {outcome.name}: none is running in state "
                 f"{before.value!r}"
             )
-        self._trigger(outcome.value)
+        _MACHINE.events[outcome.value].trigger(self._model)
         label: str | None = outcome.value
         if before.seen == self.state.seen:
             label = None
@@ -366,12 +366,6 @@ class LifecycleMachine:
             )
         allowed = ", ".join(each.value for each in self.allowed()) or "nothing"
         return f"cannot {request.value} in state {self.state.value!r}; allowed here: {allowed}"
-
-    def _trigger(self, name: str) -> None:
-        try:
-            _MACHINE.events[name].trigger(self._model)
-        except transitions.MachineError as error:
-            raise RefusedError(f"cannot take {name!r} in state {self.state.value!r}") from error
 
     def _announce(self, before: NodeState, label: str | None) -> None:
         event = None
