@@ -253,11 +253,6 @@ class Managed:
         return self._controller.machine.state
 
     @property
-    def node(self) -> Node:
-        """The rclpy node."""
-        return self._node
-
-    @property
     def interface(self) -> NodeDataLayer:
         """What a supervisor may ask of its data layer."""
         return self.data_layer

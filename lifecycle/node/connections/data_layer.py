@@ -197,8 +197,8 @@ class NodeDataLayer:
         """Remove every endpoint and every connection but the node's own participant."""
         for mapping in reversed(self.mappings):
             self._mapper.unmap(mapping)
-        for handle in self.endpoints.handles.values():
-            handle.forget()
+            if mapping.handle is not None:
+                mapping.handle.forget()
         for connection in reversed(self.connections.named):
             self._close(connection)
         self.connections.close_all()

@@ -34,7 +34,6 @@ class EndpointTable:
     Attributes:
         changed: likewise.
         mappings: every declared endpoint, in the order of declaration.
-        handles: of its publishers, by name.
     """
 
     def __init__(self, node: Node, gate: NodeGate, changed: Callable[[], None]) -> None:
@@ -43,7 +42,6 @@ class EndpointTable:
         self._gate = gate
         self.changed = changed
         self.mappings: dict[Key, Mapping] = {}
-        self.handles: dict[str, DeclaredPublisher] = {}
 
     def add(self, endpoint: PlannedEndpoint, handler: Callable[..., Any] | None) -> Mapping:
         """Declare one more endpoint; it does not exist yet.
@@ -63,17 +61,16 @@ class EndpointTable:
         self.mappings[key] = mapping
         if endpoint.kind is EndpointKind.PUBLISHER:
             warn = self._node.get_logger().warning
-            handle = DeclaredPublisher(endpoint.name, warn, Kept.of(endpoint.qos))
-            self.handles[endpoint.name] = handle
-            self._gate.add(handle, handle)
+            mapping.handle = DeclaredPublisher(endpoint.name, warn, Kept.of(endpoint.qos))
+            self._gate.add(mapping.handle, mapping.handle)
         self.changed()
         return mapping
 
     def remove(self, mapping: Mapping) -> None:
         """Forget one endpoint, which is mapped nowhere."""
         del self.mappings[mapping.key]
-        if mapping.endpoint.kind is EndpointKind.PUBLISHER:
-            self._gate.remove(self.handles.pop(mapping.endpoint.name))
+        if mapping.handle is not None:
+            self._gate.remove(mapping.handle)
 
     def hint(self, key: Key, lossy: bool | None, size_bytes: int | None) -> None:
         """Keep the author's hints on an endpoint; None leaves what was said before."""
@@ -101,8 +98,9 @@ class EndpointTable:
         Raises:
             UnknownEndpointError: no such declaration.
         """
-        self._declared(EndpointKind.PUBLISHER, name)
-        return self.handles[name]
+        handle = self._declared(EndpointKind.PUBLISHER, name).handle
+        assert handle is not None
+        return handle
 
     def client(self, kind: EndpointKind, name: str) -> Any:
         """Return the rclpy object of a declared endpoint that has no handle, as clients have none.

@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from lifecycle.node.connections.connection_status import ConnectionStatus
     from lifecycle.node.endpoints.endpoint_table import EndpointTable
     from lifecycle.node.endpoints.making import Maker
-    from lifecycle.node.endpoints.publisher import DeclaredPublisher
     from lifecycle.node.lifecycle.services import Turns
 
 SETTLE_S = 0.25
@@ -129,7 +128,8 @@ class Mapper:
     def map(self, mapping: Mapping, connection: Connection) -> None:
         """Map an endpoint that is mapped nowhere; raises LifecycleError."""
         mapping.placement = self._place(mapping, connection)
-        self._attach(mapping)
+        if mapping.handle is not None:
+            mapping.handle.attach(mapping.entity)
         self._status.mapped(mapping)
         self._table.changed()
 
@@ -139,9 +139,8 @@ class Mapper:
         placement = mapping.placement
         if placement is None:
             return
-        handle = self._handle(mapping)
-        if handle is not None:
-            handle.detach()
+        if mapping.handle is not None:
+            mapping.handle.detach()
         mapping.placement = mapping.peers = None
         self._unplace(mapping, placement)
 
@@ -231,15 +230,6 @@ class Mapper:
             running[0].peers_changed(mapping.peers or 0)
         self._table.changed()  # as many peers as before may be others
 
-    def _handle(self, mapping: Mapping) -> DeclaredPublisher | None:
-        publishes = mapping.endpoint.kind is EndpointKind.PUBLISHER
-        return self._table.handles[mapping.endpoint.name] if publishes else None
-
-    def _attach(self, mapping: Mapping) -> None:
-        handle = self._handle(mapping)
-        if handle is not None:
-            handle.attach(mapping.entity)
-
     def _end_handover(self, mapping: Mapping) -> None:
         running = self._handovers.get(mapping.key)
         if running is not None:
@@ -271,12 +261,11 @@ class Mapper:
 
     def _take_over(self, mapping: Mapping, old: Placement) -> None:
         """Let the new one do what the old one did until now, which is destroyed."""
-        qos = mapping.endpoint.qos
-        if mapping.endpoint.kind is EndpointKind.PUBLISHER and (
-            qos is None or qos.reliability.name != "BEST_EFFORT"
-        ):
-            old.entity.wait_for_all_acked(_ACKNOWLEDGED)
-        self._attach(mapping)
+        if mapping.handle is not None:
+            qos = mapping.endpoint.qos
+            if qos is None or qos.reliability.name != "BEST_EFFORT":
+                old.entity.wait_for_all_acked(_ACKNOWLEDGED)
+            mapping.handle.attach(mapping.entity)
         self._unplace(mapping, old)
 
     def _refuse_shared_flow(self, mapping: Mapping, connection: Connection) -> None:

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from rclpy.subscription import Subscription
 
     from lifecycle.middleware import ServerWatch
+    from lifecycle.node.endpoints.publisher import DeclaredPublisher
 
 
 Key = tuple[EndpointKind, str]
@@ -209,6 +210,7 @@ class Mapping:
     Attributes:
         interface: the message, service or action class.
         handler: takes messages, requests or goals; None where the kind has no handler.
+        handle: what authors publish by; None for other kinds.
         placement: where it is; None while it is mapped nowhere.
         error: why it could not be made as asked; empty if it was.
         name: fully qualified, given by `remap`; empty for the name that was declared.
@@ -221,6 +223,7 @@ class Mapping:
     endpoint: PlannedEndpoint
     interface: type[Any]
     handler: Callable[..., Any] | None = None
+    handle: DeclaredPublisher | None = None
     placement: Placement | None = None
     error: str = ""
     name: str = ""

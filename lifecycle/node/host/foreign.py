@@ -272,11 +272,6 @@ class ForeignNode:
         return str(self._node.get_fully_qualified_name())
 
     @property
-    def node(self) -> Node:
-        """The rclpy node."""
-        return self._node
-
-    @property
     def spec(self) -> PlannedNode:
         """What it was planned to be."""
         return self._spec
