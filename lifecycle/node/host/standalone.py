@@ -21,7 +21,7 @@ import threading
 import traceback
 import typing
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn, cast
 
 import rclpy
 from rclpy.signals import SignalHandlerOptions
@@ -39,9 +39,9 @@ from lifecycle.middleware import (
     noting_shared_memory,
     participant_settings,
 )
-from lifecycle.node.author.node import LifecycleNode
+from lifecycle.node.author.managed import Managed
 from lifecycle.node.author.spec import Construction, Mode, constructing, parse_mode
-from lifecycle.node.host.foreign import Adoption, ForeignNode, Hosted, keywords
+from lifecycle.node.host.foreign import Adoption, ForeignNode, Hosted
 from lifecycle.node.host.loop import Heartbeat, NodeLoop, Watchdog, on_signal
 from lifecycle.node.lifecycle.machine import CallbackOutcome
 from lifecycle.plan import PlannedNode
@@ -49,6 +49,8 @@ from lifecycle.plan import PlannedNode
 if TYPE_CHECKING:
     from rclpy.context import Context
     from rclpy.node import Node
+
+    from lifecycle.node.author.node import LifecycleNode
 
 _REPEATED_AFTER_S = (0.1, 0.3)
 """Fast DDS repeats what was lost after up to 3 s: too late for a silence."""
@@ -167,32 +169,40 @@ def run(
     with on_signal(
         lambda number: _on_signal(number, loop, report, interrupted), beside=loop.beside
     ):
-        if spec is not None and not _is_ours(node_class):
-            _adopt(node_class, spec, loop, context=context, report=report, mode=mode)
-            loop.spin_and_exit()
-        noting = contextlib.ExitStack()
+        if spec is None:
+            node = _make_alone(node_class, mode, context)
+            hosted: Hosted = node.lifecycle
+        else:
+            node, hosted = _adopt(node_class, spec, loop, context=context, mode=mode)
+        name = hosted.full_name
+        loop.add(node, hosted)
+        if isinstance(hosted, Managed):
+            liveliness.open(node, loop.republish_names)
+        hosted.add_listener(lambda _: report(f"{name}: {_state(hosted)}"))
+        report(f"{name}: {_state(hosted)}")
+        if isinstance(hosted, Managed):
+            drives_itself = hosted.mode is Mode.AUTO
+        else:
+            drives_itself = mode is Mode.AUTO and hosted.spec.managed
+        if drives_itself:
+            loop.call_soon(_bring_up, hosted, loop, report)
+        loop.spin_and_exit()
+    raise AssertionError("spin_and_exit returned")
+
+
+def _make_alone(node_class: Callable[..., Any], mode: Mode | None, context: Context) -> Any:
+    """Make a LifecycleNode that has no plan."""
+    with contextlib.ExitStack() as noting:
+        noting.enter_context(noting_shared_memory(context, is_new=False))
         construction = Construction(
-            spec=spec,
+            spec=None,
             mode=mode,
             context=context,
             use_global_arguments=True,
             constructed=noting.close,  # the class may make more participants after that
         )
-        with constructing(construction), participant_settings(context, _settings(spec)), noting:
-            noting.enter_context(noting_shared_memory(context, is_new=False))
-            node: LifecycleNode = node_class(**({} if spec is None else keywords(spec, node_class)))
-        loop.add(node, node.lifecycle)
-        liveliness.open(node, loop.republish_names)
-        node.lifecycle.add_listener(lambda _: report(f"{_name(node)}: {_state(node)}"))
-        report(f"{_name(node)}: {_state(node)}")
-        if node.lifecycle.mode is Mode.AUTO:
-            loop.call_soon(_bring_up, node.lifecycle, loop, report)
-        loop.spin_and_exit()
-    raise AssertionError("spin_and_exit returned")
-
-
-def _is_ours(node_class: Callable[..., Any]) -> bool:
-    return isinstance(node_class, type) and issubclass(node_class, LifecycleNode)
+        with constructing(construction):
+            return node_class()
 
 
 def _adopt(
@@ -201,15 +211,19 @@ def _adopt(
     loop: NodeLoop,
     *,
     context: Context,
-    report: Callable[[str], None],
     mode: Mode | None,
-) -> None:
-    """Make a node of others as planned; nothing holds it but its own states."""
+) -> tuple[Any, Hosted]:
+    """Make a node as planned; nothing holds it but its own states."""
 
     @contextlib.contextmanager
     def carrying(planned: PlannedNode) -> Iterator[Context]:
+        settings = ParticipantSettings.of(
+            planned.connections,
+            transports=planned.transports,
+            max_datagram_bytes=planned.max_datagram_bytes,
+        )
         shared_memory = noting_shared_memory(context, is_new=False)
-        with participant_settings(context, _settings(planned)), shared_memory:
+        with participant_settings(context, settings), shared_memory:
             yield context
 
     def host(node: Node, planned: PlannedNode) -> ForeignNode:
@@ -226,13 +240,7 @@ def _adopt(
     follow_nodes(adoption)
     adoption.make(spec, [spec], maker)
     node, foreign = adoption.made[spec.key]
-    hosted: Hosted = foreign or node.lifecycle
-    loop.add(node, hosted)
-    name = hosted.full_name
-    hosted.add_listener(lambda _: report(f"{name}: {hosted.reported.label}"))
-    report(f"{name}: {hosted.reported.label or 'running'}")
-    if mode is Mode.AUTO and spec.managed:
-        loop.call_soon(_bring_up, hosted, loop, report)
+    return node, foreign or cast("LifecycleNode", node).lifecycle
 
 
 async def _bring_up(hosted: Hosted, loop: NodeLoop, report: Callable[[str], None]) -> None:
@@ -256,22 +264,10 @@ def _on_signal(
     loop.stop(number.name, code=interrupted if number is signal.SIGINT else ExitCode.OK)
 
 
-def _settings(spec: PlannedNode | None) -> ParticipantSettings:
-    if spec is None:
-        return ParticipantSettings()
-    return ParticipantSettings.of(
-        spec.connections,
-        transports=spec.transports,
-        max_datagram_bytes=spec.max_datagram_bytes,
-    )
-
-
-def _name(node: LifecycleNode) -> str:
-    return node.lifecycle.full_name
-
-
-def _state(node: LifecycleNode) -> str:
-    return node.lifecycle.state.value
+def _state(hosted: Hosted) -> str:
+    if isinstance(hosted, Managed):
+        return hosted.state.value
+    return hosted.reported.label or "running"
 
 
 def _report_line(say: Callable[[str], None], line: str) -> None:
