@@ -65,7 +65,6 @@ from lifecycle.verify import NodeConfiguration
 if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup
 
-    from lifecycle.node.lifecycle.gate import Later
 
 _STEADY = ("unconfigured", "inactive", "active", "finalized")
 _MATCHED = {
@@ -78,7 +77,11 @@ _CONNECTED = ("inactive", "activating", "active", "deactivating")
 
 
 class Spinner(Protocol):
-    """What runs the callbacks of nodes, see NodeLoop."""
+    """What runs the callbacks of nodes: NodeLoop, and NodeInProcess."""
+
+    @property
+    def watching(self) -> Watching:
+        """Events that its own executor waits for, whether a node is spun or not."""
 
     def spin(self, node: Node) -> None:
         """Run a node's callbacks from now on."""
@@ -88,6 +91,9 @@ class Spinner(Protocol):
 
     def call_soon(self, task: Callable[..., Any], *arguments: object) -> None:
         """Run a function, sync or async, where callbacks of nodes run."""
+
+    def call_beside(self, task: Callable[[], Any]) -> object:
+        """Run a function, sync or async, where `watching` is watched; false after its end."""
 
 
 class SharedMatch:
@@ -198,8 +204,6 @@ class ForeignNode:
         spec: what it was planned to be.
         supervisor: name of the system whose gate holds it; empty for none.
         spinner: runs its callbacks.
-        later: runs a function in the host's executor.
-        watching: has the events of its endpoints.
 
     Attributes:
         configuration_changes: notifies of each change of its configuration.
@@ -212,14 +216,12 @@ class ForeignNode:
         *,
         supervisor: str,
         spinner: Spinner,
-        later: Later,
-        watching: Watching,
     ) -> None:
         self._node = node
         self._spec = spec
         self._supervisor = supervisor
         self._spinner = spinner
-        self._watching = watching
+        self._watching = spinner.watching
         self._group = ReentrantCallbackGroup()
         self._gate = NodeGate()
         self._watches: dict[int, MatchWatch | SharedMatch | ServerWatch] = {}
@@ -232,7 +234,7 @@ class ForeignNode:
         self._is_ours = False
         self._machine: RclpyStateMachine | None = None
         self.configuration_changes = ConfigurationChanges(
-            later, self.get_configuration, failed=node.get_logger().error
+            spinner.call_beside, self.get_configuration, failed=node.get_logger().error
         )
         self._made = Undeclared(self.configuration_changes.touch)
         node.add_post_set_parameters_callback(lambda _: self.configuration_changes.touch())
@@ -588,7 +590,7 @@ class Adoption:
 
     Args:
         carrying: yields the context that a planned node is to be constructed on.
-        host: makes the ForeignNode of an rclpy node and its plan.
+        spinner: runs the callbacks of nodes that are not ours.
         supervisor: name of the system whose gate holds the nodes; empty for none.
         use_global_arguments: nodes take remaps from the process's own --ros-args.
         constructed: called for each node of rclpy that is made, and when one of ours is.
@@ -600,7 +602,7 @@ class Adoption:
     def __init__(
         self,
         carrying: Carrying,
-        host: Callable[[Node, PlannedNode], ForeignNode],
+        spinner: Spinner,
         *,
         supervisor: str = "",
         mode: Mode | None = Mode.MANUAL,
@@ -609,7 +611,7 @@ class Adoption:
     ) -> None:
         self._carrying = carrying
         self._constructed = constructed
-        self._host = host
+        self._spinner = spinner
         self._supervisor = supervisor
         self._mode = mode
         self._use_global_arguments = use_global_arguments
@@ -710,8 +712,9 @@ class Adoption:
             parameters.give_empty_arrays(node, planned)
         with self._carrying(planned) as context:
             yield name, {**options, "context": context}
-        foreign = None if ours and planned.managed else self._host(node, planned)
-        if foreign is not None:
+        foreign = None
+        if not (ours and planned.managed):
+            foreign = ForeignNode(node, planned, supervisor=self._supervisor, spinner=self._spinner)
             self._foreign[id(node)] = foreign
         self.made[planned.key] = (node, foreign)
         if not ours:

@@ -23,7 +23,6 @@ from typing import Any, NoReturn
 
 import rclpy
 from rclpy.context import Context
-from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from lifecycle import codec
@@ -308,7 +307,7 @@ class Host:
         self._unannounced: Unannounced | None = None
         self._adoption = Adoption(
             self._participants.carrying,
-            self._adopt,
+            self._loop,
             supervisor=spec.system,
             constructed=self._meet,
         )
@@ -448,16 +447,6 @@ class Host:
                 hosted.add_listener(self._report_state)
             hosted.configuration_changes.listen(self._report_configuration)
             self._loop.add(node, hosted)
-
-    def _adopt(self, node: Node, planned: PlannedNode) -> ForeignNode:
-        return ForeignNode(
-            node,
-            planned,
-            supervisor=self._spec.system,
-            spinner=self._loop,
-            later=self._loop.call_beside,
-            watching=self._loop.watching,
-        )
 
     async def _ready(self) -> None:
         for hosted in self._nodes.values():

@@ -68,6 +68,7 @@ class NodeInProcess:
     Attributes:
         node: the user's own object.
         peer: an ordinary rclpy node beside it, spun by the same thread.
+        watching: events of nodes that are not ours.
     """
 
     def __init__(
@@ -91,8 +92,8 @@ class NodeInProcess:
         self._context = Context()
         self._context.init(args=[], domain_id=domain_id)
         self._executor = NodeExecutor(context=self._context)
-        self._watching = Watching()
-        self._executor.add_node(self._watching)
+        self.watching = Watching()
+        self._executor.add_node(self.watching)
         try:
             self.node, self._hosted, self._all = self._construct(planned, group, maker)
         except BaseException:
@@ -123,17 +124,7 @@ class NodeInProcess:
             with participant_settings(self._context, settings):
                 yield self._context
 
-        def host(node: Node, each: PlannedNode) -> ForeignNode:
-            return ForeignNode(
-                node,
-                each,
-                supervisor="",
-                spinner=self,
-                later=self._executor.create_task,
-                watching=self._watching,
-            )
-
-        adoption = Adoption(carrying, host, mode=Mode.MANUAL)
+        adoption = Adoption(carrying, self, mode=Mode.MANUAL)
         follow_no_more = follow_nodes(adoption)
         try:
             adoption.make(planned, group or (planned,), maker)
@@ -158,6 +149,10 @@ class NodeInProcess:
     def call_soon(self, task: Callable[..., Any], *arguments: object) -> None:
         """Run a function, sync or async, where callbacks of nodes run."""
         self._executor.create_task(task, *arguments)
+
+    def call_beside(self, task: Callable[[], Any]) -> object:
+        """As `call_soon`: everything runs in one thread."""
+        return self._executor.create_task(task)
 
     def _make_peers(self) -> None:
         from rcl_interfaces.msg import Log

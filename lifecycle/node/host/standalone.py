@@ -41,14 +41,13 @@ from lifecycle.middleware import (
 )
 from lifecycle.node.author.managed import Managed
 from lifecycle.node.author.spec import Construction, Mode, constructing, parse_mode
-from lifecycle.node.host.foreign import Adoption, ForeignNode, Hosted
+from lifecycle.node.host.foreign import Adoption, Hosted
 from lifecycle.node.host.loop import Heartbeat, NodeLoop, Watchdog, on_signal
 from lifecycle.node.lifecycle.machine import CallbackOutcome
 from lifecycle.plan import PlannedNode
 
 if TYPE_CHECKING:
     from rclpy.context import Context
-    from rclpy.node import Node
 
     from lifecycle.node.author.node import LifecycleNode
 
@@ -226,17 +225,7 @@ def _adopt(
         with participant_settings(context, settings), shared_memory:
             yield context
 
-    def host(node: Node, planned: PlannedNode) -> ForeignNode:
-        return ForeignNode(
-            node,
-            planned,
-            supervisor="",
-            spinner=loop,
-            later=loop.call_beside,
-            watching=loop.watching,
-        )
-
-    adoption = Adoption(carrying, host, mode=mode, use_global_arguments=True)
+    adoption = Adoption(carrying, loop, mode=mode, use_global_arguments=True)
     follow_nodes(adoption)
     adoption.make(spec, [spec], maker)
     node, foreign = adoption.made[spec.key]
