@@ -109,7 +109,7 @@ FINISHED: dict[tuple[NodeState, CallbackOutcome], NodeState] = {
 
 def machine_in(state: NodeState, changes: list[StateChange] | None = None) -> LifecycleMachine:
     """Return a machine that was brought to `state`; `changes` hears of what comes after."""
-    heard: list[StateChange] = []
+    heard: list[StateChange] = [] if changes is None else changes
     machine = LifecycleMachine(heard.append)
     for step in PATHS[state]:
         if isinstance(step, TransitionRequest):
@@ -117,19 +117,7 @@ def machine_in(state: NodeState, changes: list[StateChange] | None = None) -> Li
         else:
             machine.finish(step)
     assert machine.state is state
-    if changes is not None:
-        machine = machine_with(state, changes)
-    return machine
-
-
-def machine_with(state: NodeState, changes: list[StateChange]) -> LifecycleMachine:
-    machine = LifecycleMachine(changes.append)
-    for step in PATHS[state]:
-        if isinstance(step, TransitionRequest):
-            machine.request(step)
-        else:
-            machine.finish(step)
-    changes.clear()
+    heard.clear()
     return machine
 
 
