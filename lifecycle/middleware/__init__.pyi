@@ -93,8 +93,6 @@ from .rcl.rclpy_nodes import Watching as Watching
 from .rcl.rclpy_nodes import follow_nodes as follow_nodes
 from .rcl.rclpy_nodes import interface_of as interface_of
 from .rcl.rclpy_nodes import is_rclpy_managed as is_rclpy_managed
-from .rcl.rclpy_nodes import serve_type_descriptions as serve_type_descriptions
-from .rcl.rclpy_nodes import without_type_descriptions as without_type_descriptions
 from .rcl.rmw_choice import check_rmw as check_rmw
 from .rcl.timers import NodeTimers as NodeTimers
 from .services.actions import GoalClient as GoalClient

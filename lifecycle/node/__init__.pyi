@@ -13,7 +13,6 @@ from .author.spec import load_nodes as load_nodes
 from .connections.connection_status import ConnectionEvent as ConnectionEvent
 from .connections.connection_status import ConnectionEventKind as ConnectionEventKind
 from .connections.connections import Connection as Connection
-from .host.control import SERVED_ON_DEMAND as SERVED_ON_DEMAND
 from .host.control import Command as Command
 from .host.control import Event as Event
 from .host.control import HostSpec as HostSpec

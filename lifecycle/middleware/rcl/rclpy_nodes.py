@@ -13,14 +13,13 @@ import contextlib
 import functools
 import sys
 import traceback
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any, Protocol
 
 from lifecycle_msgs.msg import Transition
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.lifecycle import LifecycleNodeMixin, TransitionCallbackReturn
 from rclpy.node import Node
-from rclpy.type_description_service import TypeDescriptionService
 
 from lifecycle.manifest import EndpointKind
 
@@ -108,29 +107,6 @@ def follow_nodes(hooks: NodeHooks) -> Callable[[], None]:
             setattr(Node, name, method)
 
     return undo
-
-
-@contextlib.contextmanager
-def without_type_descriptions(node: Node) -> Iterator[None]:
-    """Have rclpy construct `node` without `~/get_type_description`, inside the block."""
-    start = TypeDescriptionService._start_service  # noqa: SLF001 - rclpy has no option for it
-
-    def start_of_others(service: Any) -> None:
-        if service._get_node() is not node:  # noqa: SLF001
-            start(service)
-
-    TypeDescriptionService._start_service = start_of_others  # noqa: SLF001
-    try:
-        yield
-    finally:
-        TypeDescriptionService._start_service = start  # noqa: SLF001
-
-
-def serve_type_descriptions(node: Node) -> None:
-    """Make `~/get_type_description` where its parameter does not forbid it; again is harmless."""
-    service = node._type_description_service  # noqa: SLF001
-    if service.enabled and service._type_description_srv is None:  # noqa: SLF001
-        service._start_service()  # noqa: SLF001
 
 
 def _noting(make: Callable[..., Any], kind: EndpointKind, hooks: NodeHooks) -> Callable[..., Any]:

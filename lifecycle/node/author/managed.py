@@ -21,7 +21,6 @@ from rclpy.timer import Timer
 from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest import EndpointKind, Health
-from lifecycle.middleware import serve_type_descriptions
 from lifecycle.node import configuration
 from lifecycle.node.author import parameters
 from lifecycle.node.author.declaring import DeclaredInCode
@@ -35,7 +34,6 @@ from lifecycle.node.connections.connection_status import (
 )
 from lifecycle.node.connections.data_layer import NodeDataLayer, RemoteInterface
 from lifecycle.node.endpoints.mapping import wire_name
-from lifecycle.node.host.control import INTERFACE_ON_DEMAND, Operation
 from lifecycle.node.lifecycle.controller import Controller
 from lifecycle.node.lifecycle.execution import SUCCESS, Result
 from lifecycle.node.lifecycle.gate import NodeGate
@@ -177,12 +175,10 @@ class Managed:
         supervisor: str = "",
         *,
         served: bool = True,
-        serves_parameters: bool = True,
         health: Callable[[], Any] | None = None,
     ) -> None:
         self._node = node
         self._supervisor = supervisor
-        self._serves_parameters = serves_parameters
         # By its supervisor, through the gate; a node without one needs no permission.
         self._let_through = not supervisor
         self.mode = mode
@@ -232,8 +228,7 @@ class Managed:
             node, self.data_layer, log=node.get_logger().error, group=self._turns.group
         )
         if served:
-            # A supervisor sees who asks for the others, and has them made.
-            self._remote.serve(but=INTERFACE_ON_DEMAND if supervisor else ())
+            self._remote.serve()
         if spec.events or spec.membership:
             self._join()
 
@@ -321,22 +316,6 @@ class Managed:
             await self.bring_up()
 
         timer = self._turns.timer(0.0, once)
-
-    def serve(self, operation: Operation) -> None:
-        """Offer the services of `SERVED_ON_DEMAND`: a client asks for one; again is harmless."""
-        if operation is Operation.SERVE_INTERFACE:
-            self._remote.serve()
-        elif operation is Operation.SERVE_PARAMETERS:
-            self.serve_parameters()
-        elif operation is Operation.SERVE_TYPE_DESCRIPTIONS:
-            serve_type_descriptions(self._node)
-
-    def serve_parameters(self) -> None:
-        """Offer the parameter services, if they are not there yet."""
-        if not self._serves_parameters:
-            self._serves_parameters = True
-            for each in parameters.serve(self._node):
-                self.undeclared.remove(each)  # rclpy's
 
     def sleep(self, seconds: float) -> Future:
         """Return what is done in `seconds`, in every state."""

@@ -14,7 +14,6 @@ oldest trap of lifecycle callbacks).
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import inspect
 from collections.abc import Callable
@@ -27,7 +26,6 @@ from rclpy.context import Context
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.logging import LoggingSeverity
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.service import Service
@@ -38,7 +36,7 @@ from rclpy.timer import Timer
 
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest import EndpointKind
-from lifecycle.middleware import NodeTimers, without_type_descriptions
+from lifecycle.middleware import NodeTimers
 from lifecycle.network import ConnectionUrl
 from lifecycle.node import configuration
 from lifecycle.node.author import parameters
@@ -421,13 +419,7 @@ class LifecycleNode(Declarations, LocalInterface, GatedFactories):
             options.setdefault("use_global_arguments", construction.use_global_arguments)
             mode = construction.mode or mode
         supervisor = construction.supervisor if construction is not None else ""
-        # A supervisor sees who asks for these services, and has them made.
-        later = bool(supervisor) and parameters.may_have_none(planned, options)
-        if later:
-            options["start_parameter_services"] = False
-        types = without_type_descriptions(self) if supervisor else contextlib.nullcontext()
-        with types:
-            super().__init__(name, namespace=namespace, context=context, **options)
+        super().__init__(name, namespace=namespace, context=context, **options)
         self._gate = NodeGate()
         spec = planned or plan_without_manifest(
             type(self), name=self.get_name(), namespace=self.get_namespace()
@@ -441,7 +433,6 @@ class LifecycleNode(Declarations, LocalInterface, GatedFactories):
             self._gate,
             supervisor,
             served=enable_communication_interface,
-            serves_parameters=not later,
             health=None if type(self).health is LifecycleNode.health else self.health,
         )
         if construction is not None:
@@ -510,13 +501,6 @@ class LifecycleNode(Declarations, LocalInterface, GatedFactories):
         goes on meanwhile, requests to cancel a goal included.
         """
         return self.lifecycle.sleep(seconds)
-
-    def declare_parameters(self, *arguments: Any, **options: Any) -> list[Parameter]:
-        """As rclpy's; a node that has parameters serves them."""
-        declared: list[Parameter] = super().declare_parameters(*arguments, **options)
-        if declared and self._gate is not None:  # those before are rclpy's own
-            self.lifecycle.serve_parameters()
-        return declared
 
     def undeclare_parameter(self, name: str) -> None:
         """As rclpy's, which notifies nothing; the node's configuration has changed."""

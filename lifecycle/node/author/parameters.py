@@ -18,7 +18,6 @@ from rclpy.exceptions import (
     InvalidParameterValueException,
 )
 from rclpy.parameter import Parameter
-from rclpy.parameter_service import ParameterService
 
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest import ParameterDeclaration, ParameterValue, type_of
@@ -27,10 +26,9 @@ from lifecycle.plan import DEFAULT, raw_value
 from lifecycle.verify import ParameterReport
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping
+    from collections.abc import Callable, Iterable, Iterator
 
     from rclpy.node import Node
-    from rclpy.service import Service
 
     from lifecycle.plan import PlannedNode
 
@@ -134,30 +132,6 @@ def _declare_empty(
         last.read_only = True
         node.set_descriptor(name, last)
     return value
-
-
-_MAKES_MORE = (
-    "allow_undeclared_parameters",
-    "automatically_declare_parameters_from_overrides",
-    "start_parameter_services",
-)
-"""rclpy's options by which a node may have parameters that no declaration of its code adds."""
-
-
-def may_have_none(spec: PlannedNode | None, options: Mapping[str, Any]) -> bool:
-    """Return whether, for all that is known before it is made, a node declares no parameter."""
-    if spec is None or spec.declared_parameters or spec.parameters:
-        return False
-    return not options.get("parameter_overrides") and not any(
-        each in options for each in _MAKES_MORE
-    )
-
-
-def serve(node: Node) -> tuple[Service, ...]:
-    """Make rclpy's parameter services for a node that was made without; return them."""
-    before = set(node.services)
-    node._parameter_service = ParameterService(node)  # noqa: SLF001 - where rclpy keeps it
-    return tuple(each for each in node.services if each not in before)
 
 
 def declare(node: Node, spec: PlannedNode) -> None:

@@ -19,7 +19,7 @@ says of each whether it succeeded and why not:
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue, SetParametersResult
@@ -403,17 +403,17 @@ class RemoteInterface:
         self._interface = interface
         self._log = log
         self._group = group
-        self._unserved = {
+        self._acts = {
             "connect_to": self._connect_to,
             "map_to": self._map_to,
             "disconnect": self._disconnect,
             "remap": self._remap,
         }
 
-    def serve(self, *, but: Collection[str] = ()) -> None:
-        """Offer the services that are not there yet, without those named; again is harmless."""
-        for name in [each for each in self._unserved if each not in but]:
-            act = self._served(self._unserved.pop(name))
+    def serve(self, *names: str) -> None:
+        """Offer the services of these names, or all."""
+        for name in names or self._acts:
+            act = self._served(self._acts[name])
             Node.create_service(
                 self._node, SetParameters, f"~/{name}", act, callback_group=self._group
             )

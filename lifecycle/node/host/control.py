@@ -51,10 +51,6 @@ class Operation(enum.Enum):
     CONNECT_TO = "connect_to"  # connection, urls
     MAP_TO = "map_to"  # endpoint, connection
     DISCONNECT_FROM = "disconnect_from"  # connection
-    # Make services that are made when a client asks, see SERVED_ON_DEMAND.
-    SERVE_INTERFACE = "serve_interface"
-    SERVE_PARAMETERS = "serve_parameters"
-    SERVE_TYPE_DESCRIPTIONS = "serve_type_descriptions"
     # Of the whole process: a link is down, and retransmit soon what was not acknowledged; and
     # announce to the graph anew which nodes are here.
     SEND_AGAIN_SOON = "send_again_soon"
@@ -63,29 +59,6 @@ class Operation(enum.Enum):
     # file, not that of a supervisor that was killed.
     PROCEED = "proceed"
     END = "end"
-
-
-INTERFACE_ON_DEMAND = ("connect_to", "disconnect", "remap")
-"""`map_to` is always there: with it a node is known to be one of ours."""
-
-PARAMETERS_ON_DEMAND = (
-    "describe_parameters",
-    "get_parameter_types",
-    "get_parameters",
-    "list_parameters",
-    "set_parameters",
-    "set_parameters_atomically",
-)
-"""Of a node that has declared no parameter; rclpy itself declares some for each."""
-
-SERVED_ON_DEMAND = {
-    Operation.SERVE_INTERFACE: INTERFACE_ON_DEMAND,
-    Operation.SERVE_PARAMETERS: PARAMETERS_ON_DEMAND,
-    Operation.SERVE_TYPE_DESCRIPTIONS: ("get_type_description",),
-}
-"""Services that a supervised node offers once a client of one of them is in the graph: each costs
-0.24 MiB, and all others the traffic to discover it. Its supervisor sees such clients, has the node
-make all of that operation, and has another way to do the same."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

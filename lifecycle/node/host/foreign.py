@@ -55,7 +55,6 @@ from lifecycle.node.configuration import ConfigurationChanges
 from lifecycle.node.connections.connections import Connection, Connections
 from lifecycle.node.connections.data_layer import RemoteInterface
 from lifecycle.node.endpoints.mapping import MatchWatch
-from lifecycle.node.host.control import INTERFACE_ON_DEMAND, Operation
 from lifecycle.node.lifecycle.execution import SUCCESS, Result
 from lifecycle.node.lifecycle.gate import GatedPublisher, NodeGate
 from lifecycle.node.lifecycle.machine import CallbackOutcome, RefusedError
@@ -253,7 +252,7 @@ class ForeignNode:
         remote = RemoteInterface(
             self._node, immovable, log=self._node.get_logger().error, group=self._group
         )
-        remote.serve(but=INTERFACE_ON_DEMAND)
+        remote.serve("map_to")  # with it a node is known to be one of ours
         self._is_ours = False
         services = tuple(each for each in self._node.services if each not in before)
         self._watching.take_services(self._node, services)
@@ -461,9 +460,6 @@ class ForeignNode:
         """The node was destroyed, in a process that goes on."""
         if self._machine is not None:
             self._machine.destroy()
-
-    def serve(self, operation: Operation) -> None:
-        """Do nothing: it has no node interface, and all else from the start."""
 
     @property
     def interface(self) -> Any:

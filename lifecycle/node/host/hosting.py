@@ -48,7 +48,6 @@ from lifecycle.middleware import (
 )
 from lifecycle.node.author.spec import load_nodes
 from lifecycle.node.host.control import (
-    SERVED_ON_DEMAND,
     Command,
     Event,
     HostChannel,
@@ -147,7 +146,6 @@ _ANSWERED_WITHOUT_CONFIGURATION = frozenset(
         Operation.DEACTIVATE,
         Operation.CLEANUP,
         Operation.SHUTDOWN,
-        *SERVED_ON_DEMAND,
     }
 )
 
@@ -229,8 +227,6 @@ class HostCommands:
         operation, ok, error = command.operation, True, ""
         if operation in self._of_process:
             self._of_process[operation]()
-        elif operation in SERVED_ON_DEMAND:
-            node.serve(operation)
         elif operation is Operation.CONNECT_TO:
             node.interface.connect_to(command.connection, command.connections)
         elif operation is Operation.MAP_TO:

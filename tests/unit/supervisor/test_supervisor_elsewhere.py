@@ -6,16 +6,14 @@ import asyncio
 import contextlib
 import dataclasses
 import socket
-from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
-from lifecycle.graph import set_within
 from lifecycle.manifest.model import Condition, Machine
 from lifecycle.plan.model import Plan
-from lifecycle.supervisor.nodes.system import RemoteNode, RemoteNodes, ServicesOnDemand, System
+from lifecycle.supervisor.nodes.system import RemoteNode, RemoteNodes, System
 from lifecycle.supervisor.run.failure import ended
 from lifecycle.supervisor.run.options import address_that_is_down
 from lifecycle.verify.observation import Observation, ObservedNode
@@ -138,65 +136,6 @@ def test_a_task_that_loses_a_cancellation_is_ended_all_the_same() -> None:
 
     assert run(main())
     assert lost == [None]
-
-
-class _Changes:
-    """Counts changes of a graph that come at given times."""
-
-    def __init__(self, *at_s: float) -> None:
-        self.count = 0
-        self._event = asyncio.Event()
-        for each in at_s:
-            asyncio.get_running_loop().call_later(each, self._change)
-
-    def _change(self) -> None:
-        self.count += 1
-        self._event.set()
-
-    async def beyond(self, count: int, timeout_s: float | None) -> bool:
-        while self.count <= count:
-            self._event.clear()
-            if not await set_within(self._event, timeout_s):
-                return False
-        return True
-
-
-@pytest.mark.parametrize(
-    ("changes_s", "looks_s"),
-    [
-        ((1.0,), [0.0, 1.05]),
-        ((1.0, 1.01, 1.02), [0.0, 1.1]),  # a client's endpoints come together
-        ([1.0 + index / 50 for index in range(40)], [0.0, 1.5, 1.87]),  # a bring-up
-    ],
-)
-def test_what_clients_ask_for_is_looked_for_once_after_each_burst(
-    tmp_path: Path, changes_s: Sequence[float], looks_s: list[float]
-) -> None:
-    async def main() -> list[float]:
-        loop = asyncio.get_running_loop()
-        began_s = loop.time()
-        looks: list[float] = []
-
-        class Look(ServicesOnDemand):
-            async def _look(self) -> None:
-                looks.append(round(loop.time() - began_s, 2))
-
-        plan = plan_of(planned_node("camera"))
-        world = World(plan, tmp_path)
-        system = System(plan, emit=world.emit, logs=tmp_path, processes=plan.processes)
-        follow = asyncio.ensure_future(Look(system, _NoServices(), _Changes(*changes_s)).follow())
-        await asyncio.sleep(10.0)
-        await ended(follow)
-        return looks
-
-    assert run(main())[: len(looks_s)] == looks_s
-
-
-class _NoServices:
-    """A graph without services."""
-
-    def service_names(self) -> frozenset[str]:
-        return frozenset()
 
 
 @pytest.mark.parametrize(
