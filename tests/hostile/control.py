@@ -123,7 +123,7 @@ def _other_plan(change: str, verb: str, system: Running) -> None:
         plan["nodes"][0]["name"] = "\x1b[2J\nok"
     elif change == "twice the same":
         plan["nodes"] *= 2
-    question = {"ask": verb, "node": "", "plan": plan, "reload": False, "dry_run": True}
+    question = {"ask": verb, "node": "", "plan": plan, "dry_run": True}
     _sent(json.dumps(question).encode() + b"\n", "read", system)
 
 

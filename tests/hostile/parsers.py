@@ -166,7 +166,7 @@ READERS: dict[str, Reader] = {
         errors=(PlanNoticeError,),
     ),
     "control question": Reader(
-        good=b'{"ask":"restart","node":"talker","plan":null,"reload":false}',
+        good=b'{"ask":"restart","node":"talker","plan":null}',
         read=lambda data, _: from_json(data, QuestionWithPlan),
         errors=(ValueError,),
     ),

@@ -15,7 +15,6 @@ from lifecycle.cli.common import (
     asking,
     assignments_argument,
     format_option,
-    load_manifest,
     machine_option,
     say_differences,
     target_argument,
@@ -203,7 +202,6 @@ def give_order(  # noqa: PLR0917 - in the order of the command line
     timeout: float,
     node: str = "",
     *,
-    reload: bool = False,
     mode: str = "",
 ) -> int:
     """Have a running supervisor carry out an order; say why where it does not.
@@ -215,7 +213,6 @@ def give_order(  # noqa: PLR0917 - in the order of the command line
         machine: as it was given to `up`.
         timeout: seconds.
         node: for `restart`, one node; empty for all.
-        reload: for `restart`, take the manifest as it is now.
         mode: for `mode`, the one to enter.
 
     Returns:
@@ -223,21 +220,15 @@ def give_order(  # noqa: PLR0917 - in the order of the command line
         stays closed, 6 if a step failed or took longer than `timeout` seconds.
 
     Raises:
-        UsageError: no such run, or no manifest to reload.
+        UsageError: no such run.
         ManifestError: the manifest cannot be loaded.
     """
     path, plan = target_plan(os.environ, target, assignments, machine)
-    if reload and plan is None:
-        raise UsageError(
-            f"cannot reload {target!r}: it is no manifest", hint="name the manifest's file"
-        )
     if verb == "pause" and plan is not None:
         say_differences(path, plan)
-    if reload:
-        load_manifest(target, assignments, quiet=True, machine=machine)
     from lifecycle.supervisor import ControlRequest, Question, order
 
-    question = Question(ask=ControlRequest(verb), node=node, plan=plan, reload=reload, mode=mode)
+    question = Question(ask=ControlRequest(verb), node=node, plan=plan, mode=mode)
     try:
         answer = order(path, question, timeout)
     except TimeoutError:
@@ -309,13 +300,8 @@ def resume_command(target: str, assignments: tuple[str, ...], machine: str, time
     shell_complete=completing("nodes arguments"),
 )
 @machine_option("As it was given to `lifecycle up`.")
-@click.option(
-    "--reload", is_flag=True, help="Take the manifest as it is now, where it has changed."
-)
 @order_timeout
-def restart_command(
-    *, target: str, words: tuple[str, ...], machine: str, timeout: float, reload: bool
-) -> int:
+def restart_command(target: str, words: tuple[str, ...], machine: str, timeout: float) -> int:
     """Take a running system down and bring it up again, or only the process of NODE.
 
     What comes back is verified together with what stayed, and activated only if the gate opens: in
@@ -323,13 +309,13 @@ def restart_command(
     nodes of its process restart with it, all others stay active.
 
     What is restarted is what was started. A manifest or parameter file that has changed since is
-    refused (exit 2), naming what differs; --reload takes it, for NODE only if nothing else differs.
+    refused (exit 2), naming what differs; `lifecycle apply MANIFEST` takes it.
     """
     nodes = [word for word in words if ":=" not in word]
     if len(nodes) > 1:
         raise UsageError(f"cannot restart {', '.join(nodes)} at once; name one node, or none")
     assignments = tuple(word for word in words if ":=" in word)
-    return give_order("restart", target, assignments, machine, timeout, *nodes, reload=reload)
+    return give_order("restart", target, assignments, machine, timeout, *nodes)
 
 
 @click.command("mode")

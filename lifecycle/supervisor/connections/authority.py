@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Collection, Iterable, Mapping
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 from lifecycle import dataclasses
 from lifecycle.errors import BringUpError
@@ -36,6 +36,10 @@ from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.run.events import Emitter, Notice, WiringChanged, WiringLost
 from lifecycle.supervisor.run.failure import ended
 from lifecycle.verify import Finding, NodeConfiguration, Observation
+
+if TYPE_CHECKING:
+    from lifecycle.supervisor.nodes.driver import NodeDriver, NodeInterfaceClient
+    from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
 
 _BEYOND = (Condition.CONNECTED, Condition.ACTIVE, Condition.HEALTHY)
 """What needs the data layer."""
@@ -87,14 +91,9 @@ CALM_S = 10.0
 """A node that stayed wired for so long has its tries back."""
 
 
-class Reaching(Protocol):
-    """How nodes that are not ours are reached, see ObserverParticipant."""
-
-    def node_interface(self, node: str) -> NodeInterface:
-        """Return what drives the node interface of any node that has one, by full name."""
-
-
-def authority_of(system: System, emit: Emitter, reaching: Reaching) -> ConnectionAuthority | None:
+def authority_of(
+    system: System, emit: Emitter, reaching: ObserverParticipant
+) -> ConnectionAuthority | None:
     """Return who wires `system`; None if its nodes do it themselves."""
     layer = system.plan.data_layer
     if layer.authority is not Authority.SUPERVISOR:
@@ -102,34 +101,6 @@ def authority_of(system: System, emit: Emitter, reaching: Reaching) -> Connectio
     dynamic = layer.source is DataLayerSource.DYNAMIC
     source = NegotiatedSource(system.plan) if dynamic else PlannedSource(system.plan)
     return ConnectionAuthority(system, source, emit, interface_of=reaching.node_interface)
-
-
-class Source(Protocol):
-    """Where instructions come from.
-
-    Attributes:
-        expected: the plan as it must be seen now.
-        problems: what cannot be connected at all, in whole sentences with both capability lists.
-    """
-
-    expected: Plan
-    problems: tuple[str, ...]
-
-    def instructions(self, known: Mapping[str, NodeConfiguration]) -> Mapping[str, Instructions]:
-        """Return what each node must have, by full name, given what nodes report."""
-
-    def replan(self, plan: Plan, names: Collection[str]) -> None:
-        """Take the plan as it is now that these nodes are started again."""
-
-
-class NodeInterface(Protocol):
-    """How one node is instructed, see nodes/driver.py."""
-
-    async def interface(self) -> NodeConfiguration | None:
-        """Read what the node can be wired by; None where it has no node interface."""
-
-    async def wire(self, step: Step) -> NodeConfiguration | None:
-        """Make one step; raises BringUpError."""
 
 
 class PlannedSource:
@@ -179,10 +150,10 @@ class ConnectionAuthority:
     def __init__(
         self,
         system: System,
-        source: Source,
+        source: PlannedSource | NegotiatedSource,
         emit: Emitter,
         *,
-        interface_of: Callable[[str], NodeInterface],
+        interface_of: Callable[[str], NodeDriver | NodeInterfaceClient],
     ) -> None:
         self._system = system
         self._source = source
@@ -345,7 +316,7 @@ class ConnectionAuthority:
 
     def _wirable(
         self,
-    ) -> Iterable[tuple[str, NodeInterface, NodeRun | None, NodeConfiguration]]:
+    ) -> Iterable[tuple[str, NodeDriver | NodeInterfaceClient, NodeRun | None, NodeConfiguration]]:
         dead = self._system.dead()
         for name in self._instructions:
             node = self._system.node_named(name)
@@ -369,7 +340,7 @@ class ConnectionAuthority:
     async def _repair_node(
         self,
         name: str,
-        interface: NodeInterface,
+        interface: NodeDriver | NodeInterfaceClient,
         node: NodeRun | None,
         configuration: NodeConfiguration,
     ) -> float | None:
@@ -423,7 +394,7 @@ class ConnectionAuthority:
     async def _make(
         self,
         wiring: _Wiring,
-        interface: NodeInterface,
+        interface: NodeDriver | NodeInterfaceClient,
         missing: Iterable[Step],
         node: NodeRun | None,
     ) -> None:

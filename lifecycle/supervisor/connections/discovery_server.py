@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
+from typing import TYPE_CHECKING
 
 from lifecycle.errors import BringUpError, MiddlewareError
 from lifecycle.manifest import Run, RunKind
@@ -17,9 +18,12 @@ from lifecycle.plan import PlannedProcess, PlannedServer
 from lifecycle.supervisor.control.protocol import ProcessState
 from lifecycle.supervisor.nodes.bring_up import died
 from lifecycle.supervisor.nodes.system import System
-from lifecycle.supervisor.processes.process import COMMAND_ESCALATION, ManagedProcess, Spawner
+from lifecycle.supervisor.processes.process import COMMAND_ESCALATION, ManagedProcess
 from lifecycle.supervisor.run.failure import StepFailedError, finding_of
 from lifecycle.verify import DEADLINE, START_FAILED, Finding
+
+if TYPE_CHECKING:
+    from lifecycle.supervisor.processes.fork_server import ForkServer
 
 NAME = "discovery_server"
 """Its process; no node can be called so, as keys of processes are manifest keys."""
@@ -31,7 +35,7 @@ LOOK_AGAIN_S = 0.02
 """Between two looks whether it listens: a process that is not ours to change does not notify us."""
 
 
-async def begin(system: System, spawner: Spawner, *, ours: bool) -> None:
+async def begin(system: System, spawner: ForkServer, *, ours: bool) -> None:
     """Start the plan's discovery server, or wait for the one of another machine.
 
     Args:

@@ -15,7 +15,7 @@ import functools
 import time
 from collections.abc import Callable, Coroutine, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from lifecycle.errors import LifecycleError
 from lifecycle.graph import set_within
@@ -27,7 +27,7 @@ from lifecycle.supervisor.run.options import UpOptions
 from lifecycle.verify import NOT_PROGRAMMED, FlowReport, Verdict
 
 if TYPE_CHECKING:
-    from lifecycle.programming import TargetChanges, TargetOptions
+    from lifecycle.programming import Programmer, Removal, TargetOptions
 
 _T = TypeVar("_T")
 
@@ -49,50 +49,18 @@ _SWEEP_S = 10.0
 """For servers to remove what dead runs left; what is not removed then stays listed."""
 
 
-class Removes(Protocol):
-    """What removes everything of one run from networks."""
-
-    def close(self, *, within_s: float | None) -> tuple[TargetChanges, ...]:
-        """Remove everything."""
-        ...
-
-    def cancel(self) -> None:
-        """From another thread: let what is under way fail at once."""
-        ...
-
-
-class Programs(Removes, Protocol):
-    """What a Programmer does for its keeper."""
-
-    def update(
-        self, flows: Sequence[FlowReport], *, hold: bool, within_s: float | None
-    ) -> tuple[TargetChanges, ...]:
-        """Bring networks up to date."""
-        ...
-
-    def renew(self, *, within_s: float | None) -> float | None:
-        """Prolong what would expire; return seconds until the next time."""
-        ...
-
-    def resume(self) -> None:
-        """Work again after a `cancel`."""
-        ...
-
-    def replan(self, plan: Plan) -> None:
-        """From now on program flows of this plan; what is there already stays listed."""
-        ...
-
-
 class Keeper:
     """Programs the latest flows, in a thread.
 
     Args:
-        programmer: see Programs.
+        programmer: see Programmer.
         report: takes what was done and what failed, as text for people; called from the loop.
         worker: the thread.
     """
 
-    def __init__(self, programmer: Programs, report: Callable[[str], None], worker: Worker) -> None:
+    def __init__(
+        self, programmer: Programmer, report: Callable[[str], None], worker: Worker
+    ) -> None:
         self._worker = worker
         self._programmer = programmer
         self._report = report
@@ -201,7 +169,7 @@ class Keeper:
 
 
 async def remove(
-    removes: Removes,
+    removes: Programmer | Removal,
     report: Callable[[str], None],
     hurry: asyncio.Event | None,
     worker: Worker,
@@ -209,7 +177,7 @@ async def remove(
     """Remove everything of one run, in a thread and within CLOSE_S for all servers together.
 
     Args:
-        removes: see Removes.
+        removes: see there.
         report: takes what was done or failed, as text for people.
         hurry: once set, no server is waited for any more.
         worker: the thread.
@@ -247,7 +215,7 @@ class Networks:
     """
 
     def __init__(
-        self, system: str, directory: Path, emit: Emitter, programmer: Programs | None = None
+        self, system: str, directory: Path, emit: Emitter, programmer: Programmer | None = None
     ) -> None:
         self._system = system
         self._directory = directory

@@ -15,17 +15,15 @@ from collections.abc import Collection, Iterable, Iterator
 
 from lifecycle import dataclasses
 from lifecycle.errors import BringUpError, ExitCode, LifecycleError, UsageError
-from lifecycle.manifest import DataLayerSource, did_you_mean
+from lifecycle.manifest import did_you_mean
 from lifecycle.network import parse
 from lifecycle.plan import (
     Plan,
     PlanChange,
     PlanDifference,
-    PlannedNode,
     change_between,
     changes,
     with_files_of_now,
-    without_positions,
 )
 from lifecycle.supervisor.control.protocol import ChangedNodes, ProcessState
 from lifecycle.supervisor.nodes.system import NodeRun, System
@@ -64,7 +62,6 @@ class Order:
     Attributes:
         node: for RESTART, manifest key or fully qualified name; empty for the whole system.
         plan: the plan of the manifest that the order names, as it is now; None if it names none.
-        reload: for RESTART, `plan` is to run from now on.
         keys: for RESTART by policy, of the nodes, which are down already; empty for one by hand.
             For PAUSE by policy, of the nodes that are deactivated; empty for all.
         reason: for PAUSE by policy, what it is for, as `lifecycle status` shows it.
@@ -81,7 +78,6 @@ class Order:
     reason: str = ""
     mode: str = ""
     plan: Plan | None = None
-    reload: bool = False
     dry_run: bool = False
     timeout_s: float = 0.0
     change: PlanChange | None = None
@@ -267,10 +263,10 @@ class Mailbox:
 
 
 _MOST = 20
-_RELOADED = ("nodes.", "links.", "policy.", "on_violation.", "modes.")
-"""Parts of a manifest that a running supervisor can reload: the rest made the supervisor's own
+_CHANGEABLE = ("nodes.", "links.", "policy.", "on_violation.", "modes.")
+"""Parts of a manifest that a running supervisor can change: the rest made the supervisor's own
 participant, its authority and the networks that it programs."""
-_NOT_RELOADED = ("policy.ros_interface",)
+_NOT_CHANGEABLE = ("policy.ros_interface",)
 
 
 class Revisions:
@@ -283,14 +279,6 @@ class Revisions:
     def differences(self, plan: Plan) -> tuple[str, ...]:
         """Say how `plan` differs from what runs, one line each; empty if it does not."""
         return _lines(changes(self._system.first, plan))
-
-    def takes(self, order: Order) -> bool:
-        """Whether an order brings a plan that is to replace the one that runs."""
-        return (
-            order.reload
-            and order.plan is not None
-            and bool(changes(self._system.first, order.plan))
-        )
 
     def change(self, plan: Plan) -> PlanChange:
         """Return what `plan` is for the system that runs."""
@@ -313,9 +301,7 @@ class Revisions:
             self._check_apply(order.plan)
         elif order.plan is not None:
             found = changes(running, order.plan)
-            if found and order.reload:
-                self._check_reload(order, order.plan, found)
-            elif found and order.kind is not OrderKind.PAUSE:
+            if found and order.kind is not OrderKind.PAUSE:
                 raise self._refused(order, found)
         elif order.kind is OrderKind.RESTART:
             keys = self._restarted(order)
@@ -344,19 +330,6 @@ class Revisions:
             f"take the new one: {take}{same}"
         )
 
-    def _check_reload(self, order: Order, plan: Plan, found: tuple[PlanDifference, ...]) -> None:
-        running = self._system.first
-        what = f"cannot reload the manifest of {running.system!r} while it runs"
-        self._check_surroundings(plan, found, what)
-        if running.data_layer.source is DataLayerSource.DYNAMIC:
-            raise _refused_whole(what, "its data layer is negotiated by the manifest that runs")
-        if self._options.program:
-            raise _refused_whole(what, "networks are programmed by the manifest that runs")
-        if _has_tcp(running, plan):
-            raise _refused_whole(what, _TCP)
-        if order.node:
-            self._check_node(order, plan, found)
-
     def _check_apply(self, plan: Plan) -> None:
         """Make sure that the running system can become that of another plan."""
         system, running = self._system, self._system.first
@@ -370,8 +343,7 @@ class Revisions:
         if change.ends_or_starts and _has_tcp(running, plan):
             raise _refused_whole(what, _TCP)
         for key in (*change.restarted, *change.removed):
-            if system.nodes[key].running is not None:
-                name = system.nodes[key].name
+            if (name := system.nodes[key].name) in system.adopted:
                 raise UsageError(
                     f"{what}: {name!r} would be taken down, and was adopted",
                     hint="who started it ends it; then lifecycle down, and lifecycle up",
@@ -385,7 +357,7 @@ class Revisions:
             *_lines(
                 each
                 for each in found
-                if not f"{each.path}.".startswith(_RELOADED) or each.path in _NOT_RELOADED
+                if not f"{each.path}.".startswith(_CHANGEABLE) or each.path in _NOT_CHANGEABLE
             ),
             *(() if elsewhere else _places(running, plan)),
         ]
@@ -396,31 +368,6 @@ class Revisions:
         own = local_processes(plan, self._options.machine)
         if self._system.remote or len(own) < len(plan.processes):
             raise _refused_whole(what, "nodes on other machines run by it, too:", _lines(found))
-
-    def _check_node(self, order: Order, plan: Plan, found: tuple[PlanDifference, ...]) -> None:
-        """Make sure that only the nodes that restart are to change."""
-        running = self._system.first
-        keys = self._restarted(order)
-        whole = f"restart the whole system: lifecycle restart {plan.manifest_path} --reload"
-        others = [each for each in found if each.node not in keys]
-        if others:
-            listed = "\n".join(_lines(others))
-            raise UsageError(
-                f"cannot reload {order.node!r} alone: more has changed:\n{listed}\n{whole}"
-            )
-        processes = {each.name: each.nodes for each in plan.processes}
-        name = running.node(keys[0]).process if isinstance(keys, tuple) else ""
-        if processes.get(name) != tuple(keys):
-            raise UsageError(
-                f"cannot reload {order.node!r} alone: it would run in another process", hint=whole
-            )
-        for node in plan.nodes:
-            if node.key not in keys and _bare(node) != _bare(running.node(node.key)):
-                raise UsageError(
-                    f"cannot reload {order.node!r} alone: {node.full_name!r} would be connected "
-                    "otherwise",
-                    hint=whole,
-                )
 
 
 def _is_whole(plan: Plan) -> bool:
@@ -506,8 +453,3 @@ def _urls(plan: Plan) -> Iterator[str]:
         yield from node.connections.urls
         for each in node.participants:
             yield from each.connections.urls
-
-
-def _bare(node: PlannedNode) -> object:
-    """Return a planned node without positions."""
-    return without_positions(dataclasses.replace(node, files=()))

@@ -79,7 +79,7 @@ class NodeStatus(msgspec.Struct, frozen=True, kw_only=True):
         node: fully qualified name.
         process: name of its process; empty if this supervisor does not run it.
         process_state: None if this supervisor does not run it.
-        pid: also of an adopted node's process; 0 where it is not known.
+        pid: of its process; 0 if this supervisor does not run it.
         state: lifecycle_msgs/State label; empty for a node that is not managed.
         doing: what it does or waits for; empty when nothing.
         matched: publishers and subscriptions that report at least one match.
@@ -180,7 +180,6 @@ class Question(msgspec.Struct, frozen=True, kw_only=True):
         node: for RESTART, manifest key or fully qualified name; empty for the whole system.
         plan: for DIFFERENCES and orders, the Plan of the client's manifest as it is now; None if
             it was given none. What reads it knows its type, see server.py.
-        reload: for RESTART, `plan` is to run from now on.
         mode: for MODE, the name of the one to enter.
         dry_run: for APPLY, only say what would become of the system.
         timeout_s: for APPLY, seconds until the system must be active by `plan`; else it goes back.
@@ -190,7 +189,6 @@ class Question(msgspec.Struct, frozen=True, kw_only=True):
     ask: ControlRequest
     node: str = ""
     plan: object = None
-    reload: bool = False
     mode: str = ""
     dry_run: bool = False
     timeout_s: float = 0.0

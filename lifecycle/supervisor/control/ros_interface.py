@@ -12,7 +12,7 @@ import asyncio
 import contextlib
 from collections.abc import Awaitable, Callable, Iterable, Sequence
 from importlib.util import find_spec
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
@@ -41,6 +41,10 @@ from lifecycle.supervisor.run.events import (
     WiringChanged,
 )
 from lifecycle.verify import Outcome, Verdict, supervisor_label, takes_diagnostics
+
+if TYPE_CHECKING:
+    from lifecycle.middleware import RosInterface as RosEntities
+    from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
 
 Entry = tuple[int, str, str, str, Sequence[tuple[str, str]]]
 """Level, name, message, hardware id and values of a diagnostic_msgs/DiagnosticStatus."""
@@ -91,41 +95,7 @@ def _not_installed() -> str:
     return f"no Python package {' or '.join(lacking)} is installed" if lacking else ""
 
 
-class Offer(Protocol):
-    """Topics and services, see lifecycle.middleware.RosInterface."""
-
-    def publish_status(self, text: str) -> None:
-        """Publish to present and later subscribers."""
-
-    def publish_diagnostics(self, entries: Iterable[Entry]) -> None:
-        """Publish diagnostics."""
-
-    def destroy(self) -> None:
-        """Offer and publish nothing any more."""
-
-
 Answer = Callable[[bool, str], None]
-
-
-class Offering(Protocol):
-    """What makes topics and services, see ObserverParticipant."""
-
-    def ros_interface(
-        self,
-        prefix: str,
-        services: Iterable[str],
-        on_call: Callable[[str, Answer], None],
-        *,
-        diagnoses: bool,
-    ) -> Offer:
-        """Make them; calls come from any thread.
-
-        Raises:
-            MiddlewareError: they cannot be made.
-        """
-
-    def is_subscribed(self, topic: str) -> bool:
-        """Return whether discovery shows a subscription of a topic."""
 
 
 class RosInterface:
@@ -147,7 +117,7 @@ class RosInterface:
         self,
         plan: Plan,
         machine: str,
-        participant: Offering,
+        participant: ObserverParticipant,
         *,
         modes: Iterable[str] = (),
         status: Callable[[], SystemStatus],
@@ -166,7 +136,7 @@ class RosInterface:
         self._order = order
         self._down = down
         self._notify = notify
-        self._offer: Offer | None = None
+        self._offer: RosEntities | None = None
         self._opens = self._access is not RosInterfaceAccess.OFF
         self._was_active = False
         self._due: asyncio.TimerHandle | None = None
@@ -268,7 +238,7 @@ class RosInterface:
             self._say(self._offer)
             self._publish_in(EACH_S)
 
-    def _say(self, offer: Offer) -> None:
+    def _say(self, offer: RosEntities) -> None:
         status = self._status()
         if (timeless := _timeless(status)) != self._published:
             self._published = timeless

@@ -155,7 +155,6 @@ class ControlServer:
                 kind=OrderKind(question.ask.value),
                 node=question.node,
                 plan=question.plan,
-                reload=question.reload,
                 mode=question.mode,
                 dry_run=question.dry_run,
                 timeout_s=question.timeout_s,

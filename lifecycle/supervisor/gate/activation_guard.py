@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 from lifecycle import dataclasses
 from lifecycle.errors import BringUpError
@@ -17,10 +18,14 @@ from lifecycle.node import Operation
 from lifecycle.plan import Plan
 from lifecycle.supervisor.control.protocol import Reach
 from lifecycle.supervisor.nodes.driver import ACTIVE
-from lifecycle.supervisor.nodes.system import ChangeSource, NodeRun, ObservationSource, System
+from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.run.events import Notice
 from lifecycle.supervisor.run.failure import ended
 from lifecycle.verify import ACTIVATED_AT_CLOSED_GATE, Finding, Observation, Outcome
+
+if TYPE_CHECKING:
+    from lifecycle.supervisor.gate.verification_loop import ChangeCounter
+    from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
 
 TRIES = 5
 """A node that is activated again and again is not deactivated for ever: its finding stays."""
@@ -77,7 +82,7 @@ class ActivationGuard:
             if node.name in self._deactivating or node.name in self._given_up
         )
 
-    async def follow(self, observer: ObservationSource, changes: ChangeSource) -> None:
+    async def follow(self, observer: ObserverParticipant, changes: ChangeCounter) -> None:
         """Look at every change, for as long as no verdict is made: until this is cancelled."""
         while True:
             count = changes.count

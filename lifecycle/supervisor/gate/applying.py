@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable, Collection, Coroutine, Mapping
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from lifecycle import dataclasses
 from lifecycle.errors import BringUpError, MiddlewareError, UsageError
@@ -32,10 +32,13 @@ from lifecycle.supervisor.gate.verification_loop import VerificationLoop
 from lifecycle.supervisor.nodes.bring_up import BringUp
 from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.policy.schedule import RestartSchedule
-from lifecycle.supervisor.processes.process import Spawner
 from lifecycle.supervisor.run.events import Emitter, ManifestApplied, Notice, SystemReached
 from lifecycle.supervisor.run.failure import StepFailedError, together
 from lifecycle.verify import PROCESS_DIED, Stage, not_ok
+
+if TYPE_CHECKING:
+    from lifecycle.supervisor.gate.sequence import GateSequence
+    from lifecycle.supervisor.processes.fork_server import ForkServer
 
 Alive = Callable[[Coroutine[Any, Any, object]], Coroutine[Any, Any, None]]
 """Runs a step; the unexpected end of any process ends it."""
@@ -45,62 +48,6 @@ SetsParameters = Callable[[str, Mapping[str, Any], Mapping[str, str]], Awaitable
 `plan.ExpectedParameter`; raises MiddlewareError."""
 
 _LEAST_S = 1.0
-
-
-class Steps(Protocol):
-    """What a manifest is applied by, see sequence.py.
-
-    Attributes:
-        phase: as people read it.
-    """
-
-    phase: str
-
-    def active(self) -> frozenset[str]:
-        """Return the names of the nodes that are active."""
-
-    def inactive(self) -> tuple[NodeRun, ...]:
-        """Return the nodes that wait for the gate."""
-
-    def interrupted(self) -> frozenset[str]:
-        """Return the keys of the nodes, with their processes, that were cut off in a step."""
-
-    def with_process_of(self, node: NodeRun) -> tuple[NodeRun, ...]:
-        """Return all that comes and goes with a node."""
-
-    def reached(self, phase: str) -> None:
-        """Note that the system is active, or paused."""
-
-    async def take_down(self, nodes: tuple[NodeRun, ...]) -> None:
-        """Take nodes down, in reverse order, with all of their processes."""
-
-    async def begin_again(
-        self, nodes: tuple[NodeRun, ...], plan: Plan | None = None, revision: int | None = None
-    ) -> tuple[NodeRun, ...]:
-        """Take a plan, and make nodes that are down ready to be brought up; return those."""
-
-    async def connect_unfinished(self, timeout_s: float) -> None:
-        """Bring every node that is not down as far as its gate."""
-
-    async def verify(self, timeout_s: float) -> Permit:
-        """Judge the system as it is until its gate opens; activate nothing."""
-
-    async def program_flows(self, permit: Permit, deadline: float) -> None:
-        """Program networks with the flows of a verdict."""
-
-    async def activate(
-        self, permit: Permit, deadline: float, nodes: tuple[NodeRun, ...] | None = None
-    ) -> None:
-        """Program networks, activate what is not active, and judge what it has become."""
-
-    async def confirm(self, deadline: float) -> None:
-        """Judge what a system has become that is as active as it is to be."""
-
-    async def withdraw(self, permit: Permit) -> None:
-        """Deactivate again what was activated since the gate opened."""
-
-    async def put_down(self, failure: StepFailedError) -> None:
-        """Take down what failed, to be started again later; else raise what ends the run."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -146,7 +93,7 @@ class Applying:
 
     def __init__(
         self,
-        sequence: Steps,
+        sequence: GateSequence,
         *,
         system: System,
         bring_up: BringUp,
@@ -156,7 +103,7 @@ class Applying:
         emit: Emitter,
         alive: Alive,
         sets: SetsParameters,
-        spawner: Spawner,
+        spawner: ForkServer,
         timeout_s: float,
     ) -> None:
         self._sequence = sequence

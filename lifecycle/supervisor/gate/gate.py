@@ -9,10 +9,13 @@ It dies with the gate: once anything goes wrong, nodes not yet activated stay in
 from __future__ import annotations
 
 import asyncio
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 from lifecycle.errors import BringUpError, ExitCode, LifecycleError
 from lifecycle.verify import Outcome, Verdict
+
+if TYPE_CHECKING:
+    from lifecycle.supervisor.gate.verification_loop import VerificationLoop
 
 
 class VerificationError(LifecycleError):
@@ -56,28 +59,6 @@ def closes(verdict: Verdict, *, strict: bool) -> bool:
     if verdict.verdict is Outcome.VIOLATED or verdict.blocking:
         return True
     return strict and verdict.verdict is Outcome.UNVERIFIABLE
-
-
-class Judging(Protocol):
-    """What a permit asks about the verdict that it came from, see VerificationLoop.
-
-    Attributes:
-        latest: the verdict that holds; None before the first.
-    """
-
-    latest: Verdict | None
-
-    def is_current(self, verdict: Verdict) -> bool:
-        """Whether nothing changed since the look that `verdict` came from."""
-
-    async def again(self, ahead: frozenset[str], deadline: float | None) -> Verdict:
-        """Judge the system as it is now, in which the nodes `ahead` may be active.
-
-        Args:
-            ahead: full names.
-            deadline: by the running loop's clock, until which what heals with time may do so, see
-                `behind_s`; None for a moment only.
-        """
 
 
 class Permit:
@@ -187,7 +168,7 @@ class Gate:
         permit: the one that holds at this moment; None while the gate is closed.
     """
 
-    def __init__(self, *, strict: bool, judging: Judging | None = None) -> None:
+    def __init__(self, *, strict: bool, judging: VerificationLoop | None = None) -> None:
         self.strict = strict
         self.permit: Permit | None = None
         self._judging = judging

@@ -316,7 +316,7 @@ class Holding:
             if pending.order.kind is OrderKind.APPLY:
                 change = await self._apply(pending.order)
             else:
-                await self._carry_out_in_spite(self._taking(pending.order))
+                await self._carry_out_in_spite(pending.order)
         except (UsageError, NotBegunError) as error:
             pending.finish(Done(exit_code=error.exit_code, error=str(error)))
         except RolledBackError as error:
@@ -336,15 +336,6 @@ class Holding:
             pending.finish(Done(change=change))
         finally:
             self._under_way = None
-
-    def _taking(self, order: Order) -> Order:
-        """Return an order without a plan that is the one that runs; say what is taken otherwise."""
-        if not self._revisions.takes(order):
-            return dataclasses.replace(order, plan=None, reload=False)
-        assert order.plan is not None
-        for line in self._revisions.differences(order.plan):
-            self._emit(Notice(message=f"takes the changed manifest: {line}"))
-        return order
 
     async def _apply(self, order: Order) -> ChangedNodes:
         """Have the system run by another manifest; return what that was for its nodes."""

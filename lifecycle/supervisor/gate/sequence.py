@@ -20,7 +20,7 @@ import asyncio
 import contextlib
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Collection, Coroutine, Iterable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lifecycle.errors import BringUpError
 from lifecycle.manifest import TargetState
@@ -48,7 +48,6 @@ from lifecycle.supervisor.gate.verification_loop import VerificationLoop
 from lifecycle.supervisor.nodes.bring_up import BringUp
 from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.policy.schedule import RestartSchedule
-from lifecycle.supervisor.processes.process import Spawner
 from lifecycle.supervisor.run.events import Emitter, GateOpened, ModeEntered, Notice, SystemReached
 from lifecycle.supervisor.run.failure import StepFailedError, ended, failure_of, together
 from lifecycle.supervisor.run.shutdown import TakeDown
@@ -64,6 +63,9 @@ from lifecycle.verify import (
     rule,
     taken_on_trust,
 )
+
+if TYPE_CHECKING:
+    from lifecycle.supervisor.processes.fork_server import ForkServer
 
 UNCHANGED_S = 5.0
 """Who is discovered at all over TCP is after 0.1–1.6 s, on a machine with both processors busy
@@ -153,7 +155,7 @@ class GateSequence:
         vanishes: Callable[[str], Coroutine[Any, Any, None]],
         replanned: Callable[[Iterable[str]], None],
         program: Callable[[Verdict, float], Coroutine[Any, Any, None]],
-        spawner: Spawner,
+        spawner: ForkServer,
         following: Callable[[], contextlib.AbstractAsyncContextManager[None]],
         outrun: Callable[[], Coroutine[Any, Any, None]],
         hurry: asyncio.Event,
@@ -369,7 +371,7 @@ class GateSequence:
         self._schedule.by_hand([each.planned.key for each in nodes])
         async with self._watched():
             await self.take_down(nodes)
-            await self.begin_again(nodes, order.plan if order.reload else None)
+            await self.begin_again(nodes)
             # Who waits for one that is started again later follows it.
             await self.connect_unfinished(self._timeout_s)
         self._emit(SystemReached(reached="connected", elapsed_s=self._emit.elapsed_s))
@@ -735,22 +737,15 @@ class GateSequence:
             each.name for each in nodes if each.process is not None or each.planned.run.component
         ]
         if plan is not None:
-            nodes = self._reload(plan, nodes, revision)
+            old = nodes
+            nodes = self._system.take(plan, old, revision)
+            self._replanned({each.name for each in (*old, *nodes)})
         else:
             self._replan(nodes)
             self._system.renew(nodes)
         self._comes_back(names)
         await self._alive(together(self._vanishes(name) for name in gone))
         return nodes
-
-    def _reload(
-        self, plan: Plan, nodes: tuple[NodeRun, ...], revision: int | None
-    ) -> tuple[NodeRun, ...]:
-        """Take another manifest's plan for nodes that are down; return those to bring up."""
-        names = {each.name for each in nodes}
-        fresh = self._system.reload(plan, plan.processes, nodes, revision)
-        self._replanned(names | {each.name for each in fresh})
-        return fresh
 
     def _replan(self, nodes: Iterable[NodeRun]) -> None:
         """Connect nodes that come again so that those who stay find them."""

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Collection, Iterator
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 from lifecycle import dataclasses
 from lifecycle.graph import set_within
@@ -26,7 +26,7 @@ from lifecycle.supervisor.gate.standstill import Standstill
 from lifecycle.supervisor.gate.violations import Violations
 from lifecycle.supervisor.health.agreement import Agreement
 from lifecycle.supervisor.health.liveliness import NodeArrivals
-from lifecycle.supervisor.nodes.system import ObservedGraph, System
+from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.scope import unlimited
 from lifecycle.supervisor.run.events import Emitter, Event, ProcessChanged, VerdictChanged
 from lifecycle.supervisor.run.failure import ended
@@ -53,6 +53,10 @@ from lifecycle.verify import (
     with_findings,
     with_only,
 )
+
+if TYPE_CHECKING:
+    from lifecycle.supervisor.connections.authority import ConnectionAuthority
+    from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
 
 PASSING_S = 1.0
 """Discovery shows a newcomer's endpoints before its name, measured 0.02–0.45 s earlier; what nodes
@@ -212,7 +216,7 @@ ASK_AGAIN_AT_MOST_S = 0.5
 class ChangeCounter:
     """Counts the moments at which it is worth looking again: the graph's and the nodes'."""
 
-    def __init__(self, system: System, observer: ObservedGraph) -> None:
+    def __init__(self, system: System, observer: ObserverParticipant) -> None:
         self._system = system
         self._observer = observer
         self._count = 0
@@ -268,19 +272,6 @@ class ChangeCounter:
         self._event = asyncio.Event()
 
 
-class Looker(Protocol):
-    """What acts on observations, and has findings of its own; see connections/authority.py."""
-
-    def look(self, observation: Observation) -> None:
-        """Take what was seen, before it is judged."""
-
-    def findings(self) -> tuple[Finding, ...]:
-        """Return what the observation alone does not show."""
-
-    def is_at_work(self) -> bool:
-        """Whether something is missing, as of the last observation, that is still to be made."""
-
-
 class VerificationLoop:
     """Judges one system.
 
@@ -294,13 +285,13 @@ class VerificationLoop:
     def __init__(
         self,
         system: System,
-        observer: ObservedGraph,
+        observer: ObserverParticipant,
         changes: ChangeCounter,
         emit: Emitter,
         *,
         strict: bool,
         verify_: Callable[..., Verdict] | None = None,
-        looker: Looker | None = None,
+        looker: ConnectionAuthority | None = None,
         agreement: Agreement | None = None,
         guard: ActivationGuard | None = None,
     ) -> None:

@@ -11,8 +11,8 @@ import asyncio
 import contextlib
 import logging
 import os
-from collections.abc import Callable, Iterator
-from typing import Protocol
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 from lifecycle import dataclasses
 from lifecycle.manifest import DiscoveryRange, RunKind
@@ -42,6 +42,11 @@ from lifecycle.verify import (
     rule,
 )
 
+if TYPE_CHECKING:
+    from lifecycle.middleware import PlanNotices
+    from lifecycle.supervisor.health.peer_supervisors import PeerSupervisors
+    from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
+
 ANNOUNCED_S = 5.0
 """A supervisor that is there has announced its plan within so long: with its first matched
 endpoints, and where Fast DDS lost that, 3 s later."""
@@ -55,33 +60,8 @@ _MOST = 64
 _logger = logging.getLogger(__name__)
 
 
-class PlanNoticeTopic(Protocol):
-    """One PlanNotices of lifecycle.middleware."""
-
-    def announce(self, text: str) -> None:
-        """Announce to all who are there and who come later."""
-
-    def destroy(self) -> None:
-        """Announce and receive nothing any more."""
-
-
 FAILED = "failed: "
 """How the reason of a supervisor begins whose run failed."""
-
-
-class PlanExchange(Protocol):
-    """What carries notices, see ObserverParticipant."""
-
-    def plan_notices(self, on_notice: Callable[[str], None]) -> PlanNoticeTopic:
-        """Take part in the exchange of plans; the callback comes from any thread."""
-
-
-class Connected(Protocol):
-    """Knows which supervisors are connected, see PeerSupervisors."""
-
-    @property
-    def machines(self) -> frozenset[str]:
-        """Machines whose supervisor is connected now."""
 
 
 class Agreement:
@@ -93,7 +73,9 @@ class Agreement:
         connected: who is there.
     """
 
-    def __init__(self, system: System, air: PlanExchange, connected: Connected) -> None:
+    def __init__(
+        self, system: System, air: ObserverParticipant, connected: PeerSupervisors
+    ) -> None:
         self._system = system
         self._air = air
         self._connected = connected
@@ -104,7 +86,7 @@ class Agreement:
             for machine in dict.fromkeys(each.planned.machine for each in system.nodes.values())
             if machine
         )
-        self._notices: PlanNoticeTopic | None = None
+        self._notices: PlanNotices | None = None
         self._run = os.urandom(8).hex()
         self._known: list[PlanNotice] = []
         self._compared: dict[PlanNotice, tuple[str, ...]] = {}

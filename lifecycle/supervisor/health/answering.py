@@ -7,15 +7,17 @@ hosts are watched without asking, see liveliness.py. Must not import rclpy.
 from __future__ import annotations
 
 import asyncio
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest import RunKind
-from lifecycle.plan import PlannedNode
 from lifecycle.supervisor.control.protocol import Reach
 from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.run.events import Notice
 from lifecycle.supervisor.run.failure import ended
+
+if TYPE_CHECKING:
+    from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
 
 EVERY_S = 2.0
 """A node is asked again so long after it answered."""
@@ -30,17 +32,10 @@ SHOWN_S = 5.0
 """Discovery has shown the services of a node that is there for so long."""
 
 
-class Asking(Protocol):
-    """Asks nodes, see ObserverParticipant."""
-
-    async def answers(self, node: PlannedNode, *, timeout_s: float) -> bool | None:
-        """Return whether a node answers; None where it serves nothing to ask."""
-
-
 class Answering:
     """Asks the nodes of others whether they answer, and has the system know who does not."""
 
-    def __init__(self, system: System, asking: Asking) -> None:
+    def __init__(self, system: System, asking: ObserverParticipant) -> None:
         self._system = system
         self._asking = asking
         self._said: set[str] = set()

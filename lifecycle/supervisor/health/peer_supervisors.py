@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Callable, Coroutine, Iterable, Mapping
-from typing import Any, Protocol
+from collections.abc import Callable, Coroutine, Mapping
+from typing import TYPE_CHECKING, Any
 
 from lifecycle import dataclasses
 from lifecycle.errors import BringUpError
@@ -22,6 +22,10 @@ from lifecycle.supervisor.processes.control_channel import ControlChannel
 from lifecycle.supervisor.run.events import MachineConnection
 from lifecycle.supervisor.run.failure import ended
 
+if TYPE_CHECKING:
+    from lifecycle.middleware import AlivePublisher, AliveSubscription
+    from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
+
 CALL_EACH_S = 0.25
 """While a peer is missing."""
 
@@ -29,48 +33,9 @@ SAID_AGAIN_S = (0.1, 0.3)
 """Fast DDS repeats what was lost after up to 3 s: too late for a silence."""
 
 
-class AliveReceiver(Protocol):
-    """One AliveSubscription of lifecycle.middleware."""
-
-    def destroy(self) -> None:
-        """Stop receiving."""
-
-
-class AliveSender(Protocol):
-    """One AlivePublisher of lifecycle.middleware."""
-
-    def notify(self, silent: Mapping[str, str]) -> None:
-        """Say which of our nodes are silent."""
-
-    def destroy(self) -> None:
-        """Leave."""
-
-
-class AliveExchange(Protocol):
-    """What carries announcements, see nodes/observer_participant.py."""
-
-    def announce_machine(self, system: str, machine: str) -> AliveSender:
-        """Announce ourselves as the supervisor of a machine."""
-
-    def watch_machine(self, system: str, machine: str, to: Listener) -> AliveReceiver:
-        """Watch the supervisor of a machine; callbacks come from any thread."""
-
-    def watch_node(self, node: str, to: Listener) -> AliveReceiver:
-        """Watch a node that is attached."""
-
-    def call_out(self, addresses: Iterable[str]) -> None:
-        """Make all peers announce themselves; a few datagrams."""
-
-    def send_again_soon(self) -> None:
-        """Have what waits for a link to come back be sent soon when it does."""
-
-    def republish_names(self) -> None:
-        """Announce our names to the graph again."""
-
-
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Listener:
-    """What an AliveReceiver calls, from any thread.
+    """What an AliveSubscription calls, from any thread.
 
     Attributes:
         alive: with True when the peer is alive, with False when not any more.
@@ -103,16 +68,16 @@ class _PeerSupervisor:
 class PeerSupervisors:
     """Watches the peers that a system depends on; `open` it in a loop and `close` it."""
 
-    def __init__(self, system: System, exchange: AliveExchange) -> None:
+    def __init__(self, system: System, exchange: ObserverParticipant) -> None:
         self._system = system
         self._exchange = exchange
         self._loop = asyncio.get_running_loop()
         self._closed = False
         self._known: list[_PeerSupervisor] = []
         self._machines: list[_PeerSupervisor] = []
-        self._watches: list[AliveReceiver] = []
+        self._watches: list[AliveSubscription] = []
         self._attached: tuple[str, ...] = ()
-        self._announcements: list[AliveSender] = []
+        self._announcements: list[AlivePublisher] = []
         self._said: Mapping[str, str] = {}
         self._missing: dict[str, _PeerSupervisor] = {}
         self._calling: asyncio.Task[None] | None = None
@@ -145,10 +110,7 @@ class PeerSupervisors:
         """Follow the attached nodes of the plan as it is now, where they are others."""
         if self._attached == self._attached_nodes():
             return
-        for each in (*self._watches, *self._announcements):
-            each.destroy()
-        self._watches.clear()
-        self._announcements.clear()
+        self._destroy()
         self._machines.clear()
         self._missing.clear()
         for peer in self._known:
@@ -175,8 +137,13 @@ class PeerSupervisors:
         self._closed = True
         tasks = [*self._tasks, *([self._calling] if self._calling else [])]
         await ended(*tasks)
-        for each in (*self._watches, *self._announcements):
-            each.destroy()
+        self._destroy()
+
+    def _destroy(self) -> None:
+        for watch in self._watches:
+            watch.destroy()
+        for announcement in self._announcements:
+            announcement.destroy()
         self._watches.clear()
         self._announcements.clear()
 

@@ -12,25 +12,27 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections.abc import Callable, Coroutine, Iterable, Sequence
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from lifecycle.errors import BringUpError
 from lifecycle.node import Operation
 from lifecycle.supervisor.control.protocol import ProcessState, Reach
 from lifecycle.supervisor.gate.verification_loop import LEASE_S, ChangeCounter
 from lifecycle.supervisor.nodes.bring_up import ALSO_S, died
-from lifecycle.supervisor.nodes.system import NodeRun, ObservedGraph, System
-from lifecycle.supervisor.processes.adopted_process import AdoptedProcess
+from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.processes.control_channel import ControlChannel
 from lifecycle.supervisor.processes.process import ManagedProcess
 from lifecycle.supervisor.run.events import Event, NodeChanged, ProcessChanged
 from lifecycle.supervisor.run.failure import StepFailedError, ended
 
+if TYPE_CHECKING:
+    from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
+
 _SPEAK_S = 0.7 + ALSO_S
 """A step notices its node's death itself within this, and knows what the node was doing."""
 
 
-async def first_death(system: System, known: set[str]) -> ManagedProcess | AdoptedProcess:
+async def first_death(system: System, known: set[str]) -> ManagedProcess:
     """Wait until a process ends that was not asked to.
 
     Args:
@@ -39,13 +41,10 @@ async def first_death(system: System, known: set[str]) -> ManagedProcess | Adopt
     """
     servers: tuple[ManagedProcess, ...] = () if system.server is None else (system.server,)
     while True:
-        every: tuple[ManagedProcess | AdoptedProcess, ...] = (
-            *system.processes.values(),
-            *system.adopted,
-            *servers,
-        )
-        living: dict[asyncio.Future[Any], ManagedProcess | AdoptedProcess] = {
-            process.ended: process for process in every if process.name not in known
+        living: dict[asyncio.Future[Any], ManagedProcess] = {
+            process.ended: process
+            for process in (*system.processes.values(), *servers)
+            if process.name not in known
         }
         if not living:
             await asyncio.get_running_loop().create_future()  # for ever: until cancelled
@@ -53,10 +52,7 @@ async def first_death(system: System, known: set[str]) -> ManagedProcess | Adopt
         for exited in done:
             process = living[exited]
             known.add(process.name)
-            if isinstance(process, AdoptedProcess):
-                if process.died:
-                    return process
-            elif process.state is ProcessState.EXITED and not process.is_over:
+            if process.state is ProcessState.EXITED and not process.is_over:
                 return process
 
 
@@ -101,16 +97,14 @@ class ProcessMonitor:
         """Return the failure of every process that has ended although it was to run."""
         server = self._system.server
         servers = () if server is None else (server,)
-        every = (*self._system.processes.values(), *self._system.adopted, *servers)
+        every = (*self._system.processes.values(), *servers)
         return tuple(self._failure(each) for each in every if each.died)
 
     async def next_death(self) -> StepFailedError:
         """Wait for the next process that ends unasked; return the failure that this is."""
         return self._failure(await first_death(self._system, self.dead))
 
-    def _failure(self, process: ManagedProcess | AdoptedProcess) -> StepFailedError:
-        if isinstance(process, AdoptedProcess):
-            return process.failure()
+    def _failure(self, process: ManagedProcess) -> StepFailedError:
         keys = process.planned.nodes
         node = self._system.nodes[keys[0]] if len(keys) == 1 else None
         return died(process, node)
@@ -142,29 +136,6 @@ _ALWAYS = 3
 _PREFIX_DIGITS = 24
 
 
-class ParticipantRegistry(Protocol):
-    """Where participants are seen and removed, see ObserverParticipant."""
-
-    def participants_of(
-        self, pid: int, *, nodes: Iterable[str], reported: Iterable[str]
-    ) -> frozenset[str]:
-        """Return the GUID prefixes of the participants that discovery shows of a process."""
-
-    def remove_participants(self, prefixes: Iterable[str], pids: Iterable[int]) -> None:
-        """Have all others forget participants whose process is dead."""
-
-    def introduce(
-        self, newcomers: Iterable[int], pids: Iterable[int], *, rediscover: bool = False
-    ) -> None:
-        """Have new participants discovered by, and discover, those that were there before.
-
-        Args:
-            newcomers: pids of the new ones.
-            pids: of the others.
-            rediscover: the new ones drop us first, and discover us again.
-        """
-
-
 async def _republish(channel: ControlChannel, node: str) -> None:
     # One that ends meanwhile has nothing to publish any more.
     with contextlib.suppress(BringUpError):
@@ -174,9 +145,9 @@ async def _republish(channel: ControlChannel, node: str) -> None:
 class StaleNodes:
     """Removes what processes of one system leave in the graph when they die.
 
-    Only processes that this supervisor started or adopted count, once the kernel says that they
-    ended. Of each only those participants count that bear its pid and that its nodes reported, or
-    were seen on, or, where there are none of these, that nobody has a name for.
+    Only processes that this supervisor started count, once the kernel says that they ended. Of each
+    only those participants count that bear its pid and that its nodes reported, or were seen on,
+    or, where there are none of these, that nobody has a name for.
 
     Args:
         system: whose processes; `on_event` must be given its events.
@@ -185,7 +156,7 @@ class StaleNodes:
     """
 
     def __init__(
-        self, system: System, graph: ParticipantRegistry, *, disown_ports: Callable[[], None]
+        self, system: System, graph: ObserverParticipant, *, disown_ports: Callable[[], None]
     ) -> None:
         self._system = system
         self._graph = graph
@@ -314,7 +285,6 @@ class StaleNodes:
     ) -> None:
         if every and (repetition < _ALWAYS or shown):
             pids = [each.pid for each in self._system.living]
-            pids += [each.pid for each in self._system.adopted if not each.ended.done()]
             self._graph.remove_participants(every, pids)
         if repetition == len(AGAIN_S) or self._closed:
             return
@@ -342,7 +312,9 @@ def _reported(node: NodeRun) -> Iterable[str]:
 class Sightings:
     """Who is in the graph of one system, as an event to wait for."""
 
-    def __init__(self, system: System, observer: ObservedGraph, changes: ChangeCounter) -> None:
+    def __init__(
+        self, system: System, observer: ObserverParticipant, changes: ChangeCounter
+    ) -> None:
         self._system = system
         self._observer = observer
         self._changes = changes

@@ -46,12 +46,8 @@ async def watch_reception(
 
 def _names(system: System) -> dict[int, tuple[str, ...]]:
     """Return the names of the nodes of each process of this host, by pid."""
-    names = {
+    return {
         each.pid: tuple(system.nodes[key].name for key in each.planned.nodes if key in system.nodes)
         for each in system.processes.values()
         if each.pid and not each.is_gone
     }
-    for adopted in system.adopted:
-        if adopted.pid and not adopted.ended.done():
-            names[adopted.pid] = tuple(each.full_name for each in adopted.nodes)
-    return names

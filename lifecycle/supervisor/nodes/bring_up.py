@@ -13,7 +13,7 @@ import asyncio
 import contextlib
 from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterable, Iterator
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from lifecycle import dataclasses
 from lifecycle.errors import BringUpError, MiddlewareError
@@ -36,7 +36,7 @@ from lifecycle.supervisor.processes.control_channel import (
     ControlChannel,
     HostFailedError,
 )
-from lifecycle.supervisor.processes.process import ManagedProcess, Spawner, wait_under_load
+from lifecycle.supervisor.processes.process import ManagedProcess, wait_under_load
 from lifecycle.supervisor.run.events import Notice
 from lifecycle.supervisor.run.failure import StepFailedError, ended, together, within
 from lifecycle.verify import (
@@ -47,6 +47,10 @@ from lifecycle.verify import (
     TRANSITION_FAILED,
     Rule,
 )
+
+if TYPE_CHECKING:
+    from lifecycle.supervisor.connections.authority import ConnectionAuthority
+    from lifecycle.supervisor.processes.fork_server import ForkServer
 
 T = TypeVar("T")
 
@@ -73,16 +77,6 @@ _ING = {
 
 _TO_UNDO = (Operation.CONFIGURE, Operation.CONNECT)
 """What is left to undo of a node that was deactivated."""
-
-
-class Wirer(Protocol):
-    """Makes the nodes' connections and mappings, see connections/authority.py."""
-
-    async def ready(self, node: NodeRun) -> None:
-        """Wait until every node is configured whose interface this node's wiring depends on."""
-
-    async def wire(self, node: NodeRun) -> None:
-        """Make all that a configured node must have before it connects; raises BringUpError."""
 
 
 _GATHERED_S = 0.5
@@ -183,11 +177,11 @@ class BringUp:
         self,
         system: System,
         *,
-        spawner_of: Callable[[ManagedProcess], Spawner],
+        spawner_of: Callable[[ManagedProcess], ForkServer],
         services: Callable[[PlannedNode], NodeDriver],
         appears: Callable[[str], Awaitable[None]],
         recorded: Callable[[], None],
-        wirer: Wirer | None = None,
+        wirer: ConnectionAuthority | None = None,
         gives: Callable[[PlannedNode], Awaitable[None]] | None = None,
         alone: Callable[[NodeRun], None] | None = None,
         loads: Callable[[PlannedNode, str], Awaitable[Callable[[], Awaitable[None]]]] | None = None,
@@ -517,7 +511,7 @@ class BringUp:
         if not self._system.adopts or not others or node.found:
             return
         node.found = state
-        where = "" if node.running is None else node.running.where
+        where = self._system.adopted.get(node.name)
         message = f"{node.name!r} is adopted, found {state}" + (f": {where}" if where else "")
         self._system.emit(Notice(message=message))
 

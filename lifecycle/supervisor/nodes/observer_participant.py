@@ -17,10 +17,9 @@ from lifecycle.errors import MiddlewareError
 from lifecycle.graph import set_within
 from lifecycle.manifest import EndpointKind, supervisor_alive_topic
 from lifecycle.plan import ParticipantConnections, Plan, PlannedNode
-from lifecycle.supervisor.control.ros_interface import Answer, Offer
+from lifecycle.supervisor.control.ros_interface import Answer
 from lifecycle.supervisor.health.peer_supervisors import Listener
 from lifecycle.supervisor.nodes.driver import NodeDriver, NodeInterfaceClient, ServiceDriver
-from lifecycle.supervisor.processes.adopted_process import RunningNode
 from lifecycle.verify import (
     NodeConfiguration,
     Observation,
@@ -36,6 +35,7 @@ if TYPE_CHECKING:
         AliveSubscription,
         GraphObserver,
         PlanNotices,
+        RosInterface,
     )
 
 _QUIET_S = 0.005
@@ -144,22 +144,14 @@ class ObserverParticipant:
         """
         await self._graph.clients.set_parameters(node, values, types)
 
-    async def running(self, wait_s: float) -> tuple[tuple[RunningNode, ...], str]:
+    async def running(self, wait_s: float) -> tuple[tuple[ObservedNode, ...], str]:
         """Return the nodes in the graph once discovery has settled, and what it lacked in the end.
 
         Args:
             wait_s: seconds, > 0, that it may take.
         """
         (nodes, _), unsettled = await settled(self._graph.discovery, wait_s)
-        processes = self.processes()
-        return tuple(
-            RunningNode(
-                name=each.full_name,
-                count=each.count,
-                processes=processes.get(each.full_name, {}),
-            )
-            for each in nodes
-        ), unsettled
+        return nodes, unsettled
 
     def processes(self) -> dict[str, dict[int, str]]:
         """Return the command lines of this host's processes by full node name and pid."""
@@ -197,10 +189,6 @@ class ObserverParticipant:
     async def wait_change(self) -> None:
         """Wait until something changed."""
         await self._graph.wait_change()
-
-    def service_names(self) -> frozenset[str]:
-        """Return the names of all services that have a server or a client."""
-        return self._graph.discovery.service_names()
 
     def put_configuration(self, configuration: NodeConfiguration) -> None:
         """Give what a node reported over its control channel."""
@@ -254,7 +242,7 @@ class ObserverParticipant:
         on_call: Callable[[str, Answer], None],
         *,
         diagnoses: bool,
-    ) -> Offer:
+    ) -> RosInterface:
         """Make the topics and services by which ROS programs reach the supervisor.
 
         Raises:

@@ -9,50 +9,33 @@ Must not import rclpy.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 from lifecycle import dataclasses
 from lifecycle.errors import BringUpError
 from lifecycle.manifest import Condition, RunKind, TargetState
-from lifecycle.node import SERVED_ON_DEMAND, Operation
 from lifecycle.node import Event as HostEvent
+from lifecycle.node import Operation
 from lifecycle.plan import Plan, PlannedNode, PlannedProcess, attached_to, in_mode
-from lifecycle.supervisor.control.protocol import ProcessState, Reach
+from lifecycle.supervisor.control.protocol import Reach
 from lifecycle.supervisor.gate.gate import Permit
 from lifecycle.supervisor.health.liveliness import SilenceMonitor
 from lifecycle.supervisor.nodes.driver import ACTIVE, INACTIVE, NodeCondition, NodeDriver
-from lifecycle.supervisor.processes.adopted_process import AdoptedProcess, RunningNode
-from lifecycle.supervisor.processes.control_channel import ControlChannel
 from lifecycle.supervisor.processes.fork_server_main import GRACE_S
 from lifecycle.supervisor.processes.logs import LogDirectory
 from lifecycle.supervisor.processes.process import ManagedProcess, own_run_delay_s
 from lifecycle.supervisor.run.events import Emitter, NodeChanged, Notice, RequestSent
 from lifecycle.verify import HealthReport, NodeConfiguration, Observation, health_of
 
+if TYPE_CHECKING:
+    from lifecycle.supervisor.gate.verification_loop import ChangeCounter
+    from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
+
 ASK_AGAIN_S = 0.2
 """A remote node is asked again so long after, because the event that it connected may be missed:
 its announcer may not be matched yet."""
-
-
-class ObservationSource(Protocol):
-    """What a supervisor sees of the graph, see lifecycle.graph.Graph."""
-
-    async def observe(self, plan: Plan) -> Observation:
-        """Return what the graph holds now, nodes' own reports included."""
-
-
-class ChangeSource(Protocol):
-    """When it is worth looking again, see verification_loop.ChangeCounter."""
-
-    @property
-    def count(self) -> int:
-        """Changes so far."""
-
-    async def beyond(self, count: int, timeout_s: float | None) -> bool:
-        """Wait for a change after `count`."""
 
 
 class RemoteNode:
@@ -95,8 +78,8 @@ class RemoteNodes:
         self,
         plan: Plan,
         nodes: Iterable[RemoteNode],
-        observer: ObservationSource,
-        changes: ChangeSource,
+        observer: ObserverParticipant,
+        changes: ChangeCounter,
     ) -> None:
         self._nodes = tuple(nodes)
         # Ours report by themselves: only these have to be asked.
@@ -119,7 +102,9 @@ class RemoteNodes:
 class AwaitedHealth:
     """Takes from the graph the health that others wait for, where no host of ours reports all."""
 
-    def __init__(self, system: System, observer: ObservationSource, changes: ChangeSource) -> None:
+    def __init__(
+        self, system: System, observer: ObserverParticipant, changes: ChangeCounter
+    ) -> None:
         self._system = system
         self._observer = observer
         self._changes = changes
@@ -146,75 +131,6 @@ class AwaitedHealth:
                 each.health = own.get(each.name), published.get(each.name)
                 each.wake()
             await self._changes.beyond(count, ASK_AGAIN_S)
-
-
-class ServiceNames(Protocol):
-    """What is asked for in the graph, see nodes/observer_participant.py."""
-
-    def service_names(self) -> frozenset[str]:
-        """Return the names of all services that have a server or a client."""
-
-
-class ServicesOnDemand:
-    """Has nodes of ours offer the services that a client waits for.
-
-    They are not there from the start, see node's SERVED_ON_DEMAND. Only hosts of ours leave them
-    out, and each has one supervisor.
-    """
-
-    def __init__(self, system: System, graph: ServiceNames, changes: ChangeSource) -> None:
-        self._system = system
-        self._graph = graph
-        self._changes = changes
-        self._offered: dict[tuple[str, Operation], ControlChannel] = {}
-
-    async def follow(self) -> None:
-        """Look once after each burst of changes, until this is cancelled."""
-        loop = asyncio.get_running_loop()
-        while True:
-            count = self._changes.count
-            await self._look()
-            await self._changes.beyond(count, None)
-            end_s = loop.time() + _BURST_S
-            while (left_s := end_s - loop.time()) > 0:
-                count = self._changes.count
-                await asyncio.sleep(min(_QUIET_S, left_s))
-                if self._changes.count == count:
-                    break
-
-    async def _look(self) -> None:
-        quiet = {
-            (node.name, operation): channel
-            for node in self._system.nodes.values()
-            if (channel := _channel_of(node)) is not None
-            for operation in SERVED_ON_DEMAND
-            if self._offered.get((node.name, operation)) is not channel
-        }
-        if not quiet:
-            return
-        # What a node offers from the start has a server: it is asked for once, which is harmless.
-        names = self._graph.service_names()
-        asked = {
-            (name, operation): channel
-            for (name, operation), channel in quiet.items()
-            if any(f"{name}/{service}" in names for service in SERVED_ON_DEMAND[operation])
-        }
-        self._offered.update(asked)
-        await asyncio.gather(*(_offer(channel, *each) for each, channel in asked.items()))
-
-
-def _channel_of(node: NodeRun) -> ControlChannel | None:
-    """Return the channel to a managed node's host, while that runs."""
-    process = node.process
-    if process is None or process.state is not ProcessState.RUNNING or not node.planned.managed:
-        return None
-    return process.channel
-
-
-async def _offer(channel: ControlChannel, node: str, operation: Operation) -> None:
-    # A host that hangs or ends is noticed elsewhere.
-    with contextlib.suppress(BringUpError, asyncio.TimeoutError):
-        await asyncio.wait_for(channel.request(node, operation), _OFFER_S)
 
 
 def _conditions(planned: PlannedNode, observation: Observation) -> Iterable[Condition]:
@@ -258,15 +174,6 @@ _CONDITIONS = {
     Condition.HEALTHY: Reach.ACTIVE,
 }
 
-_QUIET_S = 0.05
-"""So often is looked whether a burst is over: a client's endpoints come together."""
-
-_BURST_S = 0.5
-"""While a system comes up the graph changes all the time: then it is looked at so often."""
-
-_OFFER_S = 5.0
-
-
 _REPORTING = {
     True: (Reach.CONFIGURED, Reach.CONNECTED, Reach.ACTIVE),
     False: (Reach.STARTED, Reach.ACTIVE),
@@ -275,33 +182,6 @@ _REPORTING = {
 
 _REFRESH_S = 1.0
 """A host answers from its executor within a millisecond; this long it is busy or hung."""
-
-
-class ObservedGraph(Protocol):
-    """What a supervisor sees of the graph, see lifecycle.graph.Graph."""
-
-    async def observe(self, plan: Plan) -> Observation:
-        """Return what the graph holds now, with the configurations put here and read there."""
-
-    def expect_newcomers(self, *, everybody: bool = False) -> bool:
-        """Have the next `observe` wait for who came lately; return whether there may be anybody.
-
-        Args:
-            everybody: this process did not run for a while, and anybody may have come.
-        """
-
-    def reread_parameters(self) -> bool:
-        """Have the next `observe` read all parameters again; return whether it reads any."""
-
-    @property
-    def changes(self) -> int:
-        """Changes of the graph so far, each counted as soon as it is noticed."""
-
-    async def wait_change(self) -> None:
-        """Wait until the graph may have changed since the last `observe`."""
-
-    def put_configuration(self, configuration: NodeConfiguration) -> None:
-        """Give what a node reported over its control channel."""
 
 
 class NodeRun:
@@ -318,8 +198,6 @@ class NodeRun:
         connections: names of what the authority connected it to, oldest first.
         found: state in which it was adopted, `running` for one that is not managed; empty for one
             that is not adopted.
-        running: as it ran before this supervisor did; None if it did not.
-        adopted: the process that others started it in, where that is known.
         reports_changes: its host reports unasked when its configuration changes.
         unload: has its container unload a component; None for what is not loaded into one.
         is_up: it was started and brought as far as its gate; cleared when it goes down.
@@ -342,8 +220,6 @@ class NodeRun:
         self.stuck = False
         self.connections: tuple[str, ...] = ()
         self.found = ""
-        self.running: RunningNode | None = None
-        self.adopted: AdoptedProcess | None = None
         self.reports_changes = False
         self.unload: Callable[[], Awaitable[None]] | None = None
         self.is_up = False
@@ -388,17 +264,13 @@ class NodeRun:
 
     @property
     def pid(self) -> int:
-        """Its process; 0 if that was not started, or is not known."""
-        if self.process is not None:
-            return self.process.pid
-        return 0 if self.adopted is None else self.adopted.pid
+        """Its process; 0 if that was not started by this supervisor."""
+        return 0 if self.process is None else self.process.pid
 
     @property
     def is_gone(self) -> bool:
         """Whether its process has ended, as far as that is noticed."""
-        if self.process is not None:
-            return self.process.is_gone
-        return self.adopted is not None and self.adopted.ended.done()
+        return self.process is not None and self.process.is_gone
 
     def run_delay_s(self) -> float:
         """Return the run delay of its process and ours, seconds: ready to run, but without CPU."""
@@ -513,7 +385,8 @@ class System:
         machines: those whose nodes it brings up; None if that is all of them.
         remote: the plan's other nodes, which another supervisor brings up.
         adopts: takes nodes that others started as they are found, active ones too.
-        adopted: processes that others started and that run nodes of it, where they are known.
+        adopted: the nodes that ran before it, by full name, with the process that each is in as
+            people read it; empty where that is not known.
         touched: set whenever a node reported something of itself: time to judge again.
         mode: name of the one that it is in, or is on its way to; empty for a plan without modes.
         liveliness: which nodes are silent.
@@ -560,7 +433,7 @@ class System:
         self.machines = frozenset(each.machine for each in own) if self.remote else None
         self._by_name = {node.name: node for node in self.nodes.values()}
         self.adopts = False
-        self.adopted: tuple[AdoptedProcess, ...] = ()
+        self.adopted: dict[str, str] = {}
         self.touched = asyncio.Event()
         self.present: frozenset[str] | None = None
         self.liveliness = SilenceMonitor(emit, self.touched.set, self._is_there)
@@ -595,11 +468,10 @@ class System:
 
     def over(self) -> dict[str, str]:
         """Return how the process ended of each node that has ended by itself as it may."""
-        processes = {node.name: node.process or node.adopted for node in self.nodes.values()}
         return {
-            name: str(process.ended.result())
-            for name, process in processes.items()
-            if process is not None and process.is_over
+            node.name: str(node.process.ended.result())
+            for node in self.nodes.values()
+            if node.process is not None and node.process.is_over
         }
 
     def _is_there(self, name: str) -> bool:
@@ -613,16 +485,17 @@ class System:
         """Return the node with this fully qualified name."""
         return self._by_name.get(name)
 
-    def adopt(self, running: Mapping[str, RunningNode]) -> None:
+    def adopt(self, running: Mapping[str, str]) -> None:
         """Leave nodes to who started them: none of them is started, nor ended.
 
         Args:
-            running: by key; of the processes that would have been started for them, all nodes.
+            running: by key, the process that each is in as people read it; of the processes that
+                would have been started for them, all nodes.
         """
         self.adopts = True
-        for key, each in running.items():
+        for key, where in running.items():
             node = self.nodes[key]
-            node.running = each
+            self.adopted[node.name] = where
             if node.process is not None:
                 self.processes.pop(node.process.name, None)
                 node.process = None
@@ -644,30 +517,20 @@ class System:
         names = [each.name for each in plan.modes]
         return self.mode if self.mode in names else next(iter(names), "")
 
-    def reload(
-        self,
-        plan: Plan,
-        processes: Iterable[PlannedProcess],
-        nodes: Collection[NodeRun],
-        revision: int | None = None,
+    def take(
+        self, plan: Plan, nodes: Collection[NodeRun], revision: int | None = None
     ) -> tuple[NodeRun, ...]:
         """Take another manifest's plan; what of it reaches processes may differ for `nodes` alone.
 
         Args:
             plan: of which all nodes are this supervisor's.
-            processes: of that plan.
             nodes: those that were taken down, with all of their processes.
             revision: of one that was in force before; None for a new one.
 
         Returns:
             The nodes to bring up in their place.
         """
-        names = {each.key: each.full_name for each in plan.nodes}
-        adopted = {
-            key: node
-            for key, node in self.nodes.items()
-            if node.running is not None and names.get(key) == node.name
-        }
+        adopted = {each.key for each in plan.nodes if each.full_name in self.adopted}
         if revision is None:
             revision = self._last_revision = self._last_revision + 1
         self.revision = revision
@@ -679,12 +542,9 @@ class System:
         self.plan = self.expected = taken
         kept = {each.process.name: each.process for each in stay.values() if each.process}
         self.nodes, self.processes = {}, {}
-        for process in processes:
+        for process in taken.processes:
             managed = kept.get(process.name)
-            others = process.run.kind is RunKind.ATTACH or not adopted.keys().isdisjoint(
-                process.nodes
-            )
-            if managed is None and not others:
+            if managed is None and process.run.kind is not RunKind.ATTACH:
                 managed = self._process(process)
                 managed.joins = bool(kept)
             elif managed is not None:
@@ -700,10 +560,6 @@ class System:
                     continue
                 node = self.nodes[key] = NodeRun(self.plan.node(key), self.emit)
                 node.process = managed
-                if key in adopted:
-                    before = adopted[key]
-                    node.running, node.adopted = before.running, before.adopted
-                    node.found = before.found
                 node.advance(Reach.WAITING)
         self._by_name = {node.name: node for node in self.nodes.values()}
         return tuple(each for key, each in self.nodes.items() if key not in stay)
@@ -795,7 +651,7 @@ class System:
             or any(after.node == key for after in node.planned.after)
         )
 
-    async def refresh(self, observer: ObservedGraph, *, marks: bool = False) -> None:
+    async def refresh(self, observer: ObserverParticipant, *, marks: bool = False) -> None:
         """Read the configuration of every reachable node and give it to the observer.
 
         One whose host reports every change by itself is not asked. A node that does not answer

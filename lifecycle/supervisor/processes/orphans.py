@@ -17,7 +17,7 @@ import signal
 import time
 from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 from lifecycle.run_directory import (
     OWN_CHILD,
@@ -29,6 +29,9 @@ from lifecycle.run_directory import (
     is_process,
     parent_of,
 )
+
+if TYPE_CHECKING:
+    from lifecycle.supervisor.processes.fork_server import ForkServer
 
 GRACE_S = 3.0
 """Between asking an orphan to end and killing it."""
@@ -59,20 +62,9 @@ class _Orphan:
             signal.pidfd_send_signal(self.pidfd, number)
 
 
-class ProcessFamily(Protocol):
-    """What knows the processes of a run by their descent, see fork_server.ForkServer."""
-
-    @property
-    def pid(self) -> int:
-        """The fork server."""
-
-    def family(self) -> frozenset[int]:
-        """Return the pids of all that was started, without the fork server itself."""
-
-
 def end_strays(
     run_id: str,
-    fork_server: ProcessFamily | None = None,
+    fork_server: ForkServer | None = None,
     grace_s: float = 0.5,
     *,
     spare: Collection[int] = (),
@@ -107,7 +99,7 @@ def end_strays(
 
 async def end_left(
     run_id: str,
-    family: ProcessFamily,
+    family: ForkServer,
     ended: Mapping[int, str],
     living: Collection[int],
     known: Collection[int] = (),
@@ -149,7 +141,7 @@ async def end_left(
 
 
 def belonging(
-    run_id: str, family: ProcessFamily, processes: Mapping[int, str], others: Collection[int]
+    run_id: str, family: ForkServer, processes: Mapping[int, str], others: Collection[int]
 ) -> set[int]:
     """Return the pids of all that processes of a run have started, whether they live or not.
 

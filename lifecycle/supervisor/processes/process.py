@@ -16,7 +16,7 @@ import os
 import signal
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from lifecycle import dataclasses
 from lifecycle.manifest import Output, Resources
@@ -35,6 +35,9 @@ from lifecycle.supervisor.processes.logs import (
     logger_of,
 )
 from lifecycle.supervisor.run.events import Emitter, LogLine, ProcessChanged
+
+if TYPE_CHECKING:
+    from lifecycle.supervisor.processes.fork_server import ForkServer, ForkServerChild
 
 CHANGES: dict[ProcessState, frozenset[ProcessState]] = {
     ProcessState.STARTING: frozenset(
@@ -153,61 +156,6 @@ class SpawnRequest:
     resources: Resources | None = None
 
 
-class Child(Protocol):
-    """A started process, which is the leader of its own session and process group.
-
-    Attributes:
-        pid: process id in our pid namespace.
-        exited: resolves as soon as it ended.
-    """
-
-    pid: int
-    exited: asyncio.Future[ProcessExit]
-
-    def signal(self, number: int) -> None:
-        """Send a signal to the process and everything in its group; harmless once it ended."""
-
-    def run_delay_s(self) -> float:
-        """Return the seconds that its threads have waited for a processor, added up.
-
-        Those of all its descendants count, too; 0 where the kernel does not say.
-        """
-
-
-class Spawner(Protocol):
-    """Starts processes."""
-
-    async def ready(self) -> None:
-        """Wait, bounded, until processes can be started.
-
-        Raises:
-            BringUpError: they cannot.
-        """
-
-    async def spawn(self, request: SpawnRequest) -> Child:
-        """Start one process.
-
-        Raises:
-            BringUpError: it cannot be started.
-        """
-
-    def belonging(self, processes: Mapping[int, str]) -> frozenset[int]:
-        """Return the pids of all that processes have started; their names by pid."""
-
-    async def end_left(
-        self, ended: Mapping[int, str], known: Collection[int] = ()
-    ) -> tuple[int, ...]:
-        """End, bounded, what processes have left that have ended; return the pids.
-
-        Args:
-            ended: their names by pid.
-            known: pids of what belonged to them before.
-        """
-
-    async def close(self) -> None:
-        """Give up the spawner; its children must have ended."""
-
-
 Escalation = Sequence[tuple[int, float]]
 """Steps to end a process: (signal number, 0 for none; seconds to wait for its end after it)."""
 
@@ -285,7 +233,7 @@ class ManagedProcess:
         self._variables = variables
         self.state = ProcessState.STARTING
         self.channel: ControlChannel | None = None
-        self.child: Child | None = None
+        self.child: ForkServerChild | None = None
         self.ended: asyncio.Future[ProcessExit] = asyncio.get_running_loop().create_future()
         self.asked_to_end = False
         self.started_s = emit.elapsed_s
@@ -327,7 +275,7 @@ class ManagedProcess:
             self.log.add(line)
         return brief(stacks)
 
-    async def spawn(self, spawner: Spawner, channel: ControlChannel | None) -> None:
+    async def spawn(self, spawner: ForkServer, channel: ControlChannel | None) -> None:
         """Start the process; returns once it exists.
 
         Raises:

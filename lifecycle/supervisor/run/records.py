@@ -6,11 +6,14 @@ Owns: `Records`, which keeps the run directory true.
 from __future__ import annotations
 
 import asyncio
+from typing import TYPE_CHECKING
 
 from lifecycle.run_directory import FORK_SERVER, ChildRecord, RunDirectory, start_ticks
 from lifecycle.supervisor.nodes.system import System
-from lifecycle.supervisor.processes.orphans import ProcessFamily
 from lifecycle.supervisor.run.events import Emitter, Notice
+
+if TYPE_CHECKING:
+    from lifecycle.supervisor.processes.fork_server import ForkServer
 
 _AGAIN_S = 2.0
 """How often a record is tried that could not be written."""
@@ -20,7 +23,7 @@ class Records:
     """The records of one run; `close` it."""
 
     def __init__(
-        self, directory: RunDirectory, system: System, fork_server: ProcessFamily, emit: Emitter
+        self, directory: RunDirectory, system: System, fork_server: ForkServer, emit: Emitter
     ) -> None:
         self._emit = emit
         self._again: asyncio.TimerHandle | None = None

@@ -12,26 +12,22 @@ import os
 import signal
 from collections.abc import (
     AsyncIterator,
-    Awaitable,
-    Callable,
     Collection,
     Coroutine,
     Iterable,
     Iterator,
-    Mapping,
 )
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from lifecycle import dataclasses
 from lifecycle.errors import ExitCode
-from lifecycle.plan import PlannedNode
 from lifecycle.run_directory import RunDirectory, start_ticks
 from lifecycle.supervisor.connections import discovery_server
-from lifecycle.supervisor.connections.authority import Reaching, authority_of
+from lifecycle.supervisor.connections.authority import authority_of
 from lifecycle.supervisor.connections.networks import Networks
 from lifecycle.supervisor.control.orders import ACTIVE, HELD, PAUSED, Revisions
 from lifecycle.supervisor.control.protocol import SystemStatus
-from lifecycle.supervisor.control.ros_interface import Offering, RosInterface
+from lifecycle.supervisor.control.ros_interface import RosInterface
 from lifecycle.supervisor.control.server import ControlServer, SupervisorSnapshot
 from lifecycle.supervisor.control.status import system_status
 from lifecycle.supervisor.gate.activation_guard import ActivationGuard
@@ -39,33 +35,26 @@ from lifecycle.supervisor.gate.gate import Gate, VerificationError, closes
 from lifecycle.supervisor.gate.hold import Holding
 from lifecycle.supervisor.gate.sequence import GateSequence
 from lifecycle.supervisor.gate.verification_loop import ChangeCounter, VerificationLoop
-from lifecycle.supervisor.health import agreement, peer_supervisors
+from lifecycle.supervisor.health import agreement
 from lifecycle.supervisor.health.agreement import Agreement
-from lifecycle.supervisor.health.answering import Answering, Asking
+from lifecycle.supervisor.health.answering import Answering
 from lifecycle.supervisor.health.peer_supervisors import PeerSupervisors
 from lifecycle.supervisor.health.process_monitor import (
-    ParticipantRegistry,
     ProcessMonitor,
     Sightings,
     StaleNodes,
 )
 from lifecycle.supervisor.health.reception import watch_reception
-from lifecycle.supervisor.nodes.adoption import SETTLE_S, Adoption, Census, ran_before
+from lifecycle.supervisor.nodes.adoption import adopt, ran_before
 from lifecycle.supervisor.nodes.bring_up import BringUp
-from lifecycle.supervisor.nodes.driver import NodeDriver
 from lifecycle.supervisor.nodes.system import (
     AwaitedHealth,
     NodeRun,
-    ObservedGraph,
     RemoteNodes,
-    ServiceNames,
-    ServicesOnDemand,
     System,
 )
 from lifecycle.supervisor.policy.schedule import RestartSchedule
-from lifecycle.supervisor.processes.adopted_process import AdoptedProcess
-from lifecycle.supervisor.processes.orphans import ProcessFamily, end_strays, reap_adopted
-from lifecycle.supervisor.processes.process import Spawner
+from lifecycle.supervisor.processes.orphans import end_strays, reap_adopted
 from lifecycle.supervisor.run.events import (
     Emitter,
     LogLine,
@@ -89,6 +78,10 @@ from lifecycle.verify import (
     missing,
     not_ok,
 )
+
+if TYPE_CHECKING:
+    from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
+    from lifecycle.supervisor.processes.fork_server import ForkServer
 
 _GLANCE_S = 1.0
 """How long `--until connected` looks for a verdict to report; it gates nothing."""
@@ -161,76 +154,6 @@ class _Time:
         )
 
 
-class SessionParticipant(
-    ObservedGraph,
-    peer_supervisors.AliveExchange,
-    agreement.PlanExchange,
-    Reaching,
-    ParticipantRegistry,
-    ServiceNames,
-    Offering,
-    Census,
-    Asking,
-    Protocol,
-):
-    """What a session needs of its participant in the graph, see nodes/observer_participant.py.
-
-    The parts are the Protocols of those who use them; here is what the session itself asks.
-    """
-
-    async def load(self, node: PlannedNode, container: str) -> Callable[[], Awaitable[None]]:
-        """Have a component container load a node; return what unloads it.
-
-        Raises:
-            MiddlewareError: with the reason; so does what unloads.
-        """
-
-    async def give(self, node: PlannedNode) -> None:
-        """Set the parameters that a running node has with other values than its plan gives it."""
-
-    async def set_parameters(
-        self, node: str, values: Mapping[str, Any], types: Mapping[str, str]
-    ) -> None:
-        """Set parameters of a running node, by full name, all or none.
-
-        Raises:
-            MiddlewareError: it does not answer, or refuses.
-        """
-
-    def driver(self, node: PlannedNode) -> NodeDriver:
-        """Return the driver of a managed node that is not in a host of ours."""
-
-    def drop_configuration(self, node: str) -> None:
-        """Forget what a node reported whose process ended."""
-
-    def announce_ourselves(self) -> None:
-        """Have our participant announce itself to those that it knows."""
-
-    def can_be_unannounced(self) -> bool:
-        """Return whether participants like ours can be, see HostSpec."""
-
-    def names_can_go_by_udp(self) -> bool:
-        """Return whether names of nodes that are started now would arrive, see HostSpec."""
-
-    def prepare_to_leave(self) -> None:
-        """Close connections that are not answered, so that leaving does not wait for them."""
-
-
-class SessionForkServer(Spawner, ProcessFamily, Protocol):
-    """What a session needs of its fork server, see processes/fork_server.py."""
-
-    @property
-    def waited_for(self) -> tuple[int, ...]:
-        """Pids of processes whose ends the fork server reads: no other code may reap them."""
-
-    @property
-    def died(self) -> asyncio.Future[str]:
-        """Resolves with how, if the fork server ends unasked."""
-
-    def disown_ports(self) -> None:
-        """Have all participants of this host send no more to ports whose process was killed."""
-
-
 class Session:
     """A supervisor of one system.
 
@@ -254,8 +177,8 @@ class Session:
         *,
         directory: RunDirectory,
         records: Records,
-        fork_server: SessionForkServer,
-        observer_participant: SessionParticipant,
+        fork_server: ForkServer,
+        observer_participant: ObserverParticipant,
         networks: Networks,
         emit: Emitter,
         ending: Ending,
@@ -320,7 +243,6 @@ class Session:
             system.plan, system.awaited(), observer_participant, self._changes
         )
         self._awaited_health = AwaitedHealth(system, observer_participant, self._changes)
-        self._interfaces = ServicesOnDemand(system, observer_participant, self._changes)
         self._gate_sequence = GateSequence(
             system,
             bring_up=self._bring_up,
@@ -422,10 +344,7 @@ class Session:
         self._emit.listen(self._ros_interface.on_event)
         self._ros_interface.begin()
         result = UpResult(exit_code=ExitCode.INTERNAL, verdict=NOT_JUDGED)
-        beside = (
-            asyncio.ensure_future(self._interfaces.follow()),
-            asyncio.ensure_future(watch_reception(self._system)),
-        )
+        receiving = asyncio.ensure_future(watch_reception(self._system))
         answering = Answering(self._system, self._observer_participant)
         asking = asyncio.ensure_future(answering.follow())
         try:
@@ -440,9 +359,7 @@ class Session:
                 if self._hurry.is_set() and result.exit_code == ExitCode.OK:
                     result = _hurried(result)
         finally:
-            await ended(*beside)
-            for each in self._system.adopted:
-                each.close()
+            await ended(receiving)
             self._stale.close()
             self._judge.close()
             await self._changes.close()
@@ -614,16 +531,9 @@ class Session:
             VerificationError: a node runs more than once.
             StepFailedError: of a process with several nodes only some run.
         """
-        running, unsettled = await self._observer_participant.running(SETTLE_S)
-        if unsettled:
-            self._emit(Notice(message=f"what runs may not be all that is adopted: {unsettled}"))
-        adoption = Adoption(self._system, running)
-        if findings := adoption.findings():
+        if findings := await adopt(self._system, self._observer_participant):
             raise VerificationError(self._judge.refuse(findings))
-        names = adoption.adopt(self._adopted_ended)
-        if not names:
-            self._emit(Notice(message="nothing is adopted: no node of the manifest runs yet"))
-        self._replanned(names)
+        self._replanned(self._system.adopted)
 
     def _forget(self, nodes: Collection[NodeRun], left: Collection[int]) -> None:
         for node in nodes:
@@ -633,14 +543,9 @@ class Session:
                 self._stale.forget(pid, tuple(nodes))
 
     def _alone(self, node: NodeRun) -> None:
-        ours = self._fork_server.family()
-        if findings := ran_before(node, self._observer_participant, ours):
+        processes = self._observer_participant.processes().get(node.name, {})
+        if findings := ran_before(node, processes, self._fork_server.family()):
             raise VerificationError(self._judge.refuse(findings))
-
-    def _adopted_ended(self, process: AdoptedProcess) -> None:
-        nodes = [each for each in self._system.nodes.values() if each.adopted is process]
-        self._stale.forget(process.pid, nodes)
-        self._system.touched.set()
 
     @contextlib.asynccontextmanager
     async def _following(self) -> AsyncIterator[None]:

@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 
 from lifecycle.errors import ExitCode
-from lifecycle.middleware import segments_of, sweep
 from tests.ros.supervisor.running import BOUND_S, Up, pair, up, verb
 
 _ELSEWHERE = str(Path(__file__).with_name("managed_elsewhere.py"))
@@ -82,12 +81,6 @@ def test_a_node_is_not_touched_but_adopted_and_outlives_a_supervisor_that_is_kil
             adopts(following, "active", base.pid)
             assert asked(following) == []
             assert following.pid_of("talker") != killed.pid_of("talker")
-            # Its pidfd notifies at once; DDS would show it for 20 s.
-            segments = segments_of([base.pid])
-            base.kill()
-            assert following.finish() == ExitCode.BRING_UP_FAILED
-            (failure,) = following.of_kind("failure")
-            assert (failure["rule"], failure["subject"]) == ("run.process-died", "/base")
+            assert verb("down", str(manifest), runtime=tmp_path).returncode == ExitCode.OK
             following.assert_nothing_left()
-            # What another's process leaves is not a supervisor's to remove.
-            sweep(segments)
+            assert base.poll() is None

@@ -24,7 +24,6 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from lifecycle.errors import ExitCode
-from tests.ros.middleware.free_ports import free_ports
 from tests.ros.supervisor.running import BOUND_S, ENOUGH, Up, pair, up, verb
 from tests.ros.supervisor.test_parameters import ARM
 
@@ -512,17 +511,9 @@ def test_a_changed_manifest_is_neither_restarted_nor_resumed_in_silence(
         )
         assert verb("resume", "pair", runtime=tmp_path).returncode == ExitCode.OK
 
-        # One node is not what has changed.
-        refused = verb("restart", str(manifest), "listener", "--reload", runtime=tmp_path)
-        assert refused.returncode == ExitCode.USAGE
-        assert refused.stderr == (
-            f"cannot reload 'listener' alone: more has changed:\n{said}"
-            f"restart the whole system: lifecycle restart {manifest} --reload\n"
-        )
         listener, talker = run.pid_of("listener"), run.pid_of("talker")
-        taken = verb("restart", str(manifest), "talker", "--reload", runtime=tmp_path)
+        taken = verb("apply", str(manifest), runtime=tmp_path)
         assert (taken.returncode, taken.stderr) == (ExitCode.OK, "")
-        run.met("notice", message=f"takes the changed manifest: {said}".strip())
         run.catch_up()
         assert run.pid_of("listener") == listener
         assert run.pid_of("talker") != talker
@@ -538,111 +529,6 @@ def line_of(manifest: Path, start: str) -> int:
     return next(number for number, line in enumerate(lines, 1) if line.startswith(start))
 
 
-@pytest.mark.thorough
-def test_a_node_is_not_reloaded_alone_where_others_would_notice(
-    tmp_path: Path, fresh_domain: int
-) -> None:
-    running = {"data_layer/authority": "supervisor"}
-    manifest = pair(tmp_path, fresh_domain, edit=running)
-    with up(manifest, runtime=tmp_path) as run:
-        run.until("system", reached="active")
-        begun = len(run.events)
-        refusals: dict[str, dict[str, object]] = {
-            "it would run in another process": {"nodes/talker/process": "other"},
-            "'/listener' would be connected otherwise": {
-                "nodes/talker/flows": {"publishers": {"chatter": {"transport": "multicast"}}}
-            },
-        }
-        for why, edit in refusals.items():
-            pair(tmp_path, fresh_domain, edit={**running, **edit})
-            refused = verb("restart", str(manifest), "talker", "--reload", runtime=tmp_path)
-            assert refused.returncode == ExitCode.USAGE
-            assert refused.stderr == (
-                f"cannot reload 'talker' alone: {why}; restart the whole system: "
-                f"lifecycle restart {manifest} --reload\n"
-            )
-        run.catch_up()
-        assert requests(run, begun) == []
-        assert phases(tmp_path)[0] == "active"
-
-
-@pytest.mark.thorough
-def test_a_manifest_that_moves_the_supervisor_itself_is_not_reloaded(
-    tmp_path: Path, fresh_domain: int
-) -> None:
-    first_port = free_ports(_PORTS)[0]
-    how = {"discovery": {"domain_id": fresh_domain, "mode": "static", "first_port": first_port}}
-    manifest = pair(tmp_path, fresh_domain, edit=how)
-    with up(manifest, runtime=tmp_path) as run:
-        run.until("system", reached="active")
-        # One more participant, whose ports come before those of others.
-        unique = {"publishers": {"chatter": {"unique": "strictly_required"}}}
-        pair(tmp_path, fresh_domain, edit={**how, "nodes/talker/flows": unique})
-        for words in ((), ("talker",)):
-            refused = verb("restart", str(manifest), *words, "--reload", runtime=tmp_path)
-            assert refused.returncode == ExitCode.USAGE
-            assert refused.stderr == (
-                "cannot reload the manifest of 'pair' while it runs: its supervisor would be "
-                "connected otherwise; end it and start it anew: lifecycle down, then lifecycle up\n"
-            )
-        assert phases(tmp_path)[0] == "active"
-
-
-@pytest.mark.thorough
-def test_a_reloaded_system_has_the_nodes_of_the_new_manifest(
-    tmp_path: Path, fresh_domain: int
-) -> None:
-    manifest = pair(tmp_path, fresh_domain)
-    with up(manifest, runtime=tmp_path) as run:
-        run.until("system", reached="active")
-        old = {run.pid_of("talker"), run.pid_of("listener")}
-        begun = len(run.events)
-        document = yaml.safe_load(manifest.read_text())
-        nodes = document["nodes"]
-        nodes["second"] = {**nodes["listener"], "after": {"talker": "connected"}}
-        del nodes["listener"]
-        document["links"][0]["to"] = "second"
-        manifest.write_text(yaml.safe_dump(document))
-        taken = verb("restart", str(manifest), "--reload", runtime=tmp_path)
-        assert (taken.returncode, taken.stderr) == (ExitCode.OK, "")
-        run.until("system", reached="active")
-        run.met(
-            "notice",
-            since=begun,
-            message=("takes the changed manifest: nodes.listener: was declared, is not declared"),
-        )
-        assert_no_activate_before_a_new_gate(run, begun)
-        assert not old & {run.pid_of("talker"), run.pid_of("second")}
-        assert phases(tmp_path) == ("active", {"/talker": "active", "/second": "active"})
-        judged = verb("verify", str(manifest), *ENOUGH, runtime=tmp_path)
-        assert judged.returncode == ExitCode.OK, judged.stdout
-        assert verb("restart", str(manifest), "second", runtime=tmp_path).returncode == ExitCode.OK
-        assert verb("down", str(manifest), runtime=tmp_path).returncode == ExitCode.OK
-        assert run.finish() == ExitCode.OK
-        run.assert_nothing_left()
-
-
-@pytest.mark.thorough
-def test_a_reloaded_system_that_is_not_as_declared_is_held(
-    tmp_path: Path, fresh_domain: int, make_intruder: Intruders
-) -> None:
-    manifest = pair(tmp_path, fresh_domain, edit={"policy/undeclared_nodes": "open"})
-    make_intruder(fresh_domain)
-    with up(manifest, runtime=tmp_path) as run:
-        run.until("system", reached="active")
-        begun = len(run.events)
-        pair(tmp_path, fresh_domain)
-        refused = verb("restart", str(manifest), "--reload", runtime=tmp_path)
-        assert refused.returncode == ExitCode.VIOLATED
-        assert "graph.undeclared-node" in refused.stderr
-        assert "activate" not in [operation for _, operation in requests(run, begun)]
-        assert phases(tmp_path) == ("held", {"/talker": "inactive", "/listener": "inactive"})
-        pair(tmp_path, fresh_domain, edit={"policy/undeclared_nodes": "open"})
-        taken = verb("restart", str(manifest), "--reload", runtime=tmp_path)
-        assert (taken.returncode, taken.stderr) == (ExitCode.OK, "")
-        assert phases(tmp_path) == ("active", {"/talker": "active", "/listener": "active"})
-
-
 def test_what_a_running_supervisor_cannot_take_is_refused_with_the_reason(
     active: Up, shared_domain: int
 ) -> None:
@@ -650,18 +536,15 @@ def test_what_a_running_supervisor_cannot_take_is_refused_with_the_reason(
     end = "; end it and start it anew: lifecycle down, then lifecycle up\n"
     edit = {"discovery/range": "subnet", "policy/ros_interface": "full"}
     manifest = pair(directory, domain_id, edit=edit)
-    refused = verb("restart", str(manifest), "--reload", runtime=directory)
+    refused = verb("apply", str(manifest), runtime=directory)
     assert refused.returncode == ExitCode.USAGE
     assert refused.stderr == (
-        "cannot reload the manifest of 'pair' while it runs: a running supervisor cannot "
+        f"cannot apply {manifest} to 'pair' while it runs: a running supervisor cannot "
         'change this:\ndiscovery.range: was "localhost", is "subnet"\n'
         'policy.ros_interface: was "read_only", is "full"' + end
     )
-    refused = verb("restart", "pair", "--reload", runtime=directory)
-    assert refused.returncode == ExitCode.USAGE
-    assert refused.stderr == ("cannot reload 'pair': it is no manifest; name the manifest's file\n")
     pair(directory, domain_id + 1)
-    refused = verb("restart", str(manifest), "--reload", runtime=directory)
+    refused = verb("restart", str(manifest), runtime=directory)
     assert refused.returncode == ExitCode.USAGE
     assert refused.stderr.startswith(
         f"cannot find a running system 'pair@{domain_id + 1}'; running: pair@{domain_id}"
@@ -687,7 +570,7 @@ def test_a_parameter_file_that_changed_is_not_taken_in_silence(
             assert refused.returncode == ExitCode.USAGE
             assert "nodes.talker.parameter_files: was [" in refused.stderr
         assert verb("restart", "pair", "listener", runtime=tmp_path).returncode == ExitCode.OK
-        taken = verb("restart", str(manifest), "talker", "--reload", runtime=tmp_path)
+        taken = verb("apply", str(manifest), runtime=tmp_path)
         assert (taken.returncode, taken.stderr) == (ExitCode.OK, "")
         assert verb("restart", "pair", runtime=tmp_path).returncode == ExitCode.OK
 

@@ -32,7 +32,6 @@ from lifecycle.supervisor.control.ros_interface import Entry
 from lifecycle.supervisor.health.peer_supervisors import Listener
 from lifecycle.supervisor.nodes.driver import NodeDriver, NodeInterfaceClient, ServiceDriver
 from lifecycle.supervisor.nodes.system import System
-from lifecycle.supervisor.processes.adopted_process import RunningNode
 from lifecycle.supervisor.processes.orphans import end_strays
 from lifecycle.supervisor.processes.process import ProcessExit
 from lifecycle.supervisor.run.events import (
@@ -178,7 +177,6 @@ class FakeParticipant:
         services: of the nodes in `others`.
         changes: so far.
         dropped: nodes whose reports were forgotten.
-        asked_for: services that have a client.
         while_looking: done once, when the next look has seen everything and is not over yet.
         ros: what ROS programs see of the supervisor; None before it is made.
         no_ros: why it cannot be made; empty if it can.
@@ -196,7 +194,6 @@ class FakeParticipant:
         self.services = FakeServices(self, hosts.log)
         self.changes = 0
         self.dropped: list[str] = []
-        self.asked_for: set[str] = set()
         self.while_looking: Callable[[], None] | None = None
         self.ros: FakeRosInterface | None = None
         self.no_ros = ""
@@ -247,17 +244,12 @@ class FakeParticipant:
             happens()
         return seen
 
-    async def running(self, wait_s: float) -> tuple[tuple[RunningNode, ...], str]:
+    async def running(self, wait_s: float) -> tuple[tuple[ObservedNode, ...], str]:
         del wait_s
-        found = tuple(
-            RunningNode(
-                name=name,
-                count=2 if name in self.twice else 1,
-                processes=self.processes().get(name, {}),
-            )
-            for name in self.others
+        found = (
+            ObservedNode(full_name=name, count=1 + (name in self.twice)) for name in self.others
         )
-        return found, ""
+        return tuple(found), ""
 
     def processes(self) -> dict[str, dict[int, str]]:
         return {name: {pid: "by hand"} for name, pid in self.pids.items()}
@@ -290,9 +282,6 @@ class FakeParticipant:
 
     def driver(self, node: PlannedNode) -> NodeDriver:
         return ServiceDriver(self.services, node)
-
-    def service_names(self) -> frozenset[str]:
-        return frozenset(self.asked_for)
 
     def node_interface(self, node: str) -> NodeInterfaceClient:
         return NodeInterfaceClient(self.services, node)
@@ -663,11 +652,9 @@ class SessionWorld:
         finally:
             self._directory.release()
 
-    async def order(
-        self, ask: ControlRequest, node: str = "", *, reload: Plan | None = None, mode: str = ""
-    ) -> str:
+    async def order(self, ask: ControlRequest, node: str = "", *, mode: str = "") -> str:
         """Order something through the control socket; return the answer, `0` or `4 cannot …`."""
-        question = Question(ask=ask, node=node, plan=reload, reload=reload is not None, mode=mode)
+        question = Question(ask=ask, node=node, mode=mode)
         answer = await self._asked(question)
         return f"{answer.exit_code} {answer.error}".rstrip()
 

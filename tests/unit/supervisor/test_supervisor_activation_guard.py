@@ -12,7 +12,7 @@ from lifecycle.plan import Plan
 from lifecycle.supervisor.control.protocol import Reach
 from lifecycle.supervisor.gate.activation_guard import TRIES, ActivationGuard
 from lifecycle.supervisor.nodes.driver import LifecycleClients, ServiceDriver
-from lifecycle.supervisor.nodes.system import ChangeSource, NodeRun
+from lifecycle.supervisor.nodes.system import NodeRun
 from lifecycle.supervisor.run.events import Notice
 from lifecycle.verify.observation import Observation, ObservedNode
 from tests.builders import plan_of, planned_node
@@ -117,7 +117,7 @@ def _followed(tmp_path: Path, *kinds: RunKind) -> list[list[str]]:
         world = World(plan_of(*nodes), tmp_path)
         graph = _Graph()
         guard = ActivationGuard(world.system)
-        following = asyncio.ensure_future(guard.follow(graph, cast("ChangeSource", graph)))
+        following = asyncio.ensure_future(guard.follow(graph, graph))
         await asyncio.sleep(0)
         following.cancel()
         return graph.asked

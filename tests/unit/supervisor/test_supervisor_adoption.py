@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
-import subprocess
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -18,11 +16,10 @@ from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import Condition, RunKind, TargetState
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.control.server import ControlRequest
-from lifecycle.supervisor.processes.adopted_process import RunningNode
 from lifecycle.supervisor.run.options import Until
 from tests.builders import plan_of, planned_node
 from tests.unit.supervisor.fakes import World, run
-from tests.unit.supervisor.session_world import CAMERA_DOWN, INTRUDED, SessionWorld, over
+from tests.unit.supervisor.session_world import INTRUDED, SessionWorld, over
 
 ROBOT = plan_of(
     planned_node("camera", after={"lidar": Condition.ACTIVE}),
@@ -37,18 +34,10 @@ FOUND = {"/new": "unconfigured", "/arm": "inactive", "/lidar": "active", "/logge
 
 ADOPTED = [
     "[notice] '/arm' is adopted, found inactive",
-    "[notice] '/lidar' is adopted, found active: pid {pid}, by hand",
+    "[notice] '/lidar' is adopted, found active: pid 7, by hand",
     "[notice] '/logger' is adopted, found running",
     "[notice] '/new' is adopted, found unconfigured",
 ]
-
-
-@pytest.fixture
-def somebodys() -> Iterator[subprocess.Popen[bytes]]:
-    """A process of somebody else."""
-    with subprocess.Popen(["sleep", "60"]) as process:
-        yield process
-        process.kill()
 
 
 def world_of(tmp_path: Path, plan: Plan = ROBOT, **options: object) -> SessionWorld:
@@ -67,23 +56,20 @@ def notices(world: SessionWorld) -> list[str]:
     return sorted(line for line in world.story if line.startswith("[notice]"))
 
 
-def test_what_runs_is_verified_in_place_and_in_the_end_as_it_was_found(
-    tmp_path: Path, somebodys: subprocess.Popen[bytes]
-) -> None:
+def test_what_runs_is_verified_in_place_and_in_the_end_as_it_was_found(tmp_path: Path) -> None:
     async def main() -> None:
         world = world_of(tmp_path, stop_after_s=3.0)
-        world.graph.pids["/lidar"] = somebodys.pid
+        world.graph.pids["/lidar"] = 7
         await world.run()
         assert world.result is not None
         assert world.result.exit_code == ExitCode.OK
-        assert notices(world) == [each.format(pid=somebodys.pid) for each in ADOPTED]
+        assert notices(world) == ADOPTED
         assert [each for each in world.outline if each.endswith("start")] == ["camera start"]
         assert "[gate] ok: /camera, /new, /arm" in world.outline
         assert requests(world, "/lidar") == requests(world, "/logger") == []
         assert requests(world, "/arm") == ["activate", "deactivate"]
         assert requests(world, "/new") == ["configure", "activate", "deactivate", "cleanup"]
         assert world.graph.others == FOUND
-        assert somebodys.poll() is None
 
     run(main())
 
@@ -138,9 +124,8 @@ def test_a_process_of_which_some_nodes_run_is_not_started_beside_them(tmp_path: 
         ]
         assert world.messages == [
             (
-                "cannot start '/new': the manifest has it in one process with '/lidar', which runs "
-                "already; end that one, and both are started, or start them together, and both are "
-                "adopted"
+                "cannot start '/new': process 'both' is to run it with others, which run already; "
+                "end those and all are started, or start it with them"
             )
         ]
 
@@ -199,58 +184,6 @@ def test_an_attached_node_that_is_active_is_refused_but_for_adopt(tmp_path: Path
         folder = tmp_path / str(adopt)
         folder.mkdir()
         run(main(folder, adopt=adopt))
-
-
-@pytest.mark.parametrize("keep_going", [False, True])
-def test_the_end_of_an_adopted_process_is_noticed_like_that_of_one_of_ours(
-    tmp_path: Path, somebodys: subprocess.Popen[bytes], keep_going: bool
-) -> None:
-    async def main() -> None:
-        world = world_of(tmp_path, keep_going=keep_going, stop_after_s=60.0)
-        world.graph.pids = {"/arm": somebodys.pid, "/lidar": somebodys.pid}
-
-        async def end() -> None:
-            await world.story.until("[system] active")
-            somebodys.kill()
-            somebodys.wait()
-            for name in world.graph.pids:
-                world.graph.others.pop(name)
-            world.graph.note()
-
-        await world.run(end())
-        goes_on = ", and the run goes on" if keep_going else ""
-        assert f"[failure] run.process-died /arm{goes_on}" in world.outline
-        assert world.outline[-len(CAMERA_DOWN) - 2 :] == [*CAMERA_DOWN, *over(6)]
-        assert world.messages[0] == (
-            f"cannot keep '/arm' and '/lidar' running: pid {somebodys.pid}, which was adopted, has "
-            "ended; how it ended is known to who started it"
-        )
-        assert requests(world, "/arm") == ["activate"]
-
-    run(main())
-
-
-def test_an_adopted_node_that_may_end_may_end(
-    tmp_path: Path, somebodys: subprocess.Popen[bytes]
-) -> None:
-    async def main() -> None:
-        client = planned_node("logger", kind=RunKind.COMMAND, managed=False)
-        plan = plan_of(planned_node("camera"), dataclasses.replace(client, may_end=True))
-        world = world_of(tmp_path, plan, stop_after_s=60.0)
-        world.graph.pids["/logger"] = somebodys.pid
-
-        async def end() -> None:
-            await world.story.until("[system] active")
-            somebodys.kill()
-            somebodys.wait()
-            world.graph.others.clear()
-            world.graph.note()
-
-        await world.run(end())
-        assert "[verdict] active unverifiable graph.ended-node /logger" in world.outline
-        assert world.outline[-1] == "[stopped] 0"
-
-    run(main())
 
 
 def test_a_pause_deactivates_what_was_found_active_and_a_resume_leaves_it_so(
@@ -319,8 +252,8 @@ def test_nothing_is_asked_of_a_node_that_ran_before_one_of_ours(
 def test_another_manifest_starts_nothing_beside_what_is_adopted(tmp_path: Path) -> None:
     async def main() -> None:
         system = World(ROBOT, tmp_path).system
-        system.adopt({"lidar": RunningNode(name="/lidar")})
-        system.reload(ROBOT, ROBOT.processes, tuple(system.nodes.values()))
+        system.adopt({"lidar": ""})
+        system.take(ROBOT, tuple(system.nodes.values()))
         assert sorted(system.processes) == ["arm", "camera", "logger", "new"]
         lidar = system.nodes["lidar"]
         assert (lidar.process, lidar.planned.run.kind) == (None, RunKind.ATTACH)

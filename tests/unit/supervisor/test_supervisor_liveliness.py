@@ -428,7 +428,7 @@ def test_a_reloaded_plan_has_its_own_attached_nodes_followed_and_no_others(tmp_p
         assert air.calls
 
         plan = attached("radar", "sonar")
-        system.reload(plan, plan.processes, tuple(system.nodes.values()))
+        system.take(plan, tuple(system.nodes.values()))
         air.ears.clear()
         peer_supervisors.renew()
         assert air.destroyed == 2

@@ -14,7 +14,6 @@ import pytest
 
 from lifecycle.manifest.model import Discovery
 from lifecycle.supervisor.control.protocol import ControlRequest
-from tests.builders import plan_of
 from tests.unit.supervisor.fakes import run
 from tests.unit.supervisor.session_world import (
     ACTIVATED,
@@ -352,33 +351,6 @@ def test_a_restarted_node_stays_inactive_while_the_system_is_wrong_and_can_be_re
             "ended after it was active, exit code 0: lifecycle down; violated for no longer than "
             "1 s, and not counted: /intruder (graph.undeclared-node)"
         )
-
-    run(main())
-
-
-@pytest.mark.parametrize("node", ["viewer", ""])
-def test_a_changed_manifest_is_taken_by_what_restarts(tmp_path: Path, node: str) -> None:
-    camera, viewer = CHAIN.nodes
-    changed = plan_of(camera, dataclasses.replace(viewer, log_level="debug"))
-
-    async def main() -> None:
-        world = SessionWorld(CHAIN, tmp_path)
-
-        async def order() -> None:
-            await world.story.until("[system] active")
-            assert await world.order(ControlRequest.RESTART, node, reload=changed) == "0"
-            # It is the one that runs now, and restarting it changes nothing.
-            assert await world.order(ControlRequest.RESTART, node, reload=changed) == "0"
-            assert await world.order(ControlRequest.DOWN) == "0"
-
-        await world.run(order())
-        difference = 'robot.lifecycle.yaml:1:1: nodes.viewer.log_level: was not set, is "debug"'
-        assert [line for line in world.outline if line.startswith("[notice]")] == [
-            f"[notice] takes the changed manifest: {difference}"
-        ]
-        assert world.story.count("/viewer configure") == 3
-        assert world.story.count("/camera configure") == (1 if node else 3)
-        assert world.system.plan == changed
 
     run(main())
 

@@ -59,7 +59,7 @@ def system() -> System:
     process = SimpleNamespace(pid=7, planned=SimpleNamespace(nodes=("camera",)))
     living = (SimpleNamespace(pid=8),)
     fake: Any = SimpleNamespace(
-        nodes={"camera": node}, processes={"camera": process}, living=living, adopted=()
+        nodes={"camera": node}, processes={"camera": process}, living=living
     )
     return cast("System", fake)
 

@@ -29,7 +29,6 @@ from lifecycle.plan.model import (
 from lifecycle.supervisor.connections.authority import (
     TRIES,
     ConnectionAuthority,
-    NodeInterface,
     PlannedSource,
 )
 from lifecycle.supervisor.connections.desired_state import (
@@ -142,7 +141,7 @@ class Wiring:
                 node.full_name, "publishers/out", "subscriptions/in"
             )
 
-    def _hand(self, name: str) -> NodeInterface:
+    def _hand(self, name: str) -> FakeHand:
         return self.hands[name]
 
     def told(self, node: str) -> list[str]:
