@@ -74,7 +74,7 @@ def build_data_layer(root: Cursor, found: list[Diagnostic]) -> DataLayer:
 
 
 def build_on_violation(cursor: Cursor) -> OnViolation:
-    """Build `on_violation` of a document, a node or a link."""
+    """Build `on_violation` of a document or a node."""
     return tuple(
         Reaction(rule=name, what=Consequence.MODE, mode=each.text("mode"))
         if isinstance(each.value.data, Mapping)

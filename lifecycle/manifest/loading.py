@@ -202,7 +202,6 @@ def _link(cursor: Cursor) -> Link:
         from_node=cursor.text("from"),
         to_node=cursor.text("to"),
         quantities=quantities(cursor),
-        on_violation=build_on_violation(cursor),
         at=cursor.at,
     )
 

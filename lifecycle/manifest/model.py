@@ -758,7 +758,6 @@ class Link:
         max_delay_ms: > 0; None if not asked for.
         transport: overrides what would be negotiated for this pair.
         quantities: each of its numbers that only a measurement could prove, as it is written.
-        on_violation: what is done about violations that concern it; before that of its nodes.
     """
 
     topic: str
@@ -768,7 +767,6 @@ class Link:
     max_delay_ms: float | None = None
     transport: FlowTransport = FlowTransport.ANY
     quantities: tuple[Quantity, ...] = ()
-    on_violation: OnViolation = ()
     at: Position
 
 

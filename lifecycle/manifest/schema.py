@@ -147,7 +147,8 @@ def unknown_key(key: str, known: Iterable[str]) -> tuple[str, str]:
     """Return message and hint for a key that the schema does not know."""
     words = list(known)
     if key in _GONE:
-        return f"cannot use {quote(key)} any more: {_GONE[key]}", "remove it"
+        why, hint = _GONE[key]
+        return f"cannot use {quote(key)} any more: {why}", hint
     message = f"cannot use the unknown key {quote(key)}; allowed: {', '.join(words)}"
     return message, did_you_mean(key, words)
 
@@ -159,9 +160,13 @@ def missing_key(key: str, schema: Mapping[str, Any]) -> tuple[str, str]:
 
 
 _GONE = {
-    "on_supervisor_lost": "nodes whose supervisor is gone are deactivated, and their process ends",
+    "on_supervisor_lost": (
+        "nodes whose supervisor is gone are deactivated, and their process ends",
+        "remove it",
+    ),
+    "on_violation": ("a link has none", "write it at one of its nodes, or for the system"),
 }
-"""Keys of earlier versions, and what holds without them."""
+"""Keys of earlier versions: what holds without them, and what to do."""
 
 
 def bad_key(each: Violation) -> tuple[str, str]:

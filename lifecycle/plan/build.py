@@ -144,7 +144,6 @@ def _flow(pair: tuple[str, str, str], named: Sequence[Link]) -> PlannedFlow:
         linked=bool(named),
         transport=next(iter(asked), FlowTransport.ANY),
         quantities=tuple(each for link in named for each in link.quantities),
-        on_violation=tuple(each for link in named for each in link.on_violation),
     )
 
 

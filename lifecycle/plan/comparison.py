@@ -147,9 +147,8 @@ def _document(plan: Plan) -> _Tree:
                 **_fields(
                     flow,
                     *("topic", "publisher", "subscription", "linked", "medium", "medium_reason"),
-                    *("quantities", "on_violation"),
+                    "quantities",
                 ),
-                "on_violation": _consequences(flow.on_violation),
             }
             for flow in plan.flows
             if flow.linked

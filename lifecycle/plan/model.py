@@ -25,7 +25,6 @@ from lifecycle.manifest import (
     FlowTerms,
     FlowTransport,
     NodeDeclaration,
-    OnViolation,
     ParameterDeclaration,
     ParameterValue,
     Position,
@@ -333,7 +332,6 @@ class PlannedFlow:
             nodes' configurations are.
         medium_reason: one phrase for people, "same host", "links say so".
         quantities: numbers of its links that only a measurement could prove.
-        on_violation: what its links say is done about violations of it.
     """
 
     topic: str
@@ -346,7 +344,6 @@ class PlannedFlow:
     medium: str = ""
     medium_reason: str = ""
     quantities: tuple[Quantity, ...] = ()
-    on_violation: OnViolation = ()
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

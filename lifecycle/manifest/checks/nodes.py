@@ -196,18 +196,6 @@ def check_on_violation(system: DeclaredSystem) -> Iterator[Diagnostic]:
         top = Position(file=system.manifest.path, line=1, column=1)
         place = system.manifest.where(f"on_violation.{each.rule}", top)
         yield from _mode(system, each, place)
-    for link in system.manifest.links:
-        for each in link.on_violation:
-            yield from _mode(system, each, link.at)
-        ends = [system.nodes.get(key) for key in (link.from_node, link.to_node)]
-        if all(end is not None and _never_deactivated(end) for end in ends) and any(
-            each.what is Consequence.DEACTIVATE for each in link.on_violation
-        ):
-            message = (
-                f"cannot deactivate an end of {link.topic!r} when it violates: no gate holds "
-                f"{link.from_node!r} or {link.to_node!r}"
-            )
-            yield error("check.on-violation", link.at, message, hint)
 
 
 def _mode(system: DeclaredSystem, reaction: Reaction, at: Position) -> Iterator[Diagnostic]:

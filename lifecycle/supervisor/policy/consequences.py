@@ -1,6 +1,6 @@
 """What is done about violations of an active system: what the manifest says, and when it is due.
 
-Owns: `reaction_of`, which finds the nearest `on_violation` for a finding (link, node, system),
+Owns: `reaction_of`, which finds the nearest `on_violation` for a finding (node, system),
 and `Consequences`: a violation that lasts has the consequence that is asked for it, once. It looks
 at verdicts and carries nothing out: that is gate/hold.py's, by the orders that a person gives. Must
 not import rclpy.
@@ -12,7 +12,7 @@ from collections.abc import Iterable
 
 from lifecycle import dataclasses
 from lifecycle.manifest import BY_DEFAULT, Consequence, EndpointKind, OnViolation, Reaction, Restart
-from lifecycle.plan import Plan, PlannedFlow
+from lifecycle.plan import Plan
 from lifecycle.supervisor.control.protocol import Reach
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.run.events import Emitter
@@ -25,30 +25,15 @@ _Key = tuple[str, str, str, EndpointKind | None]
 def reaction_of(plan: Plan, finding: Finding) -> Reaction:
     """Return what is to be done about a violation.
 
-    What is nearest counts: a link that it is about, then its nodes, then the system; there the id
-    of the rule, then its family, then the default. Of two ends the stronger one counts.
+    What is nearest counts: its nodes, then the system; there the id of the rule, then its family,
+    then the default. Of two ends the stronger one counts.
     """
-    links = _strongest(
-        finding, (flow.on_violation for flow in plan.flows if _is_about(plan, flow, finding))
-    )
     names = finding.nodes or (finding.subject,)
     nodes = _strongest(
         finding, (each.on_violation for each in plan.nodes if each.full_name in names)
     )
-    found = links or nodes or _strongest(finding, (plan.on_violation,))
+    found = nodes or _strongest(finding, (plan.on_violation,))
     return found or Reaction(rule=BY_DEFAULT, what=Consequence.REPORT)
-
-
-def _is_about(plan: Plan, flow: PlannedFlow, finding: Finding) -> bool:
-    if not flow.on_violation:
-        return False
-    ends = plan.node(flow.publisher).full_name, plan.node(flow.subscription).full_name
-    if finding.ends == ends:
-        return finding.subject in (flow.topic, f"{flow.topic}: {ends[0]} → {ends[1]}")
-    return finding.subject == flow.topic and (finding.node, finding.endpoint) in (
-        (ends[0], EndpointKind.PUBLISHER),
-        (ends[1], EndpointKind.SUBSCRIPTION),
-    )
 
 
 def _strongest(finding: Finding, said: Iterable[OnViolation]) -> Reaction | None:

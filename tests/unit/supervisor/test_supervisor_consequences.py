@@ -14,7 +14,6 @@ import pytest
 from lifecycle.manifest import (
     Condition,
     Consequence,
-    EndpointKind,
     Health,
     Mode,
     OnViolation,
@@ -24,7 +23,7 @@ from lifecycle.manifest import (
 from lifecycle.manifest import Restart as RestartWhen
 from lifecycle.manifest.schema import MANIFEST, read_schema
 from lifecycle.node import Event as HostEvent
-from lifecycle.plan import PlannedFlow, in_mode
+from lifecycle.plan import in_mode
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.control.protocol import Reach
 from lifecycle.supervisor.control.server import ControlRequest
@@ -83,26 +82,11 @@ def test_what_is_nearest_counts(system: Said, camera: Said, found: Consequence) 
     assert reaction_of(_plan(system, camera), finding).what is found
 
 
-def test_a_link_speaks_for_its_flow_and_both_ends_of_it_and_the_stronger_end_counts() -> None:
-    flow = PlannedFlow(
-        topic="/video",
-        publisher="camera",
-        subscription="viewer",
-        linked=True,
-        on_violation=_said((("flow", STOP),)),
-    )
-    plan = dataclasses.replace(_plan((), (("default", DEACTIVATE),)), flows=(flow,))
+def test_of_two_ends_of_a_flow_the_stronger_one_counts() -> None:
+    plan = _plan((), (("default", DEACTIVATE),))
     ends = ("/camera", "/viewer")
     pair = _found("flow.not-unique", "/video: /camera → /viewer", ends=ends)
-    publisher = _found(
-        "flow.dscp-not-applied", "/video", node="/camera", endpoint=EndpointKind.PUBLISHER
-    )
-    other = _found("flow.not-unique", "/audio: /camera → /viewer", ends=ends)
-    assert [reaction_of(plan, each).what for each in (pair, publisher, other)] == [
-        STOP,
-        STOP,
-        DEACTIVATE,
-    ]
+    assert reaction_of(plan, pair).what is DEACTIVATE
 
 
 def _found(rule: str, subject: str, **rest: object) -> Finding:
