@@ -12,11 +12,9 @@ from .change import without_positions as without_positions
 from .comparison import PlanDifference as PlanDifference
 from .comparison import PlanNotice as PlanNotice
 from .comparison import PlanNoticeError as PlanNoticeError
-from .comparison import announced_plan as announced_plan
 from .comparison import changes as changes
 from .comparison import concerns as concerns
 from .comparison import decode as decode
-from .comparison import differences as differences
 from .comparison import encode as encode
 from .comparison import notice_of as notice_of
 from .comparison import plan_checksum as plan_checksum

@@ -1,6 +1,6 @@
 """Compare two plans of one system: differences, checksum, and the notice supervisors exchange.
 
-Owns: `changes`, `differences` and `plan_checksum`; `PlanNotice`, what a supervisor announces of its
+Owns: `changes` and `plan_checksum`; `PlanNotice`, what a supervisor announces of its
 plan, its text on the wire with bounds in both directions, and `concerns`: whose plan has to be the
 same as ours. Pure.
 
@@ -13,11 +13,8 @@ nodes where ports are given out in their order.
 
 from __future__ import annotations
 
-import base64
-import binascii
 import hashlib
 import json
-import zlib
 from collections.abc import Iterator, Mapping
 
 from lifecycle import dataclasses
@@ -27,7 +24,6 @@ from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedNode
 from lifecycle.plan.secrets import shown, without_secrets
 
 _VALUE_CHARACTERS = 80
-_MOST = 20
 
 _DECLARED = {
     "endpoint_policy": "endpoints",
@@ -88,25 +84,6 @@ def changes(old: Plan, new: Plan) -> tuple[PlanDifference, ...]:
             _compared((), before, after), key=lambda each: (each[0][0] == "nodes", each[0])
         )
     )
-
-
-def differences(old: Plan, new: Plan, *, words: tuple[str, str] = ("was", "is")) -> tuple[str, ...]:
-    """Describe how two plans differ: `nodes.talker.run.python: was "a:Old", is "a:New"`.
-
-    Args:
-        old: one plan.
-        new: the other.
-        words: put before the value of each, `("here", "there")` for plans of two hosts.
-
-    Returns:
-        One line per difference, at most 20 and then how many more there are; none of plans with the
-        same `plan_checksum`.
-    """
-    found = changes(old, new)
-    lines = [f"{each.path}: {words[0]} {each.old}, {words[1]} {each.new}" for each in found[:_MOST]]
-    if len(found) > _MOST:
-        lines.append(f"and {len(found) - _MOST} more")
-    return tuple(lines)
 
 
 def plan_checksum(plan: Plan) -> str:
@@ -302,10 +279,7 @@ def _at(path: _Path, places: Mapping[_Path, Position]) -> Position | None:
 
 
 MAX_TEXT = 1 << 20
-"""Characters of a notice. A plan of 100 nodes takes about 40,000."""
-
-_MAX_PLAN_BYTES = 1 << 25
-"""Of a plan unpacked: what the network delivers must not fill our memory."""
+"""Characters of a notice: what the network delivers must not fill our memory."""
 
 
 class PlanNoticeError(ValueError):
@@ -323,7 +297,6 @@ class PlanNotice:
         machines: those whose nodes it brings up.
         nodes: fully qualified names of all nodes of the plan.
         checksum: of what is planned, see comparison.plan_checksum.
-        plan: the plan as JSON, packed by zlib and written in base 64; empty if that is too long.
         left: it is being shut down, or has been.
         reason: why; empty unless it left.
     """
@@ -334,7 +307,6 @@ class PlanNotice:
     machines: tuple[str, ...]
     nodes: tuple[str, ...]
     checksum: str
-    plan: str = ""
     left: bool = False
     reason: str = ""
 
@@ -355,7 +327,7 @@ class PlanNotice:
 
 def notice_of(plan: Plan, *, run: str, host: str, machines: tuple[str, ...]) -> PlanNotice:
     """Return what the supervisor of `machines` announces."""
-    notice = PlanNotice(
+    return PlanNotice(
         run=run,
         host=host,
         system=plan.system,
@@ -363,9 +335,6 @@ def notice_of(plan: Plan, *, run: str, host: str, machines: tuple[str, ...]) -> 
         nodes=tuple(each.full_name for each in plan.nodes),
         checksum=plan_checksum(plan),
     )
-    packed = base64.b64encode(zlib.compress(to_json(without_secrets(plan)))).decode()
-    whole = dataclasses.replace(notice, plan=packed)
-    return whole if len(encode(whole)) <= MAX_TEXT else notice
 
 
 def encode(notice: PlanNotice) -> str:
@@ -389,16 +358,6 @@ def decode(text: str) -> PlanNotice:
     if not (notice.checksum.isalnum() and (notice.reason or " ").isprintable()):
         raise PlanNoticeError("cannot read a plan notice: it has characters that cannot be shown")
     return notice
-
-
-def announced_plan(notice: PlanNotice) -> Plan | None:
-    """Return the plan of a notice; None without one that can be read here."""
-    try:
-        unpacking = zlib.decompressobj()
-        text = unpacking.decompress(base64.b64decode(notice.plan, validate=True), _MAX_PLAN_BYTES)
-        return from_json(text, Plan) if unpacking.eof else None
-    except (binascii.Error, zlib.error, ValueError):
-        return None
 
 
 def concerns(plan: Plan, own: frozenset[str], notice: PlanNotice) -> bool:

@@ -25,7 +25,7 @@ from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.installed_types import bounded_size, installed_hash
 from lifecycle.manifest.nodl import read_interface
 from lifecycle.node.host.control import Event
-from lifecycle.plan.comparison import PlanNoticeError, announced_plan, notice_of
+from lifecycle.plan.comparison import PlanNoticeError, notice_of
 from lifecycle.plan.comparison import decode as decode_notice
 from lifecycle.plan.comparison import encode as encode_notice
 from lifecycle.programming.apply.ledger import Ledger
@@ -162,7 +162,7 @@ READERS: dict[str, Reader] = {
     ),
     "plan notice": Reader(
         good=encode_notice(notice_of(PLAN, run="r", host="h", machines=("local",))).encode(),
-        read=lambda data, _: announced_plan(decode_notice(_text(data))),
+        read=lambda data, _: decode_notice(_text(data)),
         errors=(PlanNoticeError,),
     ),
     "control question": Reader(

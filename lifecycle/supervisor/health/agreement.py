@@ -21,14 +21,11 @@ from lifecycle.plan import (
     Plan,
     PlanNotice,
     PlanNoticeError,
-    announced_plan,
     concerns,
     decode,
-    differences,
     encode,
     notice_of,
     plan_checksum,
-    without_secrets,
 )
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.verify import (
@@ -50,9 +47,6 @@ if TYPE_CHECKING:
 ANNOUNCED_S = 5.0
 """A supervisor that is there has announced its plan within so long: with its first matched
 endpoints, and where Fast DDS lost that, 3 s later."""
-
-_SHOWN = 5
-"""Differences that a message names."""
 
 _MOST = 64
 """Supervisors whose notices are kept."""
@@ -89,7 +83,6 @@ class Agreement:
         self._notices: PlanNotices | None = None
         self._run = os.urandom(8).hex()
         self._known: list[PlanNotice] = []
-        self._compared: dict[PlanNotice, tuple[str, ...]] = {}
         self._since: dict[str, float] = {}
         self._checksum: tuple[Plan, str] | None = None
         self._again: asyncio.TimerHandle | None = None
@@ -105,7 +98,6 @@ class Agreement:
     def announce(self, plan: Plan) -> None:
         """Say that this is what we plan from now on."""
         self._plan = plan
-        self._compared.clear()
         if self._notices is not None:
             self._notices.announce(encode(self._notice()))
 
@@ -196,9 +188,6 @@ class Agreement:
             return  # it left before we came
         others = (each for each in self._known if not notice.replaces(each))
         self._known = [*others, notice][-_MOST:]
-        self._compared = {
-            each: self._compared[each] for each in self._known if each in self._compared
-        }
         self._system.touched.set()
 
     def _different(self) -> Iterator[Finding]:
@@ -208,35 +197,18 @@ class Agreement:
             self._checksum = self._plan, plan_checksum(self._plan)
         ours = self._checksum[1]
         for notice in self._known:
-            found = self._compare(notice, ours)
-            if not found:
+            if notice.checksum == ours:
                 continue
             who = _who(notice, self._plan.system)
-            shown = "; ".join((*found[:_SHOWN], *(("and more",) if found[_SHOWN:] else ())))
+            theirs = notice.checksum[: len(ours)]
             yield PLANS_DIFFER.finding(
                 Outcome.VIOLATED,
                 subject=who,
                 expected=f"plan {ours}",
-                observed=f"plan {notice.checksum[: len(ours)]}",
-                message=f"cannot rely on {who}: it planned another system than this supervisor: "
-                f"{shown}",
+                observed=f"plan {theirs}",
+                message=f"cannot rely on {who}: plans differ (checksums {ours} here, {theirs} "
+                "there); compare 'lifecycle plan MANIFEST' on both",
             )
-
-    def _compare(self, notice: PlanNotice, ours: str) -> tuple[str, ...]:
-        """Return how the plan of a notice differs from ours."""
-        if notice not in self._compared:
-            self._compared[notice] = self._differences(notice, ours)
-        return self._compared[notice]
-
-    def _differences(self, notice: PlanNotice, ours: str) -> tuple[str, ...]:
-        if notice.checksum == ours:
-            return ()
-        plan = announced_plan(notice)
-        own = without_secrets(self._plan)  # as the other's comes
-        found = () if plan is None else differences(own, plan, words=("here", "there"))
-        if found:
-            return found
-        return ("in what cannot be read here; compare 'lifecycle plan MANIFEST' of both",)
 
     def _unknown(self, observation: Observation) -> Iterator[Finding]:
         """Yield a finding for each machine that is there and has not said what it planned."""

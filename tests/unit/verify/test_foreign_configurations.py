@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from lifecycle import codec
 from lifecycle.graph.messages import GraphMessageError
 from lifecycle.graph.messages import decode as decode_message
-from lifecycle.plan.comparison import PlanNoticeError, announced_plan
+from lifecycle.plan.comparison import PlanNoticeError
 from lifecycle.plan.comparison import decode as decode_notice
 from lifecycle.verify import Stage, render_text, to_json, to_junit, to_sarif, verify
 from lifecycle.verify.observation import (
@@ -200,21 +200,6 @@ def test_no_text_makes_a_decoder_raise_anything_but_its_own_error(text: str | by
     if isinstance(text, str):
         with pytest.raises(PlanNoticeError):
             decode_notice(text)
-
-
-@given(st.text() | st.just("eJzLAAAA"))
-def test_no_text_makes_an_announced_plan_raise(text: str) -> None:
-    notice = decode_notice(
-        json.dumps(
-            {
-                **dict.fromkeys(("run", "host", "system", "checksum"), "a"),
-                "machines": [],
-                "nodes": [],
-                "plan": text,
-            }
-        )
-    )
-    assert announced_plan(notice) is None
 
 
 def places(value: object, path: tuple[object, ...] = ()) -> list[tuple[object, ...]]:
