@@ -10,10 +10,8 @@ are carried out is gate/sequence.py's, what differs `plan.comparison`'s. Must no
 from __future__ import annotations
 
 import asyncio
-import enum
 from collections.abc import Collection, Iterable, Iterator
 
-from lifecycle import dataclasses
 from lifecycle.errors import BringUpError, ExitCode, LifecycleError, UsageError
 from lifecycle.manifest import did_you_mean
 from lifecycle.network import parse
@@ -25,7 +23,13 @@ from lifecycle.plan import (
     changes,
     with_files_of_now,
 )
-from lifecycle.supervisor.control.protocol import ChangedNodes, ProcessState
+from lifecycle.supervisor.control.protocol import (
+    Answer,
+    ChangedNodes,
+    ControlRequest,
+    ProcessState,
+    Question,
+)
 from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.run.failure import StepFailedError
 from lifecycle.supervisor.run.options import UpOptions, local_processes
@@ -37,50 +41,32 @@ HELD = "held"
 consequence of a violation closed behind them."""
 
 
-class OrderKind(enum.Enum):
-    """What may be ordered."""
-
-    PAUSE = "pause"
-    RESUME = "resume"
-    RESTART = "restart"
-    MODE = "mode"
-    APPLY = "apply"
-
-    @property
-    def said(self) -> str:
-        """How messages say it, after "cannot"."""
-        return _SAID.get(self, self.value)
-
-
-_SAID = {OrderKind.MODE: "switch the mode of", OrderKind.APPLY: "apply another manifest to"}
-
-
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Order:
-    """One order.
+class Order(Question, frozen=True, kw_only=True):
+    """One order, as it was asked for or as policy gives it.
 
     Attributes:
-        node: for RESTART, manifest key or fully qualified name; empty for the whole system.
         plan: the plan of the manifest that the order names, as it is now; None if it names none.
         keys: for RESTART by policy, of the nodes, which are down already; empty for one by hand.
             For PAUSE by policy, of the nodes that are deactivated; empty for all.
         reason: for PAUSE by policy, what it is for, as `lifecycle status` shows it.
-        mode: for MODE, the one to enter.
-        dry_run: for APPLY, only say what would become of the system.
-        timeout_s: for APPLY, seconds until the system must be active by `plan`, else it goes back;
-            0 is as long as a bring-up may take.
         change: for APPLY, what `plan` is for the running system.
     """
 
-    kind: OrderKind
-    node: str = ""
+    plan: Plan | None = None
     keys: tuple[str, ...] = ()
     reason: str = ""
-    mode: str = ""
-    plan: Plan | None = None
-    dry_run: bool = False
-    timeout_s: float = 0.0
     change: PlanChange | None = None
+
+    @property
+    def said(self) -> str:
+        """How messages say it, after "cannot"."""
+        return _SAID.get(self.ask, self.ask.value)
+
+
+_SAID = {
+    ControlRequest.MODE: "switch the mode of",
+    ControlRequest.APPLY: "apply another manifest to",
+}
 
 
 class NotBegunError(BringUpError):
@@ -102,33 +88,19 @@ class RolledBackError(LifecycleError):
         self.ends = ends
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Done:
-    """What came of an order.
-
-    Attributes:
-        error: why it was not carried out; empty if it was.
-        change: of APPLY, what it is about; None where it was not taken.
-    """
-
-    exit_code: int = ExitCode.OK
-    error: str = ""
-    change: ChangedNodes | None = None
-
-
-_PHASES = {
-    OrderKind.PAUSE: (ACTIVE, HELD),
-    OrderKind.RESUME: (PAUSED, HELD),
-    OrderKind.RESTART: (ACTIVE, PAUSED, HELD),
-    OrderKind.MODE: (ACTIVE, PAUSED, HELD),
-    OrderKind.APPLY: (ACTIVE, PAUSED, HELD),
+PHASES = {
+    ControlRequest.PAUSE: (ACTIVE, HELD),
+    ControlRequest.RESUME: (PAUSED, HELD),
+    ControlRequest.RESTART: (ACTIVE, PAUSED, HELD),
+    ControlRequest.MODE: (ACTIVE, PAUSED, HELD),
+    ControlRequest.APPLY: (ACTIVE, PAUSED, HELD),
 }
 _HINTS = {
-    OrderKind.PAUSE: "only an active system can be paused",
-    OrderKind.RESUME: "only a paused system can be resumed",
-    OrderKind.RESTART: "only a system that is active or paused can be restarted",
-    OrderKind.MODE: "only a system that is active or paused can enter another mode",
-    OrderKind.APPLY: "only a system that is active or paused can take another manifest",
+    ControlRequest.PAUSE: "only an active system can be paused",
+    ControlRequest.RESUME: "only a paused system can be resumed",
+    ControlRequest.RESTART: "only a system that is active or paused can be restarted",
+    ControlRequest.MODE: "only a system that is active or paused can enter another mode",
+    ControlRequest.APPLY: "only a system that is active or paused can take another manifest",
 }
 
 
@@ -147,31 +119,31 @@ def check_order(order: Order, system: System, phase: str, *, waits: Order | None
     Raises:
         UsageError: it does not fit the phase, or names a node that cannot be restarted.
     """
-    applies = waits is not None and waits.kind is OrderKind.APPLY
-    if applies and phase not in _PHASES[order.kind]:
+    applies = waits is not None and waits.ask is ControlRequest.APPLY
+    if applies and phase not in PHASES[order.ask]:
         raise UsageError(
-            f"cannot {order.kind.said} {system.plan.system!r}: it is {phase}, another manifest is "
+            f"cannot {order.said} {system.plan.system!r}: it is {phase}, another manifest is "
             "being applied to it",
             hint="ask again once 'lifecycle apply' has ended; 'lifecycle down' is taken at once",
         )
-    if waits is None and phase not in _PHASES[order.kind]:
+    if waits is None and phase not in PHASES[order.ask]:
         raise UsageError(
-            f"cannot {order.kind.said} {system.plan.system!r}: it is {phase}",
-            hint=_HINTS[order.kind],
+            f"cannot {order.said} {system.plan.system!r}: it is {phase}",
+            hint=_HINTS[order.ask],
         )
     server = system.server
-    starts = order.kind in (OrderKind.RESTART, OrderKind.APPLY)
+    starts = order.ask in (ControlRequest.RESTART, ControlRequest.APPLY)
     if starts and server and server.state is ProcessState.EXITED:
         raise UsageError(
-            f"cannot {order.kind.said} {order.node or system.plan.system!r}: the discovery server "
+            f"cannot {order.said} {order.node or system.plan.system!r}: the discovery server "
             "has died, and without it nobody who comes again is found",
             hint="start the system again: lifecycle down, then lifecycle up",
         )
     if order.node:
         node_of(order, system)
-    if order.kind is OrderKind.MODE:
+    if order.ask is ControlRequest.MODE:
         _check_mode(order, system)
-    if order.kind is OrderKind.APPLY and (order.plan is None or not order.timeout_s >= 0):
+    if order.ask is ControlRequest.APPLY and (order.plan is None or not order.timeout_s >= 0):
         raise UsageError(
             f"cannot apply a manifest to {system.plan.system!r} without one, or within "
             f"{order.timeout_s:g} s"
@@ -219,12 +191,12 @@ class Pending:
 
     def __init__(self, order: Order) -> None:
         self.order = order
-        self.done: asyncio.Future[Done] = asyncio.get_running_loop().create_future()
+        self.done: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
 
-    def finish(self, done: Done) -> None:
+    def finish(self, answer: Answer) -> None:
         """Answer who gave it; a second time is harmless."""
         if not self.done.done():
-            self.done.set_result(done)
+            self.done.set_result(answer)
 
 
 class Mailbox:
@@ -235,7 +207,7 @@ class Mailbox:
         self._open: set[Pending] = set()
         self._placed = asyncio.Event()
 
-    async def place(self, order: Order) -> Done:
+    async def place(self, order: Order) -> Answer:
         """Give an order and wait for what comes of it."""
         pending = Pending(order)
         self._open.add(pending)
@@ -259,7 +231,7 @@ class Mailbox:
     def close(self, reason: str) -> None:
         """Refuse what is still open."""
         for pending in tuple(self._open):
-            pending.finish(Done(exit_code=ExitCode.BRING_UP_FAILED, error=reason))
+            pending.finish(Answer(exit_code=ExitCode.BRING_UP_FAILED, error=reason))
 
 
 _MOST = 20
@@ -296,14 +268,14 @@ class Revisions:
             UsageError: the manifest has changed since the start, or cannot be taken.
         """
         running = self._system.first
-        if order.kind is OrderKind.APPLY:
+        if order.ask is ControlRequest.APPLY:
             assert order.plan is not None
             self._check_apply(order.plan)
         elif order.plan is not None:
             found = changes(running, order.plan)
-            if found and order.kind is not OrderKind.PAUSE:
+            if found and order.ask is not ControlRequest.PAUSE:
                 raise self._refused(order, found)
-        elif order.kind is OrderKind.RESTART:
+        elif order.ask is ControlRequest.RESTART:
             keys = self._restarted(order)
             found = changes(running, with_files_of_now(running))
             if found := tuple(each for each in found if each.node in keys):
@@ -319,7 +291,7 @@ class Revisions:
 
     def _refused(self, order: Order, found: Iterable[PlanDifference]) -> UsageError:
         system = self._system.plan.system
-        what, said = order.kind.value, order.kind.said
+        what, said = order.ask.value, order.said
         listed = "\n".join(_lines(found))
         path = (order.plan or self._system.first).manifest_path
         take = f"lifecycle apply {path}"

@@ -27,8 +27,9 @@ from lifecycle.manifest import (
     supervisor_status_topic,
 )
 from lifecycle.plan import Plan
-from lifecycle.supervisor.control.orders import ACTIVE, Done, Order, OrderKind
-from lifecycle.supervisor.control.protocol import NodeStatus, SystemStatus
+from lifecycle.supervisor.control import protocol
+from lifecycle.supervisor.control.orders import ACTIVE, PHASES, Order
+from lifecycle.supervisor.control.protocol import ControlRequest, NodeStatus, SystemStatus
 from lifecycle.supervisor.run.events import (
     Event,
     GateOpened,
@@ -122,7 +123,7 @@ class RosInterface:
         modes: Iterable[str] = (),
         status: Callable[[], SystemStatus],
         verdict: Callable[[], Verdict | None],
-        order: Callable[[Order], Awaitable[Done]],
+        order: Callable[[Order], Awaitable[protocol.Answer]],
         down: Callable[[], None],
         notify: Callable[[str], None],
     ) -> None:
@@ -253,12 +254,12 @@ class RosInterface:
         if name == _DOWN:
             answer(True, "the system is being taken down")
             self._down()
-        elif name.startswith(MODE_SERVICE) or name in {each.value for each in OrderKind}:
+        elif name.startswith(MODE_SERVICE) or name in {each.value for each in PHASES}:
             mode = name.removeprefix(MODE_SERVICE)
             order = (
-                Order(kind=OrderKind(name))
+                Order(ask=ControlRequest(name))
                 if mode == name
-                else Order(kind=OrderKind.MODE, mode=mode)
+                else Order(ask=ControlRequest.MODE, mode=mode)
             )
             task = asyncio.ensure_future(self._ordered(order, answer))
             self._orders.add(task)

@@ -13,6 +13,8 @@ from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import msgspec
+
 from lifecycle import dataclasses
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import UsageError
@@ -29,7 +31,7 @@ from lifecycle.supervisor.control.protocol import (
 from lifecycle.verify import Observation, Verdict
 
 if TYPE_CHECKING:
-    from lifecycle.supervisor.control.orders import Done, Order
+    from lifecycle.supervisor.control.orders import Order
 
 _BURST_S = 0.05
 _CLOSE_S = 1.0
@@ -88,7 +90,7 @@ class ControlServer:
         down: Callable[[], None],
         *,
         look: Callable[[], SupervisorSnapshot] | None = None,
-        order: Callable[[Order], Awaitable[Done]] | None = None,
+        order: Callable[[Order], Awaitable[Answer]] | None = None,
         differences: Callable[[Plan], tuple[str, ...]] = lambda _: (),
     ) -> None:
         self._path = path
@@ -148,19 +150,10 @@ class ControlServer:
     async def _answer(self, question: QuestionWithPlan) -> Answer:
         if question.ask is ControlRequest.LOOK and self._look is not None:
             return LookAnswer(look=self._look())
-        from lifecycle.supervisor.control.orders import Order, OrderKind  # clients need neither
+        from lifecycle.supervisor.control.orders import PHASES, Order  # clients need neither
 
-        if self._order is not None and question.ask.value in {each.value for each in OrderKind}:
-            order = Order(
-                kind=OrderKind(question.ask.value),
-                node=question.node,
-                plan=question.plan,
-                mode=question.mode,
-                dry_run=question.dry_run,
-                timeout_s=question.timeout_s,
-            )
-            done = await self._order(order)
-            return Answer(exit_code=done.exit_code, error=done.error, change=done.change)
+        if self._order is not None and question.ask in PHASES:
+            return await self._order(Order(**msgspec.structs.asdict(question)))
         if question.ask is ControlRequest.DIFFERENCES and question.plan is not None:
             return Answer(differences=self._differences(question.plan))
         return Answer(status=self._status())

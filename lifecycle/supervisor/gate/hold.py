@@ -14,25 +14,24 @@ import enum
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest import Consequence
 from lifecycle.supervisor.control.orders import (
     ACTIVE,
     HELD,
     PAUSED,
-    Done,
     Mailbox,
     NotBegunError,
     Order,
-    OrderKind,
     Pending,
     Revisions,
     RolledBackError,
     check_order,
     said,
 )
-from lifecycle.supervisor.control.protocol import ChangedNodes
+from lifecycle.supervisor.control.protocol import Answer, ChangedNodes, ControlRequest
 from lifecycle.supervisor.gate.gate import VerificationError
 from lifecycle.supervisor.gate.sequence import GateSequence, OutrunError
 from lifecycle.supervisor.gate.verification_loop import (
@@ -209,7 +208,7 @@ class Holding:
                 await self._by_policy(self._again if what is _Next.RESTART else self._let_through)
             stage = self._gate_sequence.stage
 
-    async def ordered(self, order: Order) -> Done:
+    async def ordered(self, order: Order) -> Answer:
         """Take an order from outside, if it fits what the system is doing; return its outcome.
 
         One that comes while another is carried out waits for that one's end, and fits then or not.
@@ -217,11 +216,11 @@ class Holding:
         try:
             self._check(order, waits=self._under_way)
         except UsageError as error:
-            return Done(exit_code=error.exit_code, error=str(error))
+            return Answer(exit_code=error.exit_code, error=str(error))
         if order.dry_run and order.plan is not None:
             change = self._revisions.said(self._revisions.change(order.plan), order.plan)
             differs = ExitCode.VIOLATED if change.differences else ExitCode.OK
-            return Done(exit_code=differs, change=change)
+            return Answer(exit_code=differs, change=change)
         return await self._mailbox.place(order)
 
     def _away(self) -> frozenset[str]:
@@ -261,9 +260,9 @@ class Holding:
         if due.what is Consequence.STOP:
             self._stop(reason, ExitCode.VIOLATED)
             await asyncio.get_running_loop().create_future()  # until it ends us
-        order = Order(kind=OrderKind.PAUSE, keys=due.keys, reason=f"{reason}; lifecycle resume")
+        order = Order(ask=ControlRequest.PAUSE, keys=due.keys, reason=f"{reason}; lifecycle resume")
         if due.what is Consequence.MODE:
-            order = Order(kind=OrderKind.MODE, mode=due.mode)
+            order = Order(ask=ControlRequest.MODE, mode=due.mode)
         await self._by_policy(lambda: self._carry_out_in_spite(order))
 
     async def _by_policy(self, work: Callable[[], Awaitable[None]]) -> None:
@@ -290,7 +289,7 @@ class Holding:
     async def _again(self) -> None:
         """Start again what is due."""
         keys = self._schedule.begin()
-        await self._gate_sequence.carry_out(Order(kind=OrderKind.RESTART, keys=keys))
+        await self._gate_sequence.carry_out(Order(ask=ControlRequest.RESTART, keys=keys))
 
     async def _let_through(self) -> None:
         """Let through its gate what waits there."""
@@ -313,27 +312,27 @@ class Holding:
             # Another order may have come first.
             self._check(pending.order)
             self._under_way = pending.order
-            if pending.order.kind is OrderKind.APPLY:
+            if pending.order.ask is ControlRequest.APPLY:
                 change = await self._apply(pending.order)
             else:
                 await self._carry_out_in_spite(pending.order)
         except (UsageError, NotBegunError) as error:
-            pending.finish(Done(exit_code=error.exit_code, error=str(error)))
+            pending.finish(Answer(exit_code=error.exit_code, error=str(error)))
         except RolledBackError as error:
-            pending.finish(Done(exit_code=error.exit_code, error=str(error)))
+            pending.finish(Answer(exit_code=error.exit_code, error=str(error)))
             self._emit(Notice(message=str(error)))
             if error.ends is not None:
                 raise error.ends from error
         except StepFailedError as error:
-            pending.finish(Done(exit_code=error.exit_code, error=str(error)))
+            pending.finish(Answer(exit_code=error.exit_code, error=str(error)))
             await self._gate_sequence.put_down(error)
         except VerificationError as error:
-            pending.finish(Done(exit_code=error.exit_code, error=str(error)))
+            pending.finish(Answer(exit_code=error.exit_code, error=str(error)))
             if self._gate_sequence.phase not in (ACTIVE, PAUSED, HELD):
                 raise
             self._emit(Notice(message=str(error)))
         else:
-            pending.finish(Done(change=change))
+            pending.finish(Answer(exit_code=ExitCode.OK, change=change))
         finally:
             self._under_way = None
 
@@ -342,13 +341,13 @@ class Holding:
         assert order.plan is not None
         running, change = self._system.first, self._revisions.change(order.plan)
         if change.differences:
-            await self._carry_out_in_spite(dataclasses.replace(order, change=change))
+            await self._carry_out_in_spite(msgspec.structs.replace(order, change=change))
         return said(change, running, order.plan, self._system.revision)
 
     async def _carry_out_in_spite(self, order: Order) -> None:
         """Carry an order out; a pause is not given up because something fails meanwhile."""
         while (failure := await failure_of(self._gate_sequence.carry_out(order))) is not None:
-            if order.kind is not OrderKind.PAUSE or not self._schedule.covers(failure):
+            if order.ask is not ControlRequest.PAUSE or not self._schedule.covers(failure):
                 raise failure
             await self._gate_sequence.put_down(failure)
 

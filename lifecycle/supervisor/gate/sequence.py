@@ -32,10 +32,9 @@ from lifecycle.supervisor.control.orders import (
     PAUSED,
     NotBegunError,
     Order,
-    OrderKind,
     node_of,
 )
-from lifecycle.supervisor.control.protocol import ProcessState, Reach
+from lifecycle.supervisor.control.protocol import ControlRequest, ProcessState, Reach
 from lifecycle.supervisor.gate.applying import Alive, Applying, SetsParameters
 from lifecycle.supervisor.gate.gate import (
     Gate,
@@ -242,13 +241,13 @@ class GateSequence:
         )
 
     async def _carry_out(self, order: Order) -> None:
-        if order.kind is OrderKind.PAUSE:
+        if order.ask is ControlRequest.PAUSE:
             await self._pause(order)
-        elif order.kind is OrderKind.RESUME:
+        elif order.ask is ControlRequest.RESUME:
             await self._through_the_gate()
-        elif order.kind is OrderKind.MODE:
+        elif order.ask is ControlRequest.MODE:
             await self._switch(order.mode)
-        elif order.kind is OrderKind.APPLY:
+        elif order.ask is ControlRequest.APPLY:
             await self._applying.apply(order)
         elif order.keys:
             await self._restart_by_policy(order.keys)

@@ -39,31 +39,6 @@ from lifecycle.supervisor.run.events import Emitter, LogLine, ProcessChanged
 if TYPE_CHECKING:
     from lifecycle.supervisor.processes.fork_server import ForkServer, ForkServerChild
 
-CHANGES: dict[ProcessState, frozenset[ProcessState]] = {
-    ProcessState.STARTING: frozenset(
-        {ProcessState.RUNNING, ProcessState.STOPPING, ProcessState.EXITED}
-    ),
-    ProcessState.RUNNING: frozenset({ProcessState.STOPPING, ProcessState.EXITED}),
-    ProcessState.STOPPING: frozenset({ProcessState.EXITED}),
-    ProcessState.EXITED: frozenset({ProcessState.BACKOFF, ProcessState.STARTING}),
-    ProcessState.BACKOFF: frozenset({ProcessState.STARTING, ProcessState.EXITED}),
-}
-"""Every legal change; a pair that is missing is a bug of the caller."""
-
-
-def change(old: ProcessState, new: ProcessState) -> ProcessState:
-    """Return `new` if a process may go there from `old`.
-
-    Raises:
-        ValueError: it may not; a bug of the caller.
-    """
-    if new not in CHANGES[old]:
-        allowed = ", ".join(sorted(state.value for state in CHANGES[old]))
-        raise ValueError(
-            f"cannot change a process from {old.value!r} to {new.value!r}; allowed: {allowed}"
-        )
-    return new
-
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class ProcessExit:
@@ -200,7 +175,7 @@ class ManagedProcess:
     Attributes:
         planned: what the plan declares of it.
         carries: full names of the nodes that are gone with it, loaded components included.
-        state: see `CHANGES`.
+        state: in the order of ProcessState; from any but the last it may be EXITED next.
         channel: to our host; None for a foreign command.
         child: None before it was spawned.
         ended: resolves with how it ended.
@@ -426,7 +401,7 @@ class ManagedProcess:
 
     def _exited(self, exited: asyncio.Future[ProcessExit]) -> None:
         # Before anybody is notified: a listener that raises must not lose it.
-        self.state = change(self.state, ProcessState.EXITED)
+        self.state = ProcessState.EXITED
         self.ended.set_result(exited.result())
         for each in self._readers:
             each.drain()
@@ -441,7 +416,7 @@ class ManagedProcess:
             log.close()
 
     def _change(self, state: ProcessState, detail: str = "") -> None:
-        self.state = change(self.state, state)
+        self.state = state
         self._say(detail)
 
     def _say(self, detail: str = "") -> None:

@@ -133,28 +133,11 @@ def up(
         MiddlewareError: no participant can be made in the plan's domain.
         Ended: a signal asked for it before there was a session; nothing is left.
     """
-    if ending is None:
-        with Ending() as ours:
-            return up(
-                plan,
-                options,
-                listeners,
-                process=process,
-                ending=ours,
-                on_start=on_start,
-                conclude=conclude,
-            )
     guarded = tuple(_Guarded(each) for each in listeners)
-    with ending.noted():
-        result = _up(
-            plan,
-            options,
-            guarded,
-            process=process,
-            ending=ending,
-            on_start=on_start,
-            conclude=conclude,
-        )
+    with contextlib.ExitStack() as ours:
+        ending = ours.enter_context(Ending()) if ending is None else ending
+        with ending.noted():
+            result = _up(plan, options, guarded, process, ending, on_start, conclude)
     for each in guarded:
         if each.error is not None:
             raise each.error
@@ -177,11 +160,10 @@ class _Guarded:
                 self.error = error
 
 
-def _up(
+def _up(  # noqa: PLR0917 - those of `up`, in its order
     plan: Plan,
     options: UpOptions,
     listeners: Iterable[Listener],
-    *,
     process: ForkServerProcess | None,
     ending: Ending,
     on_start: Callable[[Callable[[], SystemStatus]], None] | None,

@@ -15,13 +15,11 @@ from lifecycle.supervisor.control.orders import (
     ACTIVE,
     HELD,
     PAUSED,
-    Done,
     Mailbox,
     Order,
-    OrderKind,
     check_order,
 )
-from lifecycle.supervisor.control.protocol import ControlRequest, Question, Reach
+from lifecycle.supervisor.control.protocol import Answer, ControlRequest, Question, Reach
 from lifecycle.supervisor.control.server import ControlServer, SupervisorSnapshot, follow
 from lifecycle.supervisor.gate.gate import Gate
 from lifecycle.supervisor.run.shutdown import TakeDown
@@ -41,24 +39,24 @@ PLAN = plan_of(
 @pytest.mark.parametrize(
     ("kind", "fits"),
     [
-        (OrderKind.PAUSE, {ACTIVE, HELD}),
-        (OrderKind.RESUME, {PAUSED, HELD}),
-        (OrderKind.RESTART, {ACTIVE, PAUSED, HELD}),
+        (ControlRequest.PAUSE, {ACTIVE, HELD}),
+        (ControlRequest.RESUME, {PAUSED, HELD}),
+        (ControlRequest.RESTART, {ACTIVE, PAUSED, HELD}),
     ],
 )
 @pytest.mark.parametrize(
     "phase", [ACTIVE, PAUSED, HELD, "connecting", "verifying", "restarting", "stopping"]
 )
 def test_an_order_fits_some_phases_and_no_others(
-    tmp_path: Path, kind: OrderKind, fits: set[str], phase: str
+    tmp_path: Path, kind: ControlRequest, fits: set[str], phase: str
 ) -> None:
     async def test() -> None:
         system = World(PLAN, tmp_path).system
         if phase in fits:
-            check_order(Order(kind=kind), system, phase)
+            check_order(Order(ask=kind), system, phase)
         else:
             with pytest.raises(UsageError, match=rf"^cannot {kind.value} 'robot': it is {phase};"):
-                check_order(Order(kind=kind), system, phase)
+                check_order(Order(ask=kind), system, phase)
 
     run(test())
 
@@ -77,9 +75,9 @@ def test_a_node_that_is_not_ours_is_not_restarted(tmp_path: Path, node: str, mes
     async def test() -> None:
         system = World(PLAN, tmp_path).system
         for known in ("camera", "/camera"):
-            check_order(Order(kind=OrderKind.RESTART, node=known), system, ACTIVE)
+            check_order(Order(ask=ControlRequest.RESTART, node=known), system, ACTIVE)
         with pytest.raises(UsageError) as caught:
-            check_order(Order(kind=OrderKind.RESTART, node=node), system, ACTIVE)
+            check_order(Order(ask=ControlRequest.RESTART, node=node), system, ACTIVE)
         assert str(caught.value) == message
 
     run(test())
@@ -88,14 +86,16 @@ def test_a_node_that_is_not_ours_is_not_restarted(tmp_path: Path, node: str, mes
 def test_orders_are_carried_out_one_by_one_and_refused_once_all_is_over() -> None:
     async def test() -> None:
         mailbox = Mailbox()
-        first = asyncio.ensure_future(mailbox.place(Order(kind=OrderKind.PAUSE)))
-        second = asyncio.ensure_future(mailbox.place(Order(kind=OrderKind.RESUME)))
+        first = asyncio.ensure_future(mailbox.place(Order(ask=ControlRequest.PAUSE)))
+        second = asyncio.ensure_future(mailbox.place(Order(ask=ControlRequest.RESUME)))
         pending = await mailbox.next()
-        assert pending.order.kind is OrderKind.PAUSE
-        pending.finish(Done())
-        assert await first == Done()
+        assert pending.order.ask is ControlRequest.PAUSE
+        pending.finish(Answer(exit_code=0))
+        assert await first == Answer(exit_code=0)
         mailbox.close("cannot go on: over")
-        assert await second == Done(exit_code=ExitCode.BRING_UP_FAILED, error="cannot go on: over")
+        assert await second == Answer(
+            exit_code=ExitCode.BRING_UP_FAILED, error="cannot go on: over"
+        )
 
     run(test())
 
@@ -104,9 +104,9 @@ def test_the_control_socket_looks_follows_and_orders(tmp_path: Path) -> None:
     seen = SupervisorSnapshot(plan=PLAN, status=STATUS, observation=Observation(), verdict=None)
     asked: list[Order] = []
 
-    async def carry_out(given: Order) -> Done:
+    async def carry_out(given: Order) -> Answer:
         asked.append(given)
-        return Done(exit_code=ExitCode.VIOLATED, error="cannot activate: no")
+        return Answer(exit_code=ExitCode.VIOLATED, error="cannot activate: no")
 
     async def test() -> None:
         server = ControlServer(
@@ -119,7 +119,7 @@ def test_the_control_socket_looks_follows_and_orders(tmp_path: Path) -> None:
             None, lambda: order(tmp_path, Question(ask=ControlRequest.RESTART, node="camera"), 5.0)
         )
         assert (answer.exit_code, answer.error) == (ExitCode.VIOLATED, "cannot activate: no")
-        assert asked == [Order(kind=OrderKind.RESTART, node="camera")]
+        assert asked == [Order(ask=ControlRequest.RESTART, node="camera")]
 
         heard: list[SupervisorSnapshot] = []
         came = [threading.Event(), threading.Event()]

@@ -24,7 +24,6 @@ from lifecycle.node.host.control import HostSpec
 from lifecycle.plan import build_plan
 from lifecycle.plan.model import PlannedProcess
 from lifecycle.run_directory import RUN_VARIABLE, ChildRecord, RunRecord, boot_id, start_ticks
-from lifecycle.supervisor.control.protocol import ProcessState
 from lifecycle.supervisor.processes import logs, scope
 from lifecycle.supervisor.processes.control_channel import ControlChannel
 from lifecycle.supervisor.processes.fork_server import ForkServer
@@ -43,7 +42,6 @@ from lifecycle.supervisor.processes.process import (
     COMMAND_ESCALATION,
     ManagedProcess,
     ProcessExit,
-    change,
 )
 from lifecycle.supervisor.run.events import Emitter, LogLine
 from lifecycle.verify import Outcome
@@ -412,15 +410,6 @@ def test_a_log_directory_that_cannot_be_made_is_said_and_fails_nothing(tmp_path:
     assert log.tail == ("still the last line of it",)
     (line,) = said
     assert "File exists" in line or "Not a directory" in line
-
-
-def test_every_state_change_is_legal_or_refused_with_the_legal_ones() -> None:
-    assert change(ProcessState.STARTING, ProcessState.RUNNING) is ProcessState.RUNNING
-    with pytest.raises(
-        ValueError,
-        match="cannot change a process from 'stopping' to 'running'; allowed: exited",
-    ):
-        change(ProcessState.STOPPING, ProcessState.RUNNING)
 
 
 @pytest.mark.parametrize(
