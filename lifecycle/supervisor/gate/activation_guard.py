@@ -24,8 +24,8 @@ from lifecycle.supervisor.run.failure import ended
 from lifecycle.verify import ACTIVATED_AT_CLOSED_GATE, Finding, Observation, Outcome
 
 if TYPE_CHECKING:
+    from lifecycle.graph import Graph
     from lifecycle.supervisor.gate.verification_loop import ChangeCounter
-    from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
 
 TRIES = 5
 """A node that is activated again and again is not deactivated for ever: its finding stays."""
@@ -82,7 +82,7 @@ class ActivationGuard:
             if node.name in self._deactivating or node.name in self._given_up
         )
 
-    async def follow(self, observer: ObserverParticipant, changes: ChangeCounter) -> None:
+    async def follow(self, observer: Graph, changes: ChangeCounter) -> None:
         """Look at every change, for as long as no verdict is made: until this is cancelled."""
         while True:
             count = changes.count

@@ -55,8 +55,8 @@ from lifecycle.verify import (
 )
 
 if TYPE_CHECKING:
+    from lifecycle.graph import Graph
     from lifecycle.supervisor.connections.authority import ConnectionAuthority
-    from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
 
 PASSING_S = 1.0
 """Discovery shows a newcomer's endpoints before its name, measured 0.02–0.45 s earlier; what nodes
@@ -216,7 +216,7 @@ ASK_AGAIN_AT_MOST_S = 0.5
 class ChangeCounter:
     """Counts the moments at which it is worth looking again: the graph's and the nodes'."""
 
-    def __init__(self, system: System, observer: ObserverParticipant) -> None:
+    def __init__(self, system: System, observer: Graph) -> None:
         self._system = system
         self._observer = observer
         self._count = 0
@@ -285,7 +285,7 @@ class VerificationLoop:
     def __init__(
         self,
         system: System,
-        observer: ObserverParticipant,
+        observer: Graph,
         changes: ChangeCounter,
         emit: Emitter,
         *,

@@ -26,6 +26,7 @@ from lifecycle.supervisor.run.events import Event, NodeChanged, ProcessChanged
 from lifecycle.supervisor.run.failure import StepFailedError, ended
 
 if TYPE_CHECKING:
+    from lifecycle.graph import Graph
     from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
 
 _SPEAK_S = 0.7 + ALSO_S
@@ -151,15 +152,15 @@ class StaleNodes:
 
     Args:
         system: whose processes; `on_event` must be given its events.
-        graph: see above.
+        participant: ours.
         disown_ports: has all others send no more to ports in shared memory whose process is dead.
     """
 
     def __init__(
-        self, system: System, graph: ObserverParticipant, *, disown_ports: Callable[[], None]
+        self, system: System, participant: ObserverParticipant, *, disown_ports: Callable[[], None]
     ) -> None:
         self._system = system
-        self._graph = graph
+        self._participant = participant
         self._disown_ports = disown_ports
         self._later: set[asyncio.TimerHandle] = set()
         self._publishing: set[asyncio.Future[None]] = set()
@@ -191,7 +192,7 @@ class StaleNodes:
         if rediscover and known:
             return
         pids = [each.pid for each in self._system.living if each is not process]
-        self._graph.introduce([process.pid], pids, rediscover=rediscover)
+        self._participant.introduce([process.pid], pids, rediscover=rediscover)
         if repetition and process.channel is not None and not known:
             # Its endpoints may be matched and its name not be known: what it published before the
             # match is only repeated with the next heartbeat, 3 s later.
@@ -241,7 +242,7 @@ class StaleNodes:
         if process.pid:
             pids = [each.pid for each in self._system.living if each is not process]
             rediscover = looks % round(REDISCOVERED_S / STARTING_S) == 0
-            self._graph.introduce([process.pid], pids, rediscover=rediscover)
+            self._participant.introduce([process.pid], pids, rediscover=rediscover)
 
         def again() -> None:
             self._later.discard(handle)
@@ -276,7 +277,7 @@ class StaleNodes:
         self._disown_ports()
         names = [node.name for node in nodes]
         reported = frozenset(prefix for node in nodes for prefix in _reported(node))
-        prefixes = self._graph.participants_of(pid, nodes=names, reported=reported)
+        prefixes = self._participant.discovery.participants_of(pid, nodes=names, reported=reported)
         # What has no name yet may be discovered only now: it was just being made.
         self._remove(pid, prefixes, prefixes, 0)
 
@@ -285,13 +286,13 @@ class StaleNodes:
     ) -> None:
         if every and (repetition < _ALWAYS or shown):
             pids = [each.pid for each in self._system.living]
-            self._graph.remove_participants(every, pids)
+            self._participant.discovery.remove_participants(every, pids)
         if repetition == len(AGAIN_S) or self._closed:
             return
 
         def again() -> None:
             self._later.discard(handle)
-            left = self._graph.participants_of(pid, nodes=(), reported=every)
+            left = self._participant.discovery.participants_of(pid, nodes=(), reported=every)
             self._remove(pid, every or left, left & (every or left), repetition + 1)
 
         loop = asyncio.get_running_loop()
@@ -312,9 +313,7 @@ def _reported(node: NodeRun) -> Iterable[str]:
 class Sightings:
     """Who is in the graph of one system, as an event to wait for."""
 
-    def __init__(
-        self, system: System, observer: ObserverParticipant, changes: ChangeCounter
-    ) -> None:
+    def __init__(self, system: System, observer: Graph, changes: ChangeCounter) -> None:
         self._system = system
         self._observer = observer
         self._changes = changes

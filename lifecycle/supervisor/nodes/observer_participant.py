@@ -10,19 +10,17 @@ import asyncio
 import contextlib
 import os
 import shlex
-from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Awaitable, Callable, Collection, Iterable
+from typing import TYPE_CHECKING
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.graph import set_within
 from lifecycle.manifest import EndpointKind, supervisor_alive_topic
-from lifecycle.plan import ParticipantConnections, Plan, PlannedNode
+from lifecycle.plan import ParticipantConnections, PlannedNode
 from lifecycle.supervisor.control.ros_interface import Answer
 from lifecycle.supervisor.health.peer_supervisors import Listener
 from lifecycle.supervisor.nodes.driver import NodeDriver, NodeInterfaceClient, ServiceDriver
 from lifecycle.verify import (
-    NodeConfiguration,
-    Observation,
     ObservedEndpoint,
     ObservedNode,
     known_node,
@@ -44,10 +42,18 @@ _BURST_S = 0.05
 
 
 class ObserverParticipant:
-    """What a supervisor observes and reaches of one domain. `destroy` it, or use it in a `with`."""
+    """What a supervisor observes and reaches of one domain. `destroy` it, or use it in a `with`.
+
+    Attributes:
+        graph: what is observed.
+        discovery: what its participant discovers.
+        clients: of other nodes' services.
+    """
 
     def __init__(self, graph: Graph) -> None:
-        self._graph = graph
+        self.graph = graph
+        self.discovery = graph.discovery
+        self.clients = graph.clients
         self._node = graph.discovery.node
 
     @classmethod
@@ -99,50 +105,17 @@ class ObserverParticipant:
 
         return unknown_versions()
 
-    def missing_port(self) -> int | None:
-        """Return the UDP port that another process keeps from all participants of this host."""
-        return self._graph.discovery.missing_port()
-
-    def reaches_servers(self) -> bool:
-        """Wait, bounded, until a TCP discovery server can be asked; False if it never will be."""
-        return self._graph.discovery.reaches_servers()
-
     def driver(self, node: PlannedNode) -> NodeDriver:
         """Return the driver of a managed node that is not hosted by us."""
-        return ServiceDriver(self._graph.clients, node)
+        return ServiceDriver(self.clients, node)
 
     async def answers(self, node: PlannedNode, *, timeout_s: float) -> bool | None:
         """Return whether a node answers a request, within seconds; None: it serves nothing."""
-        return await self._graph.clients.answers(
-            node.full_name, managed=node.managed, timeout_s=timeout_s
-        )
+        return await self.clients.answers(node.full_name, managed=node.managed, timeout_s=timeout_s)
 
     def node_interface(self, node: str) -> NodeInterfaceClient:
         """Return what drives the node interface of any node that has one, by full name."""
-        return NodeInterfaceClient(self._graph.clients, node)
-
-    async def give(self, node: PlannedNode) -> None:
-        """Set the parameters that a running node has with other values than its plan gives it.
-
-        Raises:
-            MiddlewareError: it does not answer, or refuses.
-        """
-        await self._graph.clients.give_parameters(node)
-
-    async def set_parameters(
-        self, node: str, values: Mapping[str, Any], types: Mapping[str, str]
-    ) -> None:
-        """Set parameters of a running node, by full name, all or none.
-
-        Args:
-            node: see above.
-            values: by name.
-            types: likewise, see plan.ExpectedParameter.
-
-        Raises:
-            MiddlewareError: it does not answer, or refuses.
-        """
-        await self._graph.clients.set_parameters(node, values, types)
+        return NodeInterfaceClient(self.clients, node)
 
     async def running(self, wait_s: float) -> tuple[tuple[ObservedNode, ...], str]:
         """Return the nodes in the graph once discovery has settled, and what it lacked in the end.
@@ -150,14 +123,14 @@ class ObserverParticipant:
         Args:
             wait_s: seconds, > 0, that it may take.
         """
-        (nodes, _), unsettled = await settled(self._graph.discovery, wait_s)
+        (nodes, _), unsettled = await settled(self.discovery, wait_s)
         return nodes, unsettled
 
     def processes(self) -> dict[str, dict[int, str]]:
         """Return the command lines of this host's processes by full node name and pid."""
         return {
             name: {each.process_id: shlex.join(each.argv) for each in programs.values()}
-            for name, programs in self._graph.discovery.programs(os.environ).items()
+            for name, programs in self.discovery.programs(os.environ).items()
         }
 
     async def load(self, node: PlannedNode, container: str) -> Callable[[], Awaitable[None]]:
@@ -167,51 +140,7 @@ class ObserverParticipant:
             MiddlewareError: with the reason; so does what unloads.
         """
         limit_s = node.timeouts.start_s
-        return await self._graph.clients.load_component(node, container, timeout_s=limit_s)
-
-    async def observe(self, plan: Plan) -> Observation:
-        """Return what is there now."""
-        return await self._graph.observe(plan)
-
-    def expect_newcomers(self, *, everybody: bool = False) -> bool:
-        """Have the next `observe` wait for who came lately; return whether there may be anybody."""
-        return self._graph.expect_newcomers(everybody=everybody)
-
-    def reread_parameters(self) -> bool:
-        """Have the next `observe` read all parameters again; return whether it reads any."""
-        return self._graph.reread_parameters()
-
-    @property
-    def changes(self) -> int:
-        """Changes so far, before their bursts have passed."""
-        return self._graph.changes
-
-    async def wait_change(self) -> None:
-        """Wait until something changed."""
-        await self._graph.wait_change()
-
-    def put_configuration(self, configuration: NodeConfiguration) -> None:
-        """Give what a node reported over its control channel."""
-        self._graph.state.put_configuration(configuration)
-
-    def drop_configuration(self, node: str) -> None:
-        """Forget what a node reported whose process ended."""
-        self._graph.drop_configuration(node)
-
-    def participants_of(
-        self, pid: int, *, nodes: Iterable[str], reported: Iterable[str]
-    ) -> frozenset[str]:
-        """Return the GUID prefixes of the participants that discovery shows of a process."""
-        return self._graph.discovery.participants_of(pid, nodes=nodes, reported=reported)
-
-    def remove_participants(self, prefixes: Iterable[str], pids: Iterable[int]) -> None:
-        """Have all participants forget those whose process is dead."""
-        self._graph.discovery.remove_participants(prefixes, pids)
-
-    @property
-    def prefix(self) -> str:
-        """GUID prefix of our participant, 24 hex digits; empty where that is not known."""
-        return self._graph.discovery.prefix
+        return await self.clients.load_component(node, container, timeout_s=limit_s)
 
     def announce_machine(self, system: str, machine: str) -> AlivePublisher:
         """Announce ourselves as the supervisor of a machine, by DDS liveliness."""
@@ -265,11 +194,11 @@ class ObserverParticipant:
         """Make all participants announce themselves, as far as the system's discovery allows."""
         from lifecycle.middleware import call_out
 
-        call_out(self._graph.discovery.domain_id, self._graph.discovery.urls, addresses, os.environ)
+        call_out(self.discovery.domain_id, self.discovery.urls, addresses, os.environ)
 
     def announce_ourselves(self) -> None:
         """Have our participant announce itself to those that it knows, as far as that goes."""
-        self._graph.discovery.announce_ourselves()
+        self.discovery.announce_ourselves()
 
     def can_be_unannounced(self) -> bool:
         """Return whether participants like ours can be, see HostSpec."""
@@ -282,7 +211,7 @@ class ObserverParticipant:
         """Return whether names of nodes that are started now would arrive, see HostSpec."""
         from lifecycle.middleware import pairs_are_whole
 
-        return pairs_are_whole(self._graph.discovery.domain_id)
+        return pairs_are_whole(self.discovery.domain_id)
 
     def introduce(
         self, newcomers: Iterable[int], pids: Iterable[int], *, rediscover: bool = False
@@ -290,7 +219,7 @@ class ObserverParticipant:
         """Have new participants discovered by, and discover, those that were there before."""
         from lifecycle.middleware import introduce
 
-        discovery = self._graph.discovery
+        discovery = self.discovery
         ours = discovery.prefix if rediscover else ""
         introduce(newcomers, discovery.domain_id, discovery.urls, os.environ, pids, rediscover=ours)
 
@@ -321,7 +250,7 @@ class ObserverParticipant:
 
     def destroy(self) -> None:
         """Leave the graph."""
-        self._graph.close()
+        self.graph.close()
 
     def __enter__(self) -> ObserverParticipant:  # noqa: PYI034 - typing.Self is not in Python 3.10
         return self

@@ -30,8 +30,8 @@ from lifecycle.supervisor.run.events import Emitter, NodeChanged, Notice, Reques
 from lifecycle.verify import HealthReport, NodeConfiguration, Observation, health_of
 
 if TYPE_CHECKING:
+    from lifecycle.graph import Graph
     from lifecycle.supervisor.gate.verification_loop import ChangeCounter
-    from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
 
 ASK_AGAIN_S = 0.2
 """A remote node is asked again so long after, because the event that it connected may be missed:
@@ -78,7 +78,7 @@ class RemoteNodes:
         self,
         plan: Plan,
         nodes: Iterable[RemoteNode],
-        observer: ObserverParticipant,
+        observer: Graph,
         changes: ChangeCounter,
     ) -> None:
         self._nodes = tuple(nodes)
@@ -102,9 +102,7 @@ class RemoteNodes:
 class AwaitedHealth:
     """Takes from the graph the health that others wait for, where no host of ours reports all."""
 
-    def __init__(
-        self, system: System, observer: ObserverParticipant, changes: ChangeCounter
-    ) -> None:
+    def __init__(self, system: System, observer: Graph, changes: ChangeCounter) -> None:
         self._system = system
         self._observer = observer
         self._changes = changes
@@ -651,7 +649,7 @@ class System:
             or any(after.node == key for after in node.planned.after)
         )
 
-    async def refresh(self, observer: ObserverParticipant, *, marks: bool = False) -> None:
+    async def refresh(self, observer: Graph, *, marks: bool = False) -> None:
         """Read the configuration of every reachable node and give it to the observer.
 
         One whose host reports every change by itself is not asked. A node that does not answer
@@ -679,7 +677,7 @@ class System:
         )
         for node in nodes:
             if node.configuration is not None:
-                observer.put_configuration(node.configuration)
+                observer.state.put_configuration(node.configuration)
 
     @staticmethod
     async def _refresh(node: NodeRun) -> None:

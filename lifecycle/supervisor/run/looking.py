@@ -209,7 +209,7 @@ def _reported_to_supervisors(plan: Plan) -> tuple[NodeConfiguration, ...]:
 
 
 async def _see(plan: Plan, observer_participant: ObserverParticipant) -> JudgedSystem:
-    observation = await observer_participant.observe(plan)
+    observation = await observer_participant.graph.observe(plan)
     return _judged(plan, observation, observer_participant)
 
 
@@ -247,7 +247,7 @@ async def _judge(
     loop = asyncio.get_running_loop()
     began = loop.time()
     while True:
-        observation = await observer_participant.observe(plan)
+        observation = await observer_participant.graph.observe(plan)
         # One that is not there may be yet to come.
         seen = _judged(plan, observation, observer_participant, may_be_over=False)
         limit_s = timeout_s
@@ -270,7 +270,7 @@ def _worth_waiting(verdict: Verdict, *, strict: bool) -> bool:
 async def _change(observer_participant: ObserverParticipant, timeout_s: float) -> bool:
     """Wait for a change of the graph; False when it is time to ask the nodes again without one."""
     try:
-        await asyncio.wait_for(observer_participant.wait_change(), timeout_s)
+        await asyncio.wait_for(observer_participant.graph.wait_change(), timeout_s)
     except asyncio.TimeoutError:
         return False
     return True

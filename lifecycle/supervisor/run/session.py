@@ -200,14 +200,14 @@ class Session:
         self._reason = ""
         self._hurry = asyncio.Event()
         self._stop: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._changes = ChangeCounter(system, observer_participant)
+        self._changes = ChangeCounter(system, observer_participant.graph)
         self._authority = authority_of(system, emit, observer_participant)
         self._peer_supervisors = PeerSupervisors(system, observer_participant)
         self._agreement = Agreement(system, observer_participant, self._peer_supervisors)
         self._guard = ActivationGuard(system)
         self._judge = VerificationLoop(
             system,
-            observer_participant,
+            observer_participant.graph,
             self._changes,
             emit,
             strict=options.strict,
@@ -216,7 +216,7 @@ class Session:
             guard=self._guard,
         )
         self._gate = Gate(strict=options.strict, judging=self._judge)
-        sightings = Sightings(system, observer_participant, self._changes)
+        sightings = Sightings(system, observer_participant.graph, self._changes)
         self._stale = StaleNodes(
             system, observer_participant, disown_ports=fork_server.disown_ports
         )
@@ -232,7 +232,7 @@ class Session:
             appears=sightings.appears,
             recorded=self._records.write,
             wirer=self._authority,
-            gives=observer_participant.give,
+            gives=observer_participant.clients.give_parameters,
             loads=observer_participant.load,
             alone=self._alone,
             announce=observer_participant.announce_ourselves,
@@ -240,9 +240,9 @@ class Session:
             names_by_udp=observer_participant.names_can_go_by_udp,
         )
         self._remote_nodes = RemoteNodes(
-            system.plan, system.awaited(), observer_participant, self._changes
+            system.plan, system.awaited(), observer_participant.graph, self._changes
         )
-        self._awaited_health = AwaitedHealth(system, observer_participant, self._changes)
+        self._awaited_health = AwaitedHealth(system, observer_participant.graph, self._changes)
         self._gate_sequence = GateSequence(
             system,
             bring_up=self._bring_up,
@@ -262,7 +262,7 @@ class Session:
             spawner=fork_server,
             hurry=self._hurry,
             timeout_s=options.bring_up_s(len(system.processes)),
-            sets=observer_participant.set_parameters,
+            sets=observer_participant.clients.set_parameters,
         )
         self._revisions = Revisions(system, options)
         self._holding = Holding(
@@ -537,7 +537,7 @@ class Session:
 
     def _forget(self, nodes: Collection[NodeRun], left: Collection[int]) -> None:
         for node in nodes:
-            self._observer_participant.drop_configuration(node.name)
+            self._observer_participant.graph.drop_configuration(node.name)
         for pid in left:
             if start_ticks(pid) is None:
                 self._stale.forget(pid, tuple(nodes))
@@ -553,7 +553,9 @@ class Session:
         followers = (
             asyncio.ensure_future(self._remote_nodes.follow()),
             asyncio.ensure_future(self._awaited_health.follow()),
-            asyncio.ensure_future(self._guard.follow(self._observer_participant, self._changes)),
+            asyncio.ensure_future(
+                self._guard.follow(self._observer_participant.graph, self._changes)
+            ),
         )
         try:
             yield

@@ -402,7 +402,7 @@ async def _observer_participant(
                 unplanned=wires and dynamic and plan.policy.undeclared_nodes is EndpointPolicy.OPEN,
                 events=wires and (dynamic or layer.events),
             )
-        if number + 1 == OBSERVER_TRIES or observer_participant.reaches_servers():
+        if number + 1 == OBSERVER_TRIES or observer_participant.discovery.reaches_servers():
             break
         observer_participant.prepare_to_leave()
         observer_participant.destroy()
@@ -415,7 +415,8 @@ async def _observer_participant(
             )
         )
     # Nodes elsewhere would be found: they answer to ports of ours.
-    port = observer_participant.missing_port() if local_processes(plan, options.machine) else None
+    discovery = observer_participant.discovery
+    port = discovery.missing_port() if local_processes(plan, options.machine) else None
     if port is not None:
         observer_participant.prepare_to_leave()
         observer_participant.destroy()
@@ -495,10 +496,10 @@ def _succeed(
     They would take the two for supervisors that both say they are the same, until its lease is
     over.
     """
-    directory.participant = observer_participant.prefix
+    directory.participant = observer_participant.discovery.prefix
     killed = directory.previous
     if killed is not None and killed.boot_id == boot_id() and _PREFIX.fullmatch(killed.participant):
-        observer_participant.remove_participants([killed.participant], ())
+        observer_participant.discovery.remove_participants([killed.participant], ())
     return observer_participant
 
 

@@ -385,6 +385,7 @@ class FakeGraph:
     """An observer that sees a list of node names, and tells of changes when told to."""
 
     def __init__(self) -> None:
+        self.state = self
         self.observation = Observation()
         self.changed = asyncio.Event()
         self.put: list[NodeConfiguration] = []

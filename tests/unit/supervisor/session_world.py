@@ -200,6 +200,7 @@ class FakeParticipant:
         self.subscribed: set[str] = set()
         self.refuses = ""
         self.refuses_live: dict[str, str] = {}
+        self.graph = self.discovery = self.clients = self.state = self
         self._hosts = hosts
         self._reports: dict[str, NodeConfiguration] = {}
         self._changed = asyncio.Event()
@@ -264,7 +265,7 @@ class FakeParticipant:
     async def load(self, node: PlannedNode, container: str) -> None:
         """No container is in this world."""
 
-    async def give(self, node: PlannedNode) -> None:
+    async def give_parameters(self, node: PlannedNode) -> None:
         """Note what is set; a node may refuse."""
         given = " ".join(f"{each.name}={each.value}" for each in node.expected_parameters)
         self._hosts.log.append(f"{node.full_name} given {given}")

@@ -66,7 +66,9 @@ def system() -> System:
 
 def after(graph: Graph, *events: ProcessChanged, seconds: float = 0.0) -> None:
     async def run() -> None:
-        stale = StaleNodes(system(), graph, disown_ports=graph.disown_ports)
+        stale = StaleNodes(
+            system(), SimpleNamespace(discovery=graph), disown_ports=graph.disown_ports
+        )
         for event in events:
             stale.on_event(event)
         await asyncio.sleep(seconds)
