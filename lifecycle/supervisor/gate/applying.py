@@ -10,7 +10,7 @@ touched stays active meanwhile. Must not import rclpy.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Collection, Coroutine, Mapping
+from collections.abc import Callable, Collection, Coroutine, Mapping
 from typing import TYPE_CHECKING, Any
 
 from lifecycle import dataclasses
@@ -37,15 +37,12 @@ from lifecycle.supervisor.run.failure import StepFailedError, together
 from lifecycle.verify import PROCESS_DIED, Stage, not_ok
 
 if TYPE_CHECKING:
+    from lifecycle.middleware import NodeClients
     from lifecycle.supervisor.gate.sequence import GateSequence
     from lifecycle.supervisor.processes.fork_server import ForkServer
 
 Alive = Callable[[Coroutine[Any, Any, object]], Coroutine[Any, Any, None]]
 """Runs a step; the unexpected end of any process ends it."""
-
-SetsParameters = Callable[[str, Mapping[str, Any], Mapping[str, str]], Awaitable[None]]
-"""Sets parameters of a running node, all or none: full name, values and types, see
-`plan.ExpectedParameter`; raises MiddlewareError."""
 
 _LEAST_S = 1.0
 
@@ -87,7 +84,7 @@ class Applying:
 
     Args:
         sequence: takes down, brings up, verifies and activates; has the phase.
-        sets: see above.
+        clients: of running nodes' parameters.
         timeout_s: for becoming active by the other manifest, and for going back.
     """
 
@@ -102,7 +99,7 @@ class Applying:
         judge: VerificationLoop,
         emit: Emitter,
         alive: Alive,
-        sets: SetsParameters,
+        clients: NodeClients,
         spawner: ForkServer,
         timeout_s: float,
     ) -> None:
@@ -114,7 +111,7 @@ class Applying:
         self._judge = judge
         self._emit = emit
         self._alive = alive
-        self._sets = sets
+        self._clients = clients
         self._spawner = spawner
         self._timeout_s = timeout_s
 
@@ -339,7 +336,7 @@ class Applying:
             node = self._system.nodes[key]
             done.asked[key] = values
             try:
-                await self._sets(node.name, values.now, values.types)
+                await self._clients.set_parameters(node.name, values.now, values.types)
             except MiddlewareError as error:
                 self._emit(Notice(message=f"{error.message}; it is started again"))
                 refused.add(key)

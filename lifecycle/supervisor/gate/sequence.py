@@ -35,7 +35,7 @@ from lifecycle.supervisor.control.orders import (
     node_of,
 )
 from lifecycle.supervisor.control.protocol import ControlRequest, ProcessState, Reach
-from lifecycle.supervisor.gate.applying import Alive, Applying, SetsParameters
+from lifecycle.supervisor.gate.applying import Applying
 from lifecycle.supervisor.gate.gate import (
     Gate,
     Permit,
@@ -64,6 +64,9 @@ from lifecycle.verify import (
 )
 
 if TYPE_CHECKING:
+    from lifecycle.middleware import NodeClients
+    from lifecycle.supervisor.connections.networks import Networks
+    from lifecycle.supervisor.health.process_monitor import ProcessMonitor, Sightings
     from lifecycle.supervisor.processes.fork_server import ForkServer
 
 UNCHANGED_S = 5.0
@@ -118,20 +121,18 @@ class GateSequence:
 
     Args:
         schedule: what is started again by policy, and when.
-        alive: see above.
-        leaves: called with the names of processes that end because we want it, and `comes_back`
-            once they are started again.
+        process_monitor: notices processes that end; those that end because we want it are noted.
         forget: drops what nodes reported before they were taken down, and has all others forget
             the participants of processes that theirs had left, by pid.
-        vanishes: waits, bounded, until the graph shows no node of this name.
+        sightings: who is in the graph.
         replanned: called with the names of nodes that the plan connects otherwise from now on.
-        program: programs networks with the flows of a verdict within seconds, done when it returns.
+        networks: programmed with the flows of the verdict that opens the gate.
         following: keeps looking at the nodes of others, and at ours that others may drive, for the
             length of its block.
         outrun: returns once something is to be done before a gate that stays closed.
         spawner: must be able to start processes before any is ended to be started again.
         timeout_s: for bringing up again what an order took down.
-        sets: sets parameters of a running node.
+        clients: of running nodes' parameters.
 
     Attributes:
         phase: as people read it; see orders.py and SystemStatus.
@@ -147,19 +148,17 @@ class GateSequence:
         judge: VerificationLoop,
         gate: Gate,
         emit: Emitter,
-        alive: Alive,
-        leaves: Callable[[Iterable[str]], None],
-        comes_back: Callable[[Iterable[str]], None],
+        process_monitor: ProcessMonitor,
         forget: Callable[[Collection[NodeRun], Collection[int]], None],
-        vanishes: Callable[[str], Coroutine[Any, Any, None]],
+        sightings: Sightings,
         replanned: Callable[[Iterable[str]], None],
-        program: Callable[[Verdict, float], Coroutine[Any, Any, None]],
+        networks: Networks,
         spawner: ForkServer,
         following: Callable[[], contextlib.AbstractAsyncContextManager[None]],
         outrun: Callable[[], Coroutine[Any, Any, None]],
         hurry: asyncio.Event,
         timeout_s: float,
-        sets: SetsParameters,
+        clients: NodeClients,
     ) -> None:
         self._spawner = spawner
         self._system = system
@@ -168,13 +167,12 @@ class GateSequence:
         self._judge = judge
         self._gate = gate
         self._emit = emit
-        self._alive = alive
-        self._leaves = leaves
-        self._comes_back = comes_back
+        self._alive = process_monitor.during
+        self._process_monitor = process_monitor
         self._forget = forget
-        self._vanishes = vanishes
+        self._sightings = sightings
         self._replanned = replanned
-        self._program = program
+        self._networks = networks
         self._following = following
         self._outrun = outrun
         self._hurry = hurry
@@ -189,8 +187,8 @@ class GateSequence:
             gate=gate,
             judge=judge,
             emit=emit,
-            alive=alive,
-            sets=sets,
+            alive=self._alive,
+            clients=clients,
             spawner=spawner,
             timeout_s=timeout_s,
         )
@@ -680,7 +678,9 @@ class GateSequence:
 
     async def take_down(self, nodes: tuple[NodeRun, ...]) -> None:
         """Take nodes down, in reverse order, with all of their processes."""
-        self._leaves({each.process.name for each in nodes if each.process is not None})
+        self._process_monitor.dead |= {
+            each.process.name for each in nodes if each.process is not None
+        }
         for node in nodes:
             node.is_up = False  # what is missing of it from now on is no violation
             container = self._system.nodes.get(node.planned.run.container)
@@ -742,8 +742,8 @@ class GateSequence:
         else:
             self._replan(nodes)
             self._system.renew(nodes)
-        self._comes_back(names)
-        await self._alive(together(self._vanishes(name) for name in gone))
+        self._process_monitor.dead -= names
+        await self._alive(together(self._sightings.vanishes(name) for name in gone))
         return nodes
 
     def _replan(self, nodes: Iterable[NodeRun]) -> None:
@@ -886,7 +886,7 @@ class GateSequence:
         programmed = None
         while permit.verdict.flows != programmed:
             programmed = permit.verdict.flows
-            await self._program(permit.verdict, behind_s(deadline))
+            await self._networks.begin(permit.verdict, behind_s(deadline))
             # A network may take seconds: what changed meanwhile is judged before the gate opens.
             await permit.renewed()
 

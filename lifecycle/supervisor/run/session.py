@@ -250,19 +250,17 @@ class Session:
             judge=self._judge,
             gate=self._gate,
             emit=emit,
-            alive=self._process_monitor.during,
-            leaves=self._process_monitor.dead.update,
-            comes_back=self._process_monitor.dead.difference_update,
+            process_monitor=self._process_monitor,
             forget=self._forget,
-            vanishes=sightings.vanishes,
+            sightings=sightings,
             replanned=self._replanned,
-            program=networks.begin,
+            networks=networks,
             following=self._following,
             outrun=self._outrun,
             spawner=fork_server,
             hurry=self._hurry,
             timeout_s=options.bring_up_s(len(system.processes)),
-            sets=observer_participant.clients.set_parameters,
+            clients=observer_participant.clients,
         )
         self._revisions = Revisions(system, options)
         self._holding = Holding(
