@@ -10,12 +10,11 @@ and most runs do not need it, so it loads on first use. Must not import rclpy.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import functools
 import time
-from collections.abc import Callable, Coroutine, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING
 
 from lifecycle.errors import LifecycleError
 from lifecycle.graph import set_within
@@ -28,8 +27,6 @@ from lifecycle.verify import NOT_PROGRAMMED, FlowReport, Verdict
 
 if TYPE_CHECKING:
     from lifecycle.programming import Programmer, Removal, TargetOptions
-
-_T = TypeVar("_T")
 
 _AGAIN_S = (2.0, 60.0)
 """First and longest pause after a failure."""
@@ -47,125 +44,6 @@ _STILL_THERE = "what is left is listed, and removed by the next 'lifecycle down'
 
 _SWEEP_S = 10.0
 """For servers to remove what dead runs left; what is not removed then stays listed."""
-
-
-class Keeper:
-    """Programs the latest flows, in a thread.
-
-    Args:
-        programmer: see Programmer.
-        report: takes what was done and what failed, as text for people; called from the loop.
-        worker: the thread.
-    """
-
-    def __init__(
-        self, programmer: Programmer, report: Callable[[str], None], worker: Worker
-    ) -> None:
-        self._worker = worker
-        self._programmer = programmer
-        self._report = report
-        self._flows: tuple[FlowReport, ...] | None = None
-        self._changed = asyncio.Event()
-        self._task: asyncio.Task[None] | None = None
-        self._one_at_a_time = asyncio.Lock()  # the programmer is of one thread
-
-    async def begin(self, flows: Sequence[FlowReport], within_s: float | None = None) -> None:
-        """Program these flows, and be done when this returns; again whenever a gate opens.
-
-        Cancelled, it is over as soon as what is under way has been cut off.
-
-        Args:
-            flows: verified.
-            within_s: for all that servers are asked.
-
-        Raises:
-            LifecycleError: it failed; what was made all the same is removed by `close`.
-        """
-        await self._stop()  # what follows verdicts may wait for servers far longer than this may
-        self._flows = tuple(flows)
-        await self._program(within_s)
-        self.take(flows)  # from now on renewed in time
-
-    def replan(self, plan: Plan) -> None:
-        """Program by this plan from the next time on."""
-        self._programmer.replan(plan)
-
-    def take(self, flows: Sequence[FlowReport]) -> None:
-        """Take the flows as just verified; flows that came before and were not done are skipped."""
-        self._flows = tuple(flows)
-        self._changed.set()
-        if self._task is None:
-            self._task = asyncio.ensure_future(self._run())
-
-    async def close(self, hurry: asyncio.Event | None = None) -> None:
-        """Stop, and remove from networks everything that is ours; failures become notices.
-
-        Args:
-            hurry: once set, no server is waited for any more.
-        """
-        try:
-            await self._stop()
-        finally:
-            await remove(self._programmer, self._report, hurry, self._worker)
-
-    async def _stop(self) -> None:
-        """Follow no verdicts until `take`."""
-        task, self._task = self._task, None
-        if task is not None:
-            await ended(task)
-
-    async def _run(self) -> None:
-        pause_s: float | None = None
-        again_s = _AGAIN_S[0]
-        while True:
-            await set_within(self._changed, pause_s)
-            self._changed.clear()
-            failed = True
-            due_s = None
-            with self._telling():
-                due_s = await self._program()
-                failed = False
-            again_s = min(again_s * 2, _AGAIN_S[1]) if failed else _AGAIN_S[0]
-            pause_s = again_s if failed else due_s if due_s is None else max(due_s, _SOON_S)
-
-    async def _program(self, within_s: float | None = None) -> float | None:
-        """Program the latest flows and say what was done; return when it must be done again."""
-        loop = asyncio.get_running_loop()
-
-        def say(text: str) -> None:
-            # At once: a task that is cancelled meanwhile has changed the networks all the same.
-            loop.call_soon_threadsafe(self._report, text)
-
-        async with self._one_at_a_time:
-            return await self._whole(self._worker.run(self._once, within_s, say))
-
-    def _once(self, within_s: float | None, say: Callable[[str], None]) -> float | None:
-        assert self._flows is not None
-        until_s = None if within_s is None else time.monotonic() + within_s
-        done = self._programmer.update(self._flows, hold=True, within_s=within_s)
-        for each in done:
-            if each.pending:
-                say(each.render(done=True))
-        left_s = None if until_s is None else until_s - time.monotonic()
-        return self._programmer.renew(within_s=left_s)
-
-    async def _whole(self, work: Coroutine[Any, Any, _T]) -> _T:
-        """Wait for work in a thread to its end; cancelled, have it end at once."""
-        task = asyncio.ensure_future(work)
-        try:
-            return await asyncio.shield(task)
-        except asyncio.CancelledError:
-            self._programmer.cancel()
-            await asyncio.gather(task, return_exceptions=True)
-            self._programmer.resume()
-            raise
-
-    @contextlib.contextmanager
-    def _telling(self) -> Iterator[None]:
-        try:
-            yield
-        except LifecycleError as error:
-            self._report(str(error))
 
 
 async def remove(
@@ -205,7 +83,7 @@ async def remove(
 
 
 class Networks:
-    """Networks of one run.
+    """Networks of one run: the latest flows are programmed, in a thread.
 
     Args:
         system: its name, which failures are about.
@@ -220,31 +98,37 @@ class Networks:
         self._system = system
         self._directory = directory
         self._emit = emit
-        self._keeper: Keeper | None = None
+        self._programmer = programmer
+        self._flows: tuple[FlowReport, ...] = ()
         self._begun = False
+        self._changed = asyncio.Event()
+        self._following: asyncio.Task[None] | None = None
+        self._one_at_a_time = asyncio.Lock()  # the programmer is of one thread
         # Made here: in the end it may be too late to start a thread.
         self._worker = Worker("networks")
         if programmer is not None:
-            self._keeper = Keeper(programmer, self._report, self._worker)
             emit.listen(self._hear)
 
     async def begin(self, verdict: Verdict, timeout_s: float | None = None) -> None:
         """Program what was verified, before the first message of what is to be activated leaves.
 
         Called for every gate that opens, a restart's and a resume's too. From now on every verdict
-        is followed.
+        is followed. Cancelled, it is over as soon as what is under way has been cut off.
 
         Args:
             verdict: has the flows.
             timeout_s: what is left for it; None for the patience with each request.
 
         Raises:
-            StepFailedError: a network could not be programmed, or not in time.
+            StepFailedError: a network could not be programmed, or not in time; what was made all
+                the same is removed by `close`.
         """
-        if self._keeper is None:
+        if self._programmer is None:
             return
+        await self._stop()  # what follows verdicts may wait for servers far longer than this may
+        self._flows = verdict.flows
         try:
-            await self._keeper.begin(verdict.flows, timeout_s)
+            await self._program(self._programmer, timeout_s)
         except LifecycleError as error:
             raise StepFailedError(
                 f"cannot program networks for {self._system!r}: {error}",
@@ -252,11 +136,12 @@ class Networks:
                 subject=self._system,
             ) from error
         self._begun = True
+        self._take(verdict)  # from now on renewed in time
 
     def replan(self, plan: Plan) -> None:
         """Take the plan that runs from now on; its flows are programmed once they are verified."""
-        if self._keeper is not None:
-            self._keeper.replan(plan)
+        if self._programmer is not None:
+            self._programmer.replan(plan)
 
     async def close(self, hurry: asyncio.Event | None = None) -> None:
         """Remove everything of the system from networks, bounded; failures become notices.
@@ -265,19 +150,87 @@ class Networks:
             hurry: once set, no server is waited for any more.
         """
         self._begun = False
-        if self._keeper is not None:
-            await self._keeper.close(hurry)
-        elif (self._directory / LEDGER_NAME).is_file():
-            from lifecycle.programming import Removal
+        try:
+            await self._stop()
+        finally:
+            if self._programmer is not None:
+                await remove(self._programmer, self._report, hurry, self._worker)
+            elif (self._directory / LEDGER_NAME).is_file():
+                from lifecycle.programming import Removal
 
-            await remove(Removal(self._directory), self._report, hurry, self._worker)
+                await remove(Removal(self._directory), self._report, hurry, self._worker)
 
     def _hear(self, event: Event) -> None:
-        if self._begun and self._keeper is not None and isinstance(event, VerdictChanged):
-            self._keeper.take(event.verdict.flows)
+        if self._begun and isinstance(event, VerdictChanged):
+            self._take(event.verdict)
+
+    def _take(self, verdict: Verdict) -> None:
+        """Take the flows as just verified; those that came before and were not done are skipped."""
+        assert self._programmer is not None
+        self._flows = verdict.flows
+        self._changed.set()
+        if self._following is None:
+            self._following = asyncio.ensure_future(self._follow(self._programmer))
 
     def _report(self, text: str) -> None:
         self._emit(Notice(message=text))
+
+    async def _stop(self) -> None:
+        """Follow no verdict until the next."""
+        following, self._following = self._following, None
+        if following is not None:
+            await ended(following)
+
+    async def _follow(self, programmer: Programmer) -> None:
+        pause_s: float | None = None
+        again_s = _AGAIN_S[0]
+        while True:
+            await set_within(self._changed, pause_s)
+            self._changed.clear()
+            try:
+                due_s = await self._program(programmer)
+            except LifecycleError as error:
+                self._report(str(error))
+                pause_s = again_s = min(again_s * 2, _AGAIN_S[1])
+            else:
+                again_s = _AGAIN_S[0]
+                pause_s = None if due_s is None else max(due_s, _SOON_S)
+
+    async def _program(self, programmer: Programmer, within_s: float | None = None) -> float | None:
+        """Program the latest flows and say what was done; return when it must be done again.
+
+        Cancelled, what is under way in the thread is cut off and waited for.
+        """
+        loop = asyncio.get_running_loop()
+
+        def say(text: str) -> None:
+            # At once: a task that is cancelled meanwhile has changed the networks all the same.
+            loop.call_soon_threadsafe(self._report, text)
+
+        async with self._one_at_a_time:
+            work = self._worker.run(_once, programmer, self._flows, within_s, say)
+            task = asyncio.ensure_future(work)
+            try:
+                return await asyncio.shield(task)
+            except asyncio.CancelledError:
+                programmer.cancel()
+                await asyncio.gather(task, return_exceptions=True)
+                programmer.resume()
+                raise
+
+
+def _once(
+    programmer: Programmer,
+    flows: Sequence[FlowReport],
+    within_s: float | None,
+    say: Callable[[str], None],
+) -> float | None:
+    """Program flows, in a thread; return the seconds until something expires."""
+    until_s = None if within_s is None else time.monotonic() + within_s
+    for each in programmer.update(flows, hold=True, within_s=within_s):
+        if each.pending:
+            say(each.render(done=True))
+    return programmer.renew(within_s=None if until_s is None else until_s - time.monotonic())
 
 
 def token_variables(program: Iterable[TargetOptions]) -> frozenset[str]:

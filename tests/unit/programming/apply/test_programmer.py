@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import asyncio
 import dataclasses
 import os
-from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -29,18 +27,12 @@ from lifecycle.programming.apply.programmer import (
 )
 from lifecycle.programming.apply.target import (
     ChangeKind,
-    FlowChange,
     PartlyError,
     ProgrammingError,
-    TargetChanges,
 )
 from lifecycle.programming.apply.targets.registry import target_kind
 from lifecycle.programming.rules.rules import flow_rules
-from lifecycle.supervisor.connections import networks as keeper_module
-from lifecycle.supervisor.connections.networks import Keeper
-from lifecycle.supervisor.run.failure import Worker
 from lifecycle.verify.outcome import Outcome
-from lifecycle.verify.verdict import FlowReport
 from tests.unit.programming.apply.fakes import FakeTarget
 from tests.unit.programming.apply.samples import (
     ledger_in,
@@ -342,87 +334,3 @@ def test_an_orphan_that_cannot_be_removed_is_told_and_stays_listed(
 
         assert "environment variable TEST_TOKEN: it is empty or not set" in str(swept.errors[0])
         assert (directory / "programmed.json").exists()
-
-
-class FakePrograms:
-    """A Programmer that notes what it is asked."""
-
-    def __init__(self) -> None:
-        self.seen: list[tuple[str, ...]] = []
-        self.fail = 0
-        self.done = asyncio.Event()
-        self.due_s: float | None = None
-        self.renewed = 0
-        self.loop = asyncio.get_running_loop()
-
-    def update(
-        self, flows: Sequence[FlowReport], *, hold: bool, within_s: float | None
-    ) -> tuple[TargetChanges, ...]:
-        assert hold
-        self.seen.append(tuple(each.topic for each in flows))
-        if self.fail:
-            self.fail -= 1
-            raise ProgrammingError("cannot just now")
-        self.loop.call_soon_threadsafe(self.done.set)
-        change = FlowChange(kind=ChangeKind.CREATE, key="k", what="w")
-        return (TargetChanges(target="fake", changes=(change,)),)
-
-    def renew(self, *, within_s: float | None) -> float | None:
-        self.renewed += 1
-        return self.due_s
-
-    def close(self, *, within_s: float | None) -> tuple[TargetChanges, ...]:
-        self.seen.append(("closed",))
-        return ()
-
-    def cancel(self) -> None:
-        pass
-
-    def resume(self) -> None:
-        pass
-
-
-async def _kept(programs: FakePrograms, told: list[str]) -> None:
-    keeper = Keeper(programs, told.append, Worker("networks"))
-    keeper.take([report("/one")])
-    await asyncio.wait_for(programs.done.wait(), 5)
-    await keeper.close()
-
-
-def test_a_keeper_programs_the_latest_flows_and_removes_everything_in_the_end() -> None:
-    told: list[str] = []
-
-    async def run() -> FakePrograms:
-        programs = FakePrograms()
-        await _kept(programs, told)
-        return programs
-
-    programs = asyncio.run(run())
-
-    assert programs.seen == [("/one",), ("closed",)]
-    assert told in ([], ["fake: 1 created, 0 unchanged\n  + k: w"])
-
-
-def test_a_keeper_tells_a_failure_and_tries_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(keeper_module, "_AGAIN_S", (0.001, 0.01))
-    told: list[str] = []
-
-    async def run() -> FakePrograms:
-        programs = FakePrograms()
-        programs.fail = 2
-        await _kept(programs, told)
-        return programs
-
-    programs = asyncio.run(run())
-
-    assert programs.seen == [("/one",)] * 3 + [("closed",)]
-    assert told[:2] == ["cannot just now"] * 2
-
-
-def test_a_keeper_that_never_had_flows_still_removes_what_is_listed() -> None:
-    async def run() -> FakePrograms:
-        programs = FakePrograms()
-        await Keeper(programs, print, Worker("networks")).close()
-        return programs
-
-    assert asyncio.run(run()).seen == [("closed",)]
