@@ -122,7 +122,7 @@ class Event:
         connected: the data layer is made.
         error: the reason, with the exception's last line; the traceback is in the log.
         configuration: for "configuration", and replies that carry it (all but ACTIVATE,
-            DEACTIVATE, CLEANUP, SHUTDOWN and those of SERVED_ON_DEMAND).
+            DEACTIVATE, CLEANUP and SHUTDOWN).
         reports: of a reply: it replaces a "configuration" that would follow.
     """
 
