@@ -163,6 +163,9 @@ def interface_of(entity: Any) -> type[Any]:
 class MachineOwner(Protocol):
     """What the state machine asks and notifies."""
 
+    def is_driven(self) -> bool:
+        """Whether a supervisor drives the node."""
+
     def may_activate(self) -> bool:
         """Whether an activate request may be carried out now."""
 
@@ -180,14 +183,26 @@ _BY_LABEL = {
     "cleanup": "trigger_cleanup",
     "shutdown": "trigger_shutdown",
 }
+_DONE_IN = {
+    Transition.TRANSITION_CONFIGURE: ("inactive", "active"),
+    Transition.TRANSITION_CLEANUP: ("unconfigured",),
+    Transition.TRANSITION_ACTIVATE: ("active",),
+    Transition.TRANSITION_DEACTIVATE: ("inactive",),
+}
+"""Labels of the states in which nothing is left to do of a transition."""
 _CHANGE = "_LifecycleNodeMixin__change_state"
 
 
 class RclpyStateMachine:
     """The state machine of one node of rclpy.lifecycle, driven by its own methods.
 
+    It is guarded from the moment that rclpy has made the node: its class's constructor may ask for
+    transitions, too. Where a supervisor drives the node, the node's own code asks in vain for what
+    the supervisor does: it is SUCCESS where the node is there already, and FAILURE where the gate
+    is closed. By its services, and from its supervisor, the same request is an error.
+
     Args:
-        node: whose class derives from LifecycleNodeMixin.
+        node: whose class derives from LifecycleNodeMixin, of which the constructor may still run.
         owner: decides on activation, and is notified.
     """
 
@@ -195,19 +210,29 @@ class RclpyStateMachine:
         self._node = node
         self._owner = owner
         self._change = getattr(node, _CHANGE)
+        self._is_complete = False
+        self._is_asked = False  # by its supervisor or a client
+        self._has_said = False
         # Both its service and its trigger_ methods come by here.
         setattr(node, _CHANGE, self._request)
-        callbacks = node._callbacks  # noqa: SLF001 - registered once, by its constructor
+
+    def complete(self) -> None:
+        """Guard what the constructor of its class has made by now; again is harmless."""
+        if self._is_complete:
+            return
+        self._is_complete = True
+        callbacks = self._node._callbacks  # noqa: SLF001 - registered once, by its constructor
         for state, callback in tuple(callbacks.items()):
             callbacks[state] = self._reporting(callback)
-        service = getattr(node, "_service_change_state", None)
+        service = getattr(self._node, "_service_change_state", None)
         if service is not None:
             service.callback = self._serving(service.callback)
 
     @property
     def label(self) -> str:
         """Of the state, as lifecycle_msgs/State has it."""
-        return str(self._node._state_machine.current_state[1])  # noqa: SLF001
+        machine = getattr(self._node, "_state_machine", None)
+        return "unconfigured" if machine is None else str(machine.current_state[1])
 
     def destroy(self) -> None:
         """Let go of the node, after it was destroyed: rclpy keeps its participant for this else."""
@@ -222,15 +247,41 @@ class RclpyStateMachine:
         Raises:
             RCLError: not possible in this state, or not now.
         """
-        return getattr(self._node, _BY_LABEL[transition])()
+        with self._asked():
+            return getattr(self._node, _BY_LABEL[transition])()
+
+    @contextlib.contextmanager
+    def _asked(self) -> Iterator[None]:
+        self._is_asked = True
+        try:
+            yield
+        finally:
+            self._is_asked = False
 
     def _request(self, transition_id: int) -> Any:
+        self.complete()
+        # What its callbacks ask for is its own code's.
+        is_asked, self._is_asked = self._is_asked, False
+        is_own = not is_asked and self._owner.is_driven()
+        if is_own and self.label in _DONE_IN.get(transition_id, ()):
+            return TransitionCallbackReturn.SUCCESS
         if transition_id == Transition.TRANSITION_ACTIVATE and not self._owner.may_activate():
-            raise RCLError("the gate of its supervisor is closed")
+            if not is_own:
+                raise RCLError("the gate of its supervisor is closed")
+            self._say_that_it_is_held()
+            return TransitionCallbackReturn.FAILURE
         try:
             return self._change(transition_id)
         finally:
             self._owner.state_changed()
+
+    def _say_that_it_is_held(self) -> None:
+        if not self._has_said:
+            self._has_said = True
+            self._owner.complain(
+                "its own code asks to activate it while the gate of its supervisor is closed: it "
+                "activates once the gate lets it through"
+            )
 
     def _reporting(self, callback: Callable[[Any], Any]) -> Callable[[Any], Any]:
         name = getattr(callback, "__name__", "a callback")
@@ -256,7 +307,8 @@ class RclpyStateMachine:
         @functools.wraps(callback)
         def answer(request: Any, response: Any) -> Any:
             try:
-                return callback(request, response)
+                with self._asked():
+                    return callback(request, response)
             except RCLError as error:
                 reason = str(error).splitlines()[0].partition(", at /")[0]
                 asked = request.transition.label or f"number {request.transition.id}"

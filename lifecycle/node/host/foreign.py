@@ -71,6 +71,7 @@ _MATCHED = {
     EndpointKind.PUBLISHER: QoSPublisherEventType.RCL_PUBLISHER_MATCHED,
     EndpointKind.SUBSCRIPTION: QoSSubscriptionEventType.RCL_SUBSCRIPTION_MATCHED,
 }
+_REACHED = {"configure": "inactive", "deactivate": "inactive", "cleanup": "unconfigured"}
 _CONNECTED = ("inactive", "activating", "active", "deactivating")
 """Where a node of rclpy.lifecycle has its data layer, which it makes in on_configure."""
 
@@ -232,6 +233,8 @@ class ForeignNode:
         self._is_spun = False
         self._is_ours = False
         self._machine: RclpyStateMachine | None = None
+        if spec.managed and is_rclpy_managed(node):
+            self._machine = RclpyStateMachine(node, self)
         self.configuration_changes = ConfigurationChanges(
             spinner.call_beside, self.get_configuration, failed=node.get_logger().error
         )
@@ -414,8 +417,8 @@ class ForeignNode:
         """Its class's constructor has returned: hold it, or have it spun."""
         if self._spec.log_level:
             self._node.get_logger().set_level(LoggingSeverity[self._spec.log_level.upper()])
-        if self._spec.managed and is_rclpy_managed(self._node):
-            self._machine = RclpyStateMachine(self._node, self)
+        if self._machine is not None:
+            self._machine.complete()
         if self._machine is not None or self._let_through:
             self._spin()
 
@@ -527,6 +530,10 @@ class ForeignNode:
 
     # What its state machine asks and notifies (middleware's MachineOwner).
 
+    def is_driven(self) -> bool:
+        """Whether a supervisor drives it."""
+        return bool(self._supervisor)
+
     def may_activate(self) -> bool:
         """Whether its supervisor has let it through."""
         return self._let_through
@@ -561,8 +568,8 @@ class ForeignNode:
         if self._machine is None or operation in ("connect", "disconnect"):
             return SUCCESS
         before = self._machine.label
-        if operation == "deactivate" and before == "inactive":
-            return SUCCESS  # another client was faster
+        if before == _REACHED.get(operation):
+            return SUCCESS  # its own code, or another client, was faster
         try:
             returned = self._machine.change(operation)
         except RCLError as error:
