@@ -1,8 +1,9 @@
 """What supervision costs while nothing happens: CPU time of a supervisor and of what it watches.
 
-Ten nodes in ten processes do nothing, first under `lifecycle up`, then as managed nodes of rclpy
-that nobody watches. The user and system time of every process is read from /proc/PID/stat at both
-ends of a quiet interval, and how often its threads woke up.
+Ten nodes in ten processes do nothing: under `lifecycle up`, in its hosts, and as plain nodes of
+commands, which it asks every 2 s whether they hang; then as managed nodes of rclpy that nobody
+watches. The user and system time of every process is read from /proc/PID/stat at both ends of a
+quiet interval, and how often its threads woke up.
 
     python benchmarks/idle.py [--nodes 10] [--seconds 30] [--domain 70]
 """
@@ -19,6 +20,7 @@ import tempfile
 import time
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import psutil
 import yaml
@@ -69,11 +71,21 @@ def measure(groups: Mapping[str, list[int]], seconds: float) -> None:
         print(f"{name:42}{100 * used / took:8.2f} %{wakes / took:9.1f} wake-ups/s", flush=True)
 
 
-def supervised(nodes: int, domain_id: int, seconds: float) -> None:
+def of_commands(nodes: int, domain_id: int) -> dict[str, Any]:
+    """Return the manifest of plain nodes of rclpy, each a command of its own."""
+    code = "import rclpy; rclpy.init(); rclpy.spin(rclpy.create_node('idle'))"
+    run = {"command": [sys.executable, "-c", code]}
+    return {
+        **manifest(nodes, "single", domain_id, "localhost"),
+        "nodes": {f"node_{index}": {"run": run, "managed": False} for index in range(nodes)},
+    }
+
+
+def supervised(system: dict[str, Any], what: str, seconds: float) -> None:
     """Measure `lifecycle up`."""
     with tempfile.TemporaryDirectory() as directory:
         file = Path(directory) / "idle.lifecycle.yaml"
-        file.write_text(yaml.safe_dump(manifest(nodes, "single", domain_id, "localhost")))
+        file.write_text(yaml.safe_dump(system))
         with subprocess.Popen(
             [sys.executable, "-m", "lifecycle.cli", "up", str(file), "--format", "json"],
             cwd=ROOT,
@@ -96,7 +108,7 @@ def supervised(nodes: int, domain_id: int, seconds: float) -> None:
             groups = {
                 "supervisor": [process.pid],
                 "fork server": servers,
-                f"{nodes} nodes, supervised": hosts,
+                what: hosts,
             }
             measure(groups, seconds)
             process.send_signal(signal.SIGINT)
@@ -148,7 +160,10 @@ def main() -> None:
     parser.add_argument("--domain", type=int, default=70)
     options = parser.parse_args()
     print(f"{'':42}{'of one core':>10}")
-    supervised(options.nodes, options.domain, options.seconds)
+    hosted = manifest(options.nodes, "single", options.domain, "localhost")
+    supervised(hosted, f"{options.nodes} nodes, supervised", options.seconds)
+    commands = of_commands(options.nodes, options.domain)
+    supervised(commands, f"{options.nodes} nodes of commands, asked", options.seconds)
     alone(options.nodes, options.domain, options.seconds)
 
 

@@ -142,7 +142,7 @@ class NodeClients:
         if self._calls.open(service, ChangeState):
             # The node drops its reply if it does not know this client's reader yet. It learns of
             # our readers in order: a reply to one made later proves that it knows this one.
-            self._calls.forget(f"{node}/get_state")
+            self._calls.renew(f"{node}/get_state", GetState)
             await self.get_state(node, timeout_s=timeout_s)
         request = ChangeState.Request()
         request.transition.label = transition
@@ -362,13 +362,16 @@ class NodeClients:
                 f"cannot set {names} of {node!r} while it runs: it says {answer.result.reason!r}"
             )
 
-    async def answers(self, node: str, *, managed: bool, timeout_s: float) -> bool | None:
+    async def answers(
+        self, node: str, *, managed: bool, timeout_s: float, repeat: bool = False
+    ) -> bool | None:
         """Return whether a node answers one small request; None where it serves nothing to ask.
 
         Args:
             node: fully qualified name.
             managed: it has a state, which is asked for; else it is asked for no parameter.
             timeout_s: seconds, > 0.
+            repeat: see ServiceCalls; else a reply that is lost is none.
         """
         service, type_, request = (
             (f"{node}/get_state", GetState, GetState.Request())
@@ -378,7 +381,7 @@ class NodeClients:
         if not self._observer.offers(node, service):
             return None
         try:
-            await self._calls.call(service, type_, request, timeout_s=timeout_s, repeat=False)
+            await self._calls.call(service, type_, request, timeout_s=timeout_s, repeat=repeat)
         except ServiceUnansweredError as error:
             return False if error.found else None
         return True

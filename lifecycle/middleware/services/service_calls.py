@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import threading
+from collections import Counter
 from collections.abc import Awaitable, Callable
 from typing import Any
 
@@ -70,6 +71,8 @@ class ServiceCalls:
     def __init__(self, observer: GraphObserver) -> None:
         self._observer = observer
         self._clients: dict[tuple[str, type[Any]], Client] = {}
+        self._pending: Counter[Client] = Counter()  # calls of each
+        self._replaced: set[Client] = set()
         self.group = ReentrantCallbackGroup()
         self._destroyed = False
         self._spinner: _Spinner | None = None
@@ -116,6 +119,7 @@ class ServiceCalls:
 
             attempt_s = _FIRST_ATTEMPT_S if repeat else timeout_s
             sent = []
+            self._pending[client] += 1
             try:
                 while (left_s := deadline - loop.time()) > 0:
                     sent.append(client.call_async(request))
@@ -128,6 +132,7 @@ class ServiceCalls:
                 for pending in sent:
                     client.remove_pending_request(pending)
                 answer.cancel()
+                self._over(client)
             raise ServiceUnansweredError(service, found=True, timeout_s=timeout_s)
         except InvalidHandle as error:
             # Its node left, and its client was destroyed meanwhile.
@@ -140,8 +145,32 @@ class ServiceCalls:
         self._client(service, type_)
         return True
 
+    def renew(self, service: str, type_: type[Any]) -> None:
+        """Make the client of a service anew; calls that are under way keep theirs."""
+        replaced = self._clients.pop((service, type_), None)
+        if replaced is None:
+            return
+        self._client(service, type_)
+        if self._pending[replaced]:
+            self._replaced.add(replaced)
+        else:
+            self._observer.node.destroy_client(replaced)
+
+    def _over(self, client: Client) -> None:
+        """Note that a call is over; a client that was replaced goes with its last one."""
+        self._pending[client] -= 1
+        if self._pending[client]:
+            return
+        del self._pending[client]
+        if client in self._replaced:
+            self._replaced.discard(client)
+            self._observer.node.destroy_client(client)
+
     def forget(self, prefix: str) -> None:
         """Drop the clients of services whose name starts with `prefix`, of a node that left."""
+        for client in [each for each in self._replaced if each.srv_name.startswith(prefix)]:
+            self._replaced.discard(client)
+            self._observer.node.destroy_client(client)
         for key in [key for key in self._clients if key[0].startswith(prefix)]:
             self._observer.node.destroy_client(self._clients.pop(key))
 

@@ -25,6 +25,7 @@ from lifecycle.supervisor.gate.gate import behind_s, closes
 from lifecycle.supervisor.gate.standstill import Standstill
 from lifecycle.supervisor.gate.violations import Violations
 from lifecycle.supervisor.health.agreement import Agreement
+from lifecycle.supervisor.health.answering import Answering
 from lifecycle.supervisor.health.liveliness import NodeArrivals
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.scope import unlimited
@@ -294,6 +295,7 @@ class VerificationLoop:
         looker: ConnectionAuthority | None = None,
         agreement: Agreement | None = None,
         guard: ActivationGuard | None = None,
+        answering: Answering | None = None,
     ) -> None:
         self._system = system
         self._observer = observer
@@ -304,6 +306,7 @@ class VerificationLoop:
         self._looker = looker
         self._agreement = agreement
         self._guard = guard
+        self._answering = answering
         self.latest: Verdict | None = None
         self.violations = Violations()
         self._standstill = Standstill()
@@ -552,8 +555,10 @@ class VerificationLoop:
             if not closes(verdict, strict=self._strict):
                 if not is_read_again:
                     is_read_again = True
-                    if now < deadline and self._observer.reread_parameters():
-                        continue  # nodes of others need not say that theirs changed
+                    has_asked = await self._had_to_ask(deadline - now)
+                    # Nodes of others need not say that their parameters changed, or that they hang.
+                    if (now < deadline and self._observer.reread_parameters()) or has_asked:
+                        continue
                 lately = stage is Stage.CONNECTED and now < newcomers_until
                 if lately and self._observer.expect_newcomers():
                     continue  # the next look waits for them
@@ -577,6 +582,10 @@ class VerificationLoop:
                 wait_s, again = min(wait_s, again), min(again * 2, ASK_AGAIN_AT_MOST_S)
             if await self._changes.beyond(count, wait_s):
                 await self.quiet()
+
+    async def _had_to_ask(self, timeout_s: float) -> bool:
+        """Have nodes that are in no host of ours asked; return whether any was waited for."""
+        return self._answering is not None and await self._answering.asked(timeout_s)
 
     def _unsaid_s(self, verdict: Verdict, now: float) -> float:
         """Return for how long the health is waited for of nodes that have not said how they are.

@@ -10,7 +10,7 @@ Must not import rclpy.
 from __future__ import annotations
 
 import enum
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import TYPE_CHECKING
 
 from lifecycle import dataclasses
@@ -161,6 +161,11 @@ class SilenceMonitor:
             self._unanswering[node] = detail
             self._emit(Notice(message=_message(node, detail)))
             self._tell()
+
+    @property
+    def unanswering(self) -> Collection[str]:
+        """Names of the nodes that have answered no request."""
+        return self._unanswering.keys()
 
     def answered(self, node: str) -> None:
         """Note that it answers, or is not asked any more."""

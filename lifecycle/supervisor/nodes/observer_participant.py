@@ -109,9 +109,18 @@ class ObserverParticipant:
         """Return the driver of a managed node that is not hosted by us."""
         return ServiceDriver(self.clients, node)
 
-    async def answers(self, node: PlannedNode, *, timeout_s: float) -> bool | None:
-        """Return whether a node answers a request, within seconds; None: it serves nothing."""
-        return await self.clients.answers(node.full_name, managed=node.managed, timeout_s=timeout_s)
+    async def answers(
+        self, node: PlannedNode, *, timeout_s: float, repeat: bool = False
+    ) -> bool | None:
+        """Return whether a node answers a request, within seconds; None: it shows no service."""
+        return await self.clients.answers(
+            node.full_name, managed=node.managed, timeout_s=timeout_s, repeat=repeat
+        )
+
+    def serves_nothing(self, node: PlannedNode) -> bool:
+        """Return whether it is certain that a node has nothing that it can be asked by."""
+        serves = self.clients.serves_parameters(node.full_name)
+        return not node.managed and serves is False
 
     def node_interface(self, node: str) -> NodeInterfaceClient:
         """Return what drives the node interface of any node that has one, by full name."""

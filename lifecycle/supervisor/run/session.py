@@ -205,6 +205,7 @@ class Session:
         self._peer_supervisors = PeerSupervisors(system, observer_participant)
         self._agreement = Agreement(system, observer_participant, self._peer_supervisors)
         self._guard = ActivationGuard(system)
+        self._answering = Answering(system, observer_participant)
         self._judge = VerificationLoop(
             system,
             observer_participant.graph,
@@ -214,6 +215,7 @@ class Session:
             looker=self._authority,
             agreement=self._agreement,
             guard=self._guard,
+            answering=self._answering,
         )
         self._gate = Gate(strict=options.strict, judging=self._judge)
         sightings = Sightings(system, observer_participant.graph, self._changes)
@@ -343,8 +345,7 @@ class Session:
         self._ros_interface.begin()
         result = UpResult(exit_code=ExitCode.INTERNAL, verdict=NOT_JUDGED)
         receiving = asyncio.ensure_future(watch_reception(self._system))
-        answering = Answering(self._system, self._observer_participant)
-        asking = asyncio.ensure_future(answering.follow())
+        asking = asyncio.ensure_future(self._answering.follow())
         try:
             with self._signals():
                 try:

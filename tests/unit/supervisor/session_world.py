@@ -215,8 +215,13 @@ class FakeParticipant:
         await self._changed.wait()
         self._changed.clear()
 
-    async def answers(self, node: PlannedNode, *, timeout_s: float) -> bool | None:
+    async def answers(
+        self, node: PlannedNode, *, timeout_s: float, repeat: bool = False
+    ) -> bool | None:
         return True
+
+    def serves_nothing(self, node: PlannedNode) -> bool:
+        return False
 
     def reread_parameters(self) -> bool:
         return False
