@@ -61,6 +61,8 @@ class Run:
         self._changed = threading.Condition()
         self._beside: list[subprocess.Popen[str]] = []
         self._readers: list[threading.Thread] = []
+        self._reads = threading.Event()
+        self._reads.set()
         self.manifest.write_text(case.manifest)
         for name, text in case.files.items():
             path = directory / name
@@ -208,6 +210,14 @@ class Run:
         self.until("process", process=process, state="running")
         return int(self.of_kind("process", process=process, state="running")[-1]["pid"])
 
+    def stop_reading(self) -> None:
+        """Leave what the command prints unread, until `read_on`: its pipe fills up."""
+        self._reads.clear()
+
+    def read_on(self) -> None:
+        """Read what the command prints."""
+        self._reads.set()
+
     def signal(self, number: signal.Signals) -> None:
         """Send the command a signal."""
         assert self.process is not None
@@ -276,6 +286,7 @@ class Run:
 
     def close(self) -> None:
         """End all that still runs."""
+        self.read_on()
         for process in [*self._beside, *([self.process] if self.process else [])]:
             if process.poll() is None:
                 process.send_signal(signal.SIGCONT)
@@ -296,6 +307,7 @@ class Run:
             assert process.stdout is not None
             with contextlib.suppress(ValueError):
                 for line in process.stdout:
+                    self._reads.wait()
                     with self._changed:
                         self._lines.append(line.rstrip("\n"))
                         self._changed.notify_all()

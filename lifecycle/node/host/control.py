@@ -124,6 +124,7 @@ class Event:
         configuration: for "configuration", and replies that carry it (all but ACTIVATE,
             DEACTIVATE, CLEANUP and SHUTDOWN).
         reports: of a reply: it replaces a "configuration" that would follow.
+        changed: of a reply to ACTIVATE: nothing was done, for the node is not as it was reported.
     """
 
     kind: str
@@ -135,6 +136,7 @@ class Event:
     error: str = ""
     configuration: NodeConfiguration | None = None
     reports: bool = False
+    changed: bool = False
 
 
 _AT_ONCE_BYTES = 1 << 16

@@ -150,6 +150,10 @@ _ANSWERED_WITHOUT_CONFIGURATION = frozenset(
 )
 
 
+class ChangedError(LifecycleError):
+    """A node is not activated: it is not any more as it was reported, and is reported again."""
+
+
 class Marks:
     """The DSCP of the nodes' sockets as it was last reported: no event says that it was changed."""
 
@@ -165,12 +169,12 @@ class Marks:
         """Refuse to activate a node whose marks are not those that were verified.
 
         Raises:
-            LifecycleError: its code, or another program, has changed them since.
+            ChangedError: its code, or another program, has changed them since.
         """
         before = self._reported.get(node.full_name)
         if before is not None and node.marks != before:
             node.configuration_changes.touch()
-            raise LifecycleError(
+            raise ChangedError(
                 f"cannot activate {node.full_name}: the DSCP of its sockets was changed since it "
                 "was verified",
                 hint="look for IP_TOS or IPV6_TCLASS in its code",
@@ -212,6 +216,8 @@ class HostCommands:
         """Carry out one command and return the answer to it, whatever happens."""
         try:
             return await self._carry_out(command)
+        except ChangedError as error:
+            return self._reply(command, ok=False, error=str(error), changed=True)
         except LifecycleError as error:
             return self._reply(command, ok=False, error=str(error), describe=False)
         except Exception as error:  # noqa: BLE001 - each command is answered exactly once
@@ -241,7 +247,13 @@ class HostCommands:
         return self._reply(command, ok=ok, error=error)
 
     def _reply(
-        self, command: Command, *, ok: bool, error: str = "", describe: bool = True
+        self,
+        command: Command,
+        *,
+        ok: bool,
+        error: str = "",
+        describe: bool = True,
+        changed: bool = False,
     ) -> Event:
         node = self._nodes.get(command.node)
         if node is None:
@@ -266,6 +278,7 @@ class HostCommands:
             error=error,
             configuration=configuration,
             reports=reports,
+            changed=changed,
         )
 
 

@@ -106,6 +106,10 @@ class Permit:
         await self.renewed()
         self.sent.add(node)
 
+    def unused(self, node: str) -> None:
+        """Note that `node` was not activated by its request, and is to be sent another one."""
+        self.sent.discard(node)
+
     async def renewed(self) -> None:
         """Return once the verdict is that of the present moment.
 

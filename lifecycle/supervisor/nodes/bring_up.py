@@ -26,6 +26,7 @@ from lifecycle.supervisor.gate.gate import Permit
 from lifecycle.supervisor.nodes.driver import (
     ACTIVE,
     ActiveError,
+    ChangedError,
     ControlDriver,
     NodeCondition,
     NodeDriver,
@@ -576,11 +577,12 @@ class BringUp:
         if operation is not Operation.DEACTIVATE:
             node.undo.append(operation)
         try:
-            doing = (
-                self._configure(node)
-                if operation is Operation.CONFIGURE
-                else node.perform(operation, permit)
-            )
+            if operation is Operation.CONFIGURE:
+                doing = self._configure(node)
+            elif permit is not None:
+                doing = self._activate_as_verified(node, permit)
+            else:
+                doing = node.perform(operation)
             standing = await self._step(node, doing, limit_s, rule=TRANSITION_FAILED)
         except StepFailedError:
             if permit is not None and node.name not in permit.sent:
@@ -604,11 +606,21 @@ class BringUp:
                 if node.planned.run.kind is RunKind.ATTACH:
                     raise
             self._system.emit(Notice(message=f"{node.name!r} {BY_ITSELF}: it is deactivated"))
-            await node.perform(Operation.DEACTIVATE)
+            with contextlib.suppress(ActiveError):  # it may have been activated again: see above
+                await node.perform(Operation.DEACTIVATE)
         raise BringUpError(
             f"cannot configure {node.name!r}: it was activated again each of the {TRIES} times "
             f"that it was deactivated; {TO_DO}"
         )
+
+    async def _activate_as_verified(self, node: NodeRun, permit: Permit) -> NodeCondition:
+        """Activate a node; one that has changed since it was verified is verified again."""
+        while True:
+            with contextlib.suppress(ChangedError):
+                return await node.perform(Operation.ACTIVATE, permit)
+            permit.unused(node.name)
+            self._system.touched.set()
+            await permit.renewed()
 
     async def _start(self, node: NodeRun) -> None:
         """Have the node's process started, or find a node that others start."""

@@ -50,7 +50,11 @@ class NodeCondition:
 
 
 class ActiveError(BringUpError):
-    """A node is active before it was verified, so that it cannot be configured."""
+    """A node is active before it was verified, or each time that it was deactivated."""
+
+
+class ChangedError(BringUpError):
+    """A node was not activated: it is not any more as it was when it was verified."""
 
 
 class NodeDriver(Protocol):
@@ -63,6 +67,7 @@ class NodeDriver(Protocol):
         """Do one operation.
 
         Raises:
+            ChangedError: see there; what it is now is reported.
             BringUpError: the node refused or failed, or cannot be reached.
         """
 
@@ -100,7 +105,8 @@ class ControlDriver:
         reply = await self._channel.request(self._node, operation, permit)
         if not reply.ok:
             reason = reply.error or f"the node is {reply.state or 'in an unknown state'}"
-            raise BringUpError(f"cannot {operation.value} {self._node!r}: {reason}")
+            kind = ChangedError if reply.changed else BringUpError
+            raise kind(f"cannot {operation.value} {self._node!r}: {reason}")
         return NodeCondition(
             state=reply.state, connected=reply.connected, configuration=reply.configuration
         )
@@ -175,6 +181,16 @@ _REACHED = {
     Operation.CLEANUP: UNCONFIGURED,
     Operation.SHUTDOWN: FINALIZED,
 }
+_BEGINS_IN = {
+    Operation.CONFIGURE: (UNCONFIGURED,),
+    Operation.ACTIVATE: (INACTIVE,),
+    Operation.DEACTIVATE: (ACTIVE,),
+    Operation.CLEANUP: (INACTIVE,),
+    Operation.SHUTDOWN: (UNCONFIGURED, INACTIVE, ACTIVE),
+}
+_TRIES = 3
+"""A node that somebody else moves meanwhile is asked so often."""
+
 _REQUEST_S = 5.0
 """For one request to a node of which no plan says how long it may take."""
 
@@ -185,7 +201,8 @@ _NESTED = (Operation.CONNECT, Operation.DISCONNECT)
 class ServiceDriver:
     """Drives a managed node that we do not host, whatever state it is in already.
 
-    A request that was refused or not answered is judged by the state that is read afterwards.
+    A request that was refused or not answered is judged by the state that is read afterwards; where
+    somebody else moved the node meanwhile, it is asked again.
     """
 
     def __init__(self, services: LifecycleClients, node: PlannedNode) -> None:
@@ -215,48 +232,69 @@ class ServiceDriver:
         return await self._interface.wire(step)
 
     async def _start(self) -> NodeCondition:
+        return _standing(await self._settled(self._timeouts.start_s))
+
+    async def _settled(self, limit_s: float) -> str:
+        """Return its state; one in which somebody else's transition is under way passes."""
         while True:
-            state = await self._state(self._timeouts.start_s)
+            state = await self._state(limit_s)
             if state in _PRIMARY:
-                return _standing(state)
+                return state
             await asyncio.sleep(_PASSING_S)
 
     async def _perform(self, operation: Operation, permit: Permit | None) -> NodeCondition:
         limit_s = self._limit_s(operation)
-        state = await self._state(limit_s)
+        state = await self._settled(limit_s)
         if operation in _NESTED:
             offered = await self._services.get_available_transitions(self._node, timeout_s=limit_s)
             asked = operation.value in offered
             if asked and not await self._change(operation, limit_s):
                 raise BringUpError(f"cannot {operation.value} {self._node!r}: it refused")
             return _standing(state, already=not asked)
-        wanted = _REACHED[operation]
-        if state == wanted and operation is Operation.ACTIVATE and permit is not None:
-            await permit.use(self._node)
-            # The gate may have had it deactivated meanwhile.
-            state = await self._state(limit_s)
-        if state == wanted:
-            return _standing(state, already=True)
-        if operation is Operation.CONFIGURE and state == ACTIVE:
-            raise self._active()
-        if operation is Operation.ACTIVATE:
-            if permit is None:
-                raise BringUpError(f"cannot activate {self._node!r} without a permit from the gate")
-            accepted = await self._services.change_state(
-                self._node,
-                operation.value,
-                timeout_s=limit_s,
-                before=functools.partial(permit.use, self._node),
-            )
-        else:
-            accepted = await self._change(operation, limit_s)
-        state = await self._state(limit_s)
-        if operation is Operation.CONFIGURE and state == ACTIVE:
-            raise self._active()  # meanwhile
-        if state != wanted:
-            reason = "it stayed" if accepted else "it refused and is"
-            raise BringUpError(f"cannot {operation.value} {self._node!r}: {reason} {state}")
-        return _standing(state)
+        wanted, reason, asked, accepted = _REACHED[operation], "it is", False, False
+        for _ in range(_TRIES):
+            if state == wanted and operation is Operation.ACTIVATE and permit is not None:
+                await permit.use(self._node)
+                # The gate may have had it deactivated meanwhile.
+                state = await self._settled(limit_s)
+            if state == wanted:
+                return _standing(state, already=not asked)
+            if operation is Operation.CONFIGURE and state == ACTIVE:
+                raise self._active()
+            if state not in _BEGINS_IN[operation]:
+                break  # rclpy's nodes end of a request that their state does not allow
+            accepted = await self._ask(operation, limit_s, permit)
+            before, state, asked = state, await self._settled(limit_s), True
+            if state == wanted:
+                return _standing(state)
+            reason = "it refused and is"
+            if accepted:
+                reason = "it stayed" if state == before else "others moved it, and it is"
+            elif state == before:
+                break
+            # Somebody has moved it meanwhile: it is looked at again.
+        if operation is Operation.DEACTIVATE and state == ACTIVE and accepted:
+            raise self._active_again()
+        raise BringUpError(f"cannot {operation.value} {self._node!r}: {reason} {state}")
+
+    async def _ask(self, operation: Operation, limit_s: float, permit: Permit | None) -> bool:
+        """Ask for a transition; return whether it was accepted and completed."""
+        if operation is not Operation.ACTIVATE:
+            return await self._change(operation, limit_s)
+        if permit is None:
+            raise BringUpError(f"cannot activate {self._node!r} without a permit from the gate")
+        return await self._services.change_state(
+            self._node,
+            operation.value,
+            timeout_s=limit_s,
+            before=functools.partial(permit.use, self._node),
+        )
+
+    def _active_again(self) -> ActiveError:
+        return ActiveError(
+            f"cannot deactivate {self._node!r}: it was activated again by its own code or another "
+            f"client each of the {_TRIES} times"
+        )
 
     def _active(self) -> ActiveError:
         return ActiveError(

@@ -169,6 +169,46 @@ CLEARED = (
 )
 RESTARTED = ("up", "--stop-after", "12")
 
+TALKATIVE = {
+    "talkative.py": """\
+import sys
+from lifecycle import on_timer
+from nodes import Marked, mark
+class Talkative(Marked):
+    written = 0
+    @on_timer(period_s=0.05)
+    def write(self):
+        for _ in range(20):
+            print("x" * 1000, flush=True)
+        self.written += 20
+        if self.written == 1000:
+            mark("one", "a megabyte")
+"""
+}
+
+TALKS = """\
+manifest_version: 1
+system: talks
+discovery: {range: localhost}
+nodes:
+  one: {run: {python: "talkative:Talkative"}}
+  two: {run: {python: "nodes:Marked"}}
+"""
+
+
+def nobody_reads(run: Run) -> None:
+    """Leave all output unread, and kill a node once far more was printed than a pipe takes."""
+    run.until_active()
+    two = run.pid_of("two")
+    run.stop_reading()
+    run.wait(lambda: bool(run.marks("one", "a megabyte")), "a megabyte of output")
+    assert run.process is not None
+    assert run.process.poll() is None
+    os.kill(two, signal.SIGKILL)
+    run.process.wait(20.0)
+    run.read_on()
+
+
 CASES = (
     Case(
         attack="a shell is killed whose child is the node, and restarted",
@@ -422,5 +462,16 @@ CASES = (
         exit_code=(6, 143),
         within_s=30.0,
         before="cannot bring up …: another supervisor runs it; end it first: lifecycle down",
+    ),
+    Case(
+        attack="nobody reads what the supervisor prints, and a node is killed",
+        manifest=TALKS,
+        files=TALKATIVE,
+        verb=("up", "--strict"),
+        story=nobody_reads,
+        exit_code=6,
+        verdict=VIOLATED,
+        findings=(DIED,),
+        before="exit code 6",
     ),
 )

@@ -142,7 +142,7 @@ nodes:
 """
 RESETTING = {
     "resetting.py": '''"""A talker that takes the mark of its sockets away again."""
-import os, socket, threading
+import itertools, os, socket, stat, threading, time
 from nodes import Talker
 
 
@@ -160,6 +160,21 @@ def reset():
                 pass
 
 
+def marked():
+    """Yield sockets that have a mark."""
+    for name in os.listdir("/proc/self/fd"):
+        try:
+            if not stat.S_ISSOCK(os.fstat(int(name)).st_mode):
+                continue
+            each = socket.socket(fileno=os.dup(int(name)))
+        except OSError:
+            continue
+        if each.family == socket.AF_INET and each.getsockopt(socket.IPPROTO_IP, socket.IP_TOS):
+            yield each
+        else:
+            each.close()
+
+
 class WhenActive(Talker):
     def on_activate(self):
         super().on_activate()
@@ -169,6 +184,28 @@ class WhenActive(Talker):
 class WhenConnected(Talker):
     def on_connect(self, state=None):
         threading.Timer(0.05, reset).start()
+
+
+class UntilActive(Talker):
+    is_active = False
+
+    def on_connect(self, state=None):
+        threading.Thread(target=self.flicker, daemon=True).start()
+
+    def flicker(self):
+        while not (sockets := list(marked())):
+            time.sleep(0.01)
+        was = sockets[0].getsockopt(socket.IPPROTO_IP, socket.IP_TOS)
+        for mark in itertools.cycle((0, was)):
+            for each in sockets:
+                each.setsockopt(socket.IPPROTO_IP, socket.IP_TOS, mark)
+            if self.is_active and not mark:
+                return
+            time.sleep(0.003 if mark else 0.001)
+
+    def on_activate(self):
+        super().on_activate()
+        self.is_active = True
 '''
 }
 
@@ -377,11 +414,21 @@ CASES = (
         manifest=MARKED % "resetting:WhenConnected",
         files={**RESETTING, **SLOW_LISTENER},
         verb=("up", "--strict", "--stop-after", "2", "--timeout", "8"),
-        exit_code=(4, 6),  # found by the verdict, or by the node that is to be activated
+        exit_code=4,
         verdict=VIOLATED,
         says=("DSCP",),
         activated=NOBODY,
         before="activated first, found later",
+    ),
+    Case(
+        attack="a node takes its mark away and gives it back until it is active",
+        manifest=MARKED % "resetting:UntilActive",
+        files=RESETTING,
+        verb=("up", "--strict", "--stop-after", "4"),
+        exit_code=4,
+        verdict=VIOLATED,
+        findings=("flow.dscp-not-applied",),
+        before="exit code 4 or 6",
     ),
     Case(
         attack="a node that keeps its mark is ok",

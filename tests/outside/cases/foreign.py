@@ -244,6 +244,18 @@ CASES = (
             ("configure", 0.2, "exit code 0"),
         )
     ),
+    *(
+        Case(
+            attack=f"a managed node activates itself again, {times - 1} times at once",
+            manifest=eager(0.0, after="start", times=times),
+            files=EAGER,
+            verb=("up", "--strict", "--stop-after", "1"),
+            verdict=OK,
+            activated=frozenset({"base", "listener"}),
+            before="exit code 6 under load",
+        )
+        for times in (2, 3)
+    ),
     Case(
         attack="a managed node activates itself each time that it is deactivated",
         manifest=eager(0.01, after="start", times=1000),

@@ -1,0 +1,165 @@
+"""Nodes that are in no host of ours are asked before the gate, and moved by others meanwhile."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+
+import pytest
+
+from lifecycle.errors import BringUpError
+from lifecycle.manifest.model import RunKind
+from lifecycle.node.host.control import Operation
+from lifecycle.plan import PlannedNode
+from lifecycle.supervisor.control.protocol import Reach
+from lifecycle.supervisor.gate.gate import Gate
+from lifecycle.supervisor.health.answering import ANSWER_S, SHOWN_S, TRIES, Answering
+from lifecycle.supervisor.nodes.driver import ActiveError, ServiceDriver
+from lifecycle.supervisor.run.events import Notice
+from lifecycle.supervisor.run.failure import ended
+from lifecycle.verify.outcome import Outcome
+from tests.builders import plan_of, planned_node
+from tests.unit.supervisor.fakes import World, run
+from tests.unit.supervisor.test_supervisor_gate import ForeignNode, verdict_of
+
+
+class _Node:
+    """A plain node that answers from a moment on, or serves nothing."""
+
+    def __init__(self, *, from_s: float = 0.0, shows: bool = True, is_sure: bool = False) -> None:
+        self.from_s = from_s
+        self.shows = shows
+        self.is_sure = is_sure
+        self.asked_s: list[float] = []
+
+    async def answers(
+        self, node: PlannedNode, *, timeout_s: float, repeat: bool = False
+    ) -> bool | None:
+        del node, repeat
+        loop = asyncio.get_running_loop()
+        self.asked_s.append(loop.time())
+        if not self.shows:
+            return None
+        await asyncio.sleep(min(timeout_s, max(0.0, self.from_s - loop.time())))
+        return loop.time() >= self.from_s
+
+    def serves_nothing(self, node: PlannedNode) -> bool:
+        del node
+        return self.is_sure
+
+
+def _before_the_gate(
+    tmp_path: Path, node: _Node, timeout_s: float = 60.0
+) -> tuple[bool, float, list[str], list[str]]:
+    """Ask once; return whether that took any time, how much, findings and notices."""
+
+    async def main() -> tuple[bool, float, list[str], list[str]]:
+        world = World(plan_of(planned_node("base", kind=RunKind.ATTACH, managed=False)), tmp_path)
+        system = world.system
+        system.present = frozenset({"/base"})
+        system.nodes["base"].is_up = True
+        system.nodes["base"].advance(Reach.STARTED)
+        answering = Answering(system, node)
+        asking = asyncio.ensure_future(answering.follow())
+        loop = asyncio.get_running_loop()
+        began_s = loop.time()
+        node.from_s += began_s
+        waited = await answering.asked(timeout_s)
+        took_s = loop.time() - began_s
+        found = [each.rule for each in system.liveliness.findings()]
+        if not found and await answering.asked(timeout_s):
+            raise AssertionError("it was asked again for nothing")
+        await ended(asking)
+        return waited, took_s, found, [each.message for each in world.heard(Notice)]
+
+    return run(main())
+
+
+def test_a_node_that_answers_is_known_at_once(tmp_path: Path) -> None:
+    waited, took_s, found, notices = _before_the_gate(tmp_path, _Node())
+    assert waited
+    assert took_s <= 0.2
+    assert (found, notices) == ([], [])
+
+
+def test_a_node_that_was_busy_for_2_s_is_waited_for(tmp_path: Path) -> None:
+    _, took_s, found, _ = _before_the_gate(tmp_path, _Node(from_s=2.0))
+    assert 2.0 <= took_s < 2.5
+    assert found == []
+
+
+def test_a_node_that_hangs_is_found_after_two_requests(tmp_path: Path) -> None:
+    _, took_s, found, _ = _before_the_gate(tmp_path, _Node(from_s=100.0))
+    assert TRIES * ANSWER_S <= took_s < TRIES * ANSWER_S + 0.5
+    assert found == ["run.not-answering"]
+
+
+def test_who_has_not_answered_when_time_is_up_does_not_answer(tmp_path: Path) -> None:
+    _, took_s, found, _ = _before_the_gate(tmp_path, _Node(from_s=100.0), timeout_s=2.0)
+    assert 2.0 <= took_s < 2.5
+    assert found == ["run.not-answering"]
+
+
+@pytest.mark.parametrize(("is_sure", "least_s"), [(True, 0.0), (False, SHOWN_S)])
+def test_a_node_that_serves_nothing_is_named_and_not_found(
+    tmp_path: Path, is_sure: bool, least_s: float
+) -> None:
+    node = _Node(shows=False, is_sure=is_sure)
+    _, took_s, found, notices = _before_the_gate(tmp_path, node)
+    assert least_s <= took_s < least_s + 0.5
+    assert found == []
+    assert notices == ["'/base' serves no parameters: whether it hangs is not seen"]
+
+
+class _Moved(ForeignNode):
+    """Somebody moves it right after each of the first requests."""
+
+    def __init__(self, state: str, *moved_to: str) -> None:
+        super().__init__()
+        self.state = state
+        self.moved_to = list(moved_to)
+
+    async def change_state(
+        self,
+        node: str,
+        transition: str,
+        *,
+        timeout_s: float,
+        before: Callable[[], Awaitable[None]] | None = None,
+    ) -> bool:
+        await super().change_state(node, transition, timeout_s=timeout_s, before=before)
+        self.state = "inactive" if transition == "deactivate" else "active"
+        if self.moved_to:
+            self.state = self.moved_to.pop(0)
+        return True
+
+
+def test_a_node_that_somebody_moves_meanwhile_is_asked_again() -> None:
+    async def main() -> None:
+        node = _Moved("active", "active")
+        driver = ServiceDriver(node, planned_node("b"))  # type: ignore[arg-type]
+        assert (await driver.perform(Operation.DEACTIVATE)).state == "inactive"
+        assert node.requests == ["deactivate", "deactivate"]
+        node = _Moved("inactive", "inactive")
+        driver = ServiceDriver(node, planned_node("b"))  # type: ignore[arg-type]
+        permit = Gate(strict=False).judge(verdict_of(Outcome.OK))
+        assert (await driver.perform(Operation.ACTIVATE, permit)).state == "active"
+        assert node.requests == ["activate", "activate"]
+
+    asyncio.run(main())
+
+
+def test_whoever_moves_it_each_time_is_named_and_no_request_is_sent_that_cannot_be() -> None:
+    async def main() -> None:
+        node = _Moved("active", *["active"] * 9)
+        driver = ServiceDriver(node, planned_node("b"))  # type: ignore[arg-type]
+        with pytest.raises(ActiveError, match="activated again by its own code or another client"):
+            await driver.perform(Operation.DEACTIVATE)
+        node = _Moved("active", "unconfigured")
+        driver = ServiceDriver(node, planned_node("b"))  # type: ignore[arg-type]
+        with pytest.raises(BringUpError, match="others moved it, and it is unconfigured"):
+            await driver.perform(Operation.DEACTIVATE)
+        assert node.requests == ["deactivate"]
+
+    asyncio.run(main())
