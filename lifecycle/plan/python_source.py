@@ -363,7 +363,8 @@ class Sources:
             if paths is None:
                 raise NotThereError(f"cannot import {name!r}: {inside!r} is no package ({file})")
             so_far = f"{inside}.{part}".lstrip(".")
-            spec = importlib.machinery.PathFinder.find_spec(so_far, paths)
+            # By its last name: of nested namespace packages it would ask for the imported parent.
+            spec = importlib.machinery.PathFinder.find_spec(part, paths)
             if spec is None and not inside:
                 spec = _found_otherwise(so_far)
             if spec is None and origin and "__path__" in self._module(inside).text:
@@ -373,7 +374,8 @@ class Sources:
                 if inside:
                     hint = f"looked in {', '.join(_shown(Path(each)) for each in paths)}"
                 raise NotThereError(f"cannot find module {so_far!r}", hint=hint)
-            origin, paths, inside = spec.origin, spec.submodule_search_locations, so_far
+            found = spec.submodule_search_locations
+            origin, paths, inside = spec.origin, found and list(found), so_far
         if origin is None:
             raise NotThereError(f"cannot find anything in {name!r}: it has no __init__.py")
         if not origin.endswith(".py"):

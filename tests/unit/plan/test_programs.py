@@ -428,3 +428,9 @@ def test_a_class_that_cannot_say_how_it_is_is_not_to_be_asked(
         if each.rule == "program.health"
     ]
     assert found == ([f"cannot ask 'lidar' whether it is healthy: {why}"] if why else [])
+
+
+def test_a_class_is_found_in_nested_folders_without_an_init(folder: Path) -> None:
+    (folder / "outer" / "inner").mkdir(parents=True)
+    (folder / "outer" / "inner" / "talking.py").write_text(TALKER)
+    assert python("outer.inner.talking:Talker", *COMPLETE).diagnostics == ()
