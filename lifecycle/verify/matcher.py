@@ -155,22 +155,20 @@ def _attributed(
         The endpoints by the name of the node whose they are, sorted by it.
     """
     hidden = owners(names.nodes, reported)
-    shown: dict[str, list[ObservedEndpoint]] = {}
-    for each in observation.endpoints:
-        shown.setdefault(each.node, []).append(each)
+    unknown: list[ObservedEndpoint] = []
     by_node: dict[str, list[ObservedEndpoint]] = {}
-    for name, endpoints in shown.items():
-        node = known_node(name)
+    for each in observation.endpoints:
+        node = known_node(each.node)
         if not node:
-            for each in _unknown(endpoints, names, configurations):
-                by_node.setdefault(each.node, []).append(each)
+            unknown.append(each)
             continue
         owner = hidden.get(node) if node not in names.nodes else None
         ours = (owner.node if owner is not None else node) in configurations
-        for each in endpoints:
-            whose = owner.node if owner is not None and owner.has(each) else node
-            if _counts(each, whose, names, ours=ours):
-                by_node.setdefault(whose, []).append(_as_of(each, whose))
+        whose = owner.node if owner is not None and owner.has(each) else node
+        if _counts(each, whose, names, ours=ours):
+            by_node.setdefault(whose, []).append(_as_of(each, whose))
+    for each in _unknown(unknown, names, configurations):
+        by_node.setdefault(each.node, []).append(each)
     return {name: _sorted(fold_actions(_sorted(by_node[name]))) for name in sorted(by_node)}
 
 
