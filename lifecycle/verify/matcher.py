@@ -155,20 +155,22 @@ def _attributed(
         The endpoints by the name of the node whose they are, sorted by it.
     """
     hidden = owners(names.nodes, reported)
-    unknown: list[ObservedEndpoint] = []
-    by_node: dict[str, list[ObservedEndpoint]] = {}
+    shown: dict[str, list[ObservedEndpoint]] = {}
     for each in observation.endpoints:
-        node = known_node(each.node)
+        shown.setdefault(each.node, []).append(each)
+    by_node: dict[str, list[ObservedEndpoint]] = {}
+    for name, endpoints in shown.items():
+        node = known_node(name)
         if not node:
-            unknown.append(each)
+            for each in _unknown(endpoints, names, configurations):
+                by_node.setdefault(each.node, []).append(each)
             continue
         owner = hidden.get(node) if node not in names.nodes else None
         ours = (owner.node if owner is not None else node) in configurations
-        whose = owner.node if owner is not None and owner.has(each) else node
-        if _counts(each, whose, names, ours=ours):
-            by_node.setdefault(whose, []).append(_as_of(each, whose))
-    for each in _unknown(unknown, names, configurations):
-        by_node.setdefault(each.node, []).append(each)
+        for each in endpoints:
+            whose = owner.node if owner is not None and owner.has(each) else node
+            if _counts(each, whose, names, ours=ours):
+                by_node.setdefault(whose, []).append(_as_of(each, whose))
     return {name: _sorted(fold_actions(_sorted(by_node[name]))) for name in sorted(by_node)}
 
 
