@@ -23,9 +23,7 @@ from lifecycle.verify.matcher import lay_out
 from lifecycle.verify.outcome import ConnectionReport
 from lifecycle.verify.view import Actual, SeenEndpoint, View
 from tests.builders import (
-    at,
     endpoint,
-    link,
     node,
     planned,
     publisher,
@@ -69,15 +67,6 @@ def actual(view: View, kind: EndpointKind, name: str) -> Actual:
         each for each in view.actual if (each.planned.kind, each.planned.resolved) == (kind, name)
     )
     return found
-
-
-def test_of_a_perfect_system_nothing_is_left_over() -> None:
-    view = view_after(unchanged)
-    assert (view.undeclared, view.unattributed, view.foreign) == ((), (), ())
-    assert (view.tools, view.of_tools) == ({}, ())
-    assert all(each.observed and each.report for each in view.actual)
-    assert not any(each.unseen or each.beyond for each in view.actual)
-    assert list(view.observed) == ["/robot/camera", "/viewer"]
 
 
 # --- nodes
@@ -130,28 +119,6 @@ def test_a_declared_node_that_is_named_like_a_tool_or_a_hidden_one_is_no_tool() 
         "/cam",
         "/_cam_net",
     ]
-
-
-def test_tools_are_sorted_and_known_by_their_endpoints_too() -> None:
-    view = view_after(
-        both(
-            add_endpoint(SUB, "/rviz2", STATUS, gid="98"),
-            add_endpoint(SUB, "/_ros2cli_7", STATUS, gid="99"),
-            add_node("/_lifecycle_observer_1"),
-        )
-    )
-    assert list(view.tools.items()) == [
-        ("/_lifecycle_observer_1", "_lifecycle_*"),
-        ("/_ros2cli_7", "_ros2cli_*"),
-        ("/rviz2", "rviz2"),
-    ]
-    assert [(each.node, each.name) for each in view.of_tools] == [
-        ("/_ros2cli_7", STATUS),
-        ("/rviz2", STATUS),
-    ]
-    assert [each.node for each in view.seen_of_tools] == ["/_ros2cli_7", "/rviz2"]
-    assert {"/rviz2", "/_ros2cli_7"}.isdisjoint(each.node for each in view.seen)
-    assert view.foreign == ()
 
 
 def test_what_belongs_to_nobody_known_and_to_others_is_kept_apart() -> None:
@@ -289,10 +256,6 @@ def test_a_topic_of_no_node_is_nobodys_although_its_participant_is_known() -> No
 
 
 # --- matching
-
-
-def other_type(name: str, kind: EndpointKind = PUB, **fields: object) -> Edit:
-    return add_endpoint(kind, "/robot/camera", name, type="std_msgs/msg/Int32", **fields)
 
 
 def test_an_endpoint_of_the_declared_type_is_matched_before_one_of_another() -> None:
@@ -479,28 +442,6 @@ def test_parts_of_an_action_that_is_declared_or_seen_are_not_left_over() -> None
     ]
 
 
-def test_what_is_left_over_is_sorted_by_node_name_kind_type_and_gid() -> None:
-    found = [
-        (SUB, "/robot/camera", "/z", "a/msg/A", "1"),
-        (PUB, "/viewer", "/a", "a/msg/A", "1"),
-        (PUB, "/viewer", "/b", "a/msg/A", "3"),
-        (PUB, "/viewer", "/b", "a/msg/A", "4"),
-        (PUB, "/viewer", "/b", "a/msg/B", "2"),
-        (SUB, "/viewer", "/b", "a/msg/A", "1"),
-    ]
-    for order in (found, found[::-1], found[3:] + found[:3]):
-        edit = both(
-            *(
-                add_endpoint(kind, node, name, type=type_, gid=gid)
-                for kind, node, name, type_, gid in order
-            )
-        )
-        assert [
-            (each.kind, each.node, each.name, each.type, each.gid)
-            for each in view_after(edit).undeclared
-        ] == found
-
-
 # --- what discovery need not show
 
 
@@ -580,52 +521,7 @@ def test_shared_memory_of_a_machine_that_others_bring_up_is_beyond_reach(
     assert list(dict.fromkeys(each.node.full_name for each in view.actual if each.beyond)) == beyond
 
 
-def test_who_is_beyond_reach_counts_among_what_is_seen_as_it_is_planned() -> None:
-    plan = connected("shm://")
-    view = lay_out(plan, Observation(), Stage.CONNECTED, machines=frozenset({"m1"}))
-    assert view.seen == tuple(
-        SeenEndpoint(
-            kind=SUB,
-            node="/two",
-            name=each.resolved,
-            type=STRING,
-            qos=each.qos,
-            report=None,
-            planned=each,
-        )
-        for each in plan.nodes[1].endpoints
-    )
-
-
-def test_of_what_is_beyond_reach_only_topics_are_seen() -> None:
-    plan = connected("shm://")
-    service = endpoint(SERVER, "s", TRIGGER, None)
-    two = dataclasses.replace(
-        planned(node("two", service, machine="m2")).nodes[0],
-        connections=plan.nodes[1].connections,
-    )
-    plan = dataclasses.replace(plan, nodes=(plan.nodes[0], two), flows=())
-    view = lay_out(plan, Observation(), Stage.CONNECTED, machines=frozenset({"m1"}))
-    assert [each.beyond for each in view.actual] == [False, True]
-    assert view.seen == ()
-
-
 # --- what is seen of topics
-
-
-def test_publishers_and_subscriptions_are_seen_with_report_and_declaration() -> None:
-    view = view_after(add_endpoint(PUB, "/guest", STATUS, gid="99", qos=QosProfile(depth=4)))
-    status = [each for each in view.seen if each.name == STATUS]
-    camera, viewer = actual(view, PUB, STATUS), actual(view, SUB, STATUS)
-    assert [(each.kind, each.node, each.type) for each in status] == [
-        (PUB, "/guest", STRING),
-        (PUB, "/robot/camera", STRING),
-        (SUB, "/viewer", STRING),
-    ]
-    assert [each.report for each in status] == [None, camera.report, viewer.report]
-    assert [each.planned for each in status] == [None, camera.planned, viewer.planned]
-    assert [each.qos.depth for each in status] == [4, 10, 10]
-    assert all(each.kind.is_topic for each in view.seen)
 
 
 @pytest.mark.parametrize(
@@ -653,31 +549,3 @@ def test_the_hash_that_discovery_shows_wins_over_the_reported_one(shown, reporte
 
 
 # --- flows
-
-
-def test_a_flow_has_all_declared_ends_of_its_two_nodes_and_no_others() -> None:
-    plan = planned(
-        node("one", publisher("a"), publisher("/a"), publisher("b"), subscription("a", line=7)),
-        node("two", subscription("a", line=8), subscription("/a", line=9), publisher("a")),
-    )
-    view = view_after(unchanged, plan)
-    flow = next(
-        each
-        for each in view.flows
-        if (each.planned.topic, each.publisher, each.subscription) == ("/a", "/one", "/two")
-    )
-    one, two = view.nodes["/one"].actual, view.nodes["/two"].actual
-    assert (flow.publishers, flow.subscriptions) == (one[:2], two[:2])
-    assert flow.at == at(8, 9)
-    assert flow.subject == "/a: /one → /two"
-
-
-def test_a_flow_without_a_declared_subscription_is_at_its_publisher() -> None:
-    plan = planned(
-        node("one", publisher("a", line=5)), node("two"), links=[link("/a", "one", "two")]
-    )
-    (flow,) = view_after(unchanged, plan).flows
-    assert (flow.at, flow.subscriptions) == (at(5, 9), ())
-    plan = planned(node("one"), node("two"), links=[link("/a", "one", "two")])
-    (flow,) = view_after(unchanged, plan).flows
-    assert flow.at is None

@@ -89,7 +89,6 @@ def _violated(plan: Plan, seen: Observation) -> list[str]:
     ]
 
 
-STRING = "std_msgs/msg/String"
 DIFFERENCES: dict[str, tuple[Edit, str]] = {
     "publisher missing": (drop_endpoint(PUB, PRIVATE), "graph.missing-endpoint"),
     "subscription missing": (drop_endpoint(SUB, COMMAND), "graph.missing-endpoint"),

@@ -6,7 +6,7 @@ import dataclasses
 
 import pytest
 
-from lifecycle.manifest.model import EndpointKind, EndpointPolicy, Policy, Run, RunKind
+from lifecycle.manifest.model import EndpointKind, EndpointPolicy, Policy
 from lifecycle.manifest.qos import QosProfile, Reliability
 from lifecycle.plan import Plan
 from lifecycle.verify import Finding, Observation, Outcome, Stage, verify
@@ -24,7 +24,6 @@ from tests.unit.verify.edits import (
 from tests.unit.verify.perfect import perfect
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
-ATTACH = Run(kind=RunKind.ATTACH)
 INT = "std_msgs/msg/Int32"
 OPEN = Policy(undeclared_nodes=EndpointPolicy.OPEN)
 
@@ -222,10 +221,6 @@ def test_where_neither_end_says_anything_a_flow_goes_by_discovery_and_a_link_doe
     assert said(edit, pair(linked=True)) == [
         ("unverifiable", "neither end reports whom it is matched with")
     ]
-
-
-def gid_of(kind: EndpointKind, plan: Plan) -> str:
-    return next(each.gid for each in perfect(plan).endpoints if each.kind is kind)
 
 
 def test_a_gid_that_discovery_does_not_show_is_that_of_the_nodes_report():

@@ -579,29 +579,6 @@ def test_a_publisher_that_was_remapped_is_missing_whether_or_not_discovery_shows
     ]
 
 
-def test_what_was_remapped_is_told_apart_from_what_was_never_made():
-    verdict = verify(
-        PLAN, both(REMAPPED, drop_endpoint(PUB, "/video"))(perfect(PLAN)), stage=Stage.CONNECTED
-    )
-    assert [each.hint for each in verdict.findings] == [
-        (
-            "publishers/video is /stage/video now: is a remap wrong, or was "
-            "/camera/remap called? the name '' gives back the declared one"
-        ),
-        (
-            "it is publishers/video under another name: is a remap wrong, or was "
-            "/camera/remap called?"
-        ),
-    ]
-
-
-def test_an_alias_that_discovery_does_not_show_is_not_declared_either():
-    verdict = verify(PLAN, ALIASED(perfect(PLAN)), stage=Stage.CONNECTED)
-    (finding,) = verdict.findings
-    assert (finding.rule, finding.subject) == ("graph.undeclared-publisher", "/copy")
-    assert finding.hint == "it is an alias of publishers/video: see who called /camera/alias"
-
-
 def test_an_open_node_may_be_given_aliases():
     plan = dataclasses.replace(
         PLAN,

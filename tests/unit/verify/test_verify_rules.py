@@ -19,7 +19,6 @@ from lifecycle.manifest.model import (
 from lifecycle.manifest.qos import (
     Durability,
     History,
-    Liveliness,
     QosProfile,
     Reliability,
     not_written,
@@ -35,14 +34,11 @@ from lifecycle.verify import (
     RULES,
     Finding,
     HealthReport,
-    Identity,
-    NodeConfiguration,
     Observation,
     Outcome,
     Stage,
     verify,
 )
-from lifecycle.verify.rules.endpoints import differ
 from lifecycle.verify.rules.run import node_of
 from tests.builders import (
     IMAGE,
@@ -58,7 +54,6 @@ from tests.builders import (
 )
 from tests.unit.verify.edits import (
     Edit,
-    add_configuration,
     add_endpoint,
     add_node,
     both,
@@ -1013,7 +1008,6 @@ def test_numbers_of_an_endpoint_that_is_missing_are_not_named_besides():
 # --- definitions of types
 
 HERE, OTHER = "RIHS01_" + "a" * 64, "RIHS01_" + "b" * 64
-NEWER = "RIHS02_" + "c" * 64
 
 
 def defined(installed: str, plan: Plan | None = None) -> Plan:
@@ -1037,20 +1031,6 @@ def hashes(publishes: str | None, subscribes: str | None) -> Edit:
     return both(
         change_endpoint(PUB, "/chatter", type_hash=publishes),
         change_endpoint(SUB, "/chatter", type_hash=subscribes),
-    )
-
-
-def test_two_ends_of_one_type_name_and_two_definitions_are_violated():
-    plan = defined("")
-    assert findings_after(hashes(HERE, HERE), plan=plan) == []
-    finding = the_finding(hashes(HERE, OTHER), plan=plan)
-    assert (finding.rule, finding.outcome) == (
-        "graph.type-definition-differs",
-        Outcome.VIOLATED,
-    )
-    assert finding.message == (
-        "cannot accept the publisher of /chatter in /talker: its std_msgs/msg/String is not that of"
-        " /listener; both have the name, so the topic is matched and the data are not understood"
     )
 
 
@@ -1082,34 +1062,6 @@ def test_without_any_hash_there_is_nothing_to_compare():
     assert findings_after(hashes(None, None), plan=defined(HERE)) == []
 
 
-def test_hashes_of_two_hash_versions_are_not_compared():
-    assert findings_after(hashes(NEWER, HERE), plan=defined(HERE)) == []
-
-
-def test_a_hash_that_is_none_but_begins_with_the_version_is_another_definition():
-    odd = "RIHS01_a_b"
-    assert differ(odd, HERE)
-    assert differ(HERE, odd)
-    assert not differ(odd, odd)
-
-
-def test_a_service_of_another_definition_is_violated():
-    plan = planned(
-        *(
-            node(
-                key, endpoint(kind, "ask", "std_srvs/srv/Trigger", None), run=ATTACH, managed=False
-            )
-            for key, kind in (("server", SERVER), ("client", CLIENT))
-        )
-    )
-    edit = both(
-        change_endpoint(SERVER, "/ask", type_hash=f"{HERE} {HERE}"),
-        change_endpoint(CLIENT, "/ask", type_hash=f"{HERE} {OTHER}"),
-    )
-    found = findings_after(edit, plan=defined("", plan))
-    assert found == [("graph.type-definition-differs", "violated", "/ask")]
-
-
 def test_an_undeclared_end_of_another_definition_is_violated_where_such_may_be():
     plan = dataclasses.replace(defined(HERE), policy=Policy(undeclared_nodes=EndpointPolicy.OPEN))
     edit = both(
@@ -1120,110 +1072,13 @@ def test_an_undeclared_end_of_another_definition_is_violated_where_such_may_be()
     )
 
 
-def test_an_optional_requirement_that_is_not_met_is_no_violation():
-    plan = planned(
-        node(
-            "one",
-            publisher("a"),
-            publisher("b"),
-            needs=[need(PUB, "a", UniqueRequirement.OPTIONALLY_REQUIRED)],
-        )
-    )
-    edit = both(
-        change_report(PUB, "/a", nfes=(udp(40000),)), change_report(PUB, "/b", nfes=(udp(40000),))
-    )
-    assert findings_after(edit, plan=plan) == []
-
-
-def test_uniqueness_is_judged_over_the_whole_system_and_not_per_process():
-    strictly = UniqueRequirement.STRICTLY_REQUIRED
-    plan = planned(
-        node("one", subscription("a"), needs=[need(SUB, "a", strictly)]),
-        node("two", subscription("b")),
-    )
-    edit = both(
-        change_report(SUB, "/a", nfes=(udp(7000, "239.255.0.1"),)),
-        change_report(SUB, "/b", nfes=(udp(7000, "239.255.0.1"),)),
-    )
-    finding = the_finding(edit, plan=plan)
-    assert finding.message == (
-        "cannot accept the subscription of /a in /one: it strictly requires a unique network flow"
-        " and shares udp 239.255.0.1:7000 with other subscriptions"
-    )
-
-
-def test_the_same_port_on_two_machines_is_not_shared():
-    strictly = UniqueRequirement.STRICTLY_REQUIRED
-    plan = planned(
-        node("one", publisher("a"), needs=[need(PUB, "a", strictly)], machine="m1"),
-        node("two", publisher("a"), needs=[need(PUB, "a", strictly)], machine="m2"),
-    )
-    assert findings_after(change_report(PUB, "/a", nfes=(udp(40000),)), plan=plan) == []
-
-
-def test_unknown_nfes_in_the_same_process_may_hide_an_equal_one():
-    strictly = UniqueRequirement.STRICTLY_REQUIRED
-    plan = planned(
-        node("one", subscription("a"), subscription("b"), needs=[need(SUB, "a", strictly)]),
-        node("two", subscription("c")),
-    )
-    assert findings_after(change_report(SUB, "/c", nfes=None), plan=plan) == []
-    assert findings_after(change_report(SUB, "/b", nfes=None), plan=plan) == [
-        ("flow.unverifiable", "violated", "/a")
-    ]
-
-
 # --- what findings say
-
-
-def test_a_missing_endpoint_is_told_whole():
-    assert the_finding(drop_endpoint(PUB, STATUS)) == Finding(
-        rule="graph.missing-endpoint",
-        outcome=Outcome.VIOLATED,
-        subject="/robot/status",
-        expected="publisher of /robot/camera",
-        observed="no such publisher",
-        message="cannot find the publisher of /robot/status that /robot/camera declares",
-        at="robot.lifecycle.yaml:13:9",
-        node="/robot/camera",
-        endpoint=PUB,
-        hint="compare the declared name, remaps and namespace with what the node creates",
-    )
 
 
 def test_a_client_without_a_server_names_both_as_who_may_be_undiscovered():
     edit = change_report(CLIENT, "/robot/camera/calibrate", server_matched=False)
     (finding,) = verify(PLAN, edit(perfect(PLAN)), stage=Stage.CONNECTED).findings
     assert finding.ends == ("/viewer", "/robot/camera")
-
-
-def test_an_incompatible_pair_names_the_policy_and_both_ends():
-    edit = both(
-        change_announced_qos(SUB, VIDEO, reliability=Reliability.RELIABLE),
-        change_announced_qos(SUB, STATUS, liveliness=Liveliness.MANUAL_BY_TOPIC),
-    )
-    verdict = verify(PLAN, edit(perfect(PLAN)), stage=Stage.CONNECTED)
-    messages = [each.message for each in verdict.findings if each.rule == "graph.qos-incompatible"]
-    status = (
-        "cannot match /robot/camera → /viewer on /robot/status: /robot/camera offers"
-        " liveliness AUTOMATIC, /viewer requests liveliness MANUAL_BY_TOPIC"
-    )
-    video = (
-        "cannot match /robot/camera → /viewer on /robot/video: /robot/camera offers"
-        " reliability BEST_EFFORT, /viewer requests reliability RELIABLE"
-    )
-    assert messages == [status, video]
-
-
-def test_one_missing_and_one_undeclared_endpoint_of_a_type_hint_at_each_other_without_a_report():
-    edit = both(
-        change_endpoint(PUB, STATUS, name="/robot/stauts"), drop_endpoint_report(PUB, STATUS)
-    )
-    verdict = verify(PLAN, edit(perfect(PLAN)), stage=Stage.CONNECTED)
-    (undeclared,) = (each for each in verdict.findings if each.subject == "/robot/stauts")
-    assert undeclared.hint == (
-        "/robot/status of the same type is missing: is a remap or a name wrong?"
-    )
 
 
 def test_a_service_that_a_user_calls_as_the_node_interface_does_is_not_hidden():
@@ -1238,43 +1093,11 @@ def test_a_service_that_a_user_calls_as_the_node_interface_does_is_not_hidden():
     )
 
 
-def test_a_wrong_remap_shows_as_one_missing_and_one_undeclared_endpoint_that_hints_at_it():
-    edit = both(
-        change_endpoint(PUB, STATUS, name="/robot/stauts"),
-        change_report(PUB, STATUS, resolved="/robot/stauts"),
-    )
-    verdict = verify(PLAN, edit(perfect(PLAN)), stage=Stage.CONNECTED)
-    assert [(each.rule, each.subject) for each in verdict.findings] == [
-        ("graph.missing-endpoint", "/robot/status"),
-        ("graph.undeclared-publisher", "/robot/stauts"),
-    ]
-    assert verdict.findings[1].hint == (
-        "it is publishers/status under another name: is a remap wrong, or was "
-        "/robot/camera/remap called?"
-    )
-
-
-def test_an_undeclared_node_is_told_with_what_it_does():
-    edit = both(add_node("/spy"), add_endpoint(PUB, "/spy", "/x", gid="1"))
-    assert the_finding(edit).observed == "node with publisher of /x"
-
-
 def test_an_endpoint_that_only_the_report_tells_of_is_undeclared_already():
     camera = perfect(PLAN).configurations[0]
     extra = dataclasses.replace(camera.endpoints[2], name="", resolved="/extra", gid="99")
     edit = change_configuration("/robot/camera", endpoints=(*camera.endpoints, extra))
     assert findings_after(edit) == [("graph.undeclared-publisher", "violated", "/extra")]
-
-
-def test_two_reports_of_one_name_are_two_nodes():
-    twin = dataclasses.replace(
-        perfect(PLAN).configurations[1],
-        identity=Identity(machine_id="other", process_id=1, node_id="/viewer@ff"),
-    )
-    assert isinstance(twin, NodeConfiguration)
-    assert ("graph.duplicate-node", "violated", "/viewer") in findings_after(
-        add_configuration(twin)
-    )
 
 
 @pytest.mark.parametrize(
@@ -1382,19 +1205,6 @@ def test_an_open_system_tolerates_who_publishes_too_and_says_so():
         "undeclared_nodes: open",
         f"/guest (publisher of {STATUS})",
     )
-
-
-def test_a_link_between_nodes_that_report_nothing_is_unverifiable():
-    plan = planned(
-        node("talker", publisher("chatter"), run=ATTACH, managed=False),
-        node("viewer", subscription("chatter"), run=ATTACH, managed=False),
-    )
-    assert findings_after(lambda seen: seen, plan=plan) == []
-    linked = dataclasses.replace(
-        plan, flows=tuple(dataclasses.replace(each, linked=True) for each in plan.flows)
-    )
-    finding = the_finding(lambda seen: seen, plan=linked)
-    assert (finding.rule, finding.outcome) == ("graph.unmatched-link", Outcome.UNVERIFIABLE)
 
 
 @pytest.mark.parametrize(("subject", "name"), [("/robot/camera", "/robot/camera"), ("host", "")])

@@ -15,11 +15,10 @@ from lifecycle.plan.model import (
     PlannedParticipant,
     StaticParticipant,
 )
-from lifecycle.verify import Observation, ObservedEndpoint, Stage
+from lifecycle.verify import Observation, Stage
 from lifecycle.verify.matcher import lay_out
 from lifecycle.verify.view import (
     UNKNOWN_QOS,
-    SeenEndpoint,
     View,
     actual_qos,
     connection_of,
@@ -29,7 +28,6 @@ from lifecycle.verify.view import (
 from tests.builders import at, need, node, planned, publisher, subscription
 from tests.unit.verify.edits import (
     Edit,
-    add_endpoint,
     both,
     drop_endpoint,
     drop_node,
@@ -37,8 +35,7 @@ from tests.unit.verify.edits import (
 )
 from tests.unit.verify.perfect import perfect
 
-PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
-CLIENT = EndpointKind.SERVICE_CLIENT
+PUB = EndpointKind.PUBLISHER
 SHM = ParticipantConnections(urls=("shm://",))
 UDP = ParticipantConnections(urls=("udpv4://10.0.0.1:7911",))
 MIXED = ParticipantConnections(urls=("shm://", "udpv4://10.0.0.1:7911"))
@@ -49,7 +46,7 @@ PLAN = planned(
     node("three"),
     machines=(Machine(name="m1", address="10.0.0.1", at=at(2)), Machine(name="m2", at=at(2))),
 )
-ONE, TWO, THREE = PLAN.nodes
+ONE = PLAN.nodes[0]
 
 
 def view_of(
@@ -72,48 +69,6 @@ def view_of(
 )
 def test_a_node_of_which_nothing_is_seen_is_absent(edit: Edit, absent: bool) -> None:
     assert view_of(edit(perfect(PLAN))).nodes["/one"].absent is absent
-
-
-def test_who_is_ours_and_whom_the_caller_brings_up() -> None:
-    everywhere, here = view_of(), view_of(machines=frozenset({"m1"}))
-    assert [each.is_ours for each in everywhere.nodes.values()] == [True, False, True]
-    assert [everywhere.brings_up(each) for each in PLAN.nodes] == [True, True, True]
-    assert [here.brings_up(each) for each in PLAN.nodes] == [True, False, False]
-
-
-@pytest.mark.parametrize(
-    ("connections", "machines", "beyond"),
-    [
-        (SHM, frozenset({"m1"}), True),
-        (SHM, frozenset({"m2"}), False),
-        (SHM, None, False),
-        (MIXED, frozenset({"m1"}), False),
-    ],
-)
-def test_a_node_that_has_only_memory_of_another_host_is_beyond_reach(
-    connections: ParticipantConnections, machines: frozenset[str] | None, beyond: bool
-) -> None:
-    two = dataclasses.replace(TWO, connections=connections)
-    assert view_of(machines=machines).is_beyond(two) is beyond
-
-
-def test_publishers_and_subscriptions_of_tools_are_seen_as_they_are_announced() -> None:
-    shown = ObservedEndpoint(
-        kind=SUB, node="/rviz2", name="/a", type="a/msg/A", qos=QosProfile(depth=3), gid="99"
-    )
-    seen = perfect(PLAN)
-    seen = dataclasses.replace(seen, endpoints=(*seen.endpoints, shown))
-    seen = add_endpoint(CLIENT, "/rviz2", "/ask", type="a/srv/B")(seen)
-    assert view_of(seen).seen_of_tools == (
-        SeenEndpoint(
-            kind=SUB,
-            node="/rviz2",
-            name="/a",
-            type="a/msg/A",
-            qos=QosProfile(depth=3),
-            expected=False,
-        ),
-    )
 
 
 # --- connections

@@ -1,28 +1,28 @@
-"""Everything that a finding says, as text to compare whole."""
+"""What a finding says, as text to compare: all facts but the sentence that it makes of them."""
 
 from __future__ import annotations
 
 import textwrap
 from collections.abc import Iterable
 
-from lifecycle.verify import Finding
+from lifecycle.verify import Finding, rule
 
 
 def told(findings: Iterable[Finding]) -> str:
-    """One paragraph for each finding, one fact a line; no line longer than a test's may be."""
+    """One paragraph for each finding, with its hint where that is not the rule's."""
     return "\n".join(_paragraph(each) for each in findings)
 
 
 def _paragraph(finding: Finding) -> str:
+    assert finding.message.startswith("cannot ")
     kind = f" ({finding.endpoint.noun})" if finding.endpoint else ""
-    facts = (
+    facts = [
         f"{finding.outcome.value} {finding.rule}: {finding.subject}",
-        finding.message,
-        f"expected: {finding.expected}",
-        f"observed: {finding.observed}",
-        f"at: {finding.at or 'nowhere'}, on {finding.node or 'no node'}{kind}",
-        f"to do: {finding.hint}",
-    )
+        f"expected {finding.expected}, observed {finding.observed}",
+        f"at {finding.at or 'nowhere'}, on {finding.node or 'no node'}{kind}",
+    ]
+    if finding.hint != rule(finding.rule).fix:
+        facts.append(f"to do: {finding.hint}")
     return "".join(
         textwrap.fill(
             fact, 96, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False
