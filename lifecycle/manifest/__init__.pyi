@@ -4,7 +4,6 @@ from .checks.parameters import command_line_parameters as command_line_parameter
 from .checks.parameters import given_value as given_value
 from .checks.parameters import is_implicit as is_implicit
 from .checks.parameters import misfit as misfit
-from .checks.parameters import read_scalar as read_scalar
 from .checks.parameters import read_sections as read_sections
 from .checks.parameters import shown_path as shown_path
 from .checks.parameters import type_of as type_of
@@ -12,7 +11,6 @@ from .diagnostics import Diagnostic as Diagnostic
 from .diagnostics import ManifestError as ManifestError
 from .diagnostics import Position as Position
 from .diagnostics import Severity as Severity
-from .flows import OWN_FLOW as OWN_FLOW
 from .flows import FlowNeeds as FlowNeeds
 from .flows import ParticipantGroup as ParticipantGroup
 from .flows import ResolvedNeed as ResolvedNeed
@@ -26,7 +24,6 @@ from .loading import declared_arguments as declared_arguments
 from .loading import load as load
 from .model import BY_DEFAULT as BY_DEFAULT
 from .model import TOLERATED_NODES as TOLERATED_NODES
-from .model import After as After
 from .model import Authority as Authority
 from .model import Condition as Condition
 from .model import ConnectionDeclaration as ConnectionDeclaration
@@ -41,11 +38,9 @@ from .model import EndpointKind as EndpointKind
 from .model import EndpointPolicy as EndpointPolicy
 from .model import Executor as Executor
 from .model import FlowIdentification as FlowIdentification
-from .model import FlowNeed as FlowNeed
 from .model import FlowTerms as FlowTerms
 from .model import FlowTransport as FlowTransport
 from .model import Health as Health
-from .model import Interface as Interface
 from .model import Limits as Limits
 from .model import Link as Link
 from .model import Machine as Machine
@@ -106,5 +101,4 @@ from .schema import did_you_mean as did_you_mean
 from .shared import SIM_TIME as SIM_TIME
 from .yaml.document import error as error
 from .yaml.document import warning as warning
-from .yaml.source import noting_files as noting_files
 from .yaml.source import read_bytes as read_bytes

@@ -42,7 +42,7 @@ from lifecycle.manifest.shared import Shared, settle
 from lifecycle.manifest.yaml import include
 from lifecycle.manifest.yaml.arguments import Substituted, substitute
 from lifecycle.manifest.yaml.document import Cursor, Document, Place, Value, error, note
-from lifecycle.manifest.yaml.source import note_file, read_document
+from lifecycle.manifest.yaml.source import read_document
 from lifecycle.manifest.yaml.substitutions import Programs, Surroundings, folder_of
 from lifecycle.manifest.yaml.yaml_parser import quote
 from lifecycle.network import DscpMapping, TransportPriorityMapping, dscp_mappings, parse_mapping
@@ -93,7 +93,6 @@ def _dscp_mapping(network: Cursor, base: Path, found: list[Diagnostic]) -> DscpM
     try:
         with (base / name).open("rb") as file:
             text = file.read(_MAX_MAPPING_BYTES)
-        note_file(base / name, text)
     except (OSError, ValueError) as problem:
         why = getattr(problem, "strerror", None) or str(problem)
         message = f"cannot read the 5QI to DSCP mapping {quote(name)}: {why}"

@@ -268,11 +268,6 @@ def matching_rule(
     return None
 
 
-def full_node_name(node_name: str, namespace: str) -> str:
-    """Return the fully qualified node name, `/robot/camera`."""
-    return f"{namespace.rstrip('/')}/{node_name}"
-
-
 def hidden_names(action: str) -> tuple[tuple[str, EndpointKind], ...]:
     """Return what an action server really offers: its hidden services, then its hidden topics.
 

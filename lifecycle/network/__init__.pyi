@@ -4,7 +4,6 @@ from .connection_url import Peer as Peer
 from .connection_url import parse as parse
 from .dscp import ECN_MASK as ECN_MASK
 from .dscp import MAX_DSCP as MAX_DSCP
-from .dscp import CodePoint as CodePoint
 from .dscp import MappedPriority as MappedPriority
 from .dscp import TransportPriorityMapping as TransportPriorityMapping
 from .dscp import code_points as code_points
@@ -15,8 +14,6 @@ from .dscp import parse_dscp as parse_dscp
 from .dscp import tos as tos
 from .five_qi import ClassIssue as ClassIssue
 from .five_qi import DscpMapping as DscpMapping
-from .five_qi import FiveQi as FiveQi
-from .five_qi import Proposal as Proposal
 from .five_qi import check_class as check_class
 from .five_qi import dscp_mapping as dscp_mapping
 from .five_qi import dscp_mappings as dscp_mappings

@@ -27,12 +27,10 @@ from .model import GRAPH_TOPIC as GRAPH_TOPIC
 from .model import GRAPH_TYPE as GRAPH_TYPE
 from .model import MAX_USER_ID as MAX_USER_ID
 from .model import ExpectedParameter as ExpectedParameter
-from .model import HeldBy as HeldBy
 from .model import ParticipantConnections as ParticipantConnections
 from .model import Plan as Plan
 from .model import PlanError as PlanError
 from .model import PlannedEndpoint as PlannedEndpoint
-from .model import PlannedFile as PlannedFile
 from .model import PlannedFlow as PlannedFlow
 from .model import PlannedNode as PlannedNode
 from .model import PlannedParticipant as PlannedParticipant
@@ -47,7 +45,6 @@ from .negotiation.data_layer import PARADIGMS as PARADIGMS
 from .negotiation.data_layer import SERIALIZATIONS as SERIALIZATIONS
 from .negotiation.data_layer import DataLayerGraph as DataLayerGraph
 from .negotiation.data_layer import NegotiatedConnection as NegotiatedConnection
-from .negotiation.data_layer import NegotiatedFlow as NegotiatedFlow
 from .negotiation.data_layer import NegotiationProblem as NegotiationProblem
 from .negotiation.data_layer import Party as Party
 from .negotiation.data_layer import PartyEndpoint as PartyEndpoint
@@ -65,7 +62,6 @@ from .parameters import DEFAULT as DEFAULT
 from .parameters import GIVEN as GIVEN
 from .parameters import NOT_FINITE as NOT_FINITE
 from .parameters import portable as portable
-from .participants import parameter_text as parameter_text
 from .programs import Resolution as Resolution
 from .programs import UnresolvedProgram as UnresolvedProgram
 from .programs import resolve_programs as resolve_programs
@@ -74,6 +70,5 @@ from .restart import is_restarted_url as is_restarted_url
 from .restart import moved_observer as moved_observer
 from .restart import moving_nodes as moving_nodes
 from .restart import restarted as restarted
-from .secrets import is_secret as is_secret
 from .secrets import shown as shown
 from .secrets import without_secrets as without_secrets

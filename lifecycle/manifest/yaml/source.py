@@ -8,11 +8,10 @@ byte over the limit. Touches the file system; knows nothing of what a manifest m
 from __future__ import annotations
 
 import contextlib
-import contextvars
 import os
 import re
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position
@@ -108,7 +107,6 @@ def read_bytes(path: str | Path, *, file: str) -> bytes:
                 "cannot read a file that has no end and nothing to read",
                 "name a regular file",
             )
-        note_file(Path(path), data)
         if len(data) > MAX_BYTES:
             size = max(os.fstat(descriptor).st_size, len(data))
             raise _refuse(
@@ -117,28 +115,6 @@ def read_bytes(path: str | Path, *, file: str) -> bytes:
                 "split it with 'include:'",
             )
     return data
-
-
-_noted: contextvars.ContextVar[dict[str, bytes] | None] = contextvars.ContextVar(
-    "noted", default=None
-)
-
-
-@contextlib.contextmanager
-def noting_files() -> Iterator[dict[str, bytes]]:
-    """Give what `read_bytes` reads within: contents by absolute path, as the path was written."""
-    noted: dict[str, bytes] = {}
-    token = _noted.set(noted)
-    try:
-        yield noted
-    finally:
-        _noted.reset(token)
-
-
-def note_file(path: Path, data: bytes) -> None:
-    """Note a file that is read in another way, see `noting_files`."""
-    if (noted := _noted.get()) is not None:
-        noted[os.path.abspath(path)] = data  # noqa: PTH100
 
 
 def _kernel_devices() -> set[int]:

@@ -14,7 +14,6 @@ from lifecycle.manifest.names import (
     RemapRuleError,
     expand,
     full_name_problem,
-    full_node_name,
     hidden_names,
     name_problem,
     namespace_problem,
@@ -226,11 +225,6 @@ def test_an_action_is_three_services_and_two_topics() -> None:
         ("/dock/_action/feedback", EndpointKind.PUBLISHER),
         ("/dock/_action/status", EndpointKind.PUBLISHER),
     )
-
-
-def test_full_node_names_have_one_slash() -> None:
-    assert full_node_name("camera", "/") == "/camera"
-    assert full_node_name("camera", "/robot") == "/robot/camera"
 
 
 def test_a_rule_knows_its_node_and_kind() -> None:
