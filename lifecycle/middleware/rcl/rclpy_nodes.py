@@ -13,7 +13,7 @@ import contextlib
 import functools
 import sys
 import traceback
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Any, Protocol
 
 from lifecycle_msgs.msg import Transition
