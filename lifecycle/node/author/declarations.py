@@ -21,6 +21,7 @@ from lifecycle.node.author.handlers import ActionHandler
 from lifecycle.node.author.managed import Managed
 from lifecycle.node.author.spec import calling_position
 from lifecycle.node.endpoints.mapping import EndpointOptions
+from lifecycle.plan import PlannedEndpoint
 
 if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup
@@ -187,20 +188,18 @@ class Declarations(Node):  # type: ignore[misc]  # rclpy is not typed
         callback: Callable[..., Any] | None = None,
         hints: tuple[bool | None, int | None] = (None, None),
     ) -> None:
-        self.lifecycle.declared.refuse(kind, name)
         topic = kind in {EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION}
         resolve: Callable[[str], str]
         if kind in {EndpointKind.ACTION_SERVER, EndpointKind.ACTION_CLIENT}:
             resolve = functools.partial(resolve_action_name, self)
         else:
             resolve = self.resolve_topic_name if topic else self.resolve_service_name
-        spec = declaring.add(
-            self.lifecycle.declared.now,
+        endpoint = PlannedEndpoint(
             kind=kind,
             name=name,
-            interface=interface,
             resolved=resolve(name),
+            type=declaring.interface_name(interface),
             qos=qos,
             at=calling_position(depth=2),
         )
-        self.lifecycle.declared.declare(spec, (kind, name), callback=callback, hints=hints)
+        self.lifecycle.declared.declare(endpoint, callback=callback, hints=hints)

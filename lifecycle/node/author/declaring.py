@@ -15,7 +15,7 @@ from rclpy.qos import QoSProfile
 
 from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest import EndpointKind, EndpointPolicy, Position, QosProfile
+from lifecycle.manifest import EndpointKind, EndpointPolicy, QosProfile
 from lifecycle.middleware import from_rclpy
 from lifecycle.node.author.handlers import Handlers, match, needs_handler
 from lifecycle.node.connections.data_layer import CONFIGURED, NodeDataLayer
@@ -54,46 +54,13 @@ def profile(qos: QosProfile | QoSProfile | int) -> QosProfile:
     return QosProfile(depth=qos) if isinstance(qos, int) else from_rclpy(qos)
 
 
-def add(
-    spec: PlannedNode,
-    *,
-    kind: EndpointKind,
-    name: str,
-    interface: type[Any],
-    resolved: str,
-    qos: QosProfile | None,
-    at: Position,
-) -> PlannedNode:
-    """Return `spec` with one more endpoint; what a manifest says of the same name is kept.
-
-    The same line may declare the same again: on_activate runs more than once.
-
-    Raises:
-        LifecycleError: the name is declared already, in code, or in the manifest as another type.
-    """
-    type_ = interface_name(interface)
-    for endpoint in spec.endpoints:
-        if endpoint.kind is not kind or endpoint.name != name:
-            continue
-        again = (endpoint.at.file, endpoint.at.line) == (at.file, at.line)
-        if endpoint.type == type_ and (endpoint.at.path or again):
-            return spec
-        there = f"{endpoint.at.file}:{endpoint.at.line}"
-        raise LifecycleError(
-            f"{at.file}:{at.line}: cannot declare {name!r} in {kind.value} as {type_}: {there} "
-            f"declares it as {endpoint.type} already"
-        )
-    endpoint = PlannedEndpoint(kind=kind, name=name, resolved=resolved, type=type_, qos=qos, at=at)
-    return dataclasses.replace(spec, endpoints=(*spec.endpoints, endpoint))
-
-
 class DeclaredInCode:
     """What one node's manifest or plan and its own code declare, taken together.
 
     Args:
+        node: whose code it is.
         spec: what the node was planned to be.
         data_layer: has the endpoints from configure on.
-        node: fully qualified name, for messages.
         state: of the node, now.
 
     Attributes:
@@ -102,89 +69,104 @@ class DeclaredInCode:
 
     def __init__(
         self,
+        node: Node,
         spec: PlannedNode,
         data_layer: NodeDataLayer,
-        *,
-        node: str,
         state: Callable[[], NodeState],
     ) -> None:
         self.spec = spec
-        self._data_layer = data_layer
         self._node = node
+        self._name = str(node.get_fully_qualified_name())
+        self._data_layer = data_layer
         self._state = state
         self._callbacks: dict[Key, Callable[..., Any]] = {}
         self._hints: dict[Key, tuple[bool | None, int | None]] = {}
         self._options: dict[Key, EndpointOptions] = {}
 
-    def refuse(self, kind: EndpointKind, name: str) -> None:
-        """Raise unless one more endpoint may be declared now.
-
-        Raises:
-            LifecycleError: not in this state, or the manifest fixes the endpoints at configure.
-        """
-        if self._state() is NodeState.UNCONFIGURED:
-            return
-        what = f"cannot declare {kind.noun} {name!r} while {self._node} is"
-        if self._state() not in CONFIGURED:
-            raise LifecycleError(
-                f"{what} {self._state().value!r}",
-                hint="declare endpoints in __init__, or from on_configure until cleanup",
-            )
-        if self.spec.endpoint_policy is EndpointPolicy.DECLARED:
-            raise LifecycleError(
-                f"{what} {self._state().value!r}: nodes.{self.spec.key}.endpoints is 'declared' in "
-                "its manifest, which fixes them at configure",
-                hint=f"write nodes.{self.spec.key}.endpoints: open, or declare it in the manifest",
-            )
-
     def declare(
         self,
-        spec: PlannedNode,
-        key: Key,
+        endpoint: PlannedEndpoint,
         *,
         callback: Callable[..., Any] | None,
         hints: tuple[bool | None, int | None],
     ) -> None:
         """Have one more endpoint, made at once where the others are.
 
+        What a manifest says of the same name is kept. The same line may declare the same again:
+        on_activate runs more than once.
+
         Args:
-            spec: the present one with the endpoint added, or as it is if the manifest has it.
-            key: of the endpoint.
+            endpoint: with the place where it is declared.
             callback: its handler, beside the decorated methods.
             hints: lossy and size in bytes.
 
         Raises:
-            LifecycleError: it needs a handler, or cannot be made.
+            LifecycleError: not in this state, the manifest fixes the endpoints at configure, it is
+                declared already, it needs a handler, or it cannot be made.
         """
+        self._refuse(endpoint)
+        key, is_new = (endpoint.kind, endpoint.name), self._is_new(endpoint)
         if self._state() is NodeState.UNCONFIGURED:
-            self.spec = spec
+            if is_new:
+                self.spec = dataclasses.replace(
+                    self.spec, endpoints=(*self.spec.endpoints, endpoint)
+                )
             if callback is not None:
                 self._callbacks[key] = callback
             self._hints[key] = hints
             return
-        (endpoint,) = (each for each in spec.endpoints if (each.kind, each.name) == key)
-        if key in self._data_layer.endpoints.mappings:
-            # The manifest has it, or it was said before.
-            self._data_layer.endpoints.hint(key, *hints)
-            return
-        if callback is None and needs_handler(endpoint.kind):
-            raise LifecycleError(
-                f"cannot serve {endpoint.kind.noun} {endpoint.name!r} of {self._node} that is "
-                "declared after configure: it has no handler",
-                hint=f"give one, {_METHODS[endpoint.kind]}({endpoint.name!r}, …, callback=…)",
-            )
-        self._data_layer.add_now(endpoint, callback)
+        if is_new:
+            if callback is None and needs_handler(endpoint.kind):
+                raise LifecycleError(
+                    f"cannot serve {endpoint.kind.noun} {endpoint.name!r} of {self._name} that is "
+                    "declared after configure: it has no handler",
+                    hint=f"give one, {_METHODS[endpoint.kind]}({endpoint.name!r}, …, callback=…)",
+                )
+            self._data_layer.add_now(endpoint, callback)
         self._data_layer.endpoints.hint(key, *hints)
+
+    def _refuse(self, endpoint: PlannedEndpoint) -> None:
+        state = self._state()
+        if state is NodeState.UNCONFIGURED:
+            return
+        what = (
+            f"cannot declare {endpoint.kind.noun} {endpoint.name!r} while {self._name} is "
+            f"{state.value!r}"
+        )
+        if state not in CONFIGURED:
+            raise LifecycleError(
+                what, hint="declare endpoints in __init__, or from on_configure until cleanup"
+            )
+        if self.spec.endpoint_policy is EndpointPolicy.DECLARED:
+            raise LifecycleError(
+                f"{what}: nodes.{self.spec.key}.endpoints is 'declared' in its manifest, which "
+                "fixes them at configure",
+                hint=f"write nodes.{self.spec.key}.endpoints: open, or declare it in the manifest",
+            )
+
+    def _is_new(self, endpoint: PlannedEndpoint) -> bool:
+        at = endpoint.at
+        later = (each.endpoint for each in self._data_layer.mappings)
+        for each in (*self.spec.endpoints, *later):
+            if (each.kind, each.name) != (endpoint.kind, endpoint.name):
+                continue
+            again = (each.at.file, each.at.line) == (at.file, at.line)
+            if each.type == endpoint.type and (each.at.path or again):
+                return False
+            raise LifecycleError(
+                f"{at.file}:{at.line}: cannot declare {endpoint.name!r} in {endpoint.kind.value} "
+                f"as {endpoint.type}: {each.at.file}:{each.at.line} declares it as {each.type} "
+                "already"
+            )
+        return True
 
     def hint(self, spelling: str, *, lossy: bool | None, size_bytes: int | None) -> None:
         """Keep a hint for negotiation; raises UnknownEndpointError."""
         if self._state() is NodeState.UNCONFIGURED:
-            declared = [(each.kind, each.name) for each in self.spec.endpoints]
-            self._hints[find_endpoint(spelling, declared, node=self._node)] = (lossy, size_bytes)
+            self._hints[self._find(spelling)] = (lossy, size_bytes)
         else:
-            self._data_layer.endpoints.hint(
-                self._data_layer.endpoints.find(spelling).key, lossy, size_bytes
-            )
+            table = self._data_layer.endpoints
+            table.hint(table.find(spelling).key, lossy, size_bytes)
 
     def set_options(self, spelling: str, options: EndpointOptions) -> None:
         """Keep how an endpoint is to be made.
@@ -194,8 +176,7 @@ class DeclaredInCode:
             LifecycleError: it exists already, or its kind cannot have them.
         """
         if self._state() is NodeState.UNCONFIGURED:
-            declared = [(each.kind, each.name) for each in self.spec.endpoints]
-            key = find_endpoint(spelling, declared, node=self._node)
+            key = self._find(spelling)
             options.refuse_unfit(key[0])
             self._options[key] = options
             return
@@ -203,40 +184,36 @@ class DeclaredInCode:
         options.refuse_unfit(mapping.endpoint.kind)
         if mapping.placement is not None:
             raise LifecycleError(
-                f"cannot set options of {mapping.spelling} of {self._node}: it exists already",
+                f"cannot set options of {mapping.spelling} of {self._name}: it exists already",
                 hint="call set_options in __init__ or in on_configure",
             )
         mapping.options = options
 
-    @property
-    def now(self) -> PlannedNode:
-        """The plan with those endpoints that were declared since configure."""
-        known = {(each.kind, each.name) for each in self.spec.endpoints}
-        later = tuple(each.endpoint for each in self._data_layer.mappings if each.key not in known)
-        return dataclasses.replace(self.spec, endpoints=(*self.spec.endpoints, *later))
+    def _find(self, spelling: str) -> Key:
+        declared = [(each.kind, each.name) for each in self.spec.endpoints]
+        return find_endpoint(spelling, declared, node=self._name)
 
-    def match(self, node_class: type) -> Handlers:
-        """Return the decorated methods of a class for the endpoints that need one.
+    def match(self) -> Handlers:
+        """Return the decorated methods of the node's class for the endpoints that need one.
 
         Raises:
             LifecycleError: an endpoint has no handler, or a handler no endpoint.
         """
         given = self._callbacks
         endpoints = [e for e in self.spec.endpoints if (e.kind, e.name) not in given]
-        return match(node_class, endpoints, node=self._node)
+        return match(type(self._node), endpoints, node=self._name)
 
-    def enact(self, node: Node, matched: Handlers) -> None:
+    def enact(self, matched: Handlers) -> None:
         """Declare all of it in the data layer; raises LifecycleError."""
-        self._data_layer.declare(self.spec, lambda each: self._handler(node, each, matched))
+
+        def handler(endpoint: PlannedEndpoint) -> Callable[..., Any] | None:
+            given = self._callbacks.get((endpoint.kind, endpoint.name))
+            if given is not None or not needs_handler(endpoint.kind):
+                return given
+            return matched.bound(self._node, endpoint)
+
+        self._data_layer.declare(self.spec, handler)
         for key, hints in self._hints.items():
             self._data_layer.endpoints.hint(key, *hints)
         for key, options in self._options.items():
             self._data_layer.endpoints.mappings[key].options = options
-
-    def _handler(
-        self, node: Node, endpoint: PlannedEndpoint, matched: Handlers
-    ) -> Callable[..., Any] | None:
-        given = self._callbacks.get((endpoint.kind, endpoint.name))
-        if given is not None or not needs_handler(endpoint.kind):
-            return given
-        return matched.bound(node, endpoint)

@@ -210,9 +210,7 @@ class Managed:
             changed=self.configuration_changes.touch,
             notify=self._report_connection,
         )
-        self.declared = DeclaredInCode(
-            spec, self.data_layer, node=self.full_name, state=lambda: self.state
-        )
+        self.declared = DeclaredInCode(node, spec, self.data_layer, lambda: self.state)
         self._controller = Controller(self, spec.timeouts, self._changed)
         self._services: LifecycleServices | None = None
         if served:
@@ -362,9 +360,9 @@ class Managed:
 
     def prepare(self) -> None:
         """Declare parameters and endpoints, and make the timers of `@on_timer` methods."""
-        matched = self.declared.match(type(self._node))
+        matched = self.declared.match()
         parameters.declare(self._node, self.spec)
-        self.declared.enact(self._node, matched)
+        self.declared.enact(matched)
         for timer in matched.timers:
             method = getattr(self._node, timer.method)
             self._method_timers.append(self._node.create_timer(timer.period_s, method))
