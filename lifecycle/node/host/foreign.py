@@ -18,7 +18,7 @@ import inspect
 import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NoReturn, Protocol
+from typing import TYPE_CHECKING, Any, NoReturn, Protocol, cast
 
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.event_handler import (
@@ -626,7 +626,7 @@ class Adoption:
 
     def make(
         self, planned: PlannedNode, group: Sequence[PlannedNode], what: Callable[..., Any]
-    ) -> tuple[str, ...]:
+    ) -> tuple[tuple[str, Any, Hosted], ...]:
         """Construct a planned node, and those of its group that the same call makes.
 
         Args:
@@ -635,7 +635,7 @@ class Adoption:
             what: the class or function.
 
         Returns:
-            The keys of what was made.
+            Key of the plan, rclpy node and what stands for it, of what was made.
 
         Raises:
             LifecycleError: something else was made. What the class or function raises passes.
@@ -649,12 +649,14 @@ class Adoption:
         finally:
             self._waiting, self._current = [], None
         self._check(planned, what, returned)
-        keys = tuple(key for key in self.made if key not in before)
-        for key in keys:
-            foreign = self.made[key][1]
+        made: list[tuple[str, Any, Hosted]] = []
+        for key, (node, foreign) in tuple(self.made.items()):
+            if key in before:
+                continue
             if foreign is not None:
                 foreign.constructed()
-        return keys
+            made.append((key, node, foreign or cast("LifecycleNode", node).lifecycle))
+        return tuple(made)
 
     def _check(self, planned: PlannedNode, what: Callable[..., Any], returned: object) -> None:
         reference = planned.run.python

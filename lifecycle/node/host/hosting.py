@@ -448,9 +448,7 @@ class Host:
     def _construct(self, planned: PlannedNode, maker: Callable[..., Any]) -> None:
         group = [each for each in self._spec.nodes if each.run == planned.run]
         by_key = {each.key: each for each in group}
-        for key in self._adoption.make(planned, group, maker):
-            node, foreign = self._adoption.made[key]
-            hosted: Hosted = foreign or node.lifecycle
+        for key, node, hosted in self._adoption.make(planned, group, maker):
             self._nodes[by_key[key].full_name] = hosted
             if by_key[key].managed:
                 hosted.add_listener(self._report_state)

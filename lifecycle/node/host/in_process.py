@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any
 
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, ShutdownException
@@ -37,9 +37,6 @@ from lifecycle.node.host.hosting import maker_of
 from lifecycle.node.lifecycle.execution import Result
 from lifecycle.node.lifecycle.machine import CallbackOutcome
 from lifecycle.plan import PlannedNode
-
-if TYPE_CHECKING:
-    from lifecycle.node.author.node import LifecycleNode
 
 WAIT_S = 10.0
 """For a message, an answer or a log line; it ends with what is waited for."""
@@ -95,11 +92,14 @@ class NodeInProcess:
         self.watching = Watching()
         self._executor.add_node(self.watching)
         try:
-            self.node, self._hosted, self._all = self._construct(planned, group, maker)
+            made = self._construct(planned, group, maker)
         except BaseException:
             self._executor.shutdown()
             self._context.try_shutdown()
             raise
+        self._all: list[tuple[Node, Hosted]] = [(node, hosted) for _, node, hosted in made]
+        self.node: Any
+        ((self.node, self._hosted),) = (each[1:] for each in made if each[0] == planned.key)
         self.peer = Node("lifecycle_test_peer", context=self._context, enable_rosout=False)
         self._make_peers()
         for node, hosted in self._all:
@@ -111,8 +111,8 @@ class NodeInProcess:
 
     def _construct(
         self, planned: PlannedNode, group: Sequence[PlannedNode], maker: Callable[..., Any]
-    ) -> tuple[Any, Hosted, tuple[tuple[Node, Hosted], ...]]:
-        """Make the nodes as a host does; return the one asked for, and all."""
+    ) -> tuple[tuple[str, Any, Hosted], ...]:
+        """Make the nodes as a host does."""
 
         @contextlib.contextmanager
         def carrying(each: PlannedNode) -> Iterator[Context]:
@@ -127,14 +127,9 @@ class NodeInProcess:
         adoption = Adoption(carrying, self, mode=Mode.MANUAL)
         follow_no_more = follow_nodes(adoption)
         try:
-            adoption.make(planned, group or (planned,), maker)
+            return adoption.make(planned, group or (planned,), maker)
         finally:
             follow_no_more()
-        made: dict[str, tuple[Any, Hosted]] = {
-            key: (node, foreign or cast("LifecycleNode", node).lifecycle)
-            for key, (node, foreign) in adoption.made.items()
-        }
-        return (*made[planned.key], tuple(made.values()))
 
     # What runs the callbacks of nodes that are not ours.
 

@@ -21,7 +21,7 @@ import threading
 import traceback
 import typing
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any, NoReturn, cast
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import rclpy
 from rclpy.signals import SignalHandlerOptions
@@ -227,9 +227,8 @@ def _adopt(
 
     adoption = Adoption(carrying, loop, mode=mode, use_global_arguments=True)
     follow_nodes(adoption)
-    adoption.make(spec, [spec], maker)
-    node, foreign = adoption.made[spec.key]
-    return node, foreign or cast("LifecycleNode", node).lifecycle
+    ((_, node, hosted),) = adoption.make(spec, [spec], maker)
+    return node, hosted
 
 
 async def _bring_up(hosted: Hosted, loop: NodeLoop, report: Callable[[str], None]) -> None:
