@@ -53,7 +53,6 @@ from lifecycle.node.connections.connections import Connection, Connections
 from lifecycle.node.connections.data_layer import NodeDataLayer
 from lifecycle.node.endpoints.making import CLIENTS
 from lifecycle.node.endpoints.mapping import Mapping, count_peers, wire_name
-from lifecycle.node.lifecycle.machine import NodeState
 from lifecycle.plan import PARADIGMS, SERIALIZATIONS, PlannedEndpoint, PlannedNode
 from lifecycle.verify import (
     ConnectionReport,
@@ -134,54 +133,32 @@ _GID_PREFIX_DIGITS = 24
 """A DDS GUID is a 12-byte participant prefix and a 4-byte entity id (DDSI-RTPS §9.3.1)."""
 
 
-def collect(
-    node: Node,
-    state: NodeState,
-    spec: PlannedNode,
-    data_layer: NodeDataLayer,
-    undeclared: Iterable[tuple[EndpointKind, Any]],
-    *,
-    health: HealthReport | None = None,
-) -> NodeConfiguration:
-    """Return the configuration of `node` as it is now.
+def endpoint_reports(
+    node: Node, data_layer: NodeDataLayer, undeclared: Iterable[tuple[EndpointKind, Any]]
+) -> tuple[EndpointReport, ...]:
+    """Return what the endpoints of one of our nodes are now.
 
     Args:
         node: the node itself.
-        state: of its state machine.
-        spec: what it was planned to be.
         data_layer: its declared endpoints and their entities.
         undeclared: kind and rclpy object of endpoints that its code made by itself.
-        health: what it says of itself; None if it says nothing.
     """
-    endpoints = (
+    return (
         *(_report(node, mapping) for mapping in data_layer.mappings),
         *(_undeclared_report(node, kind, entity) for kind, entity in undeclared),
     )
-    return _document(
-        node,
-        state.seen.label,
-        connected=state.connected,
-        endpoints=endpoints,
-        connections=connection_reports(spec, data_layer),
-        health=health,
-    )
 
 
-def collect_foreign(
+def foreign_reports(
     node: Node,
-    state: str,
-    *,
-    connected: bool,
     spec: PlannedNode,
     connections: Connections,
     endpoints: Iterable[tuple[EndpointKind, Any, Connection]],
-) -> NodeConfiguration:
-    """Return the configuration of a node of which the class is not ours, as it is now.
+) -> tuple[tuple[EndpointReport, ...], tuple[ConnectionReport, ...]]:
+    """Return what endpoints and connections of a node are now of which the class is not ours.
 
     Args:
         node: the node itself.
-        state: lifecycle_msgs/State label; empty for a plain node.
-        connected: its data layer is made.
         spec: what it was planned to be.
         connections: its participant, and those that give endpoints flows of their own.
         endpoints: kind, rclpy object and connection of what it has made.
@@ -206,15 +183,8 @@ def collect_foreign(
         )
         for each in declared.values()
     ]
-    return _document(
-        node,
-        state,
-        connected=connected,
-        endpoints=tuple(reports),
-        connections=tuple(
-            _foreign_connection(each, spec, reports)
-            for each in (connections.own, *connections.named)
-        ),
+    return tuple(reports), tuple(
+        _foreign_connection(each, spec, reports) for each in (connections.own, *connections.named)
     )
 
 
@@ -240,7 +210,7 @@ def _foreign_connection(
     )
 
 
-def _document(
+def collect(
     node: Node,
     state: str,
     *,
@@ -249,6 +219,16 @@ def _document(
     connections: tuple[ConnectionReport, ...],
     health: HealthReport | None = None,
 ) -> NodeConfiguration:
+    """Return the configuration of `node` as it is now.
+
+    Args:
+        node: the node itself.
+        state: lifecycle_msgs/State label; empty for a plain node.
+        connected: its data layer is made.
+        endpoints: what they are now.
+        connections: likewise.
+        health: what it says of itself; None if it says nothing.
+    """
     name, prefix = node.get_fully_qualified_name(), _gid_prefix(node)
     vouch_for(prefix)  # before it is answered with
     configuration = NodeConfiguration(

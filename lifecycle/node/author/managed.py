@@ -349,10 +349,10 @@ class Managed:
         undeclared = self.undeclared.beside(self.data_layer.entities)
         return configuration.collect(
             self._node,
-            self.state,
-            self.spec,
-            self.data_layer,
-            undeclared,
+            self.state.seen.label,
+            connected=self.state.connected,
+            endpoints=configuration.endpoint_reports(self._node, self.data_layer, undeclared),
+            connections=configuration.connection_reports(self.spec, self.data_layer),
             health=self._health.report,
         )
 

@@ -428,17 +428,22 @@ class ForeignNode:
         """Return its identity and its endpoints as they are."""
         if self._connections.own.has_shared_memory is None:
             self._connections.look_at_shared_memory()
-        reported = self.reported
-        return configuration.collect_foreign(
+        reported, own = self.reported, self._connections.own
+        endpoints, connections = configuration.foreign_reports(
+            self._node,
+            self._spec,
+            self._connections,
+            (
+                (kind, entity, self._apart.get(id(entity), own))
+                for kind, entity in self._made.beside(())
+            ),
+        )
+        return configuration.collect(
             self._node,
             reported.label,
             connected=reported.connected,
-            spec=self._spec,
-            connections=self._connections,
-            endpoints=(
-                (kind, entity, self._apart.get(id(entity), self._connections.own))
-                for kind, entity in self._made.beside(())
-            ),
+            endpoints=endpoints,
+            connections=connections,
         )
 
     @property
