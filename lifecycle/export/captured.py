@@ -540,9 +540,7 @@ def _report_of(
     endpoint: ObservedEndpoint, reports: Iterable[EndpointReport]
 ) -> EndpointReport | None:
     same = [
-        each
-        for each in reports
-        if each.kind is endpoint.kind and endpoint.name in (each.resolved, *each.aliases)
+        each for each in reports if each.kind is endpoint.kind and endpoint.name == each.resolved
     ]
     exact = [each for each in same if each.gid and each.gid == endpoint.gid]
     return next(iter([*exact, *same]), None)

@@ -32,7 +32,6 @@ from lifecycle.graph.model import (
     EventKind,
     GraphEvent,
     Member,
-    names_of,
 )
 from lifecycle.graph.scheduler import Deadlines, Remove, Scheduler
 from lifecycle.graph.transport import GraphTransport
@@ -108,8 +107,7 @@ def _places(event: GraphEvent) -> Iterator[tuple[EventKind, About]]:
     yield event.kind, None
     yield event.kind, event.node
     if event.endpoint is not None:
-        for name in names_of(event.endpoint):
-            yield event.kind, (event.endpoint.kind, name)
+        yield event.kind, (event.endpoint.kind, event.endpoint.resolved)
 
 
 SILENT_AFTER_S = 7.0

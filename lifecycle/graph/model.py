@@ -163,7 +163,7 @@ class EndpointIndex:
         )
 
     def named(self, kind: EndpointKind, name: str) -> tuple[Owned, ...]:
-        """Return the endpoints of a kind that have this resolved name, or have it as an alias."""
+        """Return the endpoints of a kind that have this resolved name."""
         return tuple(self._by_name.get((kind, name), {}).values())
 
     def names(self, kind: EndpointKind) -> tuple[str, ...]:
@@ -172,20 +172,13 @@ class EndpointIndex:
 
     def _put(self, node: str, key: _Key, endpoint: EndpointReport) -> None:
         owned = Owned(node=node, endpoint=endpoint)
-        for name in names_of(endpoint):
-            self._by_name.setdefault((endpoint.kind, name), {})[node, key] = owned
+        self._by_name.setdefault((endpoint.kind, endpoint.resolved), {})[node, key] = owned
 
     def _drop(self, node: str, key: _Key, endpoint: EndpointReport) -> None:
-        for name in names_of(endpoint):
-            place = (endpoint.kind, name)
-            self._by_name[place].pop((node, key), None)
-            if not self._by_name[place]:
-                del self._by_name[place]
-
-
-def names_of(endpoint: EndpointReport) -> tuple[str, ...]:
-    """Return the fully qualified names by which an endpoint can be reached, without doubles."""
-    return tuple(dict.fromkeys((endpoint.resolved, *endpoint.aliases)))
+        place = (endpoint.kind, endpoint.resolved)
+        self._by_name[place].pop((node, key), None)
+        if not self._by_name[place]:
+            del self._by_name[place]
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

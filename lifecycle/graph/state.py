@@ -262,7 +262,7 @@ class GraphState:
         return () if view is None else view.connections
 
     def publishers_of(self, topic: str) -> tuple[End, ...]:
-        """Return who publishes a topic (fully qualified), aliases included."""
+        """Return who publishes a topic (fully qualified)."""
         return self.endpoints(EndpointKind.PUBLISHER, topic)
 
     def subscriptions_of(self, topic: str) -> tuple[End, ...]:

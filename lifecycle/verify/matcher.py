@@ -300,13 +300,12 @@ def _match_node(
             )
     rest = [endpoint for place, pool in pools.items() if place not in used for endpoint in pool]
     rest += [
-        _as_observed(node, actual.report, name)
+        _as_observed(node, actual.report, actual.report.resolved)
         for actual in matched.values()
         if actual.report is not None
-        for name in (actual.report.resolved, *actual.report.aliases)
-        if name != actual.planned.resolved
-        and _is_there(actual.report, name)
-        and (actual.report.kind, name) not in places
+        and actual.report.resolved != actual.planned.resolved
+        and _is_there(actual.report, actual.report.resolved)
+        and (actual.report.kind, actual.report.resolved) not in places
     ]
     rest += [
         _as_observed(node, report, report.resolved)
@@ -376,7 +375,7 @@ def _pick_observed(
 
 def _is_there(report: EndpointReport, name: str) -> bool:
     """Return whether a node reports an endpoint under a name; it may have been remapped."""
-    return report.mapped and not report.error and name in (report.resolved, *report.aliases)
+    return report.mapped and not report.error and name == report.resolved
 
 
 def _as_observed(node: PlannedNode, report: EndpointReport, name: str) -> ObservedEndpoint:

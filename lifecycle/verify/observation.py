@@ -64,7 +64,6 @@ class EndpointReport:
         connection: name of the connection it is mapped onto; empty for the node's own participant,
             or while it is mapped nowhere.
         mapped: it exists on a connection.
-        aliases: fully qualified further names that it was given while running.
         lossy: the node's hint: its data bear an unreliable transport; None without one.
         size_bytes: the node's hint: its largest serialized message; None without one.
         type_hash: of the definition that it was made with (REP-2016), of publishers and
@@ -87,7 +86,6 @@ class EndpointReport:
     error: str = ""
     connection: str = ""
     mapped: bool = False
-    aliases: tuple[str, ...] = ()
     lossy: bool | None = None
     size_bytes: Count | None = None
     type_hash: str | None = None

@@ -118,7 +118,6 @@ OUR_SERVICES: Mapping[str, str] = {
     "map_to": "rcl_interfaces/srv/SetParameters",
     "disconnect": "rcl_interfaces/srv/SetParameters",
     "remap": "rcl_interfaces/srv/SetParameters",
-    "alias": "rcl_interfaces/srv/SetParameters",
 }
 """Services that nodes of ours offer besides. The names are common and the types standard, so
 that a node counts as ours only with the two that no other node has together, `OURS_BY`."""

@@ -241,8 +241,6 @@ def _given_name(view: View, endpoint: ObservedEndpoint) -> str:
         if report is None or report.kind is not endpoint.kind:
             continue
         declared = f"{report.kind.value}/{report.name}"
-        if endpoint.name in report.aliases:
-            return f"it is an alias of {declared}: see who called {endpoint.node}/alias"
         if endpoint.name == report.resolved != actual.planned.resolved:
             return (
                 f"it is {declared} under another name: is a remap wrong, or was "

@@ -273,17 +273,6 @@ def test_a_state_that_begins_late_learns_who_is_there_already(followed: Followed
     assert late.state.nodes() == followed.state.nodes()
 
 
-def test_an_endpoint_is_found_by_its_aliases_too(followed: Followed) -> None:
-    aliased = dataclasses.replace(endpoint(1, "/t"), aliases=("/also",))
-    followed.state.put_configuration(configuration("/given", aliased))
-    followed.settle()
-    for topic in ("/t", "/also"):
-        assert [end.node.name for end in followed.state.publishers_of(topic)] == ["/given"]
-    followed.state.put_configuration(configuration("/given", endpoint(1, "/t")))
-    followed.settle()
-    assert followed.state.publishers_of("/also") == ()
-
-
 UDP = NetworkFlowEndpoint(
     transport_protocol=TransportProtocol.UDP,
     internet_protocol=InternetProtocol.IPV4,

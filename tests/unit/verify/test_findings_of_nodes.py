@@ -423,21 +423,6 @@ at robot.lifecycle.yaml:3:3, on /robot/camera (publisher)
 to do: /robot/status of the same type is missing: is a remap or a name wrong?
 """,
     ),
-    "an alias": (
-        Case(
-            "graph.undeclared-publisher",
-            both(
-                add_endpoint(PUB, "/robot/camera", "/copy", gid="99"),
-                change_report(PUB, STATUS, aliases=("/copy",)),
-            ),
-        ),
-        """\
-violated graph.undeclared-publisher: /copy
-expected no such publisher of /robot/camera, observed publisher of type std_msgs/msg/String
-at robot.lifecycle.yaml:3:3, on /robot/camera (publisher)
-to do: it is an alias of publishers/status: see who called /robot/camera/alias
-""",
-    ),
     "another name": (
         Case(
             "graph.undeclared-publisher",
@@ -785,22 +770,6 @@ to do: /b of the same type is missing: is a remap or a name wrong?
 violated graph.undeclared-publisher: /robot/status
 expected no such publisher of /robot/camera, observed publisher of type std_msgs/msg/String
 at robot.lifecycle.yaml:3:3, on /robot/camera (publisher)
-""",
-    ),
-    "an alias of a service whose node leaves others out of its report": (
-        Case(
-            "graph.undeclared-service-server",
-            both(
-                drop_endpoint_report(PUB, "/robot/video"),
-                change_report(SERVER, CALIBRATE, aliases=("/copy",)),
-            ),
-        ),
-        """\
-violated graph.undeclared-service-server: /copy
-expected no such service server of /robot/camera, observed service server of type
-  std_srvs/srv/Trigger
-at robot.lifecycle.yaml:3:3, on /robot/camera (service server)
-to do: it is an alias of service_servers/~/calibrate: see who called /robot/camera/alias
 """,
     ),
     "parts of services of two definitions, and as many as are not": (

@@ -133,7 +133,7 @@ def test_an_endpoint_that_somebody_made_is_not_noise(
     assert not is_noise_endpoint(kind, node, name, type_, ours=True)
 
 
-@pytest.mark.parametrize("base", ["connect_to", "map_to", "disconnect", "remap", "alias"])
+@pytest.mark.parametrize("base", ["connect_to", "map_to", "disconnect", "remap"])
 def test_a_service_of_the_node_interface_is_noise_on_a_node_of_ours_alone(base: str):
     service = (SERVER, "/a", f"/a/{base}", SET_PARAMETERS)
     assert is_noise_endpoint(*service, ours=True)

@@ -564,7 +564,6 @@ def test_an_endpoint_that_a_node_may_make_is_no_finding_but_listed() -> None:
 
 
 REMAPPED = change_report(PUB, "/video", resolved="/stage/video")
-ALIASED = change_report(PUB, "/video", aliases=("/copy",))
 
 
 @pytest.mark.parametrize("shown", ["shown", "hidden"])
@@ -577,15 +576,3 @@ def test_a_publisher_that_was_remapped_is_missing_whether_or_not_discovery_shows
         ("graph.missing-endpoint", "violated", "/video"),
         ("graph.undeclared-publisher", "violated", "/stage/video"),
     ]
-
-
-def test_an_open_node_may_be_given_aliases():
-    plan = dataclasses.replace(
-        PLAN,
-        nodes=tuple(
-            dataclasses.replace(each, endpoint_policy=EndpointPolicy.OPEN) for each in PLAN.nodes
-        ),
-    )
-    verdict = verify(plan, ALIASED(perfect(plan)), stage=Stage.CONNECTED)
-    assert verdict.findings == ()
-    assert [each.name for each in verdict.open_endpoints] == ["/copy"]
