@@ -23,7 +23,9 @@ from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 from rclpy.exceptions import InvalidHandle
+from rclpy.node import Node
 from rclpy.utilities import get_rmw_implementation_identifier
+from std_srvs.srv import Trigger
 
 from lifecycle import codec, dataclasses
 from lifecycle.errors import MiddlewareError
@@ -63,7 +65,7 @@ from lifecycle.verify import (
 )
 
 if TYPE_CHECKING:
-    from rclpy.node import Node
+    from rclpy.callback_groups import CallbackGroup
 
     from lifecycle.node.lifecycle.gate import Later
 
@@ -275,10 +277,19 @@ def connection_reports(
     return (*made, *failed)
 
 
-def to_json(configuration: NodeConfiguration) -> str:
-    """Return the document that `~/get_configuration` answers with."""
-    document: bytes = codec.to_json(configuration)
-    return document.decode()
+def serve(node: Node, collect: Callable[[], NodeConfiguration], group: CallbackGroup) -> None:
+    """Offer `~/get_configuration`, which answers with the document as JSON, in every state."""
+
+    def describe(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        try:
+            response.message = codec.to_json(collect()).decode()
+            response.success = True
+        except Exception as error:  # noqa: BLE001 - asking must not end the node
+            node.get_logger().error(traceback.format_exc())
+            response.message = f"cannot describe this node: {error!r}"
+        return response
+
+    Node.create_service(node, Trigger, "~/get_configuration", describe, callback_group=group)
 
 
 def _report(node: Node, mapping: Mapping) -> EndpointReport:

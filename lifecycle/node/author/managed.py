@@ -219,9 +219,9 @@ class Managed:
                 state_machine=self._controller.machine,
                 change=self._change_by_service,
                 refuse=node.get_logger().warning,
-                configuration=lambda: configuration.to_json(self.get_configuration()),
                 group=self._turns.group,
             )
+            configuration.serve(node, self.get_configuration, self._turns.group)
         self._remote = RemoteInterface(
             node, self.data_layer, log=node.get_logger().error, group=self._turns.group
         )

@@ -16,7 +16,6 @@ import collections
 import contextlib
 import inspect
 import time
-import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NoReturn, Protocol, cast
 
@@ -32,7 +31,6 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.serialization import serialize_message
 from rclpy.time_source import TimeSource
-from std_srvs.srv import Trigger
 
 from lifecycle.errors import BringUpError, LifecycleError
 from lifecycle.manifest import EndpointKind
@@ -248,9 +246,7 @@ class ForeignNode:
         """Offer what others know our nodes by; the host answers, also while the node is held."""
         before = set(self._node.services)
         self._is_ours = True
-        Node.create_service(
-            self._node, Trigger, "~/get_configuration", self._describe, callback_group=self._group
-        )
+        configuration.serve(self._node, self.get_configuration, self._group)
         immovable: Any = Immovable(self.full_name)
         remote = RemoteInterface(
             self._node, immovable, log=self._node.get_logger().error, group=self._group
@@ -260,15 +256,6 @@ class ForeignNode:
         services = tuple(each for each in self._node.services if each not in before)
         self._watching.take_services(self._node, services)
         return services
-
-    def _describe(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        try:
-            response.message = configuration.to_json(self.get_configuration())
-            response.success = True
-        except Exception as error:  # noqa: BLE001 - asking must not end the node
-            self.complain(traceback.format_exc())
-            response.message = f"cannot describe this node: {error!r}"
-        return response
 
     @property
     def full_name(self) -> str:

@@ -9,7 +9,6 @@ state does not allow is answered with success=False; it never raises.
 
 from __future__ import annotations
 
-import traceback
 from collections.abc import Callable, Coroutine, Iterable
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +18,6 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.timer import Timer
-from std_srvs.srv import Trigger
 
 from lifecycle.node.lifecycle import machine
 from lifecycle.node.lifecycle.machine import LifecycleMachine, TransitionRequest
@@ -41,7 +39,6 @@ class LifecycleServices:
         state_machine: LifecycleMachine,
         change: Callable[[TransitionRequest], Coroutine[Any, Any, bool]],
         refuse: Callable[[str], None],
-        configuration: Callable[[], str],
         group: CallbackGroup,
     ) -> None:
         """Create the services and the event publisher on `node`.
@@ -51,13 +48,11 @@ class LifecycleServices:
             state_machine: its state; only read.
             change: runs a transition, returns whether it succeeded.
             refuse: called with why a request that names no available transition was refused.
-            configuration: returns the node configuration document, JSON.
             group: must be reentrant, so that others can ask while a transition runs.
         """
         self._machine = state_machine
         self._change = change
         self._refuse = refuse
-        self._configuration = configuration
         # Not through our node's own create_publisher: this one must work in every state.
         self._events = Node.create_publisher(
             node, msg.TransitionEvent, "~/transition_event", _TRANSITION_EVENT_DEPTH
@@ -72,7 +67,6 @@ class LifecycleServices:
                 self._get_available_transitions,
             ),
             (srv.GetAvailableTransitions, "get_transition_graph", self._get_transition_graph),
-            (Trigger, "get_configuration", self._get_configuration),
         ):
             Node.create_service(node, type_, f"~/{name}", callback, callback_group=group)
 
@@ -136,20 +130,6 @@ class LifecycleServices:
         response: srv.GetAvailableTransitions.Response,
     ) -> srv.GetAvailableTransitions.Response:
         response.available_transitions = _descriptions(machine.TRANSITION_GRAPH)
-        return response
-
-    def _get_configuration(
-        self,
-        request: Trigger.Request,  # noqa: ARG002
-        response: Trigger.Response,
-    ) -> Trigger.Response:
-        try:
-            response.message = self._configuration()
-        except Exception as error:  # noqa: BLE001 - asking must not end the node
-            self._refuse(traceback.format_exc())
-            response.message = f"cannot describe this node: {error!r}"
-            return response
-        response.success = True
         return response
 
 
