@@ -228,7 +228,7 @@ def collect(
         state: lifecycle_msgs/State label; empty for a plain node.
         connected: its data layer is made.
         endpoints: what they are now.
-        connections: likewise.
+        connections: what they are now, the node's own participant first.
         health: what it says of itself; None if it says nothing.
     """
     name, prefix = node.get_fully_qualified_name(), _gid_prefix(node)

@@ -32,7 +32,7 @@ class EndpointTable:
         changed: called when the node configuration has changed.
 
     Attributes:
-        changed: likewise.
+        changed: called when the node configuration has changed.
         mappings: every declared endpoint, in the order of declaration.
     """
 
