@@ -23,7 +23,7 @@ from lifecycle.manifest import EndpointKind, did_you_mean
 
 _MOST_BYTES = 4 * 2**20
 _MOST_IMPORTS = 20
-_DYNAMIC = ("import *", "__getattr__", "globals()", "vars()", "exec(", "setattr(sys.modules")
+_DYNAMIC = ("import *", "__getattr__", "globals()", "vars()", "exec(", "sys.modules")
 
 _HANDLERS = {
     "on_message": EndpointKind.SUBSCRIPTION,
