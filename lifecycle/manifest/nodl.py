@@ -226,13 +226,18 @@ class _NodlReading:
         self.found += reader.found
         self.endpoints += reader.interface.endpoints
         self.parameters += reader.interface.parameters
-        for index, each in enumerate(Cursor.root(document).items("include")):
-            place: Place = ("include", index, "ref")
-            ref = document.find(place)
+        includes = document.find(("include",))
+        listed = includes.data if includes else ()
+        if not isinstance(listed, tuple):
+            self._error("invalid", document.at(("include",)), "cannot include what is no list")
+            return
+        for index in range(len(listed)):
+            where = document.at(("include", index, "ref"))
+            ref = document.find(("include", index, "ref"))
             if ref is not None and isinstance(ref.data, str) and ref.data:
-                self.follow(ref.data, path.parent, document.at(place), (*chain, identity))
+                self.follow(ref.data, path.parent, where, (*chain, identity))
             else:
-                self._error("invalid", each.at, "cannot do without the key 'ref' in an include")
+                self._error("invalid", where, "cannot do without the key 'ref' in an include")
 
     def report_collisions(self) -> None:
         """Refuse a name that two entries of one list declare (nodl.schema.yaml, `include`)."""

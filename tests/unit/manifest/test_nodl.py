@@ -190,7 +190,8 @@ def test_json_is_read_as_well(tmp_path: Path) -> None:
                 "2:82 nodl.unchecked parameters.c.type",
             ],
         ),
-        ("nodl_version: 2\ninclude: [{file: a}]", ["2:11 nodl.invalid include[0]"]),
+        ("nodl_version: 2\ninclude: [{file: a}]", ["2:11 nodl.invalid include[0].ref"]),
+        ("nodl_version: 2\ninclude: {ref: a}", ["2:10 nodl.invalid include"]),
     ],
 )
 def test_what_breaks_a_document_is_an_error_and_what_is_unknown_a_warning(
