@@ -49,48 +49,41 @@ class _Bench:
         return found
 
 
-def test_a_node_that_somebody_activates_is_deactivated_at_once_and_found(tmp_path: Path) -> None:
-    async def main() -> None:
-        bench = _Bench(tmp_path)
-        assert await bench.looked() == ["state.activated-at-closed-gate"]
-        assert bench.services.requests == ["deactivate"]
-        assert bench.guard.findings() == ()
-        assert bench.world.system.touched.is_set()
-        (notice,) = bench.world.heard(Notice)
-        assert notice.message == (
-            "'/base' was activated by its own code or another client while the gate is closed: "
-            "it is deactivated"
-        )
-
-    run(main())
-
-
-def test_whoever_activates_it_again_and_again_is_not_fought_for_ever(tmp_path: Path) -> None:
-    async def main() -> None:
-        bench = _Bench(tmp_path)
-        for _ in range(TRIES + 3):
-            await bench.looked()
-        assert bench.services.requests == ["deactivate"] * TRIES
-        assert bench.world.heard(Notice)[-1].message.endswith(
-            f"it is deactivated for the last time, after {TRIES - 1} times in vain"
-        )
-
-    run(main())
-
-
-def test_what_the_gate_let_through_is_left_alone_and_so_is_what_was_not_brought_up(
+async def test_a_node_that_somebody_activates_is_deactivated_at_once_and_found(
     tmp_path: Path,
 ) -> None:
-    async def main() -> None:
-        bench = _Bench(tmp_path)
-        bench.node.undo.append(Operation.ACTIVATE)
-        assert await bench.looked() == []
-        bench.node.undo.clear()
-        bench.node.advance(Reach.STARTED)
-        assert await bench.looked() == []
-        assert bench.services.requests == []
+    bench = _Bench(tmp_path)
+    assert await bench.looked() == ["state.activated-at-closed-gate"]
+    assert bench.services.requests == ["deactivate"]
+    assert bench.guard.findings() == ()
+    assert bench.world.system.touched.is_set()
+    (notice,) = bench.world.heard(Notice)
+    assert notice.message == (
+        "'/base' was activated by its own code or another client while the gate is closed: "
+        "it is deactivated"
+    )
 
-    run(main())
+
+async def test_whoever_activates_it_again_and_again_is_not_fought_for_ever(tmp_path: Path) -> None:
+    bench = _Bench(tmp_path)
+    for _ in range(TRIES + 3):
+        await bench.looked()
+    assert bench.services.requests == ["deactivate"] * TRIES
+    assert bench.world.heard(Notice)[-1].message.endswith(
+        f"it is deactivated for the last time, after {TRIES - 1} times in vain"
+    )
+
+
+async def test_what_the_gate_let_through_is_left_alone_and_so_is_what_was_not_brought_up(
+    tmp_path: Path,
+) -> None:
+    bench = _Bench(tmp_path)
+    bench.node.undo.append(Operation.ACTIVATE)
+    assert await bench.looked() == []
+    bench.node.undo.clear()
+    bench.node.advance(Reach.STARTED)
+    assert await bench.looked() == []
+    assert bench.services.requests == []
 
 
 class _Graph:

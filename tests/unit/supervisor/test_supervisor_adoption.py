@@ -56,109 +56,95 @@ def notices(world: SessionWorld) -> list[str]:
     return sorted(line for line in world.story if line.startswith("[notice]"))
 
 
-def test_what_runs_is_verified_in_place_and_in_the_end_as_it_was_found(tmp_path: Path) -> None:
-    async def main() -> None:
-        world = world_of(tmp_path, stop_after_s=3.0)
-        world.graph.pids["/lidar"] = 7
-        await world.run()
-        assert world.result is not None
-        assert world.result.exit_code == ExitCode.OK
-        assert notices(world) == ADOPTED
-        assert [each for each in world.outline if each.endswith("start")] == ["camera start"]
-        assert "[gate] ok: /camera, /new, /arm" in world.outline
-        assert requests(world, "/lidar") == requests(world, "/logger") == []
-        assert requests(world, "/arm") == ["activate", "deactivate"]
-        assert requests(world, "/new") == ["configure", "activate", "deactivate", "cleanup"]
-        assert world.graph.others == FOUND
-
-    run(main())
-
-
-def test_on_a_violated_verdict_nothing_is_activated_and_all_is_left_as_it_was_found(
+async def test_what_runs_is_verified_in_place_and_in_the_end_as_it_was_found(
     tmp_path: Path,
 ) -> None:
-    async def main() -> None:
-        world = world_of(tmp_path)
-        world.intrude()
-        await world.run()
-        assert world.result is not None
-        assert world.result.exit_code == ExitCode.VIOLATED
-        assert f"[verdict] connected violated {INTRUDED}" in world.outline
-        assert not [each for each in world.outline if each.endswith(" activate")]
-        assert world.graph.others == {**FOUND, "/intruder": ""}
+    world = world_of(tmp_path, stop_after_s=3.0)
+    world.graph.pids["/lidar"] = 7
+    await world.run()
+    assert world.result is not None
+    assert world.result.exit_code == ExitCode.OK
+    assert notices(world) == ADOPTED
+    assert [each for each in world.outline if each.endswith("start")] == ["camera start"]
+    assert "[gate] ok: /camera, /new, /arm" in world.outline
+    assert requests(world, "/lidar") == requests(world, "/logger") == []
+    assert requests(world, "/arm") == ["activate", "deactivate"]
+    assert requests(world, "/new") == ["configure", "activate", "deactivate", "cleanup"]
+    assert world.graph.others == FOUND
 
-    run(main())
 
-
-def test_a_node_that_runs_twice_is_violated_before_anything_is_started_or_asked(
+async def test_on_a_violated_verdict_nothing_is_activated_and_all_is_left_as_it_was_found(
     tmp_path: Path,
 ) -> None:
-    async def main() -> None:
-        world = world_of(tmp_path)
-        world.graph.twice = {"/new"}
-        await world.run()
-        assert world.outline == [
-            "[verdict] connected violated graph.duplicate-node /new",
-            "[stopping] at 0.0 s: the verdict keeps the gate closed",
-            *over(4),
-        ]
-        assert world.messages == ["cannot adopt /new: 2 nodes are named so"]
-        assert world.report == (
-            "ended before it was connected, exit code 4: the verdict keeps the gate closed; "
-            "wrong: /new (graph.duplicate-node)"
+    world = world_of(tmp_path)
+    world.intrude()
+    await world.run()
+    assert world.result is not None
+    assert world.result.exit_code == ExitCode.VIOLATED
+    assert f"[verdict] connected violated {INTRUDED}" in world.outline
+    assert not [each for each in world.outline if each.endswith(" activate")]
+    assert world.graph.others == {**FOUND, "/intruder": ""}
+
+
+async def test_a_node_that_runs_twice_is_violated_before_anything_is_started_or_asked(
+    tmp_path: Path,
+) -> None:
+    world = world_of(tmp_path)
+    world.graph.twice = {"/new"}
+    await world.run()
+    assert world.outline == [
+        "[verdict] connected violated graph.duplicate-node /new",
+        "[stopping] at 0.0 s: the verdict keeps the gate closed",
+        *over(4),
+    ]
+    assert world.messages == ["cannot adopt /new: 2 nodes are named so"]
+    assert world.report == (
+        "ended before it was connected, exit code 4: the verdict keeps the gate closed; "
+        "wrong: /new (graph.duplicate-node)"
+    )
+
+
+async def test_a_process_of_which_some_nodes_run_is_not_started_beside_them(tmp_path: Path) -> None:
+    plan = plan_of(planned_node("lidar", process="both"), planned_node("new", process="both"))
+    world = world_of(tmp_path, plan)
+    del world.graph.others["/new"]
+    await world.run()
+    assert world.outline == [
+        "[failure] run.start-failed /new",
+        "[stopping] at 0.0 s: rolling back",
+        *over(6),
+    ]
+    assert world.messages == [
+        (
+            "cannot start '/new': process 'both' is to run it with others, which run already; "
+            "end those and all are started, or start it with them"
         )
-
-    run(main())
-
-
-def test_a_process_of_which_some_nodes_run_is_not_started_beside_them(tmp_path: Path) -> None:
-    async def main() -> None:
-        plan = plan_of(planned_node("lidar", process="both"), planned_node("new", process="both"))
-        world = world_of(tmp_path, plan)
-        del world.graph.others["/new"]
-        await world.run()
-        assert world.outline == [
-            "[failure] run.start-failed /new",
-            "[stopping] at 0.0 s: rolling back",
-            *over(6),
-        ]
-        assert world.messages == [
-            (
-                "cannot start '/new': process 'both' is to run it with others, which run already; "
-                "end those and all are started, or start it with them"
-            )
-        ]
-
-    run(main())
+    ]
 
 
-def test_a_node_in_a_transition_is_adopted_as_what_it_becomes(tmp_path: Path) -> None:
-    async def main() -> None:
-        world = world_of(tmp_path, plan_of(planned_node("lidar")), stop_after_s=0.0)
-        world.graph.others["/lidar"] = "activating"
+async def test_a_node_in_a_transition_is_adopted_as_what_it_becomes(tmp_path: Path) -> None:
+    world = world_of(tmp_path, plan_of(planned_node("lidar")), stop_after_s=0.0)
+    world.graph.others["/lidar"] = "activating"
 
-        async def arrive() -> None:
-            await asyncio.sleep(1.0)
-            world.graph.others["/lidar"] = "active"
+    async def arrive() -> None:
+        await asyncio.sleep(1.0)
+        world.graph.others["/lidar"] = "active"
 
-        await world.run(arrive())
-        assert notices(world) == ["[notice] '/lidar' is adopted, found active"]
-        assert world.outline[-1] == "[stopped] 0"
-
-    run(main())
+    await world.run(arrive())
+    assert notices(world) == ["[notice] '/lidar' is adopted, found active"]
+    assert world.outline[-1] == "[stopped] 0"
 
 
-def test_what_is_found_active_and_must_not_be_is_violated_and_left_active(tmp_path: Path) -> None:
-    async def main() -> None:
-        lidar = dataclasses.replace(planned_node("lidar"), state=TargetState.INACTIVE)
-        world = world_of(tmp_path, plan_of(lidar))
-        await world.run()
-        assert "[verdict] connected violated state.wrong-state /lidar" in world.outline
-        assert world.outline[-1] == "[stopped] 4"
-        assert world.graph.others == {"/lidar": "active"}
-        assert requests(world, "/lidar") == []
-
-    run(main())
+async def test_what_is_found_active_and_must_not_be_is_violated_and_left_active(
+    tmp_path: Path,
+) -> None:
+    lidar = dataclasses.replace(planned_node("lidar"), state=TargetState.INACTIVE)
+    world = world_of(tmp_path, plan_of(lidar))
+    await world.run()
+    assert "[verdict] connected violated state.wrong-state /lidar" in world.outline
+    assert world.outline[-1] == "[stopped] 4"
+    assert world.graph.others == {"/lidar": "active"}
+    assert requests(world, "/lidar") == []
 
 
 def test_an_attached_node_that_is_active_is_refused_but_for_adopt(tmp_path: Path) -> None:
@@ -186,77 +172,64 @@ def test_an_attached_node_that_is_active_is_refused_but_for_adopt(tmp_path: Path
         run(main(folder, adopt=adopt))
 
 
-def test_a_pause_deactivates_what_was_found_active_and_a_resume_leaves_it_so(
+async def test_a_pause_deactivates_what_was_found_active_and_a_resume_leaves_it_so(
     tmp_path: Path,
 ) -> None:
-    async def main() -> None:
-        world = world_of(tmp_path, plan_of(planned_node("lidar")))
+    world = world_of(tmp_path, plan_of(planned_node("lidar")))
 
-        async def orders() -> None:
-            await world.story.until("[system] active")
-            for ask in (ControlRequest.PAUSE, ControlRequest.RESUME, ControlRequest.RESTART):
-                assert await world.order(ask) == "0"
-            assert await world.order(ControlRequest.RESTART, "lidar") == (
-                "2 cannot restart '/lidar': it is attached, no process of this supervisor"
-            )
-            await world.order(ControlRequest.DOWN)
+    async def orders() -> None:
+        await world.story.until("[system] active")
+        for ask in (ControlRequest.PAUSE, ControlRequest.RESUME, ControlRequest.RESTART):
+            assert await world.order(ask) == "0"
+        assert await world.order(ControlRequest.RESTART, "lidar") == (
+            "2 cannot restart '/lidar': it is attached, no process of this supervisor"
+        )
+        await world.order(ControlRequest.DOWN)
 
-        await world.run(orders())
-        assert requests(world, "/lidar") == ["deactivate", "activate"]
-        assert world.graph.others == {"/lidar": "active"}
-        assert world.outline[-1] == "[stopped] 0"
-
-    run(main())
+    await world.run(orders())
+    assert requests(world, "/lidar") == ["deactivate", "activate"]
+    assert world.graph.others == {"/lidar": "active"}
+    assert world.outline[-1] == "[stopped] 0"
 
 
-def test_what_is_adopted_is_judged_also_where_nothing_is_to_be_activated(tmp_path: Path) -> None:
-    async def main() -> None:
-        world = world_of(tmp_path, until=Until.CONNECTED)
-        await world.run()
-        assert [each for each in world.outline if each.startswith("[verdict]")] == [
-            "[verdict] connected ok"
-        ]
-        assert world.graph.others == FOUND
+async def test_what_is_adopted_is_judged_also_where_nothing_is_to_be_activated(
+    tmp_path: Path,
+) -> None:
+    world = world_of(tmp_path, until=Until.CONNECTED)
+    await world.run()
+    assert [each for each in world.outline if each.startswith("[verdict]")] == [
+        "[verdict] connected ok"
+    ]
+    assert world.graph.others == FOUND
 
-    run(main())
 
-
-def test_nothing_is_asked_of_a_node_that_ran_before_one_of_ours(
+async def test_nothing_is_asked_of_a_node_that_ran_before_one_of_ours(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Both have the services by which ours is driven."""
     older = "lifecycle.supervisor.nodes.adoption.start_ticks"
     monkeypatch.setattr(older, lambda pid: 1 if pid == 7 else 2)
 
-    async def main() -> None:
-        world = SessionWorld(plan_of(planned_node("new", kind=RunKind.COMMAND)), tmp_path)
-        world.graph.others["/new"] = "unconfigured"
-        world.graph.pids["/new"] = 7
-        await world.run()
-        assert world.outline == [
-            "[verdict] connected violated graph.duplicate-node /new",
-            "[stopping] at 0.0 s: the verdict keeps the gate closed",
-            "new SIGTERM",
-            *over(4),
-        ]
-        assert world.messages == [
-            (
-                "cannot drive /new: a node of this name ran before (pid 7, by hand), and would "
-                "obey, too"
-            )
-        ]
-
-    run(main())
+    world = SessionWorld(plan_of(planned_node("new", kind=RunKind.COMMAND)), tmp_path)
+    world.graph.others["/new"] = "unconfigured"
+    world.graph.pids["/new"] = 7
+    await world.run()
+    assert world.outline == [
+        "[verdict] connected violated graph.duplicate-node /new",
+        "[stopping] at 0.0 s: the verdict keeps the gate closed",
+        "new SIGTERM",
+        *over(4),
+    ]
+    assert world.messages == [
+        ("cannot drive /new: a node of this name ran before (pid 7, by hand), and would obey, too")
+    ]
 
 
-def test_another_manifest_starts_nothing_beside_what_is_adopted(tmp_path: Path) -> None:
-    async def main() -> None:
-        system = World(ROBOT, tmp_path).system
-        system.adopt({"lidar": ""})
-        system.take(ROBOT, tuple(system.nodes.values()))
-        assert sorted(system.processes) == ["arm", "camera", "logger", "new"]
-        lidar = system.nodes["lidar"]
-        assert (lidar.process, lidar.planned.run.kind) == (None, RunKind.ATTACH)
-        assert system.first == ROBOT
-
-    run(main())
+async def test_another_manifest_starts_nothing_beside_what_is_adopted(tmp_path: Path) -> None:
+    system = World(ROBOT, tmp_path).system
+    system.adopt({"lidar": ""})
+    system.take(ROBOT, tuple(system.nodes.values()))
+    assert sorted(system.processes) == ["arm", "camera", "logger", "new"]
+    lidar = system.nodes["lidar"]
+    assert (lidar.process, lidar.planned.run.kind) == (None, RunKind.ATTACH)
+    assert system.first == ROBOT

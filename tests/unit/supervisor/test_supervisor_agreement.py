@@ -94,100 +94,84 @@ WAITS = ("run.plan-unknown", Outcome.VIOLATED)
 UNKNOWN = ("run.plan-unknown", Outcome.UNVERIFIABLE)
 
 
-def test_who_planned_the_same_is_no_finding_and_who_did_not_is_named(tmp_path: Path) -> None:
-    async def test() -> None:
-        left = Left(tmp_path)
-        await left.hears(two_machines())
-        assert left.found() == []
-        await left.hears(two_machines(log_level="debug"))
-        assert left.found() == [DIFFER]
-        assert left.system.touched.is_set()
-        (finding,) = left.agreement.findings(VIEWER)
-        assert finding.subject == "the supervisor of machine 'right'"
-        await left.hears(two_machines())
-        assert left.found() == []
-        left.agreement.close()
-
-    run(test())
+async def test_who_planned_the_same_is_no_finding_and_who_did_not_is_named(tmp_path: Path) -> None:
+    left = Left(tmp_path)
+    await left.hears(two_machines())
+    assert left.found() == []
+    await left.hears(two_machines(log_level="debug"))
+    assert left.found() == [DIFFER]
+    assert left.system.touched.is_set()
+    (finding,) = left.agreement.findings(VIEWER)
+    assert finding.subject == "the supervisor of machine 'right'"
+    await left.hears(two_machines())
+    assert left.found() == []
+    left.agreement.close()
 
 
-def test_a_system_of_another_name_that_plans_our_nodes_differs(tmp_path: Path) -> None:
-    async def test() -> None:
-        left = Left(tmp_path)
-        await left.hears(two_machines("robbie"))
-        assert left.found() == [DIFFER]
-        (finding,) = left.agreement.findings(VIEWER)
-        assert finding.subject == "the supervisor of system 'robbie' on machine 'right'"
-        left.agreement.close()
-
-    run(test())
+async def test_a_system_of_another_name_that_plans_our_nodes_differs(tmp_path: Path) -> None:
+    left = Left(tmp_path)
+    await left.hears(two_machines("robbie"))
+    assert left.found() == [DIFFER]
+    (finding,) = left.agreement.findings(VIEWER)
+    assert finding.subject == "the supervisor of system 'robbie' on machine 'right'"
+    left.agreement.close()
 
 
-def test_a_machine_that_does_not_say_what_it_planned_is_waited_for_and_then_unverifiable(
+async def test_a_machine_that_does_not_say_what_it_planned_is_waited_for_and_then_unverifiable(
     tmp_path: Path,
 ) -> None:
-    async def test() -> None:
-        left = Left(tmp_path)
-        # Nobody is there: that its nodes are missing is for others to say.
-        assert left.found(NOBODY) == []
-        left.machines = frozenset({"right"})
-        assert left.found(NOBODY) == [WAITS]
-        left.system.touched.clear()
-        await asyncio.wait_for(left.system.touched.wait(), 2 * ANNOUNCED_S)
-        assert left.found(NOBODY) == [UNKNOWN]
-        await left.hears(two_machines())
-        assert left.found(NOBODY) == []
-        left.agreement.close()
-
-    run(test())
+    left = Left(tmp_path)
+    # Nobody is there: that its nodes are missing is for others to say.
+    assert left.found(NOBODY) == []
+    left.machines = frozenset({"right"})
+    assert left.found(NOBODY) == [WAITS]
+    left.system.touched.clear()
+    await asyncio.wait_for(left.system.touched.wait(), 2 * ANNOUNCED_S)
+    assert left.found(NOBODY) == [UNKNOWN]
+    await left.hears(two_machines())
+    assert left.found(NOBODY) == []
+    left.agreement.close()
 
 
-def test_nodes_that_are_there_without_any_supervisor_are_waited_for_too(tmp_path: Path) -> None:
-    async def test() -> None:
-        left = Left(tmp_path)
-        assert left.found(VIEWER) == [WAITS]
-        await left.hears(two_machines())
-        assert left.found(VIEWER) == []
-        left.agreement.close()
-
-    run(test())
-
-
-def test_who_planned_something_else_is_found_behind_one_that_planned_the_same(
+async def test_nodes_that_are_there_without_any_supervisor_are_waited_for_too(
     tmp_path: Path,
 ) -> None:
-    async def test() -> None:
-        left = Left(tmp_path)
-        await left.hears(two_machines())
-        await left.hears(two_machines(log_level="debug"), "far", run="3", host="h3")
-        assert left.found(VIEWER) == [DIFFER]
-        left.agreement.close()
-
-    run(test())
+    left = Left(tmp_path)
+    assert left.found(VIEWER) == [WAITS]
+    await left.hears(two_machines())
+    assert left.found(VIEWER) == []
+    left.agreement.close()
 
 
-def test_who_was_shut_down_is_the_reason_of_its_missing_nodes(tmp_path: Path) -> None:
+async def test_who_planned_something_else_is_found_behind_one_that_planned_the_same(
+    tmp_path: Path,
+) -> None:
+    left = Left(tmp_path)
+    await left.hears(two_machines())
+    await left.hears(two_machines(log_level="debug"), "far", run="3", host="h3")
+    assert left.found(VIEWER) == [DIFFER]
+    left.agreement.close()
+
+
+async def test_who_was_shut_down_is_the_reason_of_its_missing_nodes(tmp_path: Path) -> None:
     missing = _missing("/viewer")
 
-    async def test() -> None:
-        left = Left(tmp_path)
-        await left.hears(two_machines())
-        assert left.agreement.explained(_verdict(missing)) == _verdict(missing)
-        await left.hears(two_machines(), left=True, reason="lifecycle down")
-        (told,) = left.agreement.explained(_verdict(missing)).findings
-        assert told.message == (
-            "cannot find node /viewer in domain 7: machine 'right' was shut down by its supervisor "
-            "(lifecycle down)"
-        )
-        assert told.hint == missing.hint
-        await left.hears(two_machines(), run="3")
-        assert left.agreement.explained(_verdict(missing)) == _verdict(missing)
-        left.agreement.close()
-
-    run(test())
+    left = Left(tmp_path)
+    await left.hears(two_machines())
+    assert left.agreement.explained(_verdict(missing)) == _verdict(missing)
+    await left.hears(two_machines(), left=True, reason="lifecycle down")
+    (told,) = left.agreement.explained(_verdict(missing)).findings
+    assert told.message == (
+        "cannot find node /viewer in domain 7: machine 'right' was shut down by its supervisor "
+        "(lifecycle down)"
+    )
+    assert told.hint == missing.hint
+    await left.hears(two_machines(), run="3")
+    assert left.agreement.explained(_verdict(missing)) == _verdict(missing)
+    left.agreement.close()
 
 
-def test_only_the_absence_of_who_was_shut_down_is_how_a_system_of_several_hosts_ends(
+async def test_only_the_absence_of_who_was_shut_down_is_how_a_system_of_several_hosts_ends(
     tmp_path: Path,
 ) -> None:
     unmatched = UNMATCHED_FLOW.finding(
@@ -207,90 +191,78 @@ def test_only_the_absence_of_who_was_shut_down_is_how_a_system_of_several_hosts_
         node="/viewer",
     )
 
-    async def test() -> None:
-        left = Left(tmp_path)
-        await left.hears(two_machines())
-        absent = _verdict(_missing("/viewer"), unmatched)
-        assert not left.agreement.follows_from_shut_down(absent)
-        await left.hears(two_machines(), left=True, reason="failed: rolling back")
-        assert not left.agreement.follows_from_shut_down(absent)
-        await left.hears(two_machines(), left=True, reason="lifecycle down")
-        assert left.agreement.follows_from_shut_down(absent)
-        for worse in (_missing("/camera"), intruder):
-            assert not left.agreement.follows_from_shut_down(_verdict(*absent.findings, worse))
-        assert not left.agreement.follows_from_shut_down(_verdict())
-        left.agreement.close()
-
-    run(test())
+    left = Left(tmp_path)
+    await left.hears(two_machines())
+    absent = _verdict(_missing("/viewer"), unmatched)
+    assert not left.agreement.follows_from_shut_down(absent)
+    await left.hears(two_machines(), left=True, reason="failed: rolling back")
+    assert not left.agreement.follows_from_shut_down(absent)
+    await left.hears(two_machines(), left=True, reason="lifecycle down")
+    assert left.agreement.follows_from_shut_down(absent)
+    for worse in (_missing("/camera"), intruder):
+        assert not left.agreement.follows_from_shut_down(_verdict(*absent.findings, worse))
+    assert not left.agreement.follows_from_shut_down(_verdict())
+    left.agreement.close()
 
 
-def test_our_own_plan_is_announced_and_again_when_it_changes_or_ends(tmp_path: Path) -> None:
-    async def test() -> None:
-        left = Left(tmp_path)
-        await left.hears(two_machines(log_level="debug"))
-        left.agreement.announce(two_machines(log_level="debug"))
-        assert left.found() == []
+async def test_our_own_plan_is_announced_and_again_when_it_changes_or_ends(tmp_path: Path) -> None:
+    left = Left(tmp_path)
+    await left.hears(two_machines(log_level="debug"))
+    left.agreement.announce(two_machines(log_level="debug"))
+    assert left.found() == []
+    left.agreement.leave("lifecycle down")
+    said = [decode(each) for each in left.air.said]
+    assert [(each.machines, each.left, each.reason) for each in said] == [
+        (("left",), False, ""),
+        (("left",), False, ""),
+        (("left",), True, "lifecycle down"),
+    ]
+    # What we said ourselves comes back, and is nothing new.
+    left.air.arrives(left.air.said[0])
+    await asyncio.sleep(0)
+    assert left.found() == []
+    left.agreement.close()
+
+
+async def test_a_plan_is_announced_where_another_supervisor_may_be(tmp_path: Path) -> None:
+    both = frozenset({"camera", "viewer"})
+    for where, own, announced in (
+        (DiscoveryRange.SUBNET, both, 1),
+        (DiscoveryRange.LOCALHOST, both, 0),
+        (DiscoveryRange.OFF, both, 0),
+        (DiscoveryRange.LOCALHOST, frozenset({"camera"}), 1),
+    ):
+        plan = dataclasses.replace(two_machines(), discovery_range=where)
+        left = Left(tmp_path, plan, own)
+        assert (left.air.taken_part, len(left.air.said)) == (announced, announced)
+        # A change or an end of the plan is no reason to announce it either.
+        left.agreement.announce(plan)
         left.agreement.leave("lifecycle down")
-        said = [decode(each) for each in left.air.said]
-        assert [(each.machines, each.left, each.reason) for each in said] == [
-            (("left",), False, ""),
-            (("left",), False, ""),
-            (("left",), True, "lifecycle down"),
-        ]
-        # What we said ourselves comes back, and is nothing new.
-        left.air.arrives(left.air.said[0])
-        await asyncio.sleep(0)
-        assert left.found() == []
+        assert len(left.air.said) == 3 * announced
         left.agreement.close()
-
-    run(test())
-
-
-def test_a_plan_is_announced_where_another_supervisor_may_be(tmp_path: Path) -> None:
-    async def test() -> None:
-        both = frozenset({"camera", "viewer"})
-        for where, own, announced in (
-            (DiscoveryRange.SUBNET, both, 1),
-            (DiscoveryRange.LOCALHOST, both, 0),
-            (DiscoveryRange.OFF, both, 0),
-            (DiscoveryRange.LOCALHOST, frozenset({"camera"}), 1),
-        ):
-            plan = dataclasses.replace(two_machines(), discovery_range=where)
-            left = Left(tmp_path, plan, own)
-            assert (left.air.taken_part, len(left.air.said)) == (announced, announced)
-            # A change or an end of the plan is no reason to announce it either.
-            left.agreement.announce(plan)
-            left.agreement.leave("lifecycle down")
-            assert len(left.air.said) == 3 * announced
-            left.agreement.close()
-            assert left.air.destroyed == announced
-
-    run(test())
+        assert left.air.destroyed == announced
 
 
-def test_what_is_announced_names_the_plan_this_run_this_host_and_its_machines_once(
+async def test_what_is_announced_names_the_plan_this_run_this_host_and_its_machines_once(
     tmp_path: Path,
 ) -> None:
-    async def test() -> None:
-        plan = two_machines()
-        unplaced = plan_of(*plan.nodes, planned_node("here"), planned_node("there"))
-        front = dataclasses.replace(planned_node("front"), machine="left")
-        plan = dataclasses.replace(
-            plan_of(front, *unplaced.nodes), discovery_range=plan.discovery_range
-        )
-        own = frozenset({"front", "camera", "here", "there"})
-        one, other = Left(tmp_path, plan, own), Left(tmp_path, plan, own)
-        said, of_other = decode(one.air.said[0]), decode(other.air.said[0])
-        assert said == notice_of(plan, run=said.run, host=machine_id(), machines=("left",))
-        assert len(said.run) == 16
-        assert said.run != of_other.run
-        one.agreement.leave("the operator\n  ended it")
-        left = decode(one.air.said[1])
-        assert left == dataclasses.replace(said, left=True, reason="the operator ended it")
-        one.agreement.close()
-        other.agreement.close()
-
-    run(test())
+    plan = two_machines()
+    unplaced = plan_of(*plan.nodes, planned_node("here"), planned_node("there"))
+    front = dataclasses.replace(planned_node("front"), machine="left")
+    plan = dataclasses.replace(
+        plan_of(front, *unplaced.nodes), discovery_range=plan.discovery_range
+    )
+    own = frozenset({"front", "camera", "here", "there"})
+    one, other = Left(tmp_path, plan, own), Left(tmp_path, plan, own)
+    said, of_other = decode(one.air.said[0]), decode(other.air.said[0])
+    assert said == notice_of(plan, run=said.run, host=machine_id(), machines=("left",))
+    assert len(said.run) == 16
+    assert said.run != of_other.run
+    one.agreement.leave("the operator\n  ended it")
+    left = decode(one.air.said[1])
+    assert left == dataclasses.replace(said, left=True, reason="the operator ended it")
+    one.agreement.close()
+    other.agreement.close()
 
 
 def test_after_it_was_closed_nothing_is_announced_taken_or_woken(tmp_path: Path) -> None:
@@ -329,75 +301,66 @@ def test_what_is_no_notice_is_passed_over_and_logged(
     assert record.getMessage().startswith("passed over: cannot read a plan notice: ")
 
 
-def test_what_does_not_concern_us_was_received_before_or_left_before_wakes_nobody(
+async def test_what_does_not_concern_us_was_received_before_or_left_before_wakes_nobody(
     tmp_path: Path,
 ) -> None:
-    async def test() -> None:
-        left = Left(tmp_path)
-        touched = left.system.touched
+    left = Left(tmp_path)
+    touched = left.system.touched
 
-        async def woken_by(of: Plan, **changed: object) -> bool:
-            touched.clear()
-            await left.hears(of, **changed)  # type: ignore[arg-type]
-            return touched.is_set()
+    async def woken_by(of: Plan, **changed: object) -> bool:
+        touched.clear()
+        await left.hears(of, **changed)  # type: ignore[arg-type]
+        return touched.is_set()
 
-        other = dataclasses.replace(plan_of(planned_node("rover")), system="rover")
-        assert not await woken_by(other)
-        assert not await woken_by(two_machines(), left=True)
-        assert not await woken_by(two_machines(), machine="left", run=decode(left.air.said[0]).run)
-        assert await woken_by(two_machines())
-        assert not await woken_by(two_machines())
-        assert not await woken_by(two_machines(), left=True, run="3")
-        assert await woken_by(two_machines(), left=True)
-        left.agreement.close()
-
-    run(test())
+    other = dataclasses.replace(plan_of(planned_node("rover")), system="rover")
+    assert not await woken_by(other)
+    assert not await woken_by(two_machines(), left=True)
+    assert not await woken_by(two_machines(), machine="left", run=decode(left.air.said[0]).run)
+    assert await woken_by(two_machines())
+    assert not await woken_by(two_machines())
+    assert not await woken_by(two_machines(), left=True, run="3")
+    assert await woken_by(two_machines(), left=True)
+    left.agreement.close()
 
 
-def test_the_newest_64_supervisors_are_kept(tmp_path: Path) -> None:
-    async def test() -> None:
-        left = Left(tmp_path)
-        for number in range(66):
-            # Each in place of nobody: another run, host, system and machine.
-            await left.hears(
-                two_machines(f"robot_{number}"),
-                f"machine_{number}",
-                run=f"{number}",
-                host=f"h{number}",
-            )
-        machines = [each.observed for each in left.agreement.findings(NOBODY)]
-        assert len(machines) == 64
-        subjects = [each.subject for each in left.agreement.findings(NOBODY)]
-        assert subjects[0].endswith("on machine 'machine_2'")
-        assert subjects[-1].endswith("on machine 'machine_65'")
-        left.agreement.close()
-
-    run(test())
+async def test_the_newest_64_supervisors_are_kept(tmp_path: Path) -> None:
+    left = Left(tmp_path)
+    for number in range(66):
+        # Each in place of nobody: another run, host, system and machine.
+        await left.hears(
+            two_machines(f"robot_{number}"),
+            f"machine_{number}",
+            run=f"{number}",
+            host=f"h{number}",
+        )
+    machines = [each.observed for each in left.agreement.findings(NOBODY)]
+    assert len(machines) == 64
+    subjects = [each.subject for each in left.agreement.findings(NOBODY)]
+    assert subjects[0].endswith("on machine 'machine_2'")
+    assert subjects[-1].endswith("on machine 'machine_65'")
+    left.agreement.close()
 
 
-def test_a_difference_is_told_with_both_checksums_and_where_to_look(tmp_path: Path) -> None:
+async def test_a_difference_is_told_with_both_checksums_and_where_to_look(tmp_path: Path) -> None:
     ours, theirs = two_machines(), two_machines(log_level="debug")
 
-    async def test() -> None:
-        left = Left(tmp_path)
-        await left.hears(theirs)
-        (finding,) = left.agreement.findings(VIEWER)
-        assert (finding.expected, finding.observed) == (
-            f"plan {plan_checksum(ours)}",
-            f"plan {plan_checksum(theirs)}",
-        )
-        assert finding.message == (
-            "cannot rely on the supervisor of machine 'right': plans differ (checksums "
-            f"{plan_checksum(ours)} here, {plan_checksum(theirs)} there); "
-            "compare 'lifecycle plan MANIFEST' on both"
-        )
-        # What others say is bounded: no checksum of theirs is shown longer than ours.
-        await left.hears(theirs, checksum="f" * 1000)
-        (finding,) = left.agreement.findings(VIEWER)
-        assert finding.observed == f"plan {'f' * len(plan_checksum(ours))}"
-        left.agreement.close()
-
-    run(test())
+    left = Left(tmp_path)
+    await left.hears(theirs)
+    (finding,) = left.agreement.findings(VIEWER)
+    assert (finding.expected, finding.observed) == (
+        f"plan {plan_checksum(ours)}",
+        f"plan {plan_checksum(theirs)}",
+    )
+    assert finding.message == (
+        "cannot rely on the supervisor of machine 'right': plans differ (checksums "
+        f"{plan_checksum(ours)} here, {plan_checksum(theirs)} there); "
+        "compare 'lifecycle plan MANIFEST' on both"
+    )
+    # What others say is bounded: no checksum of theirs is shown longer than ours.
+    await left.hears(theirs, checksum="f" * 1000)
+    (finding,) = left.agreement.findings(VIEWER)
+    assert finding.observed == f"plan {'f' * len(plan_checksum(ours))}"
+    left.agreement.close()
 
 
 @pytest.mark.parametrize(
@@ -409,185 +372,165 @@ def test_a_difference_is_told_with_both_checksums_and_where_to_look(tmp_path: Pa
         ("r" * 81, (), f"the supervisor of system {'r' * 80!r} on host {'h' * 40!r}"),
     ],
 )
-def test_who_planned_something_else_is_named_in_bounded_words(
+async def test_who_planned_something_else_is_named_in_bounded_words(
     tmp_path: Path, system: str, machines: tuple[str, ...], who: str
 ) -> None:
-    async def test() -> None:
-        left = Left(tmp_path)
-        await left.hears(two_machines(system, log_level="debug"), machines=machines, host="h" * 41)
-        (finding,) = left.agreement.findings(NOBODY)
-        assert finding.subject == who
-        left.agreement.close()
-
-    run(test())
+    left = Left(tmp_path)
+    await left.hears(two_machines(system, log_level="debug"), machines=machines, host="h" * 41)
+    (finding,) = left.agreement.findings(NOBODY)
+    assert finding.subject == who
+    left.agreement.close()
 
 
-def test_a_plan_that_is_not_announced_is_told_with_what_is_waited_for_and_for_how_long(
+async def test_a_plan_that_is_not_announced_is_told_with_what_is_waited_for_and_for_how_long(
     tmp_path: Path,
 ) -> None:
-    async def test() -> None:
-        left = Left(tmp_path)
-        (waits,) = left.agreement.findings(VIEWER)
-        assert (waits.subject, waits.expected, waits.observed, waits.message) == (
-            "the supervisor of machine 'right'",
-            f"plan {plan_checksum(left.plan)}",
-            "not announced yet",
-            (
-                "cannot tell whether the supervisor of machine 'right' planned the same system: "
-                "it has not said so yet"
-            ),
-        )
-        await asyncio.sleep(ANNOUNCED_S)
-        (unknown,) = left.agreement.findings(VIEWER)
-        assert (unknown.subject, unknown.expected, unknown.observed, unknown.message) == (
-            "the supervisor of machine 'right'",
-            f"plan {plan_checksum(left.plan)}",
-            "not announced",
-            (
-                "cannot tell whether the supervisor of machine 'right' planned the same system: "
-                "it has not said what it planned within 5 s"
-            ),
-        )
-        left.agreement.close()
-
-    run(test())
+    left = Left(tmp_path)
+    (waits,) = left.agreement.findings(VIEWER)
+    assert (waits.subject, waits.expected, waits.observed, waits.message) == (
+        "the supervisor of machine 'right'",
+        f"plan {plan_checksum(left.plan)}",
+        "not announced yet",
+        (
+            "cannot tell whether the supervisor of machine 'right' planned the same system: "
+            "it has not said so yet"
+        ),
+    )
+    await asyncio.sleep(ANNOUNCED_S)
+    (unknown,) = left.agreement.findings(VIEWER)
+    assert (unknown.subject, unknown.expected, unknown.observed, unknown.message) == (
+        "the supervisor of machine 'right'",
+        f"plan {plan_checksum(left.plan)}",
+        "not announced",
+        (
+            "cannot tell whether the supervisor of machine 'right' planned the same system: "
+            "it has not said what it planned within 5 s"
+        ),
+    )
+    left.agreement.close()
 
 
-def test_we_look_when_the_first_of_several_machines_had_its_time_and_then_the_next(
+async def test_we_look_when_the_first_of_several_machines_had_its_time_and_then_the_next(
     tmp_path: Path,
 ) -> None:
-    async def test() -> None:
-        plan = two_machines()
-        far = dataclasses.replace(planned_node("arm"), machine="far")
-        plan = dataclasses.replace(plan_of(*plan.nodes, far), discovery_range=DiscoveryRange.SUBNET)
-        left = Left(tmp_path, plan)
-        loop = asyncio.get_running_loop()
-        left.machines = frozenset({"right"})
-        assert left.found(NOBODY) == [WAITS]
-        await asyncio.sleep(0.9 * ANNOUNCED_S)
-        left.machines = frozenset({"right", "far"})
-        assert left.found(NOBODY) == [WAITS, WAITS]
-        for finding in left.agreement.findings(NOBODY):
-            assert finding.observed == "not announced yet"
-            assert finding.message.endswith(": it has not said so yet")
-        for looked_s, found in (
-            (ANNOUNCED_S, [UNKNOWN, WAITS]),
-            (1.9 * ANNOUNCED_S, [UNKNOWN, UNKNOWN]),
-        ):
-            left.system.touched.clear()
-            await left.system.touched.wait()
-            assert loop.time() == pytest.approx(looked_s)
-            assert left.found(NOBODY) == found
-        # There is nothing more to wait for.
-        left.system.touched.clear()
-        await asyncio.sleep(10 * ANNOUNCED_S)
-        assert not left.system.touched.is_set()
-        left.agreement.close()
-
-    run(test())
-
-
-def test_each_time_that_a_machine_comes_it_has_its_time_to_announce_and_we_look_when_it_is_over(
-    tmp_path: Path,
-) -> None:
-    async def test() -> None:
-        left = Left(tmp_path)
-        loop = asyncio.get_running_loop()
-        assert left.found(VIEWER) == [WAITS]
-        await asyncio.sleep(0.75 * ANNOUNCED_S)
-        assert left.found(VIEWER) == [WAITS]
+    plan = two_machines()
+    far = dataclasses.replace(planned_node("arm"), machine="far")
+    plan = dataclasses.replace(plan_of(*plan.nodes, far), discovery_range=DiscoveryRange.SUBNET)
+    left = Left(tmp_path, plan)
+    loop = asyncio.get_running_loop()
+    left.machines = frozenset({"right"})
+    assert left.found(NOBODY) == [WAITS]
+    await asyncio.sleep(0.9 * ANNOUNCED_S)
+    left.machines = frozenset({"right", "far"})
+    assert left.found(NOBODY) == [WAITS, WAITS]
+    for finding in left.agreement.findings(NOBODY):
+        assert finding.observed == "not announced yet"
+        assert finding.message.endswith(": it has not said so yet")
+    for looked_s, found in (
+        (ANNOUNCED_S, [UNKNOWN, WAITS]),
+        (1.9 * ANNOUNCED_S, [UNKNOWN, UNKNOWN]),
+    ):
         left.system.touched.clear()
         await left.system.touched.wait()
-        assert loop.time() == pytest.approx(ANNOUNCED_S)
-        assert left.found(VIEWER) == [UNKNOWN]
-        # It went, and came again.
-        assert left.found(NOBODY) == []
-        assert left.found(VIEWER) == [WAITS]
-        left.system.touched.clear()
-        await left.system.touched.wait()
-        assert loop.time() == pytest.approx(2 * ANNOUNCED_S)
-        left.agreement.close()
-
-    run(test())
+        assert loop.time() == pytest.approx(looked_s)
+        assert left.found(NOBODY) == found
+    # There is nothing more to wait for.
+    left.system.touched.clear()
+    await asyncio.sleep(10 * ANNOUNCED_S)
+    assert not left.system.touched.is_set()
+    left.agreement.close()
 
 
-def test_every_machine_is_waited_for_by_itself_and_a_node_without_one_or_attached_is_none(
+async def test_a_machine_that_comes_has_its_time_to_announce_and_we_look_when_it_is_over(
     tmp_path: Path,
 ) -> None:
-    async def test() -> None:
-        far = dataclasses.replace(planned_node("arm"), machine="far")
-        attached = planned_node("lidar", kind=RunKind.ATTACH)
-        attached = dataclasses.replace(attached, machine="bench")
-        plan = two_machines()
-        plan = dataclasses.replace(
-            plan_of(planned_node("nowhere"), *plan.nodes, attached, far),
-            discovery_range=DiscoveryRange.SUBNET,
-        )
-        left = Left(tmp_path, plan)
-        seen = [f"/{each.key}" for each in plan.nodes]
-        everybody = Observation(nodes=tuple(ObservedNode(full_name=each) for each in seen))
-
-        def waited_for() -> list[str]:
-            return [each.subject for each in left.agreement.findings(everybody)]
-
-        supervisor = "the supervisor of machine"
-        assert waited_for() == [f"{supervisor} 'right'", f"{supervisor} 'far'"]
-        # Who started an attached node is not known; that its supervisor is connected is.
-        left.machines = frozenset({"bench"})
-        assert sorted(waited_for()) == [
-            f"{supervisor} {each!r}" for each in ("bench", "far", "right")
-        ]
-        await left.hears(plan)
-        assert sorted(waited_for()) == [f"{supervisor} {each!r}" for each in ("bench", "far")]
-        left.agreement.close()
-
-    run(test())
+    left = Left(tmp_path)
+    loop = asyncio.get_running_loop()
+    assert left.found(VIEWER) == [WAITS]
+    await asyncio.sleep(0.75 * ANNOUNCED_S)
+    assert left.found(VIEWER) == [WAITS]
+    left.system.touched.clear()
+    await left.system.touched.wait()
+    assert loop.time() == pytest.approx(ANNOUNCED_S)
+    assert left.found(VIEWER) == [UNKNOWN]
+    # It went, and came again.
+    assert left.found(NOBODY) == []
+    assert left.found(VIEWER) == [WAITS]
+    left.system.touched.clear()
+    await left.system.touched.wait()
+    assert loop.time() == pytest.approx(2 * ANNOUNCED_S)
+    left.agreement.close()
 
 
-def test_another_system_that_plans_the_nodes_of_a_machine_has_said_what_it_planned(
+async def test_every_machine_is_waited_for_by_itself_and_a_node_without_one_or_attached_is_none(
     tmp_path: Path,
 ) -> None:
-    async def test() -> None:
-        left = Left(tmp_path)
-        # A supervisor of our system is taken at the machines that it names, and at no others.
-        await left.hears(two_machines(), "left", host="h3")
-        assert WAITS in left.found(VIEWER)
-        await left.hears(two_machines("robbie"), "elsewhere")
-        assert left.found(VIEWER) == [DIFFER]
-        left.agreement.close()
+    far = dataclasses.replace(planned_node("arm"), machine="far")
+    attached = planned_node("lidar", kind=RunKind.ATTACH)
+    attached = dataclasses.replace(attached, machine="bench")
+    plan = two_machines()
+    plan = dataclasses.replace(
+        plan_of(planned_node("nowhere"), *plan.nodes, attached, far),
+        discovery_range=DiscoveryRange.SUBNET,
+    )
+    left = Left(tmp_path, plan)
+    seen = [f"/{each.key}" for each in plan.nodes]
+    everybody = Observation(nodes=tuple(ObservedNode(full_name=each) for each in seen))
 
-    run(test())
+    def waited_for() -> list[str]:
+        return [each.subject for each in left.agreement.findings(everybody)]
 
-
-def test_of_another_system_only_one_with_a_node_of_the_machine_has_said_so(tmp_path: Path) -> None:
-    async def test() -> None:
-        left = Left(tmp_path)
-        ours = dataclasses.replace(two_machines("robbie"), nodes=two_machines().nodes[:1])
-        await left.hears(ours, "elsewhere")
-        assert left.found(VIEWER) == [DIFFER, WAITS]
-        left.agreement.close()
-
-    run(test())
-
-
-def test_shut_down_are_the_machines_of_our_system_whose_supervisor_says_so(tmp_path: Path) -> None:
-    async def test() -> None:
-        left = Left(tmp_path)
-        await left.hears(two_machines())
-        assert left.agreement.shut_down == {}
-        await left.hears(two_machines(), left=True, reason="r" * 81, machines=("right", "far"))
-        assert left.agreement.shut_down == {"right": "r" * 80, "far": "r" * 80}
-        left.agreement.close()
-        other = Left(tmp_path)
-        await other.hears(two_machines("robbie"))
-        await other.hears(two_machines("robbie"), left=True)
-        assert other.agreement.shut_down == {}
-        other.agreement.close()
-
-    run(test())
+    supervisor = "the supervisor of machine"
+    assert waited_for() == [f"{supervisor} 'right'", f"{supervisor} 'far'"]
+    # Who started an attached node is not known; that its supervisor is connected is.
+    left.machines = frozenset({"bench"})
+    assert sorted(waited_for()) == [f"{supervisor} {each!r}" for each in ("bench", "far", "right")]
+    await left.hears(plan)
+    assert sorted(waited_for()) == [f"{supervisor} {each!r}" for each in ("bench", "far")]
+    left.agreement.close()
 
 
-def test_only_missing_nodes_of_a_machine_that_was_shut_down_are_explained(tmp_path: Path) -> None:
+async def test_another_system_that_plans_the_nodes_of_a_machine_has_said_what_it_planned(
+    tmp_path: Path,
+) -> None:
+    left = Left(tmp_path)
+    # A supervisor of our system is taken at the machines that it names, and at no others.
+    await left.hears(two_machines(), "left", host="h3")
+    assert WAITS in left.found(VIEWER)
+    await left.hears(two_machines("robbie"), "elsewhere")
+    assert left.found(VIEWER) == [DIFFER]
+    left.agreement.close()
+
+
+async def test_of_another_system_only_one_with_a_node_of_the_machine_has_said_so(
+    tmp_path: Path,
+) -> None:
+    left = Left(tmp_path)
+    ours = dataclasses.replace(two_machines("robbie"), nodes=two_machines().nodes[:1])
+    await left.hears(ours, "elsewhere")
+    assert left.found(VIEWER) == [DIFFER, WAITS]
+    left.agreement.close()
+
+
+async def test_shut_down_are_the_machines_of_our_system_whose_supervisor_says_so(
+    tmp_path: Path,
+) -> None:
+    left = Left(tmp_path)
+    await left.hears(two_machines())
+    assert left.agreement.shut_down == {}
+    await left.hears(two_machines(), left=True, reason="r" * 81, machines=("right", "far"))
+    assert left.agreement.shut_down == {"right": "r" * 80, "far": "r" * 80}
+    left.agreement.close()
+    other = Left(tmp_path)
+    await other.hears(two_machines("robbie"))
+    await other.hears(two_machines("robbie"), left=True)
+    assert other.agreement.shut_down == {}
+    other.agreement.close()
+
+
+async def test_only_missing_nodes_of_a_machine_that_was_shut_down_are_explained(
+    tmp_path: Path,
+) -> None:
     def finding(name: str) -> Finding:
         return MISSING_NODE.finding(
             Outcome.VIOLATED,
@@ -605,23 +548,20 @@ def test_only_missing_nodes_of_a_machine_that_was_shut_down_are_explained(tmp_pa
         dataclasses.replace(viewer, rule="graph.unmatched-flow"),
     )
 
-    async def test() -> None:
-        left = Left(tmp_path)
-        await left.hears(two_machines())
-        # What others name is not ours to trust: no node without a machine is on the machine "".
-        await left.hears(two_machines(), left=True, machines=("right", ""))
-        explained = left.agreement.explained(_verdict(*others, viewer))
-        assert explained == _verdict(
-            *others,
-            dataclasses.replace(
-                viewer,
-                observed="machine 'right' was shut down",
-                message="cannot find node /viewer: machine 'right' was shut down by its supervisor",
-            ),
-        )
-        left.agreement.close()
-
-    run(test())
+    left = Left(tmp_path)
+    await left.hears(two_machines())
+    # What others name is not ours to trust: no node without a machine is on the machine "".
+    await left.hears(two_machines(), left=True, machines=("right", ""))
+    explained = left.agreement.explained(_verdict(*others, viewer))
+    assert explained == _verdict(
+        *others,
+        dataclasses.replace(
+            viewer,
+            observed="machine 'right' was shut down",
+            message="cannot find node /viewer: machine 'right' was shut down by its supervisor",
+        ),
+    )
+    left.agreement.close()
 
 
 def test_an_unverifiable_finding_does_not_close_the_gate_by_itself() -> None:

@@ -42,17 +42,14 @@ async def _down(world: World, hurry: asyncio.Event | None = None) -> None:
     await TakeDown(world.system, world.emit, hurry or asyncio.Event()).run()
 
 
-def test_nodes_without_an_order_come_up_side_by_side(tmp_path: Path) -> None:
-    async def main() -> None:
-        world = _world(tmp_path, planned_node("a"), planned_node("b"))
-        for what in ("a start", "b start", "/a configure", "/b configure"):
-            world.spawner.takes_s[what] = 3.0
-        began = asyncio.get_running_loop().time()
-        await world.bring_up.connect(LIMIT_S)
-        assert asyncio.get_running_loop().time() - began == pytest.approx(6.0, abs=0.1)
-        await _down(world)
-
-    run(main())
+async def test_nodes_without_an_order_come_up_side_by_side(tmp_path: Path) -> None:
+    world = _world(tmp_path, planned_node("a"), planned_node("b"))
+    for what in ("a start", "b start", "/a configure", "/b configure"):
+        world.spawner.takes_s[what] = 3.0
+    began = asyncio.get_running_loop().time()
+    await world.bring_up.connect(LIMIT_S)
+    assert asyncio.get_running_loop().time() - began == pytest.approx(6.0, abs=0.1)
+    await _down(world)
 
 
 @pytest.mark.parametrize(
@@ -102,39 +99,36 @@ def test_names_go_by_udp_where_no_port_is_taken(
     assert run(main()) == [by_udp] * count
 
 
-def test_a_bring_up_that_was_cancelled_twice_starts_everything_anew_the_next_time(
+async def test_a_bring_up_that_was_cancelled_twice_starts_everything_anew_the_next_time(
     tmp_path: Path,
 ) -> None:
     """Who is slow to end is cancelled again (run/failure.py), perhaps while it cleans up."""
 
-    async def main() -> None:
-        world = _world(tmp_path, planned_node("a"), planned_node("b"))
-        spawn, asked = world.spawner.spawn, []
+    world = _world(tmp_path, planned_node("a"), planned_node("b"))
+    spawn, asked = world.spawner.spawn, []
 
-        async def slow(request: SpawnRequest) -> FakeProcess:
-            asked.append(request.name)
-            if len(asked) > 2:
-                return await spawn(request)
-            try:
-                return await asyncio.get_running_loop().create_future()
-            except asyncio.CancelledError:
-                await asyncio.sleep(5.0)  # what was begun is undone
-                raise
+    async def slow(request: SpawnRequest) -> FakeProcess:
+        asked.append(request.name)
+        if len(asked) > 2:
+            return await spawn(request)
+        try:
+            return await asyncio.get_running_loop().create_future()
+        except asyncio.CancelledError:
+            await asyncio.sleep(5.0)  # what was begun is undone
+            raise
 
-        world.spawner.spawn = slow  # type: ignore[method-assign]
-        connecting = asyncio.ensure_future(world.bring_up.connect(LIMIT_S))
+    world.spawner.spawn = slow  # type: ignore[method-assign]
+    connecting = asyncio.ensure_future(world.bring_up.connect(LIMIT_S))
+    await asyncio.sleep(0.1)
+    for _ in range(2):
+        connecting.cancel()
         await asyncio.sleep(0.1)
-        for _ in range(2):
-            connecting.cancel()
-            await asyncio.sleep(0.1)
-        with pytest.raises(asyncio.CancelledError):
-            await connecting
-        await world.bring_up.connect(LIMIT_S)
-        assert sorted(asked) == ["a", "a", "b", "b"]
-        assert {each.reach for each in world.system.nodes.values()} == {Reach.CONNECTED}
-        await _down(world)
-
-    run(main())
+    with pytest.raises(asyncio.CancelledError):
+        await connecting
+    await world.bring_up.connect(LIMIT_S)
+    assert sorted(asked) == ["a", "a", "b", "b"]
+    assert {each.reach for each in world.system.nodes.values()} == {Reach.CONNECTED}
+    await _down(world)
 
 
 @pytest.mark.parametrize(
@@ -168,73 +162,66 @@ def test_a_condition_holds_the_step_that_it_names(
         assert all(log.index(step) < log.index(held) for step in before)
 
 
-def test_no_activate_request_is_sent_without_a_permit(tmp_path: Path) -> None:
-    async def main() -> None:
-        world = _world(tmp_path, planned_node("a"))
-        await world.bring_up.connect(LIMIT_S)
-        with pytest.raises(BringUpError, match="cannot activate '/a' without a permit"):
-            await world.system.nodes["a"].perform(Operation.ACTIVATE)
-        gate = Gate(strict=False)
-        permit = gate.judge(verdict_of(Outcome.OK))
-        gate.close()
-        with pytest.raises(StepFailedError, match="the gate was closed again"):
-            await world.bring_up.activate(permit, LIMIT_S)
-        assert "/a activate" not in world.log
-        await _down(world)
-
-    run(main())
+async def test_no_activate_request_is_sent_without_a_permit(tmp_path: Path) -> None:
+    world = _world(tmp_path, planned_node("a"))
+    await world.bring_up.connect(LIMIT_S)
+    with pytest.raises(BringUpError, match="cannot activate '/a' without a permit"):
+        await world.system.nodes["a"].perform(Operation.ACTIVATE)
+    gate = Gate(strict=False)
+    permit = gate.judge(verdict_of(Outcome.OK))
+    gate.close()
+    with pytest.raises(StepFailedError, match="the gate was closed again"):
+        await world.bring_up.activate(permit, LIMIT_S)
+    assert "/a activate" not in world.log
+    await _down(world)
 
 
-def test_what_appears_while_a_chain_is_activated_keeps_the_rest_of_it_from_being_asked(
+async def test_what_appears_while_a_chain_is_activated_keeps_the_rest_of_it_from_being_asked(
     tmp_path: Path,
 ) -> None:
     """The last node of a chain is not activated on a verdict that is seconds old."""
 
-    async def main() -> None:
-        chain = {f"n{index}": {f"n{index - 1}": Condition.ACTIVE} for index in range(1, 3)}
-        world = _world(
-            tmp_path,
-            planned_node("n0"),
-            *(planned_node(key, after=after) for key, after in chain.items()),
-        )
-        judging = _Judging(world)
-        world.spawner.takes_s["/n1 activate"] = 5.0
-        await world.bring_up.connect(LIMIT_S)
-        permit = await judging.opened()
-        asyncio.get_running_loop().call_later(2.0, judging.intrude)
-        with pytest.raises(VerificationError, match=r"graph\.undeclared-publisher") as caught:
-            await world.bring_up.activate(permit, LIMIT_S)
-        assert caught.value.again
-        assert "/n1 activate" in world.log
-        assert "/n2 activate" not in world.log
-        assert [each.node for each in world.heard(RequestSent) if _activates(each)] == [
-            "/n0",
-            "/n1",
-        ]
-        assert world.system.nodes["n2"].undo == [Operation.CONFIGURE, Operation.CONNECT]
-        await _down(world)
-        # What was active was rolled back politely.
-        assert {"/n0 deactivate", "/n1 deactivate"} <= set(world.log)
-        await judging.changes.close()
-
-    run(main())
-
-
-def test_nodes_that_are_activated_side_by_side_are_not_judged_one_by_one(tmp_path: Path) -> None:
-    async def main() -> None:
-        world = _world(tmp_path, *(planned_node(f"n{index}") for index in range(20)))
-        judging = _Judging(world)
-        await world.bring_up.connect(LIMIT_S)
-        permit = await judging.opened()
-        looks = judging.looks
-        judging.graph.changed.set()
+    chain = {f"n{index}": {f"n{index - 1}": Condition.ACTIVE} for index in range(1, 3)}
+    world = _world(
+        tmp_path,
+        planned_node("n0"),
+        *(planned_node(key, after=after) for key, after in chain.items()),
+    )
+    judging = _Judging(world)
+    world.spawner.takes_s["/n1 activate"] = 5.0
+    await world.bring_up.connect(LIMIT_S)
+    permit = await judging.opened()
+    asyncio.get_running_loop().call_later(2.0, judging.intrude)
+    with pytest.raises(VerificationError, match=r"graph\.undeclared-publisher") as caught:
         await world.bring_up.activate(permit, LIMIT_S)
-        assert {node.reach for node in world.system.nodes.values()} == {Reach.ACTIVE}
-        assert 1 <= judging.looks - looks <= 3
-        await _down(world)
-        await judging.changes.close()
+    assert caught.value.again
+    assert "/n1 activate" in world.log
+    assert "/n2 activate" not in world.log
+    assert [each.node for each in world.heard(RequestSent) if _activates(each)] == [
+        "/n0",
+        "/n1",
+    ]
+    assert world.system.nodes["n2"].undo == [Operation.CONFIGURE, Operation.CONNECT]
+    await _down(world)
+    # What was active was rolled back politely.
+    assert {"/n0 deactivate", "/n1 deactivate"} <= set(world.log)
+    await judging.changes.close()
 
-    run(main())
+
+async def test_nodes_that_are_activated_side_by_side_are_not_judged_one_by_one(
+    tmp_path: Path,
+) -> None:
+    world = _world(tmp_path, *(planned_node(f"n{index}") for index in range(20)))
+    judging = _Judging(world)
+    await world.bring_up.connect(LIMIT_S)
+    permit = await judging.opened()
+    looks = judging.looks
+    judging.graph.changed.set()
+    await world.bring_up.activate(permit, LIMIT_S)
+    assert {node.reach for node in world.system.nodes.values()} == {Reach.ACTIVE}
+    assert 1 <= judging.looks - looks <= 3
+    await _down(world)
+    await judging.changes.close()
 
 
 class _Judging:
@@ -269,401 +256,340 @@ def _activates(request: RequestSent) -> bool:
     return request.operation is Operation.ACTIVATE
 
 
-def test_a_failed_transition_ends_the_bring_up_with_the_nodes_own_reason(tmp_path: Path) -> None:
-    async def main() -> None:
-        world = _world(tmp_path, planned_node("a"), planned_node("b"))
-        world.spawner.ways["/a configure"] = "on_configure raised ValueError: no camera"
-        with pytest.raises(StepFailedError) as caught:
-            await world.bring_up.connect(LIMIT_S)
-        assert caught.value.rule.id == "run.transition-failed"
-        assert caught.value.subject == "/a"
-        assert caught.value.message == (
-            "cannot configure '/a': on_configure raised ValueError: no camera"
-        )
-        await _down(world)
-
-    run(main())
-
-
-def test_a_process_that_dies_says_what_its_node_was_doing_and_its_last_words(
+async def test_a_failed_transition_ends_the_bring_up_with_the_nodes_own_reason(
     tmp_path: Path,
 ) -> None:
-    async def main() -> None:
-        world = _world(tmp_path, planned_node("a"))
-        world.spawner.ways["/a connect"] = "die"
-        with pytest.raises(StepFailedError) as caught:
-            await world.bring_up.connect(LIMIT_S)
-        pid = world.spawner.processes["a"].pid
-        assert caught.value.rule.id == "run.process-died"
-        assert caught.value.message == (
-            f"cannot keep '/a' running: pid {pid} died while connecting: killed by SIGSEGV"
-        )
-        assert caught.value.process == "a"
-        assert caught.value.log == str(tmp_path / "a.log")
-        await _down(world)
-
-    run(main())
+    world = _world(tmp_path, planned_node("a"), planned_node("b"))
+    world.spawner.ways["/a configure"] = "on_configure raised ValueError: no camera"
+    with pytest.raises(StepFailedError) as caught:
+        await world.bring_up.connect(LIMIT_S)
+    assert caught.value.rule.id == "run.transition-failed"
+    assert caught.value.subject == "/a"
+    assert caught.value.message == (
+        "cannot configure '/a': on_configure raised ValueError: no camera"
+    )
+    await _down(world)
 
 
-def test_a_node_that_hangs_is_given_up_at_its_own_deadline(tmp_path: Path) -> None:
-    async def main() -> None:
-        world = _world(tmp_path, planned_node("a", timeouts=Timeouts(configure_s=2.0)))
-        world.spawner.ways["/a configure"] = "hang"
-        with pytest.raises(StepFailedError) as caught:
-            await world.bring_up.connect(LIMIT_S)
-        assert caught.value.message == ("cannot bring up '/a': it was still configuring after 2 s")
-        await _down(world)
-        # Nothing polite waits behind a callback that hangs.
-        assert world.log == ["a start", "/a configure"]
+async def test_a_process_that_dies_says_what_its_node_was_doing_and_its_last_words(
+    tmp_path: Path,
+) -> None:
+    world = _world(tmp_path, planned_node("a"))
+    world.spawner.ways["/a connect"] = "die"
+    with pytest.raises(StepFailedError) as caught:
+        await world.bring_up.connect(LIMIT_S)
+    pid = world.spawner.processes["a"].pid
+    assert caught.value.rule.id == "run.process-died"
+    assert caught.value.message == (
+        f"cannot keep '/a' running: pid {pid} died while connecting: killed by SIGSEGV"
+    )
+    assert caught.value.process == "a"
+    assert caught.value.log == str(tmp_path / "a.log")
+    await _down(world)
 
-    run(main())
+
+async def test_a_node_that_hangs_is_given_up_at_its_own_deadline(tmp_path: Path) -> None:
+    world = _world(tmp_path, planned_node("a", timeouts=Timeouts(configure_s=2.0)))
+    world.spawner.ways["/a configure"] = "hang"
+    with pytest.raises(StepFailedError) as caught:
+        await world.bring_up.connect(LIMIT_S)
+    assert caught.value.message == ("cannot bring up '/a': it was still configuring after 2 s")
+    await _down(world)
+    # Nothing polite waits behind a callback that hangs.
+    assert world.log == ["a start", "/a configure"]
 
 
 @pytest.mark.parametrize("step", ["a start", "/a configure"])
-def test_time_that_a_process_waits_for_a_processor_is_not_its_own(
+async def test_time_that_a_process_waits_for_a_processor_is_not_its_own(
     tmp_path: Path, step: str
 ) -> None:
-    async def main() -> None:
-        timeouts = Timeouts(start_s=2.0, configure_s=2.0)
-        world = _world(tmp_path, planned_node("a", timeouts=timeouts), planned_node("b"))
-        world.spawner.takes_s[step] = 15.0
-        world.spawner.starves["a"] = 3.0  # three of its threads, all the time
-        await world.bring_up.connect(LIMIT_S)
-        assert world.system.nodes["a"].reach is Reach.CONNECTED
-        await _down(world)
-
-    run(main())
+    timeouts = Timeouts(start_s=2.0, configure_s=2.0)
+    world = _world(tmp_path, planned_node("a", timeouts=timeouts), planned_node("b"))
+    world.spawner.takes_s[step] = 15.0
+    world.spawner.starves["a"] = 3.0  # three of its threads, all the time
+    await world.bring_up.connect(LIMIT_S)
+    assert world.system.nodes["a"].reach is Reach.CONNECTED
+    await _down(world)
 
 
-def test_what_is_done_promptly_is_done_without_a_look_at_any_process(tmp_path: Path) -> None:
-    async def main() -> None:
-        world = _world(tmp_path, planned_node("a"), planned_node("b"))
-        await world.bring_up.connect(LIMIT_S)
-        await _down(world)
-        assert world.spawner.looked_at == []
-
-    run(main())
+async def test_what_is_done_promptly_is_done_without_a_look_at_any_process(tmp_path: Path) -> None:
+    world = _world(tmp_path, planned_node("a"), planned_node("b"))
+    await world.bring_up.connect(LIMIT_S)
+    await _down(world)
+    assert world.spawner.looked_at == []
 
 
 @pytest.mark.parametrize(("starves", "after_s"), [(0.0, 2.0), (0.5, 4.0), (3.0, 20.0)])
-def test_a_start_that_hangs_is_noticed_on_a_loaded_machine_too(
+async def test_a_start_that_hangs_is_noticed_on_a_loaded_machine_too(
     tmp_path: Path, starves: float, after_s: float
 ) -> None:
-    async def main() -> None:
-        world = _world(tmp_path, planned_node("a", timeouts=Timeouts(start_s=2.0)))
-        world.spawner.ways["a start"] = "hang"
-        world.spawner.starves["a"] = starves
-        began = asyncio.get_running_loop().time()
-        with pytest.raises(StepFailedError, match="was still starting after 2 s"):
-            await world.bring_up.connect(LIMIT_S)
-        took_s = asyncio.get_running_loop().time() - began
-        assert took_s == pytest.approx(after_s + ALSO_S, abs=1.0)
-        await _down(world)
-
-    run(main())
+    world = _world(tmp_path, planned_node("a", timeouts=Timeouts(start_s=2.0)))
+    world.spawner.ways["a start"] = "hang"
+    world.spawner.starves["a"] = starves
+    began = asyncio.get_running_loop().time()
+    with pytest.raises(StepFailedError, match="was still starting after 2 s"):
+        await world.bring_up.connect(LIMIT_S)
+    took_s = asyncio.get_running_loop().time() - began
+    assert took_s == pytest.approx(after_s + ALSO_S, abs=1.0)
+    await _down(world)
 
 
-def test_the_whole_bring_up_has_a_deadline_that_names_what_everybody_was_doing(
+async def test_the_whole_bring_up_has_a_deadline_that_names_what_everybody_was_doing(
     tmp_path: Path,
 ) -> None:
-    async def main() -> None:
-        world = _world(
-            tmp_path,
-            planned_node("a", timeouts=Timeouts(configure_s=60.0)),
-            planned_node("b", after={"a": Condition.CONFIGURED}),
-        )
-        world.spawner.ways["/a configure"] = "hang"
-        with pytest.raises(StepFailedError) as caught:
-            await world.bring_up.connect(1.5)
-        assert caught.value.rule.id == "run.deadline"
-        assert caught.value.subject == "/a"
-        assert caught.value.message == (
-            "cannot bring up 'robot' within 1.5 s: /a is still configuring; "
-            "/b waits to configure until /a is configured"
-        )
-        await _down(world)
-
-    run(main())
+    world = _world(
+        tmp_path,
+        planned_node("a", timeouts=Timeouts(configure_s=60.0)),
+        planned_node("b", after={"a": Condition.CONFIGURED}),
+    )
+    world.spawner.ways["/a configure"] = "hang"
+    with pytest.raises(StepFailedError) as caught:
+        await world.bring_up.connect(1.5)
+    assert caught.value.rule.id == "run.deadline"
+    assert caught.value.subject == "/a"
+    assert caught.value.message == (
+        "cannot bring up 'robot' within 1.5 s: /a is still configuring; "
+        "/b waits to configure until /a is configured"
+    )
+    await _down(world)
 
 
-def test_nodes_of_one_process_share_it_and_its_start_waits_for_both(tmp_path: Path) -> None:
-    async def main() -> None:
-        world = _world(
-            tmp_path,
-            planned_node("a", process="both"),
-            planned_node("b", process="both", after={"c": Condition.STARTED}),
-            planned_node("c"),
-        )
-        world.spawner.takes_s["c start"] = 4.0
-        await world.bring_up.connect(LIMIT_S)
-        assert sorted(world.spawner.processes) == ["both", "c"]
-        assert world.log.index("c start") < world.log.index("both start")
-        await _down(world)
-
-    run(main())
+async def test_nodes_of_one_process_share_it_and_its_start_waits_for_both(tmp_path: Path) -> None:
+    world = _world(
+        tmp_path,
+        planned_node("a", process="both"),
+        planned_node("b", process="both", after={"c": Condition.STARTED}),
+        planned_node("c"),
+    )
+    world.spawner.takes_s["c start"] = 4.0
+    await world.bring_up.connect(LIMIT_S)
+    assert sorted(world.spawner.processes) == ["both", "c"]
+    assert world.log.index("c start") < world.log.index("both start")
+    await _down(world)
 
 
-def test_a_plain_command_is_only_started_and_whoever_stands_on_it_waits_for_its_name(
+async def test_a_plain_command_is_only_started_and_whoever_stands_on_it_waits_for_its_name(
     tmp_path: Path,
 ) -> None:
-    async def main() -> None:
-        world = _world(
-            tmp_path,
-            planned_node("plain", kind=RunKind.COMMAND, managed=False),
-            planned_node("a", after={"plain": Condition.CONFIGURED}),
-        )
-        connecting = asyncio.ensure_future(world.bring_up.connect(LIMIT_S))
-        await asyncio.sleep(1.0)
-        assert "/a configure" not in world.log
-        world.appeared["/plain"].set()
-        await connecting
-        assert world.log == ["a start", "/a configure", "/a connect"]
-        world.spawner.ends_at["plain"] = signal.SIGINT
-        await _down(world)
-        assert "plain SIGINT" in world.log
-
-    run(main())
+    world = _world(
+        tmp_path,
+        planned_node("plain", kind=RunKind.COMMAND, managed=False),
+        planned_node("a", after={"plain": Condition.CONFIGURED}),
+    )
+    connecting = asyncio.ensure_future(world.bring_up.connect(LIMIT_S))
+    await asyncio.sleep(1.0)
+    assert "/a configure" not in world.log
+    world.appeared["/plain"].set()
+    await connecting
+    assert world.log == ["a start", "/a configure", "/a connect"]
+    world.spawner.ends_at["plain"] = signal.SIGINT
+    await _down(world)
+    assert "plain SIGINT" in world.log
 
 
-def test_a_node_is_undone_as_far_as_it_came(tmp_path: Path) -> None:
-    async def main() -> None:
-        world = _world(tmp_path, planned_node("a"), planned_node("b"))
-        world.spawner.ways["/b configure"] = "it refused"
-        world.spawner.takes_s["/b configure"] = 1.0
-        with pytest.raises(StepFailedError):
-            await world.bring_up.connect(LIMIT_S)
-        before = len(world.log)
-        await _down(world)
-        undone = [line for line in world.log[before:] if line.startswith("/a")]
-        assert undone == ["/a disconnect", "/a cleanup", "/a shutdown"]
-
-    run(main())
-
-
-def test_a_node_in_the_middle_of_a_step_is_not_asked_but_ended(tmp_path: Path) -> None:
-    async def main() -> None:
-        world = _world(tmp_path, planned_node("a"), planned_node("b"))
-        world.spawner.ways["/b configure"] = "it refused"
-        world.spawner.takes_s["/b configure"] = 1.0
-        world.spawner.takes_s["/a connect"] = 60.0
-        with pytest.raises(StepFailedError):
-            await world.bring_up.connect(LIMIT_S)
-        before = len(world.log)
-        await _down(world)
-        assert [line for line in world.log[before:] if "a" in line] == ["a SIGTERM"]
-
-    run(main())
-
-
-def test_a_process_that_does_not_end_is_ended_step_by_step_and_told_of(tmp_path: Path) -> None:
-    async def main() -> None:
-        world = _world(tmp_path, planned_node("a"))
+async def test_a_node_is_undone_as_far_as_it_came(tmp_path: Path) -> None:
+    world = _world(tmp_path, planned_node("a"), planned_node("b"))
+    world.spawner.ways["/b configure"] = "it refused"
+    world.spawner.takes_s["/b configure"] = 1.0
+    with pytest.raises(StepFailedError):
         await world.bring_up.connect(LIMIT_S)
-        world.spawner.ends_at["a"] = signal.SIGTERM
-        began = asyncio.get_running_loop().time()
-        await _down(world)
-        assert asyncio.get_running_loop().time() - began == pytest.approx(4.0, abs=0.2)
-        assert world.log[-2:] == ["a SIGINT", "a SIGTERM"]
-        assert world.heard(Notice)[-1].message == "process 'a' had to be ended with SIGTERM"
-
-    run(main())
+    before = len(world.log)
+    await _down(world)
+    undone = [line for line in world.log[before:] if line.startswith("/a")]
+    assert undone == ["/a disconnect", "/a cleanup", "/a shutdown"]
 
 
-def test_in_a_hurry_nothing_is_asked_and_everything_is_killed(tmp_path: Path) -> None:
-    async def main() -> None:
-        world = _world(tmp_path, planned_node("a"))
+async def test_a_node_in_the_middle_of_a_step_is_not_asked_but_ended(tmp_path: Path) -> None:
+    world = _world(tmp_path, planned_node("a"), planned_node("b"))
+    world.spawner.ways["/b configure"] = "it refused"
+    world.spawner.takes_s["/b configure"] = 1.0
+    world.spawner.takes_s["/a connect"] = 60.0
+    with pytest.raises(StepFailedError):
         await world.bring_up.connect(LIMIT_S)
-        world.spawner.ends_at["a"] = signal.SIGKILL
-        hurry = asyncio.Event()
-        hurry.set()
-        before = len(world.log)
-        await _down(world, hurry)
-        assert world.log[before:] == ["a SIGKILL"]
-
-    run(main())
+    before = len(world.log)
+    await _down(world)
+    assert [line for line in world.log[before:] if "a" in line] == ["a SIGTERM"]
 
 
-def test_every_request_is_told_before_it_is_sent(tmp_path: Path) -> None:
-    async def main() -> None:
-        world = _world(tmp_path, planned_node("a"))
-        await world.bring_up.connect(LIMIT_S)
-        sent = [(event.node, event.operation) for event in world.heard(RequestSent)]
-        assert sent == [("/a", Operation.CONFIGURE), ("/a", Operation.CONNECT)]
-        changes = [event.state for event in world.heard(ProcessChanged)]
-        assert changes == [ProcessState.STARTING, ProcessState.RUNNING]
-        await _down(world)
+async def test_a_process_that_does_not_end_is_ended_step_by_step_and_told_of(
+    tmp_path: Path,
+) -> None:
+    world = _world(tmp_path, planned_node("a"))
+    await world.bring_up.connect(LIMIT_S)
+    world.spawner.ends_at["a"] = signal.SIGTERM
+    began = asyncio.get_running_loop().time()
+    await _down(world)
+    assert asyncio.get_running_loop().time() - began == pytest.approx(4.0, abs=0.2)
+    assert world.log[-2:] == ["a SIGINT", "a SIGTERM"]
+    assert world.heard(Notice)[-1].message == "process 'a' had to be ended with SIGTERM"
 
-    run(main())
+
+async def test_in_a_hurry_nothing_is_asked_and_everything_is_killed(tmp_path: Path) -> None:
+    world = _world(tmp_path, planned_node("a"))
+    await world.bring_up.connect(LIMIT_S)
+    world.spawner.ends_at["a"] = signal.SIGKILL
+    hurry = asyncio.Event()
+    hurry.set()
+    before = len(world.log)
+    await _down(world, hurry)
+    assert world.log[before:] == ["a SIGKILL"]
+
+
+async def test_every_request_is_told_before_it_is_sent(tmp_path: Path) -> None:
+    world = _world(tmp_path, planned_node("a"))
+    await world.bring_up.connect(LIMIT_S)
+    sent = [(event.node, event.operation) for event in world.heard(RequestSent)]
+    assert sent == [("/a", Operation.CONFIGURE), ("/a", Operation.CONNECT)]
+    changes = [event.state for event in world.heard(ProcessChanged)]
+    assert changes == [ProcessState.STARTING, ProcessState.RUNNING]
+    await _down(world)
 
 
 def _failed(caught: pytest.ExceptionInfo[StepFailedError]) -> list[tuple[str, str, str]]:
     return [(each.rule.id, each.subject, each.message) for each in caught.value.every]
 
 
-def test_everything_that_fails_side_by_side_is_named_once_and_no_other_step_begins(
+async def test_everything_that_fails_side_by_side_is_named_once_and_no_other_step_begins(
     tmp_path: Path,
 ) -> None:
-    async def main() -> None:
-        world = _world(tmp_path, *(planned_node(key) for key in "abcd"))
-        world.spawner.ways["/b configure"] = "no camera"
-        world.spawner.ways["/c configure"] = "no arm"
-        world.spawner.takes_s["/c configure"] = 0.2
-        world.spawner.takes_s["/d configure"] = 0.1
-        world.spawner.takes_s["/a configure"] = 60.0
-        loop = asyncio.get_running_loop()
-        began = loop.time()
-        with pytest.raises(StepFailedError) as caught:
-            await world.bring_up.connect(LIMIT_S)
-        assert _failed(caught) == [
-            ("run.transition-failed", "/b", "cannot configure '/b': no camera"),
-            ("run.transition-failed", "/c", "cannot configure '/c': no arm"),
-        ]
-        assert loop.time() - began == pytest.approx(ALSO_S, abs=0.1)
-        assert "/d connect" not in world.log
-        await _down(world)
-
-    run(main())
+    world = _world(tmp_path, *(planned_node(key) for key in "abcd"))
+    world.spawner.ways["/b configure"] = "no camera"
+    world.spawner.ways["/c configure"] = "no arm"
+    world.spawner.takes_s["/c configure"] = 0.2
+    world.spawner.takes_s["/d configure"] = 0.1
+    world.spawner.takes_s["/a configure"] = 60.0
+    loop = asyncio.get_running_loop()
+    began = loop.time()
+    with pytest.raises(StepFailedError) as caught:
+        await world.bring_up.connect(LIMIT_S)
+    assert _failed(caught) == [
+        ("run.transition-failed", "/b", "cannot configure '/b': no camera"),
+        ("run.transition-failed", "/c", "cannot configure '/c': no arm"),
+    ]
+    assert loop.time() - began == pytest.approx(ALSO_S, abs=0.1)
+    assert "/d connect" not in world.log
+    await _down(world)
 
 
-def test_a_lone_failure_waits_for_nobody_who_is_not_in_a_step(tmp_path: Path) -> None:
-    async def main() -> None:
-        world = _world(
-            tmp_path, planned_node("a"), planned_node("b", after={"a": Condition.ACTIVE})
-        )
-        world.spawner.ways["/a connect"] = "no network"
-        world.spawner.takes_s["/a connect"] = 1.0
-        loop = asyncio.get_running_loop()
-        began = loop.time()
-        with pytest.raises(StepFailedError) as caught:
-            await world.bring_up.connect(LIMIT_S)
-        assert len(caught.value.every) == 1
-        assert loop.time() - began == pytest.approx(1.0, abs=0.1)
-        await _down(world)
-
-    run(main())
+async def test_a_lone_failure_waits_for_nobody_who_is_not_in_a_step(tmp_path: Path) -> None:
+    world = _world(tmp_path, planned_node("a"), planned_node("b", after={"a": Condition.ACTIVE}))
+    world.spawner.ways["/a connect"] = "no network"
+    world.spawner.takes_s["/a connect"] = 1.0
+    loop = asyncio.get_running_loop()
+    began = loop.time()
+    with pytest.raises(StepFailedError) as caught:
+        await world.bring_up.connect(LIMIT_S)
+    assert len(caught.value.every) == 1
+    assert loop.time() - began == pytest.approx(1.0, abs=0.1)
+    await _down(world)
 
 
-def test_a_process_is_blamed_once_for_each_node_that_it_cannot_host_and_for_no_other(
+async def test_a_process_is_blamed_once_for_each_node_that_it_cannot_host_and_for_no_other(
     tmp_path: Path,
 ) -> None:
-    async def main() -> None:
-        world = _world(
-            tmp_path,
-            *(planned_node(key, process="all") for key in "abc"),
-            planned_node("d"),
-        )
-        error = "ModuleNotFoundError: No module named 'camera_driver'"
-        world.spawner.unhosted["all"] = {"/b": error, "/c": "cannot import 'm:C': no module 'm'"}
-        world.spawner.takes_s["d start"] = 60.0
-        process_monitor = ProcessMonitor(world.system)
-        with pytest.raises(StepFailedError) as caught:
-            await process_monitor.during(world.bring_up.connect(LIMIT_S))
-        assert _failed(caught) == [
-            ("run.start-failed", "/b", f"cannot start '/b': {error}"),
-            ("run.start-failed", "/c", "cannot import 'm:C': no module 'm'"),
-        ]
-        await _down(world)
-
-    run(main())
+    world = _world(
+        tmp_path,
+        *(planned_node(key, process="all") for key in "abc"),
+        planned_node("d"),
+    )
+    error = "ModuleNotFoundError: No module named 'camera_driver'"
+    world.spawner.unhosted["all"] = {"/b": error, "/c": "cannot import 'm:C': no module 'm'"}
+    world.spawner.takes_s["d start"] = 60.0
+    process_monitor = ProcessMonitor(world.system)
+    with pytest.raises(StepFailedError) as caught:
+        await process_monitor.during(world.bring_up.connect(LIMIT_S))
+    assert _failed(caught) == [
+        ("run.start-failed", "/b", f"cannot start '/b': {error}"),
+        ("run.start-failed", "/c", "cannot import 'm:C': no module 'm'"),
+    ]
+    await _down(world)
 
 
-def test_a_process_that_ends_before_a_step_of_its_nodes_has_begun_is_blamed_for_what_it_reported(
+async def test_a_process_that_ends_before_a_step_has_begun_is_blamed_for_what_it_reported(
     tmp_path: Path,
 ) -> None:
-    async def main() -> None:
-        world = _world(tmp_path, *(planned_node(key, process="all") for key in "abc"))
-        error = "ModuleNotFoundError: No module named 'camera_driver'"
-        world.spawner.unhosted["all"] = {"/b": error, "/c": error}
-        process = world.system.processes["all"]
+    world = _world(tmp_path, *(planned_node(key, process="all") for key in "abc"))
+    error = "ModuleNotFoundError: No module named 'camera_driver'"
+    world.spawner.unhosted["all"] = {"/b": error, "/c": error}
+    process = world.system.processes["all"]
 
-        async def start_others() -> None:
-            spec = HostSpec(
-                system="s",
-                process="all",
-                domain_id=0,
-                discovery_range=world.system.plan.discovery_range,
-                nodes=world.system.plan.nodes,
-            )
-            await process.spawn(world.spawner, ControlChannel(spec, world.system.on_host_event))
-            await asyncio.sleep(60.0)
-
-        with pytest.raises(StepFailedError) as caught:
-            await ProcessMonitor(world.system).during(start_others())
-        assert _failed(caught) == [
-            ("run.start-failed", "/b", f"cannot start '/b': {error}"),
-            ("run.start-failed", "/c", f"cannot start '/c': {error}"),
-        ]
-        await _down(world)
-
-    run(main())
-
-
-def test_a_command_that_does_not_appear_may_call_its_node_otherwise(tmp_path: Path) -> None:
-    async def main() -> None:
-        world = _world(tmp_path, planned_node("a", kind=RunKind.COMMAND, timeouts=Timeouts()))
-        world.spawner.takes_s["a start"] = 60.0
-        with pytest.raises(StepFailedError) as caught:
-            await world.bring_up.connect(LIMIT_S)
-        assert caught.value.message == (
-            "cannot bring up '/a': it was still waiting to appear in the graph after 10 s; if its "
-            "code calls it otherwise, write 'name: a' at nodes.a"
+    async def start_others() -> None:
+        spec = HostSpec(
+            system="s",
+            process="all",
+            domain_id=0,
+            discovery_range=world.system.plan.discovery_range,
+            nodes=world.system.plan.nodes,
         )
-        await _down(world)
+        await process.spawn(world.spawner, ControlChannel(spec, world.system.on_host_event))
+        await asyncio.sleep(60.0)
 
-    run(main())
+    with pytest.raises(StepFailedError) as caught:
+        await ProcessMonitor(world.system).during(start_others())
+    assert _failed(caught) == [
+        ("run.start-failed", "/b", f"cannot start '/b': {error}"),
+        ("run.start-failed", "/c", f"cannot start '/c': {error}"),
+    ]
+    await _down(world)
 
 
-def test_every_process_that_died_by_then_is_named(tmp_path: Path) -> None:
-    async def main() -> None:
-        world = _world(
-            tmp_path,
-            *(planned_node(key, kind=RunKind.COMMAND, managed=False) for key in "ab"),
-            planned_node("c"),
-        )
-        world.spawner.takes_s["c start"] = 60.0
+async def test_a_command_that_does_not_appear_may_call_its_node_otherwise(tmp_path: Path) -> None:
+    world = _world(tmp_path, planned_node("a", kind=RunKind.COMMAND, timeouts=Timeouts()))
+    world.spawner.takes_s["a start"] = 60.0
+    with pytest.raises(StepFailedError) as caught:
+        await world.bring_up.connect(LIMIT_S)
+    assert caught.value.message == (
+        "cannot bring up '/a': it was still waiting to appear in the graph after 10 s; if its "
+        "code calls it otherwise, write 'name: a' at nodes.a"
+    )
+    await _down(world)
 
-        async def die() -> None:
-            await asyncio.sleep(1.0)
-            world.spawner.processes["a"].end(ProcessExit(status=127))
-            await asyncio.sleep(0.1)
-            world.spawner.processes["b"].end(ProcessExit(status=127))
 
-        dying = asyncio.ensure_future(die())
-        with pytest.raises(StepFailedError) as caught:
-            await ProcessMonitor(world.system).during(world.bring_up.connect(LIMIT_S))
-        await dying
-        assert [(each.rule.id, each.subject) for each in caught.value.every] == [
-            ("run.process-died", "/a"),
-            ("run.process-died", "/b"),
-        ]
-        assert caught.value.reason == "failed: /a (run.process-died), /b (run.process-died)"
-        await _down(world)
+async def test_every_process_that_died_by_then_is_named(tmp_path: Path) -> None:
+    world = _world(
+        tmp_path,
+        *(planned_node(key, kind=RunKind.COMMAND, managed=False) for key in "ab"),
+        planned_node("c"),
+    )
+    world.spawner.takes_s["c start"] = 60.0
 
-    run(main())
+    async def die() -> None:
+        await asyncio.sleep(1.0)
+        world.spawner.processes["a"].end(ProcessExit(status=127))
+        await asyncio.sleep(0.1)
+        world.spawner.processes["b"].end(ProcessExit(status=127))
+
+    dying = asyncio.ensure_future(die())
+    with pytest.raises(StepFailedError) as caught:
+        await ProcessMonitor(world.system).during(world.bring_up.connect(LIMIT_S))
+    await dying
+    assert [(each.rule.id, each.subject) for each in caught.value.every] == [
+        ("run.process-died", "/a"),
+        ("run.process-died", "/b"),
+    ]
+    assert caught.value.reason == "failed: /a (run.process-died), /b (run.process-died)"
+    await _down(world)
 
 
 @pytest.mark.parametrize("kind", [RunKind.PYTHON, RunKind.COMMAND])
-def test_a_process_that_is_still_starting_is_ended_at_once_and_not_by_an_interrupt(
+async def test_a_process_that_is_still_starting_is_ended_at_once_and_not_by_an_interrupt(
     tmp_path: Path, kind: RunKind
 ) -> None:
     """SIGINT would have Python print a traceback from the middle of an import."""
 
-    async def main() -> None:
-        managed = kind is RunKind.PYTHON
-        world = _world(tmp_path, planned_node("a", kind=kind, managed=managed), planned_node("b"))
-        world.spawner.takes_s["a start"] = 60.0
-        world.spawner.ends_at["a"] = signal.SIGTERM
-        world.spawner.ways["/b configure"] = "no arm"
-        with pytest.raises(StepFailedError):
-            await world.bring_up.connect(LIMIT_S)
-        loop = asyncio.get_running_loop()
-        began = loop.time()
-        await _down(world)
-        assert [each for each in world.log if each.startswith("a SIG")] == ["a SIGTERM"]
-        assert loop.time() - began < 0.1
-        assert world.heard(Notice) == []
-
-    run(main())
+    managed = kind is RunKind.PYTHON
+    world = _world(tmp_path, planned_node("a", kind=kind, managed=managed), planned_node("b"))
+    world.spawner.takes_s["a start"] = 60.0
+    world.spawner.ends_at["a"] = signal.SIGTERM
+    world.spawner.ways["/b configure"] = "no arm"
+    with pytest.raises(StepFailedError):
+        await world.bring_up.connect(LIMIT_S)
+    loop = asyncio.get_running_loop()
+    began = loop.time()
+    await _down(world)
+    assert [each for each in world.log if each.startswith("a SIG")] == ["a SIGTERM"]
+    assert loop.time() - began < 0.1
+    assert world.heard(Notice) == []
 
 
 def test_a_failure_is_one_finding_with_the_log_that_says_more() -> None:
@@ -734,21 +660,18 @@ def test_hosts_make_their_endpoints_once_the_last_participant_is_there() -> None
     assert _proceeding(_Host(0.1), _Host(0.4), _Host(0.3)) == [0.4, 0.4, 0.4]
 
 
-def test_hosts_are_told_of_us_once_they_listen_and_before_they_have_endpoints() -> None:
-    async def main() -> None:
-        met: list[list[float | None]] = []
-        hosts = (_Host(0.1, fails=True), _Host(0.2), _Host(0.3))
-        gathering = Gathering(
-            5.0, len(hosts), lambda: met.append([each.proceeded_at for each in hosts])
-        )
-        for host in hosts:
-            gathering.expect(host)  # type: ignore[arg-type]
-        await asyncio.sleep(1.0)
-        await gathering.close()
-        assert met == [[None, None, None]]
-        assert [each.proceeded_at is None for each in hosts] == [True, False, False]
-
-    run(main())
+async def test_hosts_are_told_of_us_once_they_listen_and_before_they_have_endpoints() -> None:
+    met: list[list[float | None]] = []
+    hosts = (_Host(0.1, fails=True), _Host(0.2), _Host(0.3))
+    gathering = Gathering(
+        5.0, len(hosts), lambda: met.append([each.proceeded_at for each in hosts])
+    )
+    for host in hosts:
+        gathering.expect(host)  # type: ignore[arg-type]
+    await asyncio.sleep(1.0)
+    await gathering.close()
+    assert met == [[None, None, None]]
+    assert [each.proceeded_at is None for each in hosts] == [True, False, False]
 
 
 def test_a_host_that_cannot_be_made_holds_no_other() -> None:

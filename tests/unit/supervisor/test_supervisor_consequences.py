@@ -33,7 +33,6 @@ from lifecycle.supervisor.policy.consequences import reaction_of
 from lifecycle.supervisor.run.events import Emitter
 from lifecycle.verify import RULES, Finding, HealthReport, Outcome
 from tests.builders import HERE, configuration, plan_of, planned_node
-from tests.unit.supervisor.fakes import run
 from tests.unit.supervisor.session_world import DOWN, SessionWorld, over
 
 REPORT, DEACTIVATE, MODE, PAUSE, STOP = Consequence
@@ -104,209 +103,192 @@ def _found(rule: str, subject: str, **rest: object) -> Finding:
 # Sessions
 
 
-def test_a_violated_node_is_deactivated_and_stays_so_until_it_is_resumed(tmp_path: Path) -> None:
-    async def main() -> None:
-        plan = _plan(camera=((TWICE, DEACTIVATE),))
-        world = SessionWorld(plan, tmp_path, stop_after_s=20.0)
-
-        async def violate() -> None:
-            await world.story.until("[system] active")
-            world.double("/camera")
-            await world.story.until("[node] /camera connected", 2)
-            await asyncio.sleep(3.0)
-            camera, viewer = world.status().nodes
-            why = f"on_violation: deactivate ({TWICE} of /camera); lifecycle resume"
-            assert (world.status().phase, camera.doing, viewer.doing) == ("held", why, "")
-            assert (await world.order(ControlRequest.RESUME))[0] == "4"
-            world.double()
-            await asyncio.sleep(3.0)
-            assert world.status().nodes[0].doing == why
-            assert await world.order(ControlRequest.RESUME) == "0"
-            assert world.status().nodes[0].doing == ""
-
-        await world.run(violate())
-        outline = world.since("[verdict] active violated")
-        assert outline[:3] == [
-            f"[verdict] active violated {TWICE} /camera",
-            f"[consequence] deactivate /camera for {TWICE}",
-            "/camera deactivate",
-        ]
-        assert outline[-len(DOWN) - 8 : -len(DOWN) - 3] == [
-            "[system] verified at 6.5 s",
-            "networks programmed (ok)",
-            "[gate] ok: /camera",
-            "/camera activate",
-            "[system] active at 6.5 s",
-        ]
-        assert world.outline.count("/viewer deactivate") == 1
-        assert world.story[-1] == "[stopped] 4"
-
-    run(main())
-
-
-def test_what_passes_has_no_consequence(tmp_path: Path) -> None:
-    async def main() -> None:
-        world = SessionWorld(_plan((("default", STOP),)), tmp_path, stop_after_s=5.0)
-
-        async def violate() -> None:
-            await world.story.until("[system] active")
-            for _ in range(3):
-                world.double("/camera")
-                await asyncio.sleep(0.3)
-                world.double()
-                await asyncio.sleep(0.3)
-
-        await world.run(violate())
-        assert world.story[-1] == "[stopped] 0"
-
-    run(main())
-
-
-def test_a_violation_stops_the_run_in_order_with_exit_code_4(tmp_path: Path) -> None:
-    async def main() -> None:
-        world = SessionWorld(_plan(((TWICE, STOP), ("default", PAUSE))), tmp_path)
-
-        async def violate() -> None:
-            await world.story.until("[system] active")
-            world.double("/viewer")
-
-        await world.run(violate())
-        assert world.since("[consequence]") == [
-            f"[consequence] stop  for {TWICE}",
-            f"[stopping] at 0.5 s: on_violation: stop ({TWICE} of /viewer)",
-            *DOWN,
-            *over(4),
-        ]
-
-    run(main())
-
-
-def test_what_concerns_no_node_of_the_system_pauses_all_of_it(tmp_path: Path) -> None:
-    async def main() -> None:
-        plan = _plan((("graph", DEACTIVATE),))
-        world = SessionWorld(plan, tmp_path, stop_after_s=10.0)
-
-        async def violate() -> None:
-            await world.story.until("[system] active")
-            world.intrude()
-            await world.story.until("[system] paused")
-            await asyncio.sleep(2.0)
-            assert world.status().phase == "paused"
-            assert "graph.undeclared-node of /intruder" in world.status().nodes[1].doing
-            world.retreat()
-            assert await world.order(ControlRequest.RESUME) == "0"
-
-        await world.run(violate())
-        assert world.since("[consequence]")[:4] == [
-            "[consequence] pause  for graph.undeclared-node",
-            "/viewer deactivate",
-            "/camera deactivate",
-            "[system] paused at 0.5 s",
-        ]
-        assert len([each for each in world.outline if each.startswith("[consequence]")]) == 1
-
-    run(main())
-
-
-def test_a_node_that_is_being_restarted_has_no_consequence_and_one_withheld_comes_back_inactive(
+async def test_a_violated_node_is_deactivated_and_stays_so_until_it_is_resumed(
     tmp_path: Path,
 ) -> None:
-    async def main() -> None:
-        plan = _plan((("default", STOP), (TWICE, DEACTIVATE)), restart=RestartWhen.ON_FAILURE)
-        world = SessionWorld(plan, tmp_path, stop_after_s=20.0)
+    plan = _plan(camera=((TWICE, DEACTIVATE),))
+    world = SessionWorld(plan, tmp_path, stop_after_s=20.0)
 
-        async def violate() -> None:
-            await world.story.until("[system] active")
-            world.kill("camera")
-            await world.story.until("[restarted] camera (1)")
-            await asyncio.sleep(1.0)
+    async def violate() -> None:
+        await world.story.until("[system] active")
+        world.double("/camera")
+        await world.story.until("[node] /camera connected", 2)
+        await asyncio.sleep(3.0)
+        camera, viewer = world.status().nodes
+        why = f"on_violation: deactivate ({TWICE} of /camera); lifecycle resume"
+        assert (world.status().phase, camera.doing, viewer.doing) == ("held", why, "")
+        assert (await world.order(ControlRequest.RESUME))[0] == "4"
+        world.double()
+        await asyncio.sleep(3.0)
+        assert world.status().nodes[0].doing == why
+        assert await world.order(ControlRequest.RESUME) == "0"
+        assert world.status().nodes[0].doing == ""
+
+    await world.run(violate())
+    outline = world.since("[verdict] active violated")
+    assert outline[:3] == [
+        f"[verdict] active violated {TWICE} /camera",
+        f"[consequence] deactivate /camera for {TWICE}",
+        "/camera deactivate",
+    ]
+    assert outline[-len(DOWN) - 8 : -len(DOWN) - 3] == [
+        "[system] verified at 6.5 s",
+        "networks programmed (ok)",
+        "[gate] ok: /camera",
+        "/camera activate",
+        "[system] active at 6.5 s",
+    ]
+    assert world.outline.count("/viewer deactivate") == 1
+    assert world.story[-1] == "[stopped] 4"
+
+
+async def test_what_passes_has_no_consequence(tmp_path: Path) -> None:
+    world = SessionWorld(_plan((("default", STOP),)), tmp_path, stop_after_s=5.0)
+
+    async def violate() -> None:
+        await world.story.until("[system] active")
+        for _ in range(3):
             world.double("/camera")
-            await world.story.until("[consequence]")
-            await asyncio.sleep(1.0)
+            await asyncio.sleep(0.3)
             world.double()
-            world.kill("camera")
-            await world.story.until("[restarted] camera (2)")
-            await asyncio.sleep(1.0)
-            assert world.status().phase == "held"
-            assert await world.order(ControlRequest.RESUME) == "0"
+            await asyncio.sleep(0.3)
 
-        await world.run(violate())
-        assert world.outline.count("/camera activate") == 3
-        assert world.outline.count("/viewer activate") == 1
-        assert world.story[-1] == "[stopped] 4"
-
-    run(main())
+    await world.run(violate())
+    assert world.story[-1] == "[stopped] 0"
 
 
-def test_who_comes_again_passes_its_gate_while_another_is_held_behind_it(tmp_path: Path) -> None:
-    async def main() -> None:
-        plan = plan_of(
-            dataclasses.replace(planned_node("camera"), on_violation=_said(((TWICE, DEACTIVATE),))),
-            planned_node("viewer", supervision=Supervision(restart=RestartWhen.ON_FAILURE)),
-        )
-        world = SessionWorld(plan, tmp_path, stop_after_s=60.0)
+async def test_a_violation_stops_the_run_in_order_with_exit_code_4(tmp_path: Path) -> None:
+    world = SessionWorld(_plan(((TWICE, STOP), ("default", PAUSE))), tmp_path)
 
-        async def violate() -> None:
-            await world.story.until("[system] active")
-            world.double("/camera")
-            await world.story.until("[node] /camera connected (inactive)", 2)
-            world.double()
-            world.kill("viewer")
-            began = asyncio.get_running_loop().time()
-            await world.story.until("[restarted] viewer (1)")
-            assert asyncio.get_running_loop().time() - began < 2.0
-            camera, viewer = world.status().nodes
-            assert world.status().phase == "held"
-            assert (camera.state, viewer.state) == ("inactive", "active")
-            assert await world.order(ControlRequest.RESUME) == "0"
-            assert world.status().phase == "active"
+    async def violate() -> None:
+        await world.story.until("[system] active")
+        world.double("/viewer")
 
-        await world.run(violate())
-        assert not [each for each in world.outline if each.startswith("[failure] run.transition")]
-
-    run(main())
+    await world.run(violate())
+    assert world.since("[consequence]") == [
+        f"[consequence] stop  for {TWICE}",
+        f"[stopping] at 0.5 s: on_violation: stop ({TWICE} of /viewer)",
+        *DOWN,
+        *over(4),
+    ]
 
 
-def test_a_violation_enters_a_mode_once_and_one_that_its_gate_refuses_is_left_again(
+async def test_what_concerns_no_node_of_the_system_pauses_all_of_it(tmp_path: Path) -> None:
+    plan = _plan((("graph", DEACTIVATE),))
+    world = SessionWorld(plan, tmp_path, stop_after_s=10.0)
+
+    async def violate() -> None:
+        await world.story.until("[system] active")
+        world.intrude()
+        await world.story.until("[system] paused")
+        await asyncio.sleep(2.0)
+        assert world.status().phase == "paused"
+        assert "graph.undeclared-node of /intruder" in world.status().nodes[1].doing
+        world.retreat()
+        assert await world.order(ControlRequest.RESUME) == "0"
+
+    await world.run(violate())
+    assert world.since("[consequence]")[:4] == [
+        "[consequence] pause  for graph.undeclared-node",
+        "/viewer deactivate",
+        "/camera deactivate",
+        "[system] paused at 0.5 s",
+    ]
+    assert len([each for each in world.outline if each.startswith("[consequence]")]) == 1
+
+
+async def test_a_node_in_restart_has_no_consequence_and_one_withheld_comes_back_inactive(
     tmp_path: Path,
 ) -> None:
-    async def main() -> None:
-        plan = plan_of(planned_node("camera"), planned_node("viewer"))
-        plan = dataclasses.replace(
-            plan,
-            modes=(
-                Mode(name="normal", inactive=("viewer",), at=HERE),
-                Mode(name="safe", inactive=("camera", "viewer"), at=HERE),
-                Mode(name="other", inactive=("camera",), at=HERE),
-            ),
-            on_violation=(
-                Reaction(rule=TWICE, what=MODE, mode="safe"),
-                Reaction(rule="graph.undeclared-node", what=MODE, mode="other"),
-            ),
-        )
-        world = SessionWorld(in_mode(plan, "normal"), tmp_path, stop_after_s=20.0)
+    plan = _plan((("default", STOP), (TWICE, DEACTIVATE)), restart=RestartWhen.ON_FAILURE)
+    world = SessionWorld(plan, tmp_path, stop_after_s=20.0)
 
-        async def violate() -> None:
-            await world.story.until("[system] active")
-            world.double("/camera")
-            await world.story.until("[mode] safe")
-            await asyncio.sleep(3.0)
-            assert (world.status().mode, world.status().phase) == ("safe", "active")
-            world.double()
-            assert await world.order(ControlRequest.MODE, mode="normal") == "0"
-            world.intrude()
-            await world.story.until("[notice] cannot enter mode 'other': back to 'normal'")
-            await asyncio.sleep(3.0)
-            assert (world.status().mode, world.status().phase) == ("normal", "held")
+    async def violate() -> None:
+        await world.story.until("[system] active")
+        world.kill("camera")
+        await world.story.until("[restarted] camera (1)")
+        await asyncio.sleep(1.0)
+        world.double("/camera")
+        await world.story.until("[consequence]")
+        await asyncio.sleep(1.0)
+        world.double()
+        world.kill("camera")
+        await world.story.until("[restarted] camera (2)")
+        await asyncio.sleep(1.0)
+        assert world.status().phase == "held"
+        assert await world.order(ControlRequest.RESUME) == "0"
 
-        await world.run(violate())
-        taken = [each for each in world.outline if each.startswith("[consequence]")]
-        assert taken == [
-            f"[consequence] mode  for {TWICE}",
-            "[consequence] mode  for graph.undeclared-node",
-        ]
+    await world.run(violate())
+    assert world.outline.count("/camera activate") == 3
+    assert world.outline.count("/viewer activate") == 1
+    assert world.story[-1] == "[stopped] 4"
 
-    run(main())
+
+async def test_who_comes_again_passes_its_gate_while_another_is_held_behind_it(
+    tmp_path: Path,
+) -> None:
+    plan = plan_of(
+        dataclasses.replace(planned_node("camera"), on_violation=_said(((TWICE, DEACTIVATE),))),
+        planned_node("viewer", supervision=Supervision(restart=RestartWhen.ON_FAILURE)),
+    )
+    world = SessionWorld(plan, tmp_path, stop_after_s=60.0)
+
+    async def violate() -> None:
+        await world.story.until("[system] active")
+        world.double("/camera")
+        await world.story.until("[node] /camera connected (inactive)", 2)
+        world.double()
+        world.kill("viewer")
+        began = asyncio.get_running_loop().time()
+        await world.story.until("[restarted] viewer (1)")
+        assert asyncio.get_running_loop().time() - began < 2.0
+        camera, viewer = world.status().nodes
+        assert world.status().phase == "held"
+        assert (camera.state, viewer.state) == ("inactive", "active")
+        assert await world.order(ControlRequest.RESUME) == "0"
+        assert world.status().phase == "active"
+
+    await world.run(violate())
+    assert not [each for each in world.outline if each.startswith("[failure] run.transition")]
+
+
+async def test_a_violation_enters_a_mode_once_and_one_that_its_gate_refuses_is_left_again(
+    tmp_path: Path,
+) -> None:
+    plan = plan_of(planned_node("camera"), planned_node("viewer"))
+    plan = dataclasses.replace(
+        plan,
+        modes=(
+            Mode(name="normal", inactive=("viewer",), at=HERE),
+            Mode(name="safe", inactive=("camera", "viewer"), at=HERE),
+            Mode(name="other", inactive=("camera",), at=HERE),
+        ),
+        on_violation=(
+            Reaction(rule=TWICE, what=MODE, mode="safe"),
+            Reaction(rule="graph.undeclared-node", what=MODE, mode="other"),
+        ),
+    )
+    world = SessionWorld(in_mode(plan, "normal"), tmp_path, stop_after_s=20.0)
+
+    async def violate() -> None:
+        await world.story.until("[system] active")
+        world.double("/camera")
+        await world.story.until("[mode] safe")
+        await asyncio.sleep(3.0)
+        assert (world.status().mode, world.status().phase) == ("safe", "active")
+        world.double()
+        assert await world.order(ControlRequest.MODE, mode="normal") == "0"
+        world.intrude()
+        await world.story.until("[notice] cannot enter mode 'other': back to 'normal'")
+        await asyncio.sleep(3.0)
+        assert (world.status().mode, world.status().phase) == ("normal", "held")
+
+    await world.run(violate())
+    taken = [each for each in world.outline if each.startswith("[consequence]")]
+    assert taken == [
+        f"[consequence] mode  for {TWICE}",
+        "[consequence] mode  for graph.undeclared-node",
+    ]
 
 
 def test_what_a_node_said_of_its_health_while_it_was_inactive_lets_nobody_through() -> None:
@@ -324,49 +306,46 @@ def test_what_a_node_said_of_its_health_while_it_was_inactive_lets_nobody_throug
     assert node.has_reached(Condition.HEALTHY)
 
 
-def test_a_node_waits_until_another_is_healthy_and_one_that_no_longer_is_has_a_consequence(
+async def test_a_node_waits_until_another_is_healthy_and_one_that_no_longer_is_has_a_consequence(
     tmp_path: Path,
 ) -> None:
-    async def main() -> None:
-        camera, viewer = (planned_node(each) for each in ("camera", "viewer"))
-        camera = dataclasses.replace(camera, health=Health(check=True))
-        viewer = planned_node("viewer", after={"camera": Condition.HEALTHY})
-        plan = plan_of(camera, viewer)
-        plan = dataclasses.replace(plan, on_violation=_said((("node", DEACTIVATE),)))
-        world = SessionWorld(plan, tmp_path, stop_after_s=10.0)
-        interfaces = world.hosts.interfaces
-        unsaid = HealthReport(ok=None, message="it has not answered")
-        interfaces["/camera"] = dataclasses.replace(interfaces["/camera"], health=unsaid)
+    camera, viewer = (planned_node(each) for each in ("camera", "viewer"))
+    camera = dataclasses.replace(camera, health=Health(check=True))
+    viewer = planned_node("viewer", after={"camera": Condition.HEALTHY})
+    plan = plan_of(camera, viewer)
+    plan = dataclasses.replace(plan, on_violation=_said((("node", DEACTIVATE),)))
+    world = SessionWorld(plan, tmp_path, stop_after_s=10.0)
+    interfaces = world.hosts.interfaces
+    unsaid = HealthReport(ok=None, message="it has not answered")
+    interfaces["/camera"] = dataclasses.replace(interfaces["/camera"], health=unsaid)
 
-        def report(health: HealthReport) -> None:
-            interfaces["/camera"] = dataclasses.replace(interfaces["/camera"], health=health)
-            world.system.on_host_event(
-                HostEvent(
-                    kind="configuration",
-                    node="/camera",
-                    state=interfaces["/camera"].state,
-                    connected=True,
-                    configuration=interfaces["/camera"],
-                )
+    def report(health: HealthReport) -> None:
+        interfaces["/camera"] = dataclasses.replace(interfaces["/camera"], health=health)
+        world.system.on_host_event(
+            HostEvent(
+                kind="configuration",
+                node="/camera",
+                state=interfaces["/camera"].state,
+                connected=True,
+                configuration=interfaces["/camera"],
             )
+        )
 
-        async def change() -> None:
-            # What it does not say in 5 s is taken on trust, but nobody activates by it.
-            await world.story.until("/camera activate")
-            await asyncio.sleep(3.0)
-            assert "/viewer activate" not in world.story
-            report(HealthReport(ok=True))
-            await world.story.until("[system] active")
-            await asyncio.sleep(1.0)
-            report(HealthReport(ok=False, message="too hot"))
+    async def change() -> None:
+        # What it does not say in 5 s is taken on trust, but nobody activates by it.
+        await world.story.until("/camera activate")
+        await asyncio.sleep(3.0)
+        assert "/viewer activate" not in world.story
+        report(HealthReport(ok=True))
+        await world.story.until("[system] active")
+        await asyncio.sleep(1.0)
+        report(HealthReport(ok=False, message="too hot"))
 
-        await world.run(change())
-        at = world.outline.index("[system] active at 8.0 s")
-        assert world.outline[at + 1 : at + 4] == [
-            "[verdict] active violated node.unhealthy /camera",
-            "[consequence] deactivate /camera for node.unhealthy",
-            "/camera deactivate",
-        ]
-        assert "cannot accept node /camera: it is not healthy: too hot" in world.messages
-
-    run(main())
+    await world.run(change())
+    at = world.outline.index("[system] active at 8.0 s")
+    assert world.outline[at + 1 : at + 4] == [
+        "[verdict] active violated node.unhealthy /camera",
+        "[consequence] deactivate /camera for node.unhealthy",
+        "/camera deactivate",
+    ]
+    assert "cannot accept node /camera: it is not healthy: too hot" in world.messages

@@ -773,40 +773,34 @@ def _system(tmp_path: Path) -> System:
     return system
 
 
-def test_the_first_process_that_ends_is_told_and_each_only_once(tmp_path: Path) -> None:
-    async def test() -> None:
-        system = _system(tmp_path)
-        assert system.server is not None
-        camera, viewer = system.processes["camera"], system.processes["viewer"]
-        known: set[str] = set()
-        for process in (viewer, system.server, camera):
-            death = asyncio.ensure_future(first_death(system, known))
-            await asyncio.sleep(1.0)
-            assert not death.done()
-            _end(process)
-            assert await asyncio.wait_for(death, 1.0) is process
-            assert process.name in known
-        # All have ended: there is nothing to wait for but the end of the waiting.
+async def test_the_first_process_that_ends_is_told_and_each_only_once(tmp_path: Path) -> None:
+    system = _system(tmp_path)
+    assert system.server is not None
+    camera, viewer = system.processes["camera"], system.processes["viewer"]
+    known: set[str] = set()
+    for process in (viewer, system.server, camera):
         death = asyncio.ensure_future(first_death(system, known))
-        await asyncio.sleep(60.0)
-        assert not death.done()
-        death.cancel()
-
-    run(test())
-
-
-def test_a_process_that_is_started_again_did_not_die(tmp_path: Path) -> None:
-    async def test() -> None:
-        system = _system(tmp_path)
-        system.server = None
-        death = asyncio.ensure_future(first_death(system, set()))
-        _end(system.processes["camera"], ProcessState.BACKOFF)
         await asyncio.sleep(1.0)
         assert not death.done()
-        _end(system.processes["viewer"])
-        assert await asyncio.wait_for(death, 1.0) is system.processes["viewer"]
+        _end(process)
+        assert await asyncio.wait_for(death, 1.0) is process
+        assert process.name in known
+    # All have ended: there is nothing to wait for but the end of the waiting.
+    death = asyncio.ensure_future(first_death(system, known))
+    await asyncio.sleep(60.0)
+    assert not death.done()
+    death.cancel()
 
-    run(test())
+
+async def test_a_process_that_is_started_again_did_not_die(tmp_path: Path) -> None:
+    system = _system(tmp_path)
+    system.server = None
+    death = asyncio.ensure_future(first_death(system, set()))
+    _end(system.processes["camera"], ProcessState.BACKOFF)
+    await asyncio.sleep(1.0)
+    assert not death.done()
+    _end(system.processes["viewer"])
+    assert await asyncio.wait_for(death, 1.0) is system.processes["viewer"]
 
 
 def test_while_held_a_passing_violation_is_told_but_does_not_count(tmp_path: Path) -> None:

@@ -41,7 +41,7 @@ from lifecycle.supervisor.run.events import (
 from lifecycle.verify.observation import Observation, ObservedNode
 from lifecycle.verify.outcome import Outcome
 from tests.builders import HERE, plan_of, planned_node
-from tests.unit.supervisor.fakes import World, run
+from tests.unit.supervisor.fakes import World
 
 
 class Ears:
@@ -74,36 +74,33 @@ def test_a_silent_node_is_told_once_and_alive_when_its_last_cause_is_gone() -> N
     assert ears.changes == 4
 
 
-def test_a_node_is_not_called_alive_that_has_not_started_or_is_not_in_the_graph(
+async def test_a_node_is_not_called_alive_that_has_not_started_or_is_not_in_the_graph(
     tmp_path: Path,
 ) -> None:
-    async def test() -> None:
-        desk = Desk(tmp_path)
-        # Stopped in the middle of an import, and continued: it has not begun to live.
-        desk.system.liveliness.fell_silent(["/camera"], Cause.STOPPED, "it was stopped")
-        desk.system.liveliness.came_back(["/camera"], Cause.STOPPED)
-        # A supervisor that was started anew has not started its nodes yet.
-        desk.desk.alive(True)
-        await settle()
-        desk.desk.alive(False)
-        await settle()
-        desk.system.present = frozenset({"/lamp"})
-        desk.desk.alive(True)
-        await settle()
-        alive = [each for each in desk.events if isinstance(each, NodeAlive)]
-        assert {each.node: each.there for each in alive} == {
-            "/camera": False,
-            "/viewer": False,
-            "/lamp": True,
-        }
-        assert [describe(dataclasses.replace(each, silent_s=2.0)) for each in alive] == [
-            "/camera: not silent any more after 2.0 s, but not there yet",
-            "/viewer: not silent any more after 2.0 s, but not there yet",
-            "/lamp: alive again after 2.0 s",
-        ]
-        await desk.peer_supervisors.close()
-
-    run(test())
+    desk = Desk(tmp_path)
+    # Stopped in the middle of an import, and continued: it has not begun to live.
+    desk.system.liveliness.fell_silent(["/camera"], Cause.STOPPED, "it was stopped")
+    desk.system.liveliness.came_back(["/camera"], Cause.STOPPED)
+    # A supervisor that was started anew has not started its nodes yet.
+    desk.desk.alive(True)
+    await settle()
+    desk.desk.alive(False)
+    await settle()
+    desk.system.present = frozenset({"/lamp"})
+    desk.desk.alive(True)
+    await settle()
+    alive = [each for each in desk.events if isinstance(each, NodeAlive)]
+    assert {each.node: each.there for each in alive} == {
+        "/camera": False,
+        "/viewer": False,
+        "/lamp": True,
+    }
+    assert [describe(dataclasses.replace(each, silent_s=2.0)) for each in alive] == [
+        "/camera: not silent any more after 2.0 s, but not there yet",
+        "/viewer: not silent any more after 2.0 s, but not there yet",
+        "/lamp: alive again after 2.0 s",
+    ]
+    await desk.peer_supervisors.close()
 
 
 def test_the_same_cause_twice_is_no_news() -> None:
@@ -265,134 +262,109 @@ async def settle() -> None:
         await asyncio.sleep(0)
 
 
-def test_with_a_machine_its_nodes_are_lost_and_found(tmp_path: Path) -> None:
-    async def test() -> None:
-        desk = Desk(tmp_path)
-        desk.desk.alive(True)
-        await settle()
-        desk.desk.alive(False)
-        await settle()
-        desk.desk.alive(True)
-        await settle()
-        assert desk.told() == [
-            ("connection", "desk"),
-            ("connection", "desk"),
-            ("silent", "/viewer"),
-            ("silent", "/lamp"),
-            ("connection", "desk"),
-            ("alive", "/viewer"),
-            ("alive", "/lamp"),
-        ]
-        states = [each.established for each in desk.events if isinstance(each, MachineConnection)]
-        assert states == [True, False, True]
-        await desk.peer_supervisors.close()
-
-    run(test())
+async def test_with_a_machine_its_nodes_are_lost_and_found(tmp_path: Path) -> None:
+    desk = Desk(tmp_path)
+    desk.desk.alive(True)
+    await settle()
+    desk.desk.alive(False)
+    await settle()
+    desk.desk.alive(True)
+    await settle()
+    assert desk.told() == [
+        ("connection", "desk"),
+        ("connection", "desk"),
+        ("silent", "/viewer"),
+        ("silent", "/lamp"),
+        ("connection", "desk"),
+        ("alive", "/viewer"),
+        ("alive", "/lamp"),
+    ]
+    states = [each.established for each in desk.events if isinstance(each, MachineConnection)]
+    assert states == [True, False, True]
+    await desk.peer_supervisors.close()
 
 
-def test_a_machine_that_was_never_heard_is_not_lost(tmp_path: Path) -> None:
-    async def test() -> None:
-        desk = Desk(tmp_path)
-        desk.desk.alive(False)
-        await settle()
-        assert desk.told() == []
-        await desk.peer_supervisors.close()
-
-    run(test())
+async def test_a_machine_that_was_never_heard_is_not_lost(tmp_path: Path) -> None:
+    desk = Desk(tmp_path)
+    desk.desk.alive(False)
+    await settle()
+    assert desk.told() == []
+    await desk.peer_supervisors.close()
 
 
-def test_a_supervisor_that_leaves_properly_loses_no_node(tmp_path: Path) -> None:
-    async def test() -> None:
-        desk = Desk(tmp_path)
-        desk.desk.alive(True)
-        desk.desk.left()
-        await settle()
-        assert desk.told() == [("connection", "desk"), ("connection", "desk")]
-        await desk.peer_supervisors.close()
-
-    run(test())
+async def test_a_supervisor_that_leaves_properly_loses_no_node(tmp_path: Path) -> None:
+    desk = Desk(tmp_path)
+    desk.desk.alive(True)
+    desk.desk.left()
+    await settle()
+    assert desk.told() == [("connection", "desk"), ("connection", "desk")]
+    await desk.peer_supervisors.close()
 
 
-def test_that_dds_forgets_a_lost_machine_changes_nothing(tmp_path: Path) -> None:
-    async def test() -> None:
-        desk = Desk(tmp_path)
-        desk.desk.alive(True)
-        desk.desk.alive(False)
-        desk.desk.left()
-        await settle()
-        assert set(desk.system.liveliness.silent) == {"/viewer", "/lamp"}
-        await desk.peer_supervisors.close()
-
-    run(test())
+async def test_that_dds_forgets_a_lost_machine_changes_nothing(tmp_path: Path) -> None:
+    desk = Desk(tmp_path)
+    desk.desk.alive(True)
+    desk.desk.alive(False)
+    desk.desk.left()
+    await settle()
+    assert set(desk.system.liveliness.silent) == {"/viewer", "/lamp"}
+    await desk.peer_supervisors.close()
 
 
-def test_calls_go_out_while_somebody_is_missing_and_only_then(tmp_path: Path) -> None:
-    async def test() -> None:
-        desk = Desk(tmp_path)
-        desk.desk.alive(True)
-        await settle()
-        assert desk.air.calls == []
-        desk.desk.alive(False)
-        await asyncio.sleep(3.5 * CALL_EACH_S)
-        assert desk.air.calls == [["10.0.0.2"]] * 4
-        desk.desk.alive(True)
-        await asyncio.sleep(10 * CALL_EACH_S)
-        assert len(desk.air.calls) == 4
-        await desk.peer_supervisors.close()
-
-    run(test())
+async def test_calls_go_out_while_somebody_is_missing_and_only_then(tmp_path: Path) -> None:
+    desk = Desk(tmp_path)
+    desk.desk.alive(True)
+    await settle()
+    assert desk.air.calls == []
+    desk.desk.alive(False)
+    await asyncio.sleep(3.5 * CALL_EACH_S)
+    assert desk.air.calls == [["10.0.0.2"]] * 4
+    desk.desk.alive(True)
+    await asyncio.sleep(10 * CALL_EACH_S)
+    assert len(desk.air.calls) == 4
+    await desk.peer_supervisors.close()
 
 
-def test_what_another_supervisor_says_of_its_nodes_is_taken_over(tmp_path: Path) -> None:
-    async def test() -> None:
-        desk = Desk(tmp_path)
-        desk.desk.silent({"/viewer": "a callback hangs", "/camera": "not theirs to say"})
-        await settle()
-        assert dict(desk.system.liveliness.silent) == {"/viewer": "a callback hangs"}
-        desk.desk.silent({})
-        await settle()
-        assert desk.told() == [("silent", "/viewer"), ("alive", "/viewer")]
-        await desk.peer_supervisors.close()
-
-    run(test())
+async def test_what_another_supervisor_says_of_its_nodes_is_taken_over(tmp_path: Path) -> None:
+    desk = Desk(tmp_path)
+    desk.desk.silent({"/viewer": "a callback hangs", "/camera": "not theirs to say"})
+    await settle()
+    assert dict(desk.system.liveliness.silent) == {"/viewer": "a callback hangs"}
+    desk.desk.silent({})
+    await settle()
+    assert desk.told() == [("silent", "/viewer"), ("alive", "/viewer")]
+    await desk.peer_supervisors.close()
 
 
-def test_our_own_silent_nodes_are_told_again_and_again_until_it_is_over(tmp_path: Path) -> None:
-    async def test() -> None:
-        desk = Desk(tmp_path)
-        desk.system.liveliness.fell_silent(["/camera"], Cause.HUNG, "it hangs")
-        await asyncio.sleep(1)
-        desk.system.liveliness.came_back(["/camera"], Cause.HUNG)
-        await asyncio.sleep(1)
-        assert desk.air.voices["robot/robot"].told == [{"/camera": "it hangs"}] * 3 + [{}] * 3
-        await desk.peer_supervisors.close()
-
-    run(test())
-
-
-def test_who_is_lost_to_us_is_not_told_to_others(tmp_path: Path) -> None:
-    async def test() -> None:
-        desk = Desk(tmp_path)
-        desk.desk.alive(True)
-        desk.desk.alive(False)
-        await asyncio.sleep(1)
-        assert desk.air.voices["robot/robot"].told == []
-        await desk.peer_supervisors.close()
-
-    run(test())
+async def test_our_own_silent_nodes_are_told_again_and_again_until_it_is_over(
+    tmp_path: Path,
+) -> None:
+    desk = Desk(tmp_path)
+    desk.system.liveliness.fell_silent(["/camera"], Cause.HUNG, "it hangs")
+    await asyncio.sleep(1)
+    desk.system.liveliness.came_back(["/camera"], Cause.HUNG)
+    await asyncio.sleep(1)
+    assert desk.air.voices["robot/robot"].told == [{"/camera": "it hangs"}] * 3 + [{}] * 3
+    await desk.peer_supervisors.close()
 
 
-def test_a_system_of_one_machine_neither_speaks_nor_listens(tmp_path: Path) -> None:
-    async def test() -> None:
-        plan = plan_of(planned_node("camera"))
-        system = System(plan, emit=Emitter(), logs=tmp_path, processes=plan.processes)
-        air = FakeAir()
-        peer_supervisors = PeerSupervisors(system, air)
-        peer_supervisors.open()
-        assert (air.ears, air.voices) == ({}, {})
-        await peer_supervisors.close()
+async def test_who_is_lost_to_us_is_not_told_to_others(tmp_path: Path) -> None:
+    desk = Desk(tmp_path)
+    desk.desk.alive(True)
+    desk.desk.alive(False)
+    await asyncio.sleep(1)
+    assert desk.air.voices["robot/robot"].told == []
+    await desk.peer_supervisors.close()
 
-    run(test())
+
+async def test_a_system_of_one_machine_neither_speaks_nor_listens(tmp_path: Path) -> None:
+    plan = plan_of(planned_node("camera"))
+    system = System(plan, emit=Emitter(), logs=tmp_path, processes=plan.processes)
+    air = FakeAir()
+    peer_supervisors = PeerSupervisors(system, air)
+    peer_supervisors.open()
+    assert (air.ears, air.voices) == ({}, {})
+    await peer_supervisors.close()
 
 
 def attached(*keys: str) -> Plan:
@@ -408,80 +380,76 @@ def attached(*keys: str) -> Plan:
     return dataclasses.replace(plan, processes=processes)
 
 
-def test_a_reloaded_plan_has_its_own_attached_nodes_followed_and_no_others(tmp_path: Path) -> None:
-    async def test() -> None:
-        plan = attached("lidar", "radar")
-        system = System(plan, emit=Emitter(), logs=tmp_path, processes=plan.processes)
-        air = FakeAir()
-        peer_supervisors = PeerSupervisors(system, air)
-        peer_supervisors.open()
-        assert set(air.ears) == {"/lidar", "/radar"}
-        old = dict(air.ears)
-        for each in old.values():
-            each.listener.alive(True)
-        peer_supervisors.renew()
-        assert air.destroyed == 0  # the same nodes: nobody is heard anew
-        old["/lidar"].listener.alive(False)
-        await settle()
-        assert set(system.liveliness.silent) == {"/lidar"}
-        await asyncio.sleep(1)
-        assert air.calls
+async def test_a_reloaded_plan_has_its_own_attached_nodes_followed_and_no_others(
+    tmp_path: Path,
+) -> None:
+    plan = attached("lidar", "radar")
+    system = System(plan, emit=Emitter(), logs=tmp_path, processes=plan.processes)
+    air = FakeAir()
+    peer_supervisors = PeerSupervisors(system, air)
+    peer_supervisors.open()
+    assert set(air.ears) == {"/lidar", "/radar"}
+    old = dict(air.ears)
+    for each in old.values():
+        each.listener.alive(True)
+    peer_supervisors.renew()
+    assert air.destroyed == 0  # the same nodes: nobody is heard anew
+    old["/lidar"].listener.alive(False)
+    await settle()
+    assert set(system.liveliness.silent) == {"/lidar"}
+    await asyncio.sleep(1)
+    assert air.calls
 
-        plan = attached("radar", "sonar")
-        system.take(plan, tuple(system.nodes.values()))
-        air.ears.clear()
-        peer_supervisors.renew()
-        assert air.destroyed == 2
-        assert set(air.ears) == {"/radar", "/sonar"}
-        # Who is not planned any more is neither missed nor called, whatever was on the way.
-        old["/radar"].listener.alive(False)
-        await settle()
-        assert dict(system.liveliness.silent) == {}
-        air.calls.clear()
-        await asyncio.sleep(1)
-        assert air.calls == []
-        air.ears["/sonar"].listener.alive(True)
-        air.ears["/sonar"].listener.alive(False)
-        await settle()
-        assert set(system.liveliness.silent) == {"/sonar"}
-        await peer_supervisors.close()
-
-    run(test())
+    plan = attached("radar", "sonar")
+    system.take(plan, tuple(system.nodes.values()))
+    air.ears.clear()
+    peer_supervisors.renew()
+    assert air.destroyed == 2
+    assert set(air.ears) == {"/radar", "/sonar"}
+    # Who is not planned any more is neither missed nor called, whatever was on the way.
+    old["/radar"].listener.alive(False)
+    await settle()
+    assert dict(system.liveliness.silent) == {}
+    air.calls.clear()
+    await asyncio.sleep(1)
+    assert air.calls == []
+    air.ears["/sonar"].listener.alive(True)
+    air.ears["/sonar"].listener.alive(False)
+    await settle()
+    assert set(system.liveliness.silent) == {"/sonar"}
+    await peer_supervisors.close()
 
 
 @pytest.mark.parametrize("came_back", [True, False])
-def test_a_loss_has_us_and_our_hosts_prepare_and_after_it_tell_our_names_anew(
+async def test_a_loss_has_us_and_our_hosts_prepare_and_after_it_tell_our_names_anew(
     tmp_path: Path, came_back: bool
 ) -> None:
-    async def test() -> None:
-        plan = two_machines()
-        world = World(plan, tmp_path)
-        world.system.remote = dict(Desk(tmp_path).system.remote)
-        air = FakeAir()
-        peer_supervisors = PeerSupervisors(world.system, air)
-        peer_supervisors.open()
-        await world.bring_up.connect(30)
-        listener = air.ears["robot/desk"].listener
+    plan = two_machines()
+    world = World(plan, tmp_path)
+    world.system.remote = dict(Desk(tmp_path).system.remote)
+    air = FakeAir()
+    peer_supervisors = PeerSupervisors(world.system, air)
+    peer_supervisors.open()
+    await world.bring_up.connect(30)
+    listener = air.ears["robot/desk"].listener
+    listener.alive(True)
+    await asyncio.sleep(1)
+    assert air.done == []
+    listener.alive(False)
+    await asyncio.sleep(1)
+    done = ["send_again_soon"]
+    assert air.done == done
+    if came_back:
         listener.alive(True)
         await asyncio.sleep(1)
-        assert air.done == []
-        listener.alive(False)
-        await asyncio.sleep(1)
-        done = ["send_again_soon"]
-        assert air.done == done
-        if came_back:
-            listener.alive(True)
-            await asyncio.sleep(1)
-            done.append("republish_names")
-        assert air.done == done
-        operations = (Operation.SEND_AGAIN_SOON, Operation.REPUBLISH_NAMES)
-        asked = [each for each in operations if f"/camera {each.value}" in world.log]
-        assert [each.value for each in asked] == done
-        await peer_supervisors.close()
-        for process in world.system.processes.values():
-            await process.end(((9, 5.0),), asyncio.Event())
-
-    run(test())
+        done.append("republish_names")
+    assert air.done == done
+    operations = (Operation.SEND_AGAIN_SOON, Operation.REPUBLISH_NAMES)
+    asked = [each for each in operations if f"/camera {each.value}" in world.log]
+    assert [each.value for each in asked] == done
+    await peer_supervisors.close()
+    for process in world.system.processes.values():
+        await process.end(((9, 5.0),), asyncio.Event())
 
 
 def test_a_channel_tells_that_its_host_hangs_and_when_it_came_back() -> None:
@@ -598,36 +566,33 @@ def test_a_fork_server_tells_that_a_process_was_stopped_and_continues(tmp_path: 
     asyncio.run(test())
 
 
-def test_who_receives_nothing_any_more_is_silent_and_so_said_of_the_supervisor_itself(
+async def test_who_receives_nothing_any_more_is_silent_and_so_said_of_the_supervisor_itself(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(reception, "EACH_S", 0.0)
 
-    async def test() -> None:
-        desk = Desk(tmp_path)
-        monkeypatch.setattr(ManagedProcess, "pid", 4711)
-        asked: list[set[int]] = []
-        looks = iter([{}, {4711: "has left unread"}, {os.getpid(): "has left unread"}, {}])
-        done = asyncio.Event()
+    desk = Desk(tmp_path)
+    monkeypatch.setattr(ManagedProcess, "pid", 4711)
+    asked: list[set[int]] = []
+    looks = iter([{}, {4711: "has left unread"}, {os.getpid(): "has left unread"}, {}])
+    done = asyncio.Event()
 
-        def deadlocked(pids: Iterable[int]) -> dict[int, str]:
-            asked.append(set(pids))
-            found = next(looks, None)
-            if found is None:
-                done.set()
-            rules.append([each.rule for each in desk.system.liveliness.findings()])
-            return found or {}
+    def deadlocked(pids: Iterable[int]) -> dict[int, str]:
+        asked.append(set(pids))
+        found = next(looks, None)
+        if found is None:
+            done.set()
+        rules.append([each.rule for each in desk.system.liveliness.findings()])
+        return found or {}
 
-        rules: list[list[str]] = []
-        watching = asyncio.ensure_future(reception.watch_reception(desk.system, deadlocked))
-        await asyncio.wait_for(done.wait(), 5.0)
-        watching.cancel()
-        assert asked[0] == {os.getpid(), 4711}
-        assert rules[:5] == [[], [], ["run.silent-node"], ["run.deadlocked-observer"], []]
-        assert [(each.kind, getattr(each, "cause", "")) for each in desk.events] == [
-            ("silent", "deadlocked"),
-            ("notice", ""),
-            ("alive", ""),
-        ]
-
-    run(test())
+    rules: list[list[str]] = []
+    watching = asyncio.ensure_future(reception.watch_reception(desk.system, deadlocked))
+    await asyncio.wait_for(done.wait(), 5.0)
+    watching.cancel()
+    assert asked[0] == {os.getpid(), 4711}
+    assert rules[:5] == [[], [], ["run.silent-node"], ["run.deadlocked-observer"], []]
+    assert [(each.kind, getattr(each, "cause", "")) for each in desk.events] == [
+        ("silent", "deadlocked"),
+        ("notice", ""),
+        ("alive", ""),
+    ]

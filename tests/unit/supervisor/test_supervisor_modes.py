@@ -22,7 +22,6 @@ from lifecycle.plan import in_mode
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.control.server import ControlRequest
 from tests.builders import HERE, node, plan_of, planned, planned_node
-from tests.unit.supervisor.fakes import run
 from tests.unit.supervisor.session_world import INTRUDED, SessionWorld
 
 MODE = ControlRequest.MODE
@@ -50,39 +49,36 @@ def test_a_mode_keeps_its_nodes_inactive_and_the_next_has_them_active_again() ->
     assert in_mode(blind, "unknown") is blind
 
 
-def test_a_mode_takes_nodes_out_at_once_and_back_in_through_the_gate(tmp_path: Path) -> None:
-    async def main() -> None:
-        world = SessionWorld(_plan(), tmp_path, stop_after_s=10.0)
+async def test_a_mode_takes_nodes_out_at_once_and_back_in_through_the_gate(tmp_path: Path) -> None:
+    world = SessionWorld(_plan(), tmp_path, stop_after_s=10.0)
 
-        async def switch() -> None:
-            await world.story.until("[system] active")
-            assert await world.order(MODE, mode="degraded") == "0"
-            await asyncio.sleep(2.0)
-            status = world.status()
-            assert (status.mode, status.phase, status.not_ok) == ("degraded", "active", "")
-            assert await world.order(MODE, mode="blind") == "0"
-            await asyncio.sleep(2.0)
-            assert await world.order(MODE, mode="blnd") == (
-                "2 cannot enter mode 'blnd' of 'robot': it has the modes normal, degraded, blind; "
-                "did you mean 'blind'?"
-            )
-            assert await world.order(MODE, mode="normal") == "0"
+    async def switch() -> None:
+        await world.story.until("[system] active")
+        assert await world.order(MODE, mode="degraded") == "0"
+        await asyncio.sleep(2.0)
+        status = world.status()
+        assert (status.mode, status.phase, status.not_ok) == ("degraded", "active", "")
+        assert await world.order(MODE, mode="blind") == "0"
+        await asyncio.sleep(2.0)
+        assert await world.order(MODE, mode="blnd") == (
+            "2 cannot enter mode 'blnd' of 'robot': it has the modes normal, degraded, blind; "
+            "did you mean 'blind'?"
+        )
+        assert await world.order(MODE, mode="normal") == "0"
 
-        await world.run(switch())
-        outline = world.since("[mode]")
-        assert outline[: outline.index("[stopping] at 10.0 s: done")] == [
-            "[mode] degraded without /camera",
-            "[system] active at 0.0 s",
-            "/base deactivate",
-            "[mode] blind without /base",
-            *_through("/camera", 2.0),
-            "[mode] normal",
-            *_through("/base", 4.0),
-        ]
-        assert world.outline[world.outline.index(outline[0]) - 1] == "/camera deactivate"
-        assert world.story[-1] == "[stopped] 0"
-
-    run(main())
+    await world.run(switch())
+    outline = world.since("[mode]")
+    assert outline[: outline.index("[stopping] at 10.0 s: done")] == [
+        "[mode] degraded without /camera",
+        "[system] active at 0.0 s",
+        "/base deactivate",
+        "[mode] blind without /base",
+        *_through("/camera", 2.0),
+        "[mode] normal",
+        *_through("/base", 4.0),
+    ]
+    assert world.outline[world.outline.index(outline[0]) - 1] == "/camera deactivate"
+    assert world.story[-1] == "[stopped] 0"
 
 
 def _through(node: str, at_s: float) -> list[str]:
@@ -95,62 +91,56 @@ def _through(node: str, at_s: float) -> list[str]:
     ]
 
 
-def test_a_mode_with_less_is_entered_whatever_is_violated_and_one_with_more_is_not(
+async def test_a_mode_with_less_is_entered_whatever_is_violated_and_one_with_more_is_not(
     tmp_path: Path,
 ) -> None:
-    async def main() -> None:
-        world = SessionWorld(_plan(), tmp_path, stop_after_s=20.0)
+    world = SessionWorld(_plan(), tmp_path, stop_after_s=20.0)
 
-        async def switch() -> None:
-            await world.story.until("[system] active")
-            world.intrude()
-            await world.story.until("[verdict] active violated")
-            assert await world.order(MODE, mode="degraded") == "0"
-            answer = await world.order(MODE, mode="normal")
-            assert answer.startswith("4 cannot activate: the verdict is violated")
-            status = world.status()
-            assert (status.mode, status.phase) == ("degraded", "active")
-            # This one would take another node out: it waits at the gate of the mode before.
-            assert (await world.order(MODE, mode="blind"))[0] == "4"
-            status = world.status()
-            assert (status.mode, status.phase) == ("degraded", "held")
-            world.retreat()
-            assert await world.order(ControlRequest.RESUME) == "0"
-            assert world.status().phase == "active"
+    async def switch() -> None:
+        await world.story.until("[system] active")
+        world.intrude()
+        await world.story.until("[verdict] active violated")
+        assert await world.order(MODE, mode="degraded") == "0"
+        answer = await world.order(MODE, mode="normal")
+        assert answer.startswith("4 cannot activate: the verdict is violated")
+        status = world.status()
+        assert (status.mode, status.phase) == ("degraded", "active")
+        # This one would take another node out: it waits at the gate of the mode before.
+        assert (await world.order(MODE, mode="blind"))[0] == "4"
+        status = world.status()
+        assert (status.mode, status.phase) == ("degraded", "held")
+        world.retreat()
+        assert await world.order(ControlRequest.RESUME) == "0"
+        assert world.status().phase == "active"
 
-        await world.run(switch())
-        assert any(INTRUDED in each for each in world.outline)
-        assert "[notice] cannot enter mode 'normal': back to 'degraded'" in world.outline
-        assert world.outline.count("/camera activate") == 1
-        assert world.outline.count("/base activate") == 2
-
-    run(main())
+    await world.run(switch())
+    assert any(INTRUDED in each for each in world.outline)
+    assert "[notice] cannot enter mode 'normal': back to 'degraded'" in world.outline
+    assert world.outline.count("/camera activate") == 1
+    assert world.outline.count("/base activate") == 2
 
 
-def test_a_paused_system_stays_paused_and_what_is_restarted_comes_back_as_its_mode_says(
+async def test_a_paused_system_stays_paused_and_what_is_restarted_comes_back_as_its_mode_says(
     tmp_path: Path,
 ) -> None:
-    async def main() -> None:
-        world = SessionWorld(_plan(Restart.ON_FAILURE), tmp_path, stop_after_s=20.0)
+    world = SessionWorld(_plan(Restart.ON_FAILURE), tmp_path, stop_after_s=20.0)
 
-        async def switch() -> None:
-            await world.story.until("[system] active")
-            assert await world.order(ControlRequest.PAUSE) == "0"
-            assert await world.order(MODE, mode="degraded") == "0"
-            assert world.status().phase == "paused"
-            assert await world.order(ControlRequest.RESUME) == "0"
-            world.kill("camera")
-            await world.story.until("[restarted] camera")
-            assert world.status().phase == "active"
-            assert await world.order(ControlRequest.RESTART) == "0"
-            assert world.status().mode == "degraded"
+    async def switch() -> None:
+        await world.story.until("[system] active")
+        assert await world.order(ControlRequest.PAUSE) == "0"
+        assert await world.order(MODE, mode="degraded") == "0"
+        assert world.status().phase == "paused"
+        assert await world.order(ControlRequest.RESUME) == "0"
+        world.kill("camera")
+        await world.story.until("[restarted] camera")
+        assert world.status().phase == "active"
+        assert await world.order(ControlRequest.RESTART) == "0"
+        assert world.status().mode == "degraded"
 
-        await world.run(switch())
-        assert world.outline.count("/camera activate") == 1
-        assert world.outline.count("/base activate") == 3
-        assert world.story[-1] == "[stopped] 0"
-
-    run(main())
+    await world.run(switch())
+    assert world.outline.count("/camera activate") == 1
+    assert world.outline.count("/base activate") == 3
+    assert world.story[-1] == "[stopped] 0"
 
 
 def _with_speeds() -> Plan:
@@ -177,69 +167,61 @@ def test_a_mode_has_parameters_and_the_next_has_them_as_they_are_declared() -> N
     assert in_mode(in_mode(plan, "slow"), "normal") == plan
 
 
-def test_parameters_are_set_before_what_comes_in_is_activated_and_set_back_if_one_is_refused(
+async def test_parameters_are_set_before_what_comes_in_is_activated_and_set_back_if_one_is_refused(
     tmp_path: Path,
 ) -> None:
-    async def main() -> None:
-        plan = dataclasses.replace(
-            _with_speeds(), policy=Policy(ros_interface=RosInterfaceAccess.FULL)
-        )
-        world = SessionWorld(plan, tmp_path, stop_after_s=10.0)
+    plan = dataclasses.replace(_with_speeds(), policy=Policy(ros_interface=RosInterfaceAccess.FULL))
+    world = SessionWorld(plan, tmp_path, stop_after_s=10.0)
 
-        async def switch() -> None:
-            await world.story.until("[system] active")
-            await asyncio.sleep(0.3)
-            ros = world.graph.ros
-            assert ros is not None
-            assert ros.services[-2:] == ("mode/normal", "mode/slow")
-            assert await ros.call("mode/slow") == (True, "active")
-            assert await world.order(MODE, mode="normal") == "0"
-            world.graph.refuses = "speed=0.2"
-            assert await world.order(MODE, mode="slow") == (
-                "6 cannot enter mode 'slow': cannot set 'speed=0.2'"
-            )
-            status = world.status()
-            assert (status.mode, status.phase) == ("normal", "active")
-
-        await world.run(switch())
-        outline = [each for each in world.since("[system] active")[1:] if "[system]" not in each]
-        # Fake nodes report no parameters.
-        through = ["networks programmed (unverifiable)", "[gate] unverifiable: /camera"]
-        through.append("/camera activate")
-        assert outline[: outline.index("[stopping] at 10.0 s: done")] == [
-            "/camera deactivate",
-            "/base given speed=0.2",
-            "[mode] slow without /camera",
-            "/base given speed=1.0",
-            "[mode] normal",
-            *through,
-            "/camera deactivate",
-            "/base given speed=0.2",
-            "[notice] cannot enter mode 'slow': back to 'normal'",
-            "/base given speed=1.0",
-            "[mode] normal",
-            *through,
-        ]
-
-    run(main())
-
-
-def test_a_consequence_that_a_node_refuses_is_reported_and_the_system_goes_on(
-    tmp_path: Path,
-) -> None:
-    async def main() -> None:
-        what = Reaction(rule="graph", what=Consequence.MODE, mode="slow")
-        world = SessionWorld(
-            dataclasses.replace(_with_speeds(), on_violation=(what,)), tmp_path, stop_after_s=10.0
-        )
+    async def switch() -> None:
+        await world.story.until("[system] active")
+        await asyncio.sleep(0.3)
+        ros = world.graph.ros
+        assert ros is not None
+        assert ros.services[-2:] == ("mode/normal", "mode/slow")
+        assert await ros.call("mode/slow") == (True, "active")
+        assert await world.order(MODE, mode="normal") == "0"
         world.graph.refuses = "speed=0.2"
+        assert await world.order(MODE, mode="slow") == (
+            "6 cannot enter mode 'slow': cannot set 'speed=0.2'"
+        )
+        status = world.status()
+        assert (status.mode, status.phase) == ("normal", "active")
 
-        async def intrude() -> None:
-            await world.story.until("[system] active")
-            world.intrude()
-            await world.story.until("[notice] cannot enter mode 'slow': cannot set")
+    await world.run(switch())
+    outline = [each for each in world.since("[system] active")[1:] if "[system]" not in each]
+    # Fake nodes report no parameters.
+    through = ["networks programmed (unverifiable)", "[gate] unverifiable: /camera"]
+    through.append("/camera activate")
+    assert outline[: outline.index("[stopping] at 10.0 s: done")] == [
+        "/camera deactivate",
+        "/base given speed=0.2",
+        "[mode] slow without /camera",
+        "/base given speed=1.0",
+        "[mode] normal",
+        *through,
+        "/camera deactivate",
+        "/base given speed=0.2",
+        "[notice] cannot enter mode 'slow': back to 'normal'",
+        "/base given speed=1.0",
+        "[mode] normal",
+        *through,
+    ]
 
-        await world.run(intrude())
-        assert world.status().mode == "normal"
 
-    run(main())
+async def test_a_consequence_that_a_node_refuses_is_reported_and_the_system_goes_on(
+    tmp_path: Path,
+) -> None:
+    what = Reaction(rule="graph", what=Consequence.MODE, mode="slow")
+    world = SessionWorld(
+        dataclasses.replace(_with_speeds(), on_violation=(what,)), tmp_path, stop_after_s=10.0
+    )
+    world.graph.refuses = "speed=0.2"
+
+    async def intrude() -> None:
+        await world.story.until("[system] active")
+        world.intrude()
+        await world.story.until("[notice] cannot enter mode 'slow': cannot set")
+
+    await world.run(intrude())
+    assert world.status().mode == "normal"

@@ -26,7 +26,7 @@ from lifecycle.supervisor.run.shutdown import TakeDown
 from lifecycle.verify.observation import Observation
 from lifecycle.verify.outcome import Outcome
 from tests.builders import plan_of, planned_node
-from tests.unit.supervisor.fakes import World, run, verdict_of
+from tests.unit.supervisor.fakes import World, verdict_of
 from tests.unit.test_run_directory import STATUS
 
 PLAN = plan_of(
@@ -47,18 +47,15 @@ PLAN = plan_of(
 @pytest.mark.parametrize(
     "phase", [ACTIVE, PAUSED, HELD, "connecting", "verifying", "restarting", "stopping"]
 )
-def test_an_order_fits_some_phases_and_no_others(
+async def test_an_order_fits_some_phases_and_no_others(
     tmp_path: Path, kind: ControlRequest, fits: set[str], phase: str
 ) -> None:
-    async def test() -> None:
-        system = World(PLAN, tmp_path).system
-        if phase in fits:
+    system = World(PLAN, tmp_path).system
+    if phase in fits:
+        check_order(Order(ask=kind), system, phase)
+    else:
+        with pytest.raises(UsageError, match=rf"^cannot {kind.value} 'robot': it is {phase};"):
             check_order(Order(ask=kind), system, phase)
-        else:
-            with pytest.raises(UsageError, match=rf"^cannot {kind.value} 'robot': it is {phase};"):
-                check_order(Order(ask=kind), system, phase)
-
-    run(test())
 
 
 @pytest.mark.parametrize(
@@ -71,33 +68,27 @@ def test_an_order_fits_some_phases_and_no_others(
         ("/base", "cannot restart '/base': it is attached, no process of this supervisor"),
     ],
 )
-def test_a_node_that_is_not_ours_is_not_restarted(tmp_path: Path, node: str, message: str) -> None:
-    async def test() -> None:
-        system = World(PLAN, tmp_path).system
-        for known in ("camera", "/camera"):
-            check_order(Order(ask=ControlRequest.RESTART, node=known), system, ACTIVE)
-        with pytest.raises(UsageError) as caught:
-            check_order(Order(ask=ControlRequest.RESTART, node=node), system, ACTIVE)
-        assert str(caught.value) == message
+async def test_a_node_that_is_not_ours_is_not_restarted(
+    tmp_path: Path, node: str, message: str
+) -> None:
+    system = World(PLAN, tmp_path).system
+    for known in ("camera", "/camera"):
+        check_order(Order(ask=ControlRequest.RESTART, node=known), system, ACTIVE)
+    with pytest.raises(UsageError) as caught:
+        check_order(Order(ask=ControlRequest.RESTART, node=node), system, ACTIVE)
+    assert str(caught.value) == message
 
-    run(test())
 
-
-def test_orders_are_carried_out_one_by_one_and_refused_once_all_is_over() -> None:
-    async def test() -> None:
-        mailbox = Mailbox()
-        first = asyncio.ensure_future(mailbox.place(Order(ask=ControlRequest.PAUSE)))
-        second = asyncio.ensure_future(mailbox.place(Order(ask=ControlRequest.RESUME)))
-        pending = await mailbox.next()
-        assert pending.order.ask is ControlRequest.PAUSE
-        pending.finish(Answer(exit_code=0))
-        assert await first == Answer(exit_code=0)
-        mailbox.close("cannot go on: over")
-        assert await second == Answer(
-            exit_code=ExitCode.BRING_UP_FAILED, error="cannot go on: over"
-        )
-
-    run(test())
+async def test_orders_are_carried_out_one_by_one_and_refused_once_all_is_over() -> None:
+    mailbox = Mailbox()
+    first = asyncio.ensure_future(mailbox.place(Order(ask=ControlRequest.PAUSE)))
+    second = asyncio.ensure_future(mailbox.place(Order(ask=ControlRequest.RESUME)))
+    pending = await mailbox.next()
+    assert pending.order.ask is ControlRequest.PAUSE
+    pending.finish(Answer(exit_code=0))
+    assert await first == Answer(exit_code=0)
+    mailbox.close("cannot go on: over")
+    assert await second == Answer(exit_code=ExitCode.BRING_UP_FAILED, error="cannot go on: over")
 
 
 def test_the_control_socket_looks_follows_and_orders(tmp_path: Path) -> None:
@@ -140,54 +131,48 @@ def test_the_control_socket_looks_follows_and_orders(tmp_path: Path) -> None:
     asyncio.run(test())
 
 
-def test_nodes_are_deactivated_in_reverse_order_and_come_up_anew_in_new_processes(
+async def test_nodes_are_deactivated_in_reverse_order_and_come_up_anew_in_new_processes(
     tmp_path: Path,
 ) -> None:
-    async def test() -> None:
-        plan = plan_of(
-            planned_node("camera"), planned_node("viewer", after={"camera": Condition.ACTIVE})
-        )
-        world = World(plan, tmp_path)
-        gate = Gate(strict=False)
-        await world.bring_up.connect(30.0)
-        await world.bring_up.activate(gate.judge(verdict_of(Outcome.OK)), 30.0)
-        world.spawner.takes_s["/viewer deactivate"] = 3.0
-        before = len(world.log)
-        await world.bring_up.deactivate()
-        assert world.log[before:] == ["/viewer deactivate", "/camera deactivate"]
-        assert {node.reach for node in world.system.nodes.values()} == {Reach.CONNECTED}
+    plan = plan_of(
+        planned_node("camera"), planned_node("viewer", after={"camera": Condition.ACTIVE})
+    )
+    world = World(plan, tmp_path)
+    gate = Gate(strict=False)
+    await world.bring_up.connect(30.0)
+    await world.bring_up.activate(gate.judge(verdict_of(Outcome.OK)), 30.0)
+    world.spawner.takes_s["/viewer deactivate"] = 3.0
+    before = len(world.log)
+    await world.bring_up.deactivate()
+    assert world.log[before:] == ["/viewer deactivate", "/camera deactivate"]
+    assert {node.reach for node in world.system.nodes.values()} == {Reach.CONNECTED}
 
-        camera, viewer = world.system.nodes["camera"], world.system.nodes["viewer"]
-        old = camera.process
-        before = len(world.log)
-        await TakeDown(world.system, world.emit, asyncio.Event(), nodes=(camera,)).run()
-        assert [each for each in world.log[before:] if "viewer" in each] == []
-        world.system.renew((camera,))
-        assert camera.process is not old
-        assert world.system.processes["camera"] is camera.process
-        assert (camera.reach, viewer.reach) == (Reach.WAITING, Reach.CONNECTED)
-        await world.bring_up.connect(30.0, (camera,))
-        assert camera.reach is Reach.CONNECTED
-        await world.bring_up.close()
-        await TakeDown(world.system, world.emit, asyncio.Event()).run()
-
-    run(test())
+    camera, viewer = world.system.nodes["camera"], world.system.nodes["viewer"]
+    old = camera.process
+    before = len(world.log)
+    await TakeDown(world.system, world.emit, asyncio.Event(), nodes=(camera,)).run()
+    assert [each for each in world.log[before:] if "viewer" in each] == []
+    world.system.renew((camera,))
+    assert camera.process is not old
+    assert world.system.processes["camera"] is camera.process
+    assert (camera.reach, viewer.reach) == (Reach.WAITING, Reach.CONNECTED)
+    await world.bring_up.connect(30.0, (camera,))
+    assert camera.reach is Reach.CONNECTED
+    await world.bring_up.close()
+    await TakeDown(world.system, world.emit, asyncio.Event()).run()
 
 
-def test_a_permit_of_an_earlier_gate_activates_nothing_after_a_pause(tmp_path: Path) -> None:
-    async def test() -> None:
-        world = World(plan_of(planned_node("camera")), tmp_path)
-        gate = Gate(strict=False)
-        await world.bring_up.connect(30.0)
-        permit = gate.judge(verdict_of(Outcome.OK))
+async def test_a_permit_of_an_earlier_gate_activates_nothing_after_a_pause(tmp_path: Path) -> None:
+    world = World(plan_of(planned_node("camera")), tmp_path)
+    gate = Gate(strict=False)
+    await world.bring_up.connect(30.0)
+    permit = gate.judge(verdict_of(Outcome.OK))
+    await world.bring_up.activate(permit, 30.0)
+    gate.close()
+    await world.bring_up.deactivate()
+    before = len(world.log)
+    with pytest.raises(BringUpError, match="the gate was closed again before this request"):
         await world.bring_up.activate(permit, 30.0)
-        gate.close()
-        await world.bring_up.deactivate()
-        before = len(world.log)
-        with pytest.raises(BringUpError, match="the gate was closed again before this request"):
-            await world.bring_up.activate(permit, 30.0)
-        assert world.log[before:] == []
-        await world.bring_up.close()
-        await TakeDown(world.system, world.emit, asyncio.Event()).run()
-
-    run(test())
+    assert world.log[before:] == []
+    await world.bring_up.close()
+    await TakeDown(world.system, world.emit, asyncio.Event()).run()

@@ -49,6 +49,7 @@ from tests.builders import port_node, teleop
 
 PYTHON = sys.executable
 BOUND_S = 20.0
+REAL_TIME = True
 
 
 def _run(test: Coroutine[Any, Any, None]) -> None:
@@ -111,123 +112,102 @@ async def _bench(tmp_path: Path) -> Any:
         await bench.close()
 
 
-def test_a_command_gets_its_arguments_environment_and_session_and_its_end_is_noticed(
+async def test_a_command_gets_its_arguments_environment_and_session_and_its_end_is_noticed(
     tmp_path: Path,
 ) -> None:
-    async def test() -> None:
-        code = "import os; print(os.environ['COLOUR'], os.getsid(0) == os.getpid()); exit(3)"
-        async with _bench(tmp_path) as bench:
-            process = await bench.start(PYTHON, "-c", code, environment=(("COLOUR", "red"),))
-            assert await process.ended == ProcessExit(status=3)
-            await process.end(COMMAND_ESCALATION, asyncio.Event())
-            assert bench.lines == ["red True"]
-            assert process.log.path.read_text() == "red True\n"
-
-    _run(test())
+    code = "import os; print(os.environ['COLOUR'], os.getsid(0) == os.getpid()); exit(3)"
+    async with _bench(tmp_path) as bench:
+        process = await bench.start(PYTHON, "-c", code, environment=(("COLOUR", "red"),))
+        assert await process.ended == ProcessExit(status=3)
+        await process.end(COMMAND_ESCALATION, asyncio.Event())
+        assert bench.lines == ["red True"]
+        assert process.log.path.read_text() == "red True\n"
 
 
-def test_a_process_is_read_together_with_what_it_started(tmp_path: Path) -> None:
-    async def test() -> None:
-        started = "import subprocess; subprocess.run(['sleep', '60'])"
-        async with _bench(tmp_path) as bench:
-            process = await bench.start(PYTHON, "-c", started)
-            for _ in range(500):
-                if len(found := Lineage().of(process.pid)) > 1:
-                    break
-                await asyncio.sleep(0.02)
-            assert found == {process.pid, *descendants(process.pid)}
-            assert len(found) == 2
-
-    _run(test())
+async def test_a_process_is_read_together_with_what_it_started(tmp_path: Path) -> None:
+    started = "import subprocess; subprocess.run(['sleep', '60'])"
+    async with _bench(tmp_path) as bench:
+        process = await bench.start(PYTHON, "-c", started)
+        for _ in range(500):
+            if len(found := Lineage().of(process.pid)) > 1:
+                break
+            await asyncio.sleep(0.02)
+        assert found == {process.pid, *descendants(process.pid)}
+        assert len(found) == 2
 
 
-def test_a_killed_process_is_noticed_within_a_tenth_of_a_second(tmp_path: Path) -> None:
-    async def test() -> None:
-        took_s = []
-        async with _bench(tmp_path) as bench:
-            for _ in range(5):
-                process = await bench.start("sleep", "60")
-                began = time.monotonic()
-                os.kill(process.pid, signal.SIGKILL)
-                assert await process.ended == ProcessExit(signal=signal.SIGKILL)
-                took_s.append(time.monotonic() - began)
-        assert min(took_s) < 0.1  # the others may have had to wait for a processor
-
-    _run(test())
+async def test_a_killed_process_is_noticed_within_a_tenth_of_a_second(tmp_path: Path) -> None:
+    took_s = []
+    async with _bench(tmp_path) as bench:
+        for _ in range(5):
+            process = await bench.start("sleep", "60")
+            began = time.monotonic()
+            os.kill(process.pid, signal.SIGKILL)
+            assert await process.ended == ProcessExit(signal=signal.SIGKILL)
+            took_s.append(time.monotonic() - began)
+    assert min(took_s) < 0.1  # the others may have had to wait for a processor
 
 
-def test_how_a_process_ended_may_be_reported_later_than_it_is_waited_for(
+async def test_how_a_process_ended_may_be_reported_later_than_it_is_waited_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("lifecycle.supervisor.processes.fork_server._STATUS_WAIT_S", 0.01)
 
-    async def test() -> None:
-        wrong: list[object] = []
-        asyncio.get_running_loop().set_exception_handler(lambda _, context: wrong.append(context))
-        async with _bench(tmp_path) as bench:
-            process = await bench.start("sleep", "60")
-            os.kill(bench.fork_server.pid, signal.SIGSTOP)  # it has no processor
-            os.kill(process.pid, signal.SIGKILL)
-            assert await process.ended == ProcessExit()
-            os.kill(bench.fork_server.pid, signal.SIGCONT)
-            another = await bench.start("true")
-            await another.ended
-        assert wrong == []
-
-    _run(test())
+    wrong: list[object] = []
+    asyncio.get_running_loop().set_exception_handler(lambda _, context: wrong.append(context))
+    async with _bench(tmp_path) as bench:
+        process = await bench.start("sleep", "60")
+        os.kill(bench.fork_server.pid, signal.SIGSTOP)  # it has no processor
+        os.kill(process.pid, signal.SIGKILL)
+        assert await process.ended == ProcessExit()
+        os.kill(bench.fork_server.pid, signal.SIGCONT)
+        another = await bench.start("true")
+        await another.ended
+    assert wrong == []
 
 
-def test_a_program_that_does_not_exist_says_so_in_its_output(tmp_path: Path) -> None:
-    async def test() -> None:
-        async with _bench(tmp_path) as bench:
-            process = await bench.start("/no/such/program")
-            assert await process.ended == ProcessExit(status=127)
-            await process.end(COMMAND_ESCALATION, asyncio.Event())
-            assert process.log.tail == ("cannot run '/no/such/program': No such file or directory",)
-
-    _run(test())
+async def test_a_program_that_does_not_exist_says_so_in_its_output(tmp_path: Path) -> None:
+    async with _bench(tmp_path) as bench:
+        process = await bench.start("/no/such/program")
+        assert await process.ended == ProcessExit(status=127)
+        await process.end(COMMAND_ESCALATION, asyncio.Event())
+        assert process.log.tail == ("cannot run '/no/such/program': No such file or directory",)
 
 
-def test_a_process_that_ignores_sigint_and_sigterm_is_killed_with_its_group(
+async def test_a_process_that_ignores_sigint_and_sigterm_is_killed_with_its_group(
     tmp_path: Path,
 ) -> None:
-    async def test() -> None:
-        code = (
-            "import signal, subprocess, time\n"
-            "for number in (signal.SIGINT, signal.SIGTERM): signal.signal(number, signal.SIG_IGN)\n"
-            "print(subprocess.Popen(['sleep', '60']).pid, flush=True)\n"
-            "time.sleep(60)"
-        )
-        steps = ((signal.SIGINT, 0.1), (signal.SIGTERM, 0.1), (signal.SIGKILL, 5.0))
-        async with _bench(tmp_path) as bench:
-            process = await bench.start(PYTHON, "-c", code)
-            await bench.spoke.wait()
-            grandchild = psutil.Process(int(bench.lines[0]))
-            assert await process.end(steps, asyncio.Event()) == "SIGKILL"
-            assert process.ended.result() == ProcessExit(signal=signal.SIGKILL)
-            grandchild.wait(BOUND_S)
-
-    _run(test())
+    code = (
+        "import signal, subprocess, time\n"
+        "for number in (signal.SIGINT, signal.SIGTERM): signal.signal(number, signal.SIG_IGN)\n"
+        "print(subprocess.Popen(['sleep', '60']).pid, flush=True)\n"
+        "time.sleep(60)"
+    )
+    steps = ((signal.SIGINT, 0.1), (signal.SIGTERM, 0.1), (signal.SIGKILL, 5.0))
+    async with _bench(tmp_path) as bench:
+        process = await bench.start(PYTHON, "-c", code)
+        await bench.spoke.wait()
+        grandchild = psutil.Process(int(bench.lines[0]))
+        assert await process.end(steps, asyncio.Event()) == "SIGKILL"
+        assert process.ended.result() == ProcessExit(signal=signal.SIGKILL)
+        grandchild.wait(BOUND_S)
 
 
-def test_a_fork_server_that_is_killed_starts_nothing_more_and_its_children_are_ours(
+async def test_a_fork_server_that_is_killed_starts_nothing_more_and_its_children_are_ours(
     tmp_path: Path,
 ) -> None:
-    async def test() -> None:
-        async with _bench(tmp_path) as bench:
-            first = await bench.start("sleep", "60")
-            server = bench.fork_server
-            os.kill(server.pid, signal.SIGKILL)
-            how = await server.died
-            assert how == f"the fork server (pid {server.pid}) ended unasked: killed by SIGKILL"
-            with pytest.raises(BringUpError) as caught:
-                await bench.start("true")
-            assert str(caught.value) == f"cannot start process 'it': {how}"
-            assert not first.ended.done()
-            await first.end(COMMAND_ESCALATION, asyncio.Event())
-            assert first.ended.done()
-
-    _run(test())
+    async with _bench(tmp_path) as bench:
+        first = await bench.start("sleep", "60")
+        server = bench.fork_server
+        os.kill(server.pid, signal.SIGKILL)
+        how = await server.died
+        assert how == f"the fork server (pid {server.pid}) ended unasked: killed by SIGKILL"
+        with pytest.raises(BringUpError) as caught:
+            await bench.start("true")
+        assert str(caught.value) == f"cannot start process 'it': {how}"
+        assert not first.ended.done()
+        await first.end(COMMAND_ESCALATION, asyncio.Event())
+        assert first.ended.done()
 
 
 def test_a_python_that_does_not_exist_cannot_be_a_fork_server(
@@ -263,89 +243,76 @@ def test_ports_whose_owner_was_killed_are_the_fork_servers_matter(tmp_path: Path
             each.unlink(missing_ok=True)
 
 
-def test_when_the_supervisor_vanishes_the_fork_server_ends_what_it_forked(tmp_path: Path) -> None:
-    async def test() -> None:
-        process = ForkServerProcess(preload=False)
-        fork_server = ForkServer(process)
-        bench = _Bench(tmp_path, fork_server)
-        child = await bench.start("sleep", "60")
-        process.socket.shutdown(2)
-        assert await asyncio.get_running_loop().run_in_executor(None, process.popen.wait) == 0
-        assert not psutil.pid_exists(child.pid)
-        await child.ended
-        await bench.close()
-
-    _run(test())
-
-
-def test_lines_are_split_and_a_line_without_end_cannot_fill_the_memory() -> None:
-    async def test() -> None:
-        read, write = os.pipe()
-        lines: list[str] = []
-        reader = LineReader(read, lines.append)
-        loop = asyncio.get_running_loop()
-        data = b"one\r\ntwo\nth\xffree\n" + b"x" * (3 * LONGEST_LINE) + b"\nlast"
-
-        def fill() -> None:
-            with os.fdopen(write, "wb") as pipe:
-                pipe.write(data)
-
-        await loop.run_in_executor(None, fill)
-        await reader.ended
-        assert lines[:3] == ["one", "two", "th\ufffdree"]
-        assert max(len(line) for line in lines) == LONGEST_LINE
-        assert sum(len(line) for line in lines[3:-1]) == 3 * LONGEST_LINE
-        assert lines[-1] == "last"
-
-    _run(test())
+async def test_when_the_supervisor_vanishes_the_fork_server_ends_what_it_forked(
+    tmp_path: Path,
+) -> None:
+    process = ForkServerProcess(preload=False)
+    fork_server = ForkServer(process)
+    bench = _Bench(tmp_path, fork_server)
+    child = await bench.start("sleep", "60")
+    process.socket.shutdown(2)
+    assert await asyncio.get_running_loop().run_in_executor(None, process.popen.wait) == 0
+    assert not psutil.pid_exists(child.pid)
+    await child.ended
+    await bench.close()
 
 
-def test_whoever_writes_faster_than_we_read_does_not_keep_a_pipe_from_being_closed() -> None:
-    async def test() -> None:
-        read, write = os.pipe()
-        spoke = asyncio.Event()
-        reader = LineReader(read, lambda _: spoke.set())
-        with subprocess.Popen(  # noqa: ASYNC220 - an end that is waited for blocks nobody here
-            ["yes"], stdout=write, stderr=subprocess.DEVNULL
-        ) as left_behind:
-            os.close(write)
-            try:
-                await spoke.wait()
-                reader.close()
-                assert left_behind.wait(BOUND_S) != 0  # it has no reader any more
-            finally:
-                left_behind.kill()
+async def test_lines_are_split_and_a_line_without_end_cannot_fill_the_memory() -> None:
+    read, write = os.pipe()
+    lines: list[str] = []
+    reader = LineReader(read, lines.append)
+    loop = asyncio.get_running_loop()
+    data = b"one\r\ntwo\nth\xffree\n" + b"x" * (3 * LONGEST_LINE) + b"\nlast"
 
-    _run(test())
+    def fill() -> None:
+        with os.fdopen(write, "wb") as pipe:
+            pipe.write(data)
 
-
-def test_a_command_that_nobody_reads_any_more_ends_as_in_a_shell(tmp_path: Path) -> None:
-    async def test() -> None:
-        async with _bench(tmp_path) as bench:
-            process = await bench.start("grep", "SigIgn", "/proc/self/status")
-            await process.ended
-            await process.end(COMMAND_ESCALATION, asyncio.Event())
-            (line,) = bench.lines
-            assert not int(line.split()[1], 16) & 1 << signal.SIGPIPE - 1
-
-    _run(test())
+    await loop.run_in_executor(None, fill)
+    await reader.ended
+    assert lines[:3] == ["one", "two", "th\ufffdree"]
+    assert max(len(line) for line in lines) == LONGEST_LINE
+    assert sum(len(line) for line in lines[3:-1]) == 3 * LONGEST_LINE
+    assert lines[-1] == "last"
 
 
-def test_a_host_that_reads_nothing_any_more_does_not_keep_its_channel_from_closing() -> None:
-    async def test() -> None:
-        plan = build_plan(teleop())
-        spec = HostSpec(
-            system="s" * 2**22,
-            process="p",
-            domain_id=0,
-            discovery_range=plan.discovery_range,
-            nodes=plan.nodes,
-        )
-        channel = ControlChannel(spec, lambda _: None)
-        with await channel.open():
-            await channel.close()
+async def test_whoever_writes_faster_than_we_read_does_not_keep_a_pipe_from_being_closed() -> None:
+    read, write = os.pipe()
+    spoke = asyncio.Event()
+    reader = LineReader(read, lambda _: spoke.set())
+    with subprocess.Popen(  # noqa: ASYNC220 - an end that is waited for blocks nobody here
+        ["yes"], stdout=write, stderr=subprocess.DEVNULL
+    ) as left_behind:
+        os.close(write)
+        try:
+            await spoke.wait()
+            reader.close()
+            assert left_behind.wait(BOUND_S) != 0  # it has no reader any more
+        finally:
+            left_behind.kill()
 
-    _run(test())
+
+async def test_a_command_that_nobody_reads_any_more_ends_as_in_a_shell(tmp_path: Path) -> None:
+    async with _bench(tmp_path) as bench:
+        process = await bench.start("grep", "SigIgn", "/proc/self/status")
+        await process.ended
+        await process.end(COMMAND_ESCALATION, asyncio.Event())
+        (line,) = bench.lines
+        assert not int(line.split()[1], 16) & 1 << signal.SIGPIPE - 1
+
+
+async def test_a_host_that_reads_nothing_any_more_does_not_keep_its_channel_from_closing() -> None:
+    plan = build_plan(teleop())
+    spec = HostSpec(
+        system="s" * 2**22,
+        process="p",
+        domain_id=0,
+        discovery_range=plan.discovery_range,
+        nodes=plan.nodes,
+    )
+    channel = ControlChannel(spec, lambda _: None)
+    with await channel.open():
+        await channel.close()
 
 
 def test_a_log_that_is_full_is_rotated_and_keeps_one_older(

@@ -33,7 +33,6 @@ from lifecycle.supervisor.run.events import Emitter
 from lifecycle.supervisor.run.failure import StepFailedError
 from lifecycle.verify import rule
 from tests.builders import plan_of, planned_node
-from tests.unit.supervisor.fakes import run
 from tests.unit.supervisor.session_world import (
     ACTIVATED,
     CAMERA_DOWN,
@@ -175,473 +174,425 @@ def _back(node: str, at_s: float) -> list[str]:
     ]
 
 
-def test_a_node_that_crashed_comes_again_through_its_gate_and_the_others_are_not_touched(
+async def test_a_node_that_crashed_comes_again_through_its_gate_and_the_others_are_not_touched(
     tmp_path: Path,
 ) -> None:
-    async def main() -> None:
-        world = SessionWorld(_chain(), tmp_path, stop_after_s=10.0)
+    world = SessionWorld(_chain(), tmp_path, stop_after_s=10.0)
 
-        async def die() -> None:
-            await world.story.until("[system] active")
-            await asyncio.sleep(3.0)
-            world.kill("camera")
+    async def die() -> None:
+        await world.story.until("[system] active")
+        await asyncio.sleep(3.0)
+        world.kill("camera")
 
-        await world.run(die())
-        assert world.since("[system] active")[1:] == [
-            "[failure] run.process-died /camera, and the run goes on",
-            "[backoff] camera in 1.0 s",
-            f"[verdict] active violated {GONE}",
-            *_back("camera", 4.0),
-            "[restarted] camera (1)",
-            "[stopping] at 10.0 s: done",
-            *DOWN,
-            *over(0),
-        ]
-        assert world.report == (
-            "ended after it was active, exit code 0: done; restarted: 'camera' 1 time"
-        )
-
-    run(main())
+    await world.run(die())
+    assert world.since("[system] active")[1:] == [
+        "[failure] run.process-died /camera, and the run goes on",
+        "[backoff] camera in 1.0 s",
+        f"[verdict] active violated {GONE}",
+        *_back("camera", 4.0),
+        "[restarted] camera (1)",
+        "[stopping] at 10.0 s: done",
+        *DOWN,
+        *over(0),
+    ]
+    assert world.report == (
+        "ended after it was active, exit code 0: done; restarted: 'camera' 1 time"
+    )
 
 
-def test_a_process_that_fails_again_and_again_is_given_up_loudly_with_its_history(
+async def test_a_process_that_fails_again_and_again_is_given_up_loudly_with_its_history(
     tmp_path: Path,
 ) -> None:
-    async def main() -> None:
-        how = dataclasses.replace(ON_FAILURE, restart_sec=0.5, start_limit_burst=3)
-        world = SessionWorld(_chain(how), tmp_path)
+    how = dataclasses.replace(ON_FAILURE, restart_sec=0.5, start_limit_burst=3)
+    world = SessionWorld(_chain(how), tmp_path)
 
-        async def die() -> None:
-            await world.story.until("[system] active")
-            world.hosts.ways["/camera configure"] = "no device"
-            world.kill("camera")
+    async def die() -> None:
+        await world.story.until("[system] active")
+        world.hosts.ways["/camera configure"] = "no device"
+        world.kill("camera")
 
-        await world.run(die())
-        again = ["camera start", "/camera configure"]
-        failed = "[failure] run.transition-failed /camera, and the run goes on"
-        assert world.since("[verdict] active violated")[1:] == [
-            *again,
-            failed,
-            "/camera shutdown",
-            "[backoff] camera in 0.5 s",
-            *again,
-            failed,
-            "[gave_up] camera (3 failures)",
-            "[failure] run.gave-up /camera",
-            "[stopping] at 1.0 s: rolling back",
-            "/viewer deactivate",
-            *VIEWER_DOWN,
-            "/camera shutdown",
-            *over(7),
-        ]
-        assert world.messages[0] == (
-            "cannot keep 'camera' running: it was started 3 times within 10 s (start_limit_burst, "
-            "start_limit_interval_sec) and failed again:\n"
-            "  at 0.0 s: cannot keep '/camera' running: pid 5000001 died: killed by SIGSEGV\n"
-            "  at 0.5 s: cannot configure '/camera': no device\n"
-            "  at 1.0 s: cannot configure '/camera': no device"
-        )
-
-    run(main())
+    await world.run(die())
+    again = ["camera start", "/camera configure"]
+    failed = "[failure] run.transition-failed /camera, and the run goes on"
+    assert world.since("[verdict] active violated")[1:] == [
+        *again,
+        failed,
+        "/camera shutdown",
+        "[backoff] camera in 0.5 s",
+        *again,
+        failed,
+        "[gave_up] camera (3 failures)",
+        "[failure] run.gave-up /camera",
+        "[stopping] at 1.0 s: rolling back",
+        "/viewer deactivate",
+        *VIEWER_DOWN,
+        "/camera shutdown",
+        *over(7),
+    ]
+    assert world.messages[0] == (
+        "cannot keep 'camera' running: it was started 3 times within 10 s (start_limit_burst, "
+        "start_limit_interval_sec) and failed again:\n"
+        "  at 0.0 s: cannot keep '/camera' running: pid 5000001 died: killed by SIGSEGV\n"
+        "  at 0.5 s: cannot configure '/camera': no device\n"
+        "  at 1.0 s: cannot configure '/camera': no device"
+    )
 
 
 @pytest.mark.parametrize("step", ["start", "/camera configure", "/camera connect"])
-def test_a_node_that_dies_during_bring_up_comes_again_while_the_others_wait(
+async def test_a_node_that_dies_during_bring_up_comes_again_while_the_others_wait(
     tmp_path: Path, step: str
 ) -> None:
-    async def main() -> None:
-        viewer = planned_node(
-            "viewer", after={"camera": Condition.CONFIGURED}, supervision=ON_FAILURE
-        )
-        plan = plan_of(planned_node("camera", supervision=ON_FAILURE), viewer)
-        world = SessionWorld(plan, tmp_path, stop_after_s=5.0)
-        world.hosts.ways[step if step.startswith("/") else "camera start"] = "die"
+    viewer = planned_node("viewer", after={"camera": Condition.CONFIGURED}, supervision=ON_FAILURE)
+    plan = plan_of(planned_node("camera", supervision=ON_FAILURE), viewer)
+    world = SessionWorld(plan, tmp_path, stop_after_s=5.0)
+    world.hosts.ways[step if step.startswith("/") else "camera start"] = "die"
 
-        async def heal() -> None:
-            await world.story.until("[backoff] camera")
-            world.hosts.ways.clear()
+    async def heal() -> None:
+        await world.story.until("[backoff] camera")
+        world.hosts.ways.clear()
 
-        await world.run(heal())
-        assert (
-            world.since("[backoff]")[-7 - len(DOWN) :][:2]
-            == [
-                "[system] active at 1.0 s",
-                "[restarted] camera (1)",
-            ]
-            or "[restarted] camera (1)" in world.outline
-        )
-        assert world.outline.count("viewer start") == 1
-        assert world.outline.count("/viewer configure") == 1
-        assert world.story[-1] == "[stopped] 0"
-
-    run(main())
-
-
-def test_a_start_counts_towards_the_limit_also_where_another_s_failure_took_it_down(
-    tmp_path: Path,
-) -> None:
-    async def main() -> None:
-        twice = dataclasses.replace(ON_FAILURE, start_limit_burst=2, start_limit_interval_sec=3600)
-        world = SessionWorld(_chain(DEPENDENTS, twice), tmp_path, stop_after_s=60.0)
-
-        async def die() -> None:
-            await world.story.until("[system] active")
-            for times in (1, 2):  # more starts than the limit, and no failure of its own
-                world.kill("camera")
-                await world.story.until("[restarted] camera", times)
-            world.kill("viewer")
-
-        await world.run(die())
-        assert "[gave_up] viewer (1 failures)" in world.outline
-        assert world.outline[-1] == "[stopped] 7"
-
-    run(main())
-
-
-def test_a_start_that_was_cut_off_by_another_s_failure_counts_and_is_no_failure(
-    tmp_path: Path,
-) -> None:
-    async def main() -> None:
-        thrice = dataclasses.replace(ON_FAILURE, start_limit_burst=3, start_limit_interval_sec=3600)
-        plan = plan_of(
-            planned_node("camera", supervision=ON_FAILURE),
-            planned_node("viewer", supervision=thrice),
-        )
-        world = SessionWorld(plan, tmp_path, stop_after_s=60.0)
-
-        async def die() -> None:
-            await world.story.until("[system] active")
-            world.hosts.takes_s["/viewer configure"] = 3.0
-            world.kill("viewer")
-            await world.story.until("/viewer configure", 2)
-            world.kill("camera")
-            await world.story.until("[restarted] viewer")
-            assert sum(each == "viewer start" for each in world.outline) == 3
-            world.kill("viewer")
-
-        await world.run(die())
-        assert "[gave_up] viewer (2 failures)" in world.outline
-        assert world.outline[-1] == "[stopped] 7"
-
-    run(main())
-
-
-def test_a_node_that_fails_to_activate_is_restarted_and_what_is_active_stays_so(
-    tmp_path: Path,
-) -> None:
-    async def main() -> None:
-        world = SessionWorld(_chain(), tmp_path, stop_after_s=5.0)
-        world.hosts.ways["/viewer activate"] = "die"
-
-        async def heal() -> None:
-            await world.story.until("[backoff]")
-            world.hosts.ways.clear()
-
-        await world.run(heal())
-        assert world.since("/viewer activate") == [
-            "/viewer activate",
-            "[failure] run.process-died /viewer, and the run goes on",
-            "[backoff] viewer in 1.0 s",
-            "viewer start",
-            "/viewer configure",
-            "/viewer connect",
-            "[system] verified at 1.0 s",
-            "networks programmed (ok)",
-            "[gate] ok: /viewer",
-            "/viewer activate",
-            "[system] active at 1.0 s",
-            "[restarted] viewer (1)",
-            "[stopping] at 6.0 s: done",
-            *DOWN,
-            *over(0),
-        ]
-
-    run(main())
-
-
-def test_dependents_go_down_in_order_and_come_again_with_it(tmp_path: Path) -> None:
-    async def main() -> None:
-        how = dataclasses.replace(ON_FAILURE, on_failure=OnFailure.DEPENDENTS)
-        world = SessionWorld(_chain(how, Supervision()), tmp_path, stop_after_s=5.0)
-
-        async def die() -> None:
-            await world.story.until("[system] active")
-            world.kill("camera")
-
-        await world.run(die())
-        assert world.since("[failure]") == [
-            "[failure] run.process-died /camera, and the run goes on",
-            "/viewer deactivate",
-            *VIEWER_DOWN,
-            "[backoff] camera in 1.0 s",
-            f"[verdict] active violated {GONE}, {VIEWER_GONE}",
-            *CONNECTED[:-1],
-            "[system] connected at 1.0 s",
-            "[verdict] connected ok",
-            "[system] verified at 1.0 s",
-            "networks programmed (ok)",
-            *ACTIVATED[:-1],
+    await world.run(heal())
+    assert (
+        world.since("[backoff]")[-7 - len(DOWN) :][:2]
+        == [
             "[system] active at 1.0 s",
             "[restarted] camera (1)",
-            "[stopping] at 5.0 s: done",
-            *DOWN,
-            *over(0),
         ]
+        or "[restarted] camera (1)" in world.outline
+    )
+    assert world.outline.count("viewer start") == 1
+    assert world.outline.count("/viewer configure") == 1
+    assert world.story[-1] == "[stopped] 0"
 
-    run(main())
 
-
-def test_what_fails_while_another_is_restarted_keeps_both_at_the_gate_until_the_graph_is_whole(
+async def test_a_start_counts_towards_the_limit_also_where_another_s_failure_took_it_down(
     tmp_path: Path,
 ) -> None:
-    async def main() -> None:
-        world = SessionWorld(_chain(), tmp_path, stop_after_s=10.0)
-        world.hosts.takes_s["/camera configure"] = 2.0
+    twice = dataclasses.replace(ON_FAILURE, start_limit_burst=2, start_limit_interval_sec=3600)
+    world = SessionWorld(_chain(DEPENDENTS, twice), tmp_path, stop_after_s=60.0)
 
-        async def die() -> None:
-            await world.story.until("[system] active")
+    async def die() -> None:
+        await world.story.until("[system] active")
+        for times in (1, 2):  # more starts than the limit, and no failure of its own
             world.kill("camera")
-            await world.story.until("/camera configure", 2)
-            await asyncio.sleep(1.0)
-            world.kill("viewer")
+            await world.story.until("[restarted] camera", times)
+        world.kill("viewer")
 
-        await world.run(die())
-        assert world.since("[failure] run.process-died /viewer") == [
-            "[failure] run.process-died /viewer, and the run goes on",
-            f"[verdict] connected violated {VIEWER_GONE}, {UNREPORTED}",
-            "/camera connect",
-            "[backoff] viewer in 1.0 s",
-            f"[verdict] connected violated {VIEWER_GONE}",
-            "viewer start",
-            "/viewer configure",
-            "/viewer connect",
-            "[system] connected at 6.0 s",
-            "[verdict] connected ok",
-            "[system] verified at 6.0 s",
-            "networks programmed (ok)",
-            "[gate] ok: /camera, /viewer",
-            "/camera activate",
-            "/viewer activate",
-            "[system] active at 6.0 s",
-            "[restarted] camera (1)",
-            "[restarted] viewer (1)",
-            "[stopping] at 12.0 s: done",
-            *DOWN,
-            *over(0),
-        ]
-
-    run(main())
+    await world.run(die())
+    assert "[gave_up] viewer (1 failures)" in world.outline
+    assert world.outline[-1] == "[stopped] 7"
 
 
-def test_a_restarted_node_waits_at_a_gate_that_stays_closed_and_passes_once_it_opens(
+async def test_a_start_that_was_cut_off_by_another_s_failure_counts_and_is_no_failure(
     tmp_path: Path,
 ) -> None:
-    async def main() -> None:
-        world = SessionWorld(_chain(), tmp_path, stop_after_s=10.0)
+    thrice = dataclasses.replace(ON_FAILURE, start_limit_burst=3, start_limit_interval_sec=3600)
+    plan = plan_of(
+        planned_node("camera", supervision=ON_FAILURE),
+        planned_node("viewer", supervision=thrice),
+    )
+    world = SessionWorld(plan, tmp_path, stop_after_s=60.0)
 
-        async def die() -> None:
-            await world.story.until("[system] active")
-            world.intrude()
-            world.kill("camera")
-            await asyncio.sleep(5.0)
-            world.retreat()
+    async def die() -> None:
+        await world.story.until("[system] active")
+        world.hosts.takes_s["/viewer configure"] = 3.0
+        world.kill("viewer")
+        await world.story.until("/viewer configure", 2)
+        world.kill("camera")
+        await world.story.until("[restarted] viewer")
+        assert sum(each == "viewer start" for each in world.outline) == 3
+        world.kill("viewer")
 
-        await world.run(die())
-        assert world.since("[notice]")[:7] == [
-            f"[notice] {REFUSED}",
-            "[verdict] connected ok",
-            "[system] verified at 5.0 s",
-            "networks programmed (ok)",
-            "[gate] ok: /camera",
-            "/camera activate",
-            "[system] active at 5.0 s",
-        ]
-        assert f"[verdict] connected violated {INTRUDED}" in world.outline
-
-    run(main())
+    await world.run(die())
+    assert "[gave_up] viewer (2 failures)" in world.outline
+    assert world.outline[-1] == "[stopped] 7"
 
 
-def test_a_restarted_node_is_not_let_through_beside_one_that_is_away_and_orders_wait_5_s_for_that(
+async def test_a_node_that_fails_to_activate_is_restarted_and_what_is_active_stays_so(
     tmp_path: Path,
 ) -> None:
-    async def main() -> None:
-        plan = plan_of(planned_node("camera", supervision=ON_FAILURE), planned_node("viewer"))
-        world = SessionWorld(plan, tmp_path)
+    world = SessionWorld(_chain(), tmp_path, stop_after_s=5.0)
+    world.hosts.ways["/viewer activate"] = "die"
 
-        def hide() -> None:
-            world.graph.unseen = {"/viewer"}
-            world.graph.note()
+    async def heal() -> None:
+        await world.story.until("[backoff]")
+        world.hosts.ways.clear()
 
-        async def die() -> None:
-            await world.story.until("[system] active")
-            world.story.in_the_moment["networks programmed"] = hide
-            world.kill("camera")
-            await world.story.until("networks programmed", 2)
-            began_s = asyncio.get_running_loop().time()
-            assert await world.order(ControlRequest.PAUSE) == "0"
-            waited_s = asyncio.get_running_loop().time() - began_s
-            assert waited_s == pytest.approx(5.0, abs=0.2)
-            world.graph.unseen.clear()
-            world.graph.note()
-            assert await world.order(ControlRequest.RESUME) == "0"
-            assert await world.order(ControlRequest.DOWN) == "0"
-
-        await world.run(die())
-        away = "graph.missing-node: cannot find node /viewer in domain 30"
-        assert world.since("networks programmed", 2)[1:8] == [
-            "[verdict] connected violated graph.missing-node /viewer",
-            f"[notice] cannot activate: {CHANGED}, and its verdict now is violated\n  {away}",
-            "/viewer deactivate",
-            "[system] paused at 6.0 s",
-            "[restarted] camera (1)",
-            "[verdict] connected ok",
-            "[system] verified at 6.0 s",
-        ]
-
-    run(main())
+    await world.run(heal())
+    assert world.since("/viewer activate") == [
+        "/viewer activate",
+        "[failure] run.process-died /viewer, and the run goes on",
+        "[backoff] viewer in 1.0 s",
+        "viewer start",
+        "/viewer configure",
+        "/viewer connect",
+        "[system] verified at 1.0 s",
+        "networks programmed (ok)",
+        "[gate] ok: /viewer",
+        "/viewer activate",
+        "[system] active at 1.0 s",
+        "[restarted] viewer (1)",
+        "[stopping] at 6.0 s: done",
+        *DOWN,
+        *over(0),
+    ]
 
 
-def test_orders_in_backoff_are_carried_out_at_once(tmp_path: Path) -> None:
-    async def main() -> None:
-        world = SessionWorld(_chain(), tmp_path)
+async def test_dependents_go_down_in_order_and_come_again_with_it(tmp_path: Path) -> None:
+    how = dataclasses.replace(ON_FAILURE, on_failure=OnFailure.DEPENDENTS)
+    world = SessionWorld(_chain(how, Supervision()), tmp_path, stop_after_s=5.0)
 
-        async def order() -> None:
-            await world.story.until("[system] active")
-            world.kill("camera")
-            await world.story.until("[backoff]")
-            assert await world.order(ControlRequest.PAUSE) == "0"
-            assert world.story[-1] == "[system] paused at 0.0 s"
-            await world.story.until("[restarted]")
-            assert await world.order(ControlRequest.RESUME) == "0"
-            world.kill("viewer")
-            await world.story.until("[backoff] viewer")
-            assert await world.order(ControlRequest.RESTART, "viewer") == "0"
-            assert world.story[-1] == "[system] active at 1.0 s"
-            world.kill("viewer")
-            await world.story.until("[backoff] viewer", 2)
-            assert await world.order(ControlRequest.DOWN) == "4"
+    async def die() -> None:
+        await world.story.until("[system] active")
+        world.kill("camera")
 
-        await world.run(order())
-        assert world.since("[system] paused")[:5] == [
-            "[system] paused at 0.0 s",
-            "camera start",
-            "/camera configure",
-            "/camera connect",
-            "[system] connected at 1.0 s",
-        ]
-        assert world.since("[stopping]") == [
-            "[stopping] at 1.0 s: lifecycle down",
-            "/camera deactivate",
-            *CAMERA_DOWN,
-            *over(4),
-        ]
-
-    run(main())
+    await world.run(die())
+    assert world.since("[failure]") == [
+        "[failure] run.process-died /camera, and the run goes on",
+        "/viewer deactivate",
+        *VIEWER_DOWN,
+        "[backoff] camera in 1.0 s",
+        f"[verdict] active violated {GONE}, {VIEWER_GONE}",
+        *CONNECTED[:-1],
+        "[system] connected at 1.0 s",
+        "[verdict] connected ok",
+        "[system] verified at 1.0 s",
+        "networks programmed (ok)",
+        *ACTIVATED[:-1],
+        "[system] active at 1.0 s",
+        "[restarted] camera (1)",
+        "[stopping] at 5.0 s: done",
+        *DOWN,
+        *over(0),
+    ]
 
 
-def test_who_is_restarted_by_hand_in_its_backoff_takes_its_dependents_with_it(
+async def test_what_fails_while_another_is_restarted_keeps_both_at_the_gate(
+    tmp_path: Path,
+) -> None:
+    world = SessionWorld(_chain(), tmp_path, stop_after_s=10.0)
+    world.hosts.takes_s["/camera configure"] = 2.0
+
+    async def die() -> None:
+        await world.story.until("[system] active")
+        world.kill("camera")
+        await world.story.until("/camera configure", 2)
+        await asyncio.sleep(1.0)
+        world.kill("viewer")
+
+    await world.run(die())
+    assert world.since("[failure] run.process-died /viewer") == [
+        "[failure] run.process-died /viewer, and the run goes on",
+        f"[verdict] connected violated {VIEWER_GONE}, {UNREPORTED}",
+        "/camera connect",
+        "[backoff] viewer in 1.0 s",
+        f"[verdict] connected violated {VIEWER_GONE}",
+        "viewer start",
+        "/viewer configure",
+        "/viewer connect",
+        "[system] connected at 6.0 s",
+        "[verdict] connected ok",
+        "[system] verified at 6.0 s",
+        "networks programmed (ok)",
+        "[gate] ok: /camera, /viewer",
+        "/camera activate",
+        "/viewer activate",
+        "[system] active at 6.0 s",
+        "[restarted] camera (1)",
+        "[restarted] viewer (1)",
+        "[stopping] at 12.0 s: done",
+        *DOWN,
+        *over(0),
+    ]
+
+
+async def test_a_restarted_node_waits_at_a_gate_that_stays_closed_and_passes_once_it_opens(
+    tmp_path: Path,
+) -> None:
+    world = SessionWorld(_chain(), tmp_path, stop_after_s=10.0)
+
+    async def die() -> None:
+        await world.story.until("[system] active")
+        world.intrude()
+        world.kill("camera")
+        await asyncio.sleep(5.0)
+        world.retreat()
+
+    await world.run(die())
+    assert world.since("[notice]")[:7] == [
+        f"[notice] {REFUSED}",
+        "[verdict] connected ok",
+        "[system] verified at 5.0 s",
+        "networks programmed (ok)",
+        "[gate] ok: /camera",
+        "/camera activate",
+        "[system] active at 5.0 s",
+    ]
+    assert f"[verdict] connected violated {INTRUDED}" in world.outline
+
+
+async def test_a_restarted_node_waits_for_one_that_is_away_and_orders_wait_5_s_for_that(
+    tmp_path: Path,
+) -> None:
+    plan = plan_of(planned_node("camera", supervision=ON_FAILURE), planned_node("viewer"))
+    world = SessionWorld(plan, tmp_path)
+
+    def hide() -> None:
+        world.graph.unseen = {"/viewer"}
+        world.graph.note()
+
+    async def die() -> None:
+        await world.story.until("[system] active")
+        world.story.in_the_moment["networks programmed"] = hide
+        world.kill("camera")
+        await world.story.until("networks programmed", 2)
+        began_s = asyncio.get_running_loop().time()
+        assert await world.order(ControlRequest.PAUSE) == "0"
+        waited_s = asyncio.get_running_loop().time() - began_s
+        assert waited_s == pytest.approx(5.0, abs=0.2)
+        world.graph.unseen.clear()
+        world.graph.note()
+        assert await world.order(ControlRequest.RESUME) == "0"
+        assert await world.order(ControlRequest.DOWN) == "0"
+
+    await world.run(die())
+    away = "graph.missing-node: cannot find node /viewer in domain 30"
+    assert world.since("networks programmed", 2)[1:8] == [
+        "[verdict] connected violated graph.missing-node /viewer",
+        f"[notice] cannot activate: {CHANGED}, and its verdict now is violated\n  {away}",
+        "/viewer deactivate",
+        "[system] paused at 6.0 s",
+        "[restarted] camera (1)",
+        "[verdict] connected ok",
+        "[system] verified at 6.0 s",
+    ]
+
+
+async def test_orders_in_backoff_are_carried_out_at_once(tmp_path: Path) -> None:
+    world = SessionWorld(_chain(), tmp_path)
+
+    async def order() -> None:
+        await world.story.until("[system] active")
+        world.kill("camera")
+        await world.story.until("[backoff]")
+        assert await world.order(ControlRequest.PAUSE) == "0"
+        assert world.story[-1] == "[system] paused at 0.0 s"
+        await world.story.until("[restarted]")
+        assert await world.order(ControlRequest.RESUME) == "0"
+        world.kill("viewer")
+        await world.story.until("[backoff] viewer")
+        assert await world.order(ControlRequest.RESTART, "viewer") == "0"
+        assert world.story[-1] == "[system] active at 1.0 s"
+        world.kill("viewer")
+        await world.story.until("[backoff] viewer", 2)
+        assert await world.order(ControlRequest.DOWN) == "4"
+
+    await world.run(order())
+    assert world.since("[system] paused")[:5] == [
+        "[system] paused at 0.0 s",
+        "camera start",
+        "/camera configure",
+        "/camera connect",
+        "[system] connected at 1.0 s",
+    ]
+    assert world.since("[stopping]") == [
+        "[stopping] at 1.0 s: lifecycle down",
+        "/camera deactivate",
+        *CAMERA_DOWN,
+        *over(4),
+    ]
+
+
+async def test_who_is_restarted_by_hand_in_its_backoff_takes_its_dependents_with_it(
     tmp_path: Path,
 ) -> None:
     """They wait for nothing else; its own gate would stay closed until their delay is over."""
 
-    async def main() -> None:
-        how = dataclasses.replace(ON_FAILURE, on_failure=OnFailure.DEPENDENTS)
-        world = SessionWorld(_chain(how, Supervision()), tmp_path, stop_after_s=5.0)
+    how = dataclasses.replace(ON_FAILURE, on_failure=OnFailure.DEPENDENTS)
+    world = SessionWorld(_chain(how, Supervision()), tmp_path, stop_after_s=5.0)
 
-        async def order() -> None:
-            await world.story.until("[system] active")
-            world.kill("camera")
-            await world.story.until("[backoff] camera")
-            assert await world.order(ControlRequest.RESTART, "camera") == "0"
-            assert world.story[-1] == "[system] active at 0.0 s"
+    async def order() -> None:
+        await world.story.until("[system] active")
+        world.kill("camera")
+        await world.story.until("[backoff] camera")
+        assert await world.order(ControlRequest.RESTART, "camera") == "0"
+        assert world.story[-1] == "[system] active at 0.0 s"
 
-        await world.run(order())
-        assert world.story.count("viewer start") == 2
-
-    run(main())
+    await world.run(order())
+    assert world.story.count("viewer start") == 2
 
 
-def test_an_order_during_a_restart_waits_for_its_step_and_not_for_its_gate(tmp_path: Path) -> None:
-    async def main() -> None:
-        world = SessionWorld(_chain(), tmp_path, stop_after_s=10.0)
+async def test_an_order_during_a_restart_waits_for_its_step_and_not_for_its_gate(
+    tmp_path: Path,
+) -> None:
+    world = SessionWorld(_chain(), tmp_path, stop_after_s=10.0)
 
-        async def order() -> None:
-            await world.story.until("[system] active")
-            world.intrude()
-            world.hosts.takes_s["/camera configure"] = 2.0
-            world.kill("camera")
-            await world.story.until("/camera configure", 2)
-            assert await world.order(ControlRequest.PAUSE) == "0"
-            assert world.story[-2:] == ["[system] paused at 3.0 s", "[restarted] camera (1)"]
+    async def order() -> None:
+        await world.story.until("[system] active")
+        world.intrude()
+        world.hosts.takes_s["/camera configure"] = 2.0
+        world.kill("camera")
+        await world.story.until("/camera configure", 2)
+        assert await world.order(ControlRequest.PAUSE) == "0"
+        assert world.story[-2:] == ["[system] paused at 3.0 s", "[restarted] camera (1)"]
 
-        await world.run(order())
-        assert "[gate] ok: /camera" not in world.outline
-
-    run(main())
+    await world.run(order())
+    assert "[gate] ok: /camera" not in world.outline
 
 
 @pytest.mark.parametrize("restart", [Restart.ON_FAILURE, Restart.ALWAYS])
-def test_a_clean_exit_is_started_again_after_only_by_always(
+async def test_a_clean_exit_is_started_again_after_only_by_always(
     tmp_path: Path, restart: Restart
 ) -> None:
-    async def main() -> None:
-        how = dataclasses.replace(ON_FAILURE, restart=restart)
-        world = SessionWorld(_chain(how), tmp_path, stop_after_s=5.0)
+    how = dataclasses.replace(ON_FAILURE, restart=restart)
+    world = SessionWorld(_chain(how), tmp_path, stop_after_s=5.0)
 
-        async def leave() -> None:
-            await world.story.until("[system] active")
-            world.hosts.processes["camera"].end(ProcessExit(status=0))
+    async def leave() -> None:
+        await world.story.until("[system] active")
+        world.hosts.processes["camera"].end(ProcessExit(status=0))
 
-        await world.run(leave())
-        assert world.story[-1] == f"[stopped] {0 if restart is Restart.ALWAYS else 6}"
-
-    run(main())
+    await world.run(leave())
+    assert world.story[-1] == f"[stopped] {0 if restart is Restart.ALWAYS else 6}"
 
 
-def test_a_hang_is_ended_by_the_watchdog_and_one_that_passes_is_not(tmp_path: Path) -> None:
-    async def main() -> None:
-        world = SessionWorld(_chain(), tmp_path, stop_after_s=20.0)
+async def test_a_hang_is_ended_by_the_watchdog_and_one_that_passes_is_not(tmp_path: Path) -> None:
+    world = SessionWorld(_chain(), tmp_path, stop_after_s=20.0)
 
-        async def hang() -> None:
-            await world.story.until("[system] active")
-            process = world.system.processes["camera"]
-            for hangs_s in (2.0, 10.0):
-                process.on_stop(True)
-                await asyncio.sleep(hangs_s)
-                process.on_stop(False)
+    async def hang() -> None:
+        await world.story.until("[system] active")
+        process = world.system.processes["camera"]
+        for hangs_s in (2.0, 10.0):
+            process.on_stop(True)
+            await asyncio.sleep(hangs_s)
+            process.on_stop(False)
 
-        await world.run(hang())
-        found = [
-            each for each in world.story if each in ("camera SIGKILL", "[backoff] camera in 1.0 s")
-        ]
-        assert found == ["camera SIGKILL", "[backoff] camera in 1.0 s"]
-
-    run(main())
+    await world.run(hang())
+    found = [
+        each for each in world.story if each in ("camera SIGKILL", "[backoff] camera in 1.0 s")
+    ]
+    assert found == ["camera SIGKILL", "[backoff] camera in 1.0 s"]
 
 
-def test_status_says_what_failed_and_when_it_is_started_again(tmp_path: Path) -> None:
-    async def main() -> None:
-        world = SessionWorld(_chain(), tmp_path, stop_after_s=5.0)
+async def test_status_says_what_failed_and_when_it_is_started_again(tmp_path: Path) -> None:
+    world = SessionWorld(_chain(), tmp_path, stop_after_s=5.0)
 
-        async def look() -> None:
-            await world.story.until("[system] active")
-            world.hosts.ways["/camera configure"] = "die"
-            world.kill("camera")
-            await world.story.until("[backoff]", 2)
-            await asyncio.sleep(0.25)
-            away, viewer = world.status().nodes
-            assert (away.restarts, away.uptime_s, away.next_try_s) == (1, None, 0.75)
-            assert away.process_state is not None
-            assert (away.process_state.value, away.state) == ("backoff", "")
-            assert away.last_failure is not None
-            assert away.last_failure.signal == "SIGSEGV"
-            assert away.last_failure.stderr == ""
-            assert (viewer.restarts, viewer.uptime_s, viewer.last_failure) == (0, 1.25, None)
-            world.hosts.ways.clear()
+    async def look() -> None:
+        await world.story.until("[system] active")
+        world.hosts.ways["/camera configure"] = "die"
+        world.kill("camera")
+        await world.story.until("[backoff]", 2)
+        await asyncio.sleep(0.25)
+        away, viewer = world.status().nodes
+        assert (away.restarts, away.uptime_s, away.next_try_s) == (1, None, 0.75)
+        assert away.process_state is not None
+        assert (away.process_state.value, away.state) == ("backoff", "")
+        assert away.last_failure is not None
+        assert away.last_failure.signal == "SIGSEGV"
+        assert away.last_failure.stderr == ""
+        assert (viewer.restarts, viewer.uptime_s, viewer.last_failure) == (0, 1.25, None)
+        world.hosts.ways.clear()
 
-        await world.run(look())
-
-    run(main())
+    await world.run(look())
 
 
 @pytest.mark.parametrize(("restart", "taken"), [(Restart.ON_FAILURE, True), (Restart.NO, False)])
@@ -685,168 +636,150 @@ def test_a_component_that_was_cut_off_while_it_was_loaded_comes_again_with_its_c
     assert interrupted_in(nodes) == frozenset()
 
 
-def test_a_death_is_reported_at_once_also_while_another_process_is_taken_down(
+async def test_a_death_is_reported_at_once_also_while_another_process_is_taken_down(
     tmp_path: Path,
 ) -> None:
-    async def main() -> None:
-        plan = plan_of(
-            planned_node("camera", supervision=DEPENDENTS),
-            planned_node("viewer", supervision=ON_FAILURE, after={"camera": Condition.STARTED}),
-            planned_node("other", supervision=ON_FAILURE),
-        )
-        world = SessionWorld(plan, tmp_path, stop_after_s=20.0)
+    plan = plan_of(
+        planned_node("camera", supervision=DEPENDENTS),
+        planned_node("viewer", supervision=ON_FAILURE, after={"camera": Condition.STARTED}),
+        planned_node("other", supervision=ON_FAILURE),
+    )
+    world = SessionWorld(plan, tmp_path, stop_after_s=20.0)
 
-        async def die() -> None:
-            await world.story.until("[system] active")
-            world.hosts.takes_s["/viewer deactivate"] = 2.0
-            world.kill("camera")
-            await world.story.until("/viewer deactivate")
-            await asyncio.sleep(0.5)
-            began = asyncio.get_running_loop().time()
-            world.kill("other")
-            await world.story.until("[failure] run.process-died /other")
-            assert asyncio.get_running_loop().time() - began < 0.1
-            await world.story.until("[restarted] other")
+    async def die() -> None:
+        await world.story.until("[system] active")
+        world.hosts.takes_s["/viewer deactivate"] = 2.0
+        world.kill("camera")
+        await world.story.until("/viewer deactivate")
+        await asyncio.sleep(0.5)
+        began = asyncio.get_running_loop().time()
+        world.kill("other")
+        await world.story.until("[failure] run.process-died /other")
+        assert asyncio.get_running_loop().time() - began < 0.1
+        await world.story.until("[restarted] other")
 
-        await world.run(die())
-        failures = [each for each in world.outline if each.startswith("[failure]")]
-        assert len(failures) == 2
-        assert world.story[-1] == "[stopped] 0"
-
-    run(main())
+    await world.run(die())
+    failures = [each for each in world.outline if each.startswith("[failure]")]
+    assert len(failures) == 2
+    assert world.story[-1] == "[stopped] 0"
 
 
 @pytest.mark.parametrize(
     ("asked", "node"), [(ControlRequest.RESTART, "viewer"), (ControlRequest.RESUME, "")]
 )
-def test_an_order_does_not_keep_others_from_coming_again_that_its_gate_waits_for(
+async def test_an_order_does_not_keep_others_from_coming_again_that_its_gate_waits_for(
     tmp_path: Path, asked: ControlRequest, node: str
 ) -> None:
-    async def main() -> None:
-        world = SessionWorld(_chain(), tmp_path, stop_after_s=30.0)
+    world = SessionWorld(_chain(), tmp_path, stop_after_s=30.0)
 
-        async def order() -> None:
-            await world.story.until("[system] active")
-            if asked is ControlRequest.RESUME:
-                assert await world.order(ControlRequest.PAUSE) == "0"
-            world.kill("camera")
-            await world.story.until("[backoff] camera in 1.0 s")
-            began = asyncio.get_running_loop().time()
-            assert await world.order(asked, node) == "0"
-            assert asyncio.get_running_loop().time() - began < 2.0
-            assert world.status().phase == "active"
-            assert {each.state for each in world.status().nodes} == {"active"}
-            await world.story.until("[restarted] camera (1)")
-
-        await world.run(order())
-
-    run(main())
-
-
-def test_what_becomes_wrong_while_another_node_is_restarted_is_found_within_a_second(
-    tmp_path: Path,
-) -> None:
-    async def main() -> None:
-        plan = plan_of(
-            planned_node("camera", supervision=ON_FAILURE),
-            planned_node("viewer", supervision=ON_FAILURE),
-        )
-        world = SessionWorld(plan, tmp_path, stop_after_s=30.0)
-
-        async def intrude() -> None:
-            await world.story.until("[system] active")
-            world.hosts.takes_s["/camera configure"] = 5.0
-            world.kill("camera")
-            await world.story.until("/camera configure", 2)
-            await asyncio.sleep(1.0)
-            began = asyncio.get_running_loop().time()
-            world.intrude()
-            await world.story.until(f"[verdict] connected violated {INTRUDED}")
-            assert asyncio.get_running_loop().time() - began < 1.0
-            world.retreat()
-            await world.story.until("[restarted] camera (1)")
-
-        await world.run(intrude())
-        assert "state.wrong-state" not in " ".join(world.outline)
-
-    run(main())
-
-
-def test_a_resume_that_a_death_cuts_short_leaves_the_system_paused_and_open_to_orders(
-    tmp_path: Path,
-) -> None:
-    async def main() -> None:
-        world = SessionWorld(_chain(), tmp_path, stop_after_s=30.0)
-
-        async def order() -> None:
-            await world.story.until("[system] active")
+    async def order() -> None:
+        await world.story.until("[system] active")
+        if asked is ControlRequest.RESUME:
             assert await world.order(ControlRequest.PAUSE) == "0"
-            world.intrude()
-            resuming = asyncio.ensure_future(world.order(ControlRequest.RESUME))
-            await world.story.until(f"[verdict] connected violated {INTRUDED}")
-            began = asyncio.get_running_loop().time()
-            world.kill("viewer")
-            assert (await resuming).startswith("6 cannot keep '/viewer' running")
-            # No step of its was under way: nobody else knows more about its death.
-            assert asyncio.get_running_loop().time() - began < 0.1
-            await world.story.until("[restarted] viewer (1)")
-            assert world.status().phase == "paused"
-            world.retreat()
-            assert await world.order(ControlRequest.RESUME) == "0"
-            assert world.status().phase == "active"
+        world.kill("camera")
+        await world.story.until("[backoff] camera in 1.0 s")
+        began = asyncio.get_running_loop().time()
+        assert await world.order(asked, node) == "0"
+        assert asyncio.get_running_loop().time() - began < 2.0
+        assert world.status().phase == "active"
+        assert {each.state for each in world.status().nodes} == {"active"}
+        await world.story.until("[restarted] camera (1)")
 
-        await world.run(order())
+    await world.run(order())
 
-    run(main())
+
+async def test_what_becomes_wrong_while_another_node_is_restarted_is_found_within_a_second(
+    tmp_path: Path,
+) -> None:
+    plan = plan_of(
+        planned_node("camera", supervision=ON_FAILURE),
+        planned_node("viewer", supervision=ON_FAILURE),
+    )
+    world = SessionWorld(plan, tmp_path, stop_after_s=30.0)
+
+    async def intrude() -> None:
+        await world.story.until("[system] active")
+        world.hosts.takes_s["/camera configure"] = 5.0
+        world.kill("camera")
+        await world.story.until("/camera configure", 2)
+        await asyncio.sleep(1.0)
+        began = asyncio.get_running_loop().time()
+        world.intrude()
+        await world.story.until(f"[verdict] connected violated {INTRUDED}")
+        assert asyncio.get_running_loop().time() - began < 1.0
+        world.retreat()
+        await world.story.until("[restarted] camera (1)")
+
+    await world.run(intrude())
+    assert "state.wrong-state" not in " ".join(world.outline)
+
+
+async def test_a_resume_that_a_death_cuts_short_leaves_the_system_paused_and_open_to_orders(
+    tmp_path: Path,
+) -> None:
+    world = SessionWorld(_chain(), tmp_path, stop_after_s=30.0)
+
+    async def order() -> None:
+        await world.story.until("[system] active")
+        assert await world.order(ControlRequest.PAUSE) == "0"
+        world.intrude()
+        resuming = asyncio.ensure_future(world.order(ControlRequest.RESUME))
+        await world.story.until(f"[verdict] connected violated {INTRUDED}")
+        began = asyncio.get_running_loop().time()
+        world.kill("viewer")
+        assert (await resuming).startswith("6 cannot keep '/viewer' running")
+        # No step of its was under way: nobody else knows more about its death.
+        assert asyncio.get_running_loop().time() - began < 0.1
+        await world.story.until("[restarted] viewer (1)")
+        assert world.status().phase == "paused"
+        world.retreat()
+        assert await world.order(ControlRequest.RESUME) == "0"
+        assert world.status().phase == "active"
+
+    await world.run(order())
 
 
 @pytest.mark.parametrize("node", ["", "camera"])
-def test_a_restart_by_hand_that_a_death_cuts_short_is_finished_once_all_are_back(
+async def test_a_restart_by_hand_that_a_death_cuts_short_is_finished_once_all_are_back(
     tmp_path: Path, node: str
 ) -> None:
-    async def main() -> None:
-        plan = plan_of(
-            planned_node("camera", supervision=ON_FAILURE),
-            planned_node("viewer", supervision=ON_FAILURE),
-        )
-        world = SessionWorld(plan, tmp_path, stop_after_s=30.0)
+    plan = plan_of(
+        planned_node("camera", supervision=ON_FAILURE),
+        planned_node("viewer", supervision=ON_FAILURE),
+    )
+    world = SessionWorld(plan, tmp_path, stop_after_s=30.0)
 
-        async def order() -> None:
-            await world.story.until("[system] active")
-            world.hosts.takes_s["/camera configure"] = 2.0
-            restarting = asyncio.ensure_future(world.order(ControlRequest.RESTART, node))
-            await world.story.until("/camera configure", 2)
-            await asyncio.sleep(1.0)
-            world.kill("camera")
-            assert (await restarting).startswith("6 cannot keep '/camera' running")
-            await world.story.until("[restarted] camera (1)")
-            assert world.status().phase == "active"
-            assert {each.state for each in world.status().nodes} == {"active"}
+    async def order() -> None:
+        await world.story.until("[system] active")
+        world.hosts.takes_s["/camera configure"] = 2.0
+        restarting = asyncio.ensure_future(world.order(ControlRequest.RESTART, node))
+        await world.story.until("/camera configure", 2)
+        await asyncio.sleep(1.0)
+        world.kill("camera")
+        assert (await restarting).startswith("6 cannot keep '/camera' running")
+        await world.story.until("[restarted] camera (1)")
+        assert world.status().phase == "active"
+        assert {each.state for each in world.status().nodes} == {"active"}
 
-        await world.run(order())
-
-    run(main())
+    await world.run(order())
 
 
-def test_a_resume_that_a_death_cuts_short_behind_its_gate_is_finished_once_all_are_back(
+async def test_a_resume_that_a_death_cuts_short_behind_its_gate_is_finished_once_all_are_back(
     tmp_path: Path,
 ) -> None:
-    async def main() -> None:
-        world = SessionWorld(_chain(), tmp_path, stop_after_s=30.0)
+    world = SessionWorld(_chain(), tmp_path, stop_after_s=30.0)
 
-        async def order() -> None:
-            await world.story.until("[system] active")
-            assert await world.order(ControlRequest.PAUSE) == "0"
-            world.hosts.takes_s["/camera activate"] = 2.0
-            resuming = asyncio.ensure_future(world.order(ControlRequest.RESUME))
-            await world.story.until("/camera activate", 2)
-            await asyncio.sleep(0.5)
-            world.kill("viewer")
-            assert (await resuming).startswith("6 cannot keep '/viewer' running")
-            await world.story.until("[restarted] viewer (1)")
-            assert world.status().phase == "active"
-            assert {each.state for each in world.status().nodes} == {"active"}
+    async def order() -> None:
+        await world.story.until("[system] active")
+        assert await world.order(ControlRequest.PAUSE) == "0"
+        world.hosts.takes_s["/camera activate"] = 2.0
+        resuming = asyncio.ensure_future(world.order(ControlRequest.RESUME))
+        await world.story.until("/camera activate", 2)
+        await asyncio.sleep(0.5)
+        world.kill("viewer")
+        assert (await resuming).startswith("6 cannot keep '/viewer' running")
+        await world.story.until("[restarted] viewer (1)")
+        assert world.status().phase == "active"
+        assert {each.state for each in world.status().nodes} == {"active"}
 
-        await world.run(order())
-
-    run(main())
+    await world.run(order())

@@ -48,48 +48,42 @@ def test_it_reads_only_by_default_and_off_leaves_nothing(tmp_path: Path) -> None
     assert run(main(None, 3.0)).services == ("get_status",)
 
 
-def test_who_only_tries_a_system_pays_nothing_for_it(tmp_path: Path) -> None:
-    async def main() -> None:
-        world = SessionWorld(CHAIN, tmp_path, stop_after_s=0.1)
-        await world.run()
+async def test_who_only_tries_a_system_pays_nothing_for_it(tmp_path: Path) -> None:
+    world = SessionWorld(CHAIN, tmp_path, stop_after_s=0.1)
+    await world.run()
+    assert world.graph.ros is None
+
+
+async def test_a_bring_up_that_is_held_up_says_why_before_it_is_active(tmp_path: Path) -> None:
+    world = SessionWorld(CHAIN, tmp_path, stop_after_s=1.0)
+    world.graph.unseen.add("/camera")
+
+    async def wait() -> None:
+        await world.story.until("[joined] /viewer")
+        await asyncio.sleep(HELD_UP_S - 0.2)
         assert world.graph.ros is None
+        await asyncio.sleep(0.4)
+        ros = world.graph.ros
+        assert ros is not None
+        said = json.loads(ros.statuses[-1])
+        assert (said["phase"], said["verdict"]) == ("verifying", "violated")
+        assert said["not_ok"] == "missing: /camera (node)"
+        assert [each[:3] for each in ros.diagnostics[-1]] == [
+            (ERROR, "robot: /camera", "inactive"),
+            (WARN, "robot: /viewer", "inactive, the system is verifying"),
+            (
+                ERROR,
+                "robot: graph.missing-node",
+                "cannot find node /camera in domain 30",
+            ),
+        ]
+        world.graph.unseen.clear()
+        world.graph.note()
+        await world.story.until("[system] active")
+        await asyncio.sleep(0.1)
+        assert json.loads(ros.statuses[-1])["phase"] == "active"
 
-    run(main())
-
-
-def test_a_bring_up_that_is_held_up_says_why_before_it_is_active(tmp_path: Path) -> None:
-    async def main() -> None:
-        world = SessionWorld(CHAIN, tmp_path, stop_after_s=1.0)
-        world.graph.unseen.add("/camera")
-
-        async def wait() -> None:
-            await world.story.until("[joined] /viewer")
-            await asyncio.sleep(HELD_UP_S - 0.2)
-            assert world.graph.ros is None
-            await asyncio.sleep(0.4)
-            ros = world.graph.ros
-            assert ros is not None
-            said = json.loads(ros.statuses[-1])
-            assert (said["phase"], said["verdict"]) == ("verifying", "violated")
-            assert said["not_ok"] == "missing: /camera (node)"
-            assert [each[:3] for each in ros.diagnostics[-1]] == [
-                (ERROR, "robot: /camera", "inactive"),
-                (WARN, "robot: /viewer", "inactive, the system is verifying"),
-                (
-                    ERROR,
-                    "robot: graph.missing-node",
-                    "cannot find node /camera in domain 30",
-                ),
-            ]
-            world.graph.unseen.clear()
-            world.graph.note()
-            await world.story.until("[system] active")
-            await asyncio.sleep(0.1)
-            assert json.loads(ros.statuses[-1])["phase"] == "active"
-
-        await world.run(wait())
-
-    run(main())
+    await world.run(wait())
 
 
 def test_who_waits_for_the_status_is_told_why_a_bring_up_ends(tmp_path: Path) -> None:
@@ -110,19 +104,18 @@ def test_who_waits_for_the_status_is_told_why_a_bring_up_ends(tmp_path: Path) ->
     assert said["ends"].startswith("the verdict keeps the gate closed; wrong: /intruder")
 
 
-def test_what_cannot_be_offered_is_said_once_and_the_system_runs_without(tmp_path: Path) -> None:
-    async def main() -> None:
-        world = SessionWorld(CHAIN, tmp_path, stop_after_s=5.0)
-        world.graph.no_ros = "No module named 'diagnostic_msgs'"
-        await world.run()
-        said = [each for each in world.outline if each.startswith("[notice]")]
-        why = "cannot offer diagnostics and status in ROS: No module named 'diagnostic_msgs'"
-        off = "the system runs without; 'policy: {ros_interface: off}' does not try"
-        assert said == [f"[notice] {why}; {off}"]
-        assert world.result is not None
-        assert world.result.exit_code is ExitCode.OK
-
-    run(main())
+async def test_what_cannot_be_offered_is_said_once_and_the_system_runs_without(
+    tmp_path: Path,
+) -> None:
+    world = SessionWorld(CHAIN, tmp_path, stop_after_s=5.0)
+    world.graph.no_ros = "No module named 'diagnostic_msgs'"
+    await world.run()
+    said = [each for each in world.outline if each.startswith("[notice]")]
+    why = "cannot offer diagnostics and status in ROS: No module named 'diagnostic_msgs'"
+    off = "the system runs without; 'policy: {ros_interface: off}' does not try"
+    assert said == [f"[notice] {why}; {off}"]
+    assert world.result is not None
+    assert world.result.exit_code is ExitCode.OK
 
 
 @pytest.mark.parametrize("required", [True, False], ids=str)
@@ -142,89 +135,80 @@ def test_what_a_manifest_asks_for_must_be_installed(
         )
 
 
-def test_diagnostics_come_from_active_on_each_second_and_at_once_when_something_changed(
+async def test_diagnostics_come_from_active_on_each_second_and_at_once_when_something_changed(
     tmp_path: Path,
 ) -> None:
-    async def main() -> None:
-        world = SessionWorld(offering(RosInterfaceAccess.READ_ONLY), tmp_path, stop_after_s=9.9)
+    world = SessionWorld(offering(RosInterfaceAccess.READ_ONLY), tmp_path, stop_after_s=9.9)
 
-        async def intrude() -> None:
-            await world.story.until("[gate]")
-            assert world.graph.ros is None  # bring-up pays nothing for it
-            await world.story.until("[system] active")
-            await asyncio.sleep(3.5)
-            ros = world.graph.ros
-            assert ros is not None
-            assert (ros.prefix, ros.services) == ("/lifecycle/robot", ("get_status",))
-            assert 4 <= len(ros.diagnostics) <= 6
-            assert [each[:3] for each in ros.diagnostics[-1]] == [
-                (OK, "robot: /camera", "active"),
-                (OK, "robot: /viewer", "active"),
-            ]
-            before = len(ros.statuses)
-            world.intrude()
-            await world.story.until(f"[verdict] active violated {INTRUDED}")
-            await asyncio.sleep(0.1)
-            rule = ros.diagnostics[-1][-1]
-            assert rule[:2] == (ERROR, "robot: graph.undeclared-node")
-            assert len(ros.statuses) == before + 1
-            assert json.loads(ros.statuses[-1])["verdict"] == "violated"
-            assert (await ros.call("get_status"))[0] is False
-            world.retreat()
-            await asyncio.sleep(3.0)
-            assert ros.diagnostics[-1][-1][:3] == (OK, "robot: graph.undeclared-node", "ok")
-            assert (await ros.call("get_status"))[0] is True
+    async def intrude() -> None:
+        await world.story.until("[gate]")
+        assert world.graph.ros is None  # bring-up pays nothing for it
+        await world.story.until("[system] active")
+        await asyncio.sleep(3.5)
+        ros = world.graph.ros
+        assert ros is not None
+        assert (ros.prefix, ros.services) == ("/lifecycle/robot", ("get_status",))
+        assert 4 <= len(ros.diagnostics) <= 6
+        assert [each[:3] for each in ros.diagnostics[-1]] == [
+            (OK, "robot: /camera", "active"),
+            (OK, "robot: /viewer", "active"),
+        ]
+        before = len(ros.statuses)
+        world.intrude()
+        await world.story.until(f"[verdict] active violated {INTRUDED}")
+        await asyncio.sleep(0.1)
+        rule = ros.diagnostics[-1][-1]
+        assert rule[:2] == (ERROR, "robot: graph.undeclared-node")
+        assert len(ros.statuses) == before + 1
+        assert json.loads(ros.statuses[-1])["verdict"] == "violated"
+        assert (await ros.call("get_status"))[0] is False
+        world.retreat()
+        await asyncio.sleep(3.0)
+        assert ros.diagnostics[-1][-1][:3] == (OK, "robot: graph.undeclared-node", "ok")
+        assert (await ros.call("get_status"))[0] is True
 
-        await world.run(intrude())
+    await world.run(intrude())
+    assert world.graph.ros is not None
+    assert world.graph.ros.destroyed
+    assert json.loads(world.graph.ros.statuses[-1])["phase"] == "stopping"
+
+
+async def test_services_give_the_orders_of_the_control_socket(tmp_path: Path) -> None:
+    world = SessionWorld(offering(FULL), tmp_path)
+
+    async def order() -> None:
+        await world.story.until("[system] active")
+        await asyncio.sleep(0.3)
+        ros = world.graph.ros
+        assert ros is not None
+        assert ros.services == ("get_status", "pause", "resume", "restart", "down")
+        assert await ros.call("pause") == (True, "paused")
+        await asyncio.sleep(1.0)
+        assert ros.diagnostics[-1][0][:3] == (
+            WARN,
+            "robot: /camera",
+            "inactive, the system is paused",
+        )
+        assert await ros.call("pause") == (
+            False,
+            "cannot pause 'robot': it is paused; only an active system can be paused",
+        )
+        assert await ros.call("resume") == (True, "active")
+        assert await ros.call("restart") == (True, "active")
+        assert await ros.call("down") == (True, "the system is being taken down")
+
+    await world.run(order())
+    assert "the down service" in world.report
+
+
+async def test_a_node_that_is_silent_is_stale(tmp_path: Path) -> None:
+    world = SessionWorld(offering(FULL), tmp_path, stop_after_s=5.0)
+
+    async def hush() -> None:
+        await world.story.until("[system] active")
+        world.system.liveliness.fell_silent(["/camera"], Cause.STOPPED, "pid 7")
+        await asyncio.sleep(1.1)
         assert world.graph.ros is not None
-        assert world.graph.ros.destroyed
-        assert json.loads(world.graph.ros.statuses[-1])["phase"] == "stopping"
+        assert world.graph.ros.diagnostics[-1][0][0] == STALE
 
-    run(main())
-
-
-def test_services_give_the_orders_of_the_control_socket(tmp_path: Path) -> None:
-    async def main() -> None:
-        world = SessionWorld(offering(FULL), tmp_path)
-
-        async def order() -> None:
-            await world.story.until("[system] active")
-            await asyncio.sleep(0.3)
-            ros = world.graph.ros
-            assert ros is not None
-            assert ros.services == ("get_status", "pause", "resume", "restart", "down")
-            assert await ros.call("pause") == (True, "paused")
-            await asyncio.sleep(1.0)
-            assert ros.diagnostics[-1][0][:3] == (
-                WARN,
-                "robot: /camera",
-                "inactive, the system is paused",
-            )
-            assert await ros.call("pause") == (
-                False,
-                "cannot pause 'robot': it is paused; only an active system can be paused",
-            )
-            assert await ros.call("resume") == (True, "active")
-            assert await ros.call("restart") == (True, "active")
-            assert await ros.call("down") == (True, "the system is being taken down")
-
-        await world.run(order())
-        assert "the down service" in world.report
-
-    run(main())
-
-
-def test_a_node_that_is_silent_is_stale(tmp_path: Path) -> None:
-    async def main() -> None:
-        world = SessionWorld(offering(FULL), tmp_path, stop_after_s=5.0)
-
-        async def hush() -> None:
-            await world.story.until("[system] active")
-            world.system.liveliness.fell_silent(["/camera"], Cause.STOPPED, "pid 7")
-            await asyncio.sleep(1.1)
-            assert world.graph.ros is not None
-            assert world.graph.ros.diagnostics[-1][0][0] == STALE
-
-        await world.run(hush())
-
-    run(main())
+    await world.run(hush())

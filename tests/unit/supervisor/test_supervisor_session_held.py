@@ -14,7 +14,6 @@ import pytest
 
 from lifecycle.manifest.model import Discovery
 from lifecycle.supervisor.control.protocol import ControlRequest
-from tests.unit.supervisor.fakes import run
 from tests.unit.supervisor.session_world import (
     ACTIVATED,
     BACK,
@@ -40,455 +39,411 @@ ENDING = 1 + len(DOWN) + len(over(0))
 
 
 @pytest.mark.parametrize("heals", [False, True])
-def test_a_violation_while_holding_is_told_and_makes_the_end_no_success_even_if_it_heals(
+async def test_a_violation_while_holding_is_told_and_makes_the_end_no_success_even_if_it_heals(
     tmp_path: Path, heals: bool
 ) -> None:
-    async def main() -> None:
-        world = SessionWorld(CHAIN, tmp_path, stop_after_s=10.0)
+    world = SessionWorld(CHAIN, tmp_path, stop_after_s=10.0)
 
-        async def intrude() -> None:
-            await world.story.until("[system] active")
-            await asyncio.sleep(3.0)
-            world.intrude()
-            await asyncio.sleep(2.0)
-            if heals:
-                world.retreat()
-
-        await world.run(intrude())
-        assert world.since("[system] active")[1:] == [
-            f"[verdict] active violated {INTRUDED}",
-            *(["[verdict] active ok"] if heals else []),
-            "[stopping] at 10.0 s: done",
-            *DOWN,
-            *over(4),
-        ]
-        violated = "violated meanwhile, wrong" if heals else "violated; wrong"
-        assert world.report == (
-            "ended after it was active, exit code 4: "
-            f"done, but {violated}: /intruder (graph.undeclared-node)"
-        )
-
-    run(main())
-
-
-def test_a_passing_moment_is_no_violation_of_what_is_held(tmp_path: Path) -> None:
-    async def main() -> None:
-        world = SessionWorld(CHAIN, tmp_path, stop_after_s=10.0)
-
-        async def pass_by() -> None:
-            await world.story.until("[system] active")
-            await asyncio.sleep(3.0)
-            world.intrude()
-            await asyncio.sleep(0.2)
+    async def intrude() -> None:
+        await world.story.until("[system] active")
+        await asyncio.sleep(3.0)
+        world.intrude()
+        await asyncio.sleep(2.0)
+        if heals:
             world.retreat()
 
-        await world.run(pass_by())
-        assert world.since("[system] active")[1:] == [
-            f"[verdict] active violated {INTRUDED}",
-            "[verdict] active ok",
-            "[stopping] at 10.0 s: done",
-            *DOWN,
-            *over(0),
-        ]
+    await world.run(intrude())
+    assert world.since("[system] active")[1:] == [
+        f"[verdict] active violated {INTRUDED}",
+        *(["[verdict] active ok"] if heals else []),
+        "[stopping] at 10.0 s: done",
+        *DOWN,
+        *over(4),
+    ]
+    violated = "violated meanwhile, wrong" if heals else "violated; wrong"
+    assert world.report == (
+        "ended after it was active, exit code 4: "
+        f"done, but {violated}: /intruder (graph.undeclared-node)"
+    )
 
-    run(main())
+
+async def test_a_passing_moment_is_no_violation_of_what_is_held(tmp_path: Path) -> None:
+    world = SessionWorld(CHAIN, tmp_path, stop_after_s=10.0)
+
+    async def pass_by() -> None:
+        await world.story.until("[system] active")
+        await asyncio.sleep(3.0)
+        world.intrude()
+        await asyncio.sleep(0.2)
+        world.retreat()
+
+    await world.run(pass_by())
+    assert world.since("[system] active")[1:] == [
+        f"[verdict] active violated {INTRUDED}",
+        "[verdict] active ok",
+        "[stopping] at 10.0 s: done",
+        *DOWN,
+        *over(0),
+    ]
 
 
 @pytest.mark.parametrize("keep_going", [False, True])
-def test_a_process_that_dies_while_holding_ends_the_run_unless_it_is_to_keep_going(
+async def test_a_process_that_dies_while_holding_ends_the_run_unless_it_is_to_keep_going(
     tmp_path: Path, keep_going: bool
 ) -> None:
-    async def main() -> None:
-        world = SessionWorld(CHAIN, tmp_path, stop_after_s=10.0, keep_going=keep_going)
+    world = SessionWorld(CHAIN, tmp_path, stop_after_s=10.0, keep_going=keep_going)
 
-        async def die() -> None:
-            await world.story.until("[system] active")
-            await asyncio.sleep(3.0)
-            world.kill("camera")
+    async def die() -> None:
+        await world.story.until("[system] active")
+        await asyncio.sleep(3.0)
+        world.kill("camera")
 
-        await world.run(die())
-        gone = "graph.missing-node /camera"
-        if keep_going:
-            held = [
-                "[failure] run.process-died /camera, and the run goes on",
-                f"[verdict] active violated {gone}",
-                "[stopping] at 10.0 s: done",
-            ]
-        else:
-            held = ["[failure] run.process-died /camera", "[stopping] at 3.0 s: rolling back"]
-        down = ["/viewer deactivate", *VIEWER_DOWN]
-        assert world.since("[system] active")[1:] == [*held, *down, *over(6)]
-        assert world.report == (
-            "ended after it was active, exit code 6: "
-            + ("done, but " if keep_going else "")
-            + "failed: /camera (run.process-died)"
-        )
-
-    run(main())
+    await world.run(die())
+    gone = "graph.missing-node /camera"
+    if keep_going:
+        held = [
+            "[failure] run.process-died /camera, and the run goes on",
+            f"[verdict] active violated {gone}",
+            "[stopping] at 10.0 s: done",
+        ]
+    else:
+        held = ["[failure] run.process-died /camera", "[stopping] at 3.0 s: rolling back"]
+    down = ["/viewer deactivate", *VIEWER_DOWN]
+    assert world.since("[system] active")[1:] == [*held, *down, *over(6)]
+    assert world.report == (
+        "ended after it was active, exit code 6: "
+        + ("done, but " if keep_going else "")
+        + "failed: /camera (run.process-died)"
+    )
 
 
 # Orders
 
 
-def test_a_paused_system_is_inactive_until_it_is_judged_anew(tmp_path: Path) -> None:
-    async def main() -> None:
-        world = SessionWorld(CHAIN, tmp_path)
+async def test_a_paused_system_is_inactive_until_it_is_judged_anew(tmp_path: Path) -> None:
+    world = SessionWorld(CHAIN, tmp_path)
 
-        async def order() -> None:
-            await world.story.until("[system] active")
-            assert await world.order(ControlRequest.RESUME) == (
-                "2 cannot resume 'robot': it is active; only a paused system can be resumed"
-            )
-            assert await world.order(ControlRequest.PAUSE) == "0"
-            await asyncio.sleep(3.0)
-            assert await world.order(ControlRequest.RESUME) == "0"
-            assert await world.order(ControlRequest.DOWN) == "0"
-
-        await world.run(order())
-        assert world.since("[system] active")[1:] == [
-            "/viewer deactivate",
-            "/camera deactivate",
-            "[system] paused at 0.0 s",
-            "[system] verified at 3.0 s",
-            "networks programmed (ok)",
-            *ACTIVATED[:-1],
-            "[system] active at 3.0 s",
-            "[stopping] at 3.0 s: lifecycle down",
-            *DOWN,
-            *over(0),
-        ]
-
-    run(main())
-
-
-def test_a_system_that_is_wrong_stays_paused_and_can_be_resumed_once_it_is_right(
-    tmp_path: Path,
-) -> None:
-    async def main() -> None:
-        world = SessionWorld(CHAIN, tmp_path)
-
-        async def order() -> None:
-            await world.story.until("[system] active")
-            assert await world.order(ControlRequest.PAUSE) == "0"
-            world.intrude()
-            assert await world.order(ControlRequest.RESUME) == f"4 {REFUSED}"
-            assert await world.order(ControlRequest.PAUSE) == (
-                "2 cannot pause 'robot': it is paused; only an active system can be paused"
-            )
-            world.retreat()
-            assert await world.order(ControlRequest.RESUME) == "0"
-            assert await world.order(ControlRequest.DOWN) == "0"
-
-        await world.run(order())
-        assert world.since("[system] paused")[1:-ENDING] == [
-            f"[verdict] connected violated {INTRUDED}",
-            f"[notice] {REFUSED}",
-            "[verdict] connected ok",
-            "[system] verified at 0.5 s",
-            "networks programmed (ok)",
-            *ACTIVATED[:-1],
-            "[system] active at 0.5 s",
-        ]
-        assert world.report == "ended after it was active, exit code 0: lifecycle down"
-
-    run(main())
-
-
-def test_what_changes_while_a_system_is_resumed_has_it_paused_again(tmp_path: Path) -> None:
-    async def main() -> None:
-        world = SessionWorld(CHAIN, tmp_path)
-
-        async def order() -> None:
-            await world.story.until("[system] active")
-            assert await world.order(ControlRequest.PAUSE) == "0"
-            world.hosts.takes_s["/camera activate"] = 3.0
-            resumed = asyncio.ensure_future(world.order(ControlRequest.RESUME))
-            await world.story.until("/camera activate", 2)
-            await asyncio.sleep(1.0)
-            world.intrude()
-            assert await resumed == f"4 {REFUSED_AGAIN}"
-            world.retreat()
-            assert await world.order(ControlRequest.RESUME) == "0"
-            assert await world.order(ControlRequest.DOWN) == "0"
-
-        await world.run(order())
-        assert world.since("[gate]", 2)[:7] == [
-            OPENED,
-            "/camera activate",
-            f"[verdict] connected violated {INTRUDED}",
-            "[notice] the gate closed again: /camera is deactivated",
-            "/camera deactivate",
-            f"[notice] {REFUSED_AGAIN}",
-            "[verdict] connected ok",
-        ]
-        assert world.since("[gate]", 3)[:4] == [
-            OPENED,
-            "/camera activate",
-            "/viewer activate",
-            "[system] active at 6.5 s",
-        ]
-
-    run(main())
-
-
-def test_one_node_is_restarted_through_the_gate_and_the_others_stay_active(tmp_path: Path) -> None:
-    async def main() -> None:
-        world = SessionWorld(CHAIN, tmp_path)
-
-        async def order() -> None:
-            await world.story.until("[system] active")
-            assert await world.order(ControlRequest.RESTART, "viewer") == "0"
-            assert await world.order(ControlRequest.DOWN) == "0"
-
-        await world.run(order())
-        assert world.since("[system] active")[1:] == [
-            "/viewer deactivate",
-            *VIEWER_DOWN,
-            "viewer start",
-            "/viewer configure",
-            "/viewer connect",
-            "[system] connected at 0.0 s",
-            "[system] verified at 0.0 s",
-            "networks programmed (ok)",
-            "[gate] ok: /viewer",
-            "/viewer activate",
-            "[system] active at 0.0 s",
-            "[stopping] at 0.0 s: lifecycle down",
-            *DOWN,
-            *over(0),
-        ]
-
-    run(main())
-
-
-def test_a_restart_waits_until_nobody_takes_the_new_node_for_a_second_one_and_is_watched_anew(
-    tmp_path: Path,
-) -> None:
-    async def main() -> None:
-        world = SessionWorld(CHAIN, tmp_path)
-        world.hosts.lingers_s = 2.0
-
-        async def order() -> None:
-            await world.story.until("[system] active")
-            assert await world.order(ControlRequest.RESTART, "viewer") == "0"
-            world.kill("viewer")
-
-        await world.run(order())
-        assert world.since("viewer start", 2) == [
-            "viewer start",
-            "/viewer configure",
-            "/viewer connect",
-            "[system] connected at 2.0 s",
-            "[system] verified at 2.0 s",
-            "networks programmed (ok)",
-            "[gate] ok: /viewer",
-            "/viewer activate",
-            "[system] active at 2.0 s",
-            "[failure] run.process-died /viewer",
-            "[stopping] at 2.0 s: rolling back",
-            "/camera deactivate",
-            *CAMERA_DOWN,
-            *over(6),
-        ]
-        assert world.graph.dropped == ["/viewer"]
-
-    run(main())
-
-
-def test_an_order_to_a_system_that_is_not_up_is_refused_and_not_kept(tmp_path: Path) -> None:
-    async def main() -> None:
-        world = SessionWorld(CHAIN, tmp_path)
-        world.hosts.takes_s["/camera configure"] = 5.0
-
-        async def order() -> None:
-            await world.story.until("/camera configure")
-            for ask, hint in (
-                (ControlRequest.PAUSE, "only an active system can be paused"),
-                (ControlRequest.RESTART, "only a system that is active or paused can be restarted"),
-            ):
-                assert await world.order(ask) == (
-                    f"2 cannot {ask.value} 'robot': it is connecting; {hint}"
-                )
-            assert await world.order(ControlRequest.DOWN) == "6"
-
-        await world.run(order())
-
-    run(main())
-
-
-def test_a_restarted_node_stays_inactive_while_the_system_is_wrong_and_can_be_resumed(
-    tmp_path: Path,
-) -> None:
-    async def main() -> None:
-        world = SessionWorld(CHAIN, tmp_path)
-
-        async def order() -> None:
-            await world.story.until("[system] active")
-            world.intrude()
-            assert await world.order(ControlRequest.RESTART, "viewer") == f"4 {REFUSED}"
-            world.retreat()
-            await asyncio.sleep(1.0)
-            assert await world.order(ControlRequest.RESUME) == "0"
-            assert await world.order(ControlRequest.DOWN) == "0"
-
-        await world.run(order())
-        assert world.since("[verdict] active violated")[1:-ENDING] == [
-            "/viewer deactivate",
-            *VIEWER_DOWN,
-            "viewer start",
-            "/viewer configure",
-            "/viewer connect",
-            "[system] connected at 0.0 s",
-            f"[notice] {REFUSED}",
-            "[verdict] connected ok",
-            "[system] verified at 1.5 s",
-            "networks programmed (ok)",
-            "[gate] ok: /viewer",
-            "/viewer activate",
-            "[system] active at 1.5 s",
-        ]
-        assert world.report == (
-            "ended after it was active, exit code 0: lifecycle down; violated for no longer than "
-            "1 s, and not counted: /intruder (graph.undeclared-node)"
+    async def order() -> None:
+        await world.story.until("[system] active")
+        assert await world.order(ControlRequest.RESUME) == (
+            "2 cannot resume 'robot': it is active; only a paused system can be resumed"
         )
+        assert await world.order(ControlRequest.PAUSE) == "0"
+        await asyncio.sleep(3.0)
+        assert await world.order(ControlRequest.RESUME) == "0"
+        assert await world.order(ControlRequest.DOWN) == "0"
 
-    run(main())
+    await world.run(order())
+    assert world.since("[system] active")[1:] == [
+        "/viewer deactivate",
+        "/camera deactivate",
+        "[system] paused at 0.0 s",
+        "[system] verified at 3.0 s",
+        "networks programmed (ok)",
+        *ACTIVATED[:-1],
+        "[system] active at 3.0 s",
+        "[stopping] at 3.0 s: lifecycle down",
+        *DOWN,
+        *over(0),
+    ]
 
 
-def test_a_restart_for_which_no_port_is_left_ends_the_run(tmp_path: Path) -> None:
+async def test_a_system_that_is_wrong_stays_paused_and_can_be_resumed_once_it_is_right(
+    tmp_path: Path,
+) -> None:
+    world = SessionWorld(CHAIN, tmp_path)
+
+    async def order() -> None:
+        await world.story.until("[system] active")
+        assert await world.order(ControlRequest.PAUSE) == "0"
+        world.intrude()
+        assert await world.order(ControlRequest.RESUME) == f"4 {REFUSED}"
+        assert await world.order(ControlRequest.PAUSE) == (
+            "2 cannot pause 'robot': it is paused; only an active system can be paused"
+        )
+        world.retreat()
+        assert await world.order(ControlRequest.RESUME) == "0"
+        assert await world.order(ControlRequest.DOWN) == "0"
+
+    await world.run(order())
+    assert world.since("[system] paused")[1:-ENDING] == [
+        f"[verdict] connected violated {INTRUDED}",
+        f"[notice] {REFUSED}",
+        "[verdict] connected ok",
+        "[system] verified at 0.5 s",
+        "networks programmed (ok)",
+        *ACTIVATED[:-1],
+        "[system] active at 0.5 s",
+    ]
+    assert world.report == "ended after it was active, exit code 0: lifecycle down"
+
+
+async def test_what_changes_while_a_system_is_resumed_has_it_paused_again(tmp_path: Path) -> None:
+    world = SessionWorld(CHAIN, tmp_path)
+
+    async def order() -> None:
+        await world.story.until("[system] active")
+        assert await world.order(ControlRequest.PAUSE) == "0"
+        world.hosts.takes_s["/camera activate"] = 3.0
+        resumed = asyncio.ensure_future(world.order(ControlRequest.RESUME))
+        await world.story.until("/camera activate", 2)
+        await asyncio.sleep(1.0)
+        world.intrude()
+        assert await resumed == f"4 {REFUSED_AGAIN}"
+        world.retreat()
+        assert await world.order(ControlRequest.RESUME) == "0"
+        assert await world.order(ControlRequest.DOWN) == "0"
+
+    await world.run(order())
+    assert world.since("[gate]", 2)[:7] == [
+        OPENED,
+        "/camera activate",
+        f"[verdict] connected violated {INTRUDED}",
+        "[notice] the gate closed again: /camera is deactivated",
+        "/camera deactivate",
+        f"[notice] {REFUSED_AGAIN}",
+        "[verdict] connected ok",
+    ]
+    assert world.since("[gate]", 3)[:4] == [
+        OPENED,
+        "/camera activate",
+        "/viewer activate",
+        "[system] active at 6.5 s",
+    ]
+
+
+async def test_one_node_is_restarted_through_the_gate_and_the_others_stay_active(
+    tmp_path: Path,
+) -> None:
+    world = SessionWorld(CHAIN, tmp_path)
+
+    async def order() -> None:
+        await world.story.until("[system] active")
+        assert await world.order(ControlRequest.RESTART, "viewer") == "0"
+        assert await world.order(ControlRequest.DOWN) == "0"
+
+    await world.run(order())
+    assert world.since("[system] active")[1:] == [
+        "/viewer deactivate",
+        *VIEWER_DOWN,
+        "viewer start",
+        "/viewer configure",
+        "/viewer connect",
+        "[system] connected at 0.0 s",
+        "[system] verified at 0.0 s",
+        "networks programmed (ok)",
+        "[gate] ok: /viewer",
+        "/viewer activate",
+        "[system] active at 0.0 s",
+        "[stopping] at 0.0 s: lifecycle down",
+        *DOWN,
+        *over(0),
+    ]
+
+
+async def test_a_restart_waits_until_nobody_takes_the_new_node_for_a_second_one_and_is_watched_anew(
+    tmp_path: Path,
+) -> None:
+    world = SessionWorld(CHAIN, tmp_path)
+    world.hosts.lingers_s = 2.0
+
+    async def order() -> None:
+        await world.story.until("[system] active")
+        assert await world.order(ControlRequest.RESTART, "viewer") == "0"
+        world.kill("viewer")
+
+    await world.run(order())
+    assert world.since("viewer start", 2) == [
+        "viewer start",
+        "/viewer configure",
+        "/viewer connect",
+        "[system] connected at 2.0 s",
+        "[system] verified at 2.0 s",
+        "networks programmed (ok)",
+        "[gate] ok: /viewer",
+        "/viewer activate",
+        "[system] active at 2.0 s",
+        "[failure] run.process-died /viewer",
+        "[stopping] at 2.0 s: rolling back",
+        "/camera deactivate",
+        *CAMERA_DOWN,
+        *over(6),
+    ]
+    assert world.graph.dropped == ["/viewer"]
+
+
+async def test_an_order_to_a_system_that_is_not_up_is_refused_and_not_kept(tmp_path: Path) -> None:
+    world = SessionWorld(CHAIN, tmp_path)
+    world.hosts.takes_s["/camera configure"] = 5.0
+
+    async def order() -> None:
+        await world.story.until("/camera configure")
+        for ask, hint in (
+            (ControlRequest.PAUSE, "only an active system can be paused"),
+            (ControlRequest.RESTART, "only a system that is active or paused can be restarted"),
+        ):
+            assert await world.order(ask) == (
+                f"2 cannot {ask.value} 'robot': it is connecting; {hint}"
+            )
+        assert await world.order(ControlRequest.DOWN) == "6"
+
+    await world.run(order())
+
+
+async def test_a_restarted_node_stays_inactive_while_the_system_is_wrong_and_can_be_resumed(
+    tmp_path: Path,
+) -> None:
+    world = SessionWorld(CHAIN, tmp_path)
+
+    async def order() -> None:
+        await world.story.until("[system] active")
+        world.intrude()
+        assert await world.order(ControlRequest.RESTART, "viewer") == f"4 {REFUSED}"
+        world.retreat()
+        await asyncio.sleep(1.0)
+        assert await world.order(ControlRequest.RESUME) == "0"
+        assert await world.order(ControlRequest.DOWN) == "0"
+
+    await world.run(order())
+    assert world.since("[verdict] active violated")[1:-ENDING] == [
+        "/viewer deactivate",
+        *VIEWER_DOWN,
+        "viewer start",
+        "/viewer configure",
+        "/viewer connect",
+        "[system] connected at 0.0 s",
+        f"[notice] {REFUSED}",
+        "[verdict] connected ok",
+        "[system] verified at 1.5 s",
+        "networks programmed (ok)",
+        "[gate] ok: /viewer",
+        "/viewer activate",
+        "[system] active at 1.5 s",
+    ]
+    assert world.report == (
+        "ended after it was active, exit code 0: lifecycle down; violated for no longer than "
+        "1 s, and not counted: /intruder (graph.undeclared-node)"
+    )
+
+
+async def test_a_restart_for_which_no_port_is_left_ends_the_run(tmp_path: Path) -> None:
     full = dataclasses.replace(DIALLING, discovery=Discovery(first_port=65535))
     full_up = "cannot give out 2 more ports: they would begin at 67535, and the highest is 65535"
 
-    async def main() -> None:
-        world = SessionWorld(full, tmp_path)
+    world = SessionWorld(full, tmp_path)
 
-        async def order() -> None:
-            await world.story.until("[system] active")
-            assert await world.order(ControlRequest.RESTART, "viewer") == f"6 {full_up}"
+    async def order() -> None:
+        await world.story.until("[system] active")
+        assert await world.order(ControlRequest.RESTART, "viewer") == f"6 {full_up}"
 
-        await world.run(order())
-        assert "[failure] run.start-failed robot" in world.outline
-        assert world.report.startswith("ended after it was active, exit code 6: failed: robot")
-
-    run(main())
+    await world.run(order())
+    assert "[failure] run.start-failed robot" in world.outline
+    assert world.report.startswith("ended after it was active, exit code 6: failed: robot")
 
 
-def test_an_order_that_comes_during_another_is_carried_out_after_it(tmp_path: Path) -> None:
-    async def main() -> None:
-        world = SessionWorld(CHAIN, tmp_path)
-        world.hosts.takes_s |= {"/viewer deactivate": 3.0, "/viewer configure": 3.0}
-        answers = []
+async def test_an_order_that_comes_during_another_is_carried_out_after_it(tmp_path: Path) -> None:
+    world = SessionWorld(CHAIN, tmp_path)
+    world.hosts.takes_s |= {"/viewer deactivate": 3.0, "/viewer configure": 3.0}
+    answers = []
 
-        async def order() -> None:
-            await world.story.until("[system] active")
-            for first, second, line, times in (
-                (ControlRequest.RESTART, ControlRequest.PAUSE, "/viewer deactivate", 1),
-                (ControlRequest.RESTART, ControlRequest.RESUME, "/viewer configure", 3),
-                (ControlRequest.PAUSE, ControlRequest.PAUSE, "/viewer deactivate", 3),
-            ):
-                one = asyncio.ensure_future(world.order(first))
-                await world.story.until(line, times)
-                other = asyncio.ensure_future(world.order(second))
-                await asyncio.wait({one, other}, return_when=asyncio.FIRST_COMPLETED)
-                assert not other.done()
-                answers.append((await one, await other))
-            assert await world.order(ControlRequest.DOWN) == "0"
+    async def order() -> None:
+        await world.story.until("[system] active")
+        for first, second, line, times in (
+            (ControlRequest.RESTART, ControlRequest.PAUSE, "/viewer deactivate", 1),
+            (ControlRequest.RESTART, ControlRequest.RESUME, "/viewer configure", 3),
+            (ControlRequest.PAUSE, ControlRequest.PAUSE, "/viewer deactivate", 3),
+        ):
+            one = asyncio.ensure_future(world.order(first))
+            await world.story.until(line, times)
+            other = asyncio.ensure_future(world.order(second))
+            await asyncio.wait({one, other}, return_when=asyncio.FIRST_COMPLETED)
+            assert not other.done()
+            answers.append((await one, await other))
+        assert await world.order(ControlRequest.DOWN) == "0"
 
-        await world.run(order())
-        assert answers == [
-            ("0", "0"),
-            ("0", "0"),
-            # What it has become meanwhile counts.
-            ("0", "2 cannot pause 'robot': it is paused; only an active system can be paused"),
-        ]
-
-    run(main())
+    await world.run(order())
+    assert answers == [
+        ("0", "0"),
+        ("0", "0"),
+        # What it has become meanwhile counts.
+        ("0", "2 cannot pause 'robot': it is paused; only an active system can be paused"),
+    ]
 
 
-def test_a_restart_that_cannot_begin_leaves_everything_as_it_is(tmp_path: Path) -> None:
-    async def main() -> None:
-        world = SessionWorld(CHAIN, tmp_path)
-        why = "the fork server does not answer within 10 s"
+async def test_a_restart_that_cannot_begin_leaves_everything_as_it_is(tmp_path: Path) -> None:
+    world = SessionWorld(CHAIN, tmp_path)
+    why = "the fork server does not answer within 10 s"
 
-        async def order() -> None:
-            await world.story.until("[system] active")
-            world.hosts.cannot_start = why
-            assert await world.order(ControlRequest.RESTART) == (
-                f"6 cannot restart 'robot': {why}; everything stays as it is"
-            )
-            assert await world.order(ControlRequest.DOWN) == "0"
+    async def order() -> None:
+        await world.story.until("[system] active")
+        world.hosts.cannot_start = why
+        assert await world.order(ControlRequest.RESTART) == (
+            f"6 cannot restart 'robot': {why}; everything stays as it is"
+        )
+        assert await world.order(ControlRequest.DOWN) == "0"
 
-        await world.run(order())
-        assert world.since("[system] active")[1:] == [
-            "[stopping] at 0.0 s: lifecycle down",
-            *DOWN,
-            *over(0),
-        ]
-
-    run(main())
+    await world.run(order())
+    assert world.since("[system] active")[1:] == [
+        "[stopping] at 0.0 s: lifecycle down",
+        *DOWN,
+        *over(0),
+    ]
 
 
-def test_a_restart_in_which_a_step_fails_ends_the_run(tmp_path: Path) -> None:
-    async def main() -> None:
-        world = SessionWorld(CHAIN, tmp_path)
+async def test_a_restart_in_which_a_step_fails_ends_the_run(tmp_path: Path) -> None:
+    world = SessionWorld(CHAIN, tmp_path)
 
-        async def order() -> None:
-            await world.story.until("[system] active")
-            world.hosts.ways["/viewer configure"] = "no display"
-            assert await world.order(ControlRequest.RESTART, "/viewer") == (
-                "6 cannot configure '/viewer': no display"
-            )
+    async def order() -> None:
+        await world.story.until("[system] active")
+        world.hosts.ways["/viewer configure"] = "no display"
+        assert await world.order(ControlRequest.RESTART, "/viewer") == (
+            "6 cannot configure '/viewer': no display"
+        )
 
-        await world.run(order())
-        assert world.since("viewer start", 2) == [
-            "viewer start",
-            "/viewer configure",
-            "[failure] run.transition-failed /viewer",
-            "[stopping] at 0.0 s: rolling back",
-            "/viewer shutdown",
-            "/camera deactivate",
-            *CAMERA_DOWN,
-            *over(6),
-        ]
-
-    run(main())
+    await world.run(order())
+    assert world.since("viewer start", 2) == [
+        "viewer start",
+        "/viewer configure",
+        "[failure] run.transition-failed /viewer",
+        "[stopping] at 0.0 s: rolling back",
+        "/viewer shutdown",
+        "/camera deactivate",
+        *CAMERA_DOWN,
+        *over(6),
+    ]
 
 
-def test_a_paused_system_is_restarted_as_far_as_it_was(tmp_path: Path) -> None:
-    async def main() -> None:
-        world = SessionWorld(CHAIN, tmp_path)
+async def test_a_paused_system_is_restarted_as_far_as_it_was(tmp_path: Path) -> None:
+    world = SessionWorld(CHAIN, tmp_path)
 
-        async def order() -> None:
-            await world.story.until("[system] active")
-            assert await world.order(ControlRequest.PAUSE) == "0"
-            assert await world.order(ControlRequest.RESTART) == "0"
-            assert await world.order(ControlRequest.DOWN) == "0"
+    async def order() -> None:
+        await world.story.until("[system] active")
+        assert await world.order(ControlRequest.PAUSE) == "0"
+        assert await world.order(ControlRequest.RESTART) == "0"
+        assert await world.order(ControlRequest.DOWN) == "0"
 
-        await world.run(order())
-        assert world.since("[system] paused")[1:] == [
-            *BACK,
-            *CONNECTED,
-            "[system] paused at 0.0 s",
-            "[stopping] at 0.0 s: lifecycle down",
-            *BACK,
-            *over(0),
-        ]
-
-    run(main())
+    await world.run(order())
+    assert world.since("[system] paused")[1:] == [
+        *BACK,
+        *CONNECTED,
+        "[system] paused at 0.0 s",
+        "[stopping] at 0.0 s: lifecycle down",
+        *BACK,
+        *over(0),
+    ]
 
 
-def test_an_order_that_is_open_when_the_system_is_taken_down_is_answered(tmp_path: Path) -> None:
-    async def main() -> None:
-        world = SessionWorld(CHAIN, tmp_path)
+async def test_an_order_that_is_open_when_the_system_is_taken_down_is_answered(
+    tmp_path: Path,
+) -> None:
+    world = SessionWorld(CHAIN, tmp_path)
 
-        async def order() -> None:
-            await world.story.until("[system] active")
-            world.hosts.takes_s["/viewer deactivate"] = 2.0
-            paused = asyncio.ensure_future(world.order(ControlRequest.PAUSE))
-            await world.story.until("/viewer deactivate")
-            signal.raise_signal(signal.SIGTERM)
-            assert await paused == "6 cannot go on: 'robot' is being taken down"
+    async def order() -> None:
+        await world.story.until("[system] active")
+        world.hosts.takes_s["/viewer deactivate"] = 2.0
+        paused = asyncio.ensure_future(world.order(ControlRequest.PAUSE))
+        await world.story.until("/viewer deactivate")
+        signal.raise_signal(signal.SIGTERM)
+        assert await paused == "6 cannot go on: 'robot' is being taken down"
 
-        await world.run(order())
-
-    run(main())
+    await world.run(order())

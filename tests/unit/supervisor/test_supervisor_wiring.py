@@ -45,7 +45,7 @@ from lifecycle.supervisor.run.failure import StepFailedError
 from lifecycle.supervisor.run.shutdown import TakeDown
 from lifecycle.verify.observation import NodeConfiguration, Observation
 from tests.builders import plan_of, planned_endpoint, planned_node
-from tests.unit.supervisor.fakes import World, interface_of, rewired, run
+from tests.unit.supervisor.fakes import World, interface_of, rewired
 
 LIMIT_S = 30.0
 URL = "udpv4://127.0.0.1:7911"
@@ -178,44 +178,38 @@ async def settle(seconds: float = 0.0) -> None:
         await asyncio.sleep(0.0001)
 
 
-def test_a_node_is_connected_and_mapped_between_configure_and_connect(tmp_path: Path) -> None:
-    async def main() -> None:
-        wiring = Wiring(wired_plan(wired_node("a")), tmp_path)
-        await wiring.world.bring_up.connect(LIMIT_S)
-        assert wiring.told("/a") == [
-            "configure",
-            "get_configuration",
-            "connect_to net",
-            "map_to publishers/out net",
-            "map_to subscriptions/in",
-            "connect",
-        ]
-        assert [
-            (each.operation, each.connection, each.endpoint, each.urls, each.error)
-            for each in wiring.world.heard(WiringChanged)
-        ] == [
-            (CONNECT, "net", "", (URL,), ""),
-            (MAP, "net", "publishers/out", (), ""),
-            (MAP, "", "subscriptions/in", (), ""),
-        ]
-        await wiring.down()
-
-    run(main())
+async def test_a_node_is_connected_and_mapped_between_configure_and_connect(tmp_path: Path) -> None:
+    wiring = Wiring(wired_plan(wired_node("a")), tmp_path)
+    await wiring.world.bring_up.connect(LIMIT_S)
+    assert wiring.told("/a") == [
+        "configure",
+        "get_configuration",
+        "connect_to net",
+        "map_to publishers/out net",
+        "map_to subscriptions/in",
+        "connect",
+    ]
+    assert [
+        (each.operation, each.connection, each.endpoint, each.urls, each.error)
+        for each in wiring.world.heard(WiringChanged)
+    ] == [
+        (CONNECT, "net", "", (URL,), ""),
+        (MAP, "net", "publishers/out", (), ""),
+        (MAP, "", "subscriptions/in", (), ""),
+    ]
+    await wiring.down()
 
 
-def test_take_down_disconnects_before_the_node_is_disconnected(tmp_path: Path) -> None:
-    async def main() -> None:
-        wiring = Wiring(wired_plan(wired_node("a")), tmp_path)
-        await wiring.world.bring_up.connect(LIMIT_S)
-        await wiring.down()
-        assert wiring.told("/a")[-4:] == [
-            "disconnect_from net",
-            "disconnect",
-            "cleanup",
-            "shutdown",
-        ]
-
-    run(main())
+async def test_take_down_disconnects_before_the_node_is_disconnected(tmp_path: Path) -> None:
+    wiring = Wiring(wired_plan(wired_node("a")), tmp_path)
+    await wiring.world.bring_up.connect(LIMIT_S)
+    await wiring.down()
+    assert wiring.told("/a")[-4:] == [
+        "disconnect_from net",
+        "disconnect",
+        "cleanup",
+        "shutdown",
+    ]
 
 
 @pytest.mark.parametrize(
@@ -234,232 +228,201 @@ def test_take_down_disconnects_before_the_node_is_disconnected(tmp_path: Path) -
         ),
     ],
 )
-def test_a_failed_step_ends_bring_up_and_names_node_connection_endpoint_and_reason(
+async def test_a_failed_step_ends_bring_up_and_names_node_connection_endpoint_and_reason(
     tmp_path: Path, what: str, message: str
 ) -> None:
-    async def main() -> None:
-        wiring = Wiring(wired_plan(wired_node("a")), tmp_path)
-        wiring.world.spawner.ways[what] = "the address is not of this host"
-        with pytest.raises(StepFailedError) as caught:
-            await wiring.world.bring_up.connect(LIMIT_S)
-        assert (caught.value.rule.id, caught.value.subject) == ("run.not-wired", "/a")
-        assert caught.value.message == message
-        assert wiring.world.heard(WiringChanged)[-1].error == message
-        assert "connect" not in wiring.told("/a")
-        await wiring.down()
-
-    run(main())
-
-
-def test_a_negotiation_waits_until_everybody_is_configured(tmp_path: Path) -> None:
-    async def main() -> None:
-        plan = wired_plan(wired_node("a"), wired_node("b"), source=DataLayerSource.DYNAMIC)
-        wiring = Wiring(plan, tmp_path)
-        wiring.world.spawner.takes_s["/b configure"] = 3.0
+    wiring = Wiring(wired_plan(wired_node("a")), tmp_path)
+    wiring.world.spawner.ways[what] = "the address is not of this host"
+    with pytest.raises(StepFailedError) as caught:
         await wiring.world.bring_up.connect(LIMIT_S)
-        log = wiring.world.log
-        assert log.index("/b configure") < log.index("/a connect_to net")
-        await wiring.down()
+    assert (caught.value.rule.id, caught.value.subject) == ("run.not-wired", "/a")
+    assert caught.value.message == message
+    assert wiring.world.heard(WiringChanged)[-1].error == message
+    assert "connect" not in wiring.told("/a")
+    await wiring.down()
 
-    run(main())
+
+async def test_a_negotiation_waits_until_everybody_is_configured(tmp_path: Path) -> None:
+    plan = wired_plan(wired_node("a"), wired_node("b"), source=DataLayerSource.DYNAMIC)
+    wiring = Wiring(plan, tmp_path)
+    wiring.world.spawner.takes_s["/b configure"] = 3.0
+    await wiring.world.bring_up.connect(LIMIT_S)
+    log = wiring.world.log
+    assert log.index("/b configure") < log.index("/a connect_to net")
+    await wiring.down()
 
 
-def test_a_negotiation_does_not_wait_for_what_waits_for_a_connection(tmp_path: Path) -> None:
-    async def main() -> None:
-        late = wired_node("late", after={"plain": Condition.STARTED})
-        plain = dataclasses.replace(
-            planned_node("plain", after={"a": Condition.CONNECTED}), managed=False
-        )
-        plan = wired_plan(wired_node("a"), plain, late, source=DataLayerSource.DYNAMIC)
-        wiring = Wiring(plan, tmp_path)
+async def test_a_negotiation_does_not_wait_for_what_waits_for_a_connection(tmp_path: Path) -> None:
+    late = wired_node("late", after={"plain": Condition.STARTED})
+    plain = dataclasses.replace(
+        planned_node("plain", after={"a": Condition.CONNECTED}), managed=False
+    )
+    plan = wired_plan(wired_node("a"), plain, late, source=DataLayerSource.DYNAMIC)
+    wiring = Wiring(plan, tmp_path)
+    await wiring.world.bring_up.connect(LIMIT_S)
+    log = wiring.world.log
+    assert log.index("/a connect") < log.index("plain start") < log.index("/late configure")
+    assert "/late connect" in log
+    await wiring.down()
+
+
+async def test_capabilities_that_do_not_fit_end_bring_up(tmp_path: Path) -> None:
+    wiring = Wiring(wired_plan(wired_node("a")), tmp_path)
+    wiring.source.next = ("cannot link /a → /b on /out: /a has shm; /b has udpv4",)
+    with pytest.raises(StepFailedError) as caught:
         await wiring.world.bring_up.connect(LIMIT_S)
-        log = wiring.world.log
-        assert log.index("/a connect") < log.index("plain start") < log.index("/late configure")
-        assert "/late connect" in log
-        await wiring.down()
-
-    run(main())
+    assert caught.value.message == wiring.source.next[0]
+    await wiring.down()
 
 
-def test_capabilities_that_do_not_fit_end_bring_up(tmp_path: Path) -> None:
-    async def main() -> None:
-        wiring = Wiring(wired_plan(wired_node("a")), tmp_path)
-        wiring.source.next = ("cannot link /a → /b on /out: /a has shm; /b has udpv4",)
-        with pytest.raises(StepFailedError) as caught:
-            await wiring.world.bring_up.connect(LIMIT_S)
-        assert caught.value.message == wiring.source.next[0]
-        await wiring.down()
-
-    run(main())
-
-
-def test_a_lost_connection_is_told_and_made_again_with_its_mappings(tmp_path: Path) -> None:
-    async def main() -> None:
-        wiring = Wiring(wired_plan(wired_node("a"), events=True), tmp_path)
-        await wiring.world.bring_up.connect(LIMIT_S)
-        wiring.report("/a")
-        wiring.look()
-        await settle()
-        before = len(wiring.told("/a"))
-        wiring.lose("/a", "net")
-        wiring.look()
-        await settle()
-        assert wiring.told("/a")[before:] == ["connect_to net", "map_to publishers/out net"]
-        assert wiring.world.heard(WiringLost) == [WiringLost(node="/a", connection="net")]
-        assert wiring.authority.findings() == ()
-        await wiring.down()
-
-    run(main())
+async def test_a_lost_connection_is_told_and_made_again_with_its_mappings(tmp_path: Path) -> None:
+    wiring = Wiring(wired_plan(wired_node("a"), events=True), tmp_path)
+    await wiring.world.bring_up.connect(LIMIT_S)
+    wiring.report("/a")
+    wiring.look()
+    await settle()
+    before = len(wiring.told("/a"))
+    wiring.lose("/a", "net")
+    wiring.look()
+    await settle()
+    assert wiring.told("/a")[before:] == ["connect_to net", "map_to publishers/out net"]
+    assert wiring.world.heard(WiringLost) == [WiringLost(node="/a", connection="net")]
+    assert wiring.authority.findings() == ()
+    await wiring.down()
 
 
-def test_without_events_nobody_is_watched(tmp_path: Path) -> None:
-    async def main() -> None:
-        wiring = Wiring(wired_plan(wired_node("a"), events=False), tmp_path)
-        await wiring.world.bring_up.connect(LIMIT_S)
-        before = len(wiring.told("/a"))
-        wiring.lose("/a", "net")
-        wiring.look()
-        await settle()
-        assert len(wiring.told("/a")) == before
-        await wiring.down()
-
-    run(main())
+async def test_without_events_nobody_is_watched(tmp_path: Path) -> None:
+    wiring = Wiring(wired_plan(wired_node("a"), events=False), tmp_path)
+    await wiring.world.bring_up.connect(LIMIT_S)
+    before = len(wiring.told("/a"))
+    wiring.lose("/a", "net")
+    wiring.look()
+    await settle()
+    assert len(wiring.told("/a")) == before
+    await wiring.down()
 
 
-def test_what_cannot_be_made_again_is_tried_ever_later_and_then_a_finding(tmp_path: Path) -> None:
-    async def main() -> None:
-        wiring = Wiring(wired_plan(wired_node("a"), events=True), tmp_path)
-        await wiring.world.bring_up.connect(LIMIT_S)
-        wiring.report("/a")
-        wiring.look()
-        await settle()
-        wiring.world.spawner.ways["/a connect_to net"] = "port 7911 is taken"
-        wiring.lose("/a", "net")
-        wiring.look()
-        loop = asyncio.get_running_loop()
-        began = loop.time()
-        await settle(60.0)
-        failed = [each for each in wiring.world.heard(WiringChanged) if each.error]
-        assert [each.attempt for each in failed] == list(range(1, TRIES + 1))
-        assert loop.time() - began < 61.0
-        (finding,) = wiring.authority.findings()
-        assert (finding.rule, finding.subject) == ("run.not-wired", "/a")
-        assert finding.message == f"cannot connect '/a' to 'net' ({URL}): port 7911 is taken"
-        # The port comes free; the node tells of something: it is tried anew.
-        del wiring.world.spawner.ways["/a connect_to net"]
-        wiring.lose("/a", "other")
-        wiring.look()
-        await settle()
-        assert wiring.authority.findings() == ()
-        assert dict(wired(wiring.world.spawner.interfaces["/a"]).connections) == {"net": (URL,)}
-        await wiring.down()
-
-    run(main())
-
-
-def test_only_the_difference_is_wired_when_the_negotiation_changes(tmp_path: Path) -> None:
-    async def main() -> None:
-        plan = wired_plan(wired_node("a"), wired_node("b"), source=DataLayerSource.DYNAMIC)
-        wiring = Wiring(plan, tmp_path)
-        await wiring.world.bring_up.connect(LIMIT_S)
-        for node in ("/a", "/b"):
-            wiring.report(node)
-        wiring.look()
-        await settle()
-        before = {node: len(wiring.told(node)) for node in ("/a", "/b")}
-        wiring.source.now["/b"] = dataclasses.replace(
-            wiring.source.now["/b"],
-            connections=(("group", ParticipantConnections(urls=("udpm://239.255.1.1:7900",))),),
-            mappings=(("publishers/out", "group"), ("subscriptions/in", "")),
-        )
-        wiring.look()
-        await settle()
-        assert wiring.told("/a")[before["/a"] :] == []
-        assert wiring.told("/b")[before["/b"] :] == [
-            "connect_to group",
-            "map_to publishers/out group",
-            "disconnect_from net",
-        ]
-        await wiring.down()
-
-    run(main())
-
-
-def test_it_is_at_work_until_what_a_node_reports_already_is_done(tmp_path: Path) -> None:
-    async def main() -> None:
-        plan = wired_plan(wired_node("a"), source=DataLayerSource.DYNAMIC)
-        wiring = Wiring(plan, tmp_path)
-        await wiring.world.bring_up.connect(LIMIT_S)
-        wiring.report("/a")
-        wiring.look()
-        await settle()
-        assert not wiring.authority.is_at_work()
-        wiring.source.now["/a"] = dataclasses.replace(
-            wiring.source.now["/a"], mappings=(("publishers/out", ""), ("subscriptions/in", ""))
-        )
-        wiring.world.spawner.takes_s["/a map_to publishers/out"] = 2.0
-        wiring.look()
-        await settle(1.0)
-        # As a node does whose old endpoint stays until its peers have found the new one.
-        interfaces = wiring.world.spawner.interfaces
-        interfaces["/a"] = rewired(interfaces["/a"], MAP, endpoint="publishers/out", connection="")
-        wiring.report("/a")
-        wiring.look()
-        assert wiring.authority.is_at_work()
-        await settle(2.0)
-        wiring.look()
-        await settle()
-        assert not wiring.authority.is_at_work()
-        await wiring.down()
-
-    run(main())
-
-
-def test_a_negotiation_that_fails_while_running_is_a_finding_until_it_succeeds(
+async def test_what_cannot_be_made_again_is_tried_ever_later_and_then_a_finding(
     tmp_path: Path,
 ) -> None:
-    async def main() -> None:
-        wiring = Wiring(wired_plan(wired_node("a"), source=DataLayerSource.DYNAMIC), tmp_path)
-        await wiring.world.bring_up.connect(LIMIT_S)
-        wiring.source.next = ("cannot link /a → /b on /out: /a has shm; /b has udpv4",)
-        wiring.look()
-        wiring.look()
-        (finding,) = wiring.authority.findings()
-        assert finding.message == wiring.source.next[0]
-        assert wiring.world.heard(Notice) == [Notice(message=wiring.source.next[0])]
-        wiring.source.next = ()
-        wiring.look()
-        assert wiring.authority.findings() == ()
-        await wiring.down()
+    wiring = Wiring(wired_plan(wired_node("a"), events=True), tmp_path)
+    await wiring.world.bring_up.connect(LIMIT_S)
+    wiring.report("/a")
+    wiring.look()
+    await settle()
+    wiring.world.spawner.ways["/a connect_to net"] = "port 7911 is taken"
+    wiring.lose("/a", "net")
+    wiring.look()
+    loop = asyncio.get_running_loop()
+    began = loop.time()
+    await settle(60.0)
+    failed = [each for each in wiring.world.heard(WiringChanged) if each.error]
+    assert [each.attempt for each in failed] == list(range(1, TRIES + 1))
+    assert loop.time() - began < 61.0
+    (finding,) = wiring.authority.findings()
+    assert (finding.rule, finding.subject) == ("run.not-wired", "/a")
+    assert finding.message == f"cannot connect '/a' to 'net' ({URL}): port 7911 is taken"
+    # The port comes free; the node tells of something: it is tried anew.
+    del wiring.world.spawner.ways["/a connect_to net"]
+    wiring.lose("/a", "other")
+    wiring.look()
+    await settle()
+    assert wiring.authority.findings() == ()
+    assert dict(wired(wiring.world.spawner.interfaces["/a"]).connections) == {"net": (URL,)}
+    await wiring.down()
 
-    run(main())
+
+async def test_only_the_difference_is_wired_when_the_negotiation_changes(tmp_path: Path) -> None:
+    plan = wired_plan(wired_node("a"), wired_node("b"), source=DataLayerSource.DYNAMIC)
+    wiring = Wiring(plan, tmp_path)
+    await wiring.world.bring_up.connect(LIMIT_S)
+    for node in ("/a", "/b"):
+        wiring.report(node)
+    wiring.look()
+    await settle()
+    before = {node: len(wiring.told(node)) for node in ("/a", "/b")}
+    wiring.source.now["/b"] = dataclasses.replace(
+        wiring.source.now["/b"],
+        connections=(("group", ParticipantConnections(urls=("udpm://239.255.1.1:7900",))),),
+        mappings=(("publishers/out", "group"), ("subscriptions/in", "")),
+    )
+    wiring.look()
+    await settle()
+    assert wiring.told("/a")[before["/a"] :] == []
+    assert wiring.told("/b")[before["/b"] :] == [
+        "connect_to group",
+        "map_to publishers/out group",
+        "disconnect_from net",
+    ]
+    await wiring.down()
 
 
-def test_an_undeclared_node_that_joins_is_wired_never_activated_and_released_in_the_end(
+async def test_it_is_at_work_until_what_a_node_reports_already_is_done(tmp_path: Path) -> None:
+    plan = wired_plan(wired_node("a"), source=DataLayerSource.DYNAMIC)
+    wiring = Wiring(plan, tmp_path)
+    await wiring.world.bring_up.connect(LIMIT_S)
+    wiring.report("/a")
+    wiring.look()
+    await settle()
+    assert not wiring.authority.is_at_work()
+    wiring.source.now["/a"] = dataclasses.replace(
+        wiring.source.now["/a"], mappings=(("publishers/out", ""), ("subscriptions/in", ""))
+    )
+    wiring.world.spawner.takes_s["/a map_to publishers/out"] = 2.0
+    wiring.look()
+    await settle(1.0)
+    # As a node does whose old endpoint stays until its peers have found the new one.
+    interfaces = wiring.world.spawner.interfaces
+    interfaces["/a"] = rewired(interfaces["/a"], MAP, endpoint="publishers/out", connection="")
+    wiring.report("/a")
+    wiring.look()
+    assert wiring.authority.is_at_work()
+    await settle(2.0)
+    wiring.look()
+    await settle()
+    assert not wiring.authority.is_at_work()
+    await wiring.down()
+
+
+async def test_a_negotiation_that_fails_while_running_is_a_finding_until_it_succeeds(
     tmp_path: Path,
 ) -> None:
-    async def main() -> None:
-        wiring = Wiring(wired_plan(wired_node("a"), source=DataLayerSource.DYNAMIC), tmp_path)
-        await wiring.world.bring_up.connect(LIMIT_S)
-        guest = interface_of("/guest", "subscriptions/out")
-        wiring.hands["/guest"] = FakeHand(guest)
-        wiring.source.now["/guest"] = Instructions(
-            node="/guest", connections=(("net", NET),), mappings=(("subscriptions/out", "net"),)
-        )
-        wiring.look(guest)
-        await settle()
-        assert wiring.source.known[-1] == {"/a", "/guest"}
-        assert wiring.hands["/guest"].made == [
-            f"connect '/guest' to 'net' ({URL})",
-            "map 'subscriptions/out' of '/guest' to connection 'net'",
-        ]
-        await wiring.down()
-        assert wiring.hands["/guest"].made[2:] == ["disconnect '/guest' from 'net'"]
-
-    run(main())
+    wiring = Wiring(wired_plan(wired_node("a"), source=DataLayerSource.DYNAMIC), tmp_path)
+    await wiring.world.bring_up.connect(LIMIT_S)
+    wiring.source.next = ("cannot link /a → /b on /out: /a has shm; /b has udpv4",)
+    wiring.look()
+    wiring.look()
+    (finding,) = wiring.authority.findings()
+    assert finding.message == wiring.source.next[0]
+    assert wiring.world.heard(Notice) == [Notice(message=wiring.source.next[0])]
+    wiring.source.next = ()
+    wiring.look()
+    assert wiring.authority.findings() == ()
+    await wiring.down()
 
 
-def test_a_foreign_node_without_a_node_interface_cannot_be_connected(tmp_path: Path) -> None:
+async def test_an_undeclared_node_that_joins_is_wired_never_activated_and_released_in_the_end(
+    tmp_path: Path,
+) -> None:
+    wiring = Wiring(wired_plan(wired_node("a"), source=DataLayerSource.DYNAMIC), tmp_path)
+    await wiring.world.bring_up.connect(LIMIT_S)
+    guest = interface_of("/guest", "subscriptions/out")
+    wiring.hands["/guest"] = FakeHand(guest)
+    wiring.source.now["/guest"] = Instructions(
+        node="/guest", connections=(("net", NET),), mappings=(("subscriptions/out", "net"),)
+    )
+    wiring.look(guest)
+    await settle()
+    assert wiring.source.known[-1] == {"/a", "/guest"}
+    assert wiring.hands["/guest"].made == [
+        f"connect '/guest' to 'net' ({URL})",
+        "map 'subscriptions/out' of '/guest' to connection 'net'",
+    ]
+    await wiring.down()
+    assert wiring.hands["/guest"].made[2:] == ["disconnect '/guest' from 'net'"]
+
+
+async def test_a_foreign_node_without_a_node_interface_cannot_be_connected(tmp_path: Path) -> None:
     class Foreign:
         async def interface(self) -> None:
             return None
@@ -467,20 +430,17 @@ def test_a_foreign_node_without_a_node_interface_cannot_be_connected(tmp_path: P
         async def wire(self, step: Step) -> None:
             raise AssertionError(step)
 
-    async def main() -> None:
-        attached = dataclasses.replace(
-            wired_node("a"), run=dataclasses.replace(wired_node("a").run, kind=RunKind.ATTACH)
-        )
-        wiring = Wiring(wired_plan(attached), tmp_path)
-        node = wiring.world.system.nodes["a"]
-        node.driver = Foreign()  # type: ignore[assignment]
-        with pytest.raises(BringUpError) as caught:
-            await wiring.authority.wire(node)
-        assert caught.value.message == (
-            f"cannot connect '/a' to 'net' ({URL}): it offers no ~/connect_to"
-        )
-
-    run(main())
+    attached = dataclasses.replace(
+        wired_node("a"), run=dataclasses.replace(wired_node("a").run, kind=RunKind.ATTACH)
+    )
+    wiring = Wiring(wired_plan(attached), tmp_path)
+    node = wiring.world.system.nodes["a"]
+    node.driver = Foreign()  # type: ignore[assignment]
+    with pytest.raises(BringUpError) as caught:
+        await wiring.authority.wire(node)
+    assert caught.value.message == (
+        f"cannot connect '/a' to 'net' ({URL}): it offers no ~/connect_to"
+    )
 
 
 def test_steps_make_before_they_break_and_spare_what_is_not_ours() -> None:
