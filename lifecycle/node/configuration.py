@@ -37,11 +37,10 @@ from lifecycle.middleware import (
     endpoints_of_node,
     from_rclpy,
     get_network_flow_endpoints,
-    guid_of,
     interface_of,
     is_server_matched,
     machine_id,
-    matched_with,
+    senders_of,
     vouch_for,
 )
 from lifecycle.network import (
@@ -127,10 +126,6 @@ def checksum(configuration: NodeConfiguration) -> str:
     return hashlib.sha256(codec.to_json(stable)).hexdigest()[:_DIGITS]
 
 
-_OTHER = {
-    EndpointKind.PUBLISHER: EndpointKind.SUBSCRIPTION,
-    EndpointKind.SUBSCRIPTION: EndpointKind.PUBLISHER,
-}
 _GID_PREFIX_DIGITS = 24
 """A DDS GUID is a 12-byte participant prefix and a 4-byte entity id (DDSI-RTPS §9.3.1)."""
 
@@ -320,7 +315,7 @@ def _report(node: Node, mapping: Mapping) -> EndpointReport:
     witness = node if hidden is None else hidden.node
     report = _with_matches(report, witness, entity)
     return dataclasses.replace(
-        report, nfes=_nfes(endpoint.kind, entity, connection), dscp=_dscp(connection)
+        report, nfes=_nfes(witness, endpoint.kind, entity, connection), dscp=_dscp(connection)
     )
 
 
@@ -340,10 +335,11 @@ def _undeclared_report(
     if not kind.is_topic:
         return report
     hidden = connection.participant
-    report = _with_matches(report, node if hidden is None else hidden.node, entity)
+    witness = node if hidden is None else hidden.node
+    report = _with_matches(report, witness, entity)
     return dataclasses.replace(
         report,
-        nfes=_nfes(kind, entity, connection),
+        nfes=_nfes(witness, kind, entity, connection),
         dscp=_dscp(connection),
         connection=connection.name,
         participant=connection.node_name,
@@ -351,37 +347,31 @@ def _undeclared_report(
 
 
 def _with_matches(report: EndpointReport, witness: Node, entity: Any) -> EndpointReport:
-    """Add to the report on a publisher or subscription its GID, QoS, type hash and matched peers.
+    """Add to the report on a publisher or subscription its GID, QoS, type hash and matches.
 
     Args:
         report: the topic's name and the kind count.
         witness: the node whose participant carries it.
         entity: its rclpy object.
     """
-    info = _own_endpoint(witness, report.resolved, report.kind, guid_of(entity))
-    # Counted before the peers are queried: a peer matched meanwhile must not count as unknown.
-    matched = count_peers(entity)
-    others = endpoints_of(witness, _OTHER[report.kind], report.resolved)
+    info = _own_endpoint(witness, report.resolved, report.kind)
     return dataclasses.replace(
         report,
         qos=_actual_qos(entity, info),
         gid=info.gid if info is not None else "",
-        matched=matched,
-        peers=matched_with(entity, (each.gid for each in others)),
+        matched=count_peers(entity),
         type_hash=info.type_hash if info is not None else None,
     )
 
 
-def _own_endpoint(node: Node, topic: str, kind: EndpointKind, gid: str = "") -> EndpointInfo | None:
+def _own_endpoint(node: Node, topic: str, kind: EndpointKind) -> EndpointInfo | None:
     """Return what this process's graph cache says of the node's own endpoint on `topic`.
 
     It knows own endpoints at once, discovery has no part in it. None if there is none, or if
-    there are several and no GID identifies which is which.
+    there are several: nothing says which is which.
     """
     name = node.get_fully_qualified_name()
     own = [info for info in endpoints_of(node, kind, topic) if info.node == name]
-    if len(own) > 1 and gid:
-        own = [info for info in own if info.gid == gid]
     return own[0] if len(own) == 1 else None
 
 
@@ -433,18 +423,18 @@ _SHOWN_BY = {
 
 
 def _nfes(
-    kind: EndpointKind, entity: Any, connection: Connection | None
+    witness: Node, kind: EndpointKind, entity: Any, connection: Connection | None
 ) -> tuple[NetworkFlowEndpoint, ...] | None:
     """Return all NFEs of a connected endpoint, shared memory included.
 
     rmw_fastrtps lists shared memory for subscriptions only, but what carries a flow depends on
     both ends having it.
     """
+    publishes = kind is EndpointKind.PUBLISHER
     try:
-        nfes = get_network_flow_endpoints(entity)
+        nfes = senders_of(witness) if publishes else get_network_flow_endpoints(entity)
     except MiddlewareError:
         return None  # "unknown to the RMW" is a value here, and the verifier's to judge
-    publishes = kind is EndpointKind.PUBLISHER
     if publishes and connection is not None and connection.has_shared_memory:
         return (*nfes, SHARED_MEMORY)
     return nfes

@@ -41,7 +41,6 @@ from .rules.nodes import MISSING_NODE as MISSING_NODE
 from .rules.nodes import UNATTRIBUTED_ENDPOINT as UNATTRIBUTED_ENDPOINT
 from .rules.nodes import UNDECLARED_NODE as UNDECLARED_NODE
 from .rules.run import DEADLINE as DEADLINE
-from .rules.run import DEADLOCKED_OBSERVER as DEADLOCKED_OBSERVER
 from .rules.run import GAVE_UP as GAVE_UP
 from .rules.run import NOT_ANSWERING as NOT_ANSWERING
 from .rules.run import NOT_PROGRAMMED as NOT_PROGRAMMED

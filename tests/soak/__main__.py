@@ -24,17 +24,12 @@ import warnings
 from pathlib import Path
 
 from tests.soak.model import NEEDS_ROOT, Condition, plan
-from tests.wall_clock import LACKS
 
 _INSIDE = "SOAK_INSIDE"
 _SET_UP = (
     "mount --make-rprivate / && mount -t tmpfs -o size=2g tmpfs /dev/shm && ip link set lo up && "
     'ip link set lo multicast on && exec "$@"'
 )
-
-
-EXCUSED = 5
-"""Rounds that are done once more because Fast DDS deadlocked; it did once in 55 rounds."""
 
 
 def main() -> int:
@@ -64,7 +59,6 @@ def main() -> int:
         os.environ[_INSIDE] = "1"
         os.execvp("unshare", ["unshare", "-n", "-m", "sh", "-c", _SET_UP, "soak", *again])
     lacks = {} if private else dict.fromkeys(NEEDS_ROOT, "needs root and nft")
-    lacks |= {Condition.CLOCK: LACKS} if LACKS else {}
     skipped = [each for each in rounds if each.condition in lacks]
     for each in skipped:
         print(f"skipped, {lacks[each.condition]}: {each}")
@@ -84,7 +78,7 @@ def _soak(options: argparse.Namespace, rounds: list, *, private: bool) -> int:
     with contextlib.ExitStack() as stack:
         stack.callback(shutil.rmtree, directory, ignore_errors=True)
         soaking = stack.enter_context(_place(directory, private=private))
-        failed = excused = 0
+        failed = 0
         left = collections.deque([*rounds, None])
         while left:
             done = left.popleft()
@@ -97,14 +91,8 @@ def _soak(options: argparse.Namespace, rounds: list, *, private: bool) -> int:
                     soaking.end("down")
                 else:
                     soaking.round(done)
-            except Exception as error:  # noqa: BLE001 - whatever it is, it is reported
+            except Exception:  # noqa: BLE001 - whatever it is, it is reported
                 soaking.keep_stacks()
-                if excused < EXCUSED and (locked_up := soaking.locked_up()):
-                    excused += 1
-                    print(f"  once more, because {locked_up} ({error})", flush=True)
-                    soaking.abandon()
-                    left.appendleft(done)
-                    continue
                 failed += 1
                 print(f"FAILED: seed {options.seed}, {done or 'down'}")
                 traceback.print_exc(limit=-2, file=sys.stdout)
@@ -120,8 +108,6 @@ def _soak(options: argparse.Namespace, rounds: list, *, private: bool) -> int:
             else:
                 print(f"  as expected, {time.monotonic() - started_s:.1f} s", flush=True)
         print(soaking.measured())
-        if excused:
-            print(f"done once more, because Fast DDS was deadlocked: {excused}")
         if options.keep:
             kept = Path(tempfile.mkdtemp(prefix=f"soak-kept-{options.seed}-")) / "kept"
             shutil.copytree(directory, kept, ignore=_sockets)

@@ -102,7 +102,6 @@ class Condition(enum.Enum):
     SAFE = "safe"  # mode
     STORM = "storm"  # several `lifecycle restart` at once
     SUPERVISOR_KILLED = "supervisor_killed"  # and started again
-    CLOCK = "clock"  # the wall clock is set, and set back when it is over
     APPLY = "apply"  # another manifest is applied; the faults come while that is done
 
 
@@ -159,7 +158,6 @@ class Round:
         lasts_s: how long the condition lasts after the first fault.
         orders: what `lifecycle restart` is asked for in a storm; empty text: the whole system.
         ends: how the run is ended after it; empty: it goes on.
-        sets_s: by how many seconds the wall clock is set.
         manifest: what is applied.
         later_s: seconds from the beginning of that to the first fault.
     """
@@ -171,7 +169,6 @@ class Round:
     lasts_s: float = 0.0
     orders: tuple[str, ...] = ()
     ends: str = ""
-    sets_s: float = 0.0
     manifest: Manifest | None = None
     later_s: float = 0.0
 
@@ -180,7 +177,6 @@ class Round:
         done = ", ".join(str(each) for each in self.faults) or "nothing"
         storm = f" restart {', '.join(each or 'all' for each in self.orders)}"
         what = f"{self.condition.value}{storm if self.orders else ''}"
-        what += f" set by {self.sets_s:+g} s" if self.sets_s else ""
         what += f" {self.manifest}" if self.manifest else ""
         what += f", {self.later_s:.2f} s before" if self.manifest and self.faults else ""
         lasts = f" for {self.lasts_s:.1f} s" if self.lasts_s else ""
@@ -374,7 +370,7 @@ def plan(seed: int, rounds: int) -> tuple[Round, ...]:
 
 def _round(dice: random.Random, number: int, state: State) -> Round:
     conditions = [Condition.NONE] * 8 + [each for each in Condition if each is not Condition.NONE]
-    conditions += [Condition.CLOCK, Condition.APPLY, Condition.APPLY]
+    conditions += [Condition.APPLY, Condition.APPLY]
     condition = dice.choice(conditions)
     targets = [each.name for each in PROCESSES]
     ends = dice.random() < 0.08
@@ -409,12 +405,10 @@ def _round(dice: random.Random, number: int, state: State) -> Round:
         lasts_s=round(dice.uniform(0.5, 3.0), 1) if condition is not Condition.NONE else 0.0,
         orders=_orders(dice) if condition is Condition.STORM else (),
         ends=dice.choice(_ENDS) if ends else "",
-        sets_s=dice.choice(_SETS_S) if condition is Condition.CLOCK else 0.0,
     )
 
 
 _ENDS = ("down", "term", "interrupt")
-_SETS_S = (2.0, -2.0, 70.0, -70.0, 3600.0, -3600.0, -3600.0, 86_400.0, -86_400.0)
 _FAILS = tuple(f"{step} {way}" for step in _STEPS for way in ("raise", "exit9", "stray"))
 
 

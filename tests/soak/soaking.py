@@ -23,8 +23,7 @@ from pathlib import Path
 
 import psutil
 
-from lifecycle.middleware import Reception, leftovers, segments_of
-from lifecycle.middleware.process.reception import STUCK_S
+from lifecycle.middleware import leftovers, segments_of
 from tests.ros.supervisor.running import ROOT, command, environment, left_of
 from tests.soak.model import (
     DIES,
@@ -52,7 +51,6 @@ from tests.soak.running import (
 from tests.soak.stacks import keep_stacks
 from tests.soak.system import ISSUED, NAME, PUBLISHES, SUBSCRIBES, TINTED, manifest
 from tests.stalls import Stalls
-from tests.wall_clock import LACKS, WallClock
 
 REPORTED_S = 1.0
 """From a fault to the event that names its subject; the time that the machine's scheduler took
@@ -65,8 +63,6 @@ UP_S = 60.0
 DOWN_S = 25.0
 FLOWS_S = 5.0
 """From a system that is as it was to data that flow to every node; on two busy cores."""
-LOOKS_S = STUCK_S + 2.0
-"""So long it takes to find out that our own participant is deadlocked."""
 APPLY_S = 15.0
 """`lifecycle apply --timeout`."""
 
@@ -96,12 +92,9 @@ class Soaking:
             options = ("-t", "tmpfs", "-o", "size=24m", "tmpfs")
             subprocess.run(["mount", *options, str(self.runtime)], check=True)
         self.stumble = directory / "stumble"
-        self.clock = None if LACKS else WallClock(directory)
         self.manifest = manifest(directory, domain_id, self.mark, Manifest())
         self.in_force = self.manifest
         self.transitions = _transitions(domain_id)
-        self._abandoned: list[Transitions] = []
-        self._reception = Reception()
         self._watched: Watched | None = None
         self.domain_id = domain_id
         self.stalls = Stalls()
@@ -128,8 +121,7 @@ class Soaking:
                 each.unlink()
             for each in sorted((self.runtime / "log").glob("20*"))[:-1]:
                 shutil.rmtree(each)
-            variables = {} if self.clock is None else self.clock.variables
-            self.run = Watched(self.manifest, runtime=self.runtime, variables=variables)
+            self.run = Watched(self.manifest, runtime=self.runtime)
             self._watched = self.run
             self._until_as_it_was(self.run, UP_S)
             # What is compared with the requests must not be empty because nothing is received.
@@ -206,28 +198,6 @@ class Soaking:
         shutil.rmtree(self.directory / "stacks", ignore_errors=True)
         if self._watched is not None:
             keep_stacks(self._watched.process.pid, self.directory / "stacks")
-
-    def locked_up(self) -> str:
-        """Say whose participant receives nothing any more, if that is why a round failed.
-
-        Fast DDS 2.14 does that now and then in whoever uses it (docs/liveliness.md). The supervisor
-        reports it of its nodes and of itself; our own participant is replaced.
-        """
-        events = () if self._watched is None else tuple(self._watched.events)
-        for event in events:
-            if event.get("event") == "silent" and event["cause"] == "deadlocked":
-                return str(event["message"])
-            if event.get("event") == "notice" and "participant has left unread" in event["message"]:
-                return str(event["message"])
-        deadline = time.monotonic() + LOOKS_S
-        while time.monotonic() < deadline:
-            if how := self._reception.deadlocked([os.getpid()]).get(os.getpid()):
-                self.transitions.abandon()
-                self._abandoned.append(self.transitions)  # what destroys it would wait for ever
-                self.transitions = _transitions(self.domain_id)
-                return f"the participant that follows transition events {how}"
-            time.sleep(0.5)
-        return ""
 
     def measured(self) -> str:
         """Say how fast faults were reported, and how soon the system was as it was."""
@@ -431,10 +401,6 @@ class Soaking:
                 self._insist(run, ("mode", "safe"))
             elif done.condition is Condition.STORM:
                 stack.enter_context(self._storm(done))
-            elif done.condition is Condition.CLOCK:
-                assert self.clock is not None
-                stack.callback(self.clock.set, 0.0)
-                self.clock.set(done.sets_s)
             elif done.condition is Condition.APPLY:
                 began = self._begin_apply(run, done)
             yield began

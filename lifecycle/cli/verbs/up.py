@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -128,7 +127,6 @@ def command(
             # It imports while we do and read the manifest.
             process = _fork_server(program)
             try:
-                _load_rclpy()
                 from lifecycle.plan import build_plan, started_by_others
 
                 loaded = load_manifest(manifest, assignments, machine=machine)
@@ -173,19 +171,6 @@ def command(
     except Ended as ended:
         click.echo(f"ended before anything was started: {ended.reason}", err=True)
         return ended.exit_code
-
-
-_EXTENDED = ("bisect", "hashlib", "shutil", "xml.etree.ElementTree", "yaml")
-"""Have extension modules, which wait while others are loaded, and are imported in any case."""
-
-
-def _load_rclpy() -> None:
-    """Load the libraries of rclpy aside: a quarter of what there is to do before nodes start."""
-    from lifecycle.middleware import begin_loading
-
-    for name in _EXTENDED:
-        importlib.import_module(name)
-    begin_loading()
 
 
 def _fork_server(program: tuple[TargetOptions, ...]) -> ForkServerProcess:

@@ -66,7 +66,7 @@ _DISPOSED_S = 2.0
 process leaves the graph. Peers answer it late on a loaded machine, and not once it is gone.
 
 They are not to look at its lease if that can be helped: Fast DDS 2.14 does so in a thread of its
-own, and deadlocks if another one just unmatches a writer (its issue 6502, docs/liveliness.md).
+own, and deadlocks if another one just unmatches a writer (its issue 6502).
 """
 _LEASE_S = 10.0
 """For peers that receive no disposal: this process was killed, or the link was cut."""
@@ -401,22 +401,6 @@ def probes_for(
         _probe_around(domain_id, kind, range_, environment)
         for kind in (tuple(family.kind for family in found) or (RMW_DISCOVERY,))
     )
-
-
-def answers_unasked(urls: Sequence[ConnectionUrl], environment: Mapping[str, str]) -> bool:
-    """Return whether nobody can be asked, but all answer who is announced to them once it listens.
-
-    So it is over shared memory, and where the user's settings of Fast DDS say how others are found.
-
-    Args:
-        urls: the observer's.
-        environment: as for `probes_for`.
-    """
-    if is_served(urls, environment):
-        return False
-    if urls:
-        return not any(each.kind.is_network for each in families(urls))
-    return chosen_otherwise(environment) or connects_first(urls, environment)
 
 
 _CONNECTING = ("TCPv4", "TCPv6", "LARGE_DATA")

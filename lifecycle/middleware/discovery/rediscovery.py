@@ -17,16 +17,11 @@ outage nothing passes for about as long again (RFC 6298 §5.5).
 from __future__ import annotations
 
 import contextlib
-import itertools
 import os
 import socket
 from collections.abc import Iterable, Mapping, Sequence
 
-from rcl_interfaces.msg import ParameterEvent
-from rclpy.event_handler import PublisherEventCallbacks
-from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
 
 from lifecycle.middleware.discovery.dead_peers import listening
 from lifecycle.middleware.discovery.messages import disposal
@@ -50,6 +45,7 @@ from lifecycle.middleware.fastdds.url_profile import (
     families,
     leaves_discovery_open,
 )
+from lifecycle.middleware.rcl.hidden_node import bare_node
 from lifecycle.network import RMW_DISCOVERY, ConnectionUrl, Medium, participant_ports
 
 _PARTICIPANTS = 32
@@ -189,34 +185,7 @@ def republish_names(nodes: Iterable[Node]) -> None:
     publishers 8 were never seen by the other host). Take one node of each participant.
     """
     for node in nodes:
-        with node.context.handle:
-            made = _rclpy.Node(
-                f"{_NAMES_NODE}_{os.getpid()}_{next(_numbers)}",
-                *("", node.context.handle, None, False, False),
-            )
-        made.destroy_when_not_in_use()
-
-
-_NAMES_NODE = "_lifecycle_names"
-_numbers = itertools.count()
-
-
-def wake_participants(nodes: Iterable[Node]) -> None:
-    """Have the participants of `nodes` send what is due, and their executors look how long to wait.
-
-    A new endpoint makes both look at their clocks anew. Take one node of each participant.
-    """
-    for node in nodes:
-        # Every node publishes parameter events: a second publisher of them, for a moment, is
-        # nothing new to any peer.
-        publisher = Node.create_publisher(
-            node,
-            ParameterEvent,
-            "/parameter_events",
-            QoSProfile(depth=1),
-            event_callbacks=PublisherEventCallbacks(use_default_callbacks=False),
-        )
-        Node.destroy_publisher(node, publisher)
+        bare_node(node.context).destroy_when_not_in_use()
 
 
 AT_MOST_S = 1.0

@@ -14,14 +14,15 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from rcl_interfaces.msg import ParameterEvent
 from rclpy.callback_groups import CallbackGroup
+from rclpy.context import Context
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
-from rclpy.exceptions import InvalidHandle
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -33,11 +34,9 @@ from rclpy.validate_topic_name import validate_topic_name
 from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest import QosProfile
-from lifecycle.middleware.fastdds.local_readers import PREFIX_BYTES, guid_prefix
-from lifecycle.middleware.fastdds.settings import noted_shared_memory, participant_of
+from lifecycle.middleware.fastdds.settings import noted_shared_memory
 from lifecycle.middleware.rcl import abi
 from lifecycle.middleware.rcl.hidden_node import is_moved
-from lifecycle.middleware.rcl.matched_peers import guid_of
 from lifecycle.middleware.rcl.qos import to_rclpy
 from lifecycle.network import (
     InternetProtocol,
@@ -71,10 +70,6 @@ class NetworkFlowEndpointsUnsupported(MiddlewareError):  # noqa: N818 - states a
         self.reason = reason
 
 
-_SENDERS: dict[str, tuple[NetworkFlowEndpoint, ...]] = {}
-"""NFEs of publishers, by the GUID prefix of their participant in hex."""
-
-
 def get_network_flow_endpoints(
     entity: Publisher | Subscription,
 ) -> tuple[NetworkFlowEndpoint, ...]:
@@ -85,47 +80,42 @@ def get_network_flow_endpoints(
     only among a subscription's: ask `has_shared_memory` for a publisher. An empty tuple means that
     the endpoint cannot be reached over any network.
 
-    Sender sockets are asked for once in a participant's life, and do not change (see
-    `lifecycle.middleware.fastdds.dscp`). Fast DDS 2.14 keeps them in a list with its senders by
-    shared memory and TCP, which a thread of discovery extends when the first peer that has these is
-    matched, and lists them without the lock (RTPSParticipantImpl::get_sending_locators): who asked
-    meanwhile read what was freed, one of 4,500 hosts. So ask before the participant has peers,
-    `note_senders`.
+    Of a publisher only before its participant has peers, see `senders_of`.
 
     Raises:
         NetworkFlowEndpointsUnsupported: this RMW has no such function.
         MiddlewareError: the call failed, or the installed rcl is not known.
         rclpy.exceptions.InvalidHandle: the entity was destroyed.
     """
-    if not isinstance(entity, Publisher):
-        return read_handle(entity.handle, "subscription")
-    prefix = guid_of(entity)[: 2 * PREFIX_BYTES]
-    known = _SENDERS.get(prefix)
-    if known is None:
-        known = read_handle(entity.handle, "publisher")
-        if prefix:
-            _SENDERS[prefix] = known
-    return known
+    return read_handle(
+        entity.handle, "publisher" if isinstance(entity, Publisher) else "subscription"
+    )
 
 
-def note_senders(node: Node) -> None:
-    """Ask for the sender sockets of a node's participant, as soon as the node is made.
+_SENDERS: weakref.WeakKeyDictionary[Context, tuple[NetworkFlowEndpoint, ...]] = (
+    weakref.WeakKeyDictionary()
+)
 
-    Later it may have peers, see `get_network_flow_endpoints`. Without effect where they cannot be
-    had, or the node has no publisher.
+
+def senders_of(node: Node) -> tuple[NetworkFlowEndpoint, ...]:
+    """Return the sender sockets of a node's participant, which all its publishers have.
+
+    They do not change (see `lifecycle.middleware.fastdds.dscp`), and are asked for once in a
+    participant's life: do so before it has peers. Fast DDS 2.14 keeps them in a list with its
+    senders by shared memory and TCP, which a thread of discovery extends when the first peer that
+    has these is matched, and lists them without the lock
+    (RTPSParticipantImpl::get_sending_locators).
+
+    Raises:
+        MiddlewareError: as `get_network_flow_endpoints`, or the node has no publisher.
     """
-    publisher = next(iter(node.publishers), None)
-    if publisher is not None:
-        with contextlib.suppress(MiddlewareError):
-            get_network_flow_endpoints(publisher)
-
-
-def forget_senders(node: Node) -> None:
-    """Forget the sender sockets of a node's participant, which is about to be destroyed."""
-    with contextlib.suppress(InvalidHandle), node.handle:
-        participant = participant_of(node.handle.pointer)
-        if participant:
-            _SENDERS.pop(guid_prefix(participant).hex(), None)
+    known = _SENDERS.get(node.context)
+    if known is None:
+        publisher = next(iter(node.publishers), None)
+        if publisher is None:
+            raise MiddlewareError(f"cannot find a publisher of {node.get_name()!r} to ask")
+        known = _SENDERS[node.context] = get_network_flow_endpoints(publisher)
+    return known
 
 
 def has_shared_memory(node: Node) -> bool:
@@ -156,10 +146,7 @@ def has_shared_memory(node: Node) -> bool:
 
 
 def read_handle(handle: Any, kind: str) -> tuple[NetworkFlowEndpoint, ...]:
-    """Ask rmw for the NFEs of rclpy's bare handle of a `kind`.
-
-    Of a publisher only before its participant has peers, see `get_network_flow_endpoints`.
-    """
+    """Ask rmw for the NFEs of rclpy's bare handle of a `kind`."""
     rcl = abi.load()
     array = abi.NfeArray()
     with handle:

@@ -12,7 +12,6 @@ One costs about 2.5 MB, 7 threads, 6 sockets and 6–10 ms.
 
 from __future__ import annotations
 
-import contextlib
 import time
 import typing
 from collections.abc import Callable, Sequence
@@ -34,16 +33,13 @@ from lifecycle.middleware.fastdds import dscp as marks
 from lifecycle.middleware.fastdds import nfe
 from lifecycle.middleware.fastdds.dscp import never_wait
 from lifecycle.middleware.fastdds.nfe import (
-    forget_senders,
-    get_network_flow_endpoints,
     has_shared_memory,
+    senders_of,
 )
 from lifecycle.middleware.fastdds.participant_profile import (
     ParticipantSettings,
-    endpoint_profiles,
     find_endpoint,
 )
-from lifecycle.middleware.fastdds.settings import stop_listening, with_endpoint_profiles
 from lifecycle.middleware.fastdds.url_check import open_sockets
 from lifecycle.middleware.rcl import hidden_node
 from lifecycle.middleware.rcl.abi import is_known
@@ -182,7 +178,7 @@ class FlowParticipant:
             probe = next(iter(self.node.publishers))
             self.has_shared_memory: bool | None = None
             if dscp is not None or is_known():
-                self._nfes = get_network_flow_endpoints(probe)
+                self._nfes = senders_of(self.node)
             if dscp is not None:
                 marks.set_dscp(self._nfes, dscp)
             # It would share the sockets that are to be unique.
@@ -216,16 +212,15 @@ class FlowParticipant:
         Events (matched, deadline, …) are only handled if an executor spins `self.node`; without
         `event_callbacks` none are set up.
         """
-        with self._announced(type_, topic, writer=True):
-            publisher = self.node.create_publisher(
-                type_,
-                topic,
-                to_rclpy(qos),
-                callback_group=callback_group,
-                event_callbacks=event_callbacks
-                or PublisherEventCallbacks(use_default_callbacks=False),
-                publisher_class=publisher_class,
-            )
+        self._check_static(type_, topic, writer=True)
+        publisher = self.node.create_publisher(
+            type_,
+            topic,
+            to_rclpy(qos),
+            callback_group=callback_group,
+            event_callbacks=event_callbacks or PublisherEventCallbacks(use_default_callbacks=False),
+            publisher_class=publisher_class,
+        )
         try:
             self.ensure_dscp()
         except BaseException:
@@ -252,19 +247,19 @@ class FlowParticipant:
         Its port is given back when the participant is destroyed, which is never for a unique
         subscription on a node that stays (see `create_subscription` of this room).
         """
-        with self._announced(type_, topic, writer=False):
-            subscription = nfe.create_subscription(
-                self.node,
-                type_,
-                topic,
-                callback,
-                qos,
-                unique=unique,
-                callback_group=self._group(callback_group),
-                event_callbacks=event_callbacks,
-                raw=raw,
-                content_filter=content_filter,
-            )
+        self._check_static(type_, topic, writer=False)
+        subscription = nfe.create_subscription(
+            self.node,
+            type_,
+            topic,
+            callback,
+            qos,
+            unique=unique,
+            callback_group=self._group(callback_group),
+            event_callbacks=event_callbacks,
+            raw=raw,
+            content_filter=content_filter,
+        )
         try:
             self.ensure_dscp()
         except BaseException:
@@ -393,11 +388,9 @@ class FlowParticipant:
         for its endpoints.
         """
         self._nfes = ()  # its ports may belong to another process from now on
-        forget_senders(self.node)
         for entity in tuple(self._moved):
             self.destroy_endpoint(entity)
         forget_hidden(self.node)
-        stop_listening(self.node)
         self.node.destroy_node()
         if self._context is not None:
             self._context.try_shutdown()
@@ -419,21 +412,18 @@ class FlowParticipant:
             hidden_node.move(entity, self.node, self._served)
             self._moved.append(entity)
 
-    def _announced(
-        self, type_: type[Any], topic: str, *, writer: bool
-    ) -> contextlib.AbstractContextManager[None]:
-        """Tie an endpoint that is about to be made to its line of the static table, if any."""
+    def _check_static(self, type_: type[Any], topic: str, *, writer: bool) -> None:
+        """Refuse an endpoint that the table of static discovery does not have, if there is one."""
         endpoints = self.settings.static_endpoints
         if not endpoints:
-            return contextlib.nullcontext()
+            return
         package, kind = type_.__module__.split(".")[:2]
-        line = find_endpoint(
+        find_endpoint(
             endpoints,
             writer=writer,
             profile=self.node.resolve_topic_name(topic),
             type_name=f"{package}::{kind}::dds_::{type_.__name__}_",
         )
-        return with_endpoint_profiles(endpoint_profiles([line]))
 
     def _refuse_static(self, what: str, name: str) -> None:
         if self.settings.static_participants:

@@ -21,7 +21,6 @@ import functools
 from typing import Any
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.fastdds.endpoint_discovery import Duration
 from lifecycle.middleware.fastdds.local_readers import (
     POINTER_BYTES,
     RTPS,
@@ -38,6 +37,12 @@ _READER = b"\x00\x01\x00\xc7"
 """EntityId of the built-in reader of participants, DDSI-RTPS table 9.1."""
 
 _IMPL = f"_ZN{RTPS}19RTPSParticipantImpl"
+
+
+class Duration(ctypes.Structure):
+    """Duration_t of DDSI-RTPS as Fast DDS has it in memory."""
+
+    _fields_ = (("seconds", ctypes.c_int32), ("nanoseconds", ctypes.c_uint32))
 
 
 class _Pdp(ctypes.Structure):

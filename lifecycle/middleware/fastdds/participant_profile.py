@@ -27,7 +27,7 @@ from lifecycle.middleware.fastdds.profiles import (
     DEFAULT_FILE,
     PROFILE_NAME,
     PROFILES_FILE_VARIABLE,
-    locator,
+    announcements,
 )
 from lifecycle.middleware.fastdds.profiles import child as _child
 from lifecycle.middleware.fastdds.profiles import text as _text
@@ -38,6 +38,7 @@ from lifecycle.plan import (
     GRAPH_TYPE,
     MAX_USER_ID,
     ParticipantConnections,
+    PlannedNode,
     StaticEndpoint,
     StaticParticipant,
 )
@@ -148,18 +149,15 @@ _TRANSPORT_CHOICES = ("userTransports", "useBuiltinTransports", "builtinTranspor
 DISCOVERY_SERVER_VARIABLE = "ROS_DISCOVERY_SERVER"
 """Makes every participant a client of that server."""
 
+
+_LOCALHOST_PEERS_RANGE = url_profile.LOCALHOST_PEERS_RANGE
 _IGNORE_ALL = ("FILTER_DIFFERENT_PROCESS", "FILTER_DIFFERENT_HOST", "FILTER_SAME_PROCESS")
 """Not the first two alone: a participant that has those makes no transports."""
 
-_MANY = 24
-_HEARTBEAT_SHARE_S = 0.01
-"""From so many participants on heartbeats with each message of names are most of all messages."""
-_NAMES_ASKED_S, _NAMES_ANSWERED_S = 0.005, 0.001
-"""Of names that were sent before their writer was known Fast DDS asks after 70 ms by default."""
+_SELDOM = 4, 500
+_OFTEN = 60, 50
+"""One that is made while we announce ourselves so knows us at once, and not within 3 s."""
 
-_ANNOUNCEMENTS = 4
-_ANNOUNCEMENT_PERIOD_NS = 500_000_000
-_LOCALHOST_PEERS_RANGE = url_profile.LOCALHOST_PEERS_RANGE
 _MIN_DATAGRAM_BYTES = 500
 _MAX_DATAGRAM_BYTES = 65500
 """s_maximumMessageSize of Fast DDS: what UDP over IPv4 can carry, less some headers."""
@@ -184,13 +182,7 @@ class ParticipantSettings:
         static_name: its own name among them; its context must have it as its enclave.
         unannounced: ignores all others until `Unannounced.announce`, where a profile leaves that
             open; see `lifecycle.middleware.fastdds.participant_discovery`.
-        names_by_udp: the names of its nodes go by UDP, where a profile and the environment leave
-            transports open. By shared memory, each opens a port of each other's; the first send
-            looks at its health, up to 1 s, with the lock of the writer.
-        names_heartbeat_s: seconds, > 0, between heartbeats of the names; None for one with each
-            message, and each that is sent again, to all: the history holds one and is full. Only
-            with `names_by_udp`.
-        asks_for_names_soon: for the names of nodes that were there before, or are found late.
+        announces_often: at first, where a profile of the user's does not say how often.
 
     Raises:
         MiddlewareError: out of range, or URLs that one participant cannot have together.
@@ -204,9 +196,7 @@ class ParticipantSettings:
     static_participants: tuple[StaticParticipant, ...] = ()
     static_name: str = ""
     unannounced: bool = False
-    names_by_udp: bool = False
-    names_heartbeat_s: float | None = None
-    asks_for_names_soon: bool = False
+    announces_often: bool = False
 
     @classmethod
     def of(
@@ -236,6 +226,15 @@ class ParticipantSettings:
             super_client=super_client or getattr(connections, "super_client", False),
             static_participants=connections.static_participants,
             static_name=connections.static_name,
+        )
+
+    @classmethod
+    def of_node(cls, node: PlannedNode) -> ParticipantSettings:
+        """Return the settings of a participant that carries a planned node; raises as `of`."""
+        return cls.of(
+            node.connections,
+            transports=node.transports,
+            max_datagram_bytes=node.max_datagram_bytes,
         )
 
     def __post_init__(self) -> None:
@@ -290,8 +289,7 @@ class ParticipantSettings:
             self.chooses_transports
             or self.max_datagram_bytes is not None
             or self.unannounced
-            or self.names_by_udp
-            or self.asks_for_names_soon
+            or self.announces_often
             or self.super_client
         )
 
@@ -406,109 +404,24 @@ def profile(
     if settings.max_datagram_bytes is not None:
         _set_property(rtps, "fastdds.max_message_size", str(settings.max_datagram_bytes))
     _set_discovery(rtps, settings, is_users=base is not None and base.name != PROFILE_NAME)
-    if settings.names_by_udp:
-        profiles.extend(_names_by_udp(settings.names_heartbeat_s))
-    elif settings.asks_for_names_soon:
-        profiles.append(_names_asked_for_soon())
     profiles.append(participant)
     return ET.tostring(root, encoding="unicode", xml_declaration=True)
-
-
-def for_a_host(
-    settings: ParticipantSettings,
-    environment: Mapping[str, str],
-    *,
-    unannounced: bool,
-    names_by_udp: bool,
-    participants: int,
-) -> ParticipantSettings:
-    """Return the settings of the first participant of a host.
-
-    Args:
-        settings: what it needs otherwise.
-        environment: of this process.
-        unannounced: it is to be, if the environment leaves that open.
-        names_by_udp: likewise.
-        participants: how many are made together, ≥ 0.
-
-    Raises:
-        MiddlewareError: a file of profiles cannot be read, or is no XML.
-    """
-    base = default_profile(environment)
-    if settings.urls or (base is not None and base.name != PROFILE_NAME):
-        return settings
-    leaves_transports = not (settings.chooses_transports or environment.get(TRANSPORTS_VARIABLE))
-    leaves_names = names_by_udp and leaves_transports and are_names_open(environment)
-    return dataclasses.replace(
-        settings,
-        unannounced=unannounced and not environment.get(DISCOVERY_SERVER_VARIABLE),
-        names_by_udp=leaves_names,
-        names_heartbeat_s=participants * _HEARTBEAT_SHARE_S
-        if leaves_names and participants >= _MANY
-        else None,
-    )
-
-
-def are_names_open(environment: Mapping[str, str]) -> bool:
-    """Return whether profiles of ours may say how names of nodes go.
-
-    Those of a user's file may be for the names as well, and the first one counts.
-
-    Args:
-        environment: of this process.
-
-    Raises:
-        MiddlewareError: a file of profiles cannot be read, or is no XML.
-    """
-    base = default_profile(environment)
-    is_ours = base.name == PROFILE_NAME if base else not environment.get(PROFILES_FILE_VARIABLE)
-    return is_ours and not _has_default_file()
 
 
 def _set_discovery(rtps: ET.Element, settings: ParticipantSettings, *, is_users: bool) -> None:
     for each in rtps.iter("discoveryProtocol") if settings.super_client else ():
         if (each.text or "").strip() == "CLIENT":
             each.text = "SUPER_CLIENT"
-    if not settings.unannounced:
+    if not (settings.announces_often or settings.unannounced):
         return
     config = _child(_child(rtps, "builtin"), "discovery_config")
-    _text(config, "ignoreParticipantFlags", "|".join(_IGNORE_ALL))
-    if is_users:
-        return
-    # All the others listen by then, and each announcement goes to all of them.
-    announcements = _child(config, "initialAnnouncements")
-    announcements.clear()
-    _text(announcements, "count", str(_ANNOUNCEMENTS))
-    _text(_child(announcements, "period"), "nanosec", str(_ANNOUNCEMENT_PERIOD_NS))
-
-
-def _names_by_udp(heartbeat_s: float | None) -> Iterator[ET.Element]:
-    """Yield profiles of what each participant of rmw_fastrtps has for the names of nodes."""
-    for tag in ("data_writer", "data_reader"):
-        element = ET.Element(tag, profile_name=GRAPH_TOPIC)
-        if heartbeat_s is not None and tag == "data_writer":
-            _text(_child(element, "qos"), "disable_heartbeat_piggyback", "true")
-            period = _child(_child(element, "times"), "heartbeatPeriod")
-            _text(period, "sec", str(int(heartbeat_s)))
-            _text(period, "nanosec", str(round(heartbeat_s % 1 * 1e9)))
-        locators = _child(element, "unicastLocatorList")
-        for kind in RMW_DEFAULT:
-            if kind.is_udp:
-                locator(locators, kind, "", None)
-        yield element
-
-
-def _names_asked_for_soon() -> ET.Element:
-    element = ET.Element("data_reader", profile_name=GRAPH_TOPIC)
-    times = _child(element, "times")
-    for name, delay_s in (
-        ("initialAcknackDelay", _NAMES_ASKED_S),
-        ("heartbeatResponseDelay", _NAMES_ANSWERED_S),
-    ):
-        delay = _child(times, name)
-        _text(delay, "sec", "0")
-        _text(delay, "nanosec", str(round(delay_s * 1e9)))
-    return element
+    if settings.unannounced:
+        _text(config, "ignoreParticipantFlags", "|".join(_IGNORE_ALL))
+    if not is_users:
+        for each in config.findall("initialAnnouncements"):
+            config.remove(each)
+        # All the others listen when one that was unannounced is announced.
+        config.append(announcements(*(_OFTEN if settings.announces_often else _SELDOM)))
 
 
 def without_shared_memory(environment: Mapping[str, str]) -> tuple[Medium, ...]:

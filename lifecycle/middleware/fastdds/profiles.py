@@ -103,6 +103,14 @@ def discovery_environment(
     return {PROFILES_FILE_VARIABLE: str(path)}
 
 
+def announcements(count: int, period_ms: int) -> ET.Element:
+    """Return how often a participant announces itself at first."""
+    element = ET.Element("initialAnnouncements")
+    text(element, "count", str(count))
+    text(child(element, "period"), "nanosec", str(period_ms * 1_000_000))
+    return element
+
+
 def child(parent: ET.Element, tag: str) -> ET.Element:
     """Return the first child of this name; made if there is none."""
     found = parent.find(tag)

@@ -1,9 +1,8 @@
 """Participant settings and discovery range of an rclpy context, applied while rmw makes it.
 
 Owns: applying a ParticipantSettings at the only moment there is: while rmw_fastrtps makes the
-participant, which is when the first node of a context is constructed; and reading how far that
-participant looks for others (the discovery range that rmw gets), and taking it away from
-rmw_fastrtps; and `stop_listening`, before a participant is destroyed.
+participant, which is when the first node of a context is constructed; and keeping rmw_fastrtps from
+adding discovery of its own to it.
 
 Profiles are read from the environment once per process, and rmw_fastrtps gives every participant
 the factory's default QoS. So that default is changed for one participant at a time, by the few C++
@@ -14,7 +13,7 @@ and destructor.
 For LOCALHOST it adds a shared memory and a UDP transport to whatever a profile says
 (create_participant of rmw_fastrtps_shared_cpp), so a participant without shared memory has to bring
 the same discovery in its own profile; for SUBNET it adds a multicast group as soon as there is a
-static peer. Layouts are those of rmw 7: rmw/{init,init_options,discovery_options}.h.
+static peer.
 """
 
 from __future__ import annotations
@@ -25,14 +24,11 @@ import functools
 import hashlib
 import os
 import threading
-import time
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
-import rclpy.node
 from rclpy.context import Context
-from rclpy.exceptions import InvalidHandle
 from rclpy.utilities import get_rmw_implementation_identifier
 
 from lifecycle import dataclasses
@@ -40,13 +36,12 @@ from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds.participant_profile import (
     DISCOVERY_SERVER_VARIABLE,
     ParticipantSettings,
-    are_names_open,
     default_profile,
     endpoint_profiles,
-    for_a_host,
     profile,
     without_shared_memory,
 )
+from lifecycle.middleware.fastdds.profiles import PROFILE_NAME
 from lifecycle.middleware.fastdds.url_check import (
     check_free,
     check_host,
@@ -56,13 +51,13 @@ from lifecycle.middleware.fastdds.url_check import (
 from lifecycle.middleware.fastdds.url_profile import families
 from lifecycle.middleware.process.shared_memory import own_segments
 from lifecycle.middleware.rcl import abi
+from lifecycle.plan import StaticEndpoint
 
 _LIBRARY = "libfastrtps.so.2.14"
 _KNOWN = "Fast DDS 2.14 (ROS 2 Jazzy)"
 _DDS = "8eprosima7fastdds3dds"
 _FACTORY = f"{_DDS}24DomainParticipantFactory"
 _QOS = f"{_DDS}20DomainParticipantQos"
-_PROFILES = "8eprosima8fastrtps9xmlparser17XMLProfileManager"
 _STRING = "NSt7__cxx1112basic_stringIcSt11char_traitsIcESaIcEEE"
 _QOS_ROOM_BYTES = 16384
 """Thirteen times sizeof(DomainParticipantQos) in 2.14.5."""
@@ -124,11 +119,10 @@ class _FastDds:
             "RNS1_20DomainParticipantQosE",
             *(code, pointer, pointer, pointer),
         )
-        self.forget_profiles = bind(f"_ZN{_PROFILES}14DeleteInstanceEv", None)
-        self.load_default_files = bind(f"_ZN{_PROFILES}18loadDefaultXMLFileEv", code)
         self.copy_qos = bind(f"_ZN{_QOS}C1ERKS2_", None, pointer, pointer)
         self.destroy_qos = bind(f"_ZN{_QOS}D1Ev", None, pointer)
         self.loaded: set[str] = set()
+        self.static: dict[tuple[bool, str], int] = {}
         self.lock = threading.RLock()
 
     @contextlib.contextmanager
@@ -143,46 +137,12 @@ class _FastDds:
             self.destroy_qos(address)
 
 
-def load_library() -> None:
-    """Load what participants are made and found through, for a process that forks others."""
-    if get_rmw_implementation_identifier() == _RMW:
-        with contextlib.suppress(MiddlewareError):  # of another version, which hosts do without
-            _library()
-        _node_functions()
-
-
 @functools.lru_cache(maxsize=1)
 def _library() -> _FastDds:
     return _FastDds()
 
 
-_SET_LISTENER = (
-    f"_ZN{_DDS}17DomainParticipant12set_listenerEPNS1_25DomainParticipantListenerE"
-    "NSt6chrono8durationIlSt5ratioILl1ELl1EEEE"
-)
 _PARTICIPANT_OF = "_ZN16rmw_fastrtps_cpp22get_domain_participantEP10rmw_node_s"
-_LISTENS_S = 1
-
-
-def stop_listening(node: rclpy.node.Node) -> None:
-    """Have the participant of a node notice no others any more; before it is destroyed, bounded.
-
-    rmw_fastrtps does this while it destroys a participant, and waits for callbacks that are running
-    until the end of time. In Fast DDS 2.14 that date overflows, into the past
-    (DomainParticipant::set_listener): it does not wait then but looks again and again, and hardly
-    ever lets go of the lock that the callback needs to end. One of about 1,000 hosts hung so, where
-    twenty left at once. What has no listener has no callback to wait for.
-    """
-    pointer = ctypes.c_void_p
-    with contextlib.suppress(InvalidHandle), node.handle:
-        participant = participant_of(node.handle.pointer)
-        if not participant:
-            return
-        set_listener = fast_dds_function(
-            _SET_LISTENER, ctypes.c_uint32, pointer, pointer, ctypes.c_int64
-        )
-        if set_listener is not None:
-            set_listener(participant, None, _LISTENS_S)
 
 
 def participant_of(rcl_node: int) -> int | None:
@@ -258,70 +218,9 @@ def unknown_versions() -> str:
         except MiddlewareError:
             unknown.append(
                 f"the loaded Fast DDS is not known (known: {_KNOWN}): participants get no "
-                "connections, transports or DSCP of their own, and which endpoints are matched is "
-                "counted only"
+                "connections, transports or DSCP of their own"
             )
     return "; ".join(unknown)
-
-
-def observer_settings(
-    settings: ParticipantSettings, *, unannounced: bool, super_client: bool
-) -> ParticipantSettings:
-    """Return the settings of an observer's participant: no shared memory, unless it is chosen.
-
-    It asks soon for names of nodes that it has not received, too.
-
-    Args:
-        settings: what it needs otherwise.
-        unannounced: it is to be, see ParticipantSettings.
-        super_client: likewise.
-
-    Returns:
-        `settings`, where they, a profile or the environment say what transports it has, and with
-        another RMW or an unknown version of Fast DDS.
-    """
-    if get_rmw_implementation_identifier() != _RMW:
-        return settings
-    try:
-        _library()
-        if settings or unannounced or super_client:
-            return dataclasses.replace(settings, unannounced=unannounced, super_client=super_client)
-        transports = without_shared_memory(os.environ)
-        asks = bool(transports) and are_names_open(os.environ)
-        return dataclasses.replace(settings, transports=transports, asks_for_names_soon=asks)
-    except MiddlewareError:
-        # An error of a profile is reported where the profile is needed; Fast DDS ignores it.
-        return settings
-
-
-def host_settings(
-    settings: ParticipantSettings, *, unannounced: bool, names_by_udp: bool, participants: int
-) -> ParticipantSettings:
-    """Return the settings of a host's first participant, see `for_a_host`.
-
-    Args:
-        settings: what it needs otherwise.
-        unannounced: it is to be, where that is possible.
-        names_by_udp: likewise.
-        participants: how many are made together, ≥ 0.
-
-    Returns:
-        `settings` with another RMW, and an unknown version of Fast DDS.
-    """
-    if get_rmw_implementation_identifier() != _RMW:
-        return settings
-    try:
-        _library()
-        return for_a_host(
-            settings,
-            os.environ,
-            unannounced=unannounced,
-            names_by_udp=names_by_udp,
-            participants=participants,
-        )
-    except MiddlewareError:
-        # As for an observer.
-        return settings
 
 
 def load_profile(name: str, xml: str) -> None:
@@ -377,165 +276,126 @@ def default_participant(name: str) -> Iterator[None]:
                 raise MiddlewareError(f"cannot restore the default profile: code {result}")
 
 
-@contextlib.contextmanager
-def with_endpoint_profiles(xml: str) -> Iterator[None]:
-    """Have endpoints that are created inside the block made from these profiles.
+def load_endpoint_profiles(endpoints: Sequence[StaticEndpoint]) -> None:
+    """Have these endpoints made with the ids of their lines in the table of static discovery.
 
-    rmw_fastrtps looks for a profile by an endpoint's topic, and Fast DDS keeps the first that it
-    was given for good: so all profiles are forgotten, and those of the environment's files loaded
-    again, before and after. Profiles that other code loaded from the program are lost. Other
-    threads must not create endpoints meanwhile; those of this function wait.
+    rmw_fastrtps looks for an endpoint's profile by its topic, and Fast DDS keeps the first that it
+    gets for good: a process has one such participant.
 
     Raises:
-        MiddlewareError: Fast DDS refused them, which it explains on standard error; a file of the
-            environment's may have a profile for the same topic.
+        MiddlewareError: an endpoint of this process on the same topic has another id, or Fast DDS
+            refused the profiles, which it explains on standard error.
     """
     dds = _library()
-
-    def start_again() -> None:
-        dds.forget_profiles()
-        dds.loaded.clear()
-        dds.load_default_files()
-
     with dds.lock:
-        dds.load_profiles(dds.factory())
-        start_again()
-        try:
-            data = xml.encode()
-            result = dds.load_string(dds.factory(), data, len(data))
-            if result != _OK:
+        new = []
+        for each in endpoints:
+            known = dds.static.get((each.writer, each.profile))
+            if known is None:
+                new.append(each)
+            elif known != each.user_id:
                 raise MiddlewareError(
-                    f"cannot load endpoint profiles: Fast DDS refused them (code {result})",
-                    hint="profiles of the environment's for the same topics must go",
+                    f"cannot discover {each.profile!r} statically: this process has it with id "
+                    f"{known} already, not {each.user_id}",
+                    hint="run the nodes in processes of their own",
                 )
-            yield
-        finally:
-            start_again()
-
-
-_LOCALHOST = 2
-_SYSTEM_DEFAULT = 4
-_PEER_BYTES = 256
-
-
-class _Security(ctypes.Structure):
-    _fields_ = (("enforce", ctypes.c_int), ("root_path", ctypes.c_void_p))
-
-
-class _Peer(ctypes.Structure):
-    _fields_ = (("address", ctypes.c_char * _PEER_BYTES),)
-
-
-class _Discovery(ctypes.Structure):
-    # rmw_discovery_options_t
-    _fields_ = (
-        ("range", ctypes.c_int),
-        ("peers", ctypes.POINTER(_Peer)),
-        ("peers_count", ctypes.c_size_t),
-        ("allocator", abi.Allocator),
-    )
-
-
-class _InitOptions(ctypes.Structure):
-    # rmw_init_options_t
-    _fields_ = (
-        ("instance_id", ctypes.c_uint64),
-        ("identifier", ctypes.c_void_p),
-        ("domain_id", ctypes.c_size_t),
-        ("security", _Security),
-        ("localhost_only", ctypes.c_int),
-        ("discovery", _Discovery),
-        ("enclave", ctypes.c_char_p),
-        ("allocator", abi.Allocator),
-        ("impl", ctypes.c_void_p),
-    )
-
-
-class _RmwContext(ctypes.Structure):
-    # rmw_context_t
-    _fields_ = (
-        ("instance_id", ctypes.c_uint64),
-        ("identifier", ctypes.c_void_p),
-        ("options", _InitOptions),
-        ("domain_id", ctypes.c_size_t),
-        ("impl", ctypes.c_void_p),
-    )
-
-
-@contextlib.contextmanager
-def without_localhost(context: Context) -> Iterator[tuple[str, ...] | None]:
-    """Have rmw leave discovery alone, inside the block, if it were to look on this host only.
-
-    Args:
-        context: initialised; without a node yet, or its participant exists already.
-
-    Yields:
-        The context's static peers, if it was LOCALHOST; None if nothing was changed.
-
-    Raises:
-        MiddlewareError: the installed rmw is laid out otherwise.
-    """
-    with context.handle:
-        discovery = _discovery(context)
-        if discovery.range != _LOCALHOST:
-            yield None
+        if not new:
             return
-        peers = tuple(
-            discovery.peers[index].address.decode() for index in range(discovery.peers_count)
-        )
-        with _set(discovery, _SYSTEM_DEFAULT):
-            yield peers
+        dds.load_profiles(dds.factory())
+        data = endpoint_profiles(new).encode()
+        result = dds.load_string(dds.factory(), data, len(data))
+        if result != _OK:
+            raise MiddlewareError(
+                f"cannot load endpoint profiles: Fast DDS refused them (code {result})",
+                hint="profiles of the environment's for the same topics must go",
+            )
+        dds.static.update(((each.writer, each.profile), each.user_id) for each in new)
 
 
-@contextlib.contextmanager
-def system_default(context: Context) -> Iterator[None]:
-    """Have rmw leave discovery alone inside the block, whatever the environment asked for.
+def observer_settings(settings: ParticipantSettings, *, super_client: bool) -> ParticipantSettings:
+    """Return the settings of an observer's participant: no shared memory, unless it is chosen.
 
     Args:
-        context: initialised; without a node yet, or its participant exists already.
+        settings: what it needs otherwise.
+        super_client: it is to be, see ParticipantSettings.
 
-    Raises:
-        MiddlewareError: the installed rmw is laid out otherwise.
+    Returns:
+        `settings`, where they, a profile or the environment say what transports it has, and with
+        another RMW or an unknown version of Fast DDS.
     """
-    with context.handle, _set(_discovery(context), _SYSTEM_DEFAULT):
-        yield
+    if get_rmw_implementation_identifier() != _RMW:
+        return settings
+    try:
+        _library()
+        if settings or super_client:
+            return dataclasses.replace(settings, super_client=super_client)
+        transports = without_shared_memory(os.environ)
+        return dataclasses.replace(
+            settings, transports=transports, announces_often=bool(transports)
+        )
+    except MiddlewareError:
+        # An error of a profile is reported where the profile is needed; Fast DDS ignores it.
+        return settings
+
+
+def host_settings(settings: ParticipantSettings) -> ParticipantSettings:
+    """Return the settings of a host's first participant that is to be unannounced, if it can be.
+
+    It cannot with another RMW, an unknown version of Fast DDS, a discovery server, connection URLs
+    or a profile of the user's.
+    """
+    if get_rmw_implementation_identifier() != _RMW or settings.urls:
+        return settings
+    try:
+        _library()
+        base = default_profile()
+    except MiddlewareError:
+        # An error of a profile is reported where the profile is needed; Fast DDS ignores it.
+        return settings
+    if os.environ.get(DISCOVERY_SERVER_VARIABLE) or (base and base.name != PROFILE_NAME):
+        return settings
+    return dataclasses.replace(settings, unannounced=True)
+
+
+_RANGE, _PEERS = "ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_STATIC_PEERS"
+_LOCALHOST_ONLY = "ROS_LOCALHOST_ONLY"
+"""ROS 2 of before Jazzy has that for a range of LOCALHOST, and it counts first."""
+
+
+def _localhost_peers() -> tuple[str, ...] | None:
+    """Return the static peers where the environment asks for LOCALHOST; None if it does not."""
+    if os.environ.get(_LOCALHOST_ONLY) == "1":
+        return ()
+    if os.environ.get(_RANGE) != "LOCALHOST":
+        return None
+    return tuple(filter(None, os.environ.get(_PEERS, "").split(";")))
 
 
 @contextlib.contextmanager
-def _set(discovery: Any, range_: int) -> Iterator[None]:
-    before = discovery.range
-    discovery.range = range_
+def discovery_by_profile(settings: ParticipantSettings) -> Iterator[None]:
+    """Have rmw leave discovery to the profile of a context that is initialised in the block.
+
+    rcl reads the range from the environment then (rcl/discovery_options.h).
+
+    Args:
+        settings: that the context's participant gets; what they leave open stays as it is.
+    """
+    is_left = settings.chooses_transports and _localhost_peers() is not None
+    if not (settings.governs_discovery or is_left):
+        yield
+        return
+    before = {each: os.environ.pop(each, None) for each in (_RANGE, _LOCALHOST_ONLY)}
+    os.environ[_RANGE] = "SYSTEM_DEFAULT"
     try:
         yield
     finally:
-        discovery.range = before
-
-
-def _discovery(context: Context) -> Any:
-    address = abi.load().rmw_context(context.handle.pointer)
-    found = _RmwContext.from_address(address)
-    domain_id = context.get_domain_id()
-    options = found.options
-    laid_out_as_known = (
-        found.identifier == options.identifier
-        and (found.domain_id, options.domain_id) == (domain_id, domain_id)
-        and found.instance_id == options.instance_id
-        and 0 < options.discovery.range <= _SYSTEM_DEFAULT
-        and bytes(options.allocator) == bytes(abi.load().default_allocator)
-    )
-    if not laid_out_as_known:
-        raise MiddlewareError(
-            f"cannot use the installed rcl {abi.rcl_version() or '(version unknown)'}: its "
-            f"rmw_context_t is not laid out as rcl {abi.SUPPORTED_RCL_MAJOR}'s",
-            hint=abi.INSTALL,
-        )
-    return options.discovery
+        del os.environ[_RANGE]
+        os.environ.update({name: value for name, value in before.items() if value is not None})
 
 
 _RMW = "rmw_fastrtps_cpp"
 
 
-_REFUSED_PORT = "unique_network_request cannot be set along specific locators"
 _SHARED_MEMORY_OF: weakref.WeakKeyDictionary[Context, bool] = weakref.WeakKeyDictionary()
 
 
@@ -568,74 +428,6 @@ def noting_shared_memory(context: Context, *, is_new: bool) -> Iterator[None]:
             _SHARED_MEMORY_OF[context] = opened
 
 
-@contextlib.contextmanager
-def once_participant_is_made(
-    call: Callable[[int], None],
-    *,
-    names_by_udp: Callable[[], bool] = lambda: False,
-    check_names: Callable[[], None] = lambda: None,
-) -> Iterator[None]:
-    """Call this when the next node's participant is there, and nothing of the node but its name.
-
-    rclpy makes services, publishers and subscriptions of a node after rcl has made the node.
-
-    Args:
-        call: blocks the constructor of the first node that is made in the block, in its thread;
-            given the address of its rcl_node_t.
-        names_by_udp: its participant is made so (ParticipantSettings). rmw asks for a port for them
-            alone first, which Fast DDS refuses with a message, and then without.
-        check_names: raises MiddlewareError where they do not arrive. Then it is made again, for as
-            long as a participant takes that just left to close its ports.
-    """
-    from lifecycle.middleware.fastdds.log import without_message  # it needs this module
-
-    library = rclpy.node._rclpy  # noqa: SLF001 - there is no other moment
-    made = library.Node
-
-    def make(*args: Any, **kwargs: Any) -> Any:
-        library.Node = made
-        if names_by_udp():
-            with without_message(_REFUSED_PORT):
-                node = _made_with_names(lambda: made(*args, **kwargs), check_names)
-        else:
-            node = made(*args, **kwargs)
-        call(node.pointer)
-        return node
-
-    library.Node = make
-    try:
-        yield
-    finally:
-        library.Node = made
-
-
-_NAMES_WITHIN_S = 2.0
-"""Others that start at the same time have half a pair of ports for a moment. 0.2 s were too little
-once in 760 starts of ten nodes, on a busy machine."""
-
-_NAMES_AGAIN_S = 0.02
-
-
-def _made_with_names(make: Callable[[], Any], check_names: Callable[[], None]) -> Any:
-    """Make a node, and again if names of other nodes would not arrive at its participant."""
-    deadline = time.monotonic() + _NAMES_WITHIN_S
-    while True:
-        node = make()
-        try:
-            check_names()
-        except MiddlewareError:
-            node.destroy_when_not_in_use()
-            if time.monotonic() >= deadline:
-                raise
-            try:
-                check_names()
-            except MiddlewareError:  # also without it: another socket of the process is meant
-                return make()
-            time.sleep(_NAMES_AGAIN_S)  # the kernel gives no event
-        else:
-            return node
-
-
 _DRAFT = "lifecycle_draft_of_a_profile"
 
 
@@ -647,7 +439,8 @@ def participant_settings(context: Context, settings: ParticipantSettings) -> Ite
     Participants that other contexts get inside the block have the settings as well.
 
     Args:
-        context: initialised, without a node yet; otherwise it has no effect.
+        context: initialised in `discovery_by_profile`, without a node yet; otherwise it has no
+            effect.
         settings: empty ones change nothing, and need no Fast DDS.
 
     Raises:
@@ -670,15 +463,10 @@ def participant_settings(context: Context, settings: ParticipantSettings) -> Ite
         check_host(settings.urls)
     domain_id = context.get_domain_id()
     with contextlib.ExitStack() as stack:
-        peers = None
-        if settings.governs_discovery:
-            stack.enter_context(system_default(context))
-        elif settings.chooses_transports:
-            peers = stack.enter_context(without_localhost(context))
+        is_open = settings.chooses_transports and not settings.governs_discovery
+        peers = _localhost_peers() if is_open else None
         if settings.static_participants:
-            # The participant's own endpoints, of the graph topic, are made with it.
-            own = endpoint_profiles(settings.static_endpoints)
-            stack.enter_context(with_endpoint_profiles(own))
+            load_endpoint_profiles(settings.static_endpoints)
         base = default_profile()
         # The name says what is in it: equal profiles are loaded once.
         draft = profile(_DRAFT, settings, base=base, localhost_peers=peers, domain_id=domain_id)

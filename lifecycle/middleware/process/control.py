@@ -1,9 +1,8 @@
 """Linux process control through ctypes: prctl(2), the deadman timer, and the C library.
 
 Owns: prctl(2), the deadman timer of timer_create(2), loading the C library and its timers'
-arguments, addresses of interfaces, and whether threads can be started: what Python's standard
-library lacks. Linux only.
-Must not import rclpy: a fork server uses it before rclpy is loaded.
+arguments, addresses of interfaces, and whether there is room for a participant. Linux only. Must
+not import rclpy: a fork server uses it before rclpy is loaded.
 """
 
 from __future__ import annotations
@@ -16,6 +15,7 @@ import os
 import resource
 import signal
 import socket
+import threading
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
@@ -57,8 +57,6 @@ _PR_CAP_AMBIENT = 47
 _PR_CAP_AMBIENT_LOWER = 3
 _CAP_NET_ADMIN = 12
 _CAPABILITY_VERSION_3 = 0x20080522
-_SEMAPHORE_BYTES = 64
-"""Room for glibc's sem_t, which has 32."""
 _SIGEV_SIGNAL = 0
 _SIGEV_THREAD = 2
 
@@ -161,9 +159,6 @@ def exit_after(seconds: float, code: int) -> Callable[[], None]:
     that hangs in C++ with the GIL held, which no Python thread or signal handler can. Where the
     limit of threads is reached, the kernel ends it with SIGKILL instead.
 
-    An exception that nothing in C++ catches ends it with `code` at once, not with SIGABRT: Fast DDS
-    2.14 asks sockets of TCP for their address that another of its threads has just closed.
-
     Args:
         seconds: > 0.
         code: 0–255.
@@ -187,42 +182,11 @@ def exit_after(seconds: float, code: int) -> Callable[[], None]:
     with contextlib.suppress(MiddlewareError):
         timers.append(_Timer(ends, seconds))
 
-    abort_again = _exit_where_cpp_terminates(code)
-
     def live_on() -> None:
         for timer in timers:
             timer.disarm()
-        abort_again()
 
     return live_on
-
-
-_TERMINATED: list[object] = []
-"""Handlers that C++ was given, kept for as long as it may call them."""
-
-
-def _exit_where_cpp_terminates(code: int) -> Callable[[], None]:
-    """Replace the handler of std::terminate; return what sets it back.
-
-    It waits for the GIL: where a thread that hangs has that, the timer ends the process.
-    """
-    try:
-        # The one that is loaded: where there is none, nothing in C++ can throw.
-        cpp = ctypes.CDLL("libstdc++.so.6", mode=os.RTLD_NOLOAD | os.RTLD_NOW)
-        set_terminate = cpp["_ZSt13set_terminatePFvvE"]
-    except (OSError, AttributeError):
-        return lambda: None
-    set_terminate.restype, set_terminate.argtypes = ctypes.c_void_p, (ctypes.c_void_p,)
-
-    def terminate() -> None:
-        with contextlib.suppress(OSError):
-            os.write(2, b"the process ends at once: an exception was not caught in C++\n")
-        os._exit(code)
-
-    handler = ctypes.CFUNCTYPE(None)(terminate)
-    _TERMINATED.append(handler)
-    before = set_terminate(ctypes.cast(handler, ctypes.c_void_p))
-    return lambda: set_terminate(before)
 
 
 class _Timer:
@@ -243,74 +207,41 @@ class _Timer:
             raise _failed("timer_settime")
 
 
-class _InterfaceAddress(ctypes.Structure):
-    """`struct ifaddrs` of getifaddrs(3)."""
-
-
-_InterfaceAddress._fields_ = (
-    ("next", ctypes.POINTER(_InterfaceAddress)),
-    ("name", ctypes.c_char_p),
-    ("flags", ctypes.c_uint),
-    ("address", ctypes.c_void_p),
-    ("netmask", ctypes.c_void_p),
-    ("destination", ctypes.c_void_p),
-    ("data", ctypes.c_void_p),
-)
-_IN_SOCKADDR = {socket.AF_INET: (4, 4), socket.AF_INET6: (8, 16)}
-"""Where the address is in a `struct sockaddr_in` and `sockaddr_in6`, and how many bytes it has."""
-
-
 def interface_addresses(*families: socket.AddressFamily) -> tuple[tuple[str, str], ...]:
     """Return the name of an interface and an address of it, for all that this host has.
 
     Args:
         families: AF_INET, AF_INET6 or both.
-
-    Raises:
-        MiddlewareError: the kernel refused.
     """
-    first = ctypes.POINTER(_InterfaceAddress)()
-    if libc().getifaddrs(ctypes.byref(first)) != 0:
-        raise _failed("getifaddrs")
-    try:
-        found, each = [], first
-        while each:
-            entry = each.contents
-            if entry.address:
-                family = ctypes.c_uint16.from_address(entry.address).value
-                if family in families:
-                    at, length = _IN_SOCKADDR[socket.AddressFamily(family)]
-                    packed = ctypes.string_at(entry.address + at, length)
-                    found.append((os.fsdecode(entry.name), socket.inet_ntop(family, packed)))
-            each = entry.next
-        return tuple(found)
-    finally:
-        libc().freeifaddrs(first)
+    import psutil  # 15 ms, which few processes need
+
+    return tuple(
+        (name, each.address.partition("%")[0])
+        for name, addresses in psutil.net_if_addrs().items()
+        for each in addresses
+        if each.family in families
+    )
 
 
 def check_threads(count: int) -> None:
     """Make sure that so many threads can be started now.
 
-    They are none of Python's, each of which is waited for as it starts.
-
     Raises:
         MiddlewareError: they cannot; names the limits that hold.
     """
-    over = ctypes.create_string_buffer(_SEMAPHORE_BYTES)
-    libc().sem_init(over, 0, 0)
-    started: list[ctypes.c_ulong] = []
+    over = threading.Event()
+    threads: list[threading.Thread] = []
     try:
         for _ in range(count):
-            thread = ctypes.c_ulong()
-            if libc().pthread_create(ctypes.byref(thread), None, libc().sem_wait, over):
-                raise no_room_for_threads(count)
-            started.append(thread)
+            thread = threading.Thread(target=over.wait, daemon=True)
+            thread.start()
+            threads.append(thread)
+    except RuntimeError as error:
+        raise no_room_for_threads(count) from error
     finally:
-        for _ in started:
-            libc().sem_post(over)
-        for thread in started:
-            libc().pthread_join(thread, None)
-        libc().sem_destroy(over)
+        over.set()
+        for thread in threads:
+            thread.join()
 
 
 _OWN_DESCRIPTORS, _DESCRIPTORS_EACH = 36, 8

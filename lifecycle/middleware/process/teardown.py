@@ -8,7 +8,6 @@ whole lease (20 s) and shared memory files for ever.
 from __future__ import annotations
 
 import contextlib
-import functools
 import gc
 import logging
 import os
@@ -65,12 +64,6 @@ def leave_and_exit(
         give_up_dead_connections()
         for participant in participants:
             _attempt(participant.destroy)
-        nodes = tuple(nodes)
-        if nodes:
-            from lifecycle.middleware.fastdds.settings import stop_listening  # it needs rclpy
-
-            for node in nodes:
-                _attempt(functools.partial(stop_listening, node))
         for node in nodes:
             _release(node)
         for context in contexts:

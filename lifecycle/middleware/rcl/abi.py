@@ -220,7 +220,6 @@ class Rcl:
             rcl, "rcl_wait_set_add_guard_condition", integer, (pointer, pointer, pointer)
         )
         self.wait = _bind(rcl, "rcl_wait", integer, (pointer, ctypes.c_int64))
-        self.rmw_context = _bind(rcl, "rcl_context_get_rmw_context", pointer, (pointer,))
         self._check_layout(version)
 
     def take_error(self) -> str:

@@ -23,7 +23,6 @@ from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock
 
 from lifecycle import dataclasses
-from lifecycle.errors import MiddlewareError
 from lifecycle.export import CapturedProgram
 from lifecycle.manifest import EndpointKind, join
 from lifecycle.middleware.discovery.dead_peers import (
@@ -38,19 +37,17 @@ from lifecycle.middleware.discovery.dead_peers import (
 from lifecycle.middleware.discovery.probe import (
     ANSWER_S,
     answered_at,
-    answers_unasked,
     connects_first,
     dispose_of_announced,
     is_served,
     missing_port,
     probes_for,
 )
-from lifecycle.middleware.fastdds.participant_discovery import Unannounced
 from lifecycle.middleware.fastdds.participant_profile import (
     DISCOVERY_SERVER_VARIABLE,
     ParticipantSettings,
 )
-from lifecycle.middleware.fastdds.settings import observer_settings, stop_listening
+from lifecycle.middleware.fastdds.settings import observer_settings
 from lifecycle.middleware.fastdds.url_check import OpenSocket
 from lifecycle.middleware.process.hosted import is_vouched_for
 from lifecycle.middleware.process.process_table import programs_of
@@ -63,7 +60,7 @@ from lifecycle.middleware.rcl.graph_queries import (
     service_names,
     topic_endpoints,
 )
-from lifecycle.middleware.rcl.hidden_node import forget_hidden, quiet_node
+from lifecycle.middleware.rcl.hidden_node import quiet_node
 from lifecycle.middleware.rcl.stale_node_filter import StaleNodeFilter
 from lifecycle.plan import ParticipantConnections
 from lifecycle.verify import (
@@ -224,14 +221,13 @@ class GraphObserver:
         self._context: rclpy.Context | None = None
         self._guard: GraphGuard | None = None
         if node is None:
-            self._context, node, unannounced = _observing_node(domain_id, settings)
+            self._context, node = _observing_node(domain_id, settings)
             self._guard = GraphGuard(node, self._changed)
             self._unwatch = self._guard.stop
-            if unannounced is not None:
-                unannounced.announce()
             self._probes = probes_for(domain_id, settings.urls, os.environ)
-            served = is_served(settings.urls, os.environ)
-            self._limit_s = _ANNOUNCED_BY_SERVER_S if served else _UNPROBED_S
+            self._limit_s = _UNPROBED_S if settings.urls else PATIENCE_S
+            if is_served(settings.urls, os.environ):
+                self._limit_s = _ANNOUNCED_BY_SERVER_S
             if connects_first(settings.urls, os.environ):
                 self._limit_s = _CONNECTED_S
         else:
@@ -568,7 +564,6 @@ class GraphObserver:
         self._unwatch()
         if self._context is not None:
             give_up_dead_connections()
-            stop_listening(self.node)
             self.node.destroy_node()
             self._context.try_shutdown()
             self._context.destroy()
@@ -754,37 +749,12 @@ class GraphObserver:
         )
 
 
-def _observing_node(
-    domain_id: int, settings: ParticipantSettings
-) -> tuple[rclpy.Context, Node, Unannounced | None]:
-    """Return a new context, its node, and how it is announced if it is not yet.
-
-    The first announcement of a participant comes before it listens, and its answers are lost. Who
-    got it is quiet for its next 3 s. Where nobody can be asked to answer once more, that
-    announcement is taken back, and the participant is announced anew: without it one that was there
-    before was not seen in time in 16 of 240 tries.
-
-    Raises:
-        MiddlewareError: no participant could be made.
-    """
-    name = f"_lifecycle_observer_{os.getpid()}"
-    unasked = answers_unasked(settings.urls, os.environ)
+def _observing_node(domain_id: int, settings: ParticipantSettings) -> tuple[rclpy.Context, Node]:
+    """Return a new context and its node; raises MiddlewareError if no participant can be made."""
     served = is_served(settings.urls, os.environ)
-    chosen = observer_settings(settings, unannounced=unasked, super_client=served)
+    chosen = observer_settings(settings, super_client=served)
     with _as_super_client():
-        context, node = quiet_node(name, "/", domain_id, settings=chosen)
-    if not chosen.unannounced:
-        return context, node, None
-    try:
-        with node.handle:
-            return context, node, Unannounced.of(node.handle.pointer)
-    except MiddlewareError:  # not as known: it ignores all others, and stays so
-        forget_hidden(node)
-        node.destroy_node()
-        context.try_shutdown()
-        context.destroy()
-    known = observer_settings(settings, unannounced=False, super_client=served)
-    return *quiet_node(name, "/", domain_id, settings=known), None
+        return quiet_node(f"_lifecycle_observer_{os.getpid()}", "/", domain_id, settings=chosen)
 
 
 _SUPER_CLIENT_VARIABLE = "ROS_SUPER_CLIENT"

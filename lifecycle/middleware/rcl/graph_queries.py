@@ -465,12 +465,6 @@ class _Library:
             raise MiddlewareError(f"cannot read the {what} of the graph: {self.take_error()}")
 
 
-def load_library() -> None:
-    """Bind the functions, where the installed libraries are those that are known."""
-    if abi.is_known():
-        _library()
-
-
 @functools.lru_cache(maxsize=1)
 def _library() -> _Library:
     return _Library()

@@ -9,14 +9,17 @@ groups, and costs no thread and nothing while idle.
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import os
 import typing
 import weakref
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import rclpy
 from rclpy.client import Client
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.service import Service
@@ -24,12 +27,18 @@ from rclpy.subscription import Subscription
 from rclpy.waitable import Waitable
 
 from lifecycle.errors import MiddlewareError
+from lifecycle.middleware.fastdds.dscp import widen_discovery_buffers
 from lifecycle.middleware.fastdds.endpoint_discovery import (
-    ask_for_endpoints_soon,
+    SOON_S,
+    TOGETHER_S,
     resend_endpoints_soon,
 )
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
-from lifecycle.middleware.fastdds.settings import noting_shared_memory, participant_settings
+from lifecycle.middleware.fastdds.settings import (
+    discovery_by_profile,
+    noting_shared_memory,
+    participant_settings,
+)
 
 _hidden: weakref.WeakSet[Node] = weakref.WeakSet()
 
@@ -52,7 +61,8 @@ def quiet_node(
     context = rclpy.Context()
     node: Node | None = None
     try:
-        context.init(args=[*arguments, *enclave], domain_id=domain_id, initialize_logging=False)
+        with discovery_by_profile(settings):
+            context.init(args=[*arguments, *enclave], domain_id=domain_id, initialize_logging=False)
         shared_memory = noting_shared_memory(context, is_new=True)
         with participant_settings(context, settings), shared_memory:
             node = Node(
@@ -80,9 +90,53 @@ def quiet_node(
         ) from error
     with node.handle:
         resend_endpoints_soon(node.handle.pointer)
-        ask_for_endpoints_soon(node.handle.pointer)
     _hidden.add(node)
     return context, node
+
+
+def bare_node(context: rclpy.Context) -> Any:
+    """Return rclpy's handle of a hidden node without any endpoint.
+
+    The first node of a context makes its participant.
+    """
+    with context.handle:
+        return _rclpy.Node(
+            f"_lifecycle_names_{os.getpid()}_{next(_numbers)}",
+            *("", context.handle, None, False, False),
+        )
+
+
+_numbers = itertools.count()
+
+
+@contextlib.contextmanager
+def made_participant(
+    context: rclpy.Context, settings: ParticipantSettings, *, is_new: bool = False
+) -> Iterator[int]:
+    """Make the participant of a context with these settings; construct its first node in the block.
+
+    Yields the address of an rcl_node_t of it.
+
+    Args:
+        context: initialised in `discovery_by_profile`; settings have no effect where it has a
+            participant already.
+        settings: of the participant.
+        is_new: it has none yet.
+
+    Raises:
+        MiddlewareError: as `participant_settings`.
+    """
+    first: Any = None
+    try:
+        with participant_settings(context, settings), noting_shared_memory(context, is_new=is_new):
+            first = bare_node(context)
+        delay_s = TOGETHER_S if settings.unannounced else SOON_S
+        resend_endpoints_soon(first.pointer, delay_s)
+        widen_discovery_buffers(context.get_domain_id())
+        yield first.pointer
+    finally:
+        if first is not None:
+            first.destroy_when_not_in_use()
 
 
 def _security_hint() -> str:

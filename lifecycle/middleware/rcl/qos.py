@@ -10,11 +10,9 @@ shows), which mean the same on Fast DDS.
 
 from __future__ import annotations
 
-import contextlib
 import importlib
 import re
-import sys
-import types
+import warnings
 from typing import Any
 
 from rclpy.duration import Duration
@@ -118,53 +116,18 @@ def import_interface(name: str) -> type[Any]:
     return found
 
 
-_GENERATOR = "rosidl_generator_py.generate_py_impl"
-
-
 def load_type_support(name: str) -> None:
     """Import an interface, and of a message or service what rcl needs of it: a shared library.
-
-    The package that loads these libraries also has what generates Python from IDL, with a parser
-    and a grammar, and does without where that cannot be imported: 15 ms of CPU that nobody uses.
 
     Raises:
         UnknownInterfaceError: see import_interface.
     """
     found = import_interface(name)
-    if _GENERATOR not in sys.modules:
-        sys.modules[_GENERATOR] = None  # type: ignore[assignment]
-        try:
-            with contextlib.suppress(ImportError):
-                importlib.import_module("rosidl_generator_py")
-        finally:
-            del sys.modules[_GENERATOR]
+    with warnings.catch_warnings():
+        # What generates Python from IDL comes along, with a parser that uses what is deprecated.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        importlib.import_module("rosidl_generator_py")
     if "/msg/" in name:
         check_is_valid_msg_type(found)
     elif "/srv/" in name:
-        import_service_events()
         check_is_valid_srv_type(found)
-
-
-class _LateNumpy(types.ModuleType):
-    """In the place of numpy in a module that only uses it when it is called; imports it then."""
-
-    def __getattr__(self, name: str) -> object:
-        if sys.modules.get("numpy") is self:
-            del sys.modules["numpy"]
-        return getattr(importlib.import_module("numpy"), name)
-
-
-def import_service_events() -> None:
-    """Import what each service type needs without the numpy that this needs: 40 ms, 10 MiB.
-
-    It has one array, the GID of who called, which is made where calls are introspected.
-    """
-    if {"numpy", "service_msgs.msg"} & sys.modules.keys():
-        return
-    late = sys.modules["numpy"] = _LateNumpy("numpy")
-    try:
-        with contextlib.suppress(ImportError):  # the service type needs it, and says so
-            importlib.import_module("service_msgs.msg")
-    finally:
-        if sys.modules.get("numpy") is late:
-            del sys.modules["numpy"]

@@ -336,37 +336,37 @@ class Watching:
 
     def __init__(self) -> None:
         self.executor: Any = None
-        self._timers: list[Any] = []
-        self._subscriptions: list[Any] = []
-        self._guards: list[Any] = []
-        self._clients: list[Any] = []
-        self._services: list[Any] = []
-        self._Node__waitables: list[Any] = []
+        self.timers: list[Any] = []
+        self.subscriptions: list[Any] = []
+        self.guards: list[Any] = []
+        self.clients: list[Any] = []
+        self.services: list[Any] = []
+        self.waitables: list[Any] = []
 
     def take_services(self, node: Node, services: Collection[Any]) -> None:
         """Serve what a node offers, whoever spins the node; destroy them before it."""
         for each in services:
             node._services.remove(each)  # noqa: SLF001 - what Node.destroy_service does
-            self._services.append(each)
+            self.services.append(each)
         self._wake()
 
     def drop_services(self, services: Collection[Any]) -> None:
         """Destroy what was taken; again is harmless."""
         for each in services:
-            if each in self._services:
-                self._services.remove(each)
+            if each in self.services:
+                self.services.remove(each)
                 each.destroy()
         self._wake()
 
     def add_waitable(self, waitable: Any) -> None:
         """Wait for it from now on."""
-        self._Node__waitables.append(waitable)
+        self.waitables.append(waitable)
         self._wake()
 
     def remove_waitable(self, waitable: Any) -> None:
         """Wait for it no more; again is harmless."""
         with contextlib.suppress(ValueError):
-            self._Node__waitables.remove(waitable)
+            self.waitables.remove(waitable)
         self._wake()
 
     def _wake(self) -> None:

@@ -23,8 +23,6 @@ from rclpy.node import Node
 from rclpy.task import Future
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.discovery.rediscovery import wake_participants
-from lifecycle.middleware.process.clock import ClockWatch
 from lifecycle.middleware.rcl.graph import GraphObserver
 
 InvalidHandle = rclpy_implementation.InvalidHandle
@@ -260,20 +258,12 @@ class _Spinner:
         self._stopped = False
         self._thread = threading.Thread(target=self._spin, name=thread, daemon=True)
         self._thread.start()
-        self._node = node
-        self._clock = ClockWatch(self._clock_set)
 
     def stop(self) -> None:
         """End the thread; again is harmless."""
         self._stopped = True
-        self._clock.close()
         self._executor.shutdown()
         self._thread.join()
-
-    def _clock_set(self) -> None:
-        """Have the executor look anew how long to wait, and the participant send what is due."""
-        with contextlib.suppress(RuntimeError):  # its context may be over
-            wake_participants((self._node,))
 
     def _spin(self) -> None:
         with contextlib.suppress(ExternalShutdownException, ShutdownException):

@@ -36,7 +36,6 @@ from rclpy.timer import Timer
 
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest import EndpointKind
-from lifecycle.middleware import NodeTimers
 from lifecycle.network import ConnectionUrl
 from lifecycle.node import configuration
 from lifecycle.node.author import parameters
@@ -117,7 +116,6 @@ class GatedFactories(Node):  # type: ignore[misc]  # rclpy is not typed
     lifecycle: Managed
     _gate: NodeGate | None = None
     """None until rclpy has made its own publishers: those are never held back."""
-    _clocked: NodeTimers | None = None
 
     def create_publisher(
         self, msg_type: Any, topic: str, qos_profile: QoSProfile | int, **options: Any
@@ -156,17 +154,8 @@ class GatedFactories(Node):  # type: ignore[misc]  # rclpy is not typed
         clock: Clock | None = None,
         autostart: bool = True,
     ) -> Timer:
-        """As rclpy's; the timer runs only while the node is active, and then starts anew.
-
-        Without a `clock`, and unless time is simulated, it goes by one that only goes forward:
-        rclpy's stands still where the machine's clock is set back.
-        """
-        if self._clocked is None:
-            self._clocked = NodeTimers(self)
-        by = self._clocked.clock if clock is None else clock
-        timer = super().create_timer(timer_period_sec, callback, callback_group, by, autostart)
-        if clock is None:
-            self._clocked.add(timer)
+        """As rclpy's; the timer runs only while the node is active, and then starts anew."""
+        timer = super().create_timer(timer_period_sec, callback, callback_group, clock, autostart)
         # No callback is rclpy.Rate's: a thread that sleeps must wake up.
         if self._gate is not None and callback is not None:
             self._gate.add(timer, GatedTimer(timer, wanted=autostart))

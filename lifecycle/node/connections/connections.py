@@ -7,13 +7,14 @@ Negotiation*; which endpoint is on which connection is data_layer.py's.
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError, MiddlewareError
-from lifecycle.middleware import FlowParticipant, has_shared_memory, note_senders
+from lifecycle.middleware import FlowParticipant, has_shared_memory, senders_of
 from lifecycle.network import ConnectionUrl
 from lifecycle.node.author.handlers import nearest
 from lifecycle.plan import ParticipantConnections, PlannedParticipant
@@ -69,7 +70,8 @@ class Connections:
         self.own = Connection(name="")
         self._made: dict[str, Connection] = {}  # by name of the hidden node
         self._failed: dict[str, Connection] = {}  # by name
-        note_senders(node)
+        with contextlib.suppress(MiddlewareError):
+            senders_of(node)  # before it has peers
 
     @property
     def named(self) -> tuple[Connection, ...]:

@@ -55,8 +55,8 @@ class Operation(enum.Enum):
     # announce to the graph anew which nodes are here.
     SEND_AGAIN_SOON = "send_again_soon"
     REPUBLISH_NAMES = "republish_names"
-    # Those that are not answered: all have gathered, go on; and what follows is an orderly end of
-    # file, not that of a supervisor that was killed.
+    # Those that are not answered: all have gathered, go on; and the end of file that follows is
+    # orderly, not that of a killed supervisor.
     PROCEED = "proceed"
     END = "end"
 
@@ -66,11 +66,8 @@ class HostSpec:
     """First line from the supervisor: what this process hosts.
 
     Attributes:
-        gathers: how many hosts make their participants together, ≥ 0; unless it is 0, this one
-            reports that it has made its, and waits for `PROCEED`: unannounced before it is
-            discovered, otherwise before it makes endpoints.
-        unannounced: its participant is made so, see `Unannounced`; only if it gathers.
-        names_by_udp: likewise, see ParticipantSettings.
+        gathers: its participant is unannounced until its node is constructed; then it reports that
+            and waits for `PROCEED`, see `Unannounced`.
         folders: absolute, of the manifest and what it includes: modules are looked for there.
         log: file that it appends its output to once its supervisor was killed; empty for none.
     """
@@ -80,9 +77,7 @@ class HostSpec:
     domain_id: int
     discovery_range: DiscoveryRange
     nodes: tuple[PlannedNode, ...]
-    gathers: int = 0
-    unannounced: bool = False
-    names_by_udp: bool = False
+    gathers: bool = False
     folders: tuple[str, ...] = ()
     log: str = ""
 

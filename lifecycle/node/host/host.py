@@ -61,7 +61,7 @@ def preload(types: Iterable[str] = ()) -> None:
         importlib.import_module(name)
     for interface in _INTERFACES:
         middleware.load_type_support(interface)
-    middleware.load_libraries()
+    middleware.unknown_versions()  # it loads the libraries of the RMW, which hosts then share
     # Of the types that a node uses; else each host would make them anew.
     dataclasses.make_constructors(
         "lifecycle.node",

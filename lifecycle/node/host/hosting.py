@@ -29,22 +29,15 @@ from lifecycle import codec
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest import Executor
 from lifecycle.middleware import (
-    ENDPOINTS_MADE_S,
     BusySign,
     ParticipantSettings,
     Unannounced,
-    ask_for_endpoints_soon,
-    check_own_pair,
-    endpoints_made_s,
+    discovery_by_profile,
     follow_nodes,
     host_settings,
     leave_and_exit,
-    noting_shared_memory,
-    once_participant_is_made,
-    participant_settings,
-    resend_endpoints_soon,
+    made_participant,
     send_again_soon,
-    widen_discovery_buffers,
 )
 from lifecycle.node.author.spec import load_nodes
 from lifecycle.node.host.control import (
@@ -64,11 +57,16 @@ from lifecycle.verify import NodeConfiguration
 
 def process_context(spec: HostSpec) -> Context:
     """Initialise rclpy for a process and return its default context."""
-    rclpy.init(
-        args=[],
-        domain_id=spec.domain_id,
-        signal_handler_options=SignalHandlerOptions.NO,
-    )
+    try:
+        settings = ParticipantSettings.of_node(spec.nodes[0])
+    except LifecycleError:  # reported where the node is made
+        settings = ParticipantSettings()
+    with discovery_by_profile(settings):
+        rclpy.init(
+            args=[],
+            domain_id=spec.domain_id,
+            signal_handler_options=SignalHandlerOptions.NO,
+        )
     return rclpy.get_default_context()
 
 
@@ -80,16 +78,16 @@ class Participants:
 
     Args:
         default: that context.
-        spec: how its participant is made, where the environment leaves that open.
+        unannounced: its participant is to be, if it can be.
 
     Attributes:
-        first: the settings of the default context's participant; none before it is made.
+        unannounced: the default context's participant, until it is announced.
     """
 
-    def __init__(self, default: Context, spec: HostSpec) -> None:
-        self.first = ParticipantSettings()
+    def __init__(self, default: Context, *, unannounced: bool = False) -> None:
+        self.unannounced: Unannounced | None = None
         self._default = default
-        self._spec = spec
+        self._is_unannounced = unannounced
         self._made: dict[ParticipantSettings, Context] = {}
 
     @contextlib.contextmanager
@@ -99,31 +97,21 @@ class Participants:
         Raises:
             LifecycleError: its participant cannot be made as planned.
         """
-        settings = ParticipantSettings.of(
-            planned.connections,
-            transports=planned.transports,
-            max_datagram_bytes=planned.max_datagram_bytes,
-        )
+        settings = ParticipantSettings.of_node(planned)
         context = self._made.get(settings)
         if context is not None:
             yield context
             return
-        context, wanted = self._default, settings
+        context = self._default
         is_new = bool(self._made)  # a user's module may have made the default context's
         if is_new:
             context = Context()
-            context.init(args=[], domain_id=self._default.get_domain_id())
-        else:
-            wanted = host_settings(
-                settings,
-                unannounced=self._spec.unannounced,
-                names_by_udp=self._spec.names_by_udp,
-                participants=self._spec.gathers,
-            )
-            self.first = wanted
-        # The participant is made with the context's first node.
-        shared_memory = noting_shared_memory(context, is_new=is_new)
-        with participant_settings(context, wanted), shared_memory:
+            with discovery_by_profile(settings):
+                context.init(args=[], domain_id=self._default.get_domain_id())
+        wanted = host_settings(settings) if self._is_unannounced and not is_new else settings
+        with made_participant(context, wanted, is_new=is_new) as rcl_node:
+            if wanted.unannounced:
+                self.unannounced = Unannounced.of(rcl_node)
             yield context
         self._made[settings] = context
 
@@ -312,8 +300,7 @@ class Host:
         self._proceed = threading.Event()
         self._left = threading.Event()
         self._nodes: dict[str, Hosted] = {}
-        self._participants = Participants(context, spec)
-        self._unannounced: Unannounced | None = None
+        self._participants = Participants(context, unannounced=spec.gathers)
         self._adoption = Adoption(
             self._participants.carrying,
             self._loop,
@@ -333,26 +320,16 @@ class Host:
         """Construct, say ready, obey; never returns."""
         # Both before any constructor of the user's: whatever it does, the process can be ended.
         self._obey()
-        beside = {self._channel.fileno(): self._receive, **self._loop.beside}
-        with on_signal(lambda number: self._end(number.name), beside=beside):
+        beside = {self._channel.fileno(): self._receive}
+        with on_signal(lambda number: self._end(number.name), beside):
             follow_nodes(self._adoption)
             for index, planned in enumerate(self._spec.nodes):
                 failure: Exception | None = None
-                first = self._spec.gathers > 0 and index == 0
                 try:
                     if planned.key in self._adoption.made:
                         continue  # by the same call as one before it
                     maker = self._import(planned)
-                    with contextlib.ExitStack() as stack:
-                        if first:
-                            stack.enter_context(
-                                once_participant_is_made(
-                                    self._participant_made,
-                                    names_by_udp=lambda: self._participants.first.names_by_udp,
-                                    check_names=lambda: check_own_pair(self._spec.domain_id),
-                                )
-                            )
-                        self._construct(planned, maker)
+                    self._construct(planned, maker)
                     self._meet()  # at the latest
                 except Exception as error:  # noqa: BLE001 - reported to the supervisor
                     failure = error
@@ -363,34 +340,13 @@ class Host:
             self._loop.spin_and_exit(self._channel.drain)
         raise AssertionError("spin_and_exit returned")
 
-    def _participant_made(self, rcl_node: int) -> None:
-        """Keep it to itself until it has its endpoints, or wait for those of the other processes.
-
-        Participants that are not unannounced should find each other before they have endpoints:
-        what is made afterwards is sent once to each peer, and to those found later all of it is
-        sent again.
-        """
-        if self._participants.first.unannounced:
-            self._unannounced = Unannounced.of(rcl_node)
-        is_known = self._unannounced is None
-        delay_s = ENDPOINTS_MADE_S if is_known else endpoints_made_s(self._spec.gathers)
-        resend_endpoints_soon(rcl_node, delay_s, participants=self._spec.gathers)
-        ask_for_endpoints_soon(rcl_node, endpoints_made_s(self._spec.gathers))
-        widen_discovery_buffers(self._spec.domain_id)
-        if is_known:
-            self._gather()
-
     def _meet(self) -> None:
         """Be discovered, once the other processes are ready to be: a node has its endpoints."""
-        unannounced, self._unannounced = self._unannounced, None
+        unannounced, self._participants.unannounced = self._participants.unannounced, None
         if unannounced is not None:
-            self._gather()
+            self._channel.write(Event(kind="gathered"))
+            self._proceed.wait(_GATHER_S)
             unannounced.announce()
-
-    def _gather(self) -> None:
-        """Wait until the other processes have come as far, bounded."""
-        self._channel.write(Event(kind="gathered"))
-        self._proceed.wait(_GATHER_S)
 
     def _import(self, planned: PlannedNode) -> Callable[..., Any]:
         """Import a node's class; ending the process meanwhile need not wait for it."""

@@ -25,10 +25,10 @@ from lifecycle.middleware import (
     NodeExecutor,
     ParticipantSettings,
     Watching,
+    discovery_by_profile,
     follow_nodes,
     import_interface,
-    participant_settings,
-    stop_listening,
+    made_participant,
     to_rclpy,
 )
 from lifecycle.node.author.spec import Mode
@@ -87,7 +87,8 @@ class NodeInProcess:
         self._logs: list[str] = []
         self._closed = False
         self._context = Context()
-        self._context.init(args=[], domain_id=domain_id)
+        with discovery_by_profile(ParticipantSettings.of_node(planned)):
+            self._context.init(args=[], domain_id=domain_id)
         self._executor = NodeExecutor(context=self._context)
         self.watching = Watching()
         self._executor.add_node(self.watching)
@@ -116,12 +117,7 @@ class NodeInProcess:
 
         @contextlib.contextmanager
         def carrying(each: PlannedNode) -> Iterator[Context]:
-            settings = ParticipantSettings.of(
-                each.connections,
-                transports=each.transports,
-                max_datagram_bytes=each.max_datagram_bytes,
-            )
-            with participant_settings(self._context, settings):
+            with made_participant(self._context, ParticipantSettings.of_node(each)):
                 yield self._context
 
         adoption = Adoption(carrying, self, mode=Mode.MANUAL)
@@ -368,8 +364,6 @@ class NodeInProcess:
                 if isinstance(hosted, ForeignNode):
                     hosted.close()
             nodes = (self.peer, *(node for node, _ in self._all))
-            for each in nodes:
-                stop_listening(each)
             for each in nodes:
                 each.destroy_node()
             for _, hosted in self._all:

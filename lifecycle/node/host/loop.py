@@ -42,7 +42,6 @@ from rclpy.timer import Timer
 from lifecycle.manifest import Executor
 from lifecycle.middleware import (
     BusySign,
-    ClockTimer,
     NodeExecutor,
     Watching,
     described,
@@ -51,7 +50,6 @@ from lifecycle.middleware import (
     leave_and_exit,
     republish_names,
     show_stacks_here,
-    wake_participants,
 )
 from lifecycle.node.author.node import LifecycleNode
 from lifecycle.node.lifecycle.execution import hint
@@ -79,24 +77,23 @@ class Watchdog:
         """Leave the transitions of a node to their own deadlines."""
         hosted.add_listener(self._follow)
 
-    def begin(self, callback: Callable[[], None]) -> None:
-        """Note that a callback begins."""
+    def begin(self, entity: Any) -> None:
+        """Note that a callback begins, and of what it is; None for a task."""
         self._running = True
         if not self._changing:
-            self._sign.begin(what=self._label(callback))
+            self._sign.begin(what=self._label(entity))
 
     def end(self) -> None:
         """Note that it has ended."""
         self._running = False
         self._idle()
 
-    def _label(self, callback: Callable[[], None]) -> bytes:
-        entity = callback.args[0] if isinstance(callback, functools.partial) else None
+    def _label(self, entity: Any) -> bytes:
         if entity is None:
             return label("")
         found = self._labels.get(entity)
         if found is None:
-            found = self._labels[entity] = label(described(callback))
+            found = self._labels[entity] = label(described(entity))
         return found
 
     def _follow(self, hosted: Hosted) -> None:
@@ -227,7 +224,7 @@ class NodeLoop:
         >>> camera = Camera()
         >>> loop.add(camera, camera.lifecycle)
         >>> ending = lambda number: loop.stop(f"signal {number}", code=0)
-        >>> with on_signal(ending, beside=loop.beside):
+        >>> with on_signal(ending):
         ...     loop.spin_and_exit()
     """
 
@@ -254,12 +251,6 @@ class NodeLoop:
         self._left = False
         self._leaving = threading.Lock()
         self._code = 0
-        self._clock = ClockTimer()
-
-    @property
-    def beside(self) -> dict[int, Callable[[], bool]]:
-        """What is to be read beside signals, see `on_signal`."""
-        return {self._clock.fileno(): self._clock_set} if self._clock.works else {}
 
     @property
     def nodes(self) -> tuple[Node, ...]:
@@ -299,11 +290,8 @@ class NodeLoop:
 
     def republish_names(self) -> None:
         """Make every participant of this process publish anew which nodes and endpoints it has."""
-        republish_names(self._of_each_participant())
-
-    def _of_each_participant(self) -> tuple[Node, ...]:
         by_context = {id(node.context): node for node in self._nodes}
-        return (*by_context.values(), *hidden_nodes())
+        republish_names([*by_context.values(), *hidden_nodes()])
 
     def call_soon(self, task: Callable[..., Coroutine[Any, Any, None]], *arguments: object) -> None:
         """Run an `async def` where callbacks of nodes run; from any thread. It must not raise.
@@ -371,15 +359,6 @@ class NodeLoop:
         last()
         leave_and_exit(self._code, nodes=self._nodes, contexts=contexts)
 
-    def _clock_set(self) -> bool:
-        """Have executors look anew how long to wait, and participants send what is due."""
-        if not self._clock.is_set():
-            return False
-        self.call_beside(lambda: wake_participants(self._of_each_participant()))
-        if self._own is not self._executor:
-            self._own.wake()
-        return True
-
     def _turn(self) -> None:
         """Run the next callback under the watchdog."""
         try:
@@ -389,7 +368,7 @@ class NodeLoop:
         if not isinstance(self._watchdog, Watchdog):
             callback()
             return
-        self._watchdog.begin(callback)
+        self._watchdog.begin(callback.entity)
         try:
             callback()
         finally:
@@ -458,11 +437,12 @@ def _executor(kind: Executor, threads: int, context: Context) -> Any:
     return MultiThreadedExecutor(threads or max(2, os.cpu_count() or 0), context=context)
 
 
+_NONE: Mapping[int, Callable[[], bool]] = {}
+
+
 @contextlib.contextmanager
 def on_signal(
-    handler: Callable[[signal.Signals], None],
-    *,
-    beside: Mapping[int, Callable[[], bool]],
+    handler: Callable[[signal.Signals], None], beside: Mapping[int, Callable[[], bool]] = _NONE
 ) -> Iterator[None]:
     """Call `handler` in a thread of its own for each SIGINT and SIGTERM.
 

@@ -34,10 +34,10 @@ from lifecycle.middleware import (
     Overdue,
     ParticipantSettings,
     brief,
+    discovery_by_profile,
     follow_nodes,
+    made_participant,
     node_topic,
-    noting_shared_memory,
-    participant_settings,
 )
 from lifecycle.node.author.managed import Managed
 from lifecycle.node.author.spec import Construction, Mode, constructing, parse_mode
@@ -153,11 +153,13 @@ def run(
     """
     report = functools.partial(_report_line, say or _print)
     mode = parse_mode(lifecycle) if lifecycle is not None else None
-    rclpy.init(
-        args=sys.argv if arguments is None else arguments,
-        domain_id=domain_id,
-        signal_handler_options=SignalHandlerOptions.NO,
-    )
+    settings = ParticipantSettings() if spec is None else ParticipantSettings.of_node(spec)
+    with discovery_by_profile(settings):
+        rclpy.init(
+            args=sys.argv if arguments is None else arguments,
+            domain_id=domain_id,
+            signal_handler_options=SignalHandlerOptions.NO,
+        )
     context = rclpy.get_default_context()
     planned = Run(kind=RunKind.PYTHON) if spec is None else spec.run
     limit_s = (spec.timeouts if spec is not None else Timeouts()).silent_s
@@ -165,9 +167,7 @@ def run(
     loop = NodeLoop(
         context, liveliness.watchdog, executor=planned.executor, threads=planned.threads
     )
-    with on_signal(
-        lambda number: _on_signal(number, loop, report, interrupted), beside=loop.beside
-    ):
+    with on_signal(lambda number: _on_signal(number, loop, report, interrupted)):
         if spec is None:
             node = _make_alone(node_class, mode, context)
             hosted: Hosted = node.lifecycle
@@ -191,17 +191,9 @@ def run(
 
 def _make_alone(node_class: Callable[..., Any], mode: Mode | None, context: Context) -> Any:
     """Make a LifecycleNode that has no plan."""
-    with contextlib.ExitStack() as noting:
-        noting.enter_context(noting_shared_memory(context, is_new=False))
-        construction = Construction(
-            spec=None,
-            mode=mode,
-            context=context,
-            use_global_arguments=True,
-            constructed=noting.close,  # the class may make more participants after that
-        )
-        with constructing(construction):
-            return node_class()
+    construction = Construction(spec=None, mode=mode, context=context, use_global_arguments=True)
+    with made_participant(context, ParticipantSettings()), constructing(construction):
+        return node_class()
 
 
 def _adopt(
@@ -216,13 +208,7 @@ def _adopt(
 
     @contextlib.contextmanager
     def carrying(planned: PlannedNode) -> Iterator[Context]:
-        settings = ParticipantSettings.of(
-            planned.connections,
-            transports=planned.transports,
-            max_datagram_bytes=planned.max_datagram_bytes,
-        )
-        shared_memory = noting_shared_memory(context, is_new=False)
-        with participant_settings(context, settings), shared_memory:
+        with made_participant(context, ParticipantSettings.of_node(planned)):
             yield context
 
     adoption = Adoption(carrying, loop, mode=mode, use_global_arguments=True)

@@ -2,9 +2,8 @@
 
 Owns: `SilenceMonitor`, which turns what is noticed of processes and machines into events, findings
 and the status of nodes. Nothing here waits or asks: the kernel says that a process was stopped or
-that an executor hangs (middleware/process/busy_timer.py), DDS that a machine is lost; reception.py
-looks who receives nothing. A process that ended is not silent but dead, see process_monitor.py.
-Must not import rclpy.
+that an executor hangs (middleware/process/busy_timer.py), DDS that a machine is lost. A process
+that ended is not silent but dead, see process_monitor.py. Must not import rclpy.
 """
 
 from __future__ import annotations
@@ -24,7 +23,6 @@ from lifecycle.supervisor.run.events import (
     Notice,
 )
 from lifecycle.verify import (
-    DEADLOCKED_OBSERVER,
     NOT_ANSWERING,
     SILENT_NODE,
     Finding,
@@ -39,17 +37,12 @@ if TYPE_CHECKING:
     from lifecycle.supervisor.processes.process import ManagedProcess
 
 
-_OBSERVER = "the supervisor's participant"
-_OBSERVER_FIX = "nothing is verified any more; end the system and start it again"
-
-
 class Cause(enum.Enum):
     """Why nothing can be expected of a node; a node may have several at once."""
 
     STOPPED = "stopped"
     HUNG = "hung"
     UNSERVED = "unserved"
-    DEADLOCKED = "deadlocked"
     LOST = "lost"
     REPORTED = "told"
 
@@ -81,7 +74,6 @@ class SilenceMonitor:
         self._listeners = [changed]
         self._silent: dict[str, _Silence] = {}
         self._unanswering: dict[str, str] = {}
-        self._observer_is_deadlocked = ""
 
     @property
     def silent(self) -> Mapping[str, str]:
@@ -142,15 +134,6 @@ class SilenceMonitor:
                 silent_s = self._emit.elapsed_s - silence.since_s
                 there = self._is_there(name)
                 self._emit(NodeAlive(node=name, silent_s=silent_s, there=there))
-        if news:
-            self._tell()
-
-    def observer_is_deadlocked(self, how: str) -> None:
-        """Note how it shows that our own participant receives nothing; empty while it does."""
-        if how and not self._observer_is_deadlocked:
-            self._emit(Notice(message=f"{_OBSERVER} {how}; {_OBSERVER_FIX}"))
-        news = bool(how) is not bool(self._observer_is_deadlocked)
-        self._observer_is_deadlocked = how
         if news:
             self._tell()
 
@@ -230,31 +213,27 @@ class SilenceMonitor:
 
     def findings(self) -> tuple[Finding, ...]:
         """Return one finding for each silent node, and one if we receive nothing ourselves."""
-        return (
-            self._of_the_observer()
-            + tuple(
-                SILENT_NODE.finding(
-                    Outcome.VIOLATED,
-                    subject=name,
-                    expected="alive",
-                    observed=", ".join(cause.value for cause in silence.causes),
-                    message=_message(name, _why(silence)),
-                    node=name,
-                )
-                for name, silence in sorted(self._silent.items())
+        return tuple(
+            SILENT_NODE.finding(
+                Outcome.VIOLATED,
+                subject=name,
+                expected="alive",
+                observed=", ".join(cause.value for cause in silence.causes),
+                message=_message(name, _why(silence)),
+                node=name,
             )
-            + tuple(
-                NOT_ANSWERING.finding(
-                    Outcome.UNVERIFIABLE,
-                    subject=name,
-                    expected="alive",
-                    observed="no answer",
-                    message=_message(name, why),
-                    node=name,
-                )
-                for name, why in sorted(self._unanswering.items())
-                if name not in self._silent
+            for name, silence in sorted(self._silent.items())
+        ) + tuple(
+            NOT_ANSWERING.finding(
+                Outcome.UNVERIFIABLE,
+                subject=name,
+                expected="alive",
+                observed="no answer",
+                message=_message(name, why),
+                node=name,
             )
+            for name, why in sorted(self._unanswering.items())
+            if name not in self._silent
         )
 
     def by_now(self, verdict: Verdict) -> Verdict:
@@ -268,20 +247,6 @@ class SilenceMonitor:
                 each = dataclasses.replace(each, message=message)  # noqa: PLW2901
             found.append(each)
         return dataclasses.replace(verdict, findings=tuple(found))
-
-    def _of_the_observer(self) -> tuple[Finding, ...]:
-        if not self._observer_is_deadlocked:
-            return ()
-        message = f"{_OBSERVER} {self._observer_is_deadlocked}: it sees no change of the graph"
-        return (
-            DEADLOCKED_OBSERVER.finding(
-                Outcome.VIOLATED,
-                subject="supervisor",
-                expected="a graph that is observed",
-                observed="nothing new",
-                message=message,
-            ),
-        )
 
 
 class NodeArrivals:

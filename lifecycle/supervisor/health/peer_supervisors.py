@@ -221,7 +221,7 @@ class PeerSupervisors:
     def _tell(self) -> None:
         """Our own nodes fell silent or came back: say so."""
         liveliness = self._system.liveliness
-        causes = (Cause.DEADLOCKED, Cause.UNSERVED, Cause.HUNG, Cause.STOPPED)
+        causes = (Cause.UNSERVED, Cause.HUNG, Cause.STOPPED)
         said = {name: why for cause in causes for name, why in liveliness.causes(cause).items()}
         if said != self._said and not self._closed:
             self._said = said

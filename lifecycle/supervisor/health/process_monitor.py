@@ -143,6 +143,14 @@ async def _republish(channel: ControlChannel, node: str) -> None:
         await channel.request(node, Operation.REPUBLISH_NAMES)
 
 
+_ANNOUNCED_S = 1.5
+"""For so long at least new participants announce themselves often (middleware/fastdds)."""
+
+
+_TOGETHER_S = 0.02
+"""Those that start side by side are there within a moment: we announce ourselves once to them."""
+
+
 class StaleNodes:
     """Removes what processes of one system leave in the graph when they die.
 
@@ -165,6 +173,8 @@ class StaleNodes:
         self._later: set[asyncio.TimerHandle] = set()
         self._publishing: set[asyncio.Future[None]] = set()
         self._closed = False
+        self._began_s: float | None = None
+        self._announcing: asyncio.TimerHandle | None = None
 
     def on_event(self, event: Event) -> None:
         """Take an event of the system; of interest are ends of processes, and restarted ones."""
@@ -184,6 +194,8 @@ class StaleNodes:
         if node is None or process is None or not process.pid:
             return
         if not (process.is_restarted or process.joins):
+            if process.channel is not None and reach is Reach.STARTED:
+                self._meet(process)
             return
         if self._closed or node.reach is not reach or process.is_gone:
             return
@@ -209,6 +221,27 @@ class StaleNodes:
 
         handle = asyncio.get_running_loop().call_later(pauses[repetition], again)
         self._later.add(handle)
+
+    def _meet(self, process: ManagedProcess) -> None:
+        """Have a process that was started with the others, and listens now, know who is there.
+
+        It would know us, and those that announce themselves no more, up to 3 s later.
+        """
+        now_s = asyncio.get_running_loop().time()
+        self._began_s = now_s if self._began_s is None else self._began_s
+        if now_s - self._began_s < _ANNOUNCED_S:
+            if self._announcing is None:
+                self._announcing = asyncio.get_running_loop().call_later(
+                    _TOGETHER_S, self._announce
+                )
+        else:
+            pids = [each.pid for each in self._system.living if each is not process]
+            self._participant.introduce([process.pid], pids)
+
+    def _announce(self) -> None:
+        self._announcing = None
+        if not self._closed:
+            self._participant.announce_ourselves()
 
     def _is_known(self, node: NodeRun) -> bool:
         """Whether a node is in the graph, and has loaded what it is to load.

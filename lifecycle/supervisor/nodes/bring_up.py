@@ -85,31 +85,14 @@ _GATHERED_S = 0.5
 
 
 class Gathering:
-    """Has hosts meet, or make endpoints, when all of them are ready for it (HostSpec.gathers).
+    """Has hosts meet when all of them are ready for it (HostSpec.gathers).
 
     Args:
         limit_s: seconds, > 0, that any of them waits for the others at most.
-        hosts: how many there will be, > 0.
-        announce: has our participant announce itself to those that it knows. Unannounced ones are
-            not: they are answered.
-        unannounced: see HostSpec.
-        names_by_udp: likewise.
     """
 
-    def __init__(
-        self,
-        limit_s: float,
-        hosts: int,
-        announce: Callable[[], None],
-        *,
-        unannounced: bool = False,
-        names_by_udp: bool = False,
-    ) -> None:
-        self.hosts = hosts
-        self.unannounced = unannounced
-        self.names_by_udp = names_by_udp
+    def __init__(self, limit_s: float) -> None:
         self._limit_s = limit_s
-        self._announce = announce
         self._missing: set[ControlChannel] = set()
         self._waiting: list[ControlChannel] = []
         self._tasks: set[asyncio.Task[None]] = set()
@@ -143,8 +126,6 @@ class Gathering:
             if timer is not None:
                 timer.cancel()
         self._limit = self._quiet = None
-        if self._waiting and not self.unannounced:
-            self._announce()
         for channel in self._waiting:
             channel.proceed()
         self._waiting = []
@@ -167,11 +148,9 @@ class BringUp:
             services is the only one of its name, or raises VerificationError.
         recorded: called after each spawn, to keep the record of children true.
         gives: sets the parameters of a running node that its command line does not give it.
+        unannounced: whether hosts can be, see HostSpec.gathers.
         loads: has the container of this full name load a node, and returns what unloads it.
         wirer: wires each node between its configure and its connect; None leaves it to the nodes.
-        announce: see Gathering.
-        unannounced: whether hosts can be, see HostSpec.
-        names_by_udp: whether names that go so arrive, as far as what runs already matters.
     """
 
     def __init__(
@@ -186,13 +165,10 @@ class BringUp:
         gives: Callable[[PlannedNode], Awaitable[None]] | None = None,
         alone: Callable[[NodeRun], None] | None = None,
         loads: Callable[[PlannedNode, str], Awaitable[Callable[[], Awaitable[None]]]] | None = None,
-        announce: Callable[[], None] = lambda: None,
         unannounced: Callable[[], bool] = lambda: False,
-        names_by_udp: Callable[[], bool] = lambda: False,
     ) -> None:
-        self._announce = announce
         self._unannounced = unannounced
-        self._names_by_udp = names_by_udp
+        self._gathering: Gathering | None = None
         self._gives = gives
         self._alone = alone
         self._loads = loads
@@ -203,7 +179,6 @@ class BringUp:
         self._recorded = recorded
         self._wirer = wirer
         self._starts: dict[str, asyncio.Task[None]] = {}
-        self._gathering: Gathering | None = None
         self._appearing: list[asyncio.Task[None]] = []
         self._failures: list[StepFailedError] = []
         self._in_progress = 0
@@ -295,31 +270,11 @@ class BringUp:
             task.cancel()
         await asyncio.gather(*self._appearing, return_exceptions=True)
 
-    def _no_port_is_taken(self) -> bool:
-        """Return whether names of nodes can go by UDP (ParticipantSettings).
-
-        They arrive at the port that a participant has by its number. It has another one where that
-        is taken, as only participants with transports of their own take it.
-        """
-        return self._names_by_udp() and not any(
-            node.participants or node.transports or node.connections.urls
-            for node in self._system.plan.nodes
-        )
-
     async def _connect_all(self, nodes: Iterable[NodeRun]) -> None:
         nodes = tuple(nodes)
         hosts = {node.planned.process for node in nodes if node.planned.run.kind is RunKind.PYTHON}
-        limit_s = min((node.planned.timeouts.start_s for node in nodes), default=0.0) / 2
-        if hosts:
-            # One alone has nobody to meet.
-            unannounced = len(hosts) > 1 and self._unannounced()
-            self._gathering = Gathering(
-                limit_s,
-                len(hosts),
-                self._announce,
-                unannounced=unannounced,
-                names_by_udp=unannounced and self._no_port_is_taken(),
-            )
+        if len(hosts) > 1 and self._unannounced():  # one alone has nobody to meet
+            self._gathering = Gathering(min(node.planned.timeouts.start_s for node in nodes) / 2)
         try:
             await self._side_by_side(self._walk(node) for node in nodes)
         finally:
@@ -660,17 +615,15 @@ class BringUp:
                     domain_id=self._system.plan.domain_id,
                     discovery_range=self._system.plan.discovery_range,
                     nodes=tuple(node.planned for node in nodes),
-                    gathers=0 if self._gathering is None else self._gathering.hosts,
-                    unannounced=self._gathering is not None and self._gathering.unannounced,
-                    names_by_udp=self._gathering is not None and self._gathering.names_by_udp,
+                    gathers=self._gathering is not None,
                     folders=manifest_folders(node.planned for node in nodes),
                     log=process.log.shown,
                 ),
                 self._system.on_host_event,
                 hung,
             )
-            if self._gathering is not None:
-                self._gathering.expect(channel)
+        if channel is not None and self._gathering is not None:
+            self._gathering.expect(channel)
         try:
             await process.spawn(self._spawner_of(process), channel)
         except (BringUpError, OSError) as error:

@@ -77,9 +77,8 @@ class ObserverParticipant:
             MiddlewareError: it cannot be made.
         """
         from lifecycle.graph import Graph
-        from lifecycle.middleware import import_service_events, widen_discovery_buffers
+        from lifecycle.middleware import widen_discovery_buffers
 
-        import_service_events()  # else the first service that is asked imports numpy for them
         graph = Graph.in_loop(
             domain_id,
             connections,
@@ -215,12 +214,6 @@ class ObserverParticipant:
 
         with self._node.handle:
             return can_be_unannounced(self._node.handle.pointer)
-
-    def names_can_go_by_udp(self) -> bool:
-        """Return whether names of nodes that are started now would arrive, see HostSpec."""
-        from lifecycle.middleware import pairs_are_whole
-
-        return pairs_are_whole(self.discovery.domain_id)
 
     def introduce(
         self, newcomers: Iterable[int], pids: Iterable[int], *, rediscover: bool = False

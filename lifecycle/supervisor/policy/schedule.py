@@ -402,8 +402,8 @@ class RestartSchedule:
     # Watchdog
 
     def _look_at_silent(self) -> None:
-        """Have processes ended that are stopped, hang or receive nothing for too long."""
-        causes = (Cause.HUNG, Cause.STOPPED, Cause.DEADLOCKED)
+        """Have processes ended that are stopped or hang for too long."""
+        causes = (Cause.HUNG, Cause.STOPPED)
         silent = {
             name: why
             for cause in causes

@@ -122,8 +122,7 @@ class NodeSilent:
 
     Attributes:
         cause: "stopped" by a signal, "hung" in a callback, "unserved" by an overloaded machine,
-            "deadlocked" in Fast DDS so that it receives nothing, "lost" from the network, or "told"
-            by its own supervisor.
+            "lost" from the network, or "told" by its own supervisor.
     """
 
     kind: ClassVar[str] = "silent"

@@ -44,7 +44,6 @@ from lifecycle.supervisor.health.process_monitor import (
     Sightings,
     StaleNodes,
 )
-from lifecycle.supervisor.health.reception import watch_reception
 from lifecycle.supervisor.nodes.adoption import adopt, ran_before
 from lifecycle.supervisor.nodes.bring_up import BringUp
 from lifecycle.supervisor.nodes.system import (
@@ -237,9 +236,7 @@ class Session:
             gives=observer_participant.clients.give_parameters,
             loads=observer_participant.load,
             alone=self._alone,
-            announce=observer_participant.announce_ourselves,
             unannounced=observer_participant.can_be_unannounced,
-            names_by_udp=observer_participant.names_can_go_by_udp,
         )
         self._remote_nodes = RemoteNodes(
             system.plan, system.awaited(), observer_participant.graph, self._changes
@@ -344,7 +341,6 @@ class Session:
         self._emit.listen(self._ros_interface.on_event)
         self._ros_interface.begin()
         result = UpResult(exit_code=ExitCode.INTERNAL, verdict=NOT_JUDGED)
-        receiving = asyncio.ensure_future(watch_reception(self._system))
         asking = asyncio.ensure_future(self._answering.follow())
         try:
             with self._signals():
@@ -358,7 +354,6 @@ class Session:
                 if self._hurry.is_set() and result.exit_code == ExitCode.OK:
                     result = _hurried(result)
         finally:
-            await ended(receiving)
             self._stale.close()
             self._judge.close()
             await self._changes.close()

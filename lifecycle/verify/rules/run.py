@@ -75,12 +75,6 @@ NOT_ANSWERING = Rule(
     heals=Heals.WITH_TIME,
     about=About.PRESENCE,
 )
-DEADLOCKED_OBSERVER = Rule(
-    id="run.deadlocked-observer",
-    meaning="the supervisor receives nothing from the graph any more",
-    outcomes=(Outcome.VIOLATED,),
-    fix="end the system and start it again: Fast DDS does not get over it",
-)
 PLANS_DIFFER = Rule(
     id="run.plans-differ",
     meaning="the supervisor of another machine planned another system than this one",
@@ -104,7 +98,6 @@ RULES = (
     NOT_WIRED,
     SILENT_NODE,
     NOT_ANSWERING,
-    DEADLOCKED_OBSERVER,
     PLANS_DIFFER,
     PLAN_UNKNOWN,
 )

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import itertools
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 
@@ -304,23 +302,3 @@ def test_a_package_that_fails_to_import_is_not_said_to_be_missing(
     )
     with pytest.raises(ModuleNotFoundError, match="numpy"):
         import_interface("std_msgs/msg/String")
-
-
-def test_a_service_type_is_loaded_without_numpy_which_its_events_have_when_they_are_made() -> None:
-    code = """
-import sys
-from lifecycle.middleware import load_type_support
-load_type_support("std_srvs/srv/Trigger")
-assert "numpy" not in sys.modules, "numpy is loaded"
-from rclpy.serialization import deserialize_message, serialize_message
-from std_srvs.srv import Trigger
-sent = Trigger.Event()
-sent.info.sequence_number = 7
-assert "numpy" in sys.modules
-sent.info.client_gid[3] = 5
-received = deserialize_message(serialize_message(sent), Trigger.Event)
-import numpy
-assert isinstance(received.info.client_gid, numpy.ndarray), received.info
-assert (received.info.sequence_number, received.info.client_gid[3]) == (7, 5)
-"""
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import socket
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -19,6 +20,7 @@ from rclpy.node import Node
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+from lifecycle import codec
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware import (
@@ -362,6 +364,23 @@ def static(name: str, first: int, *, writer: bool) -> StaticParticipant:
     return StaticParticipant(name=name, endpoints=(own, *graph))
 
 
+_SENDS = """
+import sys, time
+from std_msgs.msg import String
+from lifecycle import codec
+from lifecycle.manifest.qos import QosProfile
+from lifecycle.middleware import FlowParticipant
+from lifecycle.plan import ParticipantConnections
+
+connections = codec.from_json(sys.argv[2].encode(), ParticipantConnections)
+with FlowParticipant("_out", "/", int(sys.argv[1]), connections=connections) as sending:
+    publisher = sending.create_publisher(String, "/flow", QosProfile())
+    while True:
+        publisher.publish(String(data=sys.argv[3]))
+        time.sleep(0.05)
+"""
+
+
 _SEDP_WRITERS = (bytes.fromhex("000003c2"), bytes.fromhex("000004c2"))
 
 
@@ -371,7 +390,13 @@ def test_static_endpoints_find_each_other_without_being_announced(
 ) -> None:
     table = (static("/out", 1, writer=True), static("/in", 11, writer=False))
     one = fixed("udpv4", "127.0.0.1", ports[0:3], ports[4])
-    other = fixed("udpv4", "127.0.0.1", ports[3:6], ports[1])
+    other = ParticipantConnections(
+        urls=(fixed("udpv4", "127.0.0.1", ports[3:6], ports[1]),),
+        static_name="/out",
+        static_participants=table,
+    )
+    command = [sys.executable, "-c", _SENDS, str(fresh_domain), codec.to_json(other).decode(), MARK]
+    got: list[str] = []
     with (
         watching() as loopback,
         FlowParticipant(
@@ -383,21 +408,21 @@ def test_static_endpoints_find_each_other_without_being_announced(
             ),
             served=spun,
         ) as receiving,
-        FlowParticipant(
-            "_out",
-            "/",
-            fresh_domain,
-            connections=ParticipantConnections(
-                urls=(other,), static_name="/out", static_participants=table
-            ),
-        ) as sending,
+        subprocess.Popen(command) as sending,
     ):
-        exchange(sending, receiving, wait_until)
+        try:
+            receiving.create_subscription(String, "/flow", lambda m: got.append(m.data), QOS)
+            wait_until(lambda: got)
+        finally:
+            sending.kill()
+        assert set(got) == {MARK}
         mine = [each for each in loopback.until_now() if each.source in (ports[2], ports[5])]
         assert mine, "they announce themselves"
         assert not [each for each in mine if any(w in each.payload for w in _SEDP_WRITERS)]
         with pytest.raises(MiddlewareError, match="cannot make a writer of '/other'"):
-            sending.create_publisher(String, "/other", QOS)
+            receiving.create_publisher(String, "/other", QOS)
+        with pytest.raises(MiddlewareError, match="this process has it with id 12 already, not 2"):
+            FlowParticipant("_out", "/", fresh_domain, connections=other)
 
 
 # Discovery server ---------------------------------------------------------------------------------

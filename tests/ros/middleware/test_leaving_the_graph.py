@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import pytest
-import rclpy
 from fast_dds_words import without_fast_dds
 from std_msgs.msg import String
 
@@ -20,7 +19,6 @@ from lifecycle.middleware import (
     introduce,
     leftovers,
     segments_of,
-    stop_listening,
     sweep,
 )
 
@@ -140,30 +138,6 @@ def users_of(names: Iterable[str]) -> list[str]:
             if any(f"/{name}\n" in maps.read_text() for name in names):
                 found.append(f"{maps.parent.name} {(maps.parent / 'cmdline').read_bytes()!r}")
     return found
-
-
-def test_a_participant_that_stops_listening_has_no_callback_to_be_waited_for(
-    fresh_domain: int, wait_until: WaitUntil
-) -> None:
-    """What rmw_fastrtps waits for without a bound when it destroys a participant."""
-    contexts = [rclpy.Context() for _ in range(3)]
-    with contextlib.ExitStack() as stack:
-        for each in contexts:
-            each.init(domain_id=fresh_domain)
-            stack.callback(each.try_shutdown)
-        deaf, hearing = (rclpy.create_node(f"n{i}", context=contexts[i]) for i in range(2))
-        stack.callback(hearing.destroy_node)
-        stop_listening(deaf)
-        later = rclpy.create_node("later", context=contexts[2])
-        stack.callback(later.destroy_node)
-        later.create_publisher(String, "/later", 10)
-        wait_until(lambda: hearing.count_publishers("/later") == 1)
-        assert deaf.count_publishers("/later") == 0
-        # Again is harmless, also once it is destroyed.
-        stop_listening(deaf)
-        deaf.destroy_node()
-        stop_listening(deaf)
-        wait_until(lambda: "n0" not in hearing.get_node_names())
 
 
 def test_a_process_that_hangs_with_the_gil_held_still_ends_with_its_code() -> None:

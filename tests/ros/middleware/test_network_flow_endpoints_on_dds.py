@@ -24,6 +24,7 @@ from lifecycle.middleware import (
     create_publisher,
     create_subscription,
     get_network_flow_endpoints,
+    senders_of,
 )
 from lifecycle.middleware.fastdds import nfe
 from lifecycle.middleware.fastdds.dscp import get_dscp
@@ -238,22 +239,20 @@ def test_sender_sockets_are_asked_for_once_in_the_life_of_a_participant(
     make_node: MakeNode, domain_id: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     node = make_node("camera")
-    one, other = (node.create_publisher(String, f"/{each}", 10) for each in ("a", "b"))
-    first = get_network_flow_endpoints(one)
-    participants = len(nfe._SENDERS)
+    other = make_node("other")
+    node.create_publisher(String, "/a", 10)
+    first = senders_of(node)
     with FlowParticipant("_camera_flow_0", "/", domain_id, dscp=46) as participant:
-        flow = participant.create_publisher(String, "/flow", QOS)
-        assert len(nfe._SENDERS) == participants + 1
+        participant.create_publisher(String, "/flow", QOS)
 
         def ask(*arguments: object) -> None:
             raise AssertionError(arguments)
 
         monkeypatch.setattr(nfe, "read_handle", ask)
-        assert get_network_flow_endpoints(other) == first
-        assert get_network_flow_endpoints(flow) == participant.network_flow_endpoints != first
+        assert senders_of(other) == first
+        assert senders_of(participant.node) == participant.network_flow_endpoints != first
         participant.ensure_dscp()
         assert participant.read_dscp() == 46
-    assert len(nfe._SENDERS) == participants
 
 
 def test_the_dscp_of_a_participant_is_read_back_from_every_sender_socket(

@@ -7,7 +7,6 @@ import json
 import os
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -28,8 +27,7 @@ from lifecycle.middleware import (
     has_shared_memory,
     participant_settings,
 )
-from lifecycle.middleware.fastdds import nfe, settings
-from lifecycle.middleware.fastdds.settings import without_localhost
+from lifecycle.middleware.fastdds import nfe
 from lifecycle.network.nfe import NetworkFlowEndpoint, TransportProtocol
 from lifecycle.verify.observation import Identity
 from lifecycle.verify.transport import carrier
@@ -356,28 +354,6 @@ def test_a_mark_that_was_lost_is_set_again_before_a_subscription_is_handed_out(
         assert participant.read_dscp() == 46
 
 
-def test_a_node_is_made_again_for_as_long_as_another_process_has_half_a_pair_of_ports() -> None:
-    """That takes longer than 0.2 s where the processor is busy."""
-    until_s = time.monotonic() + 0.5
-    made: list[bool] = []
-
-    class Made:
-        def __init__(self) -> None:
-            made.append(True)
-
-        def destroy_when_not_in_use(self) -> None:
-            made[-1] = False
-
-    def check() -> None:
-        if made[-1] and time.monotonic() < until_s:
-            raise MiddlewareError("port 7411 is another process's")
-
-    assert isinstance(settings._made_with_names(Made, check), Made)
-    assert time.monotonic() >= until_s
-    assert made.count(True) == 1
-    assert made[-1]
-
-
 def test_whether_a_participant_has_shared_memory_is_seen_by_what_it_opens(
     domain_id: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -412,30 +388,6 @@ def test_shared_memory_is_found_without_leaving_a_subscription(make_node: MakeNo
     ]
 
 
-def test_static_peers_and_the_range_are_read_and_left_as_they_were(
-    domain_id: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("ROS_STATIC_PEERS", "10.0.0.7;robot.local")
-    context = rclpy.Context()
-    context.init(args=[], domain_id=domain_id)
-    for _ in range(2):
-        with without_localhost(context) as peers:
-            assert peers == ("10.0.0.7", "robot.local")
-            with without_localhost(context) as nothing:
-                assert nothing is None
-    context.try_shutdown()
-    context.destroy()
-
-
-@pytest.fixture
-def asked_anew() -> Iterator[None]:
-    """What the RMW can is kept for good in a process, and asked for when a participant ends."""
-    settings._node_functions.cache_clear()
-    yield
-    settings._node_functions.cache_clear()
-
-
-@pytest.mark.usefixtures("asked_anew")
 def test_another_rmw_is_refused_in_words(domain_id: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         "lifecycle.middleware.fastdds.settings.get_rmw_implementation_identifier",

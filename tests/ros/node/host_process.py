@@ -36,9 +36,7 @@ class HostProcess:
         nodes: tuple[PlannedNode, ...],
         log: Path,
         *,
-        gathers: int = 0,
-        unannounced: bool = False,
-        names_by_udp: bool = False,
+        gathers: bool = False,
     ) -> None:
         ours, theirs = socket.socketpair()
         ours.settimeout(30)
@@ -66,8 +64,6 @@ class HostProcess:
             discovery_range=DiscoveryRange.LOCALHOST,
             nodes=nodes,
             gathers=gathers,
-            unannounced=unannounced,
-            names_by_udp=names_by_udp,
         )
         self.send(spec)
 

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import os
-import socket
 import sys
 import time
 from typing import Any
 
 import rclpy
-from edp_heartbeats import heartbeat_periods_s
-from lifecycle_msgs.srv import GetState
 from rclpy.lifecycle import LifecycleNode as RclpyLifecycleNode
 from rclpy.node import Node
 from std_msgs.msg import String
@@ -21,34 +17,6 @@ from lifecycle import LifecycleNode, on_message
 
 class Good(LifecycleNode):
     """Does everything right."""
-
-
-class Waiting(LifecycleNode):
-    """Its constructor waits for the other of the two hosts that have it."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        other = {"one": "other", "other": "one"}[self.get_name()]
-        client = self.create_client(GetState, f"/{other}/get_state")
-        print("met" if client.wait_for_service(10.0) else "alone", file=sys.stderr, flush=True)
-
-
-class WithSocket(LifecycleNode):
-    """Has a UDP socket of its own by then, at a port that a participant might have."""
-
-    def __init__(self) -> None:
-        self.own = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.own.bind(("", int(os.environ["TAKES_UDP_PORT"])))
-        super().__init__()
-
-
-class Heartbeats(LifecycleNode):
-    """Logs the heartbeat periods of its participant."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        with self.handle:
-            print("heartbeats", *heartbeat_periods_s(self.handle.pointer), file=sys.stderr)
 
 
 class Echo(LifecycleNode):

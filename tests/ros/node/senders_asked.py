@@ -1,4 +1,4 @@
-"""Node classes whose process says when it asks for sender sockets, and when it is announced.
+"""Node classes whose process says when it asks for sender sockets.
 
 It also says when it makes a subscription to learn whether it has shared memory.
 """
@@ -12,7 +12,6 @@ from typing import Any
 from hosted import Good, Plain, Theirs
 
 from lifecycle.middleware.fastdds import nfe
-from lifecycle.middleware.fastdds.participant_discovery import Unannounced
 
 __all__ = ["Good", "Plain", "Theirs"]
 
@@ -29,4 +28,3 @@ def _saying(what: str, function: Any) -> Any:
 
 nfe._listens_on_shared_memory = _saying("probed", nfe._listens_on_shared_memory)
 nfe.read_handle = _saying("asked", nfe.read_handle)
-Unannounced.announce = _saying("announced", Unannounced.announce)  # type: ignore[method-assign]

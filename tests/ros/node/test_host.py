@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import os
-import re
 import signal
 import socket
 import subprocess
@@ -22,8 +21,6 @@ from std_msgs.msg import String
 
 from lifecycle import codec
 from lifecycle.manifest.model import DiscoveryRange, Executor, Run, RunKind, Timeouts
-from lifecycle.middleware.fastdds.url_check import open_sockets, udp_sockets
-from lifecycle.network import participant_ports
 from lifecycle.node.host.control import Command, Event, HostSpec, Operation
 
 HERE = Path(__file__).parent
@@ -54,24 +51,11 @@ def test_two_nodes_in_one_process_are_brought_up_and_end_with_the_channel(start:
     assert host.wait() == 0
 
 
-def test_a_host_that_gathers_makes_no_endpoint_before_it_may(
-    start: Start, fresh_domain: int, wait_until: Callable[..., None]
-) -> None:
-    host = start(hosted("one", "Good"), gathers=1)
-    assert host.read() == Event(kind="gathered")
-    with driver_in(fresh_domain) as driver:
-        wait_until(lambda: "one" in driver.node.get_node_names())
-        assert driver.node.get_service_names_and_types_by_node("one", "/") == []
-        host.send(Command(id=0, node="", operation=Operation.PROCEED))
-        host.until("ready")
-    assert host.do("/one", CONFIGURE).ok
-
-
 @pytest.mark.parametrize("class_", ["Good", "Plain", "Theirs"])
 def test_an_unannounced_host_is_discovered_once_it_may_be_and_with_all_it_has(
     start: Start, fresh_domain: int, wait_until: Callable[..., None], class_: str
 ) -> None:
-    host = start(hosted("one", class_, managed=class_ != "Plain"), gathers=2, unannounced=True)
+    host = start(hosted("one", class_, managed=class_ != "Plain"), gathers=True)
     assert host.read() == Event(kind="gathered")
     other = start(hosted("other", "Good"))
     other.until("ready")
@@ -93,6 +77,13 @@ def _services(driver: Driver, node: str) -> list[str]:
     return [name for name, _ in driver.node.get_service_names_and_types_by_node(node, "/")]
 
 
+def test_an_unannounced_host_that_is_ended_while_it_gathers_ends(start: Start) -> None:
+    host = start(hosted("one", "Good"), gathers=True)
+    assert host.read() == Event(kind="gathered")
+    host.hang_up()
+    assert host.wait(5.0) == 0
+
+
 @pytest.mark.parametrize("class_", ["Good", "Plain", "Theirs"])
 def test_a_host_asks_for_its_sender_sockets_before_it_can_have_a_peer_and_never_again(
     start: Start, class_: str
@@ -103,12 +94,7 @@ def test_a_host_asks_for_its_sender_sockets_before_it_can_have_a_peer_and_never_
     host = start(
         hosted("one", class_, out, run=run, managed=class_ != "Plain"),
         hosted("two", "Good", out),
-        gathers=1,
-        unannounced=True,
-        names_by_udp=True,
     )
-    assert host.read() == Event(kind="gathered")
-    host.send(Command(id=0, node="", operation=Operation.PROCEED))
     host.until("ready")
     for node in ("/two",) if class_ == "Plain" else ("/one", "/two"):
         assert host.do(node, CONFIGURE).ok
@@ -119,134 +105,8 @@ def test_a_host_asks_for_its_sender_sockets_before_it_can_have_a_peer_and_never_
     assert told.endpoints[0].nfes[-1].medium == "shm"
     host.hang_up()
     assert host.wait() == 0
-    words = {"asked", "announced", "probed"}
-    said = [each for each in host.log.read_text().split("\n") if each in words]
-    assert said == ["asked", "announced"]
-
-
-def test_unannounced_hosts_meet_before_the_users_constructors_go_on(start: Start) -> None:
-    hosts = [
-        start(hosted(name, "Waiting"), gathers=2, unannounced=True) for name in ("one", "other")
-    ]
-    for host in hosts:
-        assert host.read() == Event(kind="gathered")
-    for host in hosts:
-        host.send(Command(id=0, node="", operation=Operation.PROCEED))
-    for host in hosts:
-        host.until("ready")
-        assert "met" in host.log.read_text()
-
-
-def test_a_host_whose_module_has_made_its_participant_waits_for_the_others_all_the_same(
-    start: Start, fresh_domain: int, wait_until: Callable[..., None]
-) -> None:
-    late = dataclasses.replace(
-        hosted("one", "Late", publisher("out")),
-        run=Run(kind=RunKind.PYTHON, python="at_import:Late"),
-    )
-    host = start(late, gathers=2, unannounced=True)
-    assert host.read() == Event(kind="gathered")
-    host.send(Command(id=0, node="", operation=Operation.PROCEED))
-    host.until("ready")
-    with driver_in(fresh_domain) as driver:
-        wait_until(lambda: _services(driver, "one"))
-    assert host.do("/one", CONFIGURE).ok
-    connected = host.do("/one", CONNECT)
-    assert connected.configuration is not None
-    nfes = connected.configuration.endpoints[0].nfes
-    assert nfes is not None
-    assert [each.medium for each in nfes].count("shm") == 1
-
-
-def test_an_unannounced_host_that_is_ended_while_it_gathers_ends(start: Start) -> None:
-    host = start(hosted("one", "Good"), gathers=2, unannounced=True)
-    assert host.read() == Event(kind="gathered")
-    host.hang_up()
-    assert host.wait(5.0) == 0
-
-
-@pytest.mark.parametrize(
-    ("variables", "has"),
-    [({}, False), ({"FASTDDS_BUILTIN_TRANSPORTS": "DEFAULT"}, True)],
-)
-def test_names_have_no_port_of_shared_memory_unless_transports_are_chosen(
-    start: Start, monkeypatch: pytest.MonkeyPatch, variables: dict[str, str], has: bool
-) -> None:
-    monkeypatch.delenv("FASTDDS_BUILTIN_TRANSPORTS", raising=False)
-    for name, value in variables.items():
-        monkeypatch.setenv(name, value)
-    host = start(hosted("one", "Good"), gathers=1, names_by_udp=True)
-    host.send(Command(id=0, node="", operation=Operation.PROCEED))
-    host.until("ready")
-    threads = [
-        (each / "comm").read_text() for each in Path(f"/proc/{host.process.pid}/task").iterdir()
-    ]
-    # rmw asks for ports from 7000 on for them, Fast DDS names threads by ports.
-    assert any(re.match(r"dds\.shm\.70\d\d", each) for each in threads) is has
-    assert any(each.startswith("dds.shm.") for each in threads)
-    # What Fast DDS says of it is kept from the log, and the thread that says it is ended.
-    assert host.log.read_text() == ""
-    assert not any(each.startswith("dds.log") for each in threads)
-
-
-def test_a_host_waits_for_a_port_of_a_participant_that_leaves(
-    start: Start, fresh_domain: int, wait_until: Callable[..., None]
-) -> None:
-    """One that leaves closes its ports one after the other."""
-    ports = participant_ports(fresh_domain, 0)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as leaving:
-        leaving.bind(("", ports.user_unicast))
-        host = start(hosted("one", "Good"), gathers=1, names_by_udp=True)
-        # It takes the next one for data, to which nobody sends names.
-        next_one = participant_ports(fresh_domain, 1).user_unicast
-        wait_until(lambda: next_one in {each.port for each in udp_sockets()})
-    host.send(Command(id=0, node="", operation=Operation.PROCEED))
-    host.until("ready")
-    own = {each.port for each in open_sockets(host.process.pid)}
-    assert {ports.discovery_unicast, ports.user_unicast} <= own
-    assert host.do("/one", CONFIGURE).ok
-
-
-def test_a_socket_of_a_node_s_own_is_not_taken_for_a_participant_s(
-    start: Start, fresh_domain: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """In domains above 101 the kernel itself may give it such a port."""
-    port = participant_ports(fresh_domain, 9).discovery_unicast
-    monkeypatch.setenv("TAKES_UDP_PORT", str(port))
-    host = start(hosted("one", "WithSocket"), gathers=1, names_by_udp=True)
-    host.send(Command(id=0, node="", operation=Operation.PROCEED))
-    host.until("ready")
-    own = {each.port for each in open_sockets(host.process.pid)}
-    assert port in own
-    assert participant_ports(fresh_domain, 0).user_unicast in own
-    assert host.do("/one", CONFIGURE).ok
-
-
-def test_a_host_to_which_no_names_would_arrive_says_so(start: Start, fresh_domain: int) -> None:
-    port = participant_ports(fresh_domain, 0).user_unicast
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
-        taken.bind(("", port))
-        host = start(hosted("one", "Good"), gathers=1, names_by_udp=True)
-        failed, _ = host.until("failed")
-    assert f"UDP port {port} is another process's" in failed.error
-    assert host.wait() == 1
-
-
-@pytest.mark.parametrize(("gathers", "period_s"), [(1, 1.0), (60, 3.0)])
-def test_heartbeats_of_a_host_follow_how_many_gather(
-    start: Start, gathers: int, period_s: float
-) -> None:
-    host = start(hosted("one", "Heartbeats"), gathers=gathers)
-    host.send(Command(id=0, node="", operation=Operation.PROCEED))
-    host.until("ready")
-    assert f"heartbeats {period_s} {period_s}" in host.log.read_text()
-
-
-def test_a_host_that_is_ended_while_it_gathers_ends(start: Start) -> None:
-    host = start(hosted("one", "Good"), gathers=1)
-    assert host.read() == Event(kind="gathered")
-    host.hang_up()
-    assert host.wait(5.0) == 0
+    said = [each for each in host.log.read_text().split("\n") if each in {"asked", "probed"}]
+    assert said == ["asked"]
 
 
 def test_every_change_of_state_is_told_before_the_reply(start: Start) -> None:
@@ -493,7 +353,7 @@ def test_what_hosts_are_forked_from_imports_only_what_every_node_needs() -> None
     modules, also = subprocess.check_output(
         [sys.executable, "-c", code], text=True, timeout=30
     ).splitlines()
-    unused = {"asyncio", "click", "jsonschema", "lifecycle.graph", "lifecycle.plan.build", "numpy"}
+    unused = {"asyncio", "click", "jsonschema", "lifecycle.graph", "lifecycle.plan.build"}
     assert unused.union({"lifecycle.verify.judge", "rclpy.action", "sensor_msgs"}).isdisjoint(
         modules.split()
     )

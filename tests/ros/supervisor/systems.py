@@ -80,18 +80,6 @@ class Talker(LifecycleNode):
         self.publisher("chatter").publish(String(data="hello"))
 
 
-class Ticking(LifecycleNode):
-    """Has nothing but a timer: nothing else wakes its executor."""
-
-    def on_configure(self, state):
-        self._ticks = 0
-        self.create_timer(0.3, self._tick)
-
-    def _tick(self) -> None:
-        self._ticks += 1
-        print(f"tick {self._ticks}", flush=True)
-
-
 class Numbered(Talker):
     """Says which process it is."""
 

@@ -25,30 +25,6 @@ _THIRD = {
 """Another listener."""
 
 
-def test_a_node_that_receives_nothing_any_more_is_silent_and_started_again_by_its_watchdog(
-    tmp_path: Path, fresh_domain: int
-) -> None:
-    entry = {
-        "run": {
-            "python": "tests.ros.liveliness.nodes:Deadlocked",
-            "working_directory": str(tmp_path),
-        },
-        "restart": "on-failure",
-        "watchdog_sec": 0.5,
-    }
-    with up(pair(tmp_path, fresh_domain, edit={"nodes/locked": entry}), runtime=tmp_path) as run:
-        run.until("system", reached="active")
-        silent = run.until("silent", node="/locked")
-        assert silent["cause"] == "deadlocked"
-        assert f"pid {run.pid_of('locked')}" in silent["message"]
-        assert run.until("failure", rule="run.process-died")["ends_run"] is False
-        assert run.until("restarted")["process"] == "locked"
-        assert run.of_kind("verdict")[-1]["verdict"]["verdict"] == "ok"
-        status = verb("status", "pair", "--format", "json", runtime=tmp_path)
-        found = {each["node"]: each for each in json.loads(status.stdout)["nodes"]}
-        assert "its watchdog ended it after 0.5 s" in found["/locked"]["last_failure"]["message"]
-
-
 def test_a_killed_node_of_three_is_active_and_verified_again_and_the_others_go_on(
     tmp_path: Path, fresh_domain: int
 ) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import shutil
 import signal
 import socket
@@ -66,6 +65,23 @@ def test_a_healthy_system_is_connected_verified_activated_held_and_taken_down(
         assert (logs / "listener.log").read_text() == "heard hello\n"
 
 
+OTHER_VERSIONS = """
+import ctypes
+
+library = ctypes.CDLL
+
+
+class Library(library):
+    def __init__(self, name, *arguments, **options):
+        if name and "libfastrtps.so" in name:
+            raise OSError(f"{name}: cannot open shared object file: No such file or directory")
+        super().__init__(name, *arguments, **options)
+
+
+ctypes.CDLL = Library
+"""
+
+
 NOTES_ANNOUNCING = """
 from lifecycle.middleware.fastdds.participant_discovery import Unannounced
 from tests.ros.supervisor.systems import Listener, Talker
@@ -102,43 +118,6 @@ def test_processes_that_start_together_are_discovered_once_they_have_their_endpo
         for name in ("talker", "listener"):
             said = verb("logs", name, runtime=tmp_path).stdout
             assert said.count("announced") == 1, said
-
-
-@pytest.mark.parametrize("taken", [False, True])
-def test_names_of_nodes_go_by_shared_memory_where_another_process_has_a_port_for_them(
-    tmp_path: Path, fresh_domain: int, *, taken: bool
-) -> None:
-    """It is no participant: the processes of a system start all at once, each with two ports."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
-        if taken:
-            stranger.bind(("", participant_ports(fresh_domain, 1).user_unicast))
-        with up(pair(tmp_path, fresh_domain), runtime=tmp_path) as run:
-            run.until("system", reached="active")
-            for name in ("talker", "listener"):
-                threads = Path(f"/proc/{run.pid_of(name)}/task").iterdir()
-                named = {(each / "comm").read_text().strip() for each in threads}
-                # rmw asks for ports from 7000 on for them, Fast DDS names threads by ports.
-                assert any(re.match(r"dds\.shm\.70\d\d", each) for each in named) is taken
-            run.signal(signal.SIGINT)
-            assert run.finish() == ExitCode.INTERRUPTED
-            run.assert_nothing_left()
-
-
-OTHER_VERSIONS = """
-import ctypes
-
-library = ctypes.CDLL
-
-
-class Library(library):
-    def __init__(self, name, *arguments, **options):
-        if name and "libfastrtps.so" in name:
-            raise OSError(f"{name}: cannot open shared object file: No such file or directory")
-        super().__init__(name, *arguments, **options)
-
-
-ctypes.CDLL = Library
-"""
 
 
 def test_with_libraries_that_are_not_known_all_but_unique_flows_is_verified(

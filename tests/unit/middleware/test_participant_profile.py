@@ -13,11 +13,9 @@ from lifecycle.middleware.fastdds.participant_profile import (
     DefaultProfile,
     ParticipantSettings,
     default_profile,
-    for_a_host,
     profile,
 )
 from lifecycle.middleware.fastdds.profiles import discovery_profile
-from lifecycle.network import RMW_DISCOVERY, parse
 
 UDP = ParticipantSettings(transports=("udpv4",))
 USERS = """<?xml version="1.0"?>
@@ -151,6 +149,12 @@ def test_an_unannounced_participant_ignores_all_and_announces_itself_less(tmp_pa
     assert texts(root, ".//initialAnnouncements/period/nanosec") == ["500000000"]
 
 
+def test_an_observer_announces_itself_often_at_first() -> None:
+    root = made(ParticipantSettings(announces_often=True))
+    assert texts(root, ".//initialAnnouncements/count") == ["60"]
+    assert texts(root, ".//initialAnnouncements/period/nanosec") == ["50000000"]
+
+
 @pytest.mark.parametrize(
     ("protocol", "made_so"),
     [("CLIENT", "SUPER_CLIENT"), ("SIMPLE", "SIMPLE"), ("SERVER", "SERVER")],
@@ -167,101 +171,6 @@ def test_of_a_server_that_a_profile_names_only_a_client_becomes_a_super_client(
     base = default_profile({"FASTRTPS_DEFAULT_PROFILES_FILE": str(path)})
     root = made(ParticipantSettings(super_client=True), base=base)
     assert texts(root, ".//discoveryProtocol") == [made_so]
-
-
-def test_names_by_udp_have_a_locator_at_both_ends_and_heartbeats_as_asked() -> None:
-    root = made(ParticipantSettings(names_by_udp=True))
-    for tag in ("data_writer", "data_reader"):
-        (element,) = root.findall(f".//{tag}")
-        assert element.get("profile_name") == "ros_discovery_info"
-        assert [each.tag for each in element.findall("unicastLocatorList/locator/*")] == ["udpv4"]
-    assert texts(root, ".//disable_heartbeat_piggyback") == []
-    slower = made(ParticipantSettings(names_by_udp=True, names_heartbeat_s=1.25))
-    assert texts(slower, ".//data_writer/qos/disable_heartbeat_piggyback") == ["true"]
-    assert texts(slower, ".//data_writer/times/heartbeatPeriod/*") == ["1", "250000000"]
-    assert slower.findall(".//data_reader/times") == []
-
-
-def test_an_observer_asks_soon_for_names_that_it_has_not_received() -> None:
-    root = made(ParticipantSettings(transports=(RMW_DISCOVERY,), asks_for_names_soon=True))
-    (element,) = root.findall(".//data_reader")
-    assert element.get("profile_name") == "ros_discovery_info"
-    assert texts(root, ".//data_reader/times/initialAcknackDelay/*") == ["0", "5000000"]
-    assert texts(root, ".//data_reader/times/heartbeatResponseDelay/*") == ["0", "1000000"]
-    assert root.findall(".//unicastLocatorList") == []
-    assert bool(ParticipantSettings(asks_for_names_soon=True))
-
-
-_QUICK = object()
-
-
-@pytest.mark.parametrize(
-    ("settings", "environment", "unannounced", "names"),
-    [
-        ({}, {}, True, True),
-        ({}, {"FASTRTPS_DEFAULT_PROFILES_FILE": _QUICK}, True, True),
-        ({"max_datagram_bytes": 1400}, {}, True, True),
-        ({"transports": ("udpv4",)}, {}, True, False),
-        ({}, {"FASTDDS_BUILTIN_TRANSPORTS": "DEFAULT"}, True, False),
-        ({}, {"ROS_DISCOVERY_SERVER": "127.0.0.1:11811"}, False, True),
-        ({}, {"FASTRTPS_DEFAULT_PROFILES_FILE": "mine.xml"}, False, False),
-        ({"urls": (parse("udpv4://127.0.0.1:7400"),)}, {}, False, False),
-    ],
-)
-def test_a_host_gets_what_its_environment_leaves_open(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    settings: dict[str, Any],
-    environment: dict[str, Any],
-    unannounced: bool,
-    names: bool,
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    users(tmp_path)
-    (tmp_path / "quick.xml").write_text(discovery_profile())
-    variables = {
-        name: "quick.xml" if value is _QUICK else value for name, value in environment.items()
-    }
-    before = ParticipantSettings(**settings)
-    found = for_a_host(before, variables, unannounced=True, names_by_udp=True, participants=50)
-    assert (found.unannounced, found.names_by_udp) == (unannounced, names)
-    assert found.names_heartbeat_s == (0.5 if names else None)
-    assert bool(found) or found == before
-    few = for_a_host(before, variables, unannounced=True, names_by_udp=True, participants=23)
-    assert (few.names_by_udp, few.names_heartbeat_s) == (names, None)
-    alone = for_a_host(before, variables, unannounced=False, names_by_udp=False, participants=3)
-    assert alone == before
-
-
-@pytest.mark.parametrize(("participants", "heartbeat_s"), [(23, None), (24, 0.24), (100, 1.0)])
-def test_heartbeats_of_names_follow_how_many_are_made_together(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    participants: int,
-    heartbeat_s: float | None,
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    for by_udp in (True, False):
-        found = for_a_host(
-            ParticipantSettings(),
-            {},
-            unannounced=True,
-            names_by_udp=by_udp,
-            participants=participants,
-        )
-        assert found.names_heartbeat_s == (heartbeat_s if by_udp else None)
-
-
-def test_names_are_left_alone_beside_a_file_of_the_working_directory(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """It may have a profile for them without having one for participants."""
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "DEFAULT_FASTRTPS_PROFILES.xml").write_text("<dds/>")
-    found = for_a_host(
-        ParticipantSettings(), {}, unannounced=True, names_by_udp=True, participants=50
-    )
-    assert found == ParticipantSettings(unannounced=True)
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,6 @@ from lifecycle.middleware.discovery.probe import (
     Probe,
     ProbeTarget,
     answered_at,
-    answers_unasked,
     chosen_otherwise,
     connects_first,
     dispose_of_announced,
@@ -158,24 +157,6 @@ def test_where_participants_are_told_whom_to_look_for_ours_announces_itself_by_i
     assert answered_at(25, (parse(url),) if url else (), environment) == ()
 
 
-@pytest.mark.parametrize(
-    ("url", "environment", "unasked"),
-    [
-        ("", {}, False),
-        ("", {"FASTDDS_BUILTIN_TRANSPORTS": "SHM"}, True),
-        ("", {"FASTDDS_BUILTIN_TRANSPORTS": "SHM", "ROS_DISCOVERY_SERVER": "127.0.0.1"}, False),
-        ("", {"FASTDDS_BUILTIN_TRANSPORTS": "LARGE_DATA?max_msg_size=1MB"}, True),
-        ("shm://", {}, True),
-        ("tcpv4://127.0.0.1:7911", {}, False),
-        ("udpv4://127.0.0.1:7911?metatraffic_port=7910", {}, False),
-    ],
-)
-def test_who_cannot_be_asked_answers_who_is_announced_once_it_listens(
-    url: str, environment: dict[str, str], *, unasked: bool
-) -> None:
-    assert answers_unasked((parse(url),) if url else (), environment) is unasked
-
-
 _SUBNET = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}
 
 
@@ -288,7 +269,6 @@ def test_a_profile_of_the_users_is_read_for_a_discovery_server(
     )
     environment = {"FASTRTPS_DEFAULT_PROFILES_FILE": str(file)}
     assert is_served((), environment) is served
-    assert answers_unasked((), environment) is not served
     assert not is_served((parse("shm://"),), environment)
 
 

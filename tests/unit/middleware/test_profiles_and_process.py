@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import socket
 import subprocess
 import sys
@@ -10,11 +9,10 @@ import time
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
-import psutil
 import pytest
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware import exit_after, interface_addresses, widen_discovery_buffers
+from lifecycle.middleware import exit_after, widen_discovery_buffers
 from lifecycle.middleware.fastdds.profiles import discovery_environment, discovery_profile
 from lifecycle.network import participant_ports
 
@@ -104,44 +102,6 @@ def test_the_deadman_ends_a_process_that_holds_the_gil() -> None:
     assert time.monotonic() - began < 10
 
 
-_TERMINATES = """
-import ctypes, sys, threading
-from lifecycle.middleware import exit_after
-
-cpp = ctypes.CDLL("libstdc++.so.6")
-live_on = exit_after({seconds}, 42)
-{then}
-thread = threading.Thread(target=cpp["_ZSt9terminatev"])
-thread.start()
-{meanwhile}
-thread.join()
-"""
-
-
-@pytest.mark.parametrize(
-    ("seconds", "then", "meanwhile", "code"),
-    [
-        (20, "", "", 42),
-        # What ends it waits for who holds the GIL, if that is not too late.
-        (1, "", "ctypes.PyDLL(None).sleep(60)", 42),
-        (20, "live_on()", "", -signal.SIGABRT),
-    ],
-)
-def test_what_cpp_does_not_catch_ends_a_process_that_leaves_as_it_would_have_ended(
-    seconds: float, then: str, meanwhile: str, code: int
-) -> None:
-    """Fast DDS 2.14 throws when a socket of TCP is closed by another of its threads."""
-    program = _TERMINATES.format(seconds=seconds, then=then, meanwhile=meanwhile)
-    began = time.monotonic()
-    done = subprocess.run(
-        [sys.executable, "-c", program], check=False, timeout=30, capture_output=True, text=True
-    )
-    assert done.returncode == code
-    assert time.monotonic() - began < 10
-    if not then and not meanwhile:
-        assert done.stderr == "the process ends at once: an exception was not caught in C++\n"
-
-
 def test_an_orphan_is_adopted_by_the_subreaper() -> None:
     reaper = (
         "import os, subprocess, sys, time\n"
@@ -178,16 +138,3 @@ def test_only_sockets_that_receive_discovery_of_the_domain_get_more_room() -> No
     assert after > before
     before, after = room(ports.user_unicast)
     assert after == before
-
-
-def test_the_addresses_of_interfaces_are_those_that_psutil_knows() -> None:
-    families = socket.AF_INET, socket.AF_INET6
-    known = {
-        (name, entry.address.partition("%")[0])
-        for name, entries in psutil.net_if_addrs().items()
-        for entry in entries
-        if entry.family in families
-    }
-    assert ("lo", "127.0.0.1") in known
-    assert set(interface_addresses(*families)) == known
-    assert set(interface_addresses(socket.AF_INET)) == {each for each in known if "." in each[1]}

@@ -12,10 +12,6 @@ from lifecycle.node.host.loop import Watchdog
 from lifecycle.node.lifecycle.machine import NodeState
 
 
-def callback() -> None:
-    """What runs, or not: the watchdog only knows of it."""
-
-
 class Sign:
     """A busy sign that remembers."""
 
@@ -76,7 +72,7 @@ def added(dog: Watchdog, name: str) -> Node:
 
 
 def test_the_sign_says_busy_exactly_while_a_callback_runs(dog: Watchdog, sign: Sign) -> None:
-    dog.begin(callback)
+    dog.begin(None)
     assert sign.busy
     dog.end()
     assert not sign.busy
@@ -84,7 +80,7 @@ def test_the_sign_says_busy_exactly_while_a_callback_runs(dog: Watchdog, sign: S
 
 def test_a_transition_inside_a_callback_is_not_held_against_it(dog: Watchdog, sign: Sign) -> None:
     node = added(dog, "/camera")
-    dog.begin(callback)
+    dog.begin(None)
     node.become(NodeState.CONFIGURING)
     assert not sign.busy
     node.become(NodeState.INACTIVE_DISCONNECTED)
@@ -95,20 +91,20 @@ def test_callbacks_are_not_watched_while_an_async_transition_is_under_way(
     dog: Watchdog, sign: Sign
 ) -> None:
     node = added(dog, "/camera")
-    dog.begin(callback)
+    dog.begin(None)
     node.become(NodeState.CONFIGURING)
     dog.end()
-    dog.begin(callback)
+    dog.begin(None)
     assert not sign.busy
     node.become(NodeState.INACTIVE_DISCONNECTED)
     dog.end()
-    dog.begin(callback)
+    dog.begin(None)
     assert sign.busy
 
 
 def test_of_two_transitions_both_must_end(dog: Watchdog, sign: Sign) -> None:
     one, other = added(dog, "/one"), added(dog, "/other")
-    dog.begin(callback)
+    dog.begin(None)
     one.become(NodeState.CONFIGURING)
     other.become(NodeState.CONFIGURING)
     one.become(NodeState.INACTIVE_DISCONNECTED)
@@ -121,12 +117,12 @@ def test_a_callback_that_came_back_late_is_told(
     dog: Watchdog, sign: Sign, overlong: list[float]
 ) -> None:
     sign.overlong = 1.5
-    dog.begin(callback)
+    dog.begin(None)
     dog.end()
     assert overlong == [1.5]
 
 
 def test_a_callback_in_time_is_not_told(dog: Watchdog, overlong: list[float]) -> None:
-    dog.begin(callback)
+    dog.begin(None)
     dog.end()
     assert overlong == []

@@ -196,8 +196,6 @@ class FakeProcess:
         reader, writer = await asyncio.open_connection(sock=control)
         with contextlib.closing(writer):
             spec = from_json(await reader.readline(), HostSpec)
-            self._spawner.gathers.append((spec.gathers, spec.unannounced))
-            self._spawner.names_by_udp.append(spec.names_by_udp)
             if await self._cannot_host(writer):
                 return
             nodes = [node.full_name for node in spec.nodes]
@@ -294,8 +292,6 @@ class FakeSpawner:
         tells: hosts tell unasked what nodes report whenever that changes, as ours do.
         nodes: full names of the nodes that are in the graph, by process.
         changed: called whenever the graph looks otherwise.
-        gathers: what each host was given of it and of `unannounced`, see HostSpec.
-        names_by_udp: likewise.
     """
 
     def __init__(self) -> None:
@@ -311,8 +307,6 @@ class FakeSpawner:
         self.reports_changes = False
         self.nodes: dict[str, tuple[str, ...]] = {}
         self.changed: Callable[[], None] = lambda: None
-        self.gathers: list[tuple[int, bool]] = []
-        self.names_by_udp: list[bool] = []
         self._pid = _FIRST_PID
 
     def next_pid(self) -> int:
@@ -445,16 +439,12 @@ class World:
         self.emit.listen(self.events.append)
         self.system = System(plan, emit=self.emit, logs=directory, processes=plan.processes)
         self.appeared: dict[str, asyncio.Event] = {}
-        self.can_be_unannounced = False
-        self.names_can_go_by_udp = True
         self.bring_up = BringUp(
             self.system,
             spawner_of=lambda _: self.spawner,
             services=self._no_services,
             appears=self._appears,
             recorded=lambda: None,
-            unannounced=lambda: self.can_be_unannounced,
-            names_by_udp=lambda: self.names_can_go_by_udp,
         )
 
     @property

@@ -312,9 +312,6 @@ class FakeParticipant:
     def can_be_unannounced(self) -> bool:
         return False
 
-    def names_can_go_by_udp(self) -> bool:
-        return False
-
     def announce_machine(self, system: str, machine: str) -> _Connection:
         raise AssertionError(f"{system} has no other machine than {machine}")
 

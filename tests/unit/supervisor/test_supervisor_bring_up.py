@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 import signal
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -50,53 +49,6 @@ async def test_nodes_without_an_order_come_up_side_by_side(tmp_path: Path) -> No
     await world.bring_up.connect(LIMIT_S)
     assert asyncio.get_running_loop().time() - began == pytest.approx(6.0, abs=0.1)
     await _down(world)
-
-
-@pytest.mark.parametrize(
-    ("names", "can_be", "gathers"),
-    [
-        ("abc", True, [(3, True)] * 3),
-        ("abc", False, [(3, False)] * 3),
-        ("a", True, [(1, False)]),  # nobody to meet
-    ],
-)
-def test_hosts_are_given_how_many_of_them_make_participants_together(
-    tmp_path: Path, names: str, can_be: bool, gathers: list[tuple[int, bool]]
-) -> None:
-    async def main() -> list[tuple[int, bool]]:
-        world = _world(tmp_path, *(planned_node(name) for name in names))
-        world.can_be_unannounced = can_be
-        await world.bring_up.connect(LIMIT_S)
-        await _down(world)
-        return world.spawner.gathers
-
-    assert run(main()) == gathers
-
-
-@pytest.mark.parametrize(
-    ("count", "can_be", "arrive", "changes", "by_udp"),
-    [
-        (2, True, True, {}, True),
-        (40, True, True, {}, True),
-        (1, True, True, {}, False),
-        (2, False, True, {}, False),
-        # Its port may be another's.
-        (2, True, False, {}, False),
-        (2, True, True, {"transports": ("udpv6",)}, False),
-    ],
-)
-def test_names_go_by_udp_where_no_port_is_taken(
-    tmp_path: Path, count: int, can_be: bool, arrive: bool, changes: dict[str, Any], by_udp: bool
-) -> None:
-    async def main() -> list[bool]:
-        nodes = [planned_node(f"n{number}") for number in range(count)]
-        world = _world(tmp_path, *nodes[1:], dataclasses.replace(nodes[0], **changes))
-        world.can_be_unannounced, world.names_can_go_by_udp = can_be, arrive
-        await world.bring_up.connect(LIMIT_S)
-        await _down(world)
-        return world.spawner.names_by_udp
-
-    assert run(main()) == [by_udp] * count
 
 
 async def test_a_bring_up_that_was_cancelled_twice_starts_everything_anew_the_next_time(
@@ -627,22 +579,22 @@ class _Host:
         self.proceeded_at = asyncio.get_running_loop().time()
 
 
-def test_our_participant_is_not_announced_to_unannounced_hosts() -> None:
+@pytest.mark.parametrize(
+    ("hosts", "limit_s", "proceeded_at"),
+    [
+        ((_Host(0.1), _Host(0.4), _Host(0.3)), 5.0, [0.4, 0.4, 0.4]),
+        ((_Host(0.1), _Host(0.2, fails=True)), 5.0, [0.2, None]),
+        # One that imports for long is not waited for.
+        ((_Host(0.1), _Host(0.3), _Host(9.0)), 5.0, [0.8, 0.8, 9.0]),
+        ((_Host(0.1, fails=True), _Host(0.3), _Host(0.7)), 5.0, [None, 0.7, 0.7]),
+        ([_Host(0.4 * (each + 1)) for each in range(5)], 1.0, [1.4, 1.4, 1.4, 2.0, 2.0]),
+    ],
+)
+def test_hosts_meet_once_the_last_of_them_has_its_endpoints(
+    hosts: Sequence[_Host], limit_s: float, proceeded_at: list[float | None]
+) -> None:
     async def main() -> list[float | None]:
-        hosts = (_Host(0.1), _Host(0.3))
-        gathering = Gathering(5.0, 2, lambda: pytest.fail("announced"), unannounced=True)
-        for host in hosts:
-            gathering.expect(host)  # type: ignore[arg-type]
-        await asyncio.sleep(1.0)
-        await gathering.close()
-        return [each.proceeded_at for each in hosts]
-
-    assert None not in run(main())
-
-
-def _proceeding(*hosts: _Host, limit_s: float = 5.0) -> list[float | None]:
-    async def main() -> list[float | None]:
-        gathering = Gathering(limit_s, len(hosts), lambda: None)
+        gathering = Gathering(limit_s)
         began = asyncio.get_running_loop().time()
         for host in hosts:
             gathering.expect(host)  # type: ignore[arg-type]
@@ -653,45 +605,4 @@ def _proceeding(*hosts: _Host, limit_s: float = 5.0) -> list[float | None]:
             for host in hosts
         ]
 
-    return run(main())
-
-
-def test_hosts_make_their_endpoints_once_the_last_participant_is_there() -> None:
-    assert _proceeding(_Host(0.1), _Host(0.4), _Host(0.3)) == [0.4, 0.4, 0.4]
-
-
-async def test_hosts_are_told_of_us_once_they_listen_and_before_they_have_endpoints() -> None:
-    met: list[list[float | None]] = []
-    hosts = (_Host(0.1, fails=True), _Host(0.2), _Host(0.3))
-    gathering = Gathering(
-        5.0, len(hosts), lambda: met.append([each.proceeded_at for each in hosts])
-    )
-    for host in hosts:
-        gathering.expect(host)  # type: ignore[arg-type]
-    await asyncio.sleep(1.0)
-    await gathering.close()
-    assert met == [[None, None, None]]
-    assert [each.proceeded_at is None for each in hosts] == [True, False, False]
-
-
-def test_a_host_that_cannot_be_made_holds_no_other() -> None:
-    assert _proceeding(_Host(0.1), _Host(0.2, fails=True)) == [0.2, None]
-
-
-def test_hosts_wait_for_one_that_imports_for_long_no_longer_than_half_a_second() -> None:
-    assert _proceeding(_Host(0.1), _Host(0.3), _Host(9.0)) == [0.8, 0.8, 9.0]
-
-
-def test_a_host_that_fails_first_does_not_cut_short_what_the_others_wait_for() -> None:
-    hosts = (_Host(0.1, fails=True), _Host(0.3), _Host(0.7))
-    assert _proceeding(*hosts) == [None, 0.7, 0.7]
-
-
-def test_hosts_hold_none_beyond_the_limit_where_one_failed_first() -> None:
-    hosts = [_Host(0.1, fails=True), *(_Host(0.4 * (index + 1)) for index in range(5))]
-    assert _proceeding(*hosts, limit_s=1.0)[1:4] == [1.4, 1.4, 1.4]
-
-
-def test_hosts_that_come_one_after_the_other_hold_none_beyond_the_limit() -> None:
-    hosts = [_Host(0.4 * (index + 1)) for index in range(10)]
-    assert _proceeding(*hosts, limit_s=1.0)[:5] == [1.4, 1.4, 1.4, 2.6, 2.6]
+    assert run(main()) == proceeded_at

@@ -20,7 +20,6 @@ from lifecycle.node.host.control import SIGN_DESCRIPTORS, HostSpec, Operation
 from lifecycle.node.host.control import Event as HostEvent
 from lifecycle.plan.model import Plan, PlannedProcess
 from lifecycle.supervisor.gate.verification_loop import without_nodes
-from lifecycle.supervisor.health import reception
 from lifecycle.supervisor.health.liveliness import Cause, NodeArrivals, SilenceMonitor
 from lifecycle.supervisor.health.peer_supervisors import CALL_EACH_S, Listener, PeerSupervisors
 from lifecycle.supervisor.nodes.system import System
@@ -564,35 +563,3 @@ def test_a_fork_server_tells_that_a_process_was_stopped_and_continues(tmp_path: 
         assert told.empty()
 
     asyncio.run(test())
-
-
-async def test_who_receives_nothing_any_more_is_silent_and_so_said_of_the_supervisor_itself(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(reception, "EACH_S", 0.0)
-
-    desk = Desk(tmp_path)
-    monkeypatch.setattr(ManagedProcess, "pid", 4711)
-    asked: list[set[int]] = []
-    looks = iter([{}, {4711: "has left unread"}, {os.getpid(): "has left unread"}, {}])
-    done = asyncio.Event()
-
-    def deadlocked(pids: Iterable[int]) -> dict[int, str]:
-        asked.append(set(pids))
-        found = next(looks, None)
-        if found is None:
-            done.set()
-        rules.append([each.rule for each in desk.system.liveliness.findings()])
-        return found or {}
-
-    rules: list[list[str]] = []
-    watching = asyncio.ensure_future(reception.watch_reception(desk.system, deadlocked))
-    await asyncio.wait_for(done.wait(), 5.0)
-    watching.cancel()
-    assert asked[0] == {os.getpid(), 4711}
-    assert rules[:5] == [[], [], ["run.silent-node"], ["run.deadlocked-observer"], []]
-    assert [(each.kind, getattr(each, "cause", "")) for each in desk.events] == [
-        ("silent", "deadlocked"),
-        ("notice", ""),
-        ("alive", ""),
-    ]

@@ -15,6 +15,7 @@ from lifecycle.supervisor.health import process_monitor
 from lifecycle.supervisor.health.process_monitor import STARTING_S, StaleNodes
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.run.events import NodeChanged, ProcessChanged
+from tests.unit.supervisor.fakes import run
 
 PREFIX = "010f7f015d3c1b4c00000000"
 ENDED = ProcessChanged(process="camera", state=ProcessState.EXITED, pid=7)
@@ -28,7 +29,7 @@ class Graph:
         self.removed: list[tuple[frozenset[str], tuple[int, ...]]] = []
         self.introduced: list[tuple[tuple[int, ...], tuple[int, ...]]] = []
         self.rediscovers: list[bool] = []
-        self.disowned = 0
+        self.disowned = self.announced = 0
         self._removals = removals
 
     def participants_of(
@@ -45,6 +46,9 @@ class Graph:
     ) -> None:
         self.introduced.append((tuple(newcomers), tuple(pids)))
         self.rediscovers.append(rediscover)
+
+    def announce_ourselves(self) -> None:
+        self.announced += 1
 
     def disown_ports(self) -> None:
         self.disowned += 1
@@ -112,6 +116,30 @@ def test_what_a_process_made_just_before_its_end_is_removed_once_it_is_discovere
     graph = Late(removals=2)
     after(graph, ENDED, seconds=0.3)
     assert graph.removed[0] == (frozenset((PREFIX,)), (8,))
+
+
+@pytest.mark.parametrize(("later_s", "announced", "introduced"), [(0.5, 2, []), (5.0, 1, [(9,)])])
+def test_who_is_started_with_others_meets_those_that_announce_themselves_no_more(
+    later_s: float, announced: int, introduced: list[tuple[int, ...]]
+) -> None:
+    async def main() -> Graph:
+        graph, of = Graph(removals=0), system()
+        node, process = cast("Any", of.nodes["camera"]), cast("Any", of.processes["camera"])
+        node.process, node.reach = process, Reach.STARTED
+        of.__dict__["node_named"] = lambda _: node
+        process.__dict__.update(is_restarted=False, joins=False, channel=object(), pid=7)
+        stale = StaleNodes(of, graph, disown_ports=lambda: None)
+        started = NodeChanged(node="/camera", reach=Reach.STARTED)
+        stale.on_event(started)
+        await asyncio.sleep(later_s)
+        process.pid = 9
+        stale.on_event(started)
+        await asyncio.sleep(1.0)
+        return graph
+
+    graph = run(main())
+    assert graph.announced == announced
+    assert [newcomers for newcomers, _ in graph.introduced] == introduced
 
 
 def test_a_command_that_is_started_again_is_introduced_until_its_node_has_started() -> None:
