@@ -162,12 +162,12 @@ def test_a_later_failure_is_a_notice_and_tried_again(
         programs = FakePrograms()
         networks = Networks("s", tmp_path, told.emit, programs)
         await networks.begin(verdict("/gate"))
-        programs.asked.clear()
         programs.fail = 1
         told.emit(heard("/later"))
+        programs.asked.clear()  # before each look: what is asked after it wakes us
         while programs.seen[-1:] != [("/later",)]:
-            programs.asked.clear()
             await asyncio.wait_for(programs.asked.wait(), _BOUND_S)
+            programs.asked.clear()
         await networks.close()
 
     asyncio.run(run())
