@@ -230,6 +230,7 @@ class ForeignNode:
         self._let_through = not supervisor
         self._is_spun = False
         self._is_ours = False
+        self._is_constructed = False
         self._machine: RclpyStateMachine | None = None
         if spec.managed and is_rclpy_managed(node):
             self._machine = RclpyStateMachine(node, self)
@@ -269,8 +270,8 @@ class ForeignNode:
 
     @property
     def reported(self) -> HostedState:
-        """Its state; a plain node has none."""
-        if self._machine is None:
+        """Its state; a plain node has none, nor has one whose constructor still runs."""
+        if self._machine is None or not self._is_constructed:
             return HostedState(label="", connected=True, steady=True)
         label = self._machine.label
         return HostedState(label=label, connected=label in _CONNECTED, steady=label in _STEADY)
@@ -404,6 +405,7 @@ class ForeignNode:
         """Its class's constructor has returned: hold it, or have it spun."""
         if self._spec.log_level:
             self._node.get_logger().set_level(LoggingSeverity[self._spec.log_level.upper()])
+        self._is_constructed = True
         if self._machine is not None:
             self._machine.complete()
         if self._machine is not None or self._let_through:

@@ -64,6 +64,7 @@ def _node(activate: Any) -> ForeignNode:
         "_node": types.SimpleNamespace(get_fully_qualified_name=lambda: "/base"),
         "_gate": NodeGate(),
         "_machine": Machine(activate),
+        "_is_constructed": True,
         "_let_through": False,
         "_supervisor": "robot",
         "_spec": types.SimpleNamespace(timeouts=Timeouts(activate_s=0.05)),
