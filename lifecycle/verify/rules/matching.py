@@ -335,7 +335,6 @@ def _end(actual: Actual) -> SeenEndpoint:
         qos=actual_qos(shown.qos if shown else None, report.qos if report else None),
         gid=(shown.gid if shown else "") or (report.gid if report else ""),
         report=report,
-        planned=actual.planned,
     )
 
 

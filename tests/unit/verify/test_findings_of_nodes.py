@@ -158,6 +158,7 @@ SAYS: dict[str, tuple[Case, str]] = {
         Case("graph.missing-node", drop_node("/viewer")),
         """\
 violated graph.missing-node: /viewer
+cannot find node /viewer in domain 7
 expected node in the graph, observed no such node
 at robot.lifecycle.yaml:3:3, on /viewer
 """,
@@ -166,11 +167,13 @@ at robot.lifecycle.yaml:3:3, on /viewer
         Case("graph.missing-node", lambda seen: dataclasses.replace(seen, nodes=()), FOREIGN),
         """\
 violated graph.missing-node: /talker
+cannot find node /talker in domain 0
 expected node in the graph, observed no such node
 at robot.lifecycle.yaml:3:3, on /talker
 to do: start it: the manifest attaches to it; compare domain, RMW and discovery range
 
 violated graph.missing-node: /listener
+cannot find node /listener in domain 0
 expected node in the graph, observed no such node
 at robot.lifecycle.yaml:3:3, on /listener
 to do: start it: the manifest attaches to it; compare domain, RMW and discovery range
@@ -180,6 +183,7 @@ to do: start it: the manifest attaches to it; compare domain, RMW and discovery 
         Case("graph.missing-node", drop_node("/talker"), FOREIGN, machines=frozenset({"far"})),
         """\
 violated graph.missing-node: /talker
+cannot find node /talker in domain 0
 expected node in the graph, observed no such node
 at robot.lifecycle.yaml:3:3, on /talker
 to do: start it: the manifest attaches to it; compare domain, RMW and discovery range
@@ -194,6 +198,7 @@ to do: start it: the manifest attaches to it; compare domain, RMW and discovery 
         ),
         """\
 unverifiable graph.missing-node: /robot/camera
+cannot verify node /robot/camera: it talks by the shared memory of machine 'robot' alone
 expected node in the graph, observed out of reach
 at robot.lifecycle.yaml:3:3, on /robot/camera
 to do: the supervisor of machine 'robot' verifies it
@@ -210,6 +215,7 @@ to do: the supervisor of machine 'robot' verifies it
         ),
         """\
 violated graph.duplicate-node: /robot/camera
+cannot tell 3 nodes named /robot/camera apart
 expected 1 node of this name, observed 3 nodes
 at robot.lifecycle.yaml:3:3, on /robot/camera
 to do: stop the other one, or give each its own name or namespace; have one that ran before
@@ -220,6 +226,7 @@ to do: stop the other one, or give each its own name or namespace; have one that
         Case("graph.duplicate-node", add_node("/spy", count=2), OPEN),
         """\
 violated graph.duplicate-node: /spy
+cannot tell 2 nodes named /spy apart
 expected 1 node of this name, observed 2 nodes
 at nowhere, on /spy
 """,
@@ -235,10 +242,12 @@ at nowhere, on /spy
         ),
         """\
 violated graph.undeclared-node: /nosy
+cannot allow node /nosy: the manifest does not declare it
 expected no such node, observed node with subscription of /a, publisher of /b
 at nowhere, on /nosy
 
 violated graph.undeclared-node: /spy
+cannot allow node /spy: the manifest does not declare it
 expected no such node, observed node
 at nowhere, on /spy
 """,
@@ -250,6 +259,7 @@ at nowhere, on /spy
         ),
         """\
 violated graph.missing-endpoint: /robot/dock
+cannot find the action server of /robot/dock that /robot/camera declares
 expected action server of /robot/camera, observed no such action server
 at robot.lifecycle.yaml:15:9, on /robot/camera (action server)
 """,
@@ -258,6 +268,7 @@ at robot.lifecycle.yaml:15:9, on /robot/camera (action server)
         Case("graph.missing-endpoint", drop_endpoint(SUB, STATUS)),
         """\
 violated graph.missing-endpoint: /robot/status
+cannot find the subscription of /robot/status that /viewer declares
 expected subscription of /viewer, observed no such subscription
 at robot.lifecycle.yaml:18:9, on /viewer (subscription)
 """,
@@ -272,6 +283,7 @@ at robot.lifecycle.yaml:18:9, on /viewer (subscription)
         ),
         """\
 violated graph.missing-endpoint: /robot/camera/calibrate
+cannot find the service server of /robot/camera/calibrate that /robot/camera declares
 expected service server of /robot/camera, observed no such service server
 at robot.lifecycle.yaml:14:9, on /robot/camera (service server)
 to do: service_servers/~/calibrate is /other now: is a remap wrong, or was /robot/camera/remap
@@ -282,6 +294,8 @@ to do: service_servers/~/calibrate is /other now: is a remap wrong, or was /robo
         Case("graph.type-mismatch", change_endpoint(PUB, STATUS, type="std_msgs/msg/Int32")),
         """\
 violated graph.type-mismatch: /robot/status
+cannot accept the publisher of /robot/status in /robot/camera: it is declared as
+  std_msgs/msg/String and is std_msgs/msg/Int32
 expected std_msgs/msg/String, observed std_msgs/msg/Int32
 at robot.lifecycle.yaml:13:9, on /robot/camera (publisher)
 """,
@@ -290,6 +304,8 @@ at robot.lifecycle.yaml:13:9, on /robot/camera (publisher)
         Case("graph.type-mismatch", change_endpoint(CLIENT, CALIBRATE, type="")),
         """\
 violated graph.type-mismatch: /robot/camera/calibrate
+cannot accept the service client of /robot/camera/calibrate in /viewer: it is declared as
+  std_srvs/srv/Trigger and is of unknown type
 expected std_srvs/srv/Trigger, observed no type
 at robot.lifecycle.yaml:19:9, on /viewer (service client)
 """,
@@ -301,6 +317,8 @@ at robot.lifecycle.yaml:19:9, on /viewer (service client)
         ),
         """\
 violated graph.type-mismatch: /robot/status
+cannot accept the publisher of /robot/status in /robot/camera: it is declared as
+  std_msgs/msg/String and is std_msgs/msg/Int32
 expected std_msgs/msg/String, observed std_msgs/msg/Int32
 at robot.lifecycle.yaml:13:9, on /robot/camera (publisher)
 """,
@@ -316,10 +334,14 @@ at robot.lifecycle.yaml:13:9, on /robot/camera (publisher)
         ),
         """\
 violated graph.type-mismatch: /robot/camera/calibrate
+cannot match the service client of /robot/camera/calibrate in /other: it is std_srvs/srv/Empty,
+  the manifest declares the service as std_srvs/srv/Trigger
 expected std_srvs/srv/Trigger, observed std_srvs/srv/Empty
 at nowhere, on /other (service client)
 
 violated graph.type-mismatch: /robot/camera/calibrate
+cannot match the service client of /robot/camera/calibrate in an unknown node: it is of unknown
+  type, the manifest declares the service as std_srvs/srv/Trigger
 expected std_srvs/srv/Trigger, observed no type
 at nowhere, on no node (service client)
 """,
@@ -334,6 +356,8 @@ at nowhere, on no node (service client)
         ),
         """\
 violated graph.type-mismatch: /chatter
+cannot match the publisher of /chatter in /other: it is std_msgs/msg/Int32, the manifest
+  declares the topic as std_msgs/msg/String or std_msgs/msg/Empty
 expected std_msgs/msg/String or std_msgs/msg/Empty, observed std_msgs/msg/Int32
 at nowhere, on /other (publisher)
 """,
@@ -348,6 +372,7 @@ at nowhere, on /other (publisher)
         ),
         """\
 violated endpoint.error: /robot/status
+cannot make the publisher 'status' of /robot/camera: not feasible
 expected publisher of /robot/camera, observed not feasible
 at robot.lifecycle.yaml:13:9, on /robot/camera (publisher)
 """,
@@ -360,6 +385,8 @@ at robot.lifecycle.yaml:13:9, on /robot/camera (publisher)
         ),
         """\
 unverifiable graph.unseen-endpoint: /chatter
+cannot verify the publisher of /chatter in /talker: discovery does not show it here, and its
+  node does not report it
 expected publisher of /talker, observed not shown by discovery
 at robot.lifecycle.yaml:10:9, on /talker (publisher)
 """,
@@ -368,6 +395,8 @@ at robot.lifecycle.yaml:10:9, on /talker (publisher)
         Case("graph.unseen-endpoint", drop_endpoint(SERVER, CALIBRATE), wired(PLAN, "camera")),
         """\
 unverifiable graph.unseen-endpoint: /robot/camera/calibrate
+cannot verify the service server of /robot/camera/calibrate in /robot/camera: discovery does not
+  show it here, and nobody counts whom it is matched with
 expected service server of /robot/camera, observed not shown by discovery
 at robot.lifecycle.yaml:14:9, on /robot/camera (service server)
 """,
@@ -385,6 +414,8 @@ at robot.lifecycle.yaml:14:9, on /robot/camera (service server)
         ),
         """\
 unverifiable graph.unseen-endpoint: /robot/status
+cannot verify the publisher of /robot/status in /robot/camera: it is matched with 5, of which 2
+  are known here
 expected publisher of /robot/camera, observed not shown by discovery
 at robot.lifecycle.yaml:13:9, on /robot/camera (publisher)
 """,
@@ -393,6 +424,7 @@ at robot.lifecycle.yaml:13:9, on /robot/camera (publisher)
         Case("graph.undeclared-publisher", add_endpoint(PUB, "/robot/camera", "/extra", gid="99")),
         """\
 violated graph.undeclared-publisher: /extra
+cannot allow the publisher of /extra in /robot/camera: the manifest does not declare it
 expected no such publisher of /robot/camera, observed publisher of type std_msgs/msg/String
 at robot.lifecycle.yaml:3:3, on /robot/camera (publisher)
 """,
@@ -404,6 +436,7 @@ at robot.lifecycle.yaml:3:3, on /robot/camera (publisher)
         ),
         """\
 violated graph.undeclared-service-server: /extra
+cannot allow the service server of /extra in /robot/camera: the manifest does not declare it
 expected no such service server of /robot/camera, observed service server
 at robot.lifecycle.yaml:3:3, on /robot/camera (service server)
 """,
@@ -418,6 +451,7 @@ at robot.lifecycle.yaml:3:3, on /robot/camera (service server)
         ),
         """\
 violated graph.undeclared-publisher: /robot/stauts
+cannot allow the publisher of /robot/stauts in /robot/camera: the manifest does not declare it
 expected no such publisher of /robot/camera, observed publisher of type std_msgs/msg/String
 at robot.lifecycle.yaml:3:3, on /robot/camera (publisher)
 to do: /robot/status of the same type is missing: is a remap or a name wrong?
@@ -433,6 +467,7 @@ to do: /robot/status of the same type is missing: is a remap or a name wrong?
         ),
         """\
 violated graph.undeclared-publisher: /else
+cannot allow the publisher of /else in /robot/camera: the manifest does not declare it
 expected no such publisher of /robot/camera, observed publisher of type std_msgs/msg/String
 at robot.lifecycle.yaml:3:3, on /robot/camera (publisher)
 to do: it is publishers/status under another name: is a remap wrong, or was /robot/camera/remap
@@ -446,6 +481,8 @@ to do: it is publishers/status under another name: is a remap wrong, or was /rob
         ),
         """\
 violated graph.undeclared-publisher: /robot/status
+cannot allow the publisher of /robot/status in /rviz2: the manifest does not declare it, and it
+  feeds the system
 expected no such publisher of /rviz2, observed publisher of type std_msgs/msg/String
 at nowhere, on /rviz2 (publisher)
 to do: policy.tolerated_nodes (rviz2) lets it listen only: stop it, or declare its node
@@ -461,6 +498,8 @@ to do: policy.tolerated_nodes (rviz2) lets it listen only: stop it, or declare i
         ),
         """\
 violated graph.undeclared-service-server: /robot/camera/calibrate
+cannot allow the service server of /robot/camera/calibrate in /rviz2: the manifest does not
+  declare it, and it serves the system
 expected no such service server of /rviz2, observed service server
 at nowhere, on /rviz2 (service server)
 to do: policy.tolerated_nodes (rviz2) lets it listen only: stop it, or declare its node
@@ -478,18 +517,24 @@ to do: policy.tolerated_nodes (rviz2) lets it listen only: stop it, or declare i
         ),
         """\
 violated graph.unattributed-endpoint: /a
+cannot tell whose subscription of /a this is
 expected subscription of a declared node, observed subscription of an unknown node
 at nowhere, on no node (subscription)
 
 violated graph.unattributed-endpoint: /b
+cannot tell whose publisher of /b this is (a participant of DDS vendor 0x0104, at 10.0.0.7, GID
+  01040000000000000000000000000000)
 expected publisher of a declared node, observed publisher of an unknown node
 at nowhere, on no node (publisher)
 
 violated graph.unattributed-endpoint: /c
+cannot tell whose publisher of /c this is (GID 00000000000000000000000000000000)
 expected publisher of a declared node, observed publisher of an unknown node
 at nowhere, on no node (publisher)
 
 violated graph.unattributed-endpoint: /d
+cannot tell whose publisher of /d this is (a participant of Fast DDS, GID
+  010f0000000000000000000000000000)
 expected publisher of a declared node, observed publisher of an unknown node
 at nowhere, on no node (publisher)
 """,
@@ -502,10 +547,12 @@ at nowhere, on no node (publisher)
         ),
         """\
 violated graph.unattributed-endpoint: /robot/status
+cannot tell whose publisher of /robot/status this is (GID 99)
 expected publisher of a declared node, observed publisher of an unknown node
 at nowhere, on no node (publisher)
 
 unverifiable graph.unattributed-endpoint: /robot/status
+cannot tell whose subscription of /robot/status this is (GID 98)
 expected subscription of a declared node, observed subscription of an unknown node
 at nowhere, on no node (subscription)
 """,
@@ -518,6 +565,9 @@ at nowhere, on no node (subscription)
         ),
         """\
 violated graph.type-definition-differs: /chatter
+cannot accept the subscription of /chatter in /listener: its std_msgs/msg/String is not that of
+  the definition installed here; both have the name, so the topic is matched and the data are
+  not understood
 expected std_msgs/msg/String as RIHS01_aaaaaaaa, observed std_msgs/msg/String as RIHS01_bbbbbbbb
 at robot.lifecycle.yaml:10:9, on /listener (subscription)
 """,
@@ -540,26 +590,41 @@ at robot.lifecycle.yaml:10:9, on /listener (subscription)
         ),
         """\
 violated graph.type-definition-differs: /robot/camera/calibrate
+cannot accept the service client of /robot/camera/calibrate in /viewer: its std_srvs/srv/Trigger
+  is not that of /robot/camera; both have the name, so the service is matched and the data are
+  not understood
 expected std_srvs/srv/Trigger as RIHS01_aaaaaaaa, observed std_srvs/srv/Trigger as
   RIHS01_bbbbbbbb
 at robot.lifecycle.yaml:19:9, on /viewer (service client)
 
 violated graph.type-definition-differs: /robot/camera/calibrate
+cannot accept the service client of /robot/camera/calibrate in /other: its std_srvs/srv/Trigger
+  is not that of /robot/camera; both have the name, so the service is matched and the data are
+  not understood
 expected std_srvs/srv/Trigger as RIHS01_aaaaaaaa, observed std_srvs/srv/Trigger as
   RIHS01_bbbbbbbb
 at nowhere, on /other (service client)
 
 violated graph.type-definition-differs: /robot/camera/calibrate
+cannot accept the service client of /robot/camera/calibrate in /rviz2: its std_srvs/srv/Trigger
+  is not that of /robot/camera; both have the name, so the service is matched and the data are
+  not understood
 expected std_srvs/srv/Trigger as RIHS01_aaaaaaaa, observed std_srvs/srv/Trigger as
   RIHS01_bbbbbbbb
 at nowhere, on /rviz2 (service client)
 
 violated graph.type-definition-differs: /robot/camera/calibrate
+cannot accept the service client of /robot/camera/calibrate in an unknown node: its
+  std_srvs/srv/Trigger is not that of /robot/camera; both have the name, so the service is
+  matched and the data are not understood
 expected std_srvs/srv/Trigger as RIHS01_aaaaaaaa, observed std_srvs/srv/Trigger as
   RIHS01_bbbbbbbb
 at nowhere, on no node (service client)
 
 violated graph.type-definition-differs: /robot/dock
+cannot accept the action client of /robot/dock in /robot/camera: its robot/action/Dock is not
+  that of /robot/camera; both have the name, so the action is matched and the data are not
+  understood
 expected robot/action/Dock as RIHS01_aaaaaaaa, observed robot/action/Dock as RIHS01_bbbbbbbb
 at nowhere, on /robot/camera (action client)
 """,
@@ -578,16 +643,22 @@ at nowhere, on /robot/camera (action client)
         ),
         """\
 unverifiable graph.type-definition-differs: an unknown node
+cannot verify which definitions an unknown node uses on /robot/status (publisher): it announces
+  no type hashes
 expected a type hash, observed none announced
 at nowhere, on no node
 to do: ROS 2 announces them since Iron; run the node under a newer one, or accept the gap
 
 unverifiable graph.type-definition-differs: /robot/camera
+cannot verify which definitions /robot/camera uses on /robot/status (publisher),
+  /robot/camera/calibrate (service server): it announces no type hashes
 expected a type hash, observed none announced
 at robot.lifecycle.yaml:13:9, on /robot/camera
 to do: ROS 2 announces them since Iron; run the node under a newer one, or accept the gap
 
 unverifiable graph.type-definition-differs: /viewer
+cannot verify which definitions /viewer uses on /robot/status (subscription): it announces no
+  type hashes
 expected a type hash, observed none announced
 at robot.lifecycle.yaml:18:9, on /viewer
 to do: ROS 2 announces them since Iron; run the node under a newer one, or accept the gap
@@ -597,6 +668,8 @@ to do: ROS 2 announces them since Iron; run the node under a newer one, or accep
         Case("graph.unmatched-client", change_report(ACTION_CLIENT, DOCK, server_matched=False)),
         """\
 violated graph.unmatched-client: /robot/dock: /viewer → /robot/camera
+cannot see /viewer → /robot/camera matched on action /robot/dock: the client counts no server as
+  available
 expected matched, observed the client counts no server as available
 at robot.lifecycle.yaml:20:9, on /viewer (action client)
 """,
@@ -605,6 +678,8 @@ at robot.lifecycle.yaml:20:9, on /viewer (action client)
         Case("graph.unmatched-client", change_report(CLIENT, CALIBRATE, server_matched=None)),
         """\
 unverifiable graph.unmatched-client: /robot/camera/calibrate: /viewer → /robot/camera
+cannot verify that /viewer → /robot/camera are matched on service /robot/camera/calibrate: its
+  client does not tell
 expected matched, observed its client does not tell
 at robot.lifecycle.yaml:19:9, on /viewer (service client)
 """,
@@ -620,6 +695,8 @@ at robot.lifecycle.yaml:19:9, on /viewer (service client)
         ),
         """\
 unverifiable graph.unmatched-client: /robot/camera/calibrate: /viewer → /robot/camera
+cannot verify that /viewer → /robot/camera are matched on service /robot/camera/calibrate: it
+  has 3 servers, and the client does not tell which it is matched with
 expected matched, observed it has 3 servers, and the client does not tell which it is matched
   with
 at robot.lifecycle.yaml:19:9, on /viewer (service client)
@@ -629,6 +706,7 @@ at robot.lifecycle.yaml:19:9, on /viewer (service client)
         Case("state.wrong-state", change_node("/viewer", state="unconfigured")),
         """\
 violated state.wrong-state: /viewer
+cannot accept node /viewer: it is unconfigured and must be inactive, connected
 expected inactive, connected, observed unconfigured
 at robot.lifecycle.yaml:3:3, on /viewer
 """,
@@ -641,6 +719,7 @@ at robot.lifecycle.yaml:3:3, on /viewer
         ),
         """\
 violated state.wrong-state: /viewer
+cannot accept node /viewer: it is inactive and must be active
 expected active, observed inactive
 at robot.lifecycle.yaml:3:3, on /viewer
 """,
@@ -649,6 +728,7 @@ at robot.lifecycle.yaml:3:3, on /viewer
         Case("state.wrong-state", change_node("/talker", state="unconfigured"), FOREIGN),
         """\
 violated state.wrong-state: /talker
+cannot accept node /talker: it is unconfigured and must be inactive
 expected inactive, observed unconfigured
 at robot.lifecycle.yaml:3:3, on /talker
 """,
@@ -662,6 +742,7 @@ at robot.lifecycle.yaml:3:3, on /talker
         ),
         """\
 violated state.wrong-state: /talker
+cannot accept node /talker: it is unconfigured and must be inactive or active
 expected inactive or active, observed unconfigured
 at robot.lifecycle.yaml:3:3, on /talker
 """,
@@ -670,6 +751,7 @@ at robot.lifecycle.yaml:3:3, on /talker
         Case("state.wrong-state", change_configuration("/viewer", connected=False)),
         """\
 violated state.wrong-state: /viewer
+cannot accept node /viewer: it is inactive, disconnected and must be inactive, connected
 expected inactive, connected, observed inactive, disconnected
 at robot.lifecycle.yaml:3:3, on /viewer
 """,
@@ -678,6 +760,7 @@ at robot.lifecycle.yaml:3:3, on /viewer
         Case("state.wrong-state", change_node("/talker", state=None, managed=False), FOREIGN),
         """\
 violated state.wrong-state: /talker
+cannot accept node /talker: it offers no lifecycle services
 expected managed node, inactive, observed not a managed node
 at robot.lifecycle.yaml:3:3, on /talker
 to do: make it a managed node, or declare it `managed: false`
@@ -691,6 +774,7 @@ to do: make it a managed node, or declare it `managed: false`
         ),
         """\
 violated state.wrong-state: /viewer
+cannot accept node /viewer: it offers no lifecycle services
 expected managed node, active, observed not a managed node
 at robot.lifecycle.yaml:3:3, on /viewer
 to do: make it a managed node, or declare it `managed: false`
@@ -700,6 +784,7 @@ to do: make it a managed node, or declare it `managed: false`
         Case("state.unverifiable", change_node("/talker", state=None, managed=None), FOREIGN),
         """\
 unverifiable state.unverifiable: /talker
+cannot verify the state of node /talker: nobody tells it
 expected inactive, observed unknown
 at robot.lifecycle.yaml:3:3, on /talker
 """,
@@ -708,6 +793,7 @@ at robot.lifecycle.yaml:3:3, on /talker
         Case("config.missing-report", drop_report("/viewer")),
         """\
 violated config.missing-report: /viewer
+cannot judge node /viewer: it did not report its configuration
 expected node configuration, observed no report
 at robot.lifecycle.yaml:3:3, on /viewer
 """,
@@ -719,10 +805,12 @@ at robot.lifecycle.yaml:3:3, on /viewer
         ),
         """\
 violated config.incomplete-report: /robot/status
+cannot judge the subscription of /robot/status: /viewer does not report it
 expected subscription in the report of /viewer, observed not mentioned
 at robot.lifecycle.yaml:18:9, on /viewer (subscription)
 
 violated config.incomplete-report: /robot/camera/calibrate
+cannot judge the service client of /robot/camera/calibrate: /viewer does not report it
 expected service client in the report of /viewer, observed not mentioned
 at robot.lifecycle.yaml:19:9, on /viewer (service client)
 """,
@@ -740,6 +828,7 @@ at robot.lifecycle.yaml:19:9, on /viewer (service client)
         ),
         """\
 violated graph.undeclared-publisher: /x
+cannot allow the publisher of /x in /one: the manifest does not declare it
 expected no such publisher of /one, observed publisher of type std_msgs/msg/String
 at robot.lifecycle.yaml:3:3, on /one (publisher)
 """,
@@ -756,6 +845,7 @@ at robot.lifecycle.yaml:3:3, on /one (publisher)
         ),
         """\
 violated graph.undeclared-publisher: /x
+cannot allow the publisher of /x in /one: the manifest does not declare it
 expected no such publisher of /one, observed publisher of type std_msgs/msg/String
 at robot.lifecycle.yaml:3:3, on /one (publisher)
 to do: /b of the same type is missing: is a remap or a name wrong?
@@ -768,6 +858,7 @@ to do: /b of the same type is missing: is a remap or a name wrong?
         ),
         """\
 violated graph.undeclared-publisher: /robot/status
+cannot allow the publisher of /robot/status in /robot/camera: the manifest does not declare it
 expected no such publisher of /robot/camera, observed publisher of type std_msgs/msg/String
 at robot.lifecycle.yaml:3:3, on /robot/camera (publisher)
 """,
@@ -783,6 +874,9 @@ at robot.lifecycle.yaml:3:3, on /robot/camera (publisher)
         ),
         """\
 violated graph.type-definition-differs: /robot/camera/calibrate
+cannot accept the service client of /robot/camera/calibrate in /viewer: its std_srvs/srv/Trigger
+  is not that of /robot/camera; both have the name, so the service is matched and the data are
+  not understood
 expected std_srvs/srv/Trigger as RIHS01_aaaaaaaa RIHS01_aaaaaaaa, observed std_srvs/srv/Trigger
   as RIHS01_aaaaaaaa
 at robot.lifecycle.yaml:19:9, on /viewer (service client)
@@ -799,6 +893,9 @@ at robot.lifecycle.yaml:19:9, on /viewer (service client)
         ),
         """\
 violated graph.type-definition-differs: /robot/status
+cannot accept the publisher of /robot/status in an unknown node: its std_msgs/msg/String is not
+  that of /robot/camera; both have the name, so the topic is matched and the data are not
+  understood
 expected std_msgs/msg/String as RIHS01_aaaaaaaa, observed std_msgs/msg/String as RIHS01_bbbbbbbb
 at nowhere, on no node (publisher)
 """,
@@ -814,6 +911,8 @@ at nowhere, on no node (publisher)
         ),
         """\
 violated graph.type-definition-differs: /robot/status
+cannot accept the publisher of /robot/status in /guest: its std_msgs/msg/String is not that of
+  an unknown node; both have the name, so the topic is matched and the data are not understood
 expected std_msgs/msg/String as RIHS01_bbbbbbbb, observed std_msgs/msg/String as RIHS01_aaaaaaaa
 at nowhere, on /guest (publisher)
 """,
@@ -1075,6 +1174,8 @@ def test_findings_are_on_these_alone_where(case: str):
         (HERE, f"{HERE} {HERE}", True),
         (HERE, "RIHS02_" + "b" * 8, False),
         (f"{HERE} RIHS02_b", f"{OTHER} RIHS01_b", True),
+        ("RIHS01_a_b", HERE, True),
+        (HERE, "RIHS01_a_b", True),
     ],
 )
 def test_hashes_differ_where_those_of_one_version_do(one: str, other: str, expected: bool):

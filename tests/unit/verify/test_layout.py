@@ -500,6 +500,23 @@ def test_shared_memory_of_a_machine_that_others_bring_up_is_beyond_reach(
     assert list(dict.fromkeys(each.node.full_name for each in view.actual if each.beyond)) == beyond
 
 
+def test_who_is_beyond_reach_counts_among_what_is_seen_as_it_is_planned() -> None:
+    plan = connected("shm://")
+    view = lay_out(plan, Observation(), Stage.CONNECTED, machines=frozenset({"m1"}))
+    assert view.seen == tuple(
+        SeenEndpoint(
+            kind=SUB,
+            node="/two",
+            name=each.resolved,
+            type=STRING,
+            qos=each.qos,
+            report=None,
+            planned=each,
+        )
+        for each in plan.nodes[1].endpoints
+    )
+
+
 # --- what is seen of topics
 
 

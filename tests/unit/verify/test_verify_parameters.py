@@ -182,6 +182,7 @@ SAYS: dict[str, tuple[ExpectedParameter, ParameterReport | None, str]] = {
         ABSENT,
         """\
 violated param.missing: /arm: gain
+cannot find parameter gain of node /arm, which is given under `parameters`
 expected int_array [1, 2], observed no such parameter
 at robot.lifecycle.yaml:60:7, on /arm
 """,
@@ -191,6 +192,7 @@ at robot.lifecycle.yaml:60:7, on /arm
         ABSENT,
         """\
 violated param.missing: /arm: gain
+cannot find parameter gain of node /arm, which is given under `parameters`
 expected double .nan, observed no such parameter
 at robot.lifecycle.yaml:60:7, on /arm
 """,
@@ -200,6 +202,7 @@ at robot.lifecycle.yaml:60:7, on /arm
         ABSENT,
         """\
 violated param.missing: /arm: gain
+cannot find parameter gain of node /arm, which is declared in its interface
 expected double, observed no such parameter
 at robot.lifecycle.yaml:60:7, on /arm
 """,
@@ -209,6 +212,7 @@ at robot.lifecycle.yaml:60:7, on /arm
         ABSENT,
         """\
 violated param.missing: /arm: gain
+cannot find parameter gain of node /arm, which is given in its `command`
 expected double 1.5, observed no such parameter
 at robot.lifecycle.yaml:60:7, on /arm
 """,
@@ -218,6 +222,8 @@ at robot.lifecycle.yaml:60:7, on /arm
         has(2, "int"),
         """\
 violated param.type-differs: /arm: gain
+cannot accept parameter gain of node /arm: it is an int, 2, and must be double as given under
+  `parameters`
 expected double, observed int
 at robot.lifecycle.yaml:60:7, on /arm
 """,
@@ -227,6 +233,8 @@ at robot.lifecycle.yaml:60:7, on /arm
         has("x" * LONGEST_VALUE, "string"),
         """\
 violated param.type-differs: /arm: gain
+cannot accept parameter gain of node /arm: it is a string, too long to show (SHA-256
+  '7f7531f0adf93194'…), and must be double as given under `parameters`
 expected double, observed string
 at robot.lifecycle.yaml:60:7, on /arm
 """,
@@ -236,6 +244,8 @@ at robot.lifecycle.yaml:60:7, on /arm
         has((True, False), "bool_array"),
         """\
 violated param.type-differs: /arm: gain
+cannot accept parameter gain of node /arm: it is a bool_array, [true, false], and must be string
+  as declared in its interface
 expected string, observed bool_array
 at robot.lifecycle.yaml:60:7, on /arm
 """,
@@ -245,6 +255,8 @@ at robot.lifecycle.yaml:60:7, on /arm
         has(None, ""),
         """\
 violated param.type-differs: /arm: gain
+cannot accept parameter gain of node /arm: it is not set, and must be double as declared in its
+  interface
 expected double, observed not set
 at robot.lifecycle.yaml:60:7, on /arm
 """,
@@ -254,6 +266,8 @@ at robot.lifecycle.yaml:60:7, on /arm
         has(None),
         """\
 violated param.value-differs: /arm: gain
+cannot accept parameter gain of node /arm: it is not set, and must be 1.5 as given under
+  `parameters`
 expected 1.5, observed not set
 at robot.lifecycle.yaml:60:7, on /arm
 """,
@@ -263,6 +277,8 @@ at robot.lifecycle.yaml:60:7, on /arm
         has(2.0),
         """\
 violated param.value-differs: /arm: gain
+cannot accept parameter gain of node /arm: it is 2.0, and must be 1.5 as declared in its
+  interface, where nothing else is given
 expected 1.5, observed 2.0
 at robot.lifecycle.yaml:60:7, on /arm
 to do: give the value that is meant under `parameters`, or correct the default
@@ -273,6 +289,8 @@ to do: give the value that is meant under `parameters`, or correct the default
         has((*LONG[:-1], 0.0), "double_array"),
         """\
 violated param.value-differs: /arm: gain
+cannot accept parameter gain of node /arm: it is too long to show (SHA-256 '4037f6e1ef33e117'…),
+  and must be [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, … 4096 items] as given in cfg/arm.yaml
 expected [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, … 4096 items], observed too long to show
   (SHA-256 '4037f6e1ef33e117'…)
 at robot.lifecycle.yaml:60:7, on /arm
@@ -283,6 +301,8 @@ at robot.lifecycle.yaml:60:7, on /arm
         has(1.5),
         """\
 violated param.read-only-differs: /arm: gain
+cannot accept parameter gain of node /arm: it can be set, and must be read_only as its interface
+  declares it
 expected read_only, observed can be set
 at robot.lifecycle.yaml:60:7, on /arm
 """,
@@ -394,11 +414,13 @@ def test_what_cannot_be_read_is_told_whole():
         told(judged(plan, perfect(plan, Stage.ACTIVE)))
         == """\
 unverifiable param.unverifiable: /arm: arm.yaml
+cannot verify the parameters that arm.yaml gives node /arm: it could not be read
 expected values of arm.yaml, observed unknown
 at robot.lifecycle.yaml:3:3, on /arm
 to do: lifecycle check says what keeps it from being read
 
 unverifiable param.unverifiable: /arm
+cannot verify parameter gain of node /arm: they were not read
 expected gain, observed unknown
 at robot.lifecycle.yaml:3:3, on /arm
 """

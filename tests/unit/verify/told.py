@@ -1,4 +1,4 @@
-"""What a finding says, as text to compare: all facts but the sentence that it makes of them."""
+"""What a finding says, as text to compare."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ def told(findings: Iterable[Finding]) -> str:
 
 
 def _paragraph(finding: Finding) -> str:
-    assert finding.message.startswith("cannot ")
     kind = f" ({finding.endpoint.noun})" if finding.endpoint else ""
     facts = [
         f"{finding.outcome.value} {finding.rule}: {finding.subject}",
+        finding.message,
         f"expected {finding.expected}, observed {finding.observed}",
         f"at {finding.at or 'nowhere'}, on {finding.node or 'no node'}{kind}",
     ]
