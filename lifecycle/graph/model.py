@@ -171,8 +171,8 @@ class EndpointIndex:
         return tuple(name for each, name in self._by_name if each is kind)
 
     def _put(self, node: str, key: _Key, endpoint: EndpointReport) -> None:
-        owned = Owned(node=node, endpoint=endpoint)
-        self._by_name.setdefault((endpoint.kind, endpoint.resolved), {})[node, key] = owned
+        place = (endpoint.kind, endpoint.resolved)
+        self._by_name.setdefault(place, {})[node, key] = Owned(node=node, endpoint=endpoint)
 
     def _drop(self, node: str, key: _Key, endpoint: EndpointReport) -> None:
         place = (endpoint.kind, endpoint.resolved)

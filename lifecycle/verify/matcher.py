@@ -287,8 +287,8 @@ def _match_node(
                 pools[place].remove(observed)
             elif observed is not None:
                 used.add(place)  # found by name only: it represents any number of them
-            elif unseen and report is not None and _is_there(report, planned.resolved):
-                observed = _as_observed(node, report, planned.resolved)
+            elif unseen and report is not None and report.resolved == planned.resolved:
+                observed = _as_observed(node, report) if _is_there(report) else None
             reports.take(picked)
             matched[index] = Actual(
                 node=node,
@@ -300,15 +300,15 @@ def _match_node(
             )
     rest = [endpoint for place, pool in pools.items() if place not in used for endpoint in pool]
     rest += [
-        _as_observed(node, actual.report, actual.report.resolved)
+        _as_observed(node, actual.report)
         for actual in matched.values()
         if actual.report is not None
         and actual.report.resolved != actual.planned.resolved
-        and _is_there(actual.report, actual.report.resolved)
+        and _is_there(actual.report)
         and (actual.report.kind, actual.report.resolved) not in places
     ]
     rest += [
-        _as_observed(node, report, report.resolved)
+        _as_observed(node, report)
         for report in reports.left
         if (report.kind, report.resolved) not in places
         and not is_noise_endpoint(
@@ -373,17 +373,17 @@ def _pick_observed(
     return None
 
 
-def _is_there(report: EndpointReport, name: str) -> bool:
-    """Return whether a node reports an endpoint under a name; it may have been remapped."""
-    return report.mapped and not report.error and name == report.resolved
+def _is_there(report: EndpointReport) -> bool:
+    """Return whether a node reports that an endpoint exists."""
+    return report.mapped and not report.error
 
 
-def _as_observed(node: PlannedNode, report: EndpointReport, name: str) -> ObservedEndpoint:
+def _as_observed(node: PlannedNode, report: EndpointReport) -> ObservedEndpoint:
     """An endpoint that only its node reports: discovery does not show it, or not yet."""
     return ObservedEndpoint(
         kind=report.kind,
         node=node.full_name,
-        name=name,
+        name=report.resolved,
         type=report.type,
         qos=report.qos,
         gid=report.gid,

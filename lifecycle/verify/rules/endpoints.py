@@ -240,11 +240,10 @@ def _given_name(view: View, endpoint: ObservedEndpoint) -> str:
         report = actual.report
         if report is None or report.kind is not endpoint.kind:
             continue
-        declared = f"{report.kind.value}/{report.name}"
         if endpoint.name == report.resolved != actual.planned.resolved:
             return (
-                f"it is {declared} under another name: is a remap wrong, or was "
-                f"{endpoint.node}/remap called?"
+                f"it is {report.kind.value}/{report.name} under another name: is a remap wrong, or"
+                f" was {endpoint.node}/remap called?"
             )
     return ""
 

@@ -476,8 +476,6 @@ def test_an_endpoint_that_discovery_need_not_show_is_as_its_node_says() -> None:
         found = actual(view, PUB, "/a")
         assert (found.unseen, found.observed) == (True, None)
         assert [each.kind for each in view.seen] == [SUB, SUB]
-    moved = both(drop_endpoint(PUB, "/a"), change_report(PUB, "/a", resolved="/b"))
-    assert [each.name for each in view_after(moved, plan).undeclared] == ["/b"]
     must_show = view_after(drop_endpoint(PUB, "/a"), planned(node("one", publisher("a"))))
     assert (must_show.actual[0].unseen, must_show.actual[0].observed) == (False, None)
 
