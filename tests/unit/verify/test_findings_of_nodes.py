@@ -420,6 +420,28 @@ expected publisher of /robot/camera, observed not shown by discovery
 at robot.lifecycle.yaml:13:9, on /robot/camera (publisher)
 """,
     ),
+    "parts of a declared action have other types": (
+        Case(
+            "graph.type-mismatch",
+            both(
+                add_endpoint(PUB, "/robot/camera", f"{DOCK}/_action/status", gid="98"),
+                add_endpoint(PUB, "/robot/camera", f"{DOCK}/_action/feedback", type="", gid="99"),
+            ),
+        ),
+        """\
+violated graph.type-mismatch: /robot/dock
+cannot accept the action server of /robot/dock in /robot/camera: /robot/dock/_action/feedback
+  must be robot/action/Dock_FeedbackMessage and is of unknown type
+expected robot/action/Dock_FeedbackMessage, observed no type
+at robot.lifecycle.yaml:15:9, on /robot/camera (action server)
+
+violated graph.type-mismatch: /robot/dock
+cannot accept the action server of /robot/dock in /robot/camera: /robot/dock/_action/status must
+  be action_msgs/msg/GoalStatusArray and is std_msgs/msg/String
+expected action_msgs/msg/GoalStatusArray, observed std_msgs/msg/String
+at robot.lifecycle.yaml:15:9, on /robot/camera (action server)
+""",
+    ),
     "an undeclared publisher": (
         Case("graph.undeclared-publisher", add_endpoint(PUB, "/robot/camera", "/extra", gid="99")),
         """\

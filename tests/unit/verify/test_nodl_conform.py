@@ -173,9 +173,16 @@ def test_parameters_are_all_declared_but_those_of_ros(
         (tmp_path / "arm.lifecycle.yaml").write_text(text + "    endpoints: open\n")
         plan = build_plan(load(tmp_path / "arm.lifecycle.yaml").manifest, environment={})
     seen = _seen(plan, (*HAS, *OF_ROS, NEVER_SET, GAIN))
-    named = [each.observed for each in verify(plan, seen, stage=Stage.ACTIVE).findings]
+    findings = verify(plan, seen, stage=Stage.ACTIVE).findings
     shown = {"gain": "gain (double)", "label": "label (string)", "rate": "rate (double)"}
-    assert named == ([", ".join(shown[each] for each in found)] if found else [])
+    what, whom = ("parameter", "it") if len(found) == 1 else ("parameters", "them")
+    said = (
+        f"cannot allow {what} {', '.join(found)} of node /left/arm:"
+        f" its interface does not declare {whom}"
+    )
+    assert [(each.observed, each.expected, each.message) for each in findings] == (
+        [(", ".join(shown[each] for each in found), "no such parameter", said)] if found else []
+    )
 
 
 @pytest.mark.parametrize(
