@@ -90,11 +90,11 @@ def may_be_same(a: str, b: str, *, same_machine: bool | None) -> bool:
         return a == b
     if one.is_multicast or other.is_multicast:
         return one == other
-    remote_nodes = same_machine is False
+    apart = same_machine is False
     if one.is_unspecified or other.is_unspecified:
-        return not remote_nodes
+        return not apart
     local = one.is_loopback or one.is_link_local
-    return _equal(one, other) and not (local and remote_nodes)
+    return _equal(one, other) and not (local and apart)
 
 
 def _equal(one: IpAddress, other: IpAddress) -> bool:

@@ -75,7 +75,7 @@ def restarted(
     processes = {node.process for node in first.nodes if node.key in keys}
     own = {place for place in original if not place[1] and place[0] in processes}
     new = {
-        place: dataclasses.replace(each, url=_remote_nodes(first, original, place, current[place]))
+        place: dataclasses.replace(each, url=_on_next_port(first, original, place, current[place]))
         for place, each in original.items()
         if (place in own or place[0] in keys) and each.moves
     }
@@ -171,14 +171,14 @@ def _listeners(plan: Plan, reported: Reported = _NOTHING) -> dict[_Place, _Liste
 
 
 def _with_port(urls: Collection[str]) -> Iterator[ConnectionUrl]:
-    """Yield the URL with the TCP port; a participant has at most one (url_families)."""
+    """Yield the URL with the TCP port; a participant has at most one."""
     for text in urls:
         url = parse(text)
         if url.transport.is_tcp and url.port is not None:
             yield url
 
 
-def _remote_nodes(
+def _on_next_port(
     first: Plan, original: Mapping[_Place, _Listener], place: _Place, now: _Listener
 ) -> ConnectionUrl:
     """Return the participant's URL on the next port of its own.
@@ -186,14 +186,14 @@ def _remote_nodes(
     Every participant of a host has one port of each round, whichever restarts it: supervisors that
     share a host need not ask each other.
     """
-    peer_supervisors = [each for each in original if each[0] and original[each].host == now.host]
+    listeners = [each for each in original if each[0] and original[each].host == now.host]
     taken = {host: set(ports) for host, ports in terms_of(first).taken}
     pool = PortPool(first.discovery.first_port + RESTART_PORTS_FROM, taken)
-    mine = peer_supervisors.index(place)
-    port = pool.take(now.host, len(peer_supervisors))[mine]
+    mine = listeners.index(place)
+    port = pool.take(now.host, len(listeners))[mine]
     if now.url.port != original[place].url.port:
         while port <= (now.url.port or 0):
-            port = pool.take(now.host, len(peer_supervisors))[mine]
+            port = pool.take(now.host, len(listeners))[mine]
     return dataclasses.replace(now.url, port=port)
 
 

@@ -1,4 +1,4 @@
-"""The data layer graph: parties, negotiated connections and mappings, and the diff of two graphs.
+"""The data layer graph: parties, negotiated connections and mappings.
 
 Owns: `Party`, `Terms` and `DataLayerGraph`. The rules are in `media`, and `negotiate` applies them.
 Pure.
