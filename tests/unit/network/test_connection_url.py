@@ -116,7 +116,10 @@ def test_an_ipv6_peer_without_a_port_needs_no_brackets():
         ("tcpv4://?dscp=46", "tcpv4 has no option 'dscp'", ""),
         ("udpv4://?ttl=1&ttl=1", "option 'ttl' stands twice", ""),
         ("udpv4://?ttl=256", "ttl='256' is not a number of 0–255", ""),
-        ("udpv4://?ttl=٣", "ttl='٣' is not a number of 0–255", ""),
+        *(
+            (f"udpv4://?ttl={each}", f"ttl={each!r} is not a number of 0–255", "")
+            for each in ("²", "٧", "1e3", "", "-1")
+        ),
         ("udpv4://?output_port=0", "output_port='0' is not a number of 1–65535", ""),
         ("udpv4://?dscp=64", "dscp='64' is not a number of 0–63", ""),
         (
@@ -129,6 +132,11 @@ def test_an_ipv6_peer_without_a_port_needs_no_brackets():
         (
             "udpv4://?peer=robot:7910",
             "peer='robot:7910' is no ADDRESS or ADDRESS:PORT",
+            "an IPv6 address with a port stands in brackets, [fd77::2]:7910",
+        ),
+        (
+            "udpv4://?peer=:7910",
+            "peer=':7910' is no ADDRESS or ADDRESS:PORT",
             "an IPv6 address with a port stands in brackets, [fd77::2]:7910",
         ),
         (
@@ -208,19 +216,6 @@ def test_any_text_is_a_url_or_a_sentence(text: str):
         assert parse(str(url)) == url
 
 
-@pytest.mark.parametrize("value", ["²", "٧", "1e3", "", "-1", "256"])
-def test_a_number_is_plain_digits_in_its_range(value: str) -> None:
-    with pytest.raises(ConnectionUrlError) as caught:
-        parse(f"udpv4://10.77.0.1:7911?ttl={value}")
-    assert f"ttl={value!r} is not a number of 0–255" in str(caught.value)
-
-
-def test_the_ends_of_a_range_belong_to_it() -> None:
-    assert parse("udpv4://10.77.0.1:7911?ttl=255&dscp=63&output_port=1").ttl == 255
-    with pytest.raises(ConnectionUrlError, match="dscp='64' is not a number of 0–63"):
-        parse("udpv4://10.77.0.1:7911?dscp=64")
-
-
 def test_a_scheme_that_rfc_3986_does_not_know_is_named_all_the_same() -> None:
     for text, scheme in (("zmq_pgm://a://b", "zmq_pgm"), ("10.0.0.1", ""), ("tcp://x", "tcp")):
         with pytest.raises(ConnectionUrlError) as caught:
@@ -232,11 +227,6 @@ def test_a_slash_after_the_port_is_no_path() -> None:
     assert parse("udpv4://10.77.0.1:7911/") == parse("udpv4://10.77.0.1:7911")
     with pytest.raises(ConnectionUrlError, match="only address, port and options"):
         parse("udpv4://10.77.0.1:7911/x")
-
-
-def test_a_peer_without_an_address_is_none() -> None:
-    with pytest.raises(ConnectionUrlError, match="peer=':7910' is no ADDRESS or ADDRESS:PORT"):
-        parse("udpv4://10.77.0.1:7911?peer=:7910")
 
 
 def test_colons_and_brackets_of_addresses_are_spelled_as_they_are() -> None:
