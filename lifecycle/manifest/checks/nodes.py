@@ -373,17 +373,9 @@ def check_ports(
             f"by default"
         )
         yield note("check.domain", at, message, f"use domain {domains}")
-    for host in _hosts(system):
+    for host in system.hosts.values():
         yield from _crowded(system, needs, host, domain, discovery.at or host[0].at)
         yield from _beyond_localhost(system, needs, host, environment)
-
-
-def _hosts(system: DeclaredSystem) -> list[list[Machine]]:
-    """Group machines that are one host: of one address, or of none, which means this host."""
-    hosts: dict[str, list[Machine]] = {}
-    for machine in system.manifest.machines:
-        hosts.setdefault(machine.address, []).append(machine)
-    return list(hosts.values())
 
 
 def _crowded(

@@ -19,6 +19,7 @@ from lifecycle.manifest.model import (
     Endpoint,
     EndpointKind,
     EndpointPolicy,
+    Machine,
     Manifest,
     Node,
     RosInterfaceAccess,
@@ -100,6 +101,16 @@ class DeclaredSystem:
     def nodes(self) -> dict[str, Node]:
         """Nodes by manifest key."""
         return {node.key: node for node in self.manifest.nodes}
+
+    @functools.cached_property
+    def hosts(self) -> dict[str, list[Machine]]:
+        """The machines that nodes run on, by address; those without one are this host."""
+        used = {node.machine for node in self.manifest.nodes}
+        found: dict[str, list[Machine]] = {}
+        for machine in self.manifest.machines:
+            if machine.name in used:
+                found.setdefault(machine.address, []).append(machine)
+        return found
 
     @functools.cached_property
     def by_name(self) -> dict[tuple[EndpointKind, str], tuple[Resolved, ...]]:

@@ -24,7 +24,6 @@ from lifecycle.manifest.model import (
     EndpointKind,
     FlowTransport,
     Link,
-    Machine,
     Node,
     RunKind,
 )
@@ -79,19 +78,9 @@ def _range(system: DeclaredSystem, section: Position) -> Iterator[Diagnostic]:
         yield error("check.discovery-range", at, message, "remove 'range'")
 
 
-def hosts(system: DeclaredSystem) -> dict[str, list[Machine]]:
-    """Return the machines that nodes run on, by address; those without one are this host."""
-    used = {node.machine for node in system.manifest.nodes}
-    found: dict[str, list[Machine]] = {}
-    for machine in system.manifest.machines:
-        if machine.name in used:
-            found.setdefault(machine.address, []).append(machine)
-    return found
-
-
 def _addresses(system: DeclaredSystem, section: Position) -> Iterator[Diagnostic]:
     """Judge addresses that others must know beforehand."""
-    discovery, found = system.manifest.discovery, hosts(system)
+    discovery, found = system.manifest.discovery, system.hosts
     at = system.manifest.where("discovery.mode", section)
     if discovery.mode is DiscoveryMode.DYNAMIC or len(found) < 2:
         return
@@ -123,7 +112,7 @@ def _addresses(system: DeclaredSystem, section: Position) -> Iterator[Diagnostic
 def _transport(system: DeclaredSystem, section: Position) -> Iterator[Diagnostic]:
     discovery = system.manifest.discovery
     at = system.manifest.where("discovery.transport", section)
-    transport, found = discovery.transport, hosts(system)
+    transport, found = discovery.transport, system.hosts
     medium = transport.medium
     rule, what = "check.discovery-transport", f"cannot let discovery use {transport.value} alone"
     if transport.in_memory and len(found) > 1:
