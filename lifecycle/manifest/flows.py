@@ -35,7 +35,6 @@ from lifecycle.network import (
     MappedPriority,
     Medium,
     TransportPriorityMapping,
-    UniqueRequirement,
     check_class,
     code_points,
     describe,
@@ -211,10 +210,6 @@ def identifiers(taken: Iterable[int]) -> tuple[int, ...]:
     )
 
 
-OWN_FLOW = (UniqueRequirement.STRICTLY_REQUIRED, UniqueRequirement.OPTIONALLY_REQUIRED)
-"""Requirements that make us give an endpoint an NFE of its own."""
-
-
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class ResolvedNeed:
     """One endpoint's need, resolved.
@@ -378,7 +373,7 @@ class FlowNeeds:
         return ResolvedNeed(
             need=need,
             topic=topic,
-            unique=need.unique in OWN_FLOW,
+            unique=need.unique.asks,
             marking=marking_of(need, self._manifest.network, flow_class.five_qi),
             flow_class=flow_class,
             max_delay_ms=delay,
@@ -468,7 +463,7 @@ def _identified_by_receiver(manifest: Manifest) -> frozenset[str]:
                 continue
             topic = _topic(node, endpoint.kind, endpoint.name)
             need = needs.get(endpoint.name)
-            own = need is not None and need.unique in OWN_FLOW and node.run.kind is RunKind.PYTHON
+            own = need is not None and need.unique.asks and node.run.kind is RunKind.PYTHON
             answers[topic] = answers.get(topic, True) and own
     return frozenset(topic for topic, every in answers.items() if every)
 

@@ -137,6 +137,11 @@ class UniqueRequirement(enum.Enum):
     SYSTEM_DEFAULT = "system_default"
 
     @property
+    def asks(self) -> bool:
+        """Whether we give an endpoint with it an NFE of its own."""
+        return self in (UniqueRequirement.STRICTLY_REQUIRED, UniqueRequirement.OPTIONALLY_REQUIRED)
+
+    @property
     def rmw_value(self) -> int:
         """The number in rmw_unique_network_flow_endpoints_requirement_t."""
         return list(UniqueRequirement).index(self)

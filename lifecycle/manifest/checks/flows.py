@@ -13,7 +13,7 @@ from collections.abc import Iterator
 
 from lifecycle.manifest.checks.system import DeclaredSystem, Resolved
 from lifecycle.manifest.diagnostics import Diagnostic
-from lifecycle.manifest.flows import OWN_FLOW, FlowNeeds, ResolvedNeed
+from lifecycle.manifest.flows import FlowNeeds, ResolvedNeed
 from lifecycle.manifest.model import (
     EndpointKind,
     FlowIdentification,
@@ -28,9 +28,6 @@ from lifecycle.manifest.qos import Reliability
 from lifecycle.manifest.schema import did_you_mean
 from lifecycle.manifest.yaml.document import error, note, warning
 from lifecycle.network import MAX_DSCP, UniqueRequirement, describe, five_qi_of
-
-ASKS_UNIQUE = (*OWN_FLOW, UniqueRequirement.SYSTEM_DEFAULT)
-"""Requirements that may make an endpoint's NFE unique."""
 
 _FIVE_QI = range(1, 255)  # one octet, 0 and 255 reserved (TS 24.501 §9.11.4.12)
 _KEPT_BY_CLASS = ("max_delay_ms", "loss")
@@ -274,7 +271,7 @@ def _relying(system: DeclaredSystem, needs: FlowNeeds) -> Iterator[tuple[Resolve
         if link.unique is not UniqueHow.NOT
     }
     for each, need in _needy(system, needs, EndpointKind.PUBLISHER):
-        if need.dscp is None or need.need.unique in ASKS_UNIQUE:
+        if need.dscp is None or need.need.unique is not UniqueRequirement.NOT_REQUIRED:
             continue
         if (each.node.key, each.name) in demanded and 0 <= need.dscp <= MAX_DSCP:
             yield each, need
@@ -366,7 +363,7 @@ def _remedy(each: Resolved) -> str:
 
 def _asks(each: Resolved, needs: FlowNeeds) -> bool:
     resolved = needs.of(each.node.key, each.endpoint.kind, each.endpoint.name)
-    return resolved is not None and resolved.need.unique in ASKS_UNIQUE
+    return resolved is not None and resolved.need.unique is not UniqueRequirement.NOT_REQUIRED
 
 
 def _dscp(each: Resolved, needs: FlowNeeds) -> int | None:

@@ -30,7 +30,6 @@ from lifecycle.network import (
     ConnectionUrl,
     Medium,
     Peer,
-    UniqueRequirement,
     parse,
     participant_ports,
 )
@@ -224,8 +223,7 @@ def demand(plan: Plan) -> tuple[MachineDemand, ...]:
             unique[host] = unique.get(host, 0) + sum(
                 process.run.kind is RunKind.PYTHON
                 and each.kind is EndpointKind.SUBSCRIPTION
-                and each.unique
-                in (UniqueRequirement.STRICTLY_REQUIRED, UniqueRequirement.OPTIONALLY_REQUIRED)
+                and each.unique.asks
                 for each in node.endpoints
             )
     return tuple(

@@ -30,7 +30,6 @@ from lifecycle.network import (
     TRANSPORTS_VARIABLE,
     ConnectionUrl,
     Peer,
-    UniqueRequirement,
     domain_base,
     parse,
 )
@@ -51,8 +50,6 @@ from lifecycle.plan.negotiation.data_layer import (
     PartyEndpoint,
     Terms,
 )
-
-_OWN_FLOW = (UniqueRequirement.STRICTLY_REQUIRED, UniqueRequirement.OPTIONALLY_REQUIRED)
 
 
 def transports_of(urls: Iterable[str]) -> tuple[str, ...]:
@@ -131,7 +128,7 @@ def endpoint_of(node: PlannedNode, each: PlannedEndpoint) -> PartyEndpoint:
         qos=each.qos,
         by=by,
         fixed=carrier is not None and bool(carrier.connection),
-        alone=publishes and each.unique in _OWN_FLOW,
+        alone=publishes and each.unique.asks,
         # Who shares a participant already may share a connection; who does not may not.
         group=each.participant if carrier and not carrier.connection else "",
         transport=each.transport,

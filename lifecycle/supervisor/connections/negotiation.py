@@ -16,7 +16,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 
 from lifecycle import dataclasses
 from lifecycle.manifest import Authority, DataLayerSource, EndpointKind, EndpointPolicy
-from lifecycle.network import CONNECTABLE, FAST_DDS, RMW_DEFAULT, UniqueRequirement, parse
+from lifecycle.network import CONNECTABLE, FAST_DDS, RMW_DEFAULT, parse
 from lifecycle.plan import (
     DataLayerGraph,
     NegotiatedConnection,
@@ -51,8 +51,6 @@ from lifecycle.verify import (
     NodeConfiguration,
     Observation,
 )
-
-_OWN_FLOW = (UniqueRequirement.STRICTLY_REQUIRED, UniqueRequirement.OPTIONALLY_REQUIRED)
 
 
 def party_of(
@@ -133,7 +131,7 @@ def _endpoint(
             resolved=report.resolved,
             type=report.type,
             qos=report.qos,
-            alone=report.kind is EndpointKind.PUBLISHER and report.unique in _OWN_FLOW,
+            alone=report.kind is EndpointKind.PUBLISHER and report.unique.asks,
             lossy=report.lossy,
             size_bytes=report.size_bytes,
         )
