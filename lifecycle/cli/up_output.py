@@ -14,7 +14,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import click
 
@@ -309,43 +309,25 @@ class PlainLines:
 
 def describe(event: Event) -> str | None:
     """Return the line about `event` for people, printable; None if it has none."""
-    line = _describe(event)
+    line = _LINES.get(type(event))
     if line is None:
         return None
-    return log_line(line) if isinstance(event, LogLine) else one_line(line)
+    return (log_line if isinstance(event, LogLine) else one_line)(line(event))
 
 
-@functools.singledispatch
-def _describe(event: Event) -> str | None:
-    del event
-    return None
-
-
-@_describe.register(RunStarted)
-def _(event: RunStarted) -> str:
-    return (
-        f"{event.system}: {_count(len(event.nodes), 'node')} in "
-        f"{_count(len(event.processes), 'process')}, domain {event.domain_id}, {event.rmw}, "
-        f"discovery range {event.discovery_range}; logs in {event.log_directory}"
-    )
-
-
-@_describe.register(ProcessChanged)
-def _(event: ProcessChanged) -> str:
+def _process_changed(event: ProcessChanged) -> str:
     pid = f" (pid {event.pid})" if event.pid else ""
     return f"process {event.process}: {event.state.value}{pid}" + (
         f", {event.detail}" if event.detail else ""
     )
 
 
-@_describe.register(NodeChanged)
-def _(event: NodeChanged) -> str:
+def _node_changed(event: NodeChanged) -> str:
     same = not event.state or event.reach is not Reach.ACTIVE or event.state == "active"
     return f"{event.node}: {event.reach.value}" + ("" if same else f", but {event.state}")
 
 
-@_describe.register(WiringChanged)
-def _(event: WiringChanged) -> str:
+def _wiring_changed(event: WiringChanged) -> str:
     again = f" (try {event.attempt})" if event.attempt > 1 else ""
     if event.error:
         return event.error + again
@@ -357,26 +339,18 @@ def _(event: WiringChanged) -> str:
     return f"{event.node}: disconnected from {event.connection}"
 
 
-@_describe.register(WiringLost)
-def _(event: WiringLost) -> str:
+def _wiring_lost(event: WiringLost) -> str:
     what = f"{event.endpoint} on " if event.endpoint else ""
     return f"{event.node}: lost {what}{event.connection or 'its own participant'}"
 
 
-@_describe.register(NodeSilent)
-def _(event: NodeSilent) -> str:
-    return f"{event.node}: silent; {event.message}"
-
-
-@_describe.register(NodeAlive)
-def _(event: NodeAlive) -> str:
+def _node_alive(event: NodeAlive) -> str:
     if not event.there:
         return f"{event.node}: not silent any more after {event.silent_s:.1f} s, but not there yet"
     return f"{event.node}: alive again after {event.silent_s:.1f} s"
 
 
-@_describe.register(MachineConnection)
-def _(event: MachineConnection) -> str:
+def _machine_connection(event: MachineConnection) -> str:
     if not event.established:
         what = "was shut down by its supervisor" if event.left else "connection lost"
         return f"machine {event.machine}: {what}"
@@ -384,80 +358,49 @@ def _(event: MachineConnection) -> str:
     return f"machine {event.machine}: connected{again}"
 
 
-@_describe.register(LogLine)
-def _(event: LogLine) -> str:
-    return f"[{event.process}] {event.line}"
-
-
-@_describe.register(VerdictChanged)
-def _(event: VerdictChanged) -> str:
+def _verdict_changed(event: VerdictChanged) -> str:
     waits = missing(event.verdict)
     if waits and event.stage is Stage.CONNECTED:
         return f"not verified yet; {waits}"
     return f"{event.stage.value}: {verdict_line(event.verdict)}"
 
 
-@_describe.register(GateOpened)
-def _(event: GateOpened) -> str:
+def _gate_opened(event: GateOpened) -> str:
     trusted = f"; taken on trust: {event.trusted}" if event.trusted else ""
     activating = f"activating {_count(len(event.nodes), 'node')}"
     return f"gate open on verdict {event.outcome}: {activating}{trusted}"
 
 
-@_describe.register(SystemReached)
-def _(event: SystemReached) -> str:
-    return f"system {event.reached} after {event.elapsed_s:.2f} s"
-
-
-@_describe.register(StageTimed)
-def _(event: StageTimed) -> str:
+def _stage_timed(event: StageTimed) -> str:
     last = f"  last {event.last}" if event.last else ""
     return f"stage {event.stage:<10}  {event.took_s:7.3f} s  at {event.elapsed_s:7.3f} s{last}"
 
 
-@_describe.register(Failure)
-def _(event: Failure) -> str:
+def _failure(event: Failure) -> str:
     # What ends the run comes first in the last verdict; once is enough.
     named = f"failed: {event.subject} ({event.rule})"
     return named if event.ends_run else f"{named}: {event.message}"
 
 
-@_describe.register(RestartScheduled)
-def _(event: RestartScheduled) -> str:
+def _restart_scheduled(event: RestartScheduled) -> str:
     last = f"; its last line: {event.stderr}" if event.stderr else ""
     others = len(event.nodes) - 1
     with_it = f" with {_count(others, 'other node')}" if others else ""
     return f"{event.process} is started again in {event.in_s:.1f} s{with_it}{last}"
 
 
-@_describe.register(Restarted)
-def _(event: Restarted) -> str:
-    return (
-        f"{event.process} is back {event.took_s:.2f} s after its failure; "
-        f"restarted {_count(event.restarts, 'time')}"
-    )
-
-
-@_describe.register(GaveUp)
-def _(event: GaveUp) -> str:
-    return f"gave up {event.process} after {_count(len(event.history), 'failure')}"
-
-
-@_describe.register(ConsequenceTaken)
-def _(event: ConsequenceTaken) -> str:
+def _consequence_taken(event: ConsequenceTaken) -> str:
     whom = f" {', '.join(event.nodes)}" if event.nodes else ""
     return f"on_violation: {event.action}{whom} for {event.rule} of {event.subject}"
 
 
-@_describe.register(ModeEntered)
-def _(event: ModeEntered) -> str:
+def _mode_entered(event: ModeEntered) -> str:
     without = f", without {', '.join(event.inactive)}" if event.inactive else ""
     others = f", other parameters of {', '.join(event.parameters)}" if event.parameters else ""
     return f"mode {event.mode}{without}{others}"
 
 
-@_describe.register(ManifestApplied)
-def _(event: ManifestApplied) -> str:
+def _manifest_applied(event: ManifestApplied) -> str:
     what = {
         "added": event.added,
         "removed": event.removed,
@@ -474,19 +417,39 @@ def _(event: ManifestApplied) -> str:
     return said[event.stage]
 
 
-@_describe.register(Notice)
-def _(event: Notice) -> str:
-    return event.message
-
-
-@_describe.register(Stopping)
-def _(event: Stopping) -> str:
-    return f"stopping: {event.reason}"
-
-
-@_describe.register(Stopped)
-def _(event: Stopped) -> str:
-    return f"stopped after {event.elapsed_s:.2f} s"
+_LINES: dict[type[Event], Callable[[Any], str]] = {
+    RunStarted: lambda event: (
+        f"{event.system}: {_count(len(event.nodes), 'node')} in "
+        f"{_count(len(event.processes), 'process')}, domain {event.domain_id}, {event.rmw}, "
+        f"discovery range {event.discovery_range}; logs in {event.log_directory}"
+    ),
+    ProcessChanged: _process_changed,
+    NodeChanged: _node_changed,
+    WiringChanged: _wiring_changed,
+    WiringLost: _wiring_lost,
+    NodeSilent: lambda event: f"{event.node}: silent; {event.message}",
+    NodeAlive: _node_alive,
+    MachineConnection: _machine_connection,
+    LogLine: lambda event: f"[{event.process}] {event.line}",
+    VerdictChanged: _verdict_changed,
+    GateOpened: _gate_opened,
+    SystemReached: lambda event: f"system {event.reached} after {event.elapsed_s:.2f} s",
+    StageTimed: _stage_timed,
+    Failure: _failure,
+    RestartScheduled: _restart_scheduled,
+    Restarted: lambda event: (
+        f"{event.process} is back {event.took_s:.2f} s after its failure; "
+        f"restarted {_count(event.restarts, 'time')}"
+    ),
+    GaveUp: lambda event: f"gave up {event.process} after {_count(len(event.history), 'failure')}",
+    ConsequenceTaken: _consequence_taken,
+    ModeEntered: _mode_entered,
+    ManifestApplied: _manifest_applied,
+    Notice: lambda event: event.message,
+    Stopping: lambda event: f"stopping: {event.reason}",
+    Stopped: lambda event: f"stopped after {event.elapsed_s:.2f} s",
+}
+"""Event → its line; those that are missing have none."""
 
 
 def verdict_line(verdict: Verdict) -> str:
