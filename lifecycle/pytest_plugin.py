@@ -23,7 +23,7 @@ import time
 import warnings
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -302,48 +302,8 @@ def _verdict_text(verdict: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-class MakeSystem(Protocol):
-    """What the fixture `lifecycle_system` is."""
-
-    def __call__(
-        self,
-        manifest: str | os.PathLike[str],
-        *options: str,
-        arguments: Mapping[str, object] = ...,
-        timeout_s: float = ...,
-    ) -> LifecycleSystem:
-        """Bring a system up, and return once it is verified and active.
-
-        Args:
-            manifest: the file.
-            options: of `lifecycle up`: `--strict`, `--machine NAME`, …
-            arguments: of the manifest.
-            timeout_s: for all of it.
-
-        Raises:
-            SystemFailedError: it did not come up; says why, with its verdict and its logs.
-        """
-
-
-class MakeNode(Protocol):
-    """What the fixture `lifecycle_node` is."""
-
-    def __call__(
-        self,
-        manifest: str | os.PathLike[str],
-        node: str,
-        *,
-        arguments: Mapping[str, object] = ...,
-        to: str = ...,
-    ) -> NodeInProcess:
-        """Run one node of a manifest in this process, without a supervisor.
-
-        Args:
-            manifest: the file.
-            node: its key, or its full name.
-            arguments: of the manifest.
-            to: "unconfigured", "inactive" (connected) or "active".
-        """
+MakeSystem = Callable[..., LifecycleSystem]
+MakeNode = Callable[..., "NodeInProcess"]
 
 
 @pytest.fixture
@@ -362,8 +322,11 @@ def lifecycle_system(
 ) -> Iterator[MakeSystem]:
     """Bring a manifest up in a domain of its own, and end it with the test.
 
-    The test fails, too, if the system is not as declared when it is ended. Of a test that fails,
-    pytest shows the verdict and the logs.
+    `lifecycle_system(MANIFEST, "--strict", arguments={"rate": 10}, timeout_s=60)`: the file,
+    options of `lifecycle up`, arguments of the manifest, and for how long it may take. It returns
+    once the system is verified and active, and raises SystemFailedError if that does not come. The
+    test fails, too, if the system is not as declared when it is ended. Of a test that fails, pytest
+    shows the verdict and the logs.
     """
     running: list[LifecycleSystem] = request.node.stash.setdefault(_RUNNING, [])
 
@@ -399,7 +362,12 @@ def lifecycle_system(
 def lifecycle_node(
     lifecycle_domain: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> Iterator[MakeNode]:
-    """Run one node of a manifest in this process, without a supervisor, until the test ends."""
+    """Run one node of a manifest in this process, without a supervisor, until the test ends.
+
+    `lifecycle_node(MANIFEST, NODE, arguments={...}, to="inactive")`: the file, the node's key or
+    its full name, arguments of the manifest, and the state to bring it to: "unconfigured",
+    "inactive" (connected) or "active", the default.
+    """
     with contextlib.ExitStack() as nodes:
 
         def make(

@@ -135,6 +135,20 @@ def resolve(manifest: Manifest, machine: str = "") -> Resolution:
     return resolve_programs(manifest, environment=os.environ, is_ours=own.__contains__)
 
 
+def write_text(path: Path, text: str) -> None:
+    """Write a file, and the folders that it is in.
+
+    Raises:
+        UsageError: it cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    except (OSError, ValueError) as error:
+        why = error.strerror if isinstance(error, OSError) else error
+        raise UsageError(f"cannot write {str(path)!r}: {why}") from error
+
+
 def target_arguments(function: F) -> F:
     """Add `TARGET [NAME:=VALUE …]` and `--machine` to a verb."""
     function = machine_option("As it was given to `lifecycle up`.")(function)

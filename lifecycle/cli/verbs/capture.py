@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from lifecycle.cli.common import write_text
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.printable import one_line
 
@@ -107,7 +108,7 @@ def command(
     if output is None:
         click.echo(text, nl=False)
     else:
-        _write(output, text)
+        write_text(output, text)
     _say_gaps(captured)
     return ExitCode.OK
 
@@ -134,14 +135,6 @@ def _write_nodl(captured: CapturedSystem, folder: Path, output: Path | None) -> 
     references = {}
     for node in captured.nodes:
         path = folder / f"{node.key}{SUFFIX}"
-        _write(path, to_nodl(node))
+        write_text(path, to_nodl(node))
         references[node.key] = f"local://{os.path.relpath(path, base)}"
     return references
-
-
-def _write(path: Path, text: str) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise UsageError(f"cannot write {str(path)!r}: {error.strerror}") from error

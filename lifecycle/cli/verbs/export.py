@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from lifecycle.cli.common import load_manifest, manifest_arguments
+from lifecycle.cli.common import load_manifest, manifest_arguments, write_text
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest import EndpointPolicy
 from lifecycle.printable import lines
@@ -51,7 +51,7 @@ def sros2(manifest: str, assignments: tuple[str, ...], output: Path) -> int:
     plan = build_plan(load_manifest(manifest, assignments).manifest)
     enclaves = enclaves_of(plan)
     _check_paths(enclaves)
-    _write(output / "policy.xml", render_policy(enclaves))
+    write_text(output / "policy.xml", render_policy(enclaves))
     for node in plan.nodes:
         if node.endpoint_policy is EndpointPolicy.OPEN:
             click.echo(
@@ -129,7 +129,7 @@ def _engine_command(engine: str) -> click.Command:
             programs_networks=any(each.startswith("--program") for each in words),
         )
         for name, text in ENGINES[engine](deployment).items():
-            _write(output / name, text)
+            write_text(output / name, text)
             click.echo(str(output / name))
         for word in (*assignments, *words):
             _say_secret(word, engine)
@@ -252,15 +252,6 @@ def _check_paths(enclaves: tuple[Enclave, ...]) -> None:
                 f"cannot use enclave {each.path!r} of process {each.processes[0]!r}; "
                 "write an absolute name of letters, digits and '_', as in '/robot/camera'"
             )
-
-
-def _write(path: Path, text: str) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
-    except (OSError, ValueError) as error:
-        why = error.strerror if isinstance(error, OSError) else error
-        raise UsageError(f"cannot write {str(path)!r}: {why}") from error
 
 
 def _next_commands(enclaves: tuple[Enclave, ...], output: Path, domain_id: int) -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from lifecycle.cli.common import parse_assignments
+from lifecycle.cli.common import parse_assignments, write_text
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest import ManifestError, load
 from lifecycle.printable import lines, one_line
@@ -57,11 +57,7 @@ def import_command(
     if output is None:
         click.echo(text, nl=False)
         return ExitCode.OK
-    try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        output.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise UsageError(f"cannot write {str(output)!r}: {error.strerror}") from error
+    write_text(output, text)
     try:
         warnings = load(output).warnings
     except ManifestError as error:

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from lifecycle.cli.common import write_text
 from lifecycle.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
@@ -113,15 +114,7 @@ def _write_new(root: Path, files: Mapping[Path, str]) -> None:
             hint="give --directory DIRECTORY",
         )
     for path, text in files.items():
-        _write(path, text)
-
-
-def _write(path: Path, text: str) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise UsageError(f"cannot write {str(path)!r}: {error.strerror}") from error
+        write_text(path, text)
 
 
 def _schema_text(file: str) -> str:
@@ -190,7 +183,7 @@ def _data_directory() -> Path:
 def _install(schemas: Mapping[str, str], to: Path | None) -> ExitCode:
     folder = to or _data_directory()
     for file in schemas.values():
-        _write(folder / file, _schema_text(file))
+        write_text(folder / file, _schema_text(file))
     manifest = folder / schemas["manifest"]
     reference = manifest.as_uri() if to is None else f"{to.as_posix()}/{manifest.name}"
     click.echo(
