@@ -255,7 +255,7 @@ def export_option(function: F) -> F:
     return _network(
         click.option(
             "--export",
-            type=click.Choice((*NETWORKS, "csv")),
+            type=click.Choice(NETWORKS),
             help="Print the verified flows as rules, settings or request bodies of another system "
             "instead.",
         )

@@ -52,18 +52,6 @@ def _systems(_: click.Context) -> Iterable[str]:
     return running(runtime_root(os.environ))
 
 
-def _nodes(context: click.Context) -> Iterable[str]:
-    return _mapping(context, "nodes")
-
-
-def _machines(context: click.Context) -> Iterable[str]:
-    return _mapping(context, "machines")
-
-
-def _arguments(context: click.Context) -> Iterable[str]:
-    return [f"{name}:=" for name in _mapping(context, "arguments")]
-
-
 def _runs(_: click.Context) -> Iterable[str]:
     from lifecycle.supervisor import ros_log_root, runs_of
 
@@ -83,8 +71,8 @@ def _mapping(context: click.Context, key: str) -> dict[str, Any]:
 _SOURCES: dict[str, Source] = {
     "manifests": _manifests,
     "systems": _systems,
-    "nodes": _nodes,
-    "machines": _machines,
-    "arguments": _arguments,
+    "nodes": lambda context: _mapping(context, "nodes"),
+    "machines": lambda context: _mapping(context, "machines"),
+    "arguments": lambda context: (f"{name}:=" for name in _mapping(context, "arguments")),
     "runs": _runs,
 }

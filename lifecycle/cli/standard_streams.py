@@ -48,16 +48,11 @@ _FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 """Errors of a disk that may have room again; after any other a stream has ended."""
 
 
-class _Tolerant(io.RawIOBase):
-    """Writes to a descriptor until that fails, and nothing from then on.
-
-    Attributes:
-        error: why it failed.
-    """
+class _Raw(io.RawIOBase):
+    """The raw end of a stream to a descriptor."""
 
     def __init__(self, descriptor: int) -> None:
         self._descriptor = descriptor
-        self.error: OSError | None = None
 
     def writable(self) -> bool:
         return True
@@ -67,6 +62,18 @@ class _Tolerant(io.RawIOBase):
 
     def isatty(self) -> bool:
         return os.isatty(self._descriptor)
+
+
+class _Tolerant(_Raw):
+    """Writes to a descriptor until that fails, and nothing from then on.
+
+    Attributes:
+        error: why it failed.
+    """
+
+    def __init__(self, descriptor: int) -> None:
+        super().__init__(descriptor)
+        self.error: OSError | None = None
 
     def write(self, data: ReadableBuffer) -> int:
         left = memoryview(data).cast("B")
@@ -224,7 +231,7 @@ class Writer:
         say: Callable[[str], object] = lambda _: None,
         encoding: str = "utf-8",
     ) -> None:
-        self._descriptor = descriptor
+        self.descriptor = descriptor
         self._name = name
         self._marker = marker
         self._say = say
@@ -283,10 +290,6 @@ class Writer:
             write_through=True,
         )
 
-    def fileno(self) -> int:
-        """Return the descriptor."""
-        return self._descriptor
-
     def close(self) -> None:
         """Write what is left, for as long as it is taken; say what is lost in the end.
 
@@ -340,7 +343,7 @@ class Writer:
             left = memoryview(torn + text)
             try:
                 while left:
-                    left = left[_write_some(self._descriptor, left[:_CHUNK_BYTES]) :]
+                    left = left[_write_some(self.descriptor, left[:_CHUNK_BYTES]) :]
                     torn = b"\n" if left else b""
                     self._progress += 1
             except OSError as error:
@@ -390,21 +393,13 @@ class _Lost(NamedTuple):
 _NOTHING = _Lost()
 
 
-class _Queued(io.RawIOBase):
+class _Queued(_Raw):
     """The raw end of a stream that a Writer writes."""
 
     def __init__(self, writer: Writer, *, kept: bool) -> None:
+        super().__init__(writer.descriptor)
         self._writer = writer
         self._kept = kept
-
-    def writable(self) -> bool:
-        return True
-
-    def fileno(self) -> int:
-        return self._writer.fileno()
-
-    def isatty(self) -> bool:
-        return os.isatty(self._writer.fileno())
 
     def write(self, data: ReadableBuffer) -> int:
         whole = bytes(data)

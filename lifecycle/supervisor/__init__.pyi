@@ -49,7 +49,6 @@ from .run.events import to_record as to_record
 from .run.failure import ended_early as ended_early
 from .run.history import RecordedRun as RecordedRun
 from .run.history import journal_files as journal_files
-from .run.history import moment_of as moment_of
 from .run.history import read_run as read_run
 from .run.looking import attached_picture as attached_picture
 from .run.looking import attached_pictures as attached_pictures

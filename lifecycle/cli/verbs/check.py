@@ -40,6 +40,7 @@ from lifecycle.manifest import (
     declared_arguments,
     load,
 )
+from lifecycle.network import count
 from lifecycle.plan import Resolution, UnresolvedProgram, check_plan, effective_domain
 from lifecycle.printable import json_text, lines
 
@@ -115,26 +116,22 @@ def summary(report: CheckReport) -> str:
     severities = [each.severity for each in report.diagnostics]
     errors, warnings = severities.count(Severity.ERROR), severities.count(Severity.WARNING)
     by_word = [(errors, "error"), (warnings, "warning"), (severities.count(Severity.NOTE), "note")]
-    found = [_count(number, word) for number, word in by_word if number]
+    found = [count(number, word) for number, word in by_word if number]
     found += [f"{len(report.unresolved)} not resolved"] * bool(report.unresolved)
     outcome = "ok" if report.ok else "not ok"
     verdict = f"{outcome} ({', '.join(found)})" if found else outcome
     if not report.system:
         return f"{report.manifest}: {verdict}"
     counts = (
-        _count(report.nodes, "node"),
-        _count(report.endpoints, "endpoint"),
-        _count(report.links, "link"),
+        count(report.nodes, "node"),
+        count(report.endpoints, "endpoint"),
+        count(report.links, "link"),
     )
     return f"{report.system}: {', '.join(counts)}: {verdict}"
 
 
 _LEVELS = {Severity.ERROR: "error", Severity.WARNING: "warning", Severity.NOTE: "notice"}
 """As annotations of GitHub call them."""
-
-
-def _count(number: int, word: str) -> str:
-    return f"{number} {word}{'' if number == 1 else 's'}"
 
 
 def _junit(report: CheckReport, *, strict: bool) -> str:

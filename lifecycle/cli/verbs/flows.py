@@ -123,7 +123,7 @@ class Export:
     """One export, with its options checked before anything is looked at.
 
     Args:
-        name: of NETWORKS, or csv.
+        name: of NETWORKS.
         mapping, flow_labels: see read_treatment.
         given: what the network needs, by option.
 
@@ -135,8 +135,7 @@ class Export:
         from lifecycle.programming import read_targets, read_treatment
 
         # What is exported for a network takes what programming it takes.
-        names = () if name == "csv" else (name,)
-        self._network = next(iter(read_targets(names, given, option="--export")), None)
+        (self._network,) = read_targets((name,), given, option="--export")
         self._treatment = read_treatment(mapping, label_flows=flow_labels)
 
     def write(self, plan: Plan, flows: Sequence[FlowReport]) -> None:
@@ -145,9 +144,6 @@ class Export:
         Raises:
             UsageError: it cannot be exported so.
         """
-        if self._network is None:
-            click.echo(flows_to_csv(flows), nl=False)
-            return
         rules = _open(plan, (), self._treatment).rules(flows)
         try:
             text = self._network.export(rules, plan.system)

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import datetime as dt
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING
 
 import click
 
@@ -22,24 +22,6 @@ from lifecycle.printable import json_text, lines, one_line
 if TYPE_CHECKING:
     from lifecycle.supervisor import RecordedRun
     from lifecycle.verify import Finding, Verdict
-
-F = TypeVar("F", bound=Callable[..., Any])
-
-
-def _run_argument(function: F) -> F:
-    """Add `[RUN]` and `--system` to a verb."""
-    return click.argument(
-        "run", required=False, metavar="[RUN]", shell_complete=completing("runs")
-    )(_system_option(function))
-
-
-def _system_option(function: F) -> F:
-    return click.option(
-        "--system",
-        default="",
-        metavar="NAME",
-        help="The latest run of this system.",
-    )(function)
 
 
 def _recorded(run: str | None, system: str) -> RecordedRun:
@@ -81,33 +63,27 @@ def _clock(at: float) -> str:
 
 
 @click.command("history")
-@_run_argument
-@click.option("--since", default="", metavar="TIME", help="Only what came then or later.")
-@click.option("--until", default="", metavar="TIME", help="Only what came before it was over.")
-@click.option("--node", default="", metavar="NODE", help="Only what names this node or process.")
+@click.argument("run", required=False, metavar="[RUN]", shell_complete=completing("runs"))
+@click.option("--system", default="", metavar="NAME", help="The latest run of this system.")
 @format_option("text", "json")
-def command(
-    *, run: str | None, system: str, since: str, until: str, node: str, format_: str
-) -> int:
+def command(*, run: str | None, system: str, format_: str) -> int:
     """Show what happened in a run, oldest first; of RUN, or of the run that began last.
 
-    RUN is the log directory of a run, or the journal in it. TIME is 12:03:05, +17.5 for seconds
-    since the supervisor began, or ISO 8601. Below each verdict are the findings that it has and the
-    one before had not (+), and those that are gone (-). JSON has the lines of the journal.
+    RUN is the log directory of a run, or the journal in it. Below each verdict are the findings
+    that it has and the one before had not (+), and those that are gone (-). JSON has the lines of
+    the journal.
     """
-    from lifecycle.supervisor import moment_of
-
     recorded = _recorded(run, system)
-    began = moment_of(since, recorded, first=True) if since else float("-inf")
-    ended = moment_of(until, recorded) if until else float("inf")
-    for each in _timeline(recorded, began, ended, node, json=format_ == "json"):
+    if format_ == "json":
+        for moment in recorded.moments:
+            echo_while_read(json_text(moment.text))
+        return ExitCode.OK
+    for each in _timeline(recorded):
         echo_while_read(each)
     return ExitCode.OK
 
 
-def _timeline(
-    recorded: RecordedRun, began: float, ended: float, node: str, *, json: bool
-) -> Iterator[str]:
+def _timeline(recorded: RecordedRun) -> Iterator[str]:
     from lifecycle.cli.up_output import describe
     from lifecycle.supervisor import NodeChanged, Stopped, VerdictChanged
 
@@ -116,38 +92,24 @@ def _timeline(
     ahead_s: float | None = None
     for each in recorded.moments:
         over = isinstance(each.event, Stopped) or (over and each.line.run is None)
-        text = each.text if json else (each.event and describe(each.event))
+        at = f"{_clock(each.line.at)} {each.line.elapsed_s:+10.3f}"
         # The host's clock is ahead of the one that only goes forward: by as much, until it is set.
         before_s, ahead_s = ahead_s, each.line.at - each.line.elapsed_s
-        set_s = 0.0 if before_s is None or json else ahead_s - before_s
-        changed: list[str] = []
-        if isinstance(each.event, VerdictChanged):
-            changed = [] if json else list(_changes(found, each.event.verdict))
-            found = each.event.verdict.findings
-        if not began <= each.line.elapsed_s <= ended:
-            continue
+        set_s = 0.0 if before_s is None else ahead_s - before_s
         if abs(set_s) >= _SET_S:
             way = "forward" if set_s > 0 else "back"
-            yield (
-                f"{_clock(each.line.at)} {each.line.elapsed_s:+10.3f}  the clock of this host was "
-                f"set {way} by {abs(set_s):.1f} s"
-            )
-        if not text:
-            continue
-        if node and not _names(text, node):
-            continue
-        if isinstance(each.event, NodeChanged) and not json:
+            yield f"{at}  the clock of this host was set {way} by {abs(set_s):.1f} s"
+        text = each.event and describe(each.event)
+        if isinstance(each.event, NodeChanged) and text:
             # Its state changes more often than how far it is, of which the line is.
-            if said.get(each.event.node) == text:
-                continue
-            said[each.event.node] = text
-        yield (
-            json_text(text)
-            if json
-            else f"{_clock(each.line.at)} {each.line.elapsed_s:+10.3f}  {text}"
-        )
-        yield from changed
-    if not over and not json and recorded.moments and recorded.moments[-1].line.elapsed_s <= ended:
+            before, said[each.event.node] = said.get(each.event.node), text
+            text = "" if before == text else text
+        if text:
+            yield f"{at}  {text}"
+        if isinstance(each.event, VerdictChanged):
+            yield from _changes(found, each.event.verdict)
+            found = each.event.verdict.findings
+    if not over and recorded.moments:
         pid = recorded.run.supervisor if recorded.run else 0
         if not Path(f"/proc/{pid}").exists():
             yield f"the journal ends here: supervisor {pid} ended without saying so"
@@ -162,19 +124,3 @@ def _changes(before: tuple[Finding, ...], verdict: Verdict) -> Iterator[str]:
             yield one_line(f"    + {each.outcome.value} {each.rule}: {each.message}")
     for rule, subject, outcome in sorted(known - now):
         yield one_line(f"    - {outcome.value} {rule}: {subject}")
-
-
-def _names(text: str, node: str) -> bool:
-    name = node.strip("/")
-    start = 0
-    while (found := text.find(name, start)) >= 0:
-        end = found + len(name)
-        start = found + 1
-        before = text[found - 1 : found]
-        if not _is_of_name(text[end : end + 1]) and not _is_of_name(before):
-            return True
-    return False
-
-
-def _is_of_name(character: str) -> bool:
-    return character.isalnum() or character == "_"

@@ -1,4 +1,4 @@
-"""`lifecycle ports`: DDS port arithmetic, platform limits, and whether a manifest's system fits.
+"""`lifecycle ports`: DDS port arithmetic, platform limits.
 
 Owns: the verb and what it prints; the arithmetic is `lifecycle.network`'s.
 """
@@ -12,11 +12,8 @@ import click
 
 from lifecycle import dataclasses
 from lifecycle.cli.common import (
-    assignments_argument,
     format_option,
-    load_manifest,
 )
-from lifecycle.cli.completion import completing
 from lifecycle.codec import to_json
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest import Discovery
@@ -27,39 +24,18 @@ from lifecycle.network import (
     ParticipantPorts,
     Platform,
     PortUse,
-    count,
     describe_domains,
     ephemeral_range,
     max_participants,
-    overflows,
     overlaps,
     participant_ports,
     read_ephemeral_range,
     safe_domains,
     unique_flow_ports,
 )
-from lifecycle.plan import Plan, build_plan, demand, effective_domain
+from lifecycle.plan import effective_domain
 
 THIS = "this"
-
-
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Need:
-    """What one host must hold.
-
-    Attributes:
-        host: the machine, or machines with one address; else what was asked for.
-        participants: how many.
-        owners: what each participant of a plan is for; ids are given out by start order.
-        unique_subscriptions: how many ask for a port of their own.
-        problems: why it does not fit; empty if it does.
-    """
-
-    host: str
-    participants: int
-    owners: tuple[str, ...] = ()
-    unique_subscriptions: int = 0
-    problems: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,7 +46,6 @@ class PortsReport:
         safe_domains: first and last id of each run.
         localhost_participants: so many of one host all find each other with `range: localhost`.
         unique_subscription_ports: first and last.
-        needs: one per host of the manifest, or one for `--participants`.
     """
 
     domain_id: int
@@ -83,17 +58,11 @@ class PortsReport:
     capacity: Capacity
     localhost_participants: int
     unique_subscription_ports: tuple[int, int]
-    needs: tuple[Need, ...]
 
 
 @click.command("ports")
-@click.argument(
-    "manifest", metavar="[MANIFEST]", required=False, shell_complete=completing("manifests")
-)
-@assignments_argument
-@click.option("--domain", type=int, help="Domain id, 0-232; else the manifest's or ROS_DOMAIN_ID.")
+@click.option("--domain", type=int, help="Domain id, 0-232; default: ROS_DOMAIN_ID, else 0.")
 @click.option("--participant", type=int, default=0, show_default=True, help="Counts from 0.")
-@click.option("--participants", type=int, help="Ask whether so many fit on one host.")
 @click.option(
     "--platform",
     type=click.Choice([*(each.value for each in Platform), THIS]),
@@ -102,28 +71,15 @@ class PortsReport:
     help="Whose ephemeral ports to keep clear of; `this` reads this machine's own.",
 )
 @format_option("text", "json")
-def command(
-    *,
-    manifest: str | None,
-    assignments: tuple[str, ...],
-    domain: int | None,
-    participant: int,
-    participants: int | None,
-    platform: str,
-    format_: str,
-) -> int:
+def command(*, domain: int | None, participant: int, platform: str, format_: str) -> int:
     """Show the UDP ports of a DDS participant and how many fit.
 
-    With a MANIFEST, show which participants its plan needs on each machine and whether they fit.
-
-    Exits 3 if the manifest's system does not fit, 4 if --participants do not.
+    Whether a manifest's system fits `lifecycle check` says, and `lifecycle plan` which participants
+    it has.
     """
-    if manifest is not None and participants is not None:
-        raise UsageError("cannot use --participants with a MANIFEST: its plan says how many")
-    plan = build_plan(load_manifest(manifest, assignments).manifest) if manifest else None
     ephemeral = _ephemeral(platform)
     if domain is None:
-        domain = plan.domain_id if plan else effective_domain(Discovery(), os.environ)
+        domain = effective_domain(Discovery(), os.environ)
     try:
         report = PortsReport(
             domain_id=domain,
@@ -136,13 +92,10 @@ def command(
             capacity=max_participants(domain, ephemeral),
             localhost_participants=LOCALHOST_PARTICIPANTS,
             unique_subscription_ports=(unique_flow_ports()[0], unique_flow_ports()[-1]),
-            needs=_judged(_needs(plan, participants), domain, ephemeral),
         )
     except ValueError as error:
         raise UsageError(str(error)) from error
     click.echo(to_json(report).decode() if format_ == "json" else "\n".join(_lines(report)))
-    if any(need.problems for need in report.needs):
-        return ExitCode.MANIFEST_INVALID if plan else ExitCode.VIOLATED
     return ExitCode.OK
 
 
@@ -156,37 +109,6 @@ def _ephemeral(platform: str) -> EphemeralRange:
             f"cannot tell this machine's ephemeral ports: {error}",
             hint="name a platform, for example --platform linux",
         ) from error
-
-
-def _needs(plan: Plan | None, participants: int | None) -> tuple[Need, ...]:
-    """What each host must hold, not yet judged."""
-    if plan is None:
-        asked = "--participants"
-        return () if participants is None else (Need(host=asked, participants=participants),)
-    return tuple(
-        Need(
-            host=each.machine or "this host",
-            participants=len(each.participants),
-            owners=tuple(participant.owner for participant in each.participants),
-            unique_subscriptions=each.unique_subscriptions,
-        )
-        for each in demand(plan)
-    )
-
-
-def _judged(needs: tuple[Need, ...], domain: int, ephemeral: EphemeralRange) -> tuple[Need, ...]:
-    return tuple(
-        dataclasses.replace(
-            need,
-            problems=overflows(
-                domain,
-                participants=need.participants,
-                unique_subscriptions=need.unique_subscriptions,
-                ephemeral=ephemeral,
-            ),
-        )
-        for need in needs
-    )
 
 
 def _lines(report: PortsReport) -> list[str]:
@@ -213,19 +135,7 @@ def _lines(report: PortsReport) -> list[str]:
         ),
         f"  find each other       {report.localhost_participants} with 'range: localhost'",
     ]
-    for need in report.needs:
-        lines += _need_lines(need)
     return lines
-
-
-def _need_lines(need: Need) -> list[str]:
-    counts = count(need.participants, "participant")
-    if need.unique_subscriptions:
-        counts += f", {count(need.unique_subscriptions, 'unique subscription')}"
-    return [
-        f"{need.host}: {counts}: {'do not fit' if need.problems else 'fit'}",
-        *(f"  {each}" for each in (*need.owners, *need.problems)),
-    ]
 
 
 def _use(use: PortUse) -> str:

@@ -1,13 +1,8 @@
-"""History of a run, read from its journal, which may be torn, foreign or incomplete. Needs no ROS.
-
-Owns: `read_run`, and what a person means by a time of it (`moment_of`).
-"""
+"""History of a run, read from its journal, which may be torn or foreign. Needs no ROS."""
 
 from __future__ import annotations
 
-import datetime as dt
 import os
-import re
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -99,45 +94,3 @@ def read_run(files: Iterable[Path]) -> RecordedRun:
             text = data.decode(errors="replace").rstrip("\n")
             moments.append(Moment(line=line, event=event, text=text))
     return RecordedRun(run=run, moments=tuple(moments), unreadable=tuple(unreadable))
-
-
-_AFTER = re.compile(r"\+\d+(\.\d+)?")
-_CLOCK = re.compile(r"\d{1,2}:\d{2}(:\d{2}(\.\d{1,6})?)?")
-
-
-def moment_of(word: str, recorded: RecordedRun, *, first: bool = False) -> float:
-    """Return the moment that a person means, in seconds since the supervisor began.
-
-    Args:
-        word: `12:03:05` or `12:03:05.25`, local time of the day on which the run began, or of the
-            next one; `+17.5`, seconds since the supervisor began; or ISO 8601.
-        recorded: the run it is about.
-        first: the beginning of what is named so; else its end.
-
-    Raises:
-        UsageError: it is none of these.
-    """
-    if not recorded.moments:
-        raise UsageError("cannot find any time in an empty journal")
-    if _AFTER.fullmatch(word):
-        return float(word)
-    line = recorded.moments[0].line
-    began = line.at - line.elapsed_s
-    try:
-        if not _CLOCK.fullmatch(word):
-            return dt.datetime.fromisoformat(word.replace("Z", "+00:00")).timestamp() - began
-        parts = (word if word.count(":") == 2 else f"{word}:00").partition(".")
-        clock = dt.time.fromisoformat(parts[0].zfill(8))
-        fraction_s = float(f"0.{parts[2] or 0}")
-    except ValueError:
-        raise UsageError(
-            f"cannot read the time {word!r}",
-            hint="write 12:03:05, +17.5 for seconds since the supervisor began, or ISO 8601",
-        ) from None
-    # What a person reads as 12:03:05 lasts until 12:03:06.
-    lasts_s = 0.0 if first or parts[2] else 1.0 if word.count(":") == 2 else 60.0
-    day = dt.datetime.fromtimestamp(began).astimezone().date()
-    at = dt.datetime.combine(day, clock).timestamp() + fraction_s
-    if at + max(lasts_s, 1.0) < began:
-        at += 86_400.0
-    return at + lasts_s - began

@@ -21,7 +21,7 @@ def export(name: str, *, mapping: str = "", **given: object) -> Export:
     return Export(name, mapping=mapping, flow_labels=False, **given)
 
 
-@pytest.mark.parametrize("name", [*NETWORKS, "csv"])
+@pytest.mark.parametrize("name", NETWORKS)
 def test_every_export_shows_the_flow_and_names_what_it_left_out(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -40,9 +40,8 @@ def test_every_export_shows_the_flow_and_names_what_it_left_out(
     assert text.endswith("\n")
     assert "/robot/video" in text
     assert "/robot/status" in text
-    if name != "csv":
-        assert "its network flow endpoints are not known" in text
-        assert "EF = DSCP 46 = TOS 184 (0xb8)" in text
+    assert "its network flow endpoints are not known" in text
+    assert "EF = DSCP 46 = TOS 184 (0xb8)" in text
 
 
 def test_verified_flows_are_exported_as_nft_takes_them(capsys: pytest.CaptureFixture[str]) -> None:
@@ -94,7 +93,7 @@ def test_an_export_without_what_it_needs_is_refused(name: str, message: str) -> 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--export", "csv", "--watch"], "cannot use --export with --watch; export once"),
+        (["--export", "nft", "--watch"], "cannot use --export with --watch; export once"),
         (
             ["--export", "nft", "--device", "e0"],
             "cannot use --device, --rate or --guarantee without --export tc",

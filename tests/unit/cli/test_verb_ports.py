@@ -10,36 +10,6 @@ import pytest
 from lifecycle.cli import main
 from lifecycle.errors import ExitCode
 
-SYSTEM = """\
-manifest_version: 1
-system: pair
-machines:
-  robot: {address: "10.0.0.1"}
-  operator: {address: "%s"}
-discovery: {domain_id: %s}
-nodes:
-  talker:
-    run: {python: "pair:Talker"}
-    machine: robot
-    interface:
-      publishers: [{name: chatter, type: std_msgs/msg/String}]
-    flows:
-      publishers: {chatter: {unique: strictly_required}}
-  listener:
-    run: {python: "pair:Listener"}
-    machine: operator
-    interface:
-      subscriptions: [{name: chatter, type: std_msgs/msg/String}]
-    flows:
-      subscriptions: {chatter: {unique: strictly_required}}
-"""
-
-
-def manifest(directory: Path, *, operator: str = "10.0.0.2", domain: int = 7) -> str:
-    path = directory / "pair.lifecycle.yaml"
-    path.write_text(SYSTEM % (operator, domain), encoding="utf-8")
-    return str(path)
-
 
 def test_the_four_ports_the_safe_domains_and_what_fits_are_printed(
     capsys: pytest.CaptureFixture[str],
@@ -90,19 +60,7 @@ def test_json_holds_the_same_for_a_script(capsys: pytest.CaptureFixture[str]) ->
         "capacity": {"participants": 120, "limit": "the ports of domain 167, from 49150"},
         "localhost_participants": 33,
         "unique_subscription_ports": [7000, 7399],
-        "needs": [],
     }
-
-
-@pytest.mark.parametrize(("count", "code"), [("54", ExitCode.OK), ("55", ExitCode.VIOLATED)])
-def test_a_script_learns_from_the_exit_code_whether_so_many_fit(
-    count: str, code: ExitCode, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert (
-        main(["ports", "--domain", "101", "--participants", count, "--platform", "linux"]) == code
-    )
-    said = "fit" if code is ExitCode.OK else "do not fit"
-    assert f"--participants: {count} participants: {said}\n" in capsys.readouterr().out
 
 
 def test_the_domain_comes_from_the_environment_where_nothing_names_one(
@@ -119,43 +77,6 @@ def test_this_machines_own_ephemeral_ports_are_read(capsys: pytest.CaptureFixtur
     assert f"this machine: ephemeral ports {first}–{last}\n" in capsys.readouterr().out
 
 
-def test_each_host_of_a_manifest_lists_its_participants(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["ports", manifest(tmp_path), "--platform", "linux"]) == ExitCode.OK
-    assert capsys.readouterr().out.splitlines()[-9:] == [
-        "  fit in domain 7       120 participants per host, then the ports of domain 8, from 9400",
-        "  find each other       33 with 'range: localhost'",
-        "robot: 3 participants: fit",
-        "  supervisor",
-        "  talker",
-        "  /_talker_flow_0",
-        "operator: 2 participants, 1 unique subscription: fit",
-        "  supervisor",
-        "  listener",
-    ]
-
-
-def test_machines_with_one_address_share_one_hosts_ports(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    main(["ports", manifest(tmp_path, operator="10.0.0.1")])
-    assert (
-        "robot, operator: 4 participants, 1 unique subscription: fit\n" in capsys.readouterr().out
-    )
-
-
-def test_a_manifest_whose_system_does_not_fit_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    code = main(["ports", manifest(tmp_path), "--domain", "120", "--platform", "linux"])
-    assert code == ExitCode.MANIFEST_INVALID
-    assert (
-        "  cannot run 3 participants in domain 120 on one host: none fits before the ephemeral "
-        "ports 32768–60999: they hold its multicast ports; "
-    ) in capsys.readouterr().out
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -164,14 +85,6 @@ def test_a_manifest_whose_system_does_not_fit_is_refused(
             "cannot use domain id 233: its ports would lie outside 1 to 65535; use 0 to 232\n",
         ),
         (["--participant", "-1"], "cannot use participant id -1; use 0 or more\n"),
-        (
-            ["--participants", "-1"],
-            "cannot count -1 participants or subscriptions; use 0 or more\n",
-        ),
-        (
-            ["x.lifecycle.yaml", "--participants", "3"],
-            "cannot use --participants with a MANIFEST: its plan says how many\n",
-        ),
     ],
 )
 def test_a_question_without_an_answer_is_a_usage_error(

@@ -20,7 +20,7 @@ from lifecycle.cli.verbs import history
 from lifecycle.errors import UsageError
 from lifecycle.supervisor.run import journal as module
 from lifecycle.supervisor.run.events import Notice, RunStarted, Stopped, VerdictChanged
-from lifecycle.supervisor.run.history import journal_files, moment_of, read_run
+from lifecycle.supervisor.run.history import journal_files, read_run
 from lifecycle.supervisor.run.journal import Journal
 from lifecycle.verify import Finding, Outcome, Stage, Verdict
 
@@ -145,20 +145,6 @@ def test_a_torn_line_and_a_foreign_one_are_passed_over_and_named(kept: Kept) -> 
     assert len(recorded.moments) == 2
 
 
-def test_times_are_read_as_people_write_them(kept: Kept, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TZ", "UTC")
-    kept.say("one")
-    recorded = read_run(journal_files(kept.directory))
-    assert moment_of("+2.5", recorded) == 2.5
-    assert moment_of("2023-11-14T22:13:30Z", recorded) == 10
-    assert moment_of("22:13:22", recorded) == pytest.approx(3, abs=1e-5)
-    assert moment_of("22:13:22", recorded, first=True) == 2
-    assert moment_of("22:14", recorded, first=True) == 40
-    for word in ("soon", "25:00:00", "12", "+x"):
-        with pytest.raises(UsageError, match="12:03:05"):
-            moment_of(word, recorded)
-
-
 def _verb(command: object, *words: str) -> tuple[int, str]:
     result = CliRunner().invoke(command, words, standalone_mode=False)  # type: ignore[arg-type]
     if result.exception is not None:
@@ -186,11 +172,8 @@ def test_the_verbs_tell_a_run_whose_supervisor_was_killed(kept: Kept) -> None:
     assert code == 0
     assert "robot: 2 nodes in 2 processes" in text.splitlines()[0]
     assert text.splitlines()[-1].endswith("ended without saying so")
-    assert [
-        line.split("  ")[-1]
-        for line in _verb(history.command, folder, "--node", "camera")[1].splitlines()[:-1]
-        if "about" in line
-    ] == ["about /camera\\x1b[2J"]
+    said = [line.split("  ")[-1] for line in text.splitlines() if "about" in line]
+    assert said == ["about /camera\\x1b[2J", "about /camera_2"]
     code, text = _verb(history.command, folder, "--format", "json")
     assert [{*json.loads(line)} - {"at", "elapsed_s"} for line in text.splitlines()] == [
         {"run"},
