@@ -106,11 +106,12 @@ def evaluate(path: Path, arguments: Mapping[str, str]) -> Launched:
         context = launch.LaunchContext(argv=[f"{n}:={v}" for n, v in arguments.items()])
         context.extend_locals({"current_launch_file_path": str(path.resolve())})
         context.launch_configurations.update(arguments)
-        for name, value in (
-            ("current_launch_file_path", str(path.resolve())),
-            ("current_launch_file_directory", str(path.resolve().parent)),
-        ):
-            context.extend_globals({name: value})
+        context.extend_globals(
+            {
+                "current_launch_file_path": str(path.resolve()),
+                "current_launch_file_directory": str(path.resolve().parent),
+            }
+        )
         walk = _Walk(context, started)
         walk.visit(description)
     except LifecycleError:
@@ -133,14 +134,9 @@ def _package(name: str) -> Any:
     try:
         return importlib.import_module(name)
     except ModuleNotFoundError as problem:
-        if problem.name is None or problem.name.partition(".")[0] not in (
-            "launch",
-            "launch_ros",
-            "launch_xml",
-            "launch_yaml",
-        ):
+        package = str(problem.name).partition(".")[0]
+        if not package.startswith("launch"):
             raise
-        package = problem.name.partition(".")[0]
         raise UsageError(
             f"cannot import a launch file: the Python package {package!r} is not installed here",
             hint=_INSTALL.format(package=package.replace("_", "-")),
@@ -198,7 +194,8 @@ class _Walk:
 
     def _read(self, entity: Any, kinds: Sequence[str], notes: tuple[str, ...]) -> None:
         if "TimerAction" in kinds:
-            period = self._text_or_number(entity.period)
+            period = entity.period
+            period = f"{period:g}" if isinstance(period, (int, float)) else self._text(period)
             note = f"launch starts it {period} s later; `after:` says what it waits for"
             for each in entity.actions:
                 self.visit(each, (*notes, note))
@@ -239,19 +236,16 @@ class _Walk:
         )
         self._settings(node, _private(action, "parameters"), _private(action, "remappings"))
         self._ros_arguments(node, action)
-        for name, what in (("respawn", "respawn"), ("shell", "shell"), ("env", "env")):
-            value = _private(action, name)
-            if value is None:
-                value = getattr(action, name, None)
-            if name == "env" and value is None:
-                value = getattr(getattr(action, "process_description", None), "env", None)
+        described = getattr(action, "process_description", None)
+        for name in ("respawn", "shell", "env"):
+            value = _private(action, name) or getattr(action, name, None)
+            value = value or (getattr(described, "env", None) if name == "env" else None)
             if value and not (isinstance(value, list) and self._text(value).lower() == "false"):
-                node.gaps.append(f"{what}: a manifest has nothing like it")
+                node.gaps.append(f"{name}: a manifest has nothing like it")
         if _private(action, "on_exit"):
             node.gaps.append("on_exit: what its end does to others is the supervisor's")
         self.found.nodes.append(node)
-        described = _private(action, "composable_node_descriptions") or ()
-        for each in described:
+        for each in _private(action, "composable_node_descriptions") or ():
             self._component(each, node.full_name, notes)
 
     def _run(self, action: Any) -> dict[str, Tree]:
@@ -265,17 +259,23 @@ class _Walk:
             run = {"package": package, "executable": executable}
         elif package:
             path = f"$(find-pkg-share {package})/../../lib/{package}/{executable}"
-            run = {"command": [_Written(path), *map(_literal, arguments)]}
+            run = {"command": [path, *map(_literal, arguments)]}
         else:
             run = {"command": [_literal(each) for each in (executable, *arguments)]}
         description = getattr(action, "process_description", None)
         prefix = self._text(_private(description, "prefix"))
         if prefix:
             run["prefix"] = [_literal(each) for each in shlex.split(prefix)]
-        output = self._output(action)
-        if output:
+        output = _private(action, "output")
+        output = "" if isinstance(output, dict) else self._text(output)
+        if output in ("screen", "both"):  # launch's default is log
             run["output"] = output
-        environment = self._changed()
+        # What SetEnvironmentVariable has set by now.
+        environment = {
+            name: value
+            for name, value in self._context.environment.items()
+            if self._environment.get(name) != value
+        }
         for name, value in _private(description, "additional_env") or ():
             environment[self._text(name)] = self._text(value)
         if environment:
@@ -284,19 +284,6 @@ class _Walk:
         if folder:
             run["working_directory"] = _literal(folder)
         return run
-
-    def _output(self, action: Any) -> str:
-        output = _private(action, "output")
-        text = "" if isinstance(output, dict) else self._text(output)
-        return text if text in ("screen", "both") else ""  # launch's default is log
-
-    def _changed(self) -> dict[str, str]:
-        """Return what SetEnvironmentVariable has set by now."""
-        return {
-            name: value
-            for name, value in self._context.environment.items()
-            if self._environment.get(name) != value
-        }
 
     def _namespace(self, written: Any) -> str:
         names = importlib.import_module("launch_ros.utilities")
@@ -410,9 +397,6 @@ class _Walk:
             return "".join(self._text(each) for each in value)
         return str(value.perform(self._context))
 
-    def _text_or_number(self, value: Any) -> str:
-        return f"{value:g}" if isinstance(value, (int, float)) else self._text(value)
-
     def _command(self, action: Any) -> list[str]:
         with contextlib.suppress(Exception):  # a word of it may depend on what runs
             return [self._text(each) for each in action.cmd]
@@ -420,12 +404,6 @@ class _Walk:
 
 
 _LEVELS = ("debug", "info", "warn", "error", "fatal")
-
-
-class _Written(str):
-    """Text whose substitutions are the manifest's own."""
-
-    __slots__ = ()
 
 
 def _is_a(value: Any, *names: str) -> bool:
@@ -515,7 +493,8 @@ def _keys(nodes: Iterable[LaunchedNode]) -> list[str]:
 
 
 def _tree(node: LaunchedNode, by_name: Mapping[str, str], folder: Path) -> Tree:
-    tree: dict[str, Tree] = {"run": _run_tree(node, by_name)}
+    container = {"container": by_name.get(node.container, node.container)} if node.container else {}
+    tree: dict[str, Tree] = {"run": {**node.run, **container}}
     gaps = [*node.gaps]
     if node.name:
         tree["name"] = node.name  # written even if it is the key: only then a command is given it
@@ -541,13 +520,6 @@ def _tree(node: LaunchedNode, by_name: Mapping[str, str], folder: Path) -> Tree:
         tree["log_level"] = node.log_level
     tree["endpoints"] = Noted(value="open", note=f"gap: {_NO_INTERFACE}")
     return Noted(value=tree, note="; ".join(f"gap: {each}" for each in gaps)) if gaps else tree
-
-
-def _run_tree(node: LaunchedNode, by_name: Mapping[str, str]) -> dict[str, Tree]:
-    run = dict(node.run)
-    if node.container:
-        run["container"] = by_name.get(node.container, node.container)
-    return run
 
 
 def _spelled(value: bool | float | str) -> bool | int | float | str:

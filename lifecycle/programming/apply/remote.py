@@ -29,6 +29,7 @@ from lifecycle.programming.apply.target import (
     PartlyError,
     SettingsError,
     TargetChanges,
+    deletions,
     describe_rule,
 )
 from lifecycle.programming.apply.targets.registry import (
@@ -166,8 +167,10 @@ class RemoteTarget:
         Raises:
             PartlyError: for some flows it failed; the others are done.
         """
-        planned = self.plan(rules)
         bodies = {each.key: each.body for each in self._asked(rules).requests}
+        return self._carried_out(self.plan(rules), bodies)
+
+    def _carried_out(self, planned: TargetChanges, bodies: Mapping[str, Body]) -> TargetChanges:
         done: list[FlowChange] = []
         errors: list[tuple[str, LifecycleError]] = []
         # Deletions come first in the plan: what is in the way of something new goes before it.
@@ -178,20 +181,16 @@ class RemoteTarget:
                 errors.append((change.key, error))
             else:
                 done.append(dataclasses.replace(change, detail=detail or change.detail))
+        made = dataclasses.replace(planned, changes=tuple(done))
         if errors:
-            raise self._partly(len(planned.changes), errors, done)
-        return dataclasses.replace(planned, changes=tuple(done))
+            text = [dataclasses.replace(made, left_out=()).render(done=True)]
+            raise PartlyError(
+                self.name, len(planned.changes), errors, done=text if made.pending else ()
+            )
+        return made
 
     def _asked(self, rules: Sequence[FlowRule]) -> Requests:
         return self._service.requests(self._settings, rules)
-
-    def _partly(
-        self, total: int, errors: Sequence[tuple[str, LifecycleError]], done: Sequence[FlowChange]
-    ) -> PartlyError:
-        made = TargetChanges(target=self.name, changes=tuple(done))
-        return PartlyError(
-            self.name, total, errors, done=[made.render(done=True)] if made.pending else ()
-        )
 
     def dry_run(self, rules: Sequence[FlowRule]) -> str:
         """Return the bodies as JSON, one per flow; asks no server."""
@@ -207,20 +206,8 @@ class RemoteTarget:
         Raises:
             PartlyError: some could not be deleted; they stay in the ledger.
         """
-        entries = self._record().entries
-        done: list[FlowChange] = []
-        errors: list[tuple[str, LifecycleError]] = []
-        for entry in entries:
-            change = FlowChange(kind=ChangeKind.DELETE, key=entry.key, what=entry.what)
-            try:
-                self._delete(entry)
-            except LifecycleError as error:
-                errors.append((entry.key, error))
-            else:
-                done.append(change)
-        if errors:
-            raise self._partly(len(entries), errors, done)
-        return TargetChanges(target=self.name, changes=tuple(done))
+        entries = [(each.key, each.what) for each in self._record().entries]
+        return self._carried_out(deletions(self.name, entries), {})
 
     def renew(self) -> float | None:
         """Prolong what is due.
