@@ -19,6 +19,7 @@ from rich.text import Text
 
 from lifecycle.cli.standard_streams import Writer
 from lifecycle.cli.up_output import Rollback, describe, verdict_line
+from lifecycle.cli.verbs.control import HEADS, row
 from lifecycle.printable import log_line, one_line
 from lifecycle.supervisor import (
     Event,
@@ -144,7 +145,7 @@ class Live:
 
     def _picture(self, status: SystemStatus) -> RenderableType:
         table = Table(box=box.SIMPLE_HEAD, pad_edge=False, header_style="bold")
-        for column in ("node", "process", "state", "matched", "unique flows", ""):
+        for column in HEADS:
             # Where there is no room the others keep theirs; no row takes two lines.
             table.add_column(column, no_wrap=column not in ("node", ""))
         shown = _that_fit(status.nodes, self._console.height - _AROUND_ROWS)
@@ -197,36 +198,20 @@ def _head(status: SystemStatus) -> Text:
     return head
 
 
-def _short(text: str, style: str) -> Text:
-    return Text(text, style=style, no_wrap=True, overflow="ellipsis")
-
-
 def _row(node: NodeStatus) -> tuple[RenderableType, ...]:
-    if node.process_state is None:
-        process = Text("not ours", style="dim")
-    else:
-        word = node.process_state.value
-        process = Text(f"{word} {node.pid or ''}".strip(), style=_PROCESS.get(word, ""))
+    """Return the cells of `lifecycle status`, in colours."""
+    name, process, pid, state, matched, flows, doing = row(node)
     nested = " · connected" if node.state == "inactive" and node.matched else ""
-    state = node.state if node.managed else node.reach.value
-    state = "dead" if node.died else state
-    style = "red" if node.died else "yellow"
     complete = "green" if node.matched >= node.endpoints else "yellow"
-    return (
-        _short(one_line(node.node), "red" if node.findings else "bold"),
-        process,
-        Text(
-            f"{one_line(state) or '–'}{nested}",
-            style="red" if node.died else _STATES.get(node.state, "yellow"),
-        ),
-        Text(f"{node.matched}/{node.endpoints}", style=complete if node.endpoints else "dim"),
-        Text(f"{node.unique_flows}/{node.flows}" if node.flows else "–", style="dim"),
-        _short(one_line(node.died or node.doing or _away(node)), style),
+    styled = (
+        (name, "red" if node.findings else "bold"),
+        (process, _PROCESS.get(process, "dim")),
+        (pid, "dim"),
+        (f"{state}{nested}", "red" if node.died else _STATES.get(node.state, "yellow")),
+        (matched, complete if node.endpoints else "dim"),
+        (flows, "dim"),
+        (doing, "red" if node.died else "yellow"),
     )
-
-
-def _away(node: NodeStatus) -> str:
-    """Say of a node whose process failed when it is started again, and how often it was."""
-    if node.next_try_s is not None:
-        return f"starts again in {node.next_try_s:.1f} s"
-    return f"restarted {node.restarts}×" if node.restarts else ""
+    return tuple(
+        Text(text, style=style, no_wrap=True, overflow="ellipsis") for text, style in styled
+    )

@@ -35,14 +35,14 @@ if TYPE_CHECKING:
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-_HEADS = ("node", "process", "pid", "state", "matched", "unique flows", "")
+HEADS = ("node", "process", "pid", "state", "matched", "unique flows", "")
 
 
 def status_text(status: SystemStatus) -> str:
     """Return a status as lines: one for the system, one for each node and each connection."""
     verdict = "not judged yet" if status.verdict is None else status.verdict.value
     verdict += f" ({status.not_ok})" if status.not_ok else ""
-    rows = [_HEADS, *(tuple(map(one_line, _row(node))) for node in status.nodes)]
+    rows = [HEADS, *map(row, status.nodes)]
     living = sum(not node.died and node.next_try_s is None for node in status.nodes)
     count = "" if living == len(status.nodes) else f" {living}/{len(status.nodes)}"
     mode = f", mode {status.mode}" if status.mode else ""
@@ -70,9 +70,10 @@ def connection_text(connection: ConnectionReport) -> str:
     return f"connection {connection.name} {state}; {', '.join(connection.urls)}; carries {carries}"
 
 
-def _row(node: NodeStatus) -> tuple[str, ...]:
+def row(node: NodeStatus) -> tuple[str, ...]:
+    """Return the cells of a node, below HEADS; printable."""
     process = "not ours" if node.process_state is None else node.process_state.value
-    return (
+    cells = (
         node.node,
         process,
         str(node.pid or "–"),
@@ -81,6 +82,7 @@ def _row(node: NodeStatus) -> tuple[str, ...]:
         f"{node.unique_flows}/{node.flows}",
         node.died or (f"silent: {node.silent}" if node.silent else node.doing) or _history(node),
     )
+    return tuple(map(one_line, cells))
 
 
 def _history(node: NodeStatus) -> str:

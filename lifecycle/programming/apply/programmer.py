@@ -235,7 +235,7 @@ class Programmer:
             PartlyError: something could not be removed, or not in time; it stays listed.
         """
         self._applied, self._programmed = None, {}
-        return remove_all(self._ledger, self._made_by, within_s=within_s)
+        return _remove_all(self._ledger, self._made_by or Targets(self._ledger), within_s)
 
     def cancel(self) -> None:
         """From another thread: have what servers are asked fail at once, until `resume`."""
@@ -249,14 +249,6 @@ class Programmer:
         found = self.rules(flows)
         self.left_out = found.left_out
         return found.rules
-
-
-def ledger_of(
-    plan: Plan, environment: Mapping[str, str], *, machine: str = "", owned: bool = False
-) -> Ledger:
-    """Return the ledger of a system on this host; it need not exist yet."""
-    directory: Path = runtime_root(environment) / run_name(plan, machine)
-    return Ledger(directory, plan.system, owned=owned)
 
 
 def open_programmer(
@@ -281,7 +273,8 @@ def open_programmer(
     Raises:
         UsageError: options or settings cannot be used.
     """
-    ledger = ledger_of(plan, environment, machine=machine, owned=owned)
+    directory = runtime_root(environment) / run_name(plan, machine)
+    ledger = Ledger(directory, plan.system, owned=owned)
     targets = Targets(ledger)
     return Programmer(
         plan,
@@ -291,25 +284,6 @@ def open_programmer(
         treatment=treatment,
         made_by=targets,
     )
-
-
-def remove_all(
-    ledger: Ledger, targets: Targets | None = None, *, within_s: float | None = None
-) -> tuple[TargetChanges, ...]:
-    """Remove everything that a ledger lists.
-
-    Args:
-        ledger: says what there is.
-        targets: make what removes; None for new ones.
-        within_s: for all that servers are asked; None for the patience with each request.
-
-    Raises:
-        PartlyError: something could not be removed; it stays listed.
-    """
-    own = targets or Targets(ledger)
-    with own.deadline.within(within_s), ledger.locked():
-        records = ledger.read().targets
-        return _each(records, lambda each: target_kind(each.target).restore(each, own).remove())
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -364,7 +338,7 @@ def remove_run(directory: Path, *, within_s: float | None = None) -> tuple[Targe
 
 
 class Removal:
-    """Removes everything that a run has in networks, from one thread and cancelled from another.
+    """Removes everything that a ledger lists, from one thread and cancelled from another.
 
     Args:
         directory: of the run.
@@ -383,11 +357,19 @@ class Removal:
         Raises:
             ProgrammingError: something could not be removed; it stays listed.
         """
-        return remove_all(self._ledger, self._targets, within_s=within_s)
+        return _remove_all(self._ledger, self._targets, within_s)
 
     def cancel(self) -> None:
         """Have what servers are asked fail at once."""
         self._targets.deadline.cancel()
+
+
+def _remove_all(
+    ledger: Ledger, targets: Targets, within_s: float | None
+) -> tuple[TargetChanges, ...]:
+    with targets.deadline.within(within_s), ledger.locked():
+        records = ledger.read().targets
+        return _each(records, lambda each: target_kind(each.target).restore(each, targets).remove())
 
 
 def _sweep(directory: Path, within_s: float) -> tuple[TargetChanges, ...]:
