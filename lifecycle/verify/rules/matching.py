@@ -299,7 +299,7 @@ def _of_one_end(
 def _by_count(word: str, matched: int, end: SeenEndpoint, others: Sequence[SeenEndpoint]) -> Match:
     """Conclude from a number alone: it proves the pair only if it is that of all who can match."""
     possible = _possible(end, others)
-    reason = f"{word} matched {matched} of {len(possible)}"
+    reason = f"{word} matched {matched} of {len(possible)}" if matched else f"{word} matched nobody"
     if matched == len(possible):
         return _OK
     if matched < len(possible) and (matched == 0 or all(each.expected for each in possible)):

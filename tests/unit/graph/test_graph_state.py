@@ -324,9 +324,9 @@ def judged(
     ("publisher", "subscription", "outcome", "reason"),
     [
         ({"matched": 1}, {}, Outcome.OK, ""),
-        ({"matched": 0}, {"matched": 1}, Outcome.VIOLATED, "the publisher matched 0 of 1"),
+        ({"matched": 0}, {"matched": 1}, Outcome.VIOLATED, "the publisher matched nobody"),
         ({}, {}, Outcome.UNVERIFIABLE, "neither end reports whom it is matched with"),
-        ({"matched": 0}, {}, Outcome.VIOLATED, "the publisher matched 0 of 1"),
+        ({"matched": 0}, {}, Outcome.VIOLATED, "the publisher matched nobody"),
         (
             {"matched": 2},
             {},
