@@ -24,7 +24,6 @@ from lifecycle.manifest import (
     RosInterfaceAccess,
     supervisor_prefix,
     supervisor_services,
-    supervisor_status_topic,
 )
 from lifecycle.plan import Plan
 from lifecycle.supervisor.control import protocol
@@ -161,10 +160,7 @@ class RosInterface:
         elif not self._opens:
             pass
         elif isinstance(event, Stopping):
-            # It will not be there for long: for those only who wait for it already.
             self._wait(None)
-            if self._participant.is_subscribed(self._status_topic):
-                self._open()
             self._opens = False
         elif not self._was_active and isinstance(event, _ON_ITS_WAY):
             self._was_active = isinstance(event, SystemReached) and event.reached == ACTIVE
@@ -181,10 +177,6 @@ class RosInterface:
         if offer is not None:
             self._say(offer)
             offer.destroy()
-
-    @property
-    def _status_topic(self) -> str:
-        return supervisor_status_topic(supervisor_prefix(self._plan.system, self._machine))
 
     def _open_in(self, wait_s: float) -> None:
         self._wait(asyncio.get_running_loop().call_later(wait_s, self._open))

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.graph import set_within
-from lifecycle.manifest import EndpointKind, supervisor_alive_topic
+from lifecycle.manifest import supervisor_alive_topic
 from lifecycle.plan import ParticipantConnections, PlannedNode
 from lifecycle.supervisor.control.ros_interface import Answer
 from lifecycle.supervisor.health.peer_supervisors import Listener
@@ -191,12 +191,6 @@ class ObserverParticipant:
             return RosInterface(self._node, prefix, services, on_call, diagnoses=diagnoses)
         except Exception as error:  # rclpy has no root of its own errors
             raise MiddlewareError(" ".join(str(error).split())) from error
-
-    def is_subscribed(self, topic: str) -> bool:
-        """Return whether discovery shows a subscription of a topic."""
-        from lifecycle.middleware import endpoints_of
-
-        return bool(endpoints_of(self._node, EndpointKind.SUBSCRIPTION, topic))
 
     def call_out(self, addresses: Iterable[str]) -> None:
         """Make all participants announce themselves, as far as the system's discovery allows."""

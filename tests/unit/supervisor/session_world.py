@@ -180,7 +180,6 @@ class FakeParticipant:
         while_looking: done once, when the next look has seen everything and is not over yet.
         ros: what ROS programs see of the supervisor; None before it is made.
         no_ros: why it cannot be made; empty if it can.
-        subscribed: topics that others subscribe to.
         refuses: value of a parameter that no node takes, `rate=5`.
         refuses_live: why nodes do not take parameters while they run.
     """
@@ -197,7 +196,6 @@ class FakeParticipant:
         self.while_looking: Callable[[], None] | None = None
         self.ros: FakeRosInterface | None = None
         self.no_ros = ""
-        self.subscribed: set[str] = set()
         self.refuses = ""
         self.refuses_live: dict[str, str] = {}
         self.graph = self.discovery = self.clients = self.state = self
@@ -340,9 +338,6 @@ class FakeParticipant:
         self.ros = FakeRosInterface(prefix, tuple(services), on_call)
         self.ros.diagnoses = diagnoses
         return self.ros
-
-    def is_subscribed(self, topic: str) -> bool:
-        return topic in self.subscribed
 
     def call_out(self, addresses: Iterable[str]) -> None:
         """Nobody is far away."""

@@ -38,8 +38,6 @@ from lifecycle.supervisor.run.events import (
     Stopping,
     SystemReached,
     VerdictChanged,
-    WiringChanged,
-    WiringLost,
     to_record,
 )
 from lifecycle.supervisor.run.options import UpResult
@@ -106,17 +104,6 @@ def test_plain_lines_tell_a_person_what_happens() -> None:
         "system active after 1.25 s\n"
         "failed: /camera (run.process-died)\n"
         "verdict: ok\n"
-    )
-
-
-def test_a_death_that_the_run_outlives_is_told_in_full_at_once() -> None:
-    stream = io.StringIO()
-    failure = EVENTS[-1]
-    assert isinstance(failure, Failure)
-    PlainLines(_Into(stream))(dataclasses.replace(failure, ends_run=False))
-    assert stream.getvalue() == (
-        "failed: /camera (run.process-died): "
-        "cannot keep '/camera' running: pid 7 died: killed by SIGSEGV\n"
     )
 
 
@@ -287,27 +274,6 @@ def test_a_verdict_that_reads_as_the_last_one_did_is_not_told_again() -> None:
     )
 
 
-def test_a_gate_that_takes_something_on_trust_says_what() -> None:
-    stream = io.StringIO()
-    trusted = "rate_hz 500 of /video (flow.not-measured)"
-    PlainLines(_Into(stream))(
-        GateOpened(outcome="unverifiable", nodes=("/camera",), trusted=trusted)
-    )
-    assert stream.getvalue() == (
-        "gate open on verdict unverifiable: activating 1 node; taken on trust: rate_hz 500 of"
-        " /video (flow.not-measured)\n"
-    )
-
-
-def test_a_verdict_that_is_unverifiable_names_what_is_unknown() -> None:
-    stream = io.StringIO()
-    verdict = verdict_of(Outcome.UNVERIFIABLE, "graph.unattributed-endpoint")
-    PlainLines(_Into(stream))(VerdictChanged(stage=Stage.ACTIVE, verdict=verdict))
-    assert stream.getvalue() == (
-        "active: verdict unverifiable; unknown: /camera (graph.unattributed-endpoint)\n"
-    )
-
-
 def test_a_node_on_its_way_to_active_is_waited_for_and_one_that_leaves_it_violates() -> None:
     stream = io.StringIO()
     lines = PlainLines(_Into(stream))
@@ -376,16 +342,6 @@ def test_a_status_is_a_head_and_a_line_for_each_node() -> None:
         "robot: active, verdict ok, domain 30, supervisor 1, up for 1.5 s\n"
         "node     process  pid  state   matched  unique flows\n"
         "/camera  running  7    active  1/2      1/3"
-    )
-
-
-def test_a_status_says_what_keeps_the_verdict_from_being_ok() -> None:
-    wrong = msgspec.structs.replace(
-        STATUS, verdict=Outcome.VIOLATED, not_ok="missing: /camera (node)"
-    )
-    assert status_text(wrong).splitlines()[0] == (
-        "robot: active, verdict violated (missing: /camera (node)), domain 30, supervisor 1, "
-        "up for 1.5 s"
     )
 
 
@@ -490,61 +446,6 @@ def test_ends_that_form_no_ip_flow_are_shown_as_what_they_tell() -> None:
     flow = dataclasses.replace(FLOW, source=(memory,), destination=())
     (_, row) = render_flows([flow], "text").splitlines()
     assert " ".join(row.split()).startswith("/video /camera /viewer shm unknown – – EF = DSCP 46")
-
-
-@pytest.mark.parametrize(
-    ("event", "line"),
-    [
-        (
-            WiringChanged(
-                node="/camera",
-                operation=Operation.CONNECT_TO,
-                connection="net",
-                urls=("udpv4://10.77.0.1:7911", "shm://"),
-            ),
-            "/camera: connected to net, udpv4://10.77.0.1:7911, shm://",
-        ),
-        (
-            WiringChanged(
-                node="/camera",
-                operation=Operation.MAP_TO,
-                connection="net",
-                endpoint="publishers/video",
-                attempt=3,
-            ),
-            "/camera: publishers/video mapped onto connection net (try 3)",
-        ),
-        (
-            WiringChanged(
-                node="/camera", operation=Operation.MAP_TO, endpoint="subscriptions/command"
-            ),
-            "/camera: subscriptions/command mapped onto its own participant",
-        ),
-        (
-            WiringChanged(
-                node="/camera",
-                operation=Operation.CONNECT_TO,
-                connection="net",
-                attempt=2,
-                error="cannot connect '/camera' to 'net' (shm://): no shared memory",
-            ),
-            "cannot connect '/camera' to 'net' (shm://): no shared memory (try 2)",
-        ),
-        (
-            WiringChanged(node="/camera", operation=Operation.DISCONNECT_FROM, connection="net"),
-            "/camera: disconnected from net",
-        ),
-        (WiringLost(node="/camera", connection="net"), "/camera: lost net"),
-        (
-            WiringLost(node="/camera", connection="net", endpoint="publishers/video"),
-            "/camera: lost publishers/video on net",
-        ),
-    ],
-)
-def test_a_step_of_wiring_is_one_line(event: Event, line: str) -> None:
-    stream = io.StringIO()
-    PlainLines(_Into(stream))(event)
-    assert stream.getvalue() == f"{line}\n"
 
 
 def test_a_status_lists_connections_below_their_node() -> None:

@@ -27,7 +27,6 @@ from tests.unit.supervisor.fakes import run
 from tests.unit.supervisor.session_world import CHAIN, INTRUDED, FakeRosInterface, SessionWorld
 
 OFF, FULL = RosInterfaceAccess.OFF, RosInterfaceAccess.FULL
-STATUS = "/lifecycle/robot/status"
 
 
 def offering(access: RosInterfaceAccess, plan: Plan = CHAIN) -> Plan:
@@ -40,7 +39,6 @@ def test_it_reads_only_by_default_and_off_leaves_nothing(tmp_path: Path) -> None
         directory = tmp_path / f"{access} {stop_after_s}"
         directory.mkdir()
         world = SessionWorld(plan, directory, stop_after_s=stop_after_s)
-        world.graph.subscribed.add(STATUS)
         await world.run()
         return world.graph.ros
 
@@ -84,24 +82,6 @@ async def test_a_bring_up_that_is_held_up_says_why_before_it_is_active(tmp_path:
         assert json.loads(ros.statuses[-1])["phase"] == "active"
 
     await world.run(wait())
-
-
-def test_who_waits_for_the_status_is_told_why_a_bring_up_ends(tmp_path: Path) -> None:
-    async def main(subscribed: set[str]) -> FakeRosInterface | None:
-        directory = tmp_path / str(len(subscribed))
-        directory.mkdir()
-        world = SessionWorld(CHAIN, directory, timeout_s=2.0)
-        world.graph.subscribed = subscribed
-        world.intrude()
-        await world.run()
-        return world.graph.ros
-
-    assert run(main(set())) is None
-    ros = run(main({STATUS}))
-    assert ros.destroyed
-    said = json.loads(ros.statuses[-1])
-    assert said["phase"] == "stopping"
-    assert said["ends"].startswith("the verdict keeps the gate closed; wrong: /intruder")
 
 
 async def test_what_cannot_be_offered_is_said_once_and_the_system_runs_without(
