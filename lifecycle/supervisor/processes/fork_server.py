@@ -1,4 +1,4 @@
-"""The supervisor's side of a fork server: a `Spawner` over a socket.
+"""The supervisor's side of a fork server: processes are started over a socket.
 
 Owns: asking it to fork, and following its children by pidfd, so that an end is noticed at once. A
 run whose fork server dies fails: its children become this process's own, and are ended. Must not
@@ -134,7 +134,7 @@ class _Pending(NamedTuple):
 
 
 class ForkServer:
-    """A `Spawner` that asks a process to fork.
+    """Starts processes: asks another one to fork.
 
     Args:
         process: that process; ended by `close`.

@@ -1,10 +1,9 @@
 """One process of a system: how it is started, its states, its output, and its bounded end.
 
-Owns: `ManagedProcess`; the legal changes of process states, whose names are not those of node
-states: only nodes are "active"; and `Spawner`, the interface of what starts processes:
-fork_server.py, or a test; deadlines on a loaded machine: time in which a process was ready to run
-but had no CPU does not count. What the whole system does is nodes/system.py's. Must not import
-rclpy.
+Owns: `ManagedProcess`, whose states are not called as those of nodes: only nodes are "active"; and
+deadlines on a loaded machine: time in which a process was ready to run but had no CPU does not
+count. What starts it is fork_server.py, or a test; what the whole system does is nodes/system.py's.
+Must not import rclpy.
 """
 
 from __future__ import annotations
