@@ -32,7 +32,7 @@ from lifecycle.node.connections.connection_status import (
     ConnectionEventKind,
     ConnectionEvents,
 )
-from lifecycle.node.connections.data_layer import NodeDataLayer, RemoteInterface
+from lifecycle.node.connections.data_layer import NodeDataLayer, serve_interface
 from lifecycle.node.endpoints.mapping import wire_name
 from lifecycle.node.lifecycle.controller import Controller
 from lifecycle.node.lifecycle.execution import SUCCESS, Result
@@ -222,11 +222,7 @@ class Managed:
                 group=self._turns.group,
             )
             configuration.serve(node, self.get_configuration, self._turns.group)
-        self._remote = RemoteInterface(
-            node, self.data_layer, log=node.get_logger().error, group=self._turns.group
-        )
-        if served:
-            self._remote.serve()
+            serve_interface(node, self.data_layer, self._turns.group)
         if spec.events or spec.membership:
             self._join()
 

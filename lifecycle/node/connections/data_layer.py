@@ -9,7 +9,7 @@ that the plan says, *disconnect* takes everything away. In between `connect_to`,
 `disconnect` and `remap` change single ones. See *Topological Discovery and Communication
 Negotiation*, "Node Interface".
 
-`RemoteInterface` offers it as ROS services: a request is a list of names and values, the answer
+`serve_interface` offers it as ROS services: a request is a list of names and values, the answer
 says of each whether it succeeded and why not:
 
     ros2 service call /camera/connect_to rcl_interfaces/srv/SetParameters \
@@ -381,81 +381,64 @@ class NodeDataLayer:
             )
 
 
-class RemoteInterface:
-    """Serves one node's interface.
+def serve_interface(
+    node: Node, interface: NodeDataLayer, group: CallbackGroup, *names: str
+) -> None:
+    """Serve a node's interface.
 
     Args:
         node: that has it.
         interface: does it.
-        log: called with a fault of ours and its traceback.
         group: reentrant, so that others can ask while a transition runs or a handover lasts.
+        names: of the services; all of them if left out.
     """
 
-    def __init__(
-        self,
-        node: Node,
-        interface: NodeDataLayer,
-        *,
-        log: Callable[[str], None],
-        group: CallbackGroup,
-    ) -> None:
-        self._node = node
-        self._interface = interface
-        self._log = log
-        self._group = group
-        self._acts = {
-            "connect_to": self._connect_to,
-            "map_to": self._map_to,
-            "disconnect": self._disconnect,
-            "remap": self._remap,
-        }
+    def connect_to(asked: Parameter) -> None:
+        interface.connect_to(asked.name, connections_of(_texts(asked, "a URL or several")))
 
-    def serve(self, *names: str) -> None:
-        """Offer the services of these names, or all."""
-        for name in names or self._acts:
-            act = self._served(self._acts[name])
+    def map_to(asked: Parameter) -> Future:
+        return interface.map_to(asked.name, _text(asked, "the connection's name"))
+
+    def disconnect(asked: Parameter) -> None:
+        interface.disconnect(asked.name)
+
+    def remap(asked: Parameter) -> None:
+        interface.remap(asked.name, _text(asked, "the new name"))
+
+    log = node.get_logger().error
+    for act in (connect_to, map_to, disconnect, remap):
+        if not names or act.__name__ in names:
             Node.create_service(
-                self._node, SetParameters, f"~/{name}", act, callback_group=self._group
+                node, SetParameters, f"~/{act.__name__}", _serving(act, log), callback_group=group
             )
 
-    def _served(self, act: Callable[[Parameter], Any]) -> Callable[[Any, Any], Any]:
-        async def serve(
-            request: SetParameters.Request, response: SetParameters.Response
-        ) -> SetParameters.Response:
-            # All are begun before any is waited for: handovers then last as long as one.
-            begun = [self._try(act, each) for each in request.parameters]
-            for result, lasting in begun:
-                if lasting is not None:
-                    await lasting
-                response.results.append(result)
-            return response
 
-        return serve
+def _serving(
+    act: Callable[[Parameter], Any], log: Callable[[str], object]
+) -> Callable[[Any, Any], Any]:
+    """Return what answers a request for several things at once."""
 
-    def _try(
-        self, act: Callable[[Parameter], Any], parameter: Parameter
-    ) -> tuple[SetParametersResult, Any]:
+    def begin(asked: Parameter) -> tuple[SetParametersResult, Any]:
         try:
-            return SetParametersResult(successful=True), act(parameter)
+            return SetParametersResult(successful=True), act(asked)
         except LifecycleError as error:
             return SetParametersResult(successful=False, reason=str(error)), None
         except Exception as error:  # noqa: BLE001 - asking must not end the node
-            self._log(traceback.format_exc())
+            log(traceback.format_exc())
             reason = f"cannot do this: {error!r}"
             return SetParametersResult(successful=False, reason=reason), None
 
-    def _connect_to(self, parameter: Parameter) -> None:
-        urls = _texts(parameter, "a URL or several")
-        self._interface.connect_to(parameter.name, connections_of(urls))
+    async def serve(
+        request: SetParameters.Request, response: SetParameters.Response
+    ) -> SetParameters.Response:
+        # All are begun before any is waited for: handovers then last as long as one.
+        for result, lasting in [begin(each) for each in request.parameters]:
+            if lasting is not None:
+                await lasting
+            response.results.append(result)
+        return response
 
-    def _map_to(self, parameter: Parameter) -> Any:
-        return self._interface.map_to(parameter.name, _text(parameter, "the connection's name"))
-
-    def _disconnect(self, parameter: Parameter) -> None:
-        self._interface.disconnect(parameter.name)
-
-    def _remap(self, parameter: Parameter) -> None:
-        self._interface.remap(parameter.name, _text(parameter, "the new name"))
+    return serve
 
 
 def _text(parameter: Parameter, what: str) -> str:

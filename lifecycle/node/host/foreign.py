@@ -51,7 +51,7 @@ from lifecycle.node.author.node import LifecycleNode
 from lifecycle.node.author.spec import Construction, Mode, constructing, ros_arguments
 from lifecycle.node.configuration import ConfigurationChanges
 from lifecycle.node.connections.connections import Connection, Connections
-from lifecycle.node.connections.data_layer import RemoteInterface
+from lifecycle.node.connections.data_layer import serve_interface
 from lifecycle.node.endpoints.mapping import MatchWatch
 from lifecycle.node.lifecycle.execution import SUCCESS, Result
 from lifecycle.node.lifecycle.gate import GatedPublisher, NodeGate
@@ -249,10 +249,8 @@ class ForeignNode:
         self._is_ours = True
         configuration.serve(self._node, self.get_configuration, self._group)
         immovable: Any = Immovable(self.full_name)
-        remote = RemoteInterface(
-            self._node, immovable, log=self._node.get_logger().error, group=self._group
-        )
-        remote.serve("map_to")  # with it a node is known to be one of ours
+        # With it a node is known to be one of ours.
+        serve_interface(self._node, immovable, self._group, "map_to")
         self._is_ours = False
         services = tuple(each for each in self._node.services if each not in before)
         self._watching.take_services(self._node, services)
