@@ -73,11 +73,14 @@ def measure(groups: Mapping[str, list[int]], seconds: float) -> None:
 
 def of_commands(nodes: int, domain_id: int) -> dict[str, Any]:
     """Return the manifest of plain nodes of rclpy, each a command of its own."""
-    code = "import rclpy; rclpy.init(); rclpy.spin(rclpy.create_node('idle'))"
-    run = {"command": [sys.executable, "-c", code]}
+    code = "import sys, rclpy; rclpy.init(); rclpy.spin(rclpy.create_node(sys.argv[1]))"
+    names = [f"node_{index}" for index in range(nodes)]
     return {
         **manifest(nodes, "single", domain_id, "localhost"),
-        "nodes": {f"node_{index}": {"run": run, "managed": False} for index in range(nodes)},
+        "nodes": {
+            each: {"run": {"command": [sys.executable, "-c", code, each]}, "managed": False}
+            for each in names
+        },
     }
 
 
