@@ -334,14 +334,13 @@ def _endpoint(
         return endpoint  # handed over: it is on another connection already
     if isinstance(message, MappingLost) and message.matched is None:
         return dataclasses.replace(
-            endpoint, mapped=False, connection="", matched=None, peers=None, error=message.error
+            endpoint, mapped=False, connection="", matched=None, error=message.error
         )
     return dataclasses.replace(
         endpoint,
         mapped=True,
         connection=message.connection,
         matched=endpoint.matched if message.matched is None else message.matched,
-        peers=endpoint.peers if message.matched in (None, endpoint.matched) else None,
     )
 
 

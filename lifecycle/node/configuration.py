@@ -116,7 +116,7 @@ def checksum(configuration: NodeConfiguration) -> str:
         connected=False,
         checksum="",
         endpoints=tuple(
-            dataclasses.replace(each, matched=None, peers=None, server_matched=None)
+            dataclasses.replace(each, matched=None, server_matched=None)
             for each in configuration.endpoints
         ),
         connections=tuple(

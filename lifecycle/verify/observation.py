@@ -55,8 +55,6 @@ class EndpointReport:
         nfes: this endpoint's own network flow endpoints; None where the RMW cannot list them.
         participant: base name of the hidden node that carries it; empty for the node's own.
         matched: number of matched remote endpoints; None where unknown.
-        peers: GIDs, hex, of those matched endpoints that the node's discovery knows, sorted; None
-            where the RMW cannot distinguish them. Fewer than `matched`: some are not known to it.
         server_matched: of a service or action client that exists: a server of its name is matched
             with it both ways; None for everything else and where the RMW cannot show it.
         dscp: DSCP read back from the sender sockets with getsockopt, 0–63; None if not read.
@@ -80,7 +78,6 @@ class EndpointReport:
     nfes: tuple[NetworkFlowEndpoint, ...] | None = None
     participant: str = ""
     matched: Count | None = None
-    peers: tuple[str, ...] | None = None
     server_matched: bool | None = None
     dscp: DscpValue | None = None
     error: str = ""
@@ -221,9 +218,8 @@ def _wrong(found: NodeConfiguration) -> Iterable[tuple[str, object, str]]:
         yield from _outside(f"{at}.matched", each.matched, 0, _LARGEST)
         yield from _outside(f"{at}.size_bytes", each.size_bytes, 0, _LARGEST)
         yield from _outside(f"{at}.dscp", each.dscp, 0, 63)
-        for gid in (*((each.gid,) if each.gid else ()), *(each.peers or ())):
-            if not _GID.fullmatch(gid):
-                yield f"{at}.gid or .peers", gid, "32 hex digits"
+        if each.gid and not _GID.fullmatch(each.gid):
+            yield f"{at}.gid", each.gid, "32 hex digits"
         if each.qos is not None:
             for field in ("depth", "deadline_ns", "lifespan_ns", "liveliness_lease_duration_ns"):
                 yield from _outside(f"{at}.qos.{field}", getattr(each.qos, field), 0, _LARGEST)

@@ -30,8 +30,8 @@ from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds.dscp import widen_discovery_buffers
 from lifecycle.middleware.fastdds.endpoint_discovery import (
     SOON_S,
-    TOGETHER_S,
     resend_endpoints_soon,
+    together_s,
 )
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.middleware.fastdds.settings import (
@@ -111,7 +111,11 @@ _numbers = itertools.count()
 
 @contextlib.contextmanager
 def made_participant(
-    context: rclpy.Context, settings: ParticipantSettings, *, is_new: bool = False
+    context: rclpy.Context,
+    settings: ParticipantSettings,
+    *,
+    is_new: bool = False,
+    meeting: int = 1,
 ) -> Iterator[int]:
     """Make the participant of a context with these settings; construct its first node in the block.
 
@@ -122,6 +126,7 @@ def made_participant(
             participant already.
         settings: of the participant.
         is_new: it has none yet.
+        meeting: how many participants are announced together with it, if it is unannounced.
 
     Raises:
         MiddlewareError: as `participant_settings`.
@@ -130,7 +135,7 @@ def made_participant(
     try:
         with participant_settings(context, settings), noting_shared_memory(context, is_new=is_new):
             first = bare_node(context)
-        delay_s = TOGETHER_S if settings.unannounced else SOON_S
+        delay_s = together_s(meeting) if settings.unannounced else SOON_S
         resend_endpoints_soon(first.pointer, delay_s)
         widen_discovery_buffers(context.get_domain_id())
         yield first.pointer

@@ -66,8 +66,8 @@ class HostSpec:
     """First line from the supervisor: what this process hosts.
 
     Attributes:
-        gathers: its participant is unannounced until its node is constructed; then it reports that
-            and waits for `PROCEED`, see `Unannounced`.
+        gathers: how many hosts meet; > 0: its participant is unannounced until its node is
+            constructed; then it reports that and waits for `PROCEED`, see `Unannounced`.
         folders: absolute, of the manifest and what it includes: modules are looked for there.
         log: file that it appends its output to once its supervisor was killed; empty for none.
     """
@@ -77,7 +77,7 @@ class HostSpec:
     domain_id: int
     discovery_range: DiscoveryRange
     nodes: tuple[PlannedNode, ...]
-    gathers: bool = False
+    gathers: int = 0
     folders: tuple[str, ...] = ()
     log: str = ""
 

@@ -78,16 +78,17 @@ class Participants:
 
     Args:
         default: that context.
-        unannounced: its participant is to be, if it can be.
+        meeting: how many hosts meet once all have their nodes, ≥ 0; > 0: its participant is to be
+            unannounced, if it can be.
 
     Attributes:
         unannounced: the default context's participant, until it is announced.
     """
 
-    def __init__(self, default: Context, *, unannounced: bool = False) -> None:
+    def __init__(self, default: Context, *, meeting: int = 0) -> None:
         self.unannounced: Unannounced | None = None
         self._default = default
-        self._is_unannounced = unannounced
+        self._meeting = meeting
         self._made: dict[ParticipantSettings, Context] = {}
 
     @contextlib.contextmanager
@@ -108,8 +109,9 @@ class Participants:
             context = Context()
             with discovery_by_profile(settings):
                 context.init(args=[], domain_id=self._default.get_domain_id())
-        wanted = host_settings(settings) if self._is_unannounced and not is_new else settings
-        with made_participant(context, wanted, is_new=is_new) as rcl_node:
+        wanted = host_settings(settings) if self._meeting and not is_new else settings
+        made = made_participant(context, wanted, is_new=is_new, meeting=self._meeting)
+        with made as rcl_node:
             if wanted.unannounced:
                 self.unannounced = Unannounced.of(rcl_node)
             yield context
@@ -300,7 +302,7 @@ class Host:
         self._proceed = threading.Event()
         self._left = threading.Event()
         self._nodes: dict[str, Hosted] = {}
-        self._participants = Participants(context, unannounced=spec.gathers)
+        self._participants = Participants(context, meeting=spec.gathers)
         self._adoption = Adoption(
             self._participants.carrying,
             self._loop,

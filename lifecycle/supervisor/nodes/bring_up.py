@@ -88,10 +88,12 @@ class Gathering:
     """Has hosts meet when all of them are ready for it (HostSpec.gathers).
 
     Args:
+        size: how many hosts there are, > 1.
         limit_s: seconds, > 0, that any of them waits for the others at most.
     """
 
-    def __init__(self, limit_s: float) -> None:
+    def __init__(self, size: int, limit_s: float) -> None:
+        self.size = size
         self._limit_s = limit_s
         self._missing: set[ControlChannel] = set()
         self._waiting: list[ControlChannel] = []
@@ -274,7 +276,8 @@ class BringUp:
         nodes = tuple(nodes)
         hosts = {node.planned.process for node in nodes if node.planned.run.kind is RunKind.PYTHON}
         if len(hosts) > 1 and self._unannounced():  # one alone has nobody to meet
-            self._gathering = Gathering(min(node.planned.timeouts.start_s for node in nodes) / 2)
+            limit_s = min(node.planned.timeouts.start_s for node in nodes) / 2
+            self._gathering = Gathering(len(hosts), limit_s)
         try:
             await self._side_by_side(self._walk(node) for node in nodes)
         finally:
@@ -615,7 +618,7 @@ class BringUp:
                     domain_id=self._system.plan.domain_id,
                     discovery_range=self._system.plan.discovery_range,
                     nodes=tuple(node.planned for node in nodes),
-                    gathers=self._gathering is not None,
+                    gathers=0 if self._gathering is None else self._gathering.size,
                     folders=manifest_folders(node.planned for node in nodes),
                     log=process.log.shown,
                 ),

@@ -2,12 +2,12 @@
 
 Owns: `match` and `obstacle`, by which the rules here and `lifecycle.graph`'s links judge a pair.
 
-Judged pair by pair: each end that reports names the peers that it is matched with, and both must
-name each other. Where an end's RMW only counts its peers, the count must be that of all endpoints
-of the graph that can match it, tools' included: a count that is lower or higher proves nothing
-about this pair. Where neither end reports, discovery has to do: both ends are there, of one type,
-and compatible, which is DDS's own condition for a match (DDS 1.4 §2.2.2.5, §2.2.3) but for the
-partition, which no layer reports upward; that is not enough for a declared link.
+Judged pair by pair: each end that reports counts the peers that it is matched with. A count that is
+that of all endpoints of the graph that can match it, tools' included, proves the pair; a lower one
+is settled by the other end's, and one of zero is a violation. Where neither end reports, discovery
+has to do: both ends are there, of one type, and compatible, which is DDS's own condition for a
+match (DDS 1.4 §2.2.2.5, §2.2.3) but for the partition, which no layer reports upward; that is not
+enough for a declared link.
 
 A client of a service or action reports whether a server is matched with it both ways; a server
 reports nothing about its clients.
@@ -122,12 +122,17 @@ def match(
     answers = [
         answer
         for answer in (
-            _of_one_end(publisher, subscription, subscriptions),
-            _of_one_end(subscription, publisher, publishers),
+            _of_one_end(publisher, subscriptions),
+            _of_one_end(subscription, publishers),
         )
         if answer is not None
     ]
-    return _worst(answers) if answers else None
+    if not answers:
+        return None
+    if any(outcome is Outcome.VIOLATED for outcome, _ in answers):
+        return _worst(answers)
+    # A match has two ends: one whose count is that of all who can match it proves the pair.
+    return _OK if _OK in answers else _worst(answers)
 
 
 def check(view: View) -> Iterator[Finding]:
@@ -273,32 +278,16 @@ def _worst(answers: Iterable[Match]) -> Match:
     return outcome, ", ".join(reasons)
 
 
-def _of_one_end(
-    end: SeenEndpoint, other: SeenEndpoint, others: Sequence[SeenEndpoint]
-) -> Match | None:
-    """Return what one end says of the other; None if it does not report its matches."""
+def _of_one_end(end: SeenEndpoint, others: Sequence[SeenEndpoint]) -> Match | None:
+    """Return what one end's count says; None if it does not report its matches.
+
+    It proves a pair only if it is that of all who can match the end.
+    """
     report = end.report
     if report is None or report.matched is None:
         return None
+    matched, possible = report.matched, _possible(end, others)
     word = f"the {end.kind.noun}"
-    if report.peers is None or not other.gid:
-        return _by_count(word, report.matched, end, others)
-    if other.gid in report.peers:
-        return _OK
-    unknown = report.matched - len(report.peers)
-    if unknown > 0:
-        return (
-            Outcome.UNVERIFIABLE,
-            f"{word} matched {report.matched}, of which {unknown} are not known to its node",
-        )
-    if report.matched == 0:
-        return Outcome.VIOLATED, f"{word} matched nobody"
-    return Outcome.VIOLATED, f"{word} matched {report.matched} others, not this one"
-
-
-def _by_count(word: str, matched: int, end: SeenEndpoint, others: Sequence[SeenEndpoint]) -> Match:
-    """Conclude from a number alone: it proves the pair only if it is that of all who can match."""
-    possible = _possible(end, others)
     reason = f"{word} matched {matched} of {len(possible)}" if matched else f"{word} matched nobody"
     if matched == len(possible):
         return _OK

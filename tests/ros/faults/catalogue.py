@@ -534,10 +534,10 @@ OUTSIDERS = (
         name="the listener is in a foreign partition and a tool listens instead",
         edits=_ELSEWHERE,
         intruder=("_ros2cli_4711", "--subscribe", CHATTER),
-        exit_code=ExitCode.VIOLATED,
+        exit_code=ExitCode.UNVERIFIABLE,  # the listener is in no host of ours and reports nothing
         rule="graph.unmatched-link",
         subject="/chatter",
-        message="the publisher matched 1 others, not this one",
+        message="the publisher matched 1 of 2, and does not tell which",
         options=("--strict", "--timeout", "6"),
     ),
     *(

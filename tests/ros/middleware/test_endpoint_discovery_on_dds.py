@@ -6,7 +6,7 @@ import pytest
 
 from lifecycle.middleware import FlowParticipant
 from lifecycle.middleware.fastdds import endpoint_discovery
-from lifecycle.middleware.fastdds.endpoint_discovery import TOGETHER_S, resend_endpoints_soon
+from lifecycle.middleware.fastdds.endpoint_discovery import resend_endpoints_soon, together_s
 
 
 @pytest.mark.parametrize("unknown", ["participant_of", "_functions"])
@@ -15,6 +15,6 @@ def test_only_a_known_version_is_changed(
 ) -> None:
     with FlowParticipant("_other", "/", fresh_domain) as other, other.node.handle:
         pointer = other.node.handle.pointer
-        assert resend_endpoints_soon(pointer, TOGETHER_S)
+        assert resend_endpoints_soon(pointer, together_s(20))
         monkeypatch.setattr(endpoint_discovery, unknown, lambda *_: None)
         assert not resend_endpoints_soon(pointer)

@@ -36,7 +36,7 @@ class HostProcess:
         nodes: tuple[PlannedNode, ...],
         log: Path,
         *,
-        gathers: bool = False,
+        gathers: int = 0,
     ) -> None:
         ours, theirs = socket.socketpair()
         ours.settimeout(30)

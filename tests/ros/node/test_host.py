@@ -55,7 +55,7 @@ def test_two_nodes_in_one_process_are_brought_up_and_end_with_the_channel(start:
 def test_an_unannounced_host_is_discovered_once_it_may_be_and_with_all_it_has(
     start: Start, fresh_domain: int, wait_until: Callable[..., None], class_: str
 ) -> None:
-    host = start(hosted("one", class_, managed=class_ != "Plain"), gathers=True)
+    host = start(hosted("one", class_, managed=class_ != "Plain"), gathers=2)
     assert host.read() == Event(kind="gathered")
     other = start(hosted("other", "Good"))
     other.until("ready")
@@ -78,7 +78,7 @@ def _services(driver: Driver, node: str) -> list[str]:
 
 
 def test_an_unannounced_host_that_is_ended_while_it_gathers_ends(start: Start) -> None:
-    host = start(hosted("one", "Good"), gathers=True)
+    host = start(hosted("one", "Good"), gathers=2)
     assert host.read() == Event(kind="gathered")
     host.hang_up()
     assert host.wait(5.0) == 0

@@ -368,15 +368,6 @@ def test_a_count_is_that_of_all_who_can_match_as_the_verification_has_it() -> No
     assert judged({}, {"matched": 1}, other)[0] is Outcome.OK
 
 
-@pytest.mark.parametrize(("peers", "outcome"), [(("0b",), Outcome.OK), (("77",), Outcome.VIOLATED)])
-def test_an_end_that_names_its_peers_proves_the_pair_and_no_other(
-    peers: tuple[str, ...], outcome: Outcome
-) -> None:
-    publisher = {"gid": "0a", "matched": 1, "peers": peers}
-    subscription = {"gid": "0b", "matched": 1, "peers": ("0a",)}
-    assert judged(publisher, subscription)[0] is outcome
-
-
 def test_a_link_says_by_which_flow_and_connections() -> None:
     publisher = end("/a", PUBLISHER, connection="net", matched=1)
     subscription = end("/b", SUBSCRIPTION)

@@ -594,7 +594,7 @@ def test_hosts_meet_once_the_last_of_them_has_its_endpoints(
     hosts: Sequence[_Host], limit_s: float, proceeded_at: list[float | None]
 ) -> None:
     async def main() -> list[float | None]:
-        gathering = Gathering(limit_s)
+        gathering = Gathering(3, limit_s)
         began = asyncio.get_running_loop().time()
         for host in hosts:
             gathering.expect(host)  # type: ignore[arg-type]

@@ -140,9 +140,7 @@ def _change_reports(
 
 
 def change_report(kind: EndpointKind, resolved: str, /, **fields: object) -> Edit:
-    """The node reports the endpoint otherwise; who counts nobody, or not at all, names nobody."""
-    if not fields.get("matched", 1):
-        fields.setdefault("peers", () if fields["matched"] == 0 else None)
+    """The node reports the endpoint otherwise."""
     return _change_reports(kind, resolved, lambda report: (dataclasses.replace(report, **fields),))
 
 

@@ -194,7 +194,6 @@ def _report(places: _Places, node: PlannedNode, index: int) -> EndpointReport:
         connection=connection_of(node, planned),
         mapped=True,
         matched=len(_peers(places, planned)) if is_topic else None,
-        peers=_peers(places, planned) if is_topic else None,
         server_matched=_server_matched(places, planned),
         dscp=planned.dscp,
     )
