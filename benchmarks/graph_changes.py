@@ -28,11 +28,10 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parents[1]))  # as a script, only its own directory is there
 
 from benchmarks import scale
-from lifecycle.graph import (
+from lifecycle.graph.events import GraphEvents
+from lifecycle.graph.messages import (
     ConfigurationChanged,
-    GraphEvents,
     GraphMessage,
-    GraphState,
     Heartbeat,
     Joined,
     MappingEstablished,
@@ -40,18 +39,22 @@ from lifecycle.graph import (
     encode,
 )
 from lifecycle.graph.observer import Observer
-from lifecycle.manifest import load
+from lifecycle.graph.state import GraphState
+from lifecycle.manifest.loading import load
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.plan import Plan, build_plan
+from lifecycle.plan.build import build_plan
+from lifecycle.plan.model import Plan
 from lifecycle.supervisor.gate.verification_loop import ChangeCounter, VerificationLoop
-from lifecycle.verify import NO_NAMES, DeclaredNames, Observation, Stage
 from lifecycle.verify.observation import (
     EndpointReport,
     Identity,
     NodeConfiguration,
+    Observation,
     ObservedEndpoint,
     ObservedNode,
 )
+from lifecycle.verify.tool_filter import NO_NAMES, DeclaredNames
+from lifecycle.verify.verdict import Stage
 from tests.unit.graph.simulated import ManualScheduler, Network
 from tests.unit.supervisor.fakes import World
 from tests.unit.verify.perfect import perfect

@@ -21,7 +21,7 @@ from pathlib import Path
 
 import psutil
 
-from lifecycle.middleware import segments_of, sweep
+from lifecycle.middleware.process.shared_memory import segments_of, sweep
 
 ROOT = Path(__file__).resolve().parents[1]
 GONE_S = 60.0

@@ -98,7 +98,7 @@ def be_ours(name: str) -> None:
 
 def fork_plain(nodes: int) -> None:
     """Fork plain nodes from a process that has imported what they need, and wait for its end."""
-    from lifecycle.node import preload
+    from lifecycle.node.host.host import preload
 
     # The same list as ours, so that both share as much.
     preload()
@@ -183,7 +183,7 @@ def measure(pids: Sequence[int], services: Mapping[str, int]) -> list[Cost]:
 
 def services_of(domain_id: int, nodes: int) -> dict[str, int]:
     """Return how many services each node offers, as discovery shows it."""
-    from lifecycle.middleware import GraphObserver
+    from lifecycle.middleware.rcl.graph import GraphObserver
 
     with GraphObserver(domain_id) as graph:
         names = [f"/node_{index}" for index in range(nodes)]
@@ -234,7 +234,7 @@ def parts() -> dict[str, tuple[float, int]]:
     from std_msgs.msg import String
     from std_srvs.srv import Trigger
 
-    from lifecycle.middleware import AlivePublisher
+    from lifecycle.middleware.discovery.liveliness import AlivePublisher
 
     rclpy.init()
     node = LifecycleNode("parts")

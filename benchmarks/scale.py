@@ -29,9 +29,10 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # as a script, only its own 
 
 from lifecycle.cli.verbs.check import check
 from lifecycle.cli.verbs.plan import render
-from lifecycle.manifest import load
-from lifecycle.plan import build_plan
-from lifecycle.verify import Stage, verify
+from lifecycle.manifest.loading import load
+from lifecycle.plan.build import build_plan
+from lifecycle.verify.judge import verify
+from lifecycle.verify.verdict import Stage
 from tests.unit.verify.perfect import perfect
 
 SIZES = (100, 300, 1_000)

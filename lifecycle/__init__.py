@@ -9,20 +9,16 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from lifecycle.node import (
+    from lifecycle.node.actions import GoalInterruptedError
+    from lifecycle.node.author.handlers import on_action, on_goal, on_message, on_service, on_timer
+    from lifecycle.node.author.node import (
         ERROR,
         FAILURE,
         SUCCESS,
-        GoalInterruptedError,
         LifecycleNode,
         TransitionCallbackReturn,
-        on_action,
-        on_goal,
-        on_message,
-        on_service,
-        on_timer,
-        run,
     )
+    from lifecycle.node.host.standalone import run
 
 __all__ = [
     "ERROR",

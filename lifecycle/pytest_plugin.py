@@ -28,8 +28,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 if TYPE_CHECKING:
-    from lifecycle.node import NodeInProcess
-    from lifecycle.plan import Plan, PlannedNode
+    from lifecycle.node.host.in_process import NodeInProcess
+    from lifecycle.plan.model import Plan, PlannedNode
 
 DOMAINS = (*range(215, 232), *range(70, 102))
 """Their ports lie outside Linux's ephemeral range (32768–60999), where any socket may be."""
@@ -388,7 +388,7 @@ def lifecycle_node(
             with warnings.catch_warnings():
                 # rclpy imports lark through its type supports, and lark a deprecated module.
                 warnings.simplefilter("ignore", DeprecationWarning)
-                from lifecycle.node import NodeInProcess
+                from lifecycle.node.host.in_process import NodeInProcess
 
                 made = NodeInProcess(
                     planned,
@@ -406,8 +406,8 @@ def _planned(
     manifest: str | os.PathLike[str], node: str, arguments: Mapping[str, object], domain_id: int
 ) -> tuple[Plan, PlannedNode]:
     from lifecycle.errors import UsageError
-    from lifecycle.manifest import load
-    from lifecycle.plan import build_plan
+    from lifecycle.manifest.loading import load
+    from lifecycle.plan.build import build_plan
 
     loaded = load(os.fspath(manifest), {name: str(value) for name, value in arguments.items()})
     plan = build_plan(loaded.manifest, domain_id=domain_id)

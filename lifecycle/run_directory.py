@@ -26,7 +26,7 @@ from lifecycle import dataclasses
 from lifecycle.errors import UsageError
 
 if TYPE_CHECKING:
-    from lifecycle.plan import Plan
+    from lifecycle.plan.model import Plan
 
 RUN_VARIABLE = "LIFECYCLE_RUN"
 """Set in every process of a run, with the run's id: what proves that a process is ours."""

@@ -35,8 +35,8 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.manifest.qos import QosProfile, Reliability
 from lifecycle.network.nfe import UniqueRequirement
-from lifecycle.plan import Plan, build_plan
-from lifecycle.plan.model import PlannedEndpoint, PlannedNode, PlannedProcess
+from lifecycle.plan.build import build_plan
+from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedNode, PlannedProcess
 from lifecycle.verify.observation import EndpointReport, Identity, NodeConfiguration
 
 FILE = "robot.lifecycle.yaml"

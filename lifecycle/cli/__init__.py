@@ -96,7 +96,8 @@ def _check_ros(verb: str) -> None:
             f"cannot run 'lifecycle {verb}': it needs ROS 2, and this Python has no rclpy",
             hint=_NEEDS_ROS,
         )
-    from lifecycle.middleware import check_rmw, check_room_to_load
+    from lifecycle.middleware.process.shared_memory import check_room_to_load
+    from lifecycle.middleware.rcl.rmw_choice import check_rmw
 
     check_room_to_load()
     check_rmw(os.environ)
@@ -190,7 +191,8 @@ def program() -> int:
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, signal.SIG_IGN)
     if "rclpy" in sys.modules:
-        from lifecycle.middleware import dispose_of_announced, holds_shared_memory
+        from lifecycle.middleware.discovery.probe import dispose_of_announced
+        from lifecycle.middleware.process.shared_memory import holds_shared_memory
 
         dispose_of_announced()
         if code not in _ORDERLY and not (verb == ["up"] and code == ExitCode.INTERRUPTED):

@@ -19,8 +19,10 @@ from lifecycle.errors import UsageError
 from lifecycle.printable import lines
 
 if TYPE_CHECKING:
-    from lifecycle.manifest import Loaded, Manifest
-    from lifecycle.plan import Plan, Resolution
+    from lifecycle.manifest.loading import Loaded
+    from lifecycle.manifest.model import Manifest
+    from lifecycle.plan.model import Plan
+    from lifecycle.plan.programs import Resolution
 
 F = TypeVar("F", bound=Callable[..., Any])
 Completer = Callable[[click.Context, click.Parameter, str], list[Any]]
@@ -103,7 +105,8 @@ def load_manifest(
     Raises:
         ManifestError: with every diagnostic.
     """
-    from lifecycle.manifest import ManifestError, Severity, load
+    from lifecycle.manifest.diagnostics import ManifestError, Severity
+    from lifecycle.manifest.loading import load
 
     loaded = load(path, parse_assignments(assignments))
     warnings = loaded.warnings
@@ -128,8 +131,8 @@ def resolve(manifest: Manifest, machine: str = "") -> Resolution:
     Raises:
         UsageError: the manifest declares no such machine.
     """
-    from lifecycle.plan import resolve_programs
-    from lifecycle.supervisor import own_machines
+    from lifecycle.plan.programs import resolve_programs
+    from lifecycle.supervisor.run.options import own_machines
 
     own = own_machines(manifest, machine)
     return resolve_programs(manifest, environment=os.environ, is_ours=own.__contains__)
@@ -204,7 +207,7 @@ def asking(path: Path) -> Iterator[None]:
 
 def say_differences(path: Path, plan: Plan) -> None:
     """Say on stderr where a manifest is not the one that runs."""
-    from lifecycle.supervisor import differences
+    from lifecycle.supervisor.control.client import differences
 
     if found := differences(path, plan):
         listed = "\n".join(found)
@@ -237,7 +240,7 @@ def target_plan(
                 hint="arguments belong to a manifest; name its file",
             )
         return find_run(root, target), None
-    from lifecycle.plan import build_plan
+    from lifecycle.plan.build import build_plan
 
     plan = build_plan(load_manifest(target, assignments, quiet=True).manifest)
     return find_run(root, run_name(plan, machine)), plan

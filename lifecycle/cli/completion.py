@@ -53,7 +53,7 @@ def _systems(_: click.Context) -> Iterable[str]:
 
 
 def _runs(_: click.Context) -> Iterable[str]:
-    from lifecycle.supervisor import ros_log_root, runs_of
+    from lifecycle.supervisor.processes.logs import ros_log_root, runs_of
 
     return [each.name for each in runs_of(ros_log_root(os.environ), "")]
 

@@ -24,8 +24,8 @@ from typing import Any
 
 from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError, UsageError
-from lifecycle.export import Noted, Tree, comment, to_yaml
-from lifecycle.manifest import ParameterValue
+from lifecycle.export.manifest_yaml import Noted, Tree, comment, to_yaml
+from lifecycle.manifest.model import ParameterValue
 
 MAX_ENTITIES = 10_000
 """Actions of one launch description, those of files that it includes with them."""

@@ -21,21 +21,21 @@ from lifecycle.cli.standard_streams import Writer
 from lifecycle.cli.up_output import Rollback, describe, verdict_line
 from lifecycle.cli.verbs.control import HEADS, row
 from lifecycle.printable import log_line, one_line
-from lifecycle.supervisor import (
+from lifecycle.supervisor.control.protocol import NodeStatus, SystemStatus
+from lifecycle.supervisor.run.events import (
     Event,
     Failure,
     LogLine,
     NodeChanged,
-    NodeStatus,
     ProcessChanged,
     Stopped,
     Stopping,
     SystemReached,
-    SystemStatus,
-    UpResult,
     VerdictChanged,
 )
-from lifecycle.verify import Outcome, render_text
+from lifecycle.supervisor.run.options import UpResult
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.report import render_text
 
 _REDRAW_S = 0.04
 """At most 25 times a second, however many events there are."""

@@ -21,8 +21,8 @@ from lifecycle.errors import ExitCode, LifecycleError, UsageError, exhausted
 from lifecycle.printable import lines
 
 if TYPE_CHECKING:
-    from lifecycle.plan import Plan
-    from lifecycle.verify import Verdict
+    from lifecycle.plan.model import Plan
+    from lifecycle.verify.verdict import Verdict
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -155,7 +155,8 @@ def format_verdict(
         colour: mark outcomes of text with ANSI colours.
         strict: what cannot be verified counts as refused.
     """
-    from lifecycle.verify import Outcome, render_text, to_json, to_junit, to_sarif
+    from lifecycle.verify.outcome import Outcome
+    from lifecycle.verify.report import render_text, to_json, to_junit, to_sarif
 
     if format_ == "json":
         return to_json(verdict)
@@ -266,7 +267,7 @@ class ReportFile:
 
 def exit_code_of(error: BaseException) -> ExitCode:
     """Return the exit code of a command that ended by an exception."""
-    from lifecycle.supervisor import Ended
+    from lifecycle.supervisor.run.signals import Ended
 
     if isinstance(error, LifecycleError | Ended):
         return error.exit_code
@@ -279,9 +280,10 @@ def exit_code_of(error: BaseException) -> ExitCode:
 
 def _verdict_of(error: BaseException) -> Verdict:
     """Return the verdict of a command that ended by an exception before anything was judged."""
-    from lifecycle.manifest import ManifestError, Severity
-    from lifecycle.supervisor import Ended
-    from lifecycle.verify import Finding, Outcome
+    from lifecycle.manifest.diagnostics import ManifestError, Severity
+    from lifecycle.supervisor.run.signals import Ended
+    from lifecycle.verify.outcome import Outcome
+    from lifecycle.verify.verdict import Finding
 
     code = exit_code_of(error)
     if isinstance(error, ManifestError):
@@ -315,7 +317,7 @@ def _verdict_of(error: BaseException) -> Verdict:
 
 
 def _unjudged(reason: str, code: ExitCode) -> Verdict:
-    from lifecycle.verify import NOT_JUDGED, RunEnd
+    from lifecycle.verify.verdict import NOT_JUDGED, RunEnd
 
     run = RunEnd(reason=reason, reached=None, exit_code=code)
     return dataclasses.replace(NOT_JUDGED, run=run)

@@ -251,7 +251,7 @@ class Writer:
         try:
             self._thread.start()
         except RuntimeError as error:
-            from lifecycle.middleware import no_room_for_threads
+            from lifecycle.middleware.process.control import no_room_for_threads
 
             raise no_room_for_threads(1) from error
 

@@ -19,9 +19,10 @@ from typing import Any, Protocol
 import click
 
 from lifecycle.cli.standard_streams import Writer
-from lifecycle.node import Operation
+from lifecycle.node.host.control import Operation
 from lifecycle.printable import json_text, log_line, one_line
-from lifecycle.supervisor import (
+from lifecycle.supervisor.control.protocol import ProcessState, Reach, SystemStatus
+from lifecycle.supervisor.run.events import (
     ConsequenceTaken,
     Event,
     Failure,
@@ -36,8 +37,6 @@ from lifecycle.supervisor import (
     NodeSilent,
     Notice,
     ProcessChanged,
-    ProcessState,
-    Reach,
     Restarted,
     RestartScheduled,
     RunStarted,
@@ -45,14 +44,16 @@ from lifecycle.supervisor import (
     Stopped,
     Stopping,
     SystemReached,
-    SystemStatus,
-    UpResult,
     VerdictChanged,
     WiringChanged,
     WiringLost,
     to_record,
 )
-from lifecycle.verify import Outcome, Stage, Verdict, missing, not_ok, render_text, to_json
+from lifecycle.supervisor.run.options import UpResult
+from lifecycle.verify.judge import missing, not_ok
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.report import render_text, to_json
+from lifecycle.verify.verdict import Stage, Verdict
 
 
 class RunOutput(Protocol):

@@ -18,30 +18,24 @@ from lifecycle.export.programs import (
     process_names,
     run_of,
 )
-from lifecycle.manifest import (
-    DiscoveryRange,
-    EndpointKind,
-    History,
-    ParameterValue,
-    QosProfile,
-    TargetState,
+from lifecycle.manifest.checks.parameters import is_implicit
+from lifecycle.manifest.model import DiscoveryRange, EndpointKind, ParameterValue, TargetState
+from lifecycle.manifest.names import (
     full_name_problem,
-    is_implicit,
     name_problem,
     namespace_problem,
     node_name_problem,
 )
-from lifecycle.network import InternetProtocol, UniqueRequirement
-from lifecycle.verify import (
+from lifecycle.manifest.qos import History, QosProfile
+from lifecycle.network.nfe import InternetProtocol, UniqueRequirement
+from lifecycle.verify.observation import (
     EndpointReport,
     NodeConfiguration,
     Observation,
     ObservedEndpoint,
     ObservedNode,
-    is_noise_endpoint,
-    is_noise_node,
-    known_node,
 )
+from lifecycle.verify.tool_filter import is_noise_endpoint, is_noise_node, known_node
 
 _TYPE = re.compile(r"[a-zA-Z][a-zA-Z0-9_]*/(msg|srv|action)/[a-zA-Z][a-zA-Z0-9_]*")
 

@@ -20,8 +20,9 @@ import yaml
 
 from lifecycle import dataclasses
 from lifecycle.errors import ExitCode, UsageError
-from lifecycle.manifest import THIS_HOST, Resources, Restart, Timeouts
-from lifecycle.plan import Plan, PlannedProcess
+from lifecycle.manifest.loading import THIS_HOST
+from lifecycle.manifest.model import Resources, Restart, Timeouts
+from lifecycle.plan.model import Plan, PlannedProcess
 from lifecycle.printable import one_line
 from lifecycle.run_directory import run_name
 

@@ -24,18 +24,17 @@ from lifecycle.export.captured import (
     can_be_given,
 )
 from lifecycle.export.programs import CapturedRun
-from lifecycle.manifest import (
-    INFINITE_NS,
+from lifecycle.manifest.model import (
     DiscoveryRange,
     EndpointKind,
-    History,
     ParameterValue,
-    QosProfile,
     RosArguments,
     TargetState,
-    expand,
 )
-from lifecycle.network import UniqueRequirement, describe
+from lifecycle.manifest.names import expand
+from lifecycle.manifest.qos import INFINITE_NS, History, QosProfile
+from lifecycle.network.dscp import describe
+from lifecycle.network.nfe import UniqueRequirement
 
 Scalar = Union[bool, int, float, str]  # noqa: UP007 - a run-time alias on Python 3.10
 Tree = Union[Scalar, "Noted", Sequence["Tree"], Mapping[str, "Tree"]]

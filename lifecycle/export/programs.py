@@ -14,13 +14,8 @@ from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 
 from lifecycle import dataclasses
-from lifecycle.manifest import (
-    EndpointKind,
-    RosArguments,
-    name_problem,
-    node_name_problem,
-    resolve,
-)
+from lifecycle.manifest.model import EndpointKind, RosArguments
+from lifecycle.manifest.names import name_problem, node_name_problem, resolve
 
 _OURS = "lifecycle.supervisor.processes.fork_server_main"
 """In the command line of processes that `lifecycle up` has forked."""

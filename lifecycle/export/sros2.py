@@ -15,15 +15,10 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterable
 
 from lifecycle import dataclasses
-from lifecycle.manifest import (
-    ALIVE_PULSE,
-    DIAGNOSTICS_TOPIC,
-    EndpointKind,
-    RunKind,
-    supervisor_alive_topic,
-)
-from lifecycle.plan import Plan, PlannedNode, PlannedProcess
-from lifecycle.verify import (
+from lifecycle.manifest.model import EndpointKind, RunKind
+from lifecycle.manifest.names import ALIVE_PULSE, DIAGNOSTICS_TOPIC, supervisor_alive_topic
+from lifecycle.plan.model import Plan, PlannedNode, PlannedProcess
+from lifecycle.verify.tool_filter import (
     GRAPH_TOPIC,
     NODE_SERVICES,
     OUR_SERVICES,

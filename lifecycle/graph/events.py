@@ -35,8 +35,8 @@ from lifecycle.graph.model import (
 )
 from lifecycle.graph.scheduler import Deadlines, Remove, Scheduler
 from lifecycle.graph.transport import GraphTransport
-from lifecycle.manifest import EndpointKind
-from lifecycle.verify import EndpointReport
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.verify.observation import EndpointReport
 
 _logger = logging.getLogger(__name__)
 

@@ -20,9 +20,12 @@ from lifecycle.graph.observer import BURST_S, QUIET_S, Observer
 from lifecycle.graph.scheduler import LoopScheduler, ThreadScheduler
 from lifecycle.graph.state import GraphState
 from lifecycle.graph.transport import DdsTransport, GraphTransport
-from lifecycle.middleware import GraphObserver, NodeClients
-from lifecycle.plan import ParticipantConnections, Plan
-from lifecycle.verify import Observation, Stage, Verdict, verify
+from lifecycle.middleware.rcl.graph import GraphObserver
+from lifecycle.middleware.services.clients import NodeClients
+from lifecycle.plan.model import ParticipantConnections, Plan
+from lifecycle.verify.judge import verify
+from lifecycle.verify.observation import Observation
+from lifecycle.verify.verdict import Stage, Verdict
 
 
 @typing.final

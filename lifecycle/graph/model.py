@@ -20,20 +20,14 @@ from lifecycle.graph.messages import (
     MappingEstablished,
     MappingLost,
 )
-from lifecycle.manifest import EndpointKind
-from lifecycle.network import NETWORK_MEDIA, FlowTuple, flow_tuples
-from lifecycle.verify import (
-    NONE,
-    ConnectionReport,
-    EndpointReport,
-    Identity,
-    NodeConfiguration,
-    Outcome,
-    SeenEndpoint,
-    carrier,
-    match,
-    obstacle,
-)
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.network.medium import NETWORK_MEDIA
+from lifecycle.network.nfe import FlowTuple, flow_tuples
+from lifecycle.verify.observation import EndpointReport, Identity, NodeConfiguration
+from lifecycle.verify.outcome import ConnectionReport, Outcome
+from lifecycle.verify.rules.matching import match, obstacle
+from lifecycle.verify.transport import NONE, carrier
+from lifecycle.verify.view import SeenEndpoint
 
 
 class EventKind(enum.Enum):

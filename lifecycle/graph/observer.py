@@ -25,9 +25,8 @@ from lifecycle.graph.messages import GraphMessage, Heartbeat
 from lifecycle.graph.parameters import ParameterReadings
 from lifecycle.graph.scheduler import Remove, set_within
 from lifecycle.graph.state import Answer, GraphState, Look
-from lifecycle.plan import Plan
-from lifecycle.verify import (
-    DeclaredNames,
+from lifecycle.plan.model import Plan
+from lifecycle.verify.observation import (
     EndpointReport,
     HealthReport,
     Identity,
@@ -35,6 +34,9 @@ from lifecycle.verify import (
     Observation,
     ObservedEndpoint,
     ObservedNode,
+)
+from lifecycle.verify.tool_filter import (
+    DeclaredNames,
     is_noise_node,
     known_node,
     matches,
@@ -42,7 +44,8 @@ from lifecycle.verify import (
 )
 
 if TYPE_CHECKING:  # it imports rclpy
-    from lifecycle.middleware import GraphObserver, NodeClients
+    from lifecycle.middleware.rcl.graph import GraphObserver
+    from lifecycle.middleware.services.clients import NodeClients
 
 _logger = logging.getLogger(__name__)
 

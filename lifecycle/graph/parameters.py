@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.graph.scheduler import set_within
-from lifecycle.verify import SERVES_NONE, NodeParameters, ParameterReport
+from lifecycle.verify.observation import SERVES_NONE, NodeParameters, ParameterReport
 
 if TYPE_CHECKING:  # it imports rclpy
-    from lifecycle.middleware import NodeClients
+    from lifecycle.middleware.services.clients import NodeClients
 
 _logger = logging.getLogger(__name__)
 

@@ -43,9 +43,8 @@ from lifecycle.graph.model import (
     match_ends,
 )
 from lifecycle.graph.scheduler import Remove
-from lifecycle.manifest import EndpointKind
-from lifecycle.verify import (
-    ConnectionReport,
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.verify.observation import (
     HealthReport,
     NodeConfiguration,
     NodeParameters,
@@ -53,6 +52,7 @@ from lifecycle.verify import (
     ObservedEndpoint,
     ObservedNode,
 )
+from lifecycle.verify.outcome import ConnectionReport
 
 _logger = logging.getLogger(__name__)
 

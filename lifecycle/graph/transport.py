@@ -25,7 +25,7 @@ from rclpy.subscription import Subscription
 from std_msgs.msg import String
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.verify import GRAPH_TOPIC
+from lifecycle.verify.tool_filter import GRAPH_TOPIC
 
 if TYPE_CHECKING:  # it imports asyncio, which a node that only reports has no use for
     from lifecycle.graph.scheduler import Remove

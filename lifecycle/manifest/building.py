@@ -46,7 +46,8 @@ from lifecycle.manifest.model import (
 from lifecycle.manifest.nodl import read_interface
 from lifecycle.manifest.yaml.document import Cursor, error, note
 from lifecycle.manifest.yaml.yaml_parser import YAML_1_1_BOOLEANS, has_leading_zero, quote
-from lifecycle.network import ConnectionUrl, ConnectionUrlError, parse, parse_dscp
+from lifecycle.network.connection_url import ConnectionUrl, ConnectionUrlError, parse
+from lifecycle.network.dscp import parse_dscp
 
 _KINDS = {kind.value: kind for kind in EndpointKind}
 

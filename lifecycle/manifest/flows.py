@@ -27,22 +27,21 @@ from lifecycle.manifest.model import (
     RunKind,
 )
 from lifecycle.manifest.names import resolve
-from lifecycle.network import (
+from lifecycle.network.dscp import (
     ECN_MASK,
     MAX_DSCP,
-    SAFE_DATAGRAM_BYTES,
-    ClassIssue,
     MappedPriority,
-    Medium,
     TransportPriorityMapping,
-    check_class,
     code_points,
     describe,
-    five_qi_of,
-    is_fragmented,
     map_priority,
+)
+from lifecycle.network.five_qi import ClassIssue, check_class, five_qi_of, propose
+from lifecycle.network.medium import (
+    SAFE_DATAGRAM_BYTES,
+    Medium,
+    is_fragmented,
     max_unfragmented,
-    propose,
     udp_to,
 )
 

@@ -45,7 +45,8 @@ from lifecycle.manifest.yaml.document import Cursor, Document, Place, Value, err
 from lifecycle.manifest.yaml.source import read_document
 from lifecycle.manifest.yaml.substitutions import Programs, Surroundings, folder_of
 from lifecycle.manifest.yaml.yaml_parser import quote
-from lifecycle.network import DscpMapping, TransportPriorityMapping, dscp_mappings, parse_mapping
+from lifecycle.network.dscp import TransportPriorityMapping
+from lifecycle.network.five_qi import DscpMapping, dscp_mappings, parse_mapping
 
 _MAX_MAPPING_BYTES = 1_000_000
 

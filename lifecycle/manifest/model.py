@@ -14,13 +14,11 @@ from lifecycle import dataclasses
 from lifecycle.codec import DomainId, Positive, says
 from lifecycle.manifest.diagnostics import Diagnostic, Position, Severity
 from lifecycle.manifest.qos import POLICIES, QosProfile
-from lifecycle.network import (
-    ConnectionUrl,
-    DscpMapping,
-    TransportPriorityMapping,
-    UniqueRequirement,
-)
-from lifecycle.network import FlowTransport as FlowTransport  # noqa: PLC0414 - others ask here
+from lifecycle.network.connection_url import ConnectionUrl
+from lifecycle.network.dscp import TransportPriorityMapping
+from lifecycle.network.five_qi import DscpMapping
+from lifecycle.network.medium import FlowTransport as FlowTransport  # noqa: PLC0414
+from lifecycle.network.nfe import UniqueRequirement
 
 
 class EndpointKind(enum.Enum):

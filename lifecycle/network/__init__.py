@@ -2,7 +2,3 @@
 
 Pure: imports nothing of the package but `lifecycle.codec`, no ROS, opens no socket.
 """
-
-from lifecycle.doors import open_door
-
-__getattr__, __dir__, __all__ = open_door(__name__, __file__)

@@ -20,14 +20,14 @@ from typing import TYPE_CHECKING, Any
 from rclpy.node import Node
 
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest import action_of, hidden_names
+from lifecycle.manifest.names import action_of, hidden_names
 from lifecycle.node.author.handlers import ActionHandler
 from lifecycle.node.lifecycle.execution import hint
 
 if TYPE_CHECKING:
     from rclpy.action.server import ServerGoalHandle
 
-    from lifecycle.middleware import GoalServer
+    from lifecycle.middleware.services.actions import GoalServer
 
 
 class GoalInterruptedError(LifecycleError):

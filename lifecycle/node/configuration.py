@@ -29,39 +29,27 @@ from std_srvs.srv import Trigger
 
 from lifecycle import codec, dataclasses
 from lifecycle.errors import MiddlewareError
-from lifecycle.manifest import EndpointKind, QosProfile
-from lifecycle.middleware import (
-    SHARED_MEMORY,
-    EndpointInfo,
-    endpoints_of,
-    endpoints_of_node,
-    from_rclpy,
-    get_network_flow_endpoints,
-    interface_of,
-    is_server_matched,
-    machine_id,
-    senders_of,
-    vouch_for,
-)
-from lifecycle.network import (
-    CONNECTABLE,
-    Medium,
-    NetworkFlowEndpoint,
-)
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.manifest.qos import QosProfile
+from lifecycle.middleware.fastdds.nfe import SHARED_MEMORY, get_network_flow_endpoints, senders_of
+from lifecycle.middleware.process.control import machine_id
+from lifecycle.middleware.process.hosted import vouch_for
+from lifecycle.middleware.rcl.graph_changes import is_server_matched
+from lifecycle.middleware.rcl.graph_queries import EndpointInfo, endpoints_of, endpoints_of_node
+from lifecycle.middleware.rcl.qos import from_rclpy
+from lifecycle.middleware.rcl.rclpy_nodes import interface_of
+from lifecycle.network.medium import CONNECTABLE, Medium
+from lifecycle.network.nfe import NetworkFlowEndpoint
 from lifecycle.node.author import parameters
 from lifecycle.node.author.declaring import interface_name
 from lifecycle.node.connections.connections import Connection, Connections
 from lifecycle.node.connections.data_layer import NodeDataLayer
 from lifecycle.node.endpoints.making import CLIENTS
 from lifecycle.node.endpoints.mapping import Mapping, count_peers, wire_name
-from lifecycle.plan import PARADIGMS, SERIALIZATIONS, PlannedEndpoint, PlannedNode
-from lifecycle.verify import (
-    ConnectionReport,
-    EndpointReport,
-    HealthReport,
-    Identity,
-    NodeConfiguration,
-)
+from lifecycle.plan.model import PlannedEndpoint, PlannedNode
+from lifecycle.plan.negotiation.data_layer import PARADIGMS, SERIALIZATIONS
+from lifecycle.verify.observation import EndpointReport, HealthReport, Identity, NodeConfiguration
+from lifecycle.verify.outcome import ConnectionReport
 
 if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup

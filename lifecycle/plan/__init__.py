@@ -1,5 +1,24 @@
 """Manifest → Plan: the computational and the data layer graph of a system, ready to run. Pure."""
 
-from lifecycle.doors import open_door
+from __future__ import annotations
 
-__getattr__, __dir__, __all__ = open_door(__name__, __file__)
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from lifecycle.plan.build import build_plan as build_plan
+    from lifecycle.plan.model import Plan as Plan
+
+_PUBLIC: dict[str, tuple[str, ...]] = {
+    "lifecycle.plan.build": ("build_plan",),
+    "lifecycle.plan.model": ("Plan",),
+}
+"""What programs import from here (docs/api.md), by the module that has it."""
+
+
+def __getattr__(name: str) -> object:
+    """Load the module of a public name on first use (PEP 562)."""
+    for module, names in _PUBLIC.items():
+        if name in names:
+            return getattr(importlib.import_module(module), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

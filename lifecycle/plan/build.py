@@ -17,39 +17,34 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 
 from lifecycle import dataclasses
 from lifecycle.errors import UsageError
-from lifecycle.manifest import (
-    SIM_TIME,
-    Diagnostic,
+from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position
+from lifecycle.manifest.flows import FlowNeeds, ParticipantGroup, ResolvedNeed
+from lifecycle.manifest.installed_types import installed_hash, search_prefixes
+from lifecycle.manifest.model import (
     Discovery,
     DiscoveryMode,
     DiscoveryRange,
     Endpoint,
     EndpointKind,
     EndpointPolicy,
-    FlowNeeds,
     FlowTerms,
     FlowTransport,
     Link,
     Manifest,
-    ManifestError,
     Mode,
     Node,
     NodeDeclaration,
-    ParticipantGroup,
-    Position,
-    ResolvedNeed,
     Run,
     RunKind,
     SystemDeclaration,
     UniqueHow,
-    error,
-    installed_hash,
-    read_bytes,
-    resolve,
-    search_prefixes,
-    warning,
 )
-from lifecycle.network import DEFAULT_RMW, MAX_DOMAIN_ID, domain_of
+from lifecycle.manifest.names import resolve
+from lifecycle.manifest.shared import SIM_TIME
+from lifecycle.manifest.yaml.document import error, warning
+from lifecycle.manifest.yaml.source import read_bytes
+from lifecycle.network.medium import DEFAULT_RMW
+from lifecycle.network.ports import MAX_DOMAIN_ID, domain_of
 from lifecycle.plan.connections.wiring import WiredSystem, place_declared, variables_of, wire
 from lifecycle.plan.model import (
     HeldBy,

@@ -12,7 +12,7 @@ from typing import Any
 
 from lifecycle import dataclasses
 from lifecycle.codec import to_plain
-from lifecycle.manifest import ParameterValue, RunKind, Supervision, TargetState, Timeouts
+from lifecycle.manifest.model import ParameterValue, RunKind, Supervision, TargetState, Timeouts
 from lifecycle.plan.comparison import PlanDifference, changes
 from lifecycle.plan.model import ExpectedParameter, Plan, PlannedEndpoint, PlannedNode, in_mode
 from lifecycle.plan.parameters import COMMAND

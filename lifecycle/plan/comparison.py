@@ -19,7 +19,8 @@ from collections.abc import Iterator, Mapping
 
 from lifecycle import dataclasses
 from lifecycle.codec import from_json, to_json, to_plain
-from lifecycle.manifest import OnViolation, Position, RunKind
+from lifecycle.manifest.diagnostics import Position
+from lifecycle.manifest.model import OnViolation, RunKind
 from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedNode
 from lifecycle.plan.secrets import shown, without_secrets
 

@@ -13,10 +13,9 @@ from typing import Annotated, Any
 from lifecycle import dataclasses
 from lifecycle.codec import DomainId, DscpValue, Port, Positive, says
 from lifecycle.errors import ExitCode, LifecycleError
-from lifecycle.manifest import (
-    SIM_TIME,
+from lifecycle.manifest.diagnostics import Diagnostic, Position
+from lifecycle.manifest.model import (
     Authority,
-    Diagnostic,
     DiscoveryMode,
     DiscoveryRange,
     Endpoint,
@@ -27,14 +26,14 @@ from lifecycle.manifest import (
     NodeDeclaration,
     ParameterDeclaration,
     ParameterValue,
-    Position,
     Quantity,
     Run,
     SystemDeclaration,
     TargetState,
     UniqueHow,
 )
-from lifecycle.network import UDP_UNICAST, Medium
+from lifecycle.manifest.shared import SIM_TIME
+from lifecycle.network.medium import UDP_UNICAST, Medium
 
 _UdpUnicast = Annotated[Medium, says(enum=[each.value for each in UDP_UNICAST])]
 

@@ -16,18 +16,12 @@ import math
 from typing import TYPE_CHECKING, NamedTuple
 
 from lifecycle import dataclasses
-from lifecycle.manifest import (
-    Mode,
-    ModeParameter,
-    Node,
-    ParameterDeclaration,
-    ParameterValue,
-    Position,
-)
+from lifecycle.manifest.diagnostics import Position
+from lifecycle.manifest.model import Mode, ModeParameter, Node, ParameterDeclaration, ParameterValue
 from lifecycle.plan.model import ExpectedParameter, ModeParameters
 
 if TYPE_CHECKING:
-    from lifecycle.manifest import Section
+    from lifecycle.manifest.checks.parameters import Section
 
 GIVEN = "parameters"
 COMMAND = "command"
@@ -108,14 +102,18 @@ class ParameterFiles:
 
     def unread(self, node: Node) -> tuple[str, ...]:
         """Return the files of a node whose values are not known here."""
-        from lifecycle.manifest import command_line_parameters
+        from lifecycle.manifest.checks.parameters import command_line_parameters
 
         named = [each.file for each in command_line_parameters(node) if each.file]
         files = [self._file(path) for path in (*named, *node.parameter_files)]
         return tuple(each.shown for each in files if not each.is_read)
 
     def _given(self, node: Node) -> dict[str, _Given]:
-        from lifecycle.manifest import CommandParameter, command_line_parameters, given_value
+        from lifecycle.manifest.checks.parameters import (
+            CommandParameter,
+            command_line_parameters,
+            given_value,
+        )
 
         name_of_node = node.full_name
         sections: dict[str, dict[str, _Given]] = {}
@@ -147,7 +145,7 @@ class ParameterFiles:
         return found
 
     def _file(self, path: str) -> _GivenFile:
-        from lifecycle.manifest import read_sections, shown_path
+        from lifecycle.manifest.checks.parameters import read_sections, shown_path
 
         if path not in self._files:
             shown = shown_path(path, self._manifest)
@@ -157,7 +155,7 @@ class ParameterFiles:
 
 
 def _declared(declaration: ParameterDeclaration, given: _Given | None) -> ExpectedParameter:
-    from lifecycle.manifest import misfit
+    from lifecycle.manifest.checks.parameters import misfit
 
     type_ = declaration.type
     if given is None and declaration.default is not None:
@@ -177,7 +175,7 @@ def _declared(declaration: ParameterDeclaration, given: _Given | None) -> Expect
 
 
 def _in_mode(mode: str, given: ModeParameter, type_: str) -> ExpectedParameter:
-    from lifecycle.manifest import type_of
+    from lifecycle.manifest.checks.parameters import type_of
 
     type_ = type_ or type_of(given.value)
     return ExpectedParameter(
@@ -190,7 +188,7 @@ def _in_mode(mode: str, given: ModeParameter, type_: str) -> ExpectedParameter:
 
 
 def _undeclared(name: str, given: _Given) -> ExpectedParameter | None:
-    from lifecycle.manifest import type_of
+    from lifecycle.manifest.checks.parameters import type_of
 
     if given.value is None:
         return None

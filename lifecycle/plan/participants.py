@@ -17,15 +17,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from lifecycle import dataclasses
-from lifecycle.manifest import (
-    Node,
-    ParameterValue,
-    ParticipantGroup,
-    Position,
-    RosArguments,
-    Run,
-)
-from lifecycle.network import describe
+from lifecycle.manifest.diagnostics import Position
+from lifecycle.manifest.flows import ParticipantGroup
+from lifecycle.manifest.model import Node, ParameterValue, RosArguments, Run
+from lifecycle.network.dscp import describe
 from lifecycle.plan.model import PlanError, PlannedEndpoint, PlannedParticipant
 
 

@@ -16,19 +16,10 @@ from pathlib import Path
 
 from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest import (
-    Authority,
-    Diagnostic,
-    EndpointKind,
-    Manifest,
-    Node,
-    Position,
-    Run,
-    RunKind,
-    did_you_mean,
-    error,
-    warning,
-)
+from lifecycle.manifest.diagnostics import Diagnostic, Position
+from lifecycle.manifest.model import Authority, EndpointKind, Manifest, Node, Run, RunKind
+from lifecycle.manifest.schema import did_you_mean
+from lifecycle.manifest.yaml.document import error, warning
 from lifecycle.plan.model import PlanError
 from lifecycle.plan.participants import find_executable
 from lifecycle.plan.python_source import (

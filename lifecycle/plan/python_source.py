@@ -19,7 +19,8 @@ from pathlib import Path
 
 from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest import EndpointKind, did_you_mean
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.manifest.schema import did_you_mean
 
 _MOST_BYTES = 4 * 2**20
 _MOST_IMPORTS = 20

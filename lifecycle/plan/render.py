@@ -8,23 +8,18 @@ from __future__ import annotations
 import shlex
 from collections.abc import Callable
 
-from lifecycle.manifest import (
-    BEST_AVAILABLE_NS,
+from lifecycle.manifest.model import (
     DataLayer,
     DataLayerSource,
     DiscoveryMode,
     FlowTransport,
-    History,
-    Liveliness,
-    QosProfile,
     RunKind,
     UniqueHow,
 )
-from lifecycle.network import (
-    UniqueRequirement,
-    describe,
-    unique_flow_ports,
-)
+from lifecycle.manifest.qos import BEST_AVAILABLE_NS, History, Liveliness, QosProfile
+from lifecycle.network.dscp import describe
+from lifecycle.network.nfe import UniqueRequirement
+from lifecycle.network.ports import unique_flow_ports
 from lifecycle.plan.connections.hosts import demand
 from lifecycle.plan.model import (
     HeldBy,

@@ -15,7 +15,7 @@ from collections.abc import Collection, Iterator, Mapping
 from types import MappingProxyType
 
 from lifecycle import dataclasses
-from lifecycle.network import ConnectionUrl, Peer, parse
+from lifecycle.network.connection_url import ConnectionUrl, Peer, parse
 from lifecycle.plan.connections.hosts import PortPool, contacts_of
 from lifecycle.plan.model import ParticipantConnections, Plan, PlanError, PlannedNode
 from lifecycle.plan.negotiation.parties import hosts_of, terms_of

@@ -11,9 +11,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 
 from lifecycle import dataclasses
-from lifecycle.manifest import EndpointKind, EndpointPolicy, Policy, UniqueHow
-from lifecycle.network import Medium, NetworkFlowEndpoint, TransportProtocol, is_ip
-from lifecycle.plan import Plan
+from lifecycle.manifest.model import EndpointKind, EndpointPolicy, Policy, UniqueHow
+from lifecycle.network.medium import Medium
+from lifecycle.network.nfe import NetworkFlowEndpoint, TransportProtocol, is_ip
+from lifecycle.plan.model import Plan
 from lifecycle.verify.matcher import lay_out
 from lifecycle.verify.observation import Observation
 from lifecycle.verify.outcome import Outcome

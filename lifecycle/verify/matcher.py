@@ -10,8 +10,8 @@ import itertools
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
 from lifecycle import dataclasses
-from lifecycle.manifest import EndpointKind
-from lifecycle.plan import Plan, PlannedEndpoint, PlannedNode
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedNode
 from lifecycle.verify.observation import (
     EndpointReport,
     NodeConfiguration,

@@ -13,9 +13,10 @@ from collections.abc import Iterable
 
 from lifecycle import codec, dataclasses
 from lifecycle.codec import Count, DscpValue
-from lifecycle.manifest import EndpointKind, ParameterValue, QosProfile
-from lifecycle.network import NetworkFlowEndpoint, UniqueRequirement
-from lifecycle.plan import portable
+from lifecycle.manifest.model import EndpointKind, ParameterValue
+from lifecycle.manifest.qos import QosProfile
+from lifecycle.network.nfe import NetworkFlowEndpoint, UniqueRequirement
+from lifecycle.plan.parameters import portable
 from lifecycle.verify.outcome import ConnectionReport
 
 LONGEST_CONFIGURATION = 1 << 22

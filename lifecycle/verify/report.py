@@ -24,9 +24,10 @@ from collections.abc import Iterable, Sequence
 
 from lifecycle import codec
 from lifecycle.ci_formats import Case, Json, Result, Suite, junit, sarif
-from lifecycle.manifest import UniqueHow
-from lifecycle.network import NETWORK_MEDIA, describe
-from lifecycle.plan import Plan
+from lifecycle.manifest.model import UniqueHow
+from lifecycle.network.dscp import describe
+from lifecycle.network.medium import NETWORK_MEDIA
+from lifecycle.plan.model import Plan
 from lifecycle.printable import columns, json_text, one_line
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import RULES

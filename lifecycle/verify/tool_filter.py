@@ -16,30 +16,30 @@ import re
 from collections.abc import Collection, Iterable, Mapping
 
 from lifecycle import dataclasses
-from lifecycle.manifest import (
+from lifecycle.manifest.installed_types import join
+from lifecycle.manifest.model import TOLERATED_NODES, EndpointKind, RosInterfaceAccess
+from lifecycle.manifest.names import (
     ALIVE_PULSE,
     DIAGNOSTICS_TOPIC,
     MODE_SERVICE,
     SUPERVISOR_STATUS,
     SUPERVISORS,
-    TOLERATED_NODES,
-    Certainty,
-    Durability,
-    EndpointKind,
-    History,
-    Liveliness,
-    QosProfile,
-    Reliability,
-    RosInterfaceAccess,
-    incompatibilities,
-    join,
     supervisor_alive_topic,
     supervisor_prefix,
     supervisor_services,
     supervisor_status_topic,
 )
-from lifecycle.network import UniqueRequirement
-from lifecycle.plan import Plan, uses_sim_time
+from lifecycle.manifest.qos import (
+    Certainty,
+    Durability,
+    History,
+    Liveliness,
+    QosProfile,
+    Reliability,
+    incompatibilities,
+)
+from lifecycle.network.nfe import UniqueRequirement
+from lifecycle.plan.model import Plan, uses_sim_time
 from lifecycle.verify.observation import NodeConfiguration, ObservedEndpoint
 
 OUR_NODES = "_lifecycle_*"

@@ -15,15 +15,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from lifecycle.network import (
-    ConnectionUrlError,
+from lifecycle.network.connection_url import ConnectionUrlError, parse
+from lifecycle.network.medium import Medium
+from lifecycle.network.nfe import (
     InternetProtocol,
-    Medium,
     NetworkFlowEndpoint,
     TransportProtocol,
     is_ip,
     is_multicast,
-    parse,
 )
 from lifecycle.verify.observation import Identity, NodeConfiguration
 from lifecycle.verify.view import Actual, FlowView

@@ -14,8 +14,8 @@ from types import MappingProxyType
 from typing import Protocol
 
 from lifecycle import dataclasses
-from lifecycle.manifest import EndpointKind
-from lifecycle.network import (
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.network.nfe import (
     InternetProtocol,
     LocatedNfe,
     NetworkFlowEndpoint,

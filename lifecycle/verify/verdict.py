@@ -10,8 +10,9 @@ from typing import Annotated
 
 from lifecycle import dataclasses
 from lifecycle.codec import DscpValue, Octet, says
-from lifecycle.manifest import EndpointKind, UniqueHow
-from lifecycle.network import FlowTuple, Medium, NetworkFlowEndpoint, UniqueRequirement, flow_tuples
+from lifecycle.manifest.model import EndpointKind, UniqueHow
+from lifecycle.network.medium import Medium
+from lifecycle.network.nfe import FlowTuple, NetworkFlowEndpoint, UniqueRequirement, flow_tuples
 from lifecycle.verify.outcome import Outcome
 
 _Carrier = Annotated[str, says(enum=[*map(str, Medium), "none", "unknown"])]

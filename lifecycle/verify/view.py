@@ -9,18 +9,18 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 from lifecycle import dataclasses
-from lifecycle.manifest import (
-    Durability,
-    EndpointKind,
-    History,
-    Liveliness,
-    Position,
-    QosProfile,
-    Reliability,
-    RunKind,
+from lifecycle.manifest.diagnostics import Position
+from lifecycle.manifest.model import EndpointKind, RunKind
+from lifecycle.manifest.qos import Durability, History, Liveliness, QosProfile, Reliability
+from lifecycle.network.medium import Medium
+from lifecycle.network.nfe import UniqueRequirement
+from lifecycle.plan.model import (
+    ParticipantConnections,
+    Plan,
+    PlannedEndpoint,
+    PlannedFlow,
+    PlannedNode,
 )
-from lifecycle.network import Medium, UniqueRequirement
-from lifecycle.plan import ParticipantConnections, Plan, PlannedEndpoint, PlannedFlow, PlannedNode
 from lifecycle.verify.observation import (
     EndpointReport,
     NodeConfiguration,

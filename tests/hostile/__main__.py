@@ -173,7 +173,7 @@ def place(seed: int) -> Iterator:
     """Yield a place for attacks: a folder, and a domain that the environment names."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        from lifecycle.middleware import discovery_environment
+        from lifecycle.middleware.fastdds.profiles import discovery_environment
         from lifecycle.pytest_plugin import claimed_domain
         from tests.hostile.attack import Place
 

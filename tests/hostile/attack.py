@@ -26,7 +26,7 @@ import psutil
 
 from lifecycle.cli import main
 from lifecycle.errors import ExitCode
-from lifecycle.middleware import leftovers
+from lifecycle.middleware.process.shared_memory import leftovers
 from tests.ros.supervisor.running import ROOT, environment, left_of, marked
 
 BOUND_S = 30.0

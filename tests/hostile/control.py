@@ -13,8 +13,8 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 
 from lifecycle.codec import to_json, to_plain
-from lifecycle.manifest import load
-from lifecycle.plan import build_plan
+from lifecycle.manifest.loading import load
+from lifecycle.plan.build import build_plan
 from lifecycle.run_directory import connect
 from lifecycle.supervisor.control.protocol import Answer, ControlRequest, Question, ask
 from tests.hostile.attack import (

@@ -20,9 +20,9 @@ from lifecycle.codec import from_json, to_json
 from lifecycle.errors import LifecycleError
 from lifecycle.graph.messages import GraphMessageError, Joined, encode
 from lifecycle.graph.messages import decode as decode_message
-from lifecycle.manifest import ManifestError, load
-from lifecycle.manifest.diagnostics import Position
+from lifecycle.manifest.diagnostics import ManifestError, Position
 from lifecycle.manifest.installed_types import bounded_size, installed_hash
+from lifecycle.manifest.loading import load
 from lifecycle.manifest.nodl import read_interface
 from lifecycle.node.host.control import Event
 from lifecycle.plan.comparison import PlanNoticeError, notice_of
@@ -37,8 +37,8 @@ from lifecycle.programming.apply.tool import HostTool, ToolOutput
 from lifecycle.programming.rules.nftables import parse_managed_comment
 from lifecycle.run_directory import read_record
 from lifecycle.supervisor.control.server import LookAnswer, QuestionWithPlan
-from lifecycle.verify import Stage
 from lifecycle.verify.observation import ConfigurationError, decode_configuration
+from lifecycle.verify.verdict import Stage
 from tests.hostile.attack import Attack, HostileClass, Place, mutated
 from tests.unit.programming.apply.fakes import FakeTool, failed
 from tests.unit.programming.apply.samples import nef_settings

@@ -11,9 +11,11 @@ import sys
 
 from std_msgs.msg import String
 
-from lifecycle.manifest import EndpointKind
-from lifecycle.middleware import GraphObserver, endpoints_of, republish_names
-from lifecycle.plan import ParticipantConnections
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.middleware.discovery.rediscovery import republish_names
+from lifecycle.middleware.rcl.graph import GraphObserver
+from lifecycle.middleware.rcl.graph_queries import endpoints_of
+from lifecycle.plan.model import ParticipantConnections
 
 
 def main() -> None:

@@ -10,8 +10,9 @@ from __future__ import annotations
 import asyncio
 import sys
 
-from lifecycle.graph import set_within
-from lifecycle.middleware import GraphObserver, NodeClients
+from lifecycle.graph.scheduler import set_within
+from lifecycle.middleware.rcl.graph import GraphObserver
+from lifecycle.middleware.services.clients import NodeClients
 from lifecycle.plan.model import ParticipantConnections
 
 _LIMIT_S = 15.0

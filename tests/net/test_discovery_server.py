@@ -16,7 +16,7 @@ from lifecycle.middleware.discovery.discovery_server import (
     discovery_server_command,
     discovery_server_listens,
 )
-from lifecycle.plan import PlannedServer
+from lifecycle.plan.model import PlannedServer
 from tests.net.hosts import Host, Hosts
 from tests.net.nine_systems import DOMAIN
 from tests.ros.supervisor.contacts import TRIES

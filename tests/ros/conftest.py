@@ -26,7 +26,8 @@ with warnings.catch_warnings():
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
-from lifecycle.middleware import discovery_environment, leftovers, segments_of
+from lifecycle.middleware.fastdds.profiles import discovery_environment
+from lifecycle.middleware.process.shared_memory import leftovers, segments_of
 from lifecycle.pytest_plugin import claimed_domain
 from tests.second_try import SECOND_TRY
 

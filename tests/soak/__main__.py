@@ -151,7 +151,7 @@ def _history(soaking, file: Path) -> None:
 def _place(directory: Path, *, private: bool):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        from lifecycle.middleware import discovery_environment
+        from lifecycle.middleware.fastdds.profiles import discovery_environment
         from lifecycle.pytest_plugin import claimed_domain
         from tests.soak.soaking import Soaking
     profiles = directory / "profiles"

@@ -20,9 +20,10 @@ from typing import Any
 from lifecycle_msgs.msg import TransitionEvent
 from rclpy.executors import SingleThreadedExecutor
 
-from lifecycle.middleware import GraphObserver, segments_of
 from lifecycle.middleware.fastdds.dscp import socket_descriptors
-from lifecycle.plan import ParticipantConnections
+from lifecycle.middleware.process.shared_memory import segments_of
+from lifecycle.middleware.rcl.graph import GraphObserver
+from lifecycle.plan.model import ParticipantConnections
 from lifecycle.supervisor.control.protocol import (
     Answer,
     ControlRequest,

@@ -23,7 +23,7 @@ from pathlib import Path
 
 import psutil
 
-from lifecycle.middleware import leftovers, segments_of
+from lifecycle.middleware.process.shared_memory import leftovers, segments_of
 from tests.ros.supervisor.running import ROOT, command, environment, left_of
 from tests.soak.model import (
     DIES,

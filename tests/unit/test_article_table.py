@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.manifest import load
+from lifecycle.manifest.loading import load
 from lifecycle.manifest.model import (
     Authority,
     DataLayerSource,
@@ -21,7 +21,7 @@ from lifecycle.manifest.model import (
     EndpointPolicy,
     Manifest,
 )
-from lifecycle.plan import build_plan
+from lifecycle.plan.build import build_plan
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import graphlib
-import importlib
 import re
 import subprocess
 import sys
@@ -12,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.network import Medium
+from lifecycle import graph
+from lifecycle.network.medium import Medium
 
 ROOT = Path(__file__).parents[2]
-ROOMS = sorted(each.parent.name for each in (ROOT / "lifecycle").glob("*/__init__.pyi"))
 PURE_ROOMS = (
     "manifest",
     "network",
@@ -26,7 +25,6 @@ PURE_ROOMS = (
     "programming.rules.flows_csv",
     "codec",
     "dataclasses",
-    "doors",
     "errors",
 )
 
@@ -63,7 +61,7 @@ def test_networks_are_programmed_without_ros_and_loaded_without_httpx() -> None:
         "import sys\n"
         "sys.modules['rclpy'] = sys.modules['httpx'] = None\n"
         "import lifecycle.programming.apply.programmer\n"
-        "from lifecycle.programming import read_targets\n"
+        "from lifecycle.programming.apply.targets.registry import read_targets\n"
         "assert read_targets(['nft'], {})\n"
     )
     result = subprocess.run(
@@ -72,79 +70,12 @@ def test_networks_are_programmed_without_ros_and_loaded_without_httpx() -> None:
     assert result.returncode == 0, result.stderr
 
 
-@pytest.mark.parametrize("room", ROOMS)
-def test_a_name_that_a_room_offers_is_in_the_module_that_its_stub_names(room: str) -> None:
-    folder = ROOT / "lifecycle" / room
-    stub = ast.parse((folder / "__init__.pyi").read_text())
-    missing = [
-        f"{each.name} in {node.module}"
-        for node in stub.body
-        if isinstance(node, ast.ImportFrom) and node.module
-        for each in node.names
-        if each.name not in _bound(_file(folder.joinpath(*node.module.split("."))))
-    ]
-    assert missing == []
-
-
-@pytest.mark.parametrize("room", ROOMS)
-def test_a_door_has_what_python_reads_in_its_stub(room: str) -> None:
-    opened = importlib.import_module(f"lifecycle.{room}")
-    stub = ast.parse((ROOT / "lifecycle" / room / "__init__.pyi").read_text())
-    names = [
-        each.asname for node in stub.body if isinstance(node, ast.ImportFrom) for each in node.names
-    ]
-    assert opened.__all__ == sorted(filter(None, names))
-    with pytest.raises(AttributeError, match="nowhere"):
-        opened.nowhere  # noqa: B018 - looking it up is the point
-
-
 def test_the_api_page_lists_what_the_graph_offers() -> None:
     listed = re.search(r"members: \[(.*)\]", (ROOT / "docs" / "api.md").read_text())
-    stub = (ROOT / "lifecycle" / "graph" / "__init__.pyi").read_text()
     assert listed is not None
-    assert sorted(listed[1].split(", ")) == sorted(re.findall(r"import (\w+) as", stub))
-
-
-def _file(module: Path) -> Path:
-    return (
-        module.with_suffix(".py") if module.with_suffix(".py").exists() else module / "__init__.py"
-    )
-
-
-def test_rooms_are_entered_by_their_doors() -> None:
-    """What a room's stub does not list is its own affair, for all others but its tests."""
-    around = [
-        f"{path.relative_to(ROOT)}:{node.lineno}: {name}"
-        for path in sorted((ROOT / "lifecycle").rglob("*.py"))
-        for node in ast.walk(ast.parse(path.read_text()))
-        for name in _modules_imported(node)
-        if (parts := name.split("."))[0] == "lifecycle"
-        and len(parts) > 2
-        and parts[1] in ROOMS
-        and parts[1] != path.relative_to(ROOT / "lifecycle").parts[0]
-    ]
-    assert around == []
-
-
-def _modules_imported(node: ast.AST) -> list[str]:
-    if isinstance(node, ast.ImportFrom):
-        return [node.module or ""]
-    return [each.name for each in node.names] if isinstance(node, ast.Import) else []
-
-
-def _bound(path: Path) -> set[str]:
-    """Names that a module binds, read without importing it."""
-    bound: set[str] = set()
-    for node in ast.parse(path.read_text()).body:
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
-            bound.add(node.name)
-        elif isinstance(node, ast.ImportFrom):
-            bound.update(each.asname or each.name for each in node.names)
-        elif isinstance(node, ast.Assign):
-            bound.update(each.id for each in node.targets if isinstance(each, ast.Name))
-        elif isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
-            bound.add(node.target.id)
-    return bound
+    offered = [each for names in graph._PUBLIC.values() for each in names]
+    assert sorted(listed[1].split(", ")) == sorted(offered)
+    assert all(getattr(graph, each) is not None for each in offered)
 
 
 def test_no_module_imports_itself_by_way_of_others() -> None:
@@ -173,7 +104,7 @@ def _imports() -> dict[str, set[str]]:
                 for each in node.names:
                     inner = f"{node.module}.{each.name}"
                     modules.add(inner if inner in files else node.module)
-        # A room's door loads its names on first use, and is no part of a circle.
+        # A room loads its public names on first use, and is no part of a circle.
         found[name] = {each for each in modules if each in files and each != name}
     return {
         name: {each for each in modules if files[each].name != "__init__.py"}

@@ -25,8 +25,8 @@ from lifecycle.errors import BringUpError, ExitCode, UsageError
 from lifecycle.printable import json_text, lines
 
 if TYPE_CHECKING:
-    from lifecycle.plan import Plan
-    from lifecycle.supervisor import Answer, ChangedNodes
+    from lifecycle.plan.model import Plan
+    from lifecycle.supervisor.control.protocol import Answer, ChangedNodes
 
 _SHOWN_S = 10.0
 """For a supervisor to say what would change: it only compares two plans."""
@@ -98,7 +98,7 @@ def command(
     4 or 5 for a verdict, with 6 for a step. Exits with 2 where a running supervisor cannot take
     it, and with 0 once the system is active and verified by it.
     """
-    from lifecycle.plan import build_plan
+    from lifecycle.plan.build import build_plan
 
     plan = build_plan(load_manifest(manifest, assignments, machine=machine).manifest)
     path = _run_of(plan, machine)
@@ -148,7 +148,7 @@ def _is_by(path: Path, plan: Plan) -> bool:
     """Whether a run is of a system of the same name, or began with the same file."""
     if path.name.rpartition("@")[0] == plan.system:
         return True
-    from lifecycle.supervisor import status
+    from lifecycle.supervisor.control.client import status
 
     try:
         manifest = status(path).manifest
@@ -158,7 +158,8 @@ def _is_by(path: Path, plan: Plan) -> bool:
 
 
 def _asked(path: Path, plan: Plan, *, dry_run: bool, timeout_s: float, wait_s: float) -> Answer:
-    from lifecycle.supervisor import ControlRequest, Question, order
+    from lifecycle.supervisor.control.client import order
+    from lifecycle.supervisor.control.protocol import ControlRequest, Question
 
     question = Question(ask=ControlRequest.APPLY, plan=plan, dry_run=dry_run, timeout_s=timeout_s)
     try:
@@ -174,7 +175,7 @@ def _asked(path: Path, plan: Plan, *, dry_run: bool, timeout_s: float, wait_s: f
 def _report(
     outcome: str, path: Path, plan: Plan, answer: Answer, change: ChangedNodes | None = None
 ) -> ApplyReport:
-    from lifecycle.supervisor import ChangedNodes
+    from lifecycle.supervisor.control.protocol import ChangedNodes
 
     shown = answer.change or change or ChangedNodes(revision=0)
     return ApplyReport(

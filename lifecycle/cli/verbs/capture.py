@@ -13,7 +13,7 @@ from lifecycle.errors import ExitCode, UsageError
 from lifecycle.printable import one_line
 
 if TYPE_CHECKING:
-    from lifecycle.export import CapturedSystem
+    from lifecycle.export.captured import CapturedSystem
 
 
 @click.command("capture")
@@ -75,10 +75,10 @@ def command(
     4 if no node is there.
     """
     from lifecycle.cli.verbs.init import schema_reference
-    from lifecycle.export import to_manifest
-    from lifecycle.manifest import Discovery
-    from lifecycle.plan import effective_domain, effective_range
-    from lifecycle.supervisor import capture_running
+    from lifecycle.export.manifest_yaml import to_manifest
+    from lifecycle.manifest.model import Discovery
+    from lifecycle.plan.build import effective_domain, effective_range
+    from lifecycle.supervisor.run.looking import capture_running
 
     _check_name(system)
     discovery = Discovery(domain_id=domain)
@@ -129,7 +129,7 @@ def _check_name(system: str) -> None:
 
 def _write_nodl(captured: CapturedSystem, folder: Path, output: Path | None) -> dict[str, str]:
     """Write a document for each node; return what the manifest calls them, relative to itself."""
-    from lifecycle.export import SUFFIX, to_nodl
+    from lifecycle.export.manifest_yaml import SUFFIX, to_nodl
 
     base = Path.cwd() if output is None else output.parent
     references = {}

@@ -30,18 +30,12 @@ from lifecycle.cli.report import (
 )
 from lifecycle.codec import Count, to_json
 from lifecycle.errors import ExitCode, LifecycleError, UsageError
-from lifecycle.manifest import (
-    ArgumentDeclaration,
-    Diagnostic,
-    Manifest,
-    ManifestError,
-    Position,
-    Severity,
-    declared_arguments,
-    load,
-)
-from lifecycle.network import count
-from lifecycle.plan import Resolution, UnresolvedProgram, check_plan, effective_domain
+from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position, Severity
+from lifecycle.manifest.loading import ArgumentDeclaration, declared_arguments, load
+from lifecycle.manifest.model import Manifest
+from lifecycle.network.ports import count
+from lifecycle.plan.build import check_plan, effective_domain
+from lifecycle.plan.programs import Resolution, UnresolvedProgram
 from lifecycle.printable import json_text, lines
 
 TESTS = {

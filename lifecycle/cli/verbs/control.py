@@ -30,8 +30,8 @@ from lifecycle.printable import columns, json_text, lines, one_line
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from lifecycle.supervisor import NodeStatus, SystemStatus
-    from lifecycle.verify import ConnectionReport
+    from lifecycle.supervisor.control.protocol import NodeStatus, SystemStatus
+    from lifecycle.verify.outcome import ConnectionReport
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -141,8 +141,10 @@ def status_command(
     if watch:
         return _watch(path, format_)
     from lifecycle.codec import to_json
-    from lifecycle.supervisor import status  # takes long to import, and a wrong name needs none
-    from lifecycle.verify import Outcome
+
+    # takes long to import, and a wrong name needs none
+    from lifecycle.supervisor.control.client import status
+    from lifecycle.verify.outcome import Outcome
 
     with asking(path):
         seen = status(path)
@@ -159,8 +161,8 @@ def status_command(
 def _watch(path: Path, format_: str) -> int:
     from lifecycle.cli.watched import Watched
     from lifecycle.codec import to_json
-    from lifecycle.supervisor import follow
-    from lifecycle.verify import Outcome
+    from lifecycle.supervisor.control.server import follow
+    from lifecycle.verify.outcome import Outcome
 
     verdict = None
     last = ""
@@ -228,7 +230,8 @@ def give_order(  # noqa: PLR0917 - in the order of the command line
     path, plan = target_plan(os.environ, target, assignments, machine)
     if verb == "pause" and plan is not None:
         say_differences(path, plan)
-    from lifecycle.supervisor import ControlRequest, Question, order
+    from lifecycle.supervisor.control.client import order
+    from lifecycle.supervisor.control.protocol import ControlRequest, Question
 
     question = Question(ask=ControlRequest(verb), node=node, plan=plan, mode=mode)
     try:
@@ -258,7 +261,7 @@ def down_command(
     supervisor itself was killed, what it left behind is ended too.
     """
     path = target_run(os.environ, target, assignments, machine)
-    from lifecycle.supervisor import down
+    from lifecycle.supervisor.control.client import down
 
     try:
         return down(path, timeout)

@@ -14,11 +14,11 @@ import click
 
 from lifecycle.cli.common import load_manifest, manifest_arguments, write_text
 from lifecycle.errors import ExitCode, UsageError
-from lifecycle.manifest import EndpointPolicy
+from lifecycle.manifest.model import EndpointPolicy
 from lifecycle.printable import lines
 
 if TYPE_CHECKING:
-    from lifecycle.export import Enclave
+    from lifecycle.export.sros2 import Enclave
 
 
 @click.group("export")
@@ -45,8 +45,8 @@ def sros2(manifest: str, assignments: tuple[str, ...], output: Path) -> int:
     One enclave for each process, and one for each supervisor, in policy.xml, of which `ros2
     security create_permission` makes signed permissions; the commands that are printed do that.
     """
-    from lifecycle.export import enclaves_of, render_policy
-    from lifecycle.plan import build_plan
+    from lifecycle.export.sros2 import enclaves_of, render_policy
+    from lifecycle.plan.build import build_plan
 
     plan = build_plan(load_manifest(manifest, assignments).manifest)
     enclaves = enclaves_of(plan)
@@ -110,8 +110,8 @@ def _engine_command(engine: str) -> click.Command:
         more: str,
         **rest: str,
     ) -> int:
-        from lifecycle.export import ENGINES, Deployment
-        from lifecycle.plan import build_plan
+        from lifecycle.export.engines import ENGINES, Deployment
+        from lifecycle.plan.build import build_plan
 
         words, timeout_s = _up_options(more, container=engine in _CONTAINERS)
         _check_places(engine, at=at, **rest)
@@ -166,7 +166,7 @@ _VARIABLES = {
 
 def _say_secret(word: str, engine: str) -> None:
     """Say that a word of the command line seems to be secret, and is written as it is."""
-    from lifecycle.plan import shown
+    from lifecycle.plan.secrets import shown
 
     name, is_argument, value = word.partition(":=")
     if not is_argument:
@@ -256,7 +256,7 @@ def _check_paths(enclaves: tuple[Enclave, ...]) -> None:
 
 def _next_commands(enclaves: tuple[Enclave, ...], output: Path, domain_id: int) -> str:
     """Return what to do with the files, as lines for a shell."""
-    from lifecycle.export import OVERRIDE
+    from lifecycle.export.sros2 import OVERRIDE
 
     policy = shlex.quote(str(output / "policy.xml"))
     said = [

@@ -31,16 +31,19 @@ from lifecycle.cli.verbs.verify import exit_code
 from lifecycle.cli.watched import Watched
 from lifecycle.codec import to_json
 from lifecycle.errors import ExitCode, UsageError
-from lifecycle.manifest import UniqueHow
-from lifecycle.network import NetworkFlowEndpoint, describe
+from lifecycle.manifest.model import UniqueHow
+from lifecycle.network.dscp import describe
+from lifecycle.network.nfe import NetworkFlowEndpoint
 from lifecycle.printable import columns, json_text, lines, one_line
-from lifecycle.programming import flows_to_csv
-from lifecycle.verify import FlowReport
+from lifecycle.programming.rules.flows_csv import flows_to_csv
+from lifecycle.verify.verdict import FlowReport
 
 if TYPE_CHECKING:
-    from lifecycle.plan import Plan
-    from lifecycle.programming import Programmer, TargetChanges, TargetOptions, Treatment
-    from lifecycle.verify import FlowReport, Verdict
+    from lifecycle.plan.model import Plan
+    from lifecycle.programming.apply.programmer import Programmer, Treatment
+    from lifecycle.programming.apply.target import TargetChanges
+    from lifecycle.programming.apply.targets.registry import TargetOptions
+    from lifecycle.verify.verdict import FlowReport, Verdict
 
 
 _HEADS = (
@@ -132,7 +135,8 @@ class Export:
     """
 
     def __init__(self, name: str, *, mapping: str, flow_labels: bool, **given: Any) -> None:
-        from lifecycle.programming import read_targets, read_treatment
+        from lifecycle.programming.apply.programmer import read_treatment
+        from lifecycle.programming.apply.targets.registry import read_targets
 
         # What is exported for a network takes what programming it takes.
         (self._network,) = read_targets((name,), given, option="--export")
@@ -182,7 +186,7 @@ def _show(
     One line per network flow: its 5-tuple, on IPv6 its flow label, DSCP and TOS byte, how unique it
     is, what was required and the verdict. Exits as `lifecycle verify` does.
     """
-    from lifecycle.supervisor import follow_running, judge_running, supervisor_of
+    from lifecycle.supervisor.run.looking import follow_running, judge_running, supervisor_of
 
     exporter = None
     if export is not None:
@@ -220,7 +224,7 @@ def _plan_of(target: str, assignments: tuple[str, ...]) -> Plan:
     """Return the plan of a manifest, or that of a running system of this name."""
     if is_manifest(target) or target.endswith((".yaml", ".yml")):
         return _plan(target, assignments)
-    from lifecycle.supervisor import running_plan
+    from lifecycle.supervisor.run.looking import running_plan
 
     path, _ = target_plan(os.environ, target, assignments, "")
     return running_plan(path)
@@ -238,7 +242,7 @@ def apply(
 
     What is made stays until `remove`, or until the system is brought down.
     """
-    from lifecycle.programming import PartlyError
+    from lifecycle.programming.apply.target import PartlyError
 
     programmer = _open(plan, options, treatment)
     if dry_run:
@@ -341,7 +345,8 @@ def remove_command(manifest: str, assignments: tuple[str, ...]) -> int:
 def _asked(
     targets: tuple[str, ...], given: Mapping[str, Any], mapping: str, *, flow_labels: bool
 ) -> tuple[tuple[TargetOptions, ...], Treatment]:
-    from lifecycle.programming import read_targets, read_treatment
+    from lifecycle.programming.apply.programmer import read_treatment
+    from lifecycle.programming.apply.targets.registry import read_targets
 
     options = read_targets(targets, given)
     if not options:
@@ -350,13 +355,13 @@ def _asked(
 
 
 def _plan(manifest: str, assignments: tuple[str, ...]) -> Plan:
-    from lifecycle.plan import build_plan
+    from lifecycle.plan.build import build_plan
 
     return build_plan(load_manifest(manifest, assignments).manifest)
 
 
 def _judged(manifest: str, assignments: tuple[str, ...], timeout_s: float) -> tuple[Plan, Verdict]:
-    from lifecycle.supervisor import judge_running
+    from lifecycle.supervisor.run.looking import judge_running
 
     seen = judge_running(_plan(manifest, assignments), timeout_s=timeout_s, strict=False)
     for each in seen.notices:
@@ -371,7 +376,7 @@ def _spell(plan: Plan) -> str:
 def _open(
     plan: Plan, options: Sequence[TargetOptions], treatment: Treatment | None = None
 ) -> Programmer:
-    from lifecycle.programming import open_programmer
+    from lifecycle.programming.apply.programmer import open_programmer
 
     return open_programmer(plan, options, environment=os.environ, treatment=treatment)
 

@@ -23,8 +23,8 @@ from lifecycle.errors import ExitCode, UsageError
 from lifecycle.printable import json_text
 
 if TYPE_CHECKING:
-    from lifecycle.export import Picture
-    from lifecycle.plan import Plan
+    from lifecycle.export.picture.model import Picture
+    from lifecycle.plan.model import Plan
 
 
 @click.command("graph")
@@ -66,7 +66,7 @@ def command(
         if path is not None:
             _supervised(path, draw, watch=watch)
         elif plan is not None:
-            from lifecycle.supervisor import attached_picture, attached_pictures
+            from lifecycle.supervisor.run.looking import attached_picture, attached_pictures
 
             if watch:
                 attached_pictures(plan, draw)
@@ -80,7 +80,7 @@ def command(
 
 
 def _say_if_empty(picture: Picture, plan: Plan) -> None:
-    from lifecycle.export import PicturedNodeState
+    from lifecycle.export.picture.model import PicturedNodeState
 
     if all(node.state is PicturedNodeState.ABSENT for node in picture.nodes):
         click.echo(
@@ -97,15 +97,15 @@ def _found(
     if not is_manifest(target):
         return target_run(os.environ, target, assignments, machine), None
     from lifecycle.cli.common import load_manifest
-    from lifecycle.plan import build_plan
-    from lifecycle.supervisor import supervisor_of
+    from lifecycle.plan.build import build_plan
+    from lifecycle.supervisor.run.looking import supervisor_of
 
     plan = build_plan(load_manifest(target, assignments, quiet=True).manifest)
     return supervisor_of(os.environ, plan, machine), plan
 
 
 def _supervised(path: Path, draw: Callable[[Picture], None], *, watch: bool) -> None:
-    from lifecycle.supervisor import supervised_picture, supervised_pictures
+    from lifecycle.supervisor.run.looking import supervised_picture, supervised_pictures
 
     with asking(path):
         if not watch:
@@ -142,7 +142,7 @@ def render(picture: Picture, format_: str) -> str:
         from lifecycle.codec import to_json
 
         return json_text(to_json(picture).decode())
-    from lifecycle.export import WRITERS
+    from lifecycle.export.picture import WRITERS
 
     return WRITERS[format_](picture)
 

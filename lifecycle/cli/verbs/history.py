@@ -20,8 +20,8 @@ from lifecycle.errors import ExitCode, UsageError
 from lifecycle.printable import json_text, lines, one_line
 
 if TYPE_CHECKING:
-    from lifecycle.supervisor import RecordedRun
-    from lifecycle.verify import Finding, Verdict
+    from lifecycle.supervisor.run.history import RecordedRun
+    from lifecycle.verify.verdict import Finding, Verdict
 
 
 def _recorded(run: str | None, system: str) -> RecordedRun:
@@ -30,7 +30,8 @@ def _recorded(run: str | None, system: str) -> RecordedRun:
     Raises:
         UsageError: there is none.
     """
-    from lifecycle.supervisor import journal_files, read_run, ros_log_root, runs_of
+    from lifecycle.supervisor.processes.logs import ros_log_root, runs_of
+    from lifecycle.supervisor.run.history import journal_files, read_run
 
     if run is None:
         root = ros_log_root(os.environ)
@@ -85,7 +86,7 @@ def command(*, run: str | None, system: str, format_: str) -> int:
 
 def _timeline(recorded: RecordedRun) -> Iterator[str]:
     from lifecycle.cli.up_output import describe
-    from lifecycle.supervisor import NodeChanged, Stopped, VerdictChanged
+    from lifecycle.supervisor.run.events import NodeChanged, Stopped, VerdictChanged
 
     over, said = False, dict[str, str]()
     found: tuple[Finding, ...] = ()

@@ -9,7 +9,8 @@ import click
 
 from lifecycle.cli.common import parse_assignments, write_text
 from lifecycle.errors import ExitCode, UsageError
-from lifecycle.manifest import ManifestError, load
+from lifecycle.manifest.diagnostics import ManifestError
+from lifecycle.manifest.loading import load
 from lifecycle.printable import lines, one_line
 
 

@@ -47,7 +47,7 @@ def command(*, node: str | None, follow: bool, system: str, count: int | None) -
     The files are in ROS_LOG_DIR, else ~/.ros/log, where `latest` leads to those of the run that
     began last.
     """
-    from lifecycle.supervisor import ros_log_root, runs_of
+    from lifecycle.supervisor.processes.logs import ros_log_root, runs_of
 
     root = ros_log_root(os.environ)
     runs = runs_of(root, system)
@@ -91,7 +91,7 @@ def _followed(run: Path, node: str | None, count: int | None) -> Iterator[str]:
     Raises:
         UsageError: nothing is there, and the run is over.
     """
-    from lifecycle.supervisor import is_running
+    from lifecycle.supervisor.processes.logs import is_running
 
     followed: dict[Path, BinaryIO] = {}
     first = True

@@ -9,7 +9,10 @@ import click
 from lifecycle import codec
 from lifecycle.cli.common import format_option, load_manifest, manifest_arguments
 from lifecycle.errors import ExitCode
-from lifecycle.plan import Plan, build_plan, render_text, without_secrets
+from lifecycle.plan.build import build_plan
+from lifecycle.plan.model import Plan
+from lifecycle.plan.render import render_text
+from lifecycle.plan.secrets import without_secrets
 
 
 @click.command("plan")
@@ -33,6 +36,7 @@ def render(plan: Plan, format_: str) -> str:
         return render_text(plan, width=shutil.get_terminal_size((100, 24)).columns)
     if format_ == "json":
         return codec.to_json(without_secrets(plan)).decode()
-    from lifecycle.export import WRITERS, planned_picture
+    from lifecycle.export.picture import WRITERS
+    from lifecycle.export.picture.build import planned_picture
 
     return WRITERS[format_](planned_picture(plan))

@@ -16,8 +16,8 @@ from lifecycle.cli.common import (
 )
 from lifecycle.codec import to_json
 from lifecycle.errors import ExitCode, UsageError
-from lifecycle.manifest import Discovery
-from lifecycle.network import (
+from lifecycle.manifest.model import Discovery
+from lifecycle.network.ports import (
     LOCALHOST_PARTICIPANTS,
     Capacity,
     EphemeralRange,
@@ -33,7 +33,7 @@ from lifecycle.network import (
     safe_domains,
     unique_flow_ports,
 )
-from lifecycle.plan import effective_domain
+from lifecycle.plan.build import effective_domain
 
 THIS = "this"
 

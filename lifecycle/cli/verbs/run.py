@@ -14,9 +14,12 @@ import click
 from lifecycle.cli.common import load_manifest
 from lifecycle.cli.completion import completing
 from lifecycle.errors import ExitCode, UsageError
-from lifecycle.manifest import DiscoveryRange, Resources, RunKind
-from lifecycle.middleware import limit_resources, peers_environment, refuse_new_privileges
-from lifecycle.plan import Plan, PlannedNode, build_plan, reached_hosts
+from lifecycle.manifest.model import DiscoveryRange, Resources, RunKind
+from lifecycle.middleware.discovery.probe import peers_environment
+from lifecycle.middleware.process.control import limit_resources, refuse_new_privileges
+from lifecycle.plan.build import build_plan
+from lifecycle.plan.connections.hosts import reached_hosts
+from lifecycle.plan.model import Plan, PlannedNode
 
 _ROS_ARGUMENTS = "--ros-args"
 
@@ -92,8 +95,9 @@ def find_node(plan: Plan, name: str) -> PlannedNode:
 
 def _run_class(plan: Plan, planned: PlannedNode, arguments: list[str], *, lifecycle: str) -> int:
     # Late: everything before this works without ROS, and says what is wrong without it.
-    from lifecycle.node import load_nodes, run
-    from lifecycle.supervisor import check_log_root
+    from lifecycle.node.author.spec import load_nodes
+    from lifecycle.node.host.standalone import run
+    from lifecycle.supervisor.processes.logs import check_log_root
 
     check_log_root(os.environ)
 

@@ -22,8 +22,10 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from lifecycle.cli.up_output import RunOutput
-    from lifecycle.programming import TargetOptions, Treatment
-    from lifecycle.supervisor import ForkServerProcess, UpResult
+    from lifecycle.programming.apply.programmer import Treatment
+    from lifecycle.programming.apply.targets.registry import TargetOptions
+    from lifecycle.supervisor.processes.fork_server_process import ForkServerProcess
+    from lifecycle.supervisor.run.options import UpResult
 
 
 @click.command("up")
@@ -115,7 +117,7 @@ def command(
     --program tells networks which flows were verified before anything is activated, and takes it
     back in the end.
     """
-    from lifecycle.supervisor import Ended, Ending
+    from lifecycle.supervisor.run.signals import Ended, Ending
 
     try:
         with (
@@ -127,7 +129,7 @@ def command(
             # It imports while we do and read the manifest.
             process = _fork_server(program)
             try:
-                from lifecycle.plan import build_plan, started_by_others
+                from lifecycle.plan.build import build_plan, started_by_others
 
                 loaded = load_manifest(manifest, assignments, machine=machine)
                 plan = build_plan(loaded.manifest, domain_id=domain)
@@ -135,7 +137,9 @@ def command(
                     plan = started_by_others(plan, without)
                 written.begin(plan)
                 from lifecycle.cli.up_output import output
-                from lifecycle.supervisor import Until, UpOptions, ended_early, up
+                from lifecycle.supervisor.run.failure import ended_early
+                from lifecycle.supervisor.run.options import Until, UpOptions
+                from lifecycle.supervisor.run.up import up
 
                 options = UpOptions(
                     until=Until(until),
@@ -174,7 +178,7 @@ def command(
 
 
 def _fork_server(program: tuple[TargetOptions, ...]) -> ForkServerProcess:
-    from lifecycle.supervisor import ForkServerProcess
+    from lifecycle.supervisor.processes.fork_server_process import ForkServerProcess
 
     return ForkServerProcess(without=_tokens(program), programs=bool(program))
 
@@ -190,7 +194,7 @@ def _networks(targets: tuple[str, ...], **given: Any) -> tuple[TargetOptions, ..
     """What programs networks takes long to import, so only where it is asked for."""
     if not targets and not any(given.values()):
         return ()
-    from lifecycle.programming import read_targets
+    from lifecycle.programming.apply.targets.registry import read_targets
 
     return read_targets(targets, given, option="--program")
 
@@ -199,14 +203,14 @@ def _tokens(program: tuple[TargetOptions, ...]) -> frozenset[str]:
     """Variables with secrets of networks, which nothing that is started shall have."""
     if not program:
         return frozenset()
-    from lifecycle.supervisor import token_variables
+    from lifecycle.supervisor.connections.networks import token_variables
 
     return frozenset(token_variables(program))
 
 
 def _treatment(targets: tuple[str, ...], *, mapping: str, flow_labels: bool) -> Treatment | None:
     if targets:
-        from lifecycle.programming import read_treatment
+        from lifecycle.programming.apply.programmer import read_treatment
 
         return read_treatment(mapping, label_flows=flow_labels)
     if mapping or flow_labels:

@@ -32,7 +32,7 @@ def command(  # noqa: PLR0917 - click passes options by name
     Exits with 0 if it is what was declared, 4 if it is not, and 5 under --strict, or where the
     manifest says that it blocks, if something could not be verified.
     """
-    from lifecycle.supervisor import Ended, Ending
+    from lifecycle.supervisor.run.signals import Ended, Ending
 
     try:
         with (
@@ -40,8 +40,8 @@ def command(  # noqa: PLR0917 - click passes options by name
             ReportFile(report, strict=strict) as written,
             ending.unmasked(),
         ):
-            from lifecycle.plan import build_plan
-            from lifecycle.supervisor import judge_running
+            from lifecycle.plan.build import build_plan
+            from lifecycle.supervisor.run.looking import judge_running
 
             plan = build_plan(load_manifest(manifest, assignments).manifest)
             written.begin(plan)
@@ -62,8 +62,9 @@ def command(  # noqa: PLR0917 - click passes options by name
 
 def exit_code(verdict: object, *, strict: bool) -> ExitCode:
     """Return the exit code of a verdict."""
-    from lifecycle.supervisor import closes
-    from lifecycle.verify import Outcome, Verdict
+    from lifecycle.supervisor.gate.gate import closes
+    from lifecycle.verify.outcome import Outcome
+    from lifecycle.verify.verdict import Verdict
 
     assert isinstance(verdict, Verdict)
     if not closes(verdict, strict=strict):

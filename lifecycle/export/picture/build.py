@@ -20,10 +20,15 @@ from lifecycle.export.picture.model import (
     PicturedNodeState,
     Presence,
 )
-from lifecycle.manifest import EndpointKind, RunKind, UniqueHow
-from lifecycle.network import UniqueRequirement, describe
-from lifecycle.plan import Plan
-from lifecycle.verify import Finding, FlowView, Observation, Outcome, Stage, Verdict, View, lay_out
+from lifecycle.manifest.model import EndpointKind, RunKind, UniqueHow
+from lifecycle.network.dscp import describe
+from lifecycle.network.nfe import UniqueRequirement
+from lifecycle.plan.model import Plan
+from lifecycle.verify.matcher import lay_out
+from lifecycle.verify.observation import Observation
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.verdict import Finding, Stage, Verdict
+from lifecycle.verify.view import FlowView, View
 
 UNKNOWN = "unknown node"
 """What the node of endpoints is called whose node is not known."""

@@ -11,7 +11,8 @@ import enum
 
 from lifecycle import dataclasses
 from lifecycle.codec import DomainId, Positive
-from lifecycle.verify import Finding, Outcome
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.verdict import Finding
 
 
 class LineKind(enum.Enum):

@@ -13,7 +13,8 @@ from html import escape
 from lifecycle.export.picture.drawing import picture_to_svg
 from lifecycle.export.picture.model import OUTCOMES, Picture
 from lifecycle.printable import one_line
-from lifecycle.verify import Finding, Outcome
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.verdict import Finding
 
 CSS = """\
 body{margin:0 1.5rem;font:15px/1.45 system-ui,sans-serif;color:#1b2733;background:#fff}

@@ -20,7 +20,7 @@ from lifecycle.export.picture.model import (
     words,
 )
 from lifecycle.printable import columns, one_line
-from lifecycle.verify import Outcome
+from lifecycle.verify.outcome import Outcome
 
 _ARROWS = {Presence.MISSING: "╌╌▷", Presence.UNDECLARED: "··▶"}
 

@@ -19,17 +19,10 @@ from lifecycle.manifest.model import (
     Node,
 )
 from lifecycle.manifest.yaml.document import error, warning
-from lifecycle.network import (
-    DG,
-    MAX_DOMAIN_ID,
-    UDP_UNICAST,
-    ConnectionUrl,
-    Peer,
-    domain_base,
-    is_loopback,
-    may_be_same,
-    owner_of,
-)
+from lifecycle.network.connection_url import ConnectionUrl, Peer
+from lifecycle.network.medium import UDP_UNICAST
+from lifecycle.network.nfe import is_loopback, may_be_same
+from lifecycle.network.ports import DG, MAX_DOMAIN_ID, domain_base, owner_of
 
 _WORDS = {
     "port": "port",

@@ -33,7 +33,8 @@ from lifecycle.manifest.model import (
 from lifecycle.manifest.qos import Certainty, Incompatibility, incompatibilities
 from lifecycle.manifest.schema import did_you_mean
 from lifecycle.manifest.yaml.document import error, warning
-from lifecycle.network import Medium, describe
+from lifecycle.network.dscp import describe
+from lifecycle.network.medium import Medium
 
 _OTHER_END = {
     EndpointKind.SUBSCRIPTION: EndpointKind.PUBLISHER,

@@ -27,7 +27,9 @@ from lifecycle.manifest.names import full_name_problem
 from lifecycle.manifest.qos import Reliability
 from lifecycle.manifest.schema import did_you_mean
 from lifecycle.manifest.yaml.document import error, note, warning
-from lifecycle.network import MAX_DSCP, UniqueRequirement, describe, five_qi_of
+from lifecycle.network.dscp import MAX_DSCP, describe
+from lifecycle.network.five_qi import five_qi_of
+from lifecycle.network.nfe import UniqueRequirement
 
 _FIVE_QI = range(1, 255)  # one octet, 0 and 255 reserved (TS 24.501 §9.11.4.12)
 _KEPT_BY_CLASS = ("max_delay_ms", "loss")

@@ -38,7 +38,7 @@ from lifecycle.manifest.model import (
 from lifecycle.manifest.names import full_name_problem
 from lifecycle.manifest.schema import did_you_mean
 from lifecycle.manifest.yaml.document import error, note, warning
-from lifecycle.network import (
+from lifecycle.network.ports import (
     LOCALHOST_PARTICIPANTS,
     LOCALHOST_PEERS_RANGE,
     MAX_DOMAIN_ID,

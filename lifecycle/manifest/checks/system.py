@@ -33,7 +33,7 @@ from lifecycle.manifest.names import (
     supervisor_services,
     supervisor_status_topic,
 )
-from lifecycle.network import DEFAULT_RMW
+from lifecycle.network.medium import DEFAULT_RMW
 
 _RMW_VARIABLE = "RMW_IMPLEMENTATION"
 

@@ -29,17 +29,17 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.manifest.schema import did_you_mean
 from lifecycle.manifest.yaml.document import error, note, warning
-from lifecycle.network import (
+from lifecycle.network.medium import (
     DEFAULT_RMW,
     DEFAULT_TCP,
     FAST_DDS,
     RMW_DISCOVERY,
     RTPS_OVERHEAD_BYTES,
     TRANSPORTS_VARIABLE,
-    UniqueRequirement,
     datagram_bytes,
     max_unfragmented,
 )
+from lifecycle.network.nfe import UniqueRequirement
 
 _OTHERS = ("rmw_cyclonedds", "rmw_zenoh", "rmw_connextdds")
 """RMWs that are known to give no endpoint a network flow or a DSCP of its own."""

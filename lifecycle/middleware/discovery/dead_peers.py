@@ -34,7 +34,8 @@ from lifecycle.middleware.discovery.messages import disposal
 from lifecycle.middleware.discovery.probe import ProbeTarget, probe_targets, send
 from lifecycle.middleware.fastdds.dscp import own_udp_socket, socket_descriptors
 from lifecycle.middleware.fastdds.url_check import sockets_of
-from lifecycle.network import UDP_UNICAST, ConnectionUrl, Medium
+from lifecycle.network.connection_url import ConnectionUrl
+from lifecycle.network.medium import UDP_UNICAST, Medium
 
 _UNANSWERED = 2
 """Retransmissions in a row after which a connection is dead for a leaving process: the kernel

@@ -17,8 +17,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.network import TRANSPORTS_VARIABLE
-from lifecycle.plan import PlannedServer
+from lifecycle.network.medium import TRANSPORTS_VARIABLE
+from lifecycle.plan.model import PlannedServer
 
 PROGRAM = "fast-discovery-server"
 _PREFIX = re.compile(r"44\.53\.([0-9a-f]{2})\.5f\.45\.50\.52\.4f\.53\.49\.4d\.41")

@@ -43,7 +43,7 @@ from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, Reliabilit
 from std_msgs.msg import Empty, String
 
 from lifecycle.codec import from_json
-from lifecycle.manifest import ALIVE_PULSE
+from lifecycle.manifest.names import ALIVE_PULSE
 from lifecycle.middleware.rcl import abi
 
 LEASE_S = 0.85

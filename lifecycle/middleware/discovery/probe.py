@@ -48,16 +48,9 @@ from lifecycle.middleware.fastdds.url_profile import (
     leaves_discovery_open,
 )
 from lifecycle.middleware.process.control import interface_addresses
-from lifecycle.network import (
-    DG,
-    PARTICIPANTS_PER_DOMAIN,
-    RMW_DISCOVERY,
-    TRANSPORTS_VARIABLE,
-    ConnectionUrl,
-    Medium,
-    participant_ports,
-    unicast_pairs,
-)
+from lifecycle.network.connection_url import ConnectionUrl
+from lifecycle.network.medium import RMW_DISCOVERY, TRANSPORTS_VARIABLE, Medium
+from lifecycle.network.ports import DG, PARTICIPANTS_PER_DOMAIN, participant_ports, unicast_pairs
 
 RANGE_VARIABLE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 

@@ -46,7 +46,9 @@ from lifecycle.middleware.fastdds.url_profile import (
     leaves_discovery_open,
 )
 from lifecycle.middleware.rcl.hidden_node import bare_node
-from lifecycle.network import RMW_DISCOVERY, ConnectionUrl, Medium, participant_ports
+from lifecycle.network.connection_url import ConnectionUrl
+from lifecycle.network.medium import RMW_DISCOVERY, Medium
+from lifecycle.network.ports import participant_ports
 
 _PARTICIPANTS = 32
 """Of a host whose address is known; further participants are reached by multicast."""

@@ -24,13 +24,8 @@ from collections.abc import Iterator, Sequence
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.process.shared_memory import open_files
-from lifecycle.network import (
-    DG,
-    InternetProtocol,
-    NetworkFlowEndpoint,
-    TransportProtocol,
-    participant_ports,
-)
+from lifecycle.network.nfe import InternetProtocol, NetworkFlowEndpoint, TransportProtocol
+from lifecycle.network.ports import DG, participant_ports
 
 _FAMILY = {InternetProtocol.IPV4: socket.AF_INET, InternetProtocol.IPV6: socket.AF_INET6}
 _TYPE = {TransportProtocol.UDP: socket.SOCK_DGRAM, TransportProtocol.TCP: socket.SOCK_STREAM}

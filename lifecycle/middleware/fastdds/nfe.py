@@ -33,12 +33,12 @@ from rclpy.validate_topic_name import validate_topic_name
 
 from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError
-from lifecycle.manifest import QosProfile
+from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.fastdds.settings import noted_shared_memory
 from lifecycle.middleware.rcl import abi
 from lifecycle.middleware.rcl.hidden_node import is_moved
 from lifecycle.middleware.rcl.qos import to_rclpy
-from lifecycle.network import (
+from lifecycle.network.nfe import (
     InternetProtocol,
     NetworkFlowEndpoint,
     TransportProtocol,

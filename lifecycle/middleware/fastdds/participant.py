@@ -28,7 +28,7 @@ from rclpy.service import Service
 from rclpy.subscription import Subscription
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.manifest import QosProfile
+from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.fastdds import dscp as marks
 from lifecycle.middleware.fastdds import nfe
 from lifecycle.middleware.fastdds.dscp import never_wait
@@ -45,8 +45,10 @@ from lifecycle.middleware.rcl import hidden_node
 from lifecycle.middleware.rcl.abi import is_known
 from lifecycle.middleware.rcl.hidden_node import forget_hidden, hidden_nodes, quiet_node
 from lifecycle.middleware.rcl.qos import to_rclpy
-from lifecycle.network import ConnectionUrl, Medium, NetworkFlowEndpoint, UniqueRequirement
-from lifecycle.plan import ParticipantConnections
+from lifecycle.network.connection_url import ConnectionUrl
+from lifecycle.network.medium import Medium
+from lifecycle.network.nfe import NetworkFlowEndpoint, UniqueRequirement
+from lifecycle.plan.model import ParticipantConnections
 
 _UDP_ALONE = "only UDP sockets can be marked"
 

@@ -31,9 +31,10 @@ from lifecycle.middleware.fastdds.profiles import (
 )
 from lifecycle.middleware.fastdds.profiles import child as _child
 from lifecycle.middleware.fastdds.profiles import text as _text
-from lifecycle.network import RMW_DEFAULT, TRANSPORTS_VARIABLE, UDP_UNICAST, ConnectionUrl, Medium
-from lifecycle.network import parse as parse_url
-from lifecycle.plan import (
+from lifecycle.network.connection_url import ConnectionUrl
+from lifecycle.network.connection_url import parse as parse_url
+from lifecycle.network.medium import RMW_DEFAULT, TRANSPORTS_VARIABLE, UDP_UNICAST, Medium
+from lifecycle.plan.model import (
     GRAPH_TOPIC,
     GRAPH_TYPE,
     MAX_USER_ID,

@@ -18,7 +18,7 @@ from pathlib import Path
 from xml.etree import ElementTree as ET
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.network import Medium, udp_to
+from lifecycle.network.medium import Medium, udp_to
 
 PROFILES_FILE_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 DEFAULT_FILE = "DEFAULT_FASTRTPS_PROFILES.xml"

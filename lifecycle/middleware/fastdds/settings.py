@@ -51,7 +51,7 @@ from lifecycle.middleware.fastdds.url_check import (
 from lifecycle.middleware.fastdds.url_profile import families
 from lifecycle.middleware.process.shared_memory import own_segments
 from lifecycle.middleware.rcl import abi
-from lifecycle.plan import StaticEndpoint
+from lifecycle.plan.model import StaticEndpoint
 
 _LIBRARY = "libfastrtps.so.2.14"
 _KNOWN = "Fast DDS 2.14 (ROS 2 Jazzy)"

@@ -18,7 +18,8 @@ from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds.url_profile import UrlTransport, families
 from lifecycle.middleware.process.control import interface_addresses
-from lifecycle.network import CONNECTABLE, UDP_UNICAST, ConnectionUrl, Medium
+from lifecycle.network.connection_url import ConnectionUrl
+from lifecycle.network.medium import CONNECTABLE, UDP_UNICAST, Medium
 
 _KINDS = tuple(each for each in CONNECTABLE if each.is_network and not each.is_group)
 _LISTEN = "0A"  # TCP_LISTEN of linux/tcp_states.h

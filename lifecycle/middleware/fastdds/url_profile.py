@@ -22,14 +22,9 @@ from lifecycle.middleware.fastdds.profiles import child as _child
 from lifecycle.middleware.fastdds.profiles import locator as _locator
 from lifecycle.middleware.fastdds.profiles import tcp_locator as _tcp_locator
 from lifecycle.middleware.fastdds.profiles import text as _text
-from lifecycle.network import (
-    LOCALHOST_PEERS_RANGE,
-    ConnectionUrl,
-    Medium,
-    Peer,
-    participant_ports,
-    udp_to,
-)
+from lifecycle.network.connection_url import ConnectionUrl, Peer
+from lifecycle.network.medium import Medium, udp_to
+from lifecycle.network.ports import LOCALHOST_PEERS_RANGE, participant_ports
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

@@ -13,9 +13,9 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from lifecycle import dataclasses
-from lifecycle.export import CapturedProgram
+from lifecycle.export.programs import CapturedProgram
 from lifecycle.middleware.discovery.dead_peers import is_of_process
-from lifecycle.plan import shown
+from lifecycle.plan.secrets import shown
 
 _LONGEST_VALUE = 8192
 

@@ -23,8 +23,9 @@ from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock
 
 from lifecycle import dataclasses
-from lifecycle.export import CapturedProgram
-from lifecycle.manifest import EndpointKind, join
+from lifecycle.export.programs import CapturedProgram
+from lifecycle.manifest.installed_types import join
+from lifecycle.manifest.model import EndpointKind
 from lifecycle.middleware.discovery.dead_peers import (
     PROCESS_DIGITS,
     give_up_dead_connections,
@@ -62,13 +63,12 @@ from lifecycle.middleware.rcl.graph_queries import (
 )
 from lifecycle.middleware.rcl.hidden_node import quiet_node
 from lifecycle.middleware.rcl.stale_node_filter import StaleNodeFilter
-from lifecycle.plan import ParticipantConnections
-from lifecycle.verify import (
+from lifecycle.plan.model import ParticipantConnections
+from lifecycle.verify.observation import ObservedEndpoint, ObservedNode
+from lifecycle.verify.tool_filter import (
     CLOCK,
     NO_NAMES,
     DeclaredNames,
-    ObservedEndpoint,
-    ObservedNode,
     fold_actions,
     is_noise_endpoint,
     known_node,

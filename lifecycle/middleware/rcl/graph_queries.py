@@ -26,14 +26,8 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, LivelinessPolicy, Reliabi
 
 from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError
-from lifecycle.manifest import (
-    Durability,
-    EndpointKind,
-    History,
-    Liveliness,
-    QosProfile,
-    Reliability,
-)
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.manifest.qos import Durability, History, Liveliness, QosProfile, Reliability
 from lifecycle.middleware.rcl import abi
 from lifecycle.middleware.rcl.qos import from_rclpy
 

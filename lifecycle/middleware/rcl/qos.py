@@ -26,7 +26,7 @@ from rclpy.qos import (
 from rclpy.type_support import check_is_valid_msg_type, check_is_valid_srv_type
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.manifest import Durability, History, Liveliness, QosProfile, Reliability
+from lifecycle.manifest.qos import Durability, History, Liveliness, QosProfile, Reliability
 
 _UNSPECIFIED_NS = 0
 _INFINITE_NS = 2**63 - 1

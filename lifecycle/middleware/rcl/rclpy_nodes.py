@@ -21,7 +21,7 @@ from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.lifecycle import LifecycleNodeMixin, TransitionCallbackReturn
 from rclpy.node import Node
 
-from lifecycle.manifest import EndpointKind
+from lifecycle.manifest.model import EndpointKind
 
 RCLError = _rclpy.RCLError
 

@@ -12,7 +12,7 @@ import sys
 from collections.abc import Mapping
 
 from lifecycle.errors import UsageError
-from lifecycle.network import DEFAULT_RMW
+from lifecycle.network.medium import DEFAULT_RMW
 
 _VARIABLES = ("RMW_IMPLEMENTATION", "RCL_ASSERT_RMW_ID_MATCHES")
 """Both are checked by rcl (rcl/rmw_implementation_identifier_check.c)."""

@@ -15,7 +15,7 @@ from collections.abc import Iterable, Mapping
 
 from rclpy.node import Node
 
-from lifecycle.manifest import EndpointKind
+from lifecycle.manifest.model import EndpointKind
 from lifecycle.middleware.rcl.graph_queries import endpoints_of, endpoints_of_node, node_names
 
 _NODES_TOPIC = "ros_discovery_info"

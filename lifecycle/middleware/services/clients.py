@@ -32,17 +32,18 @@ from lifecycle.middleware.services.parameters import (
     type_word,
 )
 from lifecycle.middleware.services.service_calls import ServiceCalls, ServiceUnansweredError
-from lifecycle.plan import COMMAND, DEFAULT, PlannedNode
-from lifecycle.verify import (
+from lifecycle.plan.model import PlannedNode
+from lifecycle.plan.parameters import COMMAND, DEFAULT
+from lifecycle.verify.observation import (
     ConfigurationError,
     NodeConfiguration,
     ParameterReport,
     decode_configuration,
-    is_of_supervisor,
 )
+from lifecycle.verify.tool_filter import is_of_supervisor
 
 if TYPE_CHECKING:
-    from lifecycle.export import CapturedParameter
+    from lifecycle.export.captured import CapturedParameter
 
 TIMEOUT_S = 5.0
 """For services that answer at once; a transition takes as long as the node's callback does."""

@@ -14,11 +14,11 @@ from rcl_interfaces.msg import ParameterType
 from rcl_interfaces.msg import ParameterValue as ParameterValueMessage
 from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters
 
-from lifecycle.manifest import ParameterValue
-from lifecycle.verify import ParameterReport
+from lifecycle.manifest.model import ParameterValue
+from lifecycle.verify.observation import ParameterReport
 
 if TYPE_CHECKING:
-    from lifecycle.export import CapturedParameter
+    from lifecycle.export.captured import CapturedParameter
     from lifecycle.middleware.services.service_calls import ServiceCalls
 
 _TYPES = {
@@ -48,7 +48,7 @@ async def read_parameters(
     Raises:
         ServiceUnansweredError: no such service, or no answer.
     """
-    from lifecycle.export import CapturedParameter
+    from lifecycle.export.captured import CapturedParameter
 
     return tuple(
         CapturedParameter(

@@ -22,7 +22,7 @@ from rclpy.task import Future
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from lifecycle.manifest import DIAGNOSTICS_TOPIC, supervisor_status_topic
+from lifecycle.manifest.names import DIAGNOSTICS_TOPIC, supervisor_status_topic
 
 _LATCHED = QoSProfile(
     depth=1,

@@ -14,14 +14,15 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest import EndpointKind, QosProfile
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.manifest.qos import QosProfile
 from lifecycle.node.actions import resolve_action_name
 from lifecycle.node.author import declaring
 from lifecycle.node.author.handlers import ActionHandler
 from lifecycle.node.author.managed import Managed
 from lifecycle.node.author.spec import calling_position
 from lifecycle.node.endpoints.mapping import EndpointOptions
-from lifecycle.plan import PlannedEndpoint
+from lifecycle.plan.model import PlannedEndpoint
 
 if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup

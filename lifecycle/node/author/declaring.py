@@ -15,13 +15,14 @@ from rclpy.qos import QoSProfile
 
 from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest import EndpointKind, EndpointPolicy, QosProfile
-from lifecycle.middleware import from_rclpy
+from lifecycle.manifest.model import EndpointKind, EndpointPolicy
+from lifecycle.manifest.qos import QosProfile
+from lifecycle.middleware.rcl.qos import from_rclpy
 from lifecycle.node.author.handlers import Handlers, match, needs_handler
 from lifecycle.node.connections.data_layer import CONFIGURED, NodeDataLayer
 from lifecycle.node.endpoints.mapping import EndpointOptions, Key, find_endpoint
 from lifecycle.node.lifecycle.machine import NodeState
-from lifecycle.plan import PlannedEndpoint, PlannedNode
+from lifecycle.plan.model import PlannedEndpoint, PlannedNode
 
 _METHODS = {
     EndpointKind.SUBSCRIPTION: "declare_subscription",

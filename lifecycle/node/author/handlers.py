@@ -12,8 +12,8 @@ from typing import Any, TypeVar
 
 from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest import EndpointKind
-from lifecycle.plan import PlannedEndpoint
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.plan.model import PlannedEndpoint
 
 F = TypeVar("F", bound=Callable[..., Any])
 

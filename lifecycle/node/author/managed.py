@@ -20,7 +20,7 @@ from rclpy.timer import Timer
 
 from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest import EndpointKind, Health
+from lifecycle.manifest.model import EndpointKind, Health
 from lifecycle.node import configuration
 from lifecycle.node.author import parameters
 from lifecycle.node.author.declaring import DeclaredInCode
@@ -46,8 +46,8 @@ from lifecycle.node.lifecycle.machine import (
     TransitionRequest,
 )
 from lifecycle.node.lifecycle.services import LifecycleServices, Turns
-from lifecycle.plan import PlannedNode
-from lifecycle.verify import NodeConfiguration
+from lifecycle.plan.model import PlannedNode
+from lifecycle.verify.observation import NodeConfiguration
 
 if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup
@@ -66,7 +66,8 @@ class GraphMember:
 
     def __init__(self, node: Node, group: CallbackGroup) -> None:
         # Late: most nodes report to their supervisor only.
-        from lifecycle.graph import DdsTransport, GraphReporter, steady_timer
+        from lifecycle.graph.reporter import GraphReporter
+        from lifecycle.graph.transport import DdsTransport, steady_timer
 
         self._transport = DdsTransport(node, callback_group=group)
         self.reporter = GraphReporter(

@@ -35,8 +35,8 @@ from rclpy.time_source import TimeSource
 from rclpy.timer import Timer
 
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest import EndpointKind
-from lifecycle.network import ConnectionUrl
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.network.connection_url import ConnectionUrl
 from lifecycle.node import configuration
 from lifecycle.node.author import parameters
 from lifecycle.node.author.declarations import Declarations
@@ -54,7 +54,7 @@ from lifecycle.node.connections.connections import Connection, connections_of
 from lifecycle.node.endpoints.publisher import DeclaredPublisher
 from lifecycle.node.lifecycle.gate import GatedPublisher, GatedTimer, NodeGate
 from lifecycle.node.lifecycle.machine import NodeState
-from lifecycle.verify import ConnectionReport
+from lifecycle.verify.outcome import ConnectionReport
 
 if TYPE_CHECKING:
     from rclpy.action import ActionClient

@@ -20,17 +20,19 @@ from rclpy.exceptions import (
 from rclpy.parameter import Parameter
 
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest import ParameterDeclaration, ParameterValue, type_of
-from lifecycle.middleware import parameter_value, type_word
-from lifecycle.plan import DEFAULT, raw_value
-from lifecycle.verify import ParameterReport
+from lifecycle.manifest.checks.parameters import type_of
+from lifecycle.manifest.model import ParameterDeclaration, ParameterValue
+from lifecycle.middleware.services.parameters import parameter_value, type_word
+from lifecycle.plan.model import raw_value
+from lifecycle.plan.parameters import DEFAULT
+from lifecycle.verify.observation import ParameterReport
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
     from rclpy.node import Node
 
-    from lifecycle.plan import PlannedNode
+    from lifecycle.plan.model import PlannedNode
 
 _TYPES = {
     "bool": Parameter.Type.BOOL,

@@ -22,9 +22,10 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from lifecycle import dataclasses
 from lifecycle.errors import BringUpError, LifecycleError
-from lifecycle.manifest import EndpointPolicy, Position, Run, RunKind
+from lifecycle.manifest.diagnostics import Position
+from lifecycle.manifest.model import EndpointPolicy, Run, RunKind
 from lifecycle.node.author.handlers import nearest
-from lifecycle.plan import PlannedNode
+from lifecycle.plan.model import PlannedNode
 
 if TYPE_CHECKING:
     from rclpy.context import Context

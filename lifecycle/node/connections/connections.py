@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING
 
 from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError, MiddlewareError
-from lifecycle.middleware import FlowParticipant, has_shared_memory, senders_of
-from lifecycle.network import ConnectionUrl
+from lifecycle.middleware.fastdds.nfe import has_shared_memory, senders_of
+from lifecycle.middleware.fastdds.participant import FlowParticipant
+from lifecycle.network.connection_url import ConnectionUrl
 from lifecycle.node.author.handlers import nearest
-from lifecycle.plan import ParticipantConnections, PlannedParticipant
+from lifecycle.plan.model import ParticipantConnections, PlannedParticipant
 
 if TYPE_CHECKING:
     from rclpy.node import Node

@@ -28,7 +28,7 @@ from rclpy.node import Node
 from rclpy.task import Future
 
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest import Authority
+from lifecycle.manifest.model import Authority
 from lifecycle.node.connections.connection_status import ConnectionEvent, ConnectionStatus
 from lifecycle.node.connections.connections import (
     ConnectError,
@@ -41,7 +41,7 @@ from lifecycle.node.endpoints.making import Maker
 from lifecycle.node.endpoints.mapper import Mapper
 from lifecycle.node.endpoints.mapping import Mapping
 from lifecycle.node.lifecycle.machine import NodeState
-from lifecycle.plan import (
+from lifecycle.plan.model import (
     ParticipantConnections,
     PlannedEndpoint,
     PlannedNode,

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any
 from rclpy.node import Node
 
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest import EndpointKind
-from lifecycle.middleware import import_interface
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.middleware.rcl.qos import import_interface
 from lifecycle.node.author.handlers import alternatives
 from lifecycle.node.endpoints.mapping import Key, Mapping, UnknownEndpointError, find_endpoint
 from lifecycle.node.endpoints.publisher import DeclaredPublisher, Kept
-from lifecycle.plan import PlannedEndpoint
+from lifecycle.plan.model import PlannedEndpoint
 
 if TYPE_CHECKING:
     from lifecycle.node.lifecycle.gate import NodeGate

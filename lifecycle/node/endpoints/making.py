@@ -15,12 +15,14 @@ from rclpy.node import Node
 from rclpy.qos import qos_profile_system_default
 
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest import EndpointKind, QosProfile
-from lifecycle.middleware import create_publisher, create_subscription, to_rclpy
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.manifest.qos import QosProfile
+from lifecycle.middleware.fastdds.nfe import create_publisher, create_subscription
+from lifecycle.middleware.rcl.qos import to_rclpy
 from lifecycle.node.actions import Goals, resolve_action_name
 from lifecycle.node.endpoints.mapping import Mapping, wire_name
 from lifecycle.node.lifecycle.execution import positional_count
-from lifecycle.plan import PlannedEndpoint
+from lifecycle.plan.model import PlannedEndpoint
 
 if TYPE_CHECKING:
     from lifecycle.node.connections.connections import Connection
@@ -186,7 +188,7 @@ class Maker:
         return client
 
     def _action_server(self, mapping: Mapping, connection: Connection) -> Any:
-        from lifecycle.middleware import GoalServer  # late: numpy, 100 ms
+        from lifecycle.middleware.services.actions import GoalServer  # late: numpy, 100 ms
 
         assert mapping.handler is not None
         goals = Goals(
@@ -213,7 +215,7 @@ class Maker:
         return server
 
     def _action_client(self, mapping: Mapping, connection: Connection) -> Any:
-        from lifecycle.middleware import GoalClient
+        from lifecycle.middleware.services.actions import GoalClient
         from lifecycle.node.author.node import refuse_to_block
 
         def make(node: Node, name: str) -> Any:

@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING, Any
 from rclpy.duration import Duration
 from rclpy.task import Future
 
-from lifecycle.manifest import EndpointKind
-from lifecycle.middleware import ServerWatch
-from lifecycle.network import UniqueRequirement
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.middleware.rcl.graph_changes import ServerWatch
+from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.node.connections.connections import ConnectError, Connection, Connections
 from lifecycle.node.endpoints.making import CLIENTS
 from lifecycle.node.endpoints.mapping import Key, Mapping, MatchWatch, Placement

@@ -23,10 +23,10 @@ from rclpy.publisher import Publisher
 
 from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest import EndpointKind
+from lifecycle.manifest.model import EndpointKind
 from lifecycle.node.author.handlers import nearest
 from lifecycle.node.connections.connections import Connection
-from lifecycle.plan import PlannedEndpoint
+from lifecycle.plan.model import PlannedEndpoint
 
 if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from rclpy.service_introspection import ServiceIntrospectionState
     from rclpy.subscription import Subscription
 
-    from lifecycle.middleware import ServerWatch
+    from lifecycle.middleware.rcl.graph_changes import ServerWatch
     from lifecycle.node.endpoints.publisher import DeclaredPublisher
 
 

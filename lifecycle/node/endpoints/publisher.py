@@ -18,7 +18,7 @@ from rclpy.duration import Duration
 from rclpy.serialization import serialize_message
 
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest import Durability, History, QosProfile
+from lifecycle.manifest.qos import Durability, History, QosProfile
 
 if TYPE_CHECKING:
     from rclpy.publisher import Publisher

@@ -27,9 +27,9 @@ from typing import NoReturn
 
 from lifecycle import codec, dataclasses
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest import DiscoveryRange
-from lifecycle.plan import ParticipantConnections, PlannedNode
-from lifecycle.verify import NodeConfiguration
+from lifecycle.manifest.model import DiscoveryRange
+from lifecycle.plan.model import ParticipantConnections, PlannedNode
+from lifecycle.verify.observation import NodeConfiguration
 
 SIGN_DESCRIPTORS = 2
 """Beside the first byte of the HostSpec are the two descriptors of the busy sign, by which the
@@ -267,7 +267,7 @@ def give_up(channel: HostChannel, node: str, error: Exception) -> NoReturn:
     """Report a failure, and end the process."""
     report_failure(channel, node, error)
     channel.drain()
-    from lifecycle.middleware import leave_and_exit
+    from lifecycle.middleware.process.teardown import leave_and_exit
 
     leave_and_exit(1)
 

@@ -33,16 +33,16 @@ from rclpy.serialization import serialize_message
 from rclpy.time_source import TimeSource
 
 from lifecycle.errors import BringUpError, LifecycleError
-from lifecycle.manifest import EndpointKind
-from lifecycle.middleware import (
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.middleware.fastdds.nfe import create_subscription
+from lifecycle.middleware.rcl.graph_changes import ServerWatch
+from lifecycle.middleware.rcl.rclpy_nodes import (
     RCLError,
     RclpyStateMachine,
-    ServerWatch,
     Watching,
-    create_subscription,
     is_rclpy_managed,
 )
-from lifecycle.network import UniqueRequirement
+from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.node import configuration
 from lifecycle.node.actions import resolve_action_name
 from lifecycle.node.author import parameters
@@ -56,8 +56,8 @@ from lifecycle.node.endpoints.mapping import MatchWatch
 from lifecycle.node.lifecycle.execution import SUCCESS, Result
 from lifecycle.node.lifecycle.gate import GatedPublisher, NodeGate
 from lifecycle.node.lifecycle.machine import CallbackOutcome, RefusedError
-from lifecycle.plan import PlannedEndpoint, PlannedNode
-from lifecycle.verify import NodeConfiguration
+from lifecycle.plan.model import PlannedEndpoint, PlannedNode
+from lifecycle.verify.observation import NodeConfiguration
 
 if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup

@@ -15,8 +15,10 @@ import socket
 from collections.abc import Iterable
 from typing import NoReturn
 
-from lifecycle import codec, dataclasses, middleware
-from lifecycle.manifest import DiscoveryRange
+from lifecycle import codec, dataclasses
+from lifecycle.manifest.model import DiscoveryRange
+from lifecycle.middleware.fastdds.settings import unknown_versions
+from lifecycle.middleware.rcl.qos import load_type_support
 from lifecycle.node.host.control import HostChannel, HostSpec, give_up
 
 _PRELOADED = (
@@ -60,8 +62,8 @@ def preload(types: Iterable[str] = ()) -> None:
     for name in _PRELOADED:
         importlib.import_module(name)
     for interface in _INTERFACES:
-        middleware.load_type_support(interface)
-    middleware.unknown_versions()  # it loads the libraries of the RMW, which hosts then share
+        load_type_support(interface)
+    unknown_versions()  # it loads the libraries of the RMW, which hosts then share
     # Of the types that a node uses; else each host would make them anew.
     dataclasses.make_constructors(
         "lifecycle.node",
@@ -72,7 +74,7 @@ def preload(types: Iterable[str] = ()) -> None:
     )
     for interface in types:
         with contextlib.suppress(Exception):
-            middleware.load_type_support(interface)
+            load_type_support(interface)
 
 
 __all__ = ["main", "preload", "serve"]

@@ -27,18 +27,15 @@ from rclpy.signals import SignalHandlerOptions
 
 from lifecycle import codec
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest import Executor
-from lifecycle.middleware import (
-    BusySign,
-    ParticipantSettings,
-    Unannounced,
-    discovery_by_profile,
-    follow_nodes,
-    host_settings,
-    leave_and_exit,
-    made_participant,
-    send_again_soon,
-)
+from lifecycle.manifest.model import Executor
+from lifecycle.middleware.discovery.rediscovery import send_again_soon
+from lifecycle.middleware.fastdds.participant_discovery import Unannounced
+from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
+from lifecycle.middleware.fastdds.settings import discovery_by_profile, host_settings
+from lifecycle.middleware.process.busy_timer import BusySign
+from lifecycle.middleware.process.teardown import leave_and_exit
+from lifecycle.middleware.rcl.hidden_node import made_participant
+from lifecycle.middleware.rcl.rclpy_nodes import follow_nodes
 from lifecycle.node.author.spec import load_nodes
 from lifecycle.node.host.control import (
     Command,
@@ -51,8 +48,8 @@ from lifecycle.node.host.control import (
 from lifecycle.node.host.foreign import Adoption, ForeignNode, Hosted, refuse_unmanaged
 from lifecycle.node.host.loop import Heartbeat, NodeLoop, Watchdog, on_signal
 from lifecycle.node.lifecycle.machine import CallbackOutcome
-from lifecycle.plan import PlannedNode
-from lifecycle.verify import NodeConfiguration
+from lifecycle.plan.model import PlannedNode
+from lifecycle.verify.observation import NodeConfiguration
 
 
 def process_context(spec: HostSpec) -> Context:

@@ -20,23 +20,19 @@ from rclpy.executors import ExternalShutdownException, ShutdownException
 from rclpy.node import Node
 
 from lifecycle.errors import BringUpError, UsageError
-from lifecycle.manifest import EndpointKind, RunKind
-from lifecycle.middleware import (
-    NodeExecutor,
-    ParticipantSettings,
-    Watching,
-    discovery_by_profile,
-    follow_nodes,
-    import_interface,
-    made_participant,
-    to_rclpy,
-)
+from lifecycle.manifest.model import EndpointKind, RunKind
+from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
+from lifecycle.middleware.fastdds.settings import discovery_by_profile
+from lifecycle.middleware.rcl.executor import NodeExecutor
+from lifecycle.middleware.rcl.hidden_node import made_participant
+from lifecycle.middleware.rcl.qos import import_interface, to_rclpy
+from lifecycle.middleware.rcl.rclpy_nodes import Watching, follow_nodes
 from lifecycle.node.author.spec import Mode
 from lifecycle.node.host.foreign import Adoption, ForeignNode, Hosted
 from lifecycle.node.host.hosting import maker_of
 from lifecycle.node.lifecycle.execution import Result
 from lifecycle.node.lifecycle.machine import CallbackOutcome
-from lifecycle.plan import PlannedNode
+from lifecycle.plan.model import PlannedNode
 
 WAIT_S = 10.0
 """For a message, an answer or a log line; it ends with what is waited for."""

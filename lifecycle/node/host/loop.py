@@ -39,18 +39,14 @@ from rclpy.executors import (
 from rclpy.node import Node
 from rclpy.timer import Timer
 
-from lifecycle.manifest import Executor
-from lifecycle.middleware import (
-    BusySign,
-    NodeExecutor,
-    Watching,
-    described,
-    hidden_nodes,
-    label,
-    leave_and_exit,
-    republish_names,
-    show_stacks_here,
-)
+from lifecycle.manifest.model import Executor
+from lifecycle.middleware.discovery.rediscovery import republish_names
+from lifecycle.middleware.process.busy_timer import BusySign, label
+from lifecycle.middleware.process.stacks import show_stacks_here
+from lifecycle.middleware.process.teardown import leave_and_exit
+from lifecycle.middleware.rcl.executor import NodeExecutor, described
+from lifecycle.middleware.rcl.hidden_node import hidden_nodes
+from lifecycle.middleware.rcl.rclpy_nodes import Watching
 from lifecycle.node.author.node import LifecycleNode
 from lifecycle.node.lifecycle.execution import hint
 

@@ -27,24 +27,20 @@ import rclpy
 from rclpy.signals import SignalHandlerOptions
 
 from lifecycle.errors import ExitCode
-from lifecycle.manifest import Executor, Run, RunKind, Timeouts
-from lifecycle.middleware import (
-    AlivePublisher,
-    BusySign,
-    Overdue,
-    ParticipantSettings,
-    brief,
-    discovery_by_profile,
-    follow_nodes,
-    made_participant,
-    node_topic,
-)
+from lifecycle.manifest.model import Executor, Run, RunKind, Timeouts
+from lifecycle.middleware.discovery.liveliness import AlivePublisher, node_topic
+from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
+from lifecycle.middleware.fastdds.settings import discovery_by_profile
+from lifecycle.middleware.process.busy_timer import BusySign, Overdue
+from lifecycle.middleware.process.stacks import brief
+from lifecycle.middleware.rcl.hidden_node import made_participant
+from lifecycle.middleware.rcl.rclpy_nodes import follow_nodes
 from lifecycle.node.author.managed import Managed
 from lifecycle.node.author.spec import Construction, Mode, constructing, parse_mode
 from lifecycle.node.host.foreign import Adoption, Hosted
 from lifecycle.node.host.loop import Heartbeat, NodeLoop, Watchdog, on_signal
 from lifecycle.node.lifecycle.machine import CallbackOutcome
-from lifecycle.plan import PlannedNode
+from lifecycle.plan.model import PlannedNode
 
 if TYPE_CHECKING:
     from rclpy.context import Context

@@ -12,7 +12,7 @@ from collections.abc import Callable, Coroutine, Generator
 from typing import Any, Protocol
 
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest import Timeouts
+from lifecycle.manifest.model import Timeouts
 from lifecycle.node.lifecycle import execution
 from lifecycle.node.lifecycle.execution import SUCCESS, Interruptible, Result
 from lifecycle.node.lifecycle.machine import (

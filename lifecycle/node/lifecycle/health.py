@@ -14,9 +14,9 @@ import traceback
 from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any
 
-from lifecycle.manifest import Health
+from lifecycle.manifest.model import Health
 from lifecycle.node.lifecycle.machine import NodeState
-from lifecycle.verify import HealthReport
+from lifecycle.verify.observation import HealthReport
 
 if TYPE_CHECKING:
     from rclpy.timer import Timer

@@ -14,18 +14,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 
 from lifecycle import dataclasses
-from lifecycle.manifest import Discovery, DiscoveryMode, FlowTransport, RunKind
-from lifecycle.network import (
-    DEFAULT_TCP,
-    LOOPBACK,
-    RMW_DEFAULT,
-    UDP_UNICAST,
-    ConnectionUrl,
-    Medium,
-    Peer,
-    parse,
-    udp_to,
-)
+from lifecycle.manifest.model import Discovery, DiscoveryMode, FlowTransport, RunKind
+from lifecycle.network.connection_url import ConnectionUrl, Peer, parse
+from lifecycle.network.medium import DEFAULT_TCP, LOOPBACK, RMW_DEFAULT, UDP_UNICAST, Medium, udp_to
 from lifecycle.plan.connections.hosts import (
     Contact,
     Hosts,

@@ -15,24 +15,10 @@ import ipaddress
 from collections.abc import Collection, Iterable, Mapping, Sequence
 
 from lifecycle import dataclasses
-from lifecycle.manifest import (
-    DiscoveryMode,
-    DiscoveryRange,
-    EndpointKind,
-    Machine,
-    RunKind,
-)
-from lifecycle.network import (
-    LOOPBACK,
-    LOOPBACK6,
-    MAX_PORT,
-    RMW_DISCOVERY,
-    ConnectionUrl,
-    Medium,
-    Peer,
-    parse,
-    participant_ports,
-)
+from lifecycle.manifest.model import DiscoveryMode, DiscoveryRange, EndpointKind, Machine, RunKind
+from lifecycle.network.connection_url import ConnectionUrl, Peer, parse
+from lifecycle.network.medium import LOOPBACK, LOOPBACK6, RMW_DISCOVERY, Medium
+from lifecycle.network.ports import MAX_PORT, participant_ports
 from lifecycle.plan.model import Plan, PlanError, PlannedNode, PlannedProcess
 
 

@@ -17,29 +17,23 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from lifecycle import dataclasses
-from lifecycle.manifest import (
+from lifecycle.manifest.diagnostics import Diagnostic, Position
+from lifecycle.manifest.flows import ParticipantGroup
+from lifecycle.manifest.model import (
     ConnectionDeclaration,
     DataLayerSource,
-    Diagnostic,
     Discovery,
     DiscoveryMode,
-    Durability,
     EndpointKind,
     FlowTransport,
     Manifest,
-    ParticipantGroup,
-    Position,
-    Reliability,
     RunKind,
-    error,
 )
-from lifecycle.network import (
-    TRANSPORTS_VARIABLE,
-    UniqueRequirement,
-    describe,
-    medium_of,
-    udp_to,
-)
+from lifecycle.manifest.qos import Durability, Reliability
+from lifecycle.manifest.yaml.document import error
+from lifecycle.network.dscp import describe
+from lifecycle.network.medium import TRANSPORTS_VARIABLE, medium_of, udp_to
+from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.plan.connections.control import (
     connect_control,
     connect_observers,

@@ -7,8 +7,10 @@ Pure.
 from __future__ import annotations
 
 from lifecycle import dataclasses
-from lifecycle.manifest import EndpointKind, FlowTransport, QosProfile
-from lifecycle.network import CONNECTABLE, DEFAULT_TCP, RMW_DEFAULT, Medium, Peer
+from lifecycle.manifest.model import EndpointKind, FlowTransport
+from lifecycle.manifest.qos import QosProfile
+from lifecycle.network.connection_url import Peer
+from lifecycle.network.medium import CONNECTABLE, DEFAULT_TCP, RMW_DEFAULT, Medium
 from lifecycle.plan.connections.hosts import Contact
 
 PARADIGMS = ("publish-subscribe", "request-response")

@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Collection
 
 from lifecycle import dataclasses
-from lifecycle.manifest import FlowTransport
-from lifecycle.network import CONNECTABLE, Medium, is_fragmented, max_unfragmented
+from lifecycle.manifest.model import FlowTransport
+from lifecycle.network.medium import CONNECTABLE, Medium, is_fragmented, max_unfragmented
 from lifecycle.plan.negotiation.data_layer import Party, PartyEndpoint
 
 

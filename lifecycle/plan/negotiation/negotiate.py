@@ -14,16 +14,9 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from lifecycle import dataclasses
-from lifecycle.manifest import EndpointKind, FlowTransport
-from lifecycle.network import (
-    CONNECTABLE,
-    LOOPBACK,
-    UDP_UNICAST,
-    ConnectionUrl,
-    Medium,
-    medium_of,
-    parse,
-)
+from lifecycle.manifest.model import EndpointKind, FlowTransport
+from lifecycle.network.connection_url import ConnectionUrl, parse
+from lifecycle.network.medium import CONNECTABLE, LOOPBACK, UDP_UNICAST, Medium, medium_of
 from lifecycle.plan.connections.hosts import (
     Contact,
     PortPool,

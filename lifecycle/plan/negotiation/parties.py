@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 
 from lifecycle import dataclasses
-from lifecycle.manifest import (
+from lifecycle.manifest.model import (
     DataLayer,
     Discovery,
     DiscoveryMode,
@@ -19,20 +19,17 @@ from lifecycle.manifest import (
     FlowTransport,
     RunKind,
 )
-from lifecycle.network import (
+from lifecycle.network.connection_url import ConnectionUrl, Peer, parse
+from lifecycle.network.medium import (
     BUILTIN_TRANSPORTS,
     CONNECTABLE,
     DEFAULT_TCP,
-    DG,
     FAST_DDS,
     RMW_DEFAULT,
     RMW_DISCOVERY,
     TRANSPORTS_VARIABLE,
-    ConnectionUrl,
-    Peer,
-    domain_base,
-    parse,
 )
+from lifecycle.network.ports import DG, domain_base
 from lifecycle.plan.connections.control import is_fixed, participant_name
 from lifecycle.plan.connections.hosts import Hosts, contacts_of, ports_of
 from lifecycle.plan.model import (

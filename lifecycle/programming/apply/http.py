@@ -21,7 +21,7 @@ from typing import Any, NoReturn
 from urllib.parse import quote, unquote, urlsplit
 
 from lifecycle import dataclasses
-from lifecycle.network import is_loopback
+from lifecycle.network.nfe import is_loopback
 from lifecycle.programming.apply.settings import Token
 from lifecycle.programming.apply.target import HttpError, MissingFeatureError, SettingsError
 from lifecycle.programming.apply.tool import Deadline

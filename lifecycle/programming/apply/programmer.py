@@ -19,15 +19,17 @@ import psutil
 
 from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError, UsageError
-from lifecycle.network import DscpMapping, canonical, dscp_mapping, is_loopback, parse_mapping
-from lifecycle.plan import Plan, PlannedNode
+from lifecycle.network.five_qi import DscpMapping, dscp_mapping, parse_mapping
+from lifecycle.network.nfe import canonical, is_loopback
+from lifecycle.plan.model import Plan, PlannedNode
 from lifecycle.programming.apply.ledger import Ledger, has_ledger, owner_is_dead
 from lifecycle.programming.apply.target import PartlyError, Target, TargetChanges
 from lifecycle.programming.apply.targets.registry import TargetOptions, Targets, target_kind
 from lifecycle.programming.apply.tool import Deadline
 from lifecycle.programming.rules.rules import FlowRule, LeftOut, RuleSet, SourceAddress, flow_rules
 from lifecycle.run_directory import is_held, run_name, runtime_root
-from lifecycle.verify import FlowReport, Outcome
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.verdict import FlowReport
 
 _DISCARD_PORT = 9
 """RFC 863; connecting a UDP socket sends nothing."""

@@ -33,7 +33,7 @@ import msgspec
 import yaml
 
 from lifecycle import dataclasses
-from lifecycle.network import is_loopback
+from lifecycle.network.nfe import is_loopback
 from lifecycle.programming.apply.target import SettingsError
 
 _MAX_BYTES = 256 * 1024

@@ -9,8 +9,9 @@ import csv
 import io
 from collections.abc import Iterable, Iterator
 
-from lifecycle.network import FlowTuple, dscp_name, tos
-from lifecycle.verify import FlowReport
+from lifecycle.network.dscp import dscp_name, tos
+from lifecycle.network.nfe import FlowTuple
+from lifecycle.verify.verdict import FlowReport
 
 COLUMNS = (
     "topic",

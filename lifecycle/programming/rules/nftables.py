@@ -15,7 +15,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 from lifecycle import dataclasses
-from lifecycle.network import InternetProtocol, code_points, describe, dscp_name
+from lifecycle.network.dscp import code_points, describe, dscp_name
+from lifecycle.network.nfe import InternetProtocol
 from lifecycle.programming.rules.rules import FlowRule, LeftOut, asks, named
 
 FAMILY = "inet"

@@ -15,25 +15,26 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from lifecycle import dataclasses
 from lifecycle.codec import to_json
-from lifecycle.manifest import EndpointKind
-from lifecycle.network import (
-    DscpMapping,
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.network.dscp import describe, parse_dscp
+from lifecycle.network.five_qi import DscpMapping
+from lifecycle.network.medium import Medium
+from lifecycle.network.nfe import (
     FlowTuple,
     InternetProtocol,
     IpAddress,
-    Medium,
     TransportProtocol,
     canonical,
-    describe,
     is_ip,
     is_loopback,
     is_multicast,
     is_wildcard,
-    parse_dscp,
     socket_text,
 )
-from lifecycle.plan import Plan, PlannedEndpoint, PlannedNode
-from lifecycle.verify import UNKNOWN, FlowReport, Outcome
+from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedNode
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.transport import UNKNOWN
+from lifecycle.verify.verdict import FlowReport
 
 PROTOCOL_NUMBERS = {"udp": 17, "tcp": 6}
 """The two that carry flows here (IANA Assigned Internet Protocol Numbers)."""

@@ -24,7 +24,8 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from lifecycle import dataclasses
-from lifecycle.network import describe, dscp_name, five_qi_of, parse_dscp
+from lifecycle.network.dscp import describe, dscp_name, parse_dscp
+from lifecycle.network.five_qi import five_qi_of
 from lifecycle.programming.rules.nftables import (
     Action,
     nft_keyword,

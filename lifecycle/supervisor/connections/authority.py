@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING
 
 from lifecycle import dataclasses
 from lifecycle.errors import BringUpError
-from lifecycle.graph import set_within
-from lifecycle.manifest import Authority, Condition, DataLayerSource
-from lifecycle.node import Operation
-from lifecycle.plan import Plan
+from lifecycle.graph.scheduler import set_within
+from lifecycle.manifest.model import Authority, Condition, DataLayerSource
+from lifecycle.node.host.control import Operation
+from lifecycle.plan.model import Plan
 from lifecycle.supervisor.connections.desired_state import (
     ActualState,
     Instructions,
@@ -35,7 +35,8 @@ from lifecycle.supervisor.nodes.driver import ACTIVE, INACTIVE
 from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.run.events import Emitter, Notice, WiringChanged, WiringLost
 from lifecycle.supervisor.run.failure import ended
-from lifecycle.verify import Finding, NodeConfiguration, Observation
+from lifecycle.verify.observation import NodeConfiguration, Observation
+from lifecycle.verify.verdict import Finding
 
 if TYPE_CHECKING:
     from lifecycle.supervisor.nodes.driver import NodeDriver, NodeInterfaceClient

@@ -10,9 +10,12 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 
 from lifecycle import dataclasses
-from lifecycle.node import Operation
-from lifecycle.plan import ParticipantConnections, PlannedNode
-from lifecycle.verify import NOT_WIRED, Finding, NodeConfiguration, Outcome, node_of
+from lifecycle.node.host.control import Operation
+from lifecycle.plan.model import ParticipantConnections, PlannedNode
+from lifecycle.verify.observation import NodeConfiguration
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.rules.run import NOT_WIRED, node_of
+from lifecycle.verify.verdict import Finding
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

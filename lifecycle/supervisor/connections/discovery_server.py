@@ -12,15 +12,19 @@ import os
 from typing import TYPE_CHECKING
 
 from lifecycle.errors import BringUpError, MiddlewareError
-from lifecycle.manifest import Run, RunKind
-from lifecycle.middleware import discovery_server_command, discovery_server_listens
-from lifecycle.plan import PlannedProcess, PlannedServer
+from lifecycle.manifest.model import Run, RunKind
+from lifecycle.middleware.discovery.discovery_server import (
+    discovery_server_command,
+    discovery_server_listens,
+)
+from lifecycle.plan.model import PlannedProcess, PlannedServer
 from lifecycle.supervisor.control.protocol import ProcessState
 from lifecycle.supervisor.nodes.bring_up import died
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.process import COMMAND_ESCALATION, ManagedProcess
 from lifecycle.supervisor.run.failure import StepFailedError, finding_of
-from lifecycle.verify import DEADLINE, START_FAILED, Finding
+from lifecycle.verify.rules.run import DEADLINE, START_FAILED
+from lifecycle.verify.verdict import Finding
 
 if TYPE_CHECKING:
     from lifecycle.supervisor.processes.fork_server import ForkServer

@@ -15,42 +15,42 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Iterator, Mapping
 
 from lifecycle import dataclasses
-from lifecycle.manifest import Authority, DataLayerSource, EndpointKind, EndpointPolicy
-from lifecycle.network import CONNECTABLE, FAST_DDS, RMW_DEFAULT, parse
-from lifecycle.plan import (
-    DataLayerGraph,
-    NegotiatedConnection,
-    NegotiationProblem,
+from lifecycle.manifest.model import Authority, DataLayerSource, EndpointKind, EndpointPolicy
+from lifecycle.network.connection_url import parse
+from lifecycle.network.medium import CONNECTABLE, FAST_DDS, RMW_DEFAULT
+from lifecycle.plan.connections.hosts import contacts_of, ports_of
+from lifecycle.plan.connections.wiring import with_graph
+from lifecycle.plan.model import (
     ParticipantConnections,
-    Party,
-    PartyEndpoint,
     Plan,
     PlannedEndpoint,
     PlannedFlow,
     PlannedNode,
-    contacts_of,
+)
+from lifecycle.plan.negotiation.data_layer import (
+    DataLayerGraph,
+    NegotiatedConnection,
+    NegotiationProblem,
+    Party,
+    PartyEndpoint,
+)
+from lifecycle.plan.negotiation.negotiate import negotiate
+from lifecycle.plan.negotiation.parties import (
     endpoint_of,
     hosts_of,
-    negotiate,
     party_of_node,
-    ports_of,
     terms_of,
     transports_of,
     wishes_of,
-    with_graph,
 )
 from lifecycle.supervisor.connections.desired_state import (
     Instructions,
     not_wired,
     planned_instructions,
 )
-from lifecycle.verify import (
-    ConnectionReport,
-    EndpointReport,
-    Finding,
-    NodeConfiguration,
-    Observation,
-)
+from lifecycle.verify.observation import EndpointReport, NodeConfiguration, Observation
+from lifecycle.verify.outcome import ConnectionReport
+from lifecycle.verify.verdict import Finding
 
 
 def party_of(

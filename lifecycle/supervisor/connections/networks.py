@@ -17,16 +17,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lifecycle.errors import LifecycleError
-from lifecycle.graph import set_within
-from lifecycle.plan import Plan
+from lifecycle.graph.scheduler import set_within
+from lifecycle.plan.model import Plan
 from lifecycle.run_directory import LEDGER_NAME, RunDirectory
 from lifecycle.supervisor.run.events import Emitter, Event, Notice, VerdictChanged
 from lifecycle.supervisor.run.failure import StepFailedError, Worker, ended
 from lifecycle.supervisor.run.options import UpOptions
-from lifecycle.verify import NOT_PROGRAMMED, FlowReport, Verdict
+from lifecycle.verify.rules.run import NOT_PROGRAMMED
+from lifecycle.verify.verdict import FlowReport, Verdict
 
 if TYPE_CHECKING:
-    from lifecycle.programming import Programmer, Removal, TargetOptions
+    from lifecycle.programming.apply.programmer import Programmer, Removal
+    from lifecycle.programming.apply.targets.registry import TargetOptions
 
 _AGAIN_S = (2.0, 60.0)
 """First and longest pause after a failure."""
@@ -156,7 +158,7 @@ class Networks:
             if self._programmer is not None:
                 await remove(self._programmer, self._report, hurry, self._worker)
             elif (self._directory / LEDGER_NAME).is_file():
-                from lifecycle.programming import Removal
+                from lifecycle.programming.apply.programmer import Removal
 
                 await remove(Removal(self._directory), self._report, hurry, self._worker)
 
@@ -262,7 +264,7 @@ def open_networks(
     path = directory.path
     if not options.program:
         return Networks(plan.system, path, emit)
-    from lifecycle.programming import open_programmer, sweep_orphans
+    from lifecycle.programming.apply.programmer import open_programmer, sweep_orphans
 
     programmer = open_programmer(
         plan,
@@ -293,7 +295,7 @@ def remove_programmed(directory: Path, within_s: float | None = None) -> tuple[s
     """
     if not (directory / LEDGER_NAME).is_file():
         return ()
-    from lifecycle.programming import remove_run
+    from lifecycle.programming.apply.programmer import remove_run
 
     done = remove_run(directory, within_s=within_s)
     return tuple(each.render(done=True) for each in done if each.changes)

@@ -33,7 +33,7 @@ from lifecycle.supervisor.control.protocol import (
 )
 
 if TYPE_CHECKING:
-    from lifecycle.plan import Plan
+    from lifecycle.plan.model import Plan
     from lifecycle.supervisor.control.server import SupervisorSnapshot
 
 STATUS_S = 5.0
@@ -146,7 +146,7 @@ def down(path: Path, timeout_s: float) -> ExitCode:
         raise strange(path / _SOCKET, "it has no exit code")
     if answer is not None and _released(path, deadline):
         return ExitCode.OK
-    from lifecycle.middleware import sweep
+    from lifecycle.middleware.process.shared_memory import sweep
     from lifecycle.supervisor.connections.networks import remove_programmed
     from lifecycle.supervisor.processes.orphans import end_run
 

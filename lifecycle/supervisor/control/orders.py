@@ -13,16 +13,12 @@ import asyncio
 from collections.abc import Collection, Iterable, Iterator
 
 from lifecycle.errors import BringUpError, ExitCode, LifecycleError, UsageError
-from lifecycle.manifest import did_you_mean
-from lifecycle.network import parse
-from lifecycle.plan import (
-    Plan,
-    PlanChange,
-    PlanDifference,
-    change_between,
-    changes,
-    with_files_of_now,
-)
+from lifecycle.manifest.schema import did_you_mean
+from lifecycle.network.connection_url import parse
+from lifecycle.plan.build import with_files_of_now
+from lifecycle.plan.change import PlanChange, change_between
+from lifecycle.plan.comparison import PlanDifference, changes
+from lifecycle.plan.model import Plan
 from lifecycle.supervisor.control.protocol import (
     Answer,
     ChangedNodes,

@@ -18,7 +18,7 @@ import msgspec
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import UsageError
 from lifecycle.run_directory import connect
-from lifecycle.verify import ConnectionReport, Outcome
+from lifecycle.verify.outcome import ConnectionReport, Outcome
 
 _LARGEST_ANSWER = 64 * 2**20
 """Bytes of a line; a look holds a whole plan and all that was seen."""

@@ -18,14 +18,9 @@ from msgspec.structs import replace
 
 from lifecycle.codec import to_json
 from lifecycle.errors import LifecycleError, MiddlewareError
-from lifecycle.manifest import (
-    MODE_SERVICE,
-    Policy,
-    RosInterfaceAccess,
-    supervisor_prefix,
-    supervisor_services,
-)
-from lifecycle.plan import Plan
+from lifecycle.manifest.model import Policy, RosInterfaceAccess
+from lifecycle.manifest.names import MODE_SERVICE, supervisor_prefix, supervisor_services
+from lifecycle.plan.model import Plan
 from lifecycle.supervisor.control import protocol
 from lifecycle.supervisor.control.orders import ACTIVE, PHASES, Order
 from lifecycle.supervisor.control.protocol import ControlRequest, NodeStatus, SystemStatus
@@ -40,10 +35,12 @@ from lifecycle.supervisor.run.events import (
     SystemReached,
     WiringChanged,
 )
-from lifecycle.verify import Outcome, Verdict, supervisor_label, takes_diagnostics
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.tool_filter import supervisor_label, takes_diagnostics
+from lifecycle.verify.verdict import Verdict
 
 if TYPE_CHECKING:
-    from lifecycle.middleware import RosInterface as RosEntities
+    from lifecycle.middleware.services.ros_interface import RosInterface as RosEntities
     from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
 
 Entry = tuple[int, str, str, str, Sequence[tuple[str, str]]]

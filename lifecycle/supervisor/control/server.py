@@ -18,7 +18,7 @@ import msgspec
 from lifecycle import dataclasses
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import UsageError
-from lifecycle.plan import Plan
+from lifecycle.plan.model import Plan
 from lifecycle.run_directory import connect, short_path
 from lifecycle.supervisor.control.protocol import (
     ANSWER_S,
@@ -28,7 +28,8 @@ from lifecycle.supervisor.control.protocol import (
     SystemStatus,
     read_answer,
 )
-from lifecycle.verify import Observation, Verdict
+from lifecycle.verify.observation import Observation
+from lifecycle.verify.verdict import Verdict
 
 if TYPE_CHECKING:
     from lifecycle.supervisor.control.orders import Order

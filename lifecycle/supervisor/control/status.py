@@ -9,10 +9,11 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from lifecycle.manifest import RunKind, UniqueHow
+from lifecycle.manifest.model import RunKind, UniqueHow
 from lifecycle.supervisor.control.protocol import NodeStatus, SystemStatus
 from lifecycle.supervisor.processes.usage import ResourceUse, resource_use
-from lifecycle.verify import Verdict, not_ok
+from lifecycle.verify.judge import not_ok
+from lifecycle.verify.verdict import Verdict
 
 if TYPE_CHECKING:
     from lifecycle.supervisor.nodes.system import NodeRun, System

@@ -13,18 +13,21 @@ from typing import TYPE_CHECKING
 
 from lifecycle import dataclasses
 from lifecycle.errors import BringUpError
-from lifecycle.manifest import RunKind
-from lifecycle.node import Operation
-from lifecycle.plan import Plan
+from lifecycle.manifest.model import RunKind
+from lifecycle.node.host.control import Operation
+from lifecycle.plan.model import Plan
 from lifecycle.supervisor.control.protocol import Reach
 from lifecycle.supervisor.nodes.driver import ACTIVE
 from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.run.events import Notice
 from lifecycle.supervisor.run.failure import ended
-from lifecycle.verify import ACTIVATED_AT_CLOSED_GATE, Finding, Observation, Outcome
+from lifecycle.verify.observation import Observation
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.rules.state import ACTIVATED_AT_CLOSED_GATE
+from lifecycle.verify.verdict import Finding
 
 if TYPE_CHECKING:
-    from lifecycle.graph import Graph
+    from lifecycle.graph.graph import Graph
     from lifecycle.supervisor.gate.verification_loop import ChangeCounter
 
 TRIES = 5

@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any
 
 from lifecycle import dataclasses
 from lifecycle.errors import BringUpError, MiddlewareError, UsageError
-from lifecycle.manifest import Condition
-from lifecycle.plan import GivenParameters, Plan, PlanChange
+from lifecycle.manifest.model import Condition
+from lifecycle.plan.change import GivenParameters, PlanChange
+from lifecycle.plan.model import Plan
 from lifecycle.supervisor.control.orders import (
     ACTIVE,
     HELD,
@@ -34,10 +35,12 @@ from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.policy.schedule import RestartSchedule
 from lifecycle.supervisor.run.events import Emitter, ManifestApplied, Notice, SystemReached
 from lifecycle.supervisor.run.failure import StepFailedError, together
-from lifecycle.verify import PROCESS_DIED, Stage, not_ok
+from lifecycle.verify.judge import not_ok
+from lifecycle.verify.rules.run import PROCESS_DIED
+from lifecycle.verify.verdict import Stage
 
 if TYPE_CHECKING:
-    from lifecycle.middleware import NodeClients
+    from lifecycle.middleware.services.clients import NodeClients
     from lifecycle.supervisor.gate.sequence import GateSequence
     from lifecycle.supervisor.processes.fork_server import ForkServer
 

@@ -12,7 +12,8 @@ import asyncio
 from typing import TYPE_CHECKING
 
 from lifecycle.errors import BringUpError, ExitCode, LifecycleError
-from lifecycle.verify import Outcome, Verdict
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.verdict import Verdict
 
 if TYPE_CHECKING:
     from lifecycle.supervisor.gate.verification_loop import VerificationLoop

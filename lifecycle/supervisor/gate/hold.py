@@ -17,7 +17,7 @@ from typing import Any
 import msgspec
 
 from lifecycle.errors import ExitCode, UsageError
-from lifecycle.manifest import Consequence
+from lifecycle.manifest.model import Consequence
 from lifecycle.supervisor.control.orders import (
     ACTIVE,
     HELD,
@@ -46,7 +46,8 @@ from lifecycle.supervisor.policy.consequences import Consequences, Due
 from lifecycle.supervisor.policy.schedule import RestartSchedule
 from lifecycle.supervisor.run.events import ConsequenceTaken, Emitter, Notice
 from lifecycle.supervisor.run.failure import StepFailedError, ended, failure_of
-from lifecycle.verify import Stage, Verdict, not_ok
+from lifecycle.verify.judge import not_ok
+from lifecycle.verify.verdict import Stage, Verdict
 
 
 class Watch:

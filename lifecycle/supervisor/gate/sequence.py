@@ -23,9 +23,10 @@ from collections.abc import AsyncIterator, Callable, Collection, Coroutine, Iter
 from typing import TYPE_CHECKING, Any
 
 from lifecycle.errors import BringUpError
-from lifecycle.manifest import TargetState
-from lifecycle.node import Operation
-from lifecycle.plan import Plan, PlanError, moving_nodes, restarted
+from lifecycle.manifest.model import TargetState
+from lifecycle.node.host.control import Operation
+from lifecycle.plan.model import Plan, PlanError
+from lifecycle.plan.restart import moving_nodes, restarted
 from lifecycle.supervisor.control.orders import (
     ACTIVE,
     HELD,
@@ -50,21 +51,16 @@ from lifecycle.supervisor.policy.schedule import RestartSchedule
 from lifecycle.supervisor.run.events import Emitter, GateOpened, ModeEntered, Notice, SystemReached
 from lifecycle.supervisor.run.failure import StepFailedError, ended, failure_of, together
 from lifecycle.supervisor.run.shutdown import TakeDown
-from lifecycle.verify import (
-    MISSING_NODE,
-    START_FAILED,
-    TRANSITION_FAILED,
-    About,
-    Outcome,
-    Stage,
-    Verdict,
-    not_ok,
-    rule,
-    taken_on_trust,
-)
+from lifecycle.verify.judge import not_ok, taken_on_trust
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.rules import rule
+from lifecycle.verify.rules.catalogue import About
+from lifecycle.verify.rules.nodes import MISSING_NODE
+from lifecycle.verify.rules.run import START_FAILED, TRANSITION_FAILED
+from lifecycle.verify.verdict import Stage, Verdict
 
 if TYPE_CHECKING:
-    from lifecycle.middleware import NodeClients
+    from lifecycle.middleware.services.clients import NodeClients
     from lifecycle.supervisor.connections.networks import Networks
     from lifecycle.supervisor.health.process_monitor import ProcessMonitor, Sightings
     from lifecycle.supervisor.processes.fork_server import ForkServer

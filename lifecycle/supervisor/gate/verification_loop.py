@@ -15,9 +15,9 @@ from collections.abc import Callable, Collection, Iterator
 from typing import TYPE_CHECKING
 
 from lifecycle import dataclasses
-from lifecycle.graph import set_within
-from lifecycle.manifest import EndpointKind
-from lifecycle.plan import Plan
+from lifecycle.graph.scheduler import set_within
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.plan.model import Plan
 from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.control.protocol import ProcessState
 from lifecycle.supervisor.gate.activation_guard import ActivationGuard
@@ -31,32 +31,22 @@ from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.scope import unlimited
 from lifecycle.supervisor.run.events import Emitter, Event, ProcessChanged, VerdictChanged
 from lifecycle.supervisor.run.failure import ended
-from lifecycle.verify import (
-    DEFINITION_DIFFERS,
-    MISSING_REPORT,
-    NOT_JUDGED,
-    SERVER_OF,
-    SILENT_CLOCK,
-    UNATTRIBUTED_ENDPOINT,
-    UNDECLARED_NODE,
-    UNHEALTHY,
-    UNKNOWN_PEER,
-    About,
-    Finding,
-    Heals,
-    Observation,
-    Outcome,
-    Stage,
-    Verdict,
-    is_hidden_node,
-    rule,
-    verify,
-    with_findings,
-    with_only,
-)
+from lifecycle.verify.judge import verify, with_findings, with_only
+from lifecycle.verify.observation import Observation
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.rules import rule
+from lifecycle.verify.rules.catalogue import About, Heals
+from lifecycle.verify.rules.endpoints import DEFINITION_DIFFERS
+from lifecycle.verify.rules.health import UNHEALTHY
+from lifecycle.verify.rules.matching import SERVER_OF, UNKNOWN_PEER
+from lifecycle.verify.rules.nodes import UNATTRIBUTED_ENDPOINT, UNDECLARED_NODE
+from lifecycle.verify.rules.state import MISSING_REPORT
+from lifecycle.verify.rules.time import SILENT_CLOCK
+from lifecycle.verify.tool_filter import is_hidden_node
+from lifecycle.verify.verdict import NOT_JUDGED, Finding, Stage, Verdict
 
 if TYPE_CHECKING:
-    from lifecycle.graph import Graph
+    from lifecycle.graph.graph import Graph
     from lifecycle.supervisor.connections.authority import ConnectionAuthority
 
 PASSING_S = 1.0

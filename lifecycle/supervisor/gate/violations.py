@@ -7,8 +7,10 @@ changes meanwhile; a shorter one does not, and is named when the run ends. Pure.
 from __future__ import annotations
 
 from lifecycle import dataclasses
-from lifecycle.manifest import EndpointKind
-from lifecycle.verify import Finding, Outcome, Verdict, not_ok
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.verify.judge import not_ok
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.verdict import Finding, Verdict
 
 LASTS_S = 1.0
 """A violation that lasts for longer is in the exit code."""

@@ -15,10 +15,9 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from lifecycle import dataclasses
-from lifecycle.manifest import DiscoveryRange, RunKind
-from lifecycle.middleware import machine_id
-from lifecycle.plan import (
-    Plan,
+from lifecycle.manifest.model import DiscoveryRange, RunKind
+from lifecycle.middleware.process.control import machine_id
+from lifecycle.plan.comparison import (
     PlanNotice,
     PlanNoticeError,
     concerns,
@@ -27,20 +26,17 @@ from lifecycle.plan import (
     notice_of,
     plan_checksum,
 )
+from lifecycle.plan.model import Plan
 from lifecycle.supervisor.nodes.system import System
-from lifecycle.verify import (
-    MISSING_NODE,
-    PLAN_UNKNOWN,
-    PLANS_DIFFER,
-    Finding,
-    Observation,
-    Outcome,
-    Verdict,
-    rule,
-)
+from lifecycle.verify.observation import Observation
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.rules import rule
+from lifecycle.verify.rules.nodes import MISSING_NODE
+from lifecycle.verify.rules.run import PLAN_UNKNOWN, PLANS_DIFFER
+from lifecycle.verify.verdict import Finding, Verdict
 
 if TYPE_CHECKING:
-    from lifecycle.middleware import PlanNotices
+    from lifecycle.middleware.discovery.liveliness import PlanNotices
     from lifecycle.supervisor.health.peer_supervisors import PeerSupervisors
     from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
 

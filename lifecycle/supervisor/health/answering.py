@@ -12,8 +12,8 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.graph import set_within
-from lifecycle.manifest import RunKind
+from lifecycle.graph.scheduler import set_within
+from lifecycle.manifest.model import RunKind
 from lifecycle.supervisor.control.protocol import Reach
 from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.run.events import Notice

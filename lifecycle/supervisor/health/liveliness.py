@@ -13,7 +13,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import TYPE_CHECKING
 
 from lifecycle import dataclasses
-from lifecycle.middleware import Overdue
+from lifecycle.middleware.process.busy_timer import Overdue
 from lifecycle.supervisor.run.events import (
     Emitter,
     NodeAlive,
@@ -22,16 +22,11 @@ from lifecycle.supervisor.run.events import (
     NodeSilent,
     Notice,
 )
-from lifecycle.verify import (
-    NOT_ANSWERING,
-    SILENT_NODE,
-    Finding,
-    Observation,
-    Outcome,
-    Verdict,
-    is_hidden_node,
-    is_noise_node,
-)
+from lifecycle.verify.observation import Observation
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.rules.run import NOT_ANSWERING, SILENT_NODE
+from lifecycle.verify.tool_filter import is_hidden_node, is_noise_node
+from lifecycle.verify.verdict import Finding, Verdict
 
 if TYPE_CHECKING:
     from lifecycle.supervisor.processes.process import ManagedProcess

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 from lifecycle import dataclasses
 from lifecycle.errors import BringUpError
-from lifecycle.manifest import RunKind
-from lifecycle.node import Operation
+from lifecycle.manifest.model import RunKind
+from lifecycle.node.host.control import Operation
 from lifecycle.supervisor.health.liveliness import Cause
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.control_channel import ControlChannel
@@ -23,7 +23,7 @@ from lifecycle.supervisor.run.events import MachineConnection
 from lifecycle.supervisor.run.failure import ended
 
 if TYPE_CHECKING:
-    from lifecycle.middleware import AlivePublisher, AliveSubscription
+    from lifecycle.middleware.discovery.liveliness import AlivePublisher, AliveSubscription
     from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
 
 CALL_EACH_S = 0.25

@@ -15,7 +15,7 @@ from collections.abc import Callable, Coroutine, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from lifecycle.errors import BringUpError
-from lifecycle.node import Operation
+from lifecycle.node.host.control import Operation
 from lifecycle.supervisor.control.protocol import ProcessState, Reach
 from lifecycle.supervisor.gate.verification_loop import LEASE_S, ChangeCounter
 from lifecycle.supervisor.nodes.bring_up import ALSO_S, died
@@ -26,7 +26,7 @@ from lifecycle.supervisor.run.events import Event, NodeChanged, ProcessChanged
 from lifecycle.supervisor.run.failure import StepFailedError, ended
 
 if TYPE_CHECKING:
-    from lifecycle.graph import Graph
+    from lifecycle.graph.graph import Graph
     from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
 
 _SPEAK_S = 0.7 + ALSO_S

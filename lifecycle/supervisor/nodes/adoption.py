@@ -14,7 +14,10 @@ from lifecycle.run_directory import start_ticks
 from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.run.events import Notice
 from lifecycle.supervisor.run.failure import StepFailedError
-from lifecycle.verify import DUPLICATE_NODE, START_FAILED, Finding, Outcome
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.rules.nodes import DUPLICATE_NODE
+from lifecycle.verify.rules.run import START_FAILED
+from lifecycle.verify.verdict import Finding
 
 if TYPE_CHECKING:
     from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant

@@ -17,9 +17,10 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from lifecycle import dataclasses
 from lifecycle.errors import BringUpError, MiddlewareError
-from lifecycle.manifest import Condition, RosArguments, RunKind, TargetState
-from lifecycle.node import HostSpec, Operation
-from lifecycle.plan import DEFAULT, GIVEN, PlannedNode
+from lifecycle.manifest.model import Condition, RosArguments, RunKind, TargetState
+from lifecycle.node.host.control import HostSpec, Operation
+from lifecycle.plan.model import PlannedNode
+from lifecycle.plan.parameters import DEFAULT, GIVEN
 from lifecycle.supervisor.control.protocol import ProcessState, Reach
 from lifecycle.supervisor.gate.activation_guard import BY_ITSELF, TO_DO, TRIES
 from lifecycle.supervisor.gate.gate import Permit
@@ -40,13 +41,13 @@ from lifecycle.supervisor.processes.control_channel import (
 from lifecycle.supervisor.processes.process import ManagedProcess, wait_under_load
 from lifecycle.supervisor.run.events import Notice
 from lifecycle.supervisor.run.failure import StepFailedError, ended, together, within
-from lifecycle.verify import (
+from lifecycle.verify.rules import Rule
+from lifecycle.verify.rules.run import (
     DEADLINE,
     NOT_WIRED,
     PROCESS_DIED,
     START_FAILED,
     TRANSITION_FAILED,
-    Rule,
 )
 
 if TYPE_CHECKING:

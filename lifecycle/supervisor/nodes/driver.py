@@ -13,12 +13,12 @@ from typing import Protocol
 
 from lifecycle import dataclasses
 from lifecycle.errors import BringUpError, MiddlewareError
-from lifecycle.node import Operation
-from lifecycle.plan import PlannedNode
+from lifecycle.node.host.control import Operation
+from lifecycle.plan.model import PlannedNode
 from lifecycle.supervisor.connections.desired_state import Step
 from lifecycle.supervisor.gate.gate import Permit
 from lifecycle.supervisor.processes.control_channel import ControlChannel
-from lifecycle.verify import NodeConfiguration
+from lifecycle.verify.observation import NodeConfiguration
 
 ACTIVE = "active"
 INACTIVE = "inactive"

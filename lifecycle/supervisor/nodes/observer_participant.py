@@ -14,27 +14,24 @@ from collections.abc import Awaitable, Callable, Collection, Iterable
 from typing import TYPE_CHECKING
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.graph import set_within
-from lifecycle.manifest import supervisor_alive_topic
-from lifecycle.plan import ParticipantConnections, PlannedNode
+from lifecycle.graph.scheduler import set_within
+from lifecycle.manifest.names import supervisor_alive_topic
+from lifecycle.plan.model import ParticipantConnections, PlannedNode
 from lifecycle.supervisor.control.ros_interface import Answer
 from lifecycle.supervisor.health.peer_supervisors import Listener
 from lifecycle.supervisor.nodes.driver import NodeDriver, NodeInterfaceClient, ServiceDriver
-from lifecycle.verify import (
-    ObservedEndpoint,
-    ObservedNode,
-    known_node,
-)
+from lifecycle.verify.observation import ObservedEndpoint, ObservedNode
+from lifecycle.verify.tool_filter import known_node
 
 if TYPE_CHECKING:
-    from lifecycle.graph import Graph
-    from lifecycle.middleware import (
+    from lifecycle.graph.graph import Graph
+    from lifecycle.middleware.discovery.liveliness import (
         AlivePublisher,
         AliveSubscription,
-        GraphObserver,
         PlanNotices,
-        RosInterface,
     )
+    from lifecycle.middleware.rcl.graph import GraphObserver
+    from lifecycle.middleware.services.ros_interface import RosInterface
 
 _QUIET_S = 0.005
 _BURST_S = 0.05
@@ -76,8 +73,8 @@ class ObserverParticipant:
         Raises:
             MiddlewareError: it cannot be made.
         """
-        from lifecycle.graph import Graph
-        from lifecycle.middleware import widen_discovery_buffers
+        from lifecycle.graph.graph import Graph
+        from lifecycle.middleware.fastdds.dscp import widen_discovery_buffers
 
         graph = Graph.in_loop(
             domain_id,
@@ -100,7 +97,7 @@ class ObserverParticipant:
     @property
     def unknown_versions(self) -> str:
         """Which installed libraries are not known, and what that costs; empty if all are."""
-        from lifecycle.middleware import unknown_versions
+        from lifecycle.middleware.fastdds.settings import unknown_versions
 
         return unknown_versions()
 
@@ -152,7 +149,7 @@ class ObserverParticipant:
 
     def announce_machine(self, system: str, machine: str) -> AlivePublisher:
         """Announce ourselves as the supervisor of a machine, by DDS liveliness."""
-        from lifecycle.middleware import AlivePublisher
+        from lifecycle.middleware.discovery.liveliness import AlivePublisher
 
         return AlivePublisher(self._node, supervisor_alive_topic(system, machine))
 
@@ -162,13 +159,13 @@ class ObserverParticipant:
 
     def watch_node(self, node: str, to: Listener) -> AliveSubscription:
         """Watch the liveliness of a node that is attached."""
-        from lifecycle.middleware import node_topic
+        from lifecycle.middleware.discovery.liveliness import node_topic
 
         return self._watch(node_topic(node), to)
 
     def plan_notices(self, on_notice: Callable[[str], None]) -> PlanNotices:
         """Take part in the exchange of plans."""
-        from lifecycle.middleware import PlanNotices
+        from lifecycle.middleware.discovery.liveliness import PlanNotices
 
         return PlanNotices(self._node, on_notice)
 
@@ -186,7 +183,7 @@ class ObserverParticipant:
             MiddlewareError: a package cannot be loaded, or rcl refuses.
         """
         try:
-            from lifecycle.middleware import RosInterface
+            from lifecycle.middleware.services.ros_interface import RosInterface
 
             return RosInterface(self._node, prefix, services, on_call, diagnoses=diagnoses)
         except Exception as error:  # rclpy has no root of its own errors
@@ -194,7 +191,7 @@ class ObserverParticipant:
 
     def call_out(self, addresses: Iterable[str]) -> None:
         """Make all participants announce themselves, as far as the system's discovery allows."""
-        from lifecycle.middleware import call_out
+        from lifecycle.middleware.discovery.rediscovery import call_out
 
         call_out(self.discovery.domain_id, self.discovery.urls, addresses, os.environ)
 
@@ -204,7 +201,7 @@ class ObserverParticipant:
 
     def can_be_unannounced(self) -> bool:
         """Return whether participants like ours can be, see HostSpec."""
-        from lifecycle.middleware import can_be_unannounced
+        from lifecycle.middleware.fastdds.participant_discovery import can_be_unannounced
 
         with self._node.handle:
             return can_be_unannounced(self._node.handle.pointer)
@@ -213,7 +210,7 @@ class ObserverParticipant:
         self, newcomers: Iterable[int], pids: Iterable[int], *, rediscover: bool = False
     ) -> None:
         """Have new participants discovered by, and discover, those that were there before."""
-        from lifecycle.middleware import introduce
+        from lifecycle.middleware.discovery.rediscovery import introduce
 
         discovery = self.discovery
         ours = discovery.prefix if rediscover else ""
@@ -221,18 +218,18 @@ class ObserverParticipant:
 
     def send_again_soon(self) -> None:
         """Have what waits for a link to come back be sent soon when it does."""
-        from lifecycle.middleware import send_again_soon
+        from lifecycle.middleware.discovery.rediscovery import send_again_soon
 
         send_again_soon()
 
     def republish_names(self) -> None:
         """Announce our node to the graph again."""
-        from lifecycle.middleware import republish_names
+        from lifecycle.middleware.discovery.rediscovery import republish_names
 
         republish_names([self._node])
 
     def _watch(self, topic: str, to: Listener) -> AliveSubscription:
-        from lifecycle.middleware import AliveSubscription
+        from lifecycle.middleware.discovery.liveliness import AliveSubscription
 
         return AliveSubscription(
             self._node, topic, on_liveliness=to.alive, on_left=to.left, on_notice=to.silent
@@ -240,7 +237,7 @@ class ObserverParticipant:
 
     def prepare_to_leave(self) -> None:
         """Let go of connections that do not answer: all that is sent would wait for their ends."""
-        from lifecycle.middleware import give_up_dead_connections
+        from lifecycle.middleware.discovery.dead_peers import give_up_dead_connections
 
         give_up_dead_connections()
 

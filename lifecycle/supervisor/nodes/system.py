@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING
 
 from lifecycle import dataclasses
 from lifecycle.errors import BringUpError
-from lifecycle.manifest import Condition, RunKind, TargetState
-from lifecycle.node import Event as HostEvent
-from lifecycle.node import Operation
-from lifecycle.plan import Plan, PlannedNode, PlannedProcess, attached_to, in_mode
+from lifecycle.manifest.model import Condition, RunKind, TargetState
+from lifecycle.node.host.control import Event as HostEvent
+from lifecycle.node.host.control import Operation
+from lifecycle.plan.build import attached_to
+from lifecycle.plan.model import Plan, PlannedNode, PlannedProcess, in_mode
 from lifecycle.supervisor.control.protocol import Reach
 from lifecycle.supervisor.gate.gate import Permit
 from lifecycle.supervisor.health.liveliness import SilenceMonitor
@@ -27,10 +28,11 @@ from lifecycle.supervisor.processes.fork_server_main import GRACE_S
 from lifecycle.supervisor.processes.logs import LogDirectory
 from lifecycle.supervisor.processes.process import ManagedProcess, own_run_delay_s
 from lifecycle.supervisor.run.events import Emitter, NodeChanged, Notice, RequestSent
-from lifecycle.verify import HealthReport, NodeConfiguration, Observation, health_of
+from lifecycle.verify.observation import HealthReport, NodeConfiguration, Observation
+from lifecycle.verify.rules.health import health_of
 
 if TYPE_CHECKING:
-    from lifecycle.graph import Graph
+    from lifecycle.graph.graph import Graph
     from lifecycle.supervisor.gate.verification_loop import ChangeCounter
 
 ASK_AGAIN_S = 0.2

@@ -11,12 +11,22 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from lifecycle import dataclasses
-from lifecycle.manifest import BY_DEFAULT, Consequence, EndpointKind, OnViolation, Reaction, Restart
-from lifecycle.plan import Plan
+from lifecycle.manifest.model import (
+    BY_DEFAULT,
+    Consequence,
+    EndpointKind,
+    OnViolation,
+    Reaction,
+    Restart,
+)
+from lifecycle.plan.model import Plan
 from lifecycle.supervisor.control.protocol import Reach
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.run.events import Emitter
-from lifecycle.verify import About, Finding, Outcome, rule
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.rules import rule
+from lifecycle.verify.rules.catalogue import About
+from lifecycle.verify.verdict import Finding
 
 _ORDER = tuple(Consequence)
 _Key = tuple[str, str, str, EndpointKind | None]

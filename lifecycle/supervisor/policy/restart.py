@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterable
 
-from lifecycle.manifest import OnFailure, Restart, RunKind, Supervision
-from lifecycle.plan import PlannedNode
+from lifecycle.manifest.model import OnFailure, Restart, RunKind, Supervision
+from lifecycle.plan.model import PlannedNode
 
 
 class RestartPolicy:

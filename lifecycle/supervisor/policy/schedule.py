@@ -16,7 +16,7 @@ import msgspec
 
 from lifecycle import dataclasses
 from lifecycle.errors import ExitCode
-from lifecycle.manifest import Restart
+from lifecycle.manifest.model import Restart
 from lifecycle.supervisor.control.protocol import Failed, ProcessState
 from lifecycle.supervisor.health.liveliness import Cause
 from lifecycle.supervisor.nodes.bring_up import died
@@ -32,7 +32,7 @@ from lifecycle.supervisor.run.events import (
     RestartScheduled,
 )
 from lifecycle.supervisor.run.failure import StepFailedError
-from lifecycle.verify import GAVE_UP, PROCESS_DIED
+from lifecycle.verify.rules.run import GAVE_UP, PROCESS_DIED
 
 _REMEMBERED = 20
 """Failures of one process; a limit on what a report repeats, not on what is counted."""

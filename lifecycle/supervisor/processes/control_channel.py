@@ -14,9 +14,9 @@ from typing import Any
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import BringUpError
-from lifecycle.middleware import BusySign, Overdue
-from lifecycle.node import Command, Event, HostSpec, Operation
-from lifecycle.plan import ParticipantConnections
+from lifecycle.middleware.process.busy_timer import BusySign, Overdue
+from lifecycle.node.host.control import Command, Event, HostSpec, Operation
+from lifecycle.plan.model import ParticipantConnections
 from lifecycle.supervisor.gate.gate import Permit
 
 _LONGEST_LINE = 1 << 24

@@ -27,13 +27,13 @@ from typing import NoReturn
 from lifecycle import dataclasses
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware import (
+from lifecycle.middleware.process.control import (
     adopt_orphans,
-    disown_ports,
     drop_network_administration,
     limit_resources,
     refuse_new_privileges,
 )
+from lifecycle.middleware.process.shared_memory import disown_ports
 from lifecycle.supervisor.processes.fork_server_process import PRELOAD
 
 LARGEST_MESSAGE = 1 << 18
@@ -295,7 +295,7 @@ def _run(argv: tuple[str, ...], control: int | None) -> int:
     """Serve as our host, or become another program."""
     if not argv:
         assert control is not None
-        from lifecycle.node import serve
+        from lifecycle.node.host.host import serve
 
         _reseed()
         return serve(socket.socket(fileno=control))
@@ -329,7 +329,7 @@ def _pages_shared() -> Iterator[None]:
 
 def _preload(types: Iterable[str]) -> None:
     """Import what every Python node has, and interface types."""
-    from lifecycle.node import preload
+    from lifecycle.node.host.host import preload
 
     with _pages_shared():
         preload(types)

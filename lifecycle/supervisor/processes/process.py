@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lifecycle import dataclasses
-from lifecycle.manifest import Output, Resources
-from lifecycle.middleware import brief
-from lifecycle.plan import PlannedProcess
+from lifecycle.manifest.model import Output, Resources
+from lifecycle.middleware.process.stacks import brief
+from lifecycle.plan.model import PlannedProcess
 from lifecycle.printable import log_line
 from lifecycle.supervisor.control.protocol import ProcessState
 from lifecycle.supervisor.processes.control_channel import ControlChannel

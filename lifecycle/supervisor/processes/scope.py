@@ -12,11 +12,13 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lifecycle.verify import Finding, Outcome, rule
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.rules import rule
+from lifecycle.verify.verdict import Finding
 
 if TYPE_CHECKING:
-    from lifecycle.manifest import Resources
-    from lifecycle.plan import PlannedProcess
+    from lifecycle.manifest.model import Resources
+    from lifecycle.plan.model import PlannedProcess
 
 
 def why_unlimited() -> str:

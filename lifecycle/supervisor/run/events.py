@@ -14,9 +14,9 @@ import msgspec
 
 from lifecycle import dataclasses
 from lifecycle.codec import to_plain
-from lifecycle.node import Operation
+from lifecycle.node.host.control import Operation
 from lifecycle.supervisor.control.protocol import Failed, ProcessState, Reach
-from lifecycle.verify import Stage, Verdict
+from lifecycle.verify.verdict import Stage, Verdict
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -480,7 +480,7 @@ def to_record(event: Event) -> dict[str, object]:
     plain = to_plain(event)
     assert isinstance(plain, dict)
     if isinstance(event, VerdictChanged):
-        from lifecycle.verify import plain_findings  # imports every rule
+        from lifecycle.verify.report import plain_findings  # imports every rule
 
         plain["verdict"]["findings"] = plain_findings(event.verdict)
     return {"event": event.kind, **plain}

@@ -14,20 +14,13 @@ from typing import Any, TypeVar
 
 from lifecycle import dataclasses
 from lifecycle.errors import BringUpError, ExitCode
-from lifecycle.middleware import no_room_for_threads
+from lifecycle.middleware.process.control import no_room_for_threads
 from lifecycle.supervisor.run.events import Failure
 from lifecycle.supervisor.run.options import UpResult
-from lifecycle.verify import (
-    NOT_JUDGED,
-    PROCESS_DIED,
-    Finding,
-    Outcome,
-    Rule,
-    RunEnd,
-    Verdict,
-    node_of,
-    rule,
-)
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.rules import Rule, rule
+from lifecycle.verify.rules.run import PROCESS_DIED, node_of
+from lifecycle.verify.verdict import NOT_JUDGED, Finding, RunEnd, Verdict
 
 
 class StepFailedError(BringUpError):

@@ -19,19 +19,16 @@ from typing import TYPE_CHECKING, TypeVar
 
 from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError, UsageError
-from lifecycle.export import (
-    CapturedParameter,
-    CapturedSystem,
-    Picture,
-    Programs,
-    Supervised,
-    build_picture,
-    capture,
-)
-from lifecycle.graph import Look
-from lifecycle.manifest import DiscoveryRange, EndpointPolicy
-from lifecycle.middleware import check_memory, note_ended, peers_environment
-from lifecycle.plan import Plan, reached_hosts
+from lifecycle.export.captured import CapturedParameter, CapturedSystem, Programs, capture
+from lifecycle.export.picture.build import Supervised, build_picture
+from lifecycle.export.picture.model import Picture
+from lifecycle.graph.state import Look
+from lifecycle.manifest.model import DiscoveryRange, EndpointPolicy
+from lifecycle.middleware.discovery.probe import peers_environment
+from lifecycle.middleware.process.control import check_memory
+from lifecycle.middleware.process.process_table import note_ended
+from lifecycle.plan.connections.hosts import reached_hosts
+from lifecycle.plan.model import Plan
 from lifecycle.run_directory import is_held, run_name, running, runtime_root
 from lifecycle.supervisor.connections.negotiation import Expectation, is_negotiated
 from lifecycle.supervisor.control.client import look
@@ -42,23 +39,17 @@ from lifecycle.supervisor.gate.verification_loop import GracePeriod
 from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant, settled
 from lifecycle.supervisor.processes.scope import unlimited
 from lifecycle.supervisor.run.options import onlooker_connections, own_machines
-from lifecycle.verify import (
-    Heals,
-    NodeConfiguration,
-    Observation,
-    ObservedNode,
-    Outcome,
-    Stage,
-    Verdict,
-    rule,
-    tolerating_pattern,
-    verify,
-    with_findings,
-)
+from lifecycle.verify.judge import verify, with_findings
+from lifecycle.verify.observation import NodeConfiguration, Observation, ObservedNode
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.rules import rule
+from lifecycle.verify.rules.catalogue import Heals
+from lifecycle.verify.tool_filter import tolerating_pattern
+from lifecycle.verify.verdict import Stage, Verdict
 
 if TYPE_CHECKING:
-    from lifecycle.graph import Graph
-    from lifecycle.middleware import NodeClients
+    from lifecycle.graph.graph import Graph
+    from lifecycle.middleware.services.clients import NodeClients
 
 
 _ASK_AGAIN_S = 0.5
@@ -386,7 +377,7 @@ def capture_running(
     Raises:
         MiddlewareError: no participant can be made.
     """
-    from lifecycle.graph import Graph
+    from lifecycle.graph.graph import Graph
 
     environment = dict(os.environ)
 

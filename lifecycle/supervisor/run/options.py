@@ -14,18 +14,17 @@ from typing import TYPE_CHECKING
 
 from lifecycle import dataclasses
 from lifecycle.errors import ExitCode, UsageError
-from lifecycle.manifest import Machine, Manifest
-from lifecycle.network import Peer, parse
-from lifecycle.plan import (
-    ParticipantConnections,
-    Plan,
-    PlannedProcess,
-    urls_of,
-)
-from lifecycle.verify import NodeConfiguration, Verdict, only_shared_memory
+from lifecycle.manifest.model import Machine, Manifest
+from lifecycle.network.connection_url import Peer, parse
+from lifecycle.plan.model import ParticipantConnections, Plan, PlannedProcess
+from lifecycle.plan.negotiation.parties import urls_of
+from lifecycle.verify.observation import NodeConfiguration
+from lifecycle.verify.verdict import Verdict
+from lifecycle.verify.view import only_shared_memory
 
 if TYPE_CHECKING:
-    from lifecycle.programming import TargetOptions, Treatment
+    from lifecycle.programming.apply.programmer import Treatment
+    from lifecycle.programming.apply.targets.registry import TargetOptions
 
 
 TIMEOUT_S = 30.0

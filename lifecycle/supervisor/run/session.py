@@ -67,16 +67,10 @@ from lifecycle.supervisor.run.options import Until, UpOptions, UpResult
 from lifecycle.supervisor.run.records import Records
 from lifecycle.supervisor.run.shutdown import TakeDown
 from lifecycle.supervisor.run.signals import ENDED_BY, Ending
-from lifecycle.verify import (
-    NOT_JUDGED,
-    PROCESS_DIED,
-    Outcome,
-    RunEnd,
-    Stage,
-    Verdict,
-    missing,
-    not_ok,
-)
+from lifecycle.verify.judge import missing, not_ok
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.rules.run import PROCESS_DIED
+from lifecycle.verify.verdict import NOT_JUDGED, RunEnd, Stage, Verdict
 
 if TYPE_CHECKING:
     from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant

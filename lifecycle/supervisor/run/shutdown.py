@@ -12,8 +12,8 @@ from collections.abc import Awaitable, Callable, Coroutine, Iterable
 from typing import Any
 
 from lifecycle.errors import BringUpError, MiddlewareError
-from lifecycle.manifest import RunKind
-from lifecycle.node import Operation
+from lifecycle.manifest.model import RunKind
+from lifecycle.node.host.control import Operation
 from lifecycle.supervisor.connections.desired_state import Step
 from lifecycle.supervisor.control.protocol import ProcessState, Reach
 from lifecycle.supervisor.nodes.bring_up import died

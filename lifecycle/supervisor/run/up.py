@@ -19,22 +19,21 @@ from pathlib import Path
 
 from lifecycle import dataclasses
 from lifecycle.errors import ExitCode, LifecycleError, MiddlewareError
-from lifecycle.manifest import Authority, DataLayerSource, EndpointPolicy, RunKind
-from lifecycle.middleware import (
+from lifecycle.manifest.model import Authority, DataLayerSource, EndpointPolicy, RunKind
+from lifecycle.middleware.discovery.probe import discovery_peers, peers_environment
+from lifecycle.middleware.fastdds.profiles import discovery_environment
+from lifecycle.middleware.process.control import (
     adopt_orphans,
     check_descriptors,
     check_memory,
-    check_room,
     check_threads,
-    discovery_environment,
-    discovery_peers,
-    disown_ports,
     exit_after,
-    load_type_support,
-    peers_environment,
-    sweep,
 )
-from lifecycle.plan import Plan, PlannedProcess, moved_observer, reached_hosts
+from lifecycle.middleware.process.shared_memory import check_room, disown_ports, sweep
+from lifecycle.middleware.rcl.qos import load_type_support
+from lifecycle.plan.connections.hosts import reached_hosts
+from lifecycle.plan.model import Plan, PlannedProcess
+from lifecycle.plan.restart import moved_observer
 from lifecycle.run_directory import (
     RunDirectory,
     RunRecord,
@@ -82,7 +81,7 @@ from lifecycle.supervisor.run.records import Records
 from lifecycle.supervisor.run.service_manager import ServiceManager
 from lifecycle.supervisor.run.session import Session
 from lifecycle.supervisor.run.signals import Ending
-from lifecycle.verify import NOT_JUDGED
+from lifecycle.verify.verdict import NOT_JUDGED
 
 LEAVE_S = 10.0
 """A participant leaves within 0.2 s, over connections that are not answered within 4 s.

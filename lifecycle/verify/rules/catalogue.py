@@ -9,8 +9,9 @@ from __future__ import annotations
 import enum
 
 from lifecycle import dataclasses
-from lifecycle.manifest import EndpointKind, Position
-from lifecycle.plan import PlannedNode
+from lifecycle.manifest.diagnostics import Position
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.plan.model import PlannedNode
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import Finding
 from lifecycle.verify.view import Actual

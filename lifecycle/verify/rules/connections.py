@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from lifecycle.network import ConnectionUrl, ConnectionUrlError, parse
-from lifecycle.plan import ParticipantConnections, PlannedNode, is_restarted_url
+from lifecycle.network.connection_url import ConnectionUrl, ConnectionUrlError, parse
+from lifecycle.plan.model import ParticipantConnections, PlannedNode
+from lifecycle.plan.restart import is_restarted_url
 from lifecycle.verify.outcome import ConnectionReport, Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.verdict import Finding

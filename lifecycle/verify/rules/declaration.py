@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from lifecycle.manifest import Diagnostic
+from lifecycle.manifest.diagnostics import Diagnostic
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import Rule
 from lifecycle.verify.rules.parameters import REACHED_NONE

@@ -10,8 +10,9 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from lifecycle.manifest import EndpointKind, EndpointPolicy, Position
-from lifecycle.plan import PlannedEndpoint
+from lifecycle.manifest.diagnostics import Position
+from lifecycle.manifest.model import EndpointKind, EndpointPolicy
+from lifecycle.plan.model import PlannedEndpoint
 from lifecycle.verify.observation import ObservedEndpoint
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule

@@ -16,15 +16,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from lifecycle.manifest import EndpointKind, FlowTransport, Quantity, UniqueHow
-from lifecycle.network import (
-    NETWORK_MEDIA,
+from lifecycle.manifest.model import EndpointKind, FlowTransport, Quantity, UniqueHow
+from lifecycle.network.dscp import describe
+from lifecycle.network.medium import NETWORK_MEDIA, Medium
+from lifecycle.network.nfe import (
     FlowUniqueness,
-    Medium,
     NetworkFlowEndpoint,
     TransportProtocol,
     UniqueRequirement,
-    describe,
     meets,
 )
 from lifecycle.verify.outcome import Outcome

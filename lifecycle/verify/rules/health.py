@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from lifecycle import dataclasses
-from lifecycle.plan import PlannedNode
+from lifecycle.plan.model import PlannedNode
 from lifecycle.verify.observation import HealthReport
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule

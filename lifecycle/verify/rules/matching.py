@@ -18,14 +18,9 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-from lifecycle.manifest import (
-    DIAGNOSTICS_TOPIC,
-    Certainty,
-    EndpointKind,
-    EndpointPolicy,
-    QosProfile,
-    incompatibilities,
-)
+from lifecycle.manifest.model import EndpointKind, EndpointPolicy
+from lifecycle.manifest.names import DIAGNOSTICS_TOPIC
+from lifecycle.manifest.qos import Certainty, QosProfile, incompatibilities
 from lifecycle.verify.observation import ObservedEndpoint
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 
-from lifecycle.manifest import ParameterValue, Position, is_implicit
-from lifecycle.plan import COMMAND, DEFAULT, GIVEN, NOT_FINITE, ExpectedParameter, PlannedNode
+from lifecycle.manifest.checks.parameters import is_implicit
+from lifecycle.manifest.diagnostics import Position
+from lifecycle.manifest.model import ParameterValue
+from lifecycle.plan.model import ExpectedParameter, PlannedNode
+from lifecycle.plan.parameters import COMMAND, DEFAULT, GIVEN, NOT_FINITE
 from lifecycle.verify.observation import SERVES_NONE, ParameterReport, digest_of
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import Heals, Rule

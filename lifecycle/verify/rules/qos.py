@@ -5,18 +5,18 @@ from __future__ import annotations
 import enum
 from collections.abc import Iterator
 
-from lifecycle.manifest import (
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.manifest.qos import (
     BEST_AVAILABLE_NS,
     INFINITE_NS,
     POLICIES,
     Certainty,
-    EndpointKind,
     History,
     Incompatibility,
     QosProfile,
     incompatibilities,
 )
-from lifecycle.plan import PlannedEndpoint, PlannedNode
+from lifecycle.plan.model import PlannedEndpoint, PlannedNode
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import Rule
 from lifecycle.verify.verdict import Finding

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from lifecycle.manifest import TargetState
-from lifecycle.plan import PlannedNode
+from lifecycle.manifest.model import TargetState
+from lifecycle.plan.model import PlannedNode
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.verdict import Finding, Stage

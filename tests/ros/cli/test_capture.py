@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from lifecycle.errors import ExitCode
-from lifecycle.manifest import load
+from lifecycle.manifest.loading import load
 from tests.ros.supervisor.running import BOUND_S, ENOUGH, pair, up, verb
 
 pytestmark = pytest.mark.thorough

@@ -11,8 +11,9 @@ from rclpy.node import Node
 
 from lifecycle.errors import ExitCode
 from lifecycle.export.sros2 import Enclave, enclaves_of
-from lifecycle.manifest import EndpointKind, load
-from lifecycle.plan import build_plan
+from lifecycle.manifest.loading import load
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.plan.build import build_plan
 from tests.ros.supervisor.running import up
 from tests.ros.supervisor.test_systems_of_actions import acting
 

@@ -16,7 +16,7 @@ import psutil
 import pytest
 
 from lifecycle.errors import ExitCode
-from lifecycle.manifest import load
+from lifecycle.manifest.loading import load
 from lifecycle.manifest.model import RosArguments, TargetState
 from tests.ros.supervisor.running import BOUND_S, verb
 

@@ -18,9 +18,10 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from lifecycle import codec
-from lifecycle.graph import DdsTransport, GraphReporter, steady_timer
+from lifecycle.graph.reporter import GraphReporter
+from lifecycle.graph.transport import DdsTransport, steady_timer
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.middleware import leave_and_exit
+from lifecycle.middleware.process.teardown import leave_and_exit
 from lifecycle.verify.observation import EndpointReport, Identity, NodeConfiguration
 
 

@@ -22,19 +22,15 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from lifecycle import codec
-from lifecycle.graph import (
-    EventKind,
-    Graph,
-    GraphEvent,
-    GraphState,
-    NodeLiveliness,
-)
-from lifecycle.manifest import load
+from lifecycle.graph.graph import Graph
+from lifecycle.graph.model import EventKind, GraphEvent, NodeLiveliness
+from lifecycle.graph.state import GraphState
+from lifecycle.manifest.loading import load
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.middleware import segments_of, sweep
-from lifecycle.plan import build_plan
-from lifecycle.verify import Outcome
+from lifecycle.middleware.process.shared_memory import segments_of, sweep
+from lifecycle.plan.build import build_plan
 from lifecycle.verify.observation import EndpointReport, Identity, NodeConfiguration
+from lifecycle.verify.outcome import Outcome
 from tests.ros.supervisor.running import pair, up
 
 LIMIT_S = 30.0

@@ -12,9 +12,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from lifecycle.graph import Graph
-from lifecycle.middleware import GraphObserver, introduce
-from lifecycle.middleware.rcl.graph import ANSWER_S, PATIENCE_S
+from lifecycle.graph.graph import Graph
+from lifecycle.middleware.discovery.rediscovery import introduce
+from lifecycle.middleware.rcl.graph import ANSWER_S, PATIENCE_S, GraphObserver
 from tests.stalls import Stalls, assert_in_time, noted_stalls
 
 pytestmark = [pytest.mark.ros, pytest.mark.alone]

@@ -13,7 +13,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from std_msgs.msg import String
 
-from lifecycle.graph import Graph
+from lifecycle.graph.graph import Graph
 from lifecycle.manifest.model import (
     RunKind,
 )

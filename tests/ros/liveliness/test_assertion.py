@@ -9,7 +9,7 @@ import pytest
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
-from lifecycle.middleware import AlivePublisher, AliveSubscription
+from lifecycle.middleware.discovery.liveliness import AlivePublisher, AliveSubscription
 
 pytestmark = pytest.mark.ros
 

@@ -17,7 +17,9 @@ with warnings.catch_warnings():
 
 from lifecycle import codec
 from lifecycle.manifest.qos import QosProfile
-from lifecycle.middleware import FlowParticipant, get_network_flow_endpoints, leave_and_exit
+from lifecycle.middleware.fastdds.nfe import get_network_flow_endpoints
+from lifecycle.middleware.fastdds.participant import FlowParticipant
+from lifecycle.middleware.process.teardown import leave_and_exit
 
 
 def main() -> None:

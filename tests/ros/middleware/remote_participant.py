@@ -13,7 +13,8 @@ with warnings.catch_warnings():
     from std_msgs.msg import String
 
 from lifecycle.manifest.qos import QosProfile
-from lifecycle.middleware import FlowParticipant, leave_and_exit
+from lifecycle.middleware.fastdds.participant import FlowParticipant
+from lifecycle.middleware.process.teardown import leave_and_exit
 from lifecycle.plan.model import ParticipantConnections
 
 

@@ -15,17 +15,19 @@ from std_srvs.srv import Trigger
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.qos import Durability, History, Liveliness, QosProfile, Reliability
-from lifecycle.middleware import (
+from lifecycle.middleware.fastdds.nfe import (
+    NetworkFlowEndpointsUnsupported,
     UniqueFlowNotFeasible,
-    UnknownInterfaceError,
     create_subscription,
-    from_rclpy,
     get_network_flow_endpoints,
+)
+from lifecycle.middleware.rcl import abi, graph_queries
+from lifecycle.middleware.rcl.qos import (
+    UnknownInterfaceError,
+    from_rclpy,
     import_interface,
     to_rclpy,
 )
-from lifecycle.middleware.fastdds.nfe import NetworkFlowEndpointsUnsupported
-from lifecycle.middleware.rcl import abi, graph_queries
 from lifecycle.network.nfe import UniqueRequirement
 
 MakeNode = Callable[..., Node]

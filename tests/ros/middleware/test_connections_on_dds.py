@@ -23,16 +23,15 @@ from std_srvs.srv import Trigger
 from lifecycle import codec
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.qos import QosProfile
-from lifecycle.middleware import (
-    FlowParticipant,
-    GraphObserver,
-    ParticipantSettings,
+from lifecycle.middleware.discovery.discovery_server import (
     discovery_server_command,
     discovery_server_listens,
-    get_network_flow_endpoints,
-    has_shared_memory,
 )
+from lifecycle.middleware.fastdds.nfe import get_network_flow_endpoints, has_shared_memory
+from lifecycle.middleware.fastdds.participant import FlowParticipant
+from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.middleware.fastdds.url_check import OpenSocket, open_sockets
+from lifecycle.middleware.rcl.graph import GraphObserver
 from lifecycle.network.connection_url import ConnectionUrl
 from lifecycle.plan.model import (
     ParticipantConnections,
@@ -369,8 +368,8 @@ import sys, time
 from std_msgs.msg import String
 from lifecycle import codec
 from lifecycle.manifest.qos import QosProfile
-from lifecycle.middleware import FlowParticipant
-from lifecycle.plan import ParticipantConnections
+from lifecycle.middleware.fastdds.participant import FlowParticipant
+from lifecycle.plan.model import ParticipantConnections
 
 connections = codec.from_json(sys.argv[2].encode(), ParticipantConnections)
 with FlowParticipant("_out", "/", int(sys.argv[1]), connections=connections) as sending:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from lifecycle.middleware import FlowParticipant
 from lifecycle.middleware.fastdds import endpoint_discovery
 from lifecycle.middleware.fastdds.endpoint_discovery import resend_endpoints_soon, together_s
+from lifecycle.middleware.fastdds.participant import FlowParticipant
 
 
 @pytest.mark.parametrize("unknown", ["participant_of", "_functions"])

@@ -38,7 +38,7 @@ _OBSERVES = """
 import json
 import sys
 import time
-from lifecycle.middleware import GraphObserver
+from lifecycle.middleware.rcl.graph import GraphObserver
 
 found = []
 for _ in range(int(sys.argv[2])):

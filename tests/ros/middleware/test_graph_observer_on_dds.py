@@ -24,10 +24,12 @@ from test_msgs.action import Fibonacci
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import Durability, History, QosProfile, Reliability
-from lifecycle.middleware import FlowParticipant, GraphObserver, to_rclpy
 from lifecycle.middleware.discovery.probe import ANSWER_S
+from lifecycle.middleware.fastdds.participant import FlowParticipant
+from lifecycle.middleware.rcl.graph import GraphObserver
 from lifecycle.middleware.rcl.graph_queries import endpoints_of, node_names
 from lifecycle.middleware.rcl.hidden_node import quiet_node
+from lifecycle.middleware.rcl.qos import to_rclpy
 from lifecycle.verify.observation import ObservedNode
 from tests.ros.faults.system import BARE_DDS
 from tests.ros.supervisor.running import ROOT

@@ -14,13 +14,9 @@ import pytest
 from fast_dds_words import without_fast_dds
 from std_msgs.msg import String
 
-from lifecycle.middleware import (
-    GraphObserver,
-    introduce,
-    leftovers,
-    segments_of,
-    sweep,
-)
+from lifecycle.middleware.discovery.rediscovery import introduce
+from lifecycle.middleware.process.shared_memory import leftovers, segments_of, sweep
+from lifecycle.middleware.rcl.graph import GraphObserver
 
 WaitUntil = Callable[..., None]
 
@@ -32,7 +28,7 @@ from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node
 from lifecycle_msgs.srv import ChangeState
 from std_msgs.msg import String
-from lifecycle.middleware import leave_and_exit
+from lifecycle.middleware.process.teardown import leave_and_exit
 
 context = rclpy.Context()
 context.init(args=[])
@@ -143,7 +139,7 @@ def users_of(names: Iterable[str]) -> list[str]:
 def test_a_process_that_hangs_with_the_gil_held_still_ends_with_its_code() -> None:
     hang = (
         "import ctypes\n"
-        "from lifecycle.middleware import leave_and_exit\n"
+        "from lifecycle.middleware.process.teardown import leave_and_exit\n"
         "class Hangs:\n"
         "    def destroy(self): ctypes.PyDLL(None).sleep(60)\n"
         "leave_and_exit(6, participants=[Hangs()], deadline_s=0.2)\n"
@@ -154,7 +150,7 @@ def test_a_process_that_hangs_with_the_gil_held_still_ends_with_its_code() -> No
 def test_an_exception_while_leaving_is_logged_and_the_rest_still_destroyed() -> None:
     leave = (
         "import logging\n"
-        "from lifecycle.middleware import leave_and_exit\n"
+        "from lifecycle.middleware.process.teardown import leave_and_exit\n"
         "logging.basicConfig(format='%(message)s')\n"
         "class Breaks:\n"
         "    def destroy(self): raise OSError('broken')\n"
@@ -206,7 +202,7 @@ def test_a_process_knows_whether_it_still_has_shared_memory_that_has_a_name(
 ) -> None:
     code = (
         "import gc, sys, rclpy\n"
-        "from lifecycle.middleware import holds_shared_memory\n"
+        "from lifecycle.middleware.process.shared_memory import holds_shared_memory\n"
         "print(holds_shared_memory())\n"
         "rclpy.init(domain_id=int(sys.argv[1]))\n"
         "node = rclpy.create_node('some')\n"

@@ -18,16 +18,16 @@ from rclpy.node import Node
 from std_msgs.msg import String
 
 from lifecycle.manifest.qos import QosProfile
-from lifecycle.middleware import (
-    FlowParticipant,
+from lifecycle.middleware.fastdds import nfe
+from lifecycle.middleware.fastdds.dscp import get_dscp
+from lifecycle.middleware.fastdds.nfe import (
     UniqueFlowNotFeasible,
     create_publisher,
     create_subscription,
     get_network_flow_endpoints,
     senders_of,
 )
-from lifecycle.middleware.fastdds import nfe
-from lifecycle.middleware.fastdds.dscp import get_dscp
+from lifecycle.middleware.fastdds.participant import FlowParticipant
 from lifecycle.network.nfe import TransportProtocol, UniqueRequirement
 
 MakeNode = Callable[..., Node]
@@ -301,7 +301,7 @@ def test_a_marked_participant_sends_with_its_mark_over_udp(
 _MARK = """
 import sys
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware import FlowParticipant
+from lifecycle.middleware.fastdds.participant import FlowParticipant
 try:
     with FlowParticipant("_node_flow_0", "/", int(sys.argv[1]), dscp=46) as participant:
         print(sorted({nfe.internet_protocol.value for nfe in participant.network_flow_endpoints}))

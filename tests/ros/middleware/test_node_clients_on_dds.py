@@ -23,7 +23,9 @@ from std_srvs.srv import Trigger
 
 from lifecycle.codec import to_json
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware import GraphObserver, NodeClients, ServiceUnansweredError
+from lifecycle.middleware.rcl.graph import GraphObserver
+from lifecycle.middleware.services.clients import NodeClients
+from lifecycle.middleware.services.service_calls import ServiceUnansweredError
 from tests.builders import configuration
 
 InvalidHandle = rclpy_implementation.InvalidHandle

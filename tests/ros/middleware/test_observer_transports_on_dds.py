@@ -10,7 +10,7 @@ import pytest
 
 _OBSERVES = """
 import sys
-from lifecycle.middleware import GraphObserver
+from lifecycle.middleware.rcl.graph import GraphObserver
 from lifecycle.middleware.process.shared_memory import own_segments
 
 with GraphObserver(int(sys.argv[1])):

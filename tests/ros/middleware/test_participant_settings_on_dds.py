@@ -19,15 +19,15 @@ from std_msgs.msg import String
 from lifecycle import codec
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.qos import QosProfile
-from lifecycle.middleware import (
+from lifecycle.middleware.fastdds import nfe
+from lifecycle.middleware.fastdds.nfe import (
     SHARED_MEMORY,
-    FlowParticipant,
-    ParticipantSettings,
     get_network_flow_endpoints,
     has_shared_memory,
-    participant_settings,
 )
-from lifecycle.middleware.fastdds import nfe
+from lifecycle.middleware.fastdds.participant import FlowParticipant
+from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
+from lifecycle.middleware.fastdds.settings import participant_settings
 from lifecycle.network.nfe import NetworkFlowEndpoint, TransportProtocol
 from lifecycle.verify.observation import Identity
 from lifecycle.verify.transport import carrier
@@ -249,7 +249,8 @@ def test_a_participant_of_small_datagrams_still_receives_large_ones(
             "import sys, time\n"
             "from std_msgs.msg import String\n"
             "from lifecycle.manifest.qos import QosProfile\n"
-            "from lifecycle.middleware import FlowParticipant, leave_and_exit\n"
+            "from lifecycle.middleware.fastdds.participant import FlowParticipant\n"
+            "from lifecycle.middleware.process.teardown import leave_and_exit\n"
             "p = FlowParticipant('_out', '/', int(sys.argv[1]))\n"
             "publisher = p.create_publisher(String, '/flow', QosProfile())\n"
             "while not publisher.get_subscription_count(): time.sleep(0.005)\n"
@@ -415,7 +416,8 @@ import sys
 from std_msgs.msg import String
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.qos import QosProfile
-from lifecycle.middleware import FlowParticipant, get_network_flow_endpoints
+from lifecycle.middleware.fastdds.participant import FlowParticipant
+from lifecycle.middleware.fastdds.nfe import get_network_flow_endpoints
 for transports in ((), ("udpv4",), ()):
     try:
         with FlowParticipant("_p", "/", int(sys.argv[1]), transports=transports) as participant:

@@ -14,7 +14,9 @@ from std_msgs.msg import String
 
 from lifecycle import LifecycleNode, on_message
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware import GraphObserver, NodeClients, ServiceUnansweredError
+from lifecycle.middleware.rcl.graph import GraphObserver
+from lifecycle.middleware.services.clients import NodeClients
+from lifecycle.middleware.services.service_calls import ServiceUnansweredError
 from lifecycle.verify.observation import EndpointReport, NodeConfiguration
 
 WaitUntil = Callable[..., None]

@@ -14,7 +14,7 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from lifecycle import LifecycleNode, codec, on_message, on_service
-from lifecycle.middleware import get_network_flow_endpoints
+from lifecycle.middleware.fastdds.nfe import get_network_flow_endpoints
 from lifecycle.network.nfe import TransportProtocol, UniqueRequirement
 from lifecycle.plan.model import PlannedParticipant
 from lifecycle.verify.observation import NodeConfiguration

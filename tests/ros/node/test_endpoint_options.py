@@ -19,7 +19,7 @@ from std_srvs.srv import Trigger
 
 from lifecycle import LifecycleNode, on_message, on_service
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest import Liveliness, QosProfile
+from lifecycle.manifest.qos import Liveliness, QosProfile
 
 
 class Optioned(LifecycleNode):

@@ -346,7 +346,7 @@ os._exit(os.waitstatus_to_exitcode(os.wait()[1]))
 
 def test_what_hosts_are_forked_from_imports_only_what_every_node_needs() -> None:
     code = (
-        "import sys; from lifecycle.node import preload; preload(); "
+        "import sys; from lifecycle.node.host.host import preload; preload(); "
         "print(*sys.modules); preload(['example_interfaces/msg/No', 'sensor_msgs/msg/Imu']); "
         "print('sensor_msgs' in sys.modules)"
     )

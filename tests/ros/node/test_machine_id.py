@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.middleware import machine_id
 from lifecycle.middleware.process import control
+from lifecycle.middleware.process.control import machine_id
 
 
 @pytest.fixture(autouse=True)

@@ -16,7 +16,7 @@ from planning import built_with, planned, publisher, subscription
 from std_msgs.msg import String
 
 from lifecycle import LifecycleNode, codec
-from lifecycle.middleware import discovery_environment
+from lifecycle.middleware.fastdds.profiles import discovery_environment
 from lifecycle.network.nfe import NetworkFlowEndpoint, UniqueRequirement, is_ip
 from lifecycle.node.host.control import Event, Operation
 from lifecycle.plan.model import PlannedParticipant
@@ -133,7 +133,7 @@ _ALONE = """
 import sys
 from tests.ros.node.planning import planned
 from lifecycle import LifecycleNode
-from lifecycle.middleware import has_shared_memory
+from lifecycle.middleware.fastdds.nfe import has_shared_memory
 from lifecycle.node import run
 
 class It(LifecycleNode):

@@ -24,7 +24,7 @@ from typing import Any
 import psutil
 import yaml
 
-from lifecycle.middleware import leftovers, segments_of, sweep
+from lifecycle.middleware.process.shared_memory import leftovers, segments_of, sweep
 from tests.installation import LIFECYCLE, modules
 
 ROOT = Path(__file__).parents[3]

@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 
 from lifecycle.errors import ExitCode
-from lifecycle.supervisor import SystemStatus
-from lifecycle.supervisor import status as ask_status
-from lifecycle.verify import Outcome
+from lifecycle.supervisor.control.client import status as ask_status
+from lifecycle.supervisor.control.protocol import SystemStatus
+from lifecycle.verify.outcome import Outcome
 from tests.ros.supervisor.running import Up, pair, up, verb
 
 _NODES = "tests.ros.supervisor.systems"

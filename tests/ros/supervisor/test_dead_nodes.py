@@ -15,7 +15,7 @@ import rclpy
 from rclpy.node import Node
 
 from lifecycle.errors import ExitCode
-from lifecycle.middleware import leftovers, sweep
+from lifecycle.middleware.process.shared_memory import leftovers, sweep
 from tests.ros.middleware.free_ports import free_ports
 from tests.ros.supervisor.running import ENOUGH, Up, pair, up, verb
 

@@ -21,7 +21,8 @@ from rclpy.node import Node
 from std_msgs.msg import String
 
 from lifecycle.errors import ExitCode
-from lifecycle.middleware import GraphObserver, NodeClients
+from lifecycle.middleware.rcl.graph import GraphObserver
+from lifecycle.middleware.services.clients import NodeClients
 from tests.ros.faults.system import BARE_DDS, FOREIGN
 from tests.ros.supervisor.running import BOUND_S, ROOT, Up, command, environment, pair, up, verb
 

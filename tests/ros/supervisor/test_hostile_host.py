@@ -16,7 +16,7 @@ from rclpy.node import Node
 from std_msgs.msg import String
 
 from lifecycle.errors import ExitCode
-from lifecycle.middleware import segments_of
+from lifecycle.middleware.process.shared_memory import segments_of
 from lifecycle.run_directory import RUN_VARIABLE
 from tests.ros.supervisor.running import ROOT, Up, command, environment, marked, pair
 

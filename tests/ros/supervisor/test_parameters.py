@@ -13,7 +13,7 @@ from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 
 from lifecycle.errors import ExitCode
-from lifecycle.middleware import GraphObserver
+from lifecycle.middleware.rcl.graph import GraphObserver
 from lifecycle.middleware.services.service_calls import ServiceCalls
 from tests.ros.supervisor.running import BOUND_S, ENOUGH, ROOT, Up, pair, up, verb
 

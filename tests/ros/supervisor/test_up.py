@@ -22,7 +22,7 @@ import yaml
 from rclpy.node import Node
 
 from lifecycle.errors import ExitCode
-from lifecycle.network import participant_ports
+from lifecycle.network.ports import participant_ports
 from lifecycle.supervisor.gate.verification_loop import SETTLED_S
 from tests.ros.middleware.free_ports import free_ports
 from tests.ros.supervisor.running import (

@@ -12,7 +12,7 @@ from lifecycle.cli.common import NETWORKS
 from lifecycle.cli.verbs import flows, up
 from lifecycle.cli.verbs.flows import Export
 from lifecycle.errors import UsageError
-from lifecycle.programming import TARGETS
+from lifecycle.programming.apply.targets.registry import TARGETS
 from tests.unit.programming.apply.samples import camara_settings, nef_settings, settings_file
 from tests.unit.programming.rules.samples import plan, report
 

@@ -11,8 +11,9 @@ from click.testing import CliRunner
 
 from lifecycle.cli.verbs import flows as flows_verb
 from lifecycle.errors import ExitCode, UsageError
-from lifecycle.programming import TargetOptions, read_targets, read_treatment, target_kind
+from lifecycle.programming.apply.programmer import read_treatment
 from lifecycle.programming.apply.target import MissingFeatureError
+from lifecycle.programming.apply.targets.registry import TargetOptions, read_targets, target_kind
 from tests.unit.programming.apply.samples import nef_settings, settings_file
 from tests.unit.programming.apply.servers import TOKEN, NefServer
 from tests.unit.programming.rules.samples import nfe, plan, report

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from lifecycle.cli.launch_files import Launched, LaunchedNode, to_launched_manifest
-from lifecycle.manifest import load
+from lifecycle.manifest.loading import load
 
 
 def _is_installed(name: str) -> bool:

@@ -19,11 +19,13 @@ from lifecycle.cli.up_output import output
 from lifecycle.cli.verbs.graph import write_picture
 from lifecycle.cli.verbs.up import _finished
 from lifecycle.errors import ExitCode, MiddlewareError, UsageError
-from lifecycle.manifest import Diagnostic, ManifestError, Position, Severity
-from lifecycle.plan import build_plan
+from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position, Severity
+from lifecycle.plan.build import build_plan
 from lifecycle.supervisor.run.options import UpResult
 from lifecycle.supervisor.run.signals import Ended
-from lifecycle.verify import Outcome, Stage, Verdict, verify
+from lifecycle.verify.judge import verify
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.verdict import Stage, Verdict
 from tests.builders import teleop
 from tests.unit.verify.edits import drop_node
 from tests.unit.verify.perfect import perfect

@@ -39,7 +39,6 @@ TO_ASK = {
     "lifecycle.codec",
     "lifecycle.dataclasses",
     "lifecycle.errors",
-    "lifecycle.doors",
     "lifecycle.printable",
     "lifecycle.run_directory",
     "lifecycle.supervisor",

@@ -16,9 +16,9 @@ from typing import Any, get_args
 import pytest
 import yaml
 
-from lifecycle.manifest import load
+from lifecycle.manifest.loading import load
 from lifecycle.supervisor.run import events
-from lifecycle.verify import RULES
+from lifecycle.verify.rules import RULES
 
 ROOT = Path(__file__).parents[3]
 PAGES = sorted((ROOT / "docs").glob("*.md"))

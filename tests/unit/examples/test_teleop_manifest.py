@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.manifest import load
 from lifecycle.manifest.diagnostics import ManifestError
-from lifecycle.plan import build_plan
+from lifecycle.manifest.loading import load
+from lifecycle.plan.build import build_plan
 
 MANIFEST = str(Path(__file__).parents[3] / "manifests" / "teleop.lifecycle.yaml")
 

@@ -9,9 +9,11 @@ from lifecycle.export.picture.model import Picture
 from lifecycle.manifest.model import Discovery, EndpointKind, Machine, UniqueHow
 from lifecycle.manifest.qos import QosProfile, Reliability
 from lifecycle.network.nfe import UniqueRequirement
-from lifecycle.plan import Plan, build_plan
-from lifecycle.verify import Stage, verify
+from lifecycle.plan.build import build_plan
+from lifecycle.plan.model import Plan
+from lifecycle.verify.judge import verify
 from lifecycle.verify.observation import Observation, ObservedEndpoint, ObservedNode
+from lifecycle.verify.verdict import Stage
 from tests.builders import (
     STRING,
     at,

@@ -10,12 +10,12 @@ import pytest
 
 from lifecycle.export.captured import CapturedParameter, CapturedSystem, capture
 from lifecycle.export.manifest_yaml import to_manifest, to_nodl
-from lifecycle.manifest import load
+from lifecycle.manifest.loading import load
 from lifecycle.manifest.model import DiscoveryRange, EndpointKind, Manifest, RunKind
 from lifecycle.manifest.qos import Durability, History, QosProfile, Reliability
 from lifecycle.network.nfe import UniqueRequirement
-from lifecycle.plan import build_plan
-from lifecycle.verify import Outcome, Stage, verify
+from lifecycle.plan.build import build_plan
+from lifecycle.verify.judge import verify
 from lifecycle.verify.observation import (
     NodeParameters,
     Observation,
@@ -23,7 +23,8 @@ from lifecycle.verify.observation import (
     ObservedNode,
     ParameterReport,
 )
-from lifecycle.verify.outcome import ConnectionReport
+from lifecycle.verify.outcome import ConnectionReport, Outcome
+from lifecycle.verify.verdict import Stage
 from tests.builders import configuration, reported
 
 PUBLISHER, SUBSCRIPTION = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION

@@ -16,9 +16,9 @@ from click.testing import CliRunner
 
 from lifecycle.cli import cli
 from lifecycle.errors import UsageError
-from lifecycle.export import ENGINES, Deployment
-from lifecycle.manifest import Restart, Supervision
-from lifecycle.plan import Plan
+from lifecycle.export.engines import ENGINES, Deployment
+from lifecycle.manifest.model import Restart, Supervision
+from lifecycle.plan.model import Plan
 from tests.builders import plan_of, planned_node
 
 ROOT = Path(__file__).parents[3]

@@ -35,9 +35,10 @@ from lifecycle.export.picture.model import (
     Presence,
 )
 from lifecycle.manifest.model import Condition
-from lifecycle.plan import build_plan
-from lifecycle.verify import Outcome, Stage
+from lifecycle.plan.build import build_plan
 from lifecycle.verify.observation import Observation, ObservedEndpoint, ObservedNode
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.verdict import Stage
 from tests.builders import STRING, node, planned, publisher, subscription, teleop
 from tests.unit.export.pictures import PUBLISHER, article, drawn, large, small
 from tests.unit.verify.perfect import perfect

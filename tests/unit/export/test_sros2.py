@@ -12,10 +12,12 @@ from click.testing import CliRunner
 from lifecycle.cli import cli
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.export.sros2 import OVERRIDE, PLANS_TOPIC, enclaves_of, render_policy
-from lifecycle.manifest import load, supervisor_alive_topic
+from lifecycle.manifest.loading import load
+from lifecycle.manifest.names import supervisor_alive_topic
 from lifecycle.middleware.discovery import liveliness
 from lifecycle.middleware.discovery.liveliness import node_topic
-from lifecycle.plan import Plan, build_plan
+from lifecycle.plan.build import build_plan
+from lifecycle.plan.model import Plan
 
 ROOT = Path(__file__).parents[3]
 MANIFESTS = sorted((ROOT / "manifests").glob("*.lifecycle.yaml"))

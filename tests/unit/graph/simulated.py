@@ -9,8 +9,10 @@ import random
 from collections import deque
 from collections.abc import Callable, Iterable
 
-from lifecycle.graph import GraphEvents, GraphReporter, GraphState, Remove, Scheduler
-from lifecycle.graph.state import Fetch
+from lifecycle.graph.events import GraphEvents
+from lifecycle.graph.reporter import GraphReporter
+from lifecycle.graph.scheduler import Remove, Scheduler
+from lifecycle.graph.state import Fetch, GraphState
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.node.configuration import checksum
 from lifecycle.verify.observation import EndpointReport, Identity, NodeConfiguration

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from simulated import Reader, System
 
-from lifecycle.graph import NodeLiveliness
+from lifecycle.graph.model import NodeLiveliness
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.verify.observation import NodeConfiguration
 

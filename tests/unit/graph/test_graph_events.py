@@ -8,19 +8,10 @@ from typing import Any
 import pytest
 from simulated import ManualScheduler, Network, configuration, endpoint
 
-from lifecycle.graph import (
-    EventKind,
-    GraphEvent,
-    GraphEvents,
-    GraphMessage,
-    Heartbeat,
-    Joined,
-    Left,
-    NodeLiveliness,
-    StateChanged,
-    encode,
-)
+from lifecycle.graph.events import GraphEvents
 from lifecycle.graph.membership import WINDOW
+from lifecycle.graph.messages import GraphMessage, Heartbeat, Joined, Left, StateChanged, encode
+from lifecycle.graph.model import EventKind, GraphEvent, NodeLiveliness
 
 
 class Stage:

@@ -12,11 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from simulated import ManualScheduler, Network
 
-from lifecycle.graph import (
+from lifecycle.graph.events import GraphEvents
+from lifecycle.graph.messages import (
+    MESSAGES,
     ConfigurationChanged,
     ConnectionEstablished,
     ConnectionLost,
-    GraphEvents,
     GraphMessage,
     GraphMessageError,
     Heartbeat,
@@ -29,7 +30,6 @@ from lifecycle.graph import (
     encode,
     new_incarnation,
 )
-from lifecycle.graph.messages import MESSAGES
 
 SCHEMA = json.loads(
     (Path(__file__).parents[3] / "schemas" / "graph_message.v1.schema.json").read_text()

@@ -8,13 +8,8 @@ import pytest
 from simulated import ManualScheduler, Network, Transport, every
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.graph import (
-    GraphKind,
-    GraphMessage,
-    GraphReporter,
-    Heartbeat,
-    decode,
-)
+from lifecycle.graph.messages import GraphKind, GraphMessage, Heartbeat, decode
+from lifecycle.graph.reporter import GraphReporter
 
 
 class Listener:

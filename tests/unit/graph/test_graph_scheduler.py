@@ -9,8 +9,7 @@ import threading
 import pytest
 from simulated import ManualScheduler
 
-from lifecycle.graph import LoopScheduler, ThreadScheduler, set_within
-from lifecycle.graph.scheduler import Deadlines
+from lifecycle.graph.scheduler import Deadlines, LoopScheduler, ThreadScheduler, set_within
 
 LIMIT_S = 5.0
 

@@ -17,25 +17,15 @@ from simulated import (
     endpoint,
 )
 
-from lifecycle.graph import (
-    End,
-    GraphChange,
-    GraphEvents,
-    GraphMessage,
-    GraphState,
-    Heartbeat,
-    Joined,
-    MappingLost,
-    NodeLiveliness,
-    NodeView,
-    encode,
-)
-from lifecycle.graph.model import link, match_ends
+from lifecycle.graph.events import GraphEvents
+from lifecycle.graph.messages import GraphMessage, Heartbeat, Joined, MappingLost, encode
+from lifecycle.graph.model import End, GraphChange, NodeLiveliness, NodeView, link, match_ends
+from lifecycle.graph.state import GraphState
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import QosProfile, Reliability
 from lifecycle.network.nfe import InternetProtocol, NetworkFlowEndpoint, TransportProtocol
-from lifecycle.verify import Outcome
 from lifecycle.verify.observation import EndpointReport, Identity, NodeConfiguration
+from lifecycle.verify.outcome import Outcome
 
 PUBLISHER, SUBSCRIPTION = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
 

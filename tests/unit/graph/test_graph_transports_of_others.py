@@ -20,13 +20,11 @@ from simulated import (
     every,
 )
 
-from lifecycle.graph import (
-    GraphEvents,
-    GraphReporter,
-    GraphState,
-    GraphTransport,
-    Remove,
-)
+from lifecycle.graph.events import GraphEvents
+from lifecycle.graph.reporter import GraphReporter
+from lifecycle.graph.scheduler import Remove
+from lifecycle.graph.state import GraphState
+from lifecycle.graph.transport import GraphTransport
 from lifecycle.verify.observation import NodeConfiguration
 
 NODES = {

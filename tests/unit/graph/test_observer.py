@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import pytest
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.graph import GraphEvents
+from lifecycle.graph.events import GraphEvents
 from lifecycle.graph.observer import Diagnostic, DiagnosticReadings, Observer
 from lifecycle.manifest.model import (
     EndpointKind,

@@ -11,15 +11,14 @@ from collections.abc import Awaitable, Callable
 
 import pytest
 
-from lifecycle.graph import (
-    GraphEvents,
-    GraphReporter,
-    LoopScheduler,
-)
+from lifecycle.graph.events import GraphEvents
 from lifecycle.graph.observer import Observer
+from lifecycle.graph.reporter import GraphReporter
+from lifecycle.graph.scheduler import LoopScheduler
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.verify import Stage, verify
+from lifecycle.verify.judge import verify
 from lifecycle.verify.observation import EndpointReport, ObservedEndpoint, ObservedNode
+from lifecycle.verify.verdict import Stage
 from tests.unit.graph.simulated import Network, every
 from tests.unit.graph.test_observer import FakeClients, FakeGraph, configuration, plan
 from tests.unit.supervisor.fakes import run

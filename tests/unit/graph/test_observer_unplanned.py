@@ -5,15 +5,10 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 
-from lifecycle.graph import (
-    GraphEvents,
-    GraphMessage,
-    Heartbeat,
-    StateChanged,
-    encode,
-    set_within,
-)
+from lifecycle.graph.events import GraphEvents
+from lifecycle.graph.messages import GraphMessage, Heartbeat, StateChanged, encode
 from lifecycle.graph.observer import Observer
+from lifecycle.graph.scheduler import set_within
 from lifecycle.verify.observation import ObservedNode
 from tests.unit.graph.simulated import ManualScheduler, Network
 from tests.unit.graph.test_observer import FakeClients, FakeGraph, configuration, observing, plan

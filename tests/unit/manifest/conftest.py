@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.manifest import Loaded, ManifestError, load
+from lifecycle.manifest.diagnostics import ManifestError
+from lifecycle.manifest.loading import Loaded, load
 
 FILE = "s.lifecycle.yaml"
 

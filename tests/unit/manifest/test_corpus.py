@@ -17,7 +17,8 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.manifest import ManifestError, load
+from lifecycle.manifest.diagnostics import ManifestError
+from lifecycle.manifest.loading import load
 
 CORPUS = Path(__file__).parents[2] / "corpus"
 VALID = sorted((CORPUS / "valid").glob("*.lifecycle.yaml"))

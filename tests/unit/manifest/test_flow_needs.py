@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.manifest import load
 from lifecycle.manifest.flows import FlowNeeds, ParticipantGroup, identifiers, marking_of
+from lifecycle.manifest.loading import load
 from lifecycle.manifest.model import (
     EndpointKind,
     FlowIdentification,

@@ -8,35 +8,36 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.manifest import (
-    PRESETS,
+from lifecycle.manifest.diagnostics import Position, Severity
+from lifecycle.manifest.loading import load
+from lifecycle.manifest.model import (
     Condition,
     DiscoveryMode,
     DiscoveryRange,
-    Durability,
     EndpointKind,
     EndpointPolicy,
-    History,
     Limits,
-    Liveliness,
     Machine,
     Manifest,
     Node,
     OnFailure,
-    QosProfile,
-    Reliability,
     Resources,
     Restart,
     Run,
     RunKind,
-    Severity,
     Supervision,
     Timeouts,
     UniqueHow,
-    load,
 )
-from lifecycle.manifest.diagnostics import Position
-from lifecycle.manifest.qos import POLICIES
+from lifecycle.manifest.qos import (
+    POLICIES,
+    PRESETS,
+    Durability,
+    History,
+    Liveliness,
+    QosProfile,
+    Reliability,
+)
 from lifecycle.network.nfe import UniqueRequirement
 
 VALID = Path(__file__).parents[2] / "corpus" / "valid"

@@ -10,7 +10,8 @@ import yaml
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from lifecycle.manifest import ManifestError, load
+from lifecycle.manifest.diagnostics import ManifestError
+from lifecycle.manifest.loading import load
 from lifecycle.manifest.schema import read_schema
 from lifecycle.manifest.yaml.yaml_parser import compose
 

@@ -12,22 +12,18 @@ import jsonschema
 import pytest
 import yaml
 
-from lifecycle.manifest import (
-    PRESETS,
+from lifecycle.manifest.model import (
     Authority,
     Condition,
     DataLayerSource,
     DiscoveryMode,
     DiscoveryRange,
-    Durability,
     EndpointKind,
     EndpointPolicy,
     FlowTransport,
-    History,
-    Liveliness,
-    Reliability,
     UniqueHow,
 )
+from lifecycle.manifest.qos import PRESETS, Durability, History, Liveliness, Reliability
 from lifecycle.manifest.schema import MANIFEST, read_schema, validate
 from lifecycle.manifest.yaml.source import parse
 from lifecycle.network.dscp import code_points

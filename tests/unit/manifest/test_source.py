@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.manifest import ManifestError, load
+from lifecycle.manifest.diagnostics import ManifestError
+from lifecycle.manifest.loading import load
 from lifecycle.manifest.yaml.source import MAX_BYTES, parse, read_document
 
 GOOD = "manifest_version: 1\nsystem: test\nnodes: {talker: {attach: true}}\n"

@@ -23,8 +23,8 @@ from lifecycle.middleware.discovery.probe import (
     missing_port,
     probes_for,
 )
-from lifecycle.network import participant_ports
 from lifecycle.network.connection_url import parse
+from lifecycle.network.ports import participant_ports
 from lifecycle.pytest_plugin import claimed_domain
 from tests.unit.middleware.other_process import of_another_process
 

@@ -12,17 +12,22 @@ from pathlib import Path
 import pytest
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware import exit_after, widen_discovery_buffers
+from lifecycle.middleware.fastdds.dscp import widen_discovery_buffers
 from lifecycle.middleware.fastdds.profiles import discovery_environment, discovery_profile
-from lifecycle.network import participant_ports
+from lifecycle.middleware.process.control import exit_after
+from lifecycle.network.ports import participant_ports
 
 VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 
 
-def test_the_door_opens_without_importing_rclpy() -> None:
+def test_leaving_and_sweeping_are_loaded_without_importing_rclpy() -> None:
     look = (
-        "import sys; from lifecycle.middleware import sweep, exit_after, "
-        "discovery_environment, leave_and_exit; print('rclpy' in sys.modules)"
+        "import sys; import "
+        "lifecycle.middleware.fastdds.profiles, "
+        "lifecycle.middleware.process.control, "
+        "lifecycle.middleware.process.shared_memory, "
+        "lifecycle.middleware.process.teardown; "
+        "print('rclpy' in sys.modules)"
     )
     done = subprocess.run(
         [sys.executable, "-c", look], check=True, capture_output=True, text=True, timeout=30
@@ -93,7 +98,7 @@ def test_a_deadman_out_of_range_is_refused(seconds: float, code: int) -> None:
 def test_the_deadman_ends_a_process_that_holds_the_gil() -> None:
     hang = (
         "import ctypes\n"
-        "from lifecycle.middleware import exit_after\n"
+        "from lifecycle.middleware.process.control import exit_after\n"
         "exit_after(0.1, 42)\n"
         "ctypes.PyDLL(None).sleep(60)\n"
     )
@@ -105,7 +110,7 @@ def test_the_deadman_ends_a_process_that_holds_the_gil() -> None:
 def test_an_orphan_is_adopted_by_the_subreaper() -> None:
     reaper = (
         "import os, subprocess, sys, time\n"
-        "from lifecycle.middleware import adopt_orphans\n"
+        "from lifecycle.middleware.process.control import adopt_orphans\n"
         "adopt_orphans()\n"
         "grandchild = 'import os, sys; print(os.getpid(), flush=True); sys.stdin.read()'\n"
         "child = ('import subprocess, sys; '\n"

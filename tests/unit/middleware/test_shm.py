@@ -14,13 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.middleware import (
-    disown_ports,
-    leftovers,
-    segments_of,
-    sweep,
-)
 from lifecycle.middleware.process import shared_memory
+from lifecycle.middleware.process.shared_memory import disown_ports, leftovers, segments_of, sweep
 from tests.builders import port_node
 
 SEGMENT = "fastrtps_0123456789abcdef"

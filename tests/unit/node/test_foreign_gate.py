@@ -14,7 +14,7 @@ import pytest
 pytest.importorskip("rclpy")
 
 from lifecycle.manifest.model import Timeouts
-from lifecycle.middleware import RCLError
+from lifecycle.middleware.rcl.rclpy_nodes import RCLError
 from lifecycle.node.host.foreign import ForeignNode
 from lifecycle.node.lifecycle.gate import NodeGate
 from lifecycle.node.lifecycle.machine import RefusedError

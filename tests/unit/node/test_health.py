@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
-from lifecycle.manifest import Health
+from lifecycle.manifest.model import Health
 from lifecycle.node.lifecycle import health
 from lifecycle.node.lifecycle.health import HealthCheck
 from lifecycle.node.lifecycle.machine import NodeState
-from lifecycle.verify import HealthReport
+from lifecycle.verify.observation import HealthReport
 
 OK = HealthReport(ok=True)
 

@@ -25,8 +25,7 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.network.nfe import UniqueRequirement
-from lifecycle.plan import PlanChange, change_between
-from lifecycle.plan.change import GivenParameters
+from lifecycle.plan.change import GivenParameters, PlanChange, change_between
 from tests.builders import (
     at,
     link,

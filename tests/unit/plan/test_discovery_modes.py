@@ -17,7 +17,9 @@ from lifecycle.manifest.model import (
     Run,
     RunKind,
 )
-from lifecycle.plan import Plan, PlanError, build_plan, terms_of
+from lifecycle.plan.build import build_plan
+from lifecycle.plan.model import Plan, PlanError
+from lifecycle.plan.negotiation.parties import terms_of
 from tests.builders import at, link, manifest, node, planned, publisher, subscription
 
 TWO = (

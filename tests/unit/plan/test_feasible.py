@@ -21,8 +21,9 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.network.connection_url import parse
 from lifecycle.network.nfe import UniqueRequirement
-from lifecycle.plan import PlanError, build_plan, check_plan
+from lifecycle.plan.build import build_plan, check_plan
 from lifecycle.plan.connections.hosts import demand
+from lifecycle.plan.model import PlanError
 from lifecycle.plan.render import render_text
 from tests.builders import (
     at,

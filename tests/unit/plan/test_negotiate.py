@@ -12,14 +12,9 @@ from hypothesis import strategies as st
 from lifecycle.manifest.model import EndpointKind, FlowTransport
 from lifecycle.network.connection_url import Peer, parse
 from lifecycle.network.medium import CONNECTABLE, RMW_DEFAULT
-from lifecycle.plan import (
-    DataLayerGraph,
-    Party,
-    PartyEndpoint,
-    Terms,
-    negotiate,
-)
 from lifecycle.plan.connections.hosts import Contact
+from lifecycle.plan.negotiation.data_layer import DataLayerGraph, Party, PartyEndpoint, Terms
+from lifecycle.plan.negotiation.negotiate import negotiate
 from lifecycle.plan.negotiation.parties import transports_of
 
 STRING = "std_msgs/msg/String"

@@ -13,7 +13,9 @@ from lifecycle import codec
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest.model import Discovery, DiscoveryRange, EndpointKind, Run, RunKind
 from lifecycle.network.nfe import UniqueRequirement
-from lifecycle.plan import Plan, build_plan, model, started_by_others
+from lifecycle.plan import model
+from lifecycle.plan.build import build_plan, started_by_others
+from lifecycle.plan.model import Plan
 from tests.builders import (
     endpoint,
     manifest,

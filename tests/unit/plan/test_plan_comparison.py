@@ -9,15 +9,11 @@ import pytest
 
 from lifecycle import codec
 from lifecycle.cli.verbs.plan import command as plan_command
-from lifecycle.manifest import load
-from lifecycle.plan import (
-    Plan,
-    build_plan,
-    changes,
-    plan_checksum,
-    shown,
-    without_secrets,
-)
+from lifecycle.manifest.loading import load
+from lifecycle.plan.build import build_plan
+from lifecycle.plan.comparison import changes, plan_checksum
+from lifecycle.plan.model import Plan
+from lifecycle.plan.secrets import shown, without_secrets
 
 
 def differences(old: Plan, new: Plan) -> tuple[str, ...]:

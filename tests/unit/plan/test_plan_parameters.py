@@ -18,7 +18,8 @@ from lifecycle.manifest.model import (
     Run,
     RunKind,
 )
-from lifecycle.plan import Plan, build_plan
+from lifecycle.plan.build import build_plan
+from lifecycle.plan.model import Plan
 from lifecycle.plan.parameters import portable
 from tests.builders import at, manifest, node
 

@@ -21,8 +21,8 @@ from lifecycle.manifest.model import (
     UniqueHow,
 )
 from lifecycle.network.nfe import UniqueRequirement
-from lifecycle.plan import PlanError
 from lifecycle.plan.build import dependency_levels, planned_processes
+from lifecycle.plan.model import PlanError
 from lifecycle.plan.participants import command_line, parameter_text
 from tests.builders import link, need, node, planned, publisher, subscription
 

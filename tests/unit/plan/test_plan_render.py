@@ -22,7 +22,7 @@ from lifecycle.manifest.model import (
     RunKind,
 )
 from lifecycle.manifest.qos import PRESETS, History, Liveliness, QosProfile
-from lifecycle.plan import build_plan
+from lifecycle.plan.build import build_plan
 from lifecycle.plan.connections.hosts import demand
 from lifecycle.plan.render import render_text, spell_qos
 from tests.builders import at, need, node, planned, publisher, subscription, teleop

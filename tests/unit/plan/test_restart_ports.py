@@ -6,7 +6,8 @@ import pytest
 
 from lifecycle.manifest.model import Discovery, DiscoveryMode, FlowTransport
 from lifecycle.network.connection_url import parse
-from lifecycle.plan import Plan, PlanError, is_restarted_url, restarted
+from lifecycle.plan.model import Plan, PlanError
+from lifecycle.plan.restart import is_restarted_url, restarted
 from tests.builders import node, planned, publisher, subscription
 
 HOST = "tcpv4://127.0.0.1"

@@ -13,7 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.manifest import ManifestError, load
+from lifecycle.manifest.diagnostics import ManifestError
+from lifecycle.manifest.loading import load
 from lifecycle.manifest.model import (
     Authority,
     DataLayer,
@@ -29,16 +30,11 @@ from lifecycle.manifest.model import (
 from lifecycle.network.connection_url import ConnectionUrlError, parse
 from lifecycle.network.medium import Medium
 from lifecycle.node.host.control import Operation
-from lifecycle.plan import (
-    DataLayerGraph,
-    Plan,
-    build_plan,
-    hosts_of,
-    negotiate,
-    party_of_node,
-    terms_of,
-    wishes_of,
-)
+from lifecycle.plan.build import build_plan
+from lifecycle.plan.model import Plan
+from lifecycle.plan.negotiation.data_layer import DataLayerGraph
+from lifecycle.plan.negotiation.negotiate import negotiate
+from lifecycle.plan.negotiation.parties import hosts_of, party_of_node, terms_of, wishes_of
 from lifecycle.supervisor.connections.desired_state import ActualState, planned_instructions, steps
 from lifecycle.supervisor.connections.negotiation import NegotiatedSource, party_of
 from lifecycle.verify.observation import Identity, NodeConfiguration

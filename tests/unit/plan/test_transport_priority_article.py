@@ -7,12 +7,15 @@ from __future__ import annotations
 
 import pytest
 
-from lifecycle.manifest import load
 from lifecycle.manifest.checks import check
+from lifecycle.manifest.loading import load
 from lifecycle.manifest.model import EndpointKind, Machine, Manifest, Network
 from lifecycle.network.dscp import TransportPriorityMapping
-from lifecycle.plan import PlanError, build_plan
-from lifecycle.verify import Outcome, Stage, verify
+from lifecycle.plan.build import build_plan
+from lifecycle.plan.model import PlanError
+from lifecycle.verify.judge import verify
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.verdict import Stage
 from tests.builders import at, manifest, need, node, publisher
 from tests.unit.verify.edits import change_report
 from tests.unit.verify.perfect import perfect

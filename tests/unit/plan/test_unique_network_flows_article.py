@@ -26,8 +26,11 @@ from lifecycle.network.nfe import (
     TransportProtocol,
     UniqueRequirement,
 )
-from lifecycle.plan import PlanError, build_plan
-from lifecycle.verify import Outcome, Stage, verify
+from lifecycle.plan.build import build_plan
+from lifecycle.plan.model import PlanError
+from lifecycle.verify.judge import verify
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.verdict import Stage
 from tests.builders import at, link, manifest, need, node, publisher, subscription
 from tests.unit.verify.edits import change_report
 from tests.unit.verify.perfect import perfect

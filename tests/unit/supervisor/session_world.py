@@ -63,8 +63,8 @@ from lifecycle.supervisor.run.options import UpOptions, UpResult
 from lifecycle.supervisor.run.records import Records
 from lifecycle.supervisor.run.session import Session
 from lifecycle.supervisor.run.signals import Ending
-from lifecycle.verify import rule
 from lifecycle.verify.observation import NodeConfiguration, Observation, ObservedNode
+from lifecycle.verify.rules import rule
 from lifecycle.verify.verdict import Verdict
 from tests.builders import plan_of, planned_node
 from tests.unit.supervisor.fakes import FakeSpawner, interface_of

@@ -22,7 +22,8 @@ from lifecycle.supervisor.run import journal as module
 from lifecycle.supervisor.run.events import Notice, RunStarted, Stopped, VerdictChanged
 from lifecycle.supervisor.run.history import journal_files, read_run
 from lifecycle.supervisor.run.journal import Journal
-from lifecycle.verify import Finding, Outcome, Stage, Verdict
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.verdict import Finding, Stage, Verdict
 
 VERDICT = VerdictChanged(
     stage=Stage.CONNECTED,

@@ -19,7 +19,8 @@ from lifecycle.supervisor.run.events import (
     VerdictChanged,
 )
 from lifecycle.supervisor.run.service_manager import ServiceManager
-from lifecycle.verify import Outcome, Stage
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.verdict import Stage
 from tests.unit.supervisor.fakes import verdict_of
 
 

@@ -8,7 +8,7 @@ from typing import cast
 
 from lifecycle.manifest.model import RunKind
 from lifecycle.node.host.control import Operation
-from lifecycle.plan import Plan
+from lifecycle.plan.model import Plan
 from lifecycle.supervisor.control.protocol import Reach
 from lifecycle.supervisor.gate.activation_guard import TRIES, ActivationGuard
 from lifecycle.supervisor.nodes.driver import LifecycleClients, ServiceDriver

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from lifecycle.manifest.model import DiscoveryRange, Machine, Policy, RunKind
-from lifecycle.middleware import machine_id
+from lifecycle.middleware.process.control import machine_id
 from lifecycle.plan.comparison import decode, encode, notice_of, plan_checksum
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.health.agreement import ANNOUNCED_S, Agreement

@@ -11,7 +11,7 @@ import pytest
 from lifecycle.errors import BringUpError
 from lifecycle.manifest.model import RunKind
 from lifecycle.node.host.control import Operation
-from lifecycle.plan import PlannedNode
+from lifecycle.plan.model import PlannedNode
 from lifecycle.supervisor.control.protocol import Reach
 from lifecycle.supervisor.gate.gate import Gate
 from lifecycle.supervisor.health.answering import ANSWER_S, SHOWN_S, TRIES, Answering

@@ -10,17 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.manifest import (
-    Condition,
-    EndpointPolicy,
-    Mode,
-    Policy,
-    Restart,
-    Supervision,
-)
+from lifecycle.manifest.model import Condition, EndpointPolicy, Mode, Policy, Restart, Supervision
 from lifecycle.plan.model import ExpectedParameter, ModeParameters, Plan, PlannedNode
 from lifecycle.supervisor.control.protocol import Answer, ControlRequest
-from lifecycle.verify import Outcome
+from lifecycle.verify.outcome import Outcome
 from tests.builders import HERE, plan_of, planned_node
 from tests.unit.supervisor.fakes import run
 from tests.unit.supervisor.session_world import (

@@ -22,9 +22,9 @@ from lifecycle.supervisor.processes.process import ProcessExit, SpawnRequest
 from lifecycle.supervisor.run.events import Notice, ProcessChanged, RequestSent
 from lifecycle.supervisor.run.failure import StepFailedError, with_failure
 from lifecycle.supervisor.run.shutdown import TakeDown
-from lifecycle.verify import rule
 from lifecycle.verify.observation import Observation, ObservedNode
 from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.rules import rule
 from lifecycle.verify.verdict import NOT_JUDGED, Stage, Verdict
 from tests.builders import plan_of, planned_node
 from tests.unit.supervisor.fakes import FakeGraph, FakeProcess, World, run, verdict_of

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.manifest import (
+from lifecycle.manifest.model import (
     Condition,
     Consequence,
     Health,
@@ -20,18 +20,20 @@ from lifecycle.manifest import (
     Reaction,
     Supervision,
 )
-from lifecycle.manifest import Restart as RestartWhen
+from lifecycle.manifest.model import Restart as RestartWhen
 from lifecycle.manifest.schema import MANIFEST, read_schema
-from lifecycle.node import Event as HostEvent
-from lifecycle.plan import in_mode
-from lifecycle.plan.model import Plan
+from lifecycle.node.host.control import Event as HostEvent
+from lifecycle.plan.model import Plan, in_mode
 from lifecycle.supervisor.control.protocol import Reach
 from lifecycle.supervisor.control.server import ControlRequest
 from lifecycle.supervisor.nodes.driver import NodeCondition
 from lifecycle.supervisor.nodes.system import NodeRun
 from lifecycle.supervisor.policy.consequences import reaction_of
 from lifecycle.supervisor.run.events import Emitter
-from lifecycle.verify import RULES, Finding, HealthReport, Outcome
+from lifecycle.verify.observation import HealthReport
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.rules import RULES
+from lifecycle.verify.verdict import Finding
 from tests.builders import HERE, configuration, plan_of, planned_node
 from tests.unit.supervisor.session_world import DOWN, SessionWorld, over
 

@@ -6,7 +6,7 @@ import asyncio
 import dataclasses
 from pathlib import Path
 
-from lifecycle.manifest import (
+from lifecycle.manifest.model import (
     Consequence,
     Mode,
     ModeParameter,
@@ -18,8 +18,7 @@ from lifecycle.manifest import (
     Supervision,
     TargetState,
 )
-from lifecycle.plan import in_mode
-from lifecycle.plan.model import Plan
+from lifecycle.plan.model import Plan, in_mode
 from lifecycle.supervisor.control.server import ControlRequest
 from tests.builders import HERE, node, plan_of, planned, planned_node
 from tests.unit.supervisor.session_world import INTRUDED, SessionWorld

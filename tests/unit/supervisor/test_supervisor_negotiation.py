@@ -13,7 +13,7 @@ from lifecycle.manifest.model import (
     FlowTransport,
     Policy,
 )
-from lifecycle.plan import Plan
+from lifecycle.plan.model import Plan
 from lifecycle.supervisor.connections.desired_state import steps, wired
 from lifecycle.supervisor.connections.negotiation import NegotiatedSource
 from lifecycle.verify.observation import EndpointReport, NodeConfiguration

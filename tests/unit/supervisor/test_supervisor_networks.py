@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from lifecycle.errors import ExitCode
-from lifecycle.plan import Plan
+from lifecycle.plan.model import Plan
 from lifecycle.programming.apply.target import (
     ChangeKind,
     FlowChange,

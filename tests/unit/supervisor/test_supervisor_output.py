@@ -41,8 +41,9 @@ from lifecycle.supervisor.run.events import (
     to_record,
 )
 from lifecycle.supervisor.run.options import UpResult
-from lifecycle.verify import FlowReport, Outcome, Stage, to_json
-from lifecycle.verify.outcome import ConnectionReport
+from lifecycle.verify.outcome import ConnectionReport, Outcome
+from lifecycle.verify.report import to_json
+from lifecycle.verify.verdict import FlowReport, Stage
 from tests.unit.supervisor.fakes import verdict_of
 
 EVENTS: tuple[Event, ...] = (

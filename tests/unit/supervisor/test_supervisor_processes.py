@@ -21,7 +21,7 @@ from lifecycle.errors import BringUpError, UsageError
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import Resources, Run, RunKind
 from lifecycle.node.host.control import HostSpec
-from lifecycle.plan import build_plan
+from lifecycle.plan.build import build_plan
 from lifecycle.plan.model import PlannedProcess
 from lifecycle.run_directory import RUN_VARIABLE, ChildRecord, RunRecord, boot_id, start_ticks
 from lifecycle.supervisor.processes import logs, scope
@@ -44,7 +44,7 @@ from lifecycle.supervisor.processes.process import (
     ProcessExit,
 )
 from lifecycle.supervisor.run.events import Emitter, LogLine
-from lifecycle.verify import Outcome
+from lifecycle.verify.outcome import Outcome
 from tests.builders import port_node, teleop
 
 PYTHON = sys.executable

@@ -8,7 +8,7 @@ import pytest
 
 from lifecycle.manifest.model import DataLayer, EndpointKind, FlowTransport
 from lifecycle.node.host.control import Operation
-from lifecycle.plan import Plan
+from lifecycle.plan.model import Plan
 from lifecycle.supervisor.connections.desired_state import steps, wired
 from lifecycle.supervisor.connections.negotiation import Expectation, NegotiatedSource
 from lifecycle.verify.observation import NodeConfiguration, Observation

@@ -14,13 +14,7 @@ from typing import Any, cast
 
 import pytest
 
-from lifecycle.manifest import (
-    Condition,
-    OnFailure,
-    Restart,
-    RunKind,
-    Supervision,
-)
+from lifecycle.manifest.model import Condition, OnFailure, Restart, RunKind, Supervision
 from lifecycle.plan.model import Plan, PlannedNode
 from lifecycle.supervisor.control.protocol import Reach
 from lifecycle.supervisor.control.server import ControlRequest
@@ -31,7 +25,7 @@ from lifecycle.supervisor.policy.schedule import RestartSchedule
 from lifecycle.supervisor.processes.process import ProcessExit
 from lifecycle.supervisor.run.events import Emitter
 from lifecycle.supervisor.run.failure import StepFailedError
-from lifecycle.verify import rule
+from lifecycle.verify.rules import rule
 from tests.builders import plan_of, planned_node
 from tests.unit.supervisor.session_world import (
     ACTIVATED,

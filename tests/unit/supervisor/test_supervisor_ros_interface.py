@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from lifecycle.errors import ExitCode, MiddlewareError
-from lifecycle.manifest import Policy, RosInterfaceAccess
-from lifecycle.plan import Plan
+from lifecycle.manifest.model import Policy, RosInterfaceAccess
+from lifecycle.plan.model import Plan
 from lifecycle.supervisor.control.ros_interface import (
     ERROR,
     HELD_UP_S,

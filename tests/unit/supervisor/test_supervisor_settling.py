@@ -7,16 +7,12 @@ import dataclasses
 import pytest
 
 from lifecycle.manifest.model import EndpointKind, FlowTransport
-from lifecycle.plan import Plan
+from lifecycle.plan.model import Plan
 from lifecycle.supervisor.connections.negotiation import NegotiatedSource
 from lifecycle.supervisor.gate.verification_loop import PASSING_S, GracePeriod
-from lifecycle.verify import (
-    Finding,
-    Outcome,
-    Stage,
-    Verdict,
-    verify,
-)
+from lifecycle.verify.judge import verify
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.verdict import Finding, Stage, Verdict
 from tests.builders import endpoint, node, planned
 from tests.unit.supervisor.fakes import verdict_of
 from tests.unit.supervisor.test_supervisor_negotiation import LISTENER, TALKER, known, plan_of

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Callable
 
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.verify import (
+from lifecycle.verify.observation import (
     EndpointReport,
     NodeConfiguration,
     Observation,

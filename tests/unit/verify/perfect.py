@@ -24,19 +24,18 @@ from lifecycle.network.nfe import (
     TransportProtocol,
     UniqueRequirement,
 )
-from lifecycle.plan import Plan, PlannedEndpoint, PlannedNode
-from lifecycle.plan.model import PlannedParticipant
-from lifecycle.verify import (
+from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedNode, PlannedParticipant
+from lifecycle.verify.observation import (
     EndpointReport,
     Identity,
     NodeConfiguration,
     Observation,
     ObservedEndpoint,
     ObservedNode,
-    Stage,
+    ParameterReport,
 )
-from lifecycle.verify.observation import ParameterReport
 from lifecycle.verify.outcome import ConnectionReport
+from lifecycle.verify.verdict import Stage
 from lifecycle.verify.view import connection_of
 
 _TOPIC_KINDS = (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION)

@@ -9,19 +9,14 @@ import pytest
 
 from lifecycle.manifest.model import EndpointKind, EndpointPolicy, Policy, Run, RunKind
 from lifecycle.manifest.qos import QosProfile
-from lifecycle.plan import Plan, build_plan
-from lifecycle.plan.model import ParticipantConnections, PlannedParticipant
-from lifecycle.verify import (
-    Finding,
-    Identity,
-    NodeConfiguration,
-    Observation,
-    Outcome,
-    Stage,
-    verify,
-)
+from lifecycle.plan.build import build_plan
+from lifecycle.plan.model import ParticipantConnections, Plan, PlannedParticipant
+from lifecycle.verify.judge import verify
+from lifecycle.verify.observation import Identity, NodeConfiguration, Observation
+from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.endpoints import differ
 from lifecycle.verify.rules.nodes import UNDECLARED_NODE
+from lifecycle.verify.verdict import Finding, Stage
 from tests.builders import (
     endpoint,
     node,

@@ -12,10 +12,12 @@ from lifecycle.network.nfe import (
     NetworkFlowEndpoint,
     TransportProtocol,
 )
-from lifecycle.plan import Plan, build_plan
-from lifecycle.verify import Finding, FlowReport, Outcome, Stage, verify
-from lifecycle.verify.judge import flow_reports
+from lifecycle.plan.build import build_plan
+from lifecycle.plan.model import Plan
+from lifecycle.verify.judge import flow_reports, verify
 from lifecycle.verify.matcher import lay_out
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.verdict import Finding, FlowReport, Stage
 from tests.builders import at, node, planned, publisher, subscription, teleop
 from tests.unit.verify.edits import (
     Edit,

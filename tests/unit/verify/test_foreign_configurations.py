@@ -17,12 +17,14 @@ from lifecycle.graph.messages import GraphMessageError
 from lifecycle.graph.messages import decode as decode_message
 from lifecycle.plan.comparison import PlanNoticeError
 from lifecycle.plan.comparison import decode as decode_notice
-from lifecycle.verify import Stage, render_text, to_json, to_junit, to_sarif, verify
+from lifecycle.verify.judge import verify
 from lifecycle.verify.observation import (
     LONGEST_CONFIGURATION,
     ConfigurationError,
     decode_configuration,
 )
+from lifecycle.verify.report import render_text, to_json, to_junit, to_sarif
+from lifecycle.verify.verdict import Stage
 from tests.unit.verify.perfect import perfect
 from tests.unit.verify.test_verify_rules import PLAN
 

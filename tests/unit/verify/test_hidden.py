@@ -6,7 +6,7 @@ import dataclasses
 
 import pytest
 
-from lifecycle.manifest import EndpointKind
+from lifecycle.manifest.model import EndpointKind
 from lifecycle.verify.observation import NodeConfiguration, ObservedEndpoint
 from lifecycle.verify.outcome import ConnectionReport
 from lifecycle.verify.tool_filter import is_hidden_node, owners

@@ -13,11 +13,12 @@ from lifecycle.manifest.model import (
     RosInterfaceAccess,
 )
 from lifecycle.manifest.qos import Durability, Liveliness, QosProfile
-from lifecycle.network import UniqueRequirement
-from lifecycle.plan import Plan
-from lifecycle.verify import Outcome, Stage, Verdict, verify
+from lifecycle.network.nfe import UniqueRequirement
+from lifecycle.plan.model import Plan
+from lifecycle.verify.judge import verify
+from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.tool_filter import takes_diagnostics
-from lifecycle.verify.verdict import OpenEndpoint, ToleratedNode
+from lifecycle.verify.verdict import OpenEndpoint, Stage, ToleratedNode, Verdict
 from tests.builders import at, need, node, planned, publisher, subscription
 from tests.unit.verify.edits import Edit, add_endpoint, add_node, both, change_report
 from tests.unit.verify.perfect import perfect

@@ -8,18 +8,18 @@ import pytest
 
 from lifecycle.manifest.model import EndpointKind, Policy, Run, RunKind
 from lifecycle.manifest.qos import QosProfile
-from lifecycle.plan import Plan, build_plan
-from lifecycle.plan.model import ParticipantConnections
-from lifecycle.verify import (
+from lifecycle.plan.build import build_plan
+from lifecycle.plan.model import ParticipantConnections, Plan
+from lifecycle.verify.matcher import lay_out
+from lifecycle.verify.observation import (
     EndpointReport,
     Identity,
     NodeConfiguration,
     Observation,
     ObservedEndpoint,
-    Stage,
 )
-from lifecycle.verify.matcher import lay_out
 from lifecycle.verify.outcome import ConnectionReport
+from lifecycle.verify.verdict import Stage
 from lifecycle.verify.view import Actual, SeenEndpoint, View
 from tests.builders import (
     endpoint,

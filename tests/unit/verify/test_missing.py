@@ -7,9 +7,11 @@ import dataclasses
 import pytest
 
 from lifecycle.manifest.model import EndpointKind, Policy
-from lifecycle.plan import build_plan
-from lifecycle.verify import RULES, Finding, Outcome, Stage, Verdict, missing, not_ok, verify
-from lifecycle.verify.judge import taken_on_trust
+from lifecycle.plan.build import build_plan
+from lifecycle.verify.judge import missing, not_ok, taken_on_trust, verify
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.rules import RULES
+from lifecycle.verify.verdict import Finding, Stage, Verdict
 from tests.builders import teleop
 from tests.unit.verify.edits import (
     Edit,

@@ -13,12 +13,17 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.export import CapturedParameter, capture, to_nodl
-from lifecycle.manifest import EndpointKind, load
+from lifecycle.export.captured import CapturedParameter, capture
+from lifecycle.export.manifest_yaml import to_nodl
+from lifecycle.manifest.loading import load
+from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import Durability, History, Reliability
-from lifecycle.plan import Plan, build_plan
-from lifecycle.verify import Observation, Outcome, Stage, verify
-from lifecycle.verify.observation import SERVES_NONE, NodeParameters, ParameterReport
+from lifecycle.plan.build import build_plan
+from lifecycle.plan.model import Plan
+from lifecycle.verify.judge import verify
+from lifecycle.verify.observation import SERVES_NONE, NodeParameters, Observation, ParameterReport
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.verdict import Stage
 from tests.unit.verify.edits import (
     Edit,
     add_endpoint,

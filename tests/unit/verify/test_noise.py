@@ -7,19 +7,17 @@ import dataclasses
 import pytest
 
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.verify import (
-    ObservedEndpoint,
-    fold_actions,
-    is_noise_endpoint,
-    is_noise_node,
-    without_noise,
-)
+from lifecycle.verify.observation import ObservedEndpoint
 from lifecycle.verify.tool_filter import (
     DeclaredNames,
     action_part,
+    fold_actions,
+    is_noise_endpoint,
+    is_noise_node,
     known_node,
     our_nodes,
     tolerating_pattern,
+    without_noise,
 )
 from tests.builders import endpoint, node, planned, publisher, subscription
 

@@ -15,7 +15,7 @@ from lifecycle.plan.connections.hosts import Contact
 from lifecycle.plan.model import ParticipantConnections, PlannedNode, PlannedParticipant
 from lifecycle.plan.negotiation.data_layer import Party, PartyEndpoint
 from lifecycle.supervisor.connections.negotiation import party_of
-from lifecycle.verify import NodeConfiguration
+from lifecycle.verify.observation import NodeConfiguration
 from lifecycle.verify.outcome import ConnectionReport
 from tests.builders import configuration, need, node, planned, publisher, reported, subscription
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 import lifecycle
-from lifecycle.verify import RULES, Outcome, Rule
-from lifecycle.verify.rules import About, Heals
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.rules import RULES, About, Heals, Rule
 
 PAGE = Path(__file__).parents[3] / "docs" / "rules.md"
 

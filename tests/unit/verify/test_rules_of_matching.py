@@ -8,8 +8,11 @@ import pytest
 
 from lifecycle.manifest.model import EndpointKind, EndpointPolicy, Policy
 from lifecycle.manifest.qos import QosProfile, Reliability
-from lifecycle.plan import Plan
-from lifecycle.verify import Finding, Observation, Outcome, Stage, verify
+from lifecycle.plan.model import Plan
+from lifecycle.verify.judge import verify
+from lifecycle.verify.observation import Observation
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.verdict import Finding, Stage
 from tests.builders import BEST_EFFORT, link, node, planned, publisher, subscription
 from tests.unit.verify.edits import (
     Edit,

@@ -17,8 +17,10 @@ from lifecycle.manifest.qos import (
     Reliability,
     not_written,
 )
-from lifecycle.plan import Plan
-from lifecycle.verify import Finding, Outcome, Stage, verify
+from lifecycle.plan.model import Plan
+from lifecycle.verify.judge import verify
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.verdict import Finding, Stage
 from tests.builders import node, planned, publisher, subscription
 from tests.unit.verify.edits import (
     Edit,

@@ -6,11 +6,12 @@ import dataclasses
 
 import pytest
 
-from lifecycle.manifest import EndpointKind
-from lifecycle.plan import Plan
-from lifecycle.plan.model import ExpectedParameter
-from lifecycle.verify import Observation, Stage, verify
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.plan.model import ExpectedParameter, Plan
+from lifecycle.verify.judge import verify
+from lifecycle.verify.observation import Observation
 from lifecycle.verify.tool_filter import CLOCK
+from lifecycle.verify.verdict import Stage
 from tests.builders import at, endpoint, node, planned, publisher
 from tests.unit.verify.edits import Edit, add_endpoint, add_node, both, change_endpoint
 from tests.unit.verify.perfect import perfect

@@ -17,10 +17,11 @@ from lifecycle.network.nfe import (
     is_ip,
     located,
 )
-from lifecycle.plan import Plan
-from lifecycle.verify import Identity, Stage
+from lifecycle.plan.model import Plan
 from lifecycle.verify.matcher import lay_out
+from lifecycle.verify.observation import Identity
 from lifecycle.verify.uniqueness import Uniqueness
+from lifecycle.verify.verdict import Stage
 from lifecycle.verify.view import Actual
 from tests.builders import (
     configuration,

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 
-from lifecycle.verify import Outcome, Stage, verify
+from lifecycle.verify.judge import verify
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.verdict import Stage
 from tests.builders import node, planned, publisher, subscription
 from tests.unit.verify.perfect import perfect
 

@@ -18,11 +18,12 @@ from lifecycle.manifest.model import (
     RunKind,
 )
 from lifecycle.network.nfe import InternetProtocol, NetworkFlowEndpoint, TransportProtocol
-from lifecycle.plan import Plan, PlannedNode
-from lifecycle.plan.model import ParticipantConnections, PlannedParticipant
-from lifecycle.verify import Finding, Observation, Outcome, Stage, render_text, to_json, verify
-from lifecycle.verify.outcome import ConnectionReport
-from lifecycle.verify.verdict import OpenEndpoint
+from lifecycle.plan.model import ParticipantConnections, Plan, PlannedNode, PlannedParticipant
+from lifecycle.verify.judge import verify
+from lifecycle.verify.observation import Observation
+from lifecycle.verify.outcome import ConnectionReport, Outcome
+from lifecycle.verify.report import render_text, to_json
+from lifecycle.verify.verdict import Finding, OpenEndpoint, Stage
 from tests.builders import at, link, node, planned, publisher, subscription
 from tests.unit.verify.edits import (
     Edit,

@@ -11,10 +11,12 @@ from lifecycle.network.nfe import (
     TransportProtocol,
     UniqueRequirement,
 )
-from lifecycle.plan import Plan, build_plan
-from lifecycle.verify import Finding, FlowReport, Outcome, Stage, verify
+from lifecycle.plan.build import build_plan
+from lifecycle.plan.model import Plan
+from lifecycle.verify.judge import verify
 from lifecycle.verify.observation import Observation
-from lifecycle.verify.outcome import ConnectionReport
+from lifecycle.verify.outcome import ConnectionReport, Outcome
+from lifecycle.verify.verdict import Finding, FlowReport, Stage
 from tests.builders import at, link, need, node, planned, publisher, subscription, teleop
 from tests.unit.verify.edits import (
     Edit,

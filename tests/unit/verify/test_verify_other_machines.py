@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from lifecycle.verify import Stage, verify
+from lifecycle.verify.judge import verify
+from lifecycle.verify.verdict import Stage
 from tests.builders import node, planned, publisher, subscription
 from tests.unit.verify.edits import drop_node
 from tests.unit.verify.perfect import perfect

@@ -6,13 +6,21 @@ import dataclasses
 
 import pytest
 
-from lifecycle.manifest import Diagnostic, Position, Severity
+from lifecycle.manifest.diagnostics import Diagnostic, Position, Severity
 from lifecycle.manifest.model import ParameterValue, Run, RunKind
-from lifecycle.plan import Plan
-from lifecycle.plan.model import ExpectedParameter
-from lifecycle.verify import RULES, Finding, NodeConfiguration, Observation, Outcome, Stage, verify
-from lifecycle.verify.observation import LONGEST_VALUE, NodeParameters, ParameterReport
+from lifecycle.plan.model import ExpectedParameter, Plan
+from lifecycle.verify.judge import verify
+from lifecycle.verify.observation import (
+    LONGEST_VALUE,
+    NodeConfiguration,
+    NodeParameters,
+    Observation,
+    ParameterReport,
+)
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.rules import RULES
 from lifecycle.verify.rules.parameters import spell
+from lifecycle.verify.verdict import Finding, Stage
 from tests.builders import at, node, planned
 from tests.unit.verify.perfect import perfect
 from tests.unit.verify.told import told

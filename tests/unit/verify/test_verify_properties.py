@@ -12,8 +12,11 @@ from hypothesis import strategies as st
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import PRESETS
 from lifecycle.network.nfe import UniqueRequirement
-from lifecycle.plan import Plan
-from lifecycle.verify import Observation, Outcome, Stage, verify
+from lifecycle.plan.model import Plan
+from lifecycle.verify.judge import verify
+from lifecycle.verify.observation import Observation
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.verdict import Stage
 from tests.builders import endpoint, need, node, planned
 from tests.unit.verify.perfect import perfect
 

@@ -21,24 +21,23 @@ from lifecycle.network.nfe import (
     TransportProtocol,
     UniqueRequirement,
 )
-from lifecycle.plan import Plan, build_plan
-from lifecycle.verify import (
+from lifecycle.plan.build import build_plan
+from lifecycle.plan.model import Plan
+from lifecycle.verify.judge import verify
+from lifecycle.verify.observation import NodeConfiguration
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.report import render_text, to_json, to_junit, to_sarif
+from lifecycle.verify.rules import RULES
+from lifecycle.verify.verdict import (
     NOT_JUDGED,
-    RULES,
     Finding,
     FlowReport,
-    NodeConfiguration,
-    Outcome,
+    OpenEndpoint,
     RunEnd,
     Stage,
+    ToleratedNode,
     Verdict,
-    render_text,
-    to_json,
-    to_junit,
-    to_sarif,
-    verify,
 )
-from lifecycle.verify.verdict import OpenEndpoint, ToleratedNode
 from tests.builders import teleop
 from tests.unit.verify.edits import (
     Edit,

@@ -29,17 +29,14 @@ from lifecycle.network.nfe import (
     TransportProtocol,
     UniqueRequirement,
 )
-from lifecycle.plan import Plan, build_plan
-from lifecycle.verify import (
-    RULES,
-    Finding,
-    HealthReport,
-    Observation,
-    Outcome,
-    Stage,
-    verify,
-)
+from lifecycle.plan.build import build_plan
+from lifecycle.plan.model import Plan
+from lifecycle.verify.judge import verify
+from lifecycle.verify.observation import HealthReport, Observation
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.rules import RULES
 from lifecycle.verify.rules.run import node_of
+from lifecycle.verify.verdict import Finding, Stage
 from tests.builders import (
     IMAGE,
     at,

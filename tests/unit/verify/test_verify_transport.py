@@ -13,11 +13,12 @@ from lifecycle.network.nfe import (
     TransportProtocol,
     UniqueRequirement,
 )
-from lifecycle.plan import Plan
-from lifecycle.plan.model import ParticipantConnections, PlannedParticipant
-from lifecycle.verify import Finding, Identity, Outcome, Stage, verify
-from lifecycle.verify.outcome import ConnectionReport
+from lifecycle.plan.model import ParticipantConnections, Plan, PlannedParticipant
+from lifecycle.verify.judge import verify
+from lifecycle.verify.observation import Identity
+from lifecycle.verify.outcome import ConnectionReport, Outcome
 from lifecycle.verify.transport import carrier
+from lifecycle.verify.verdict import Finding, Stage
 from tests.builders import at, link, need, node, planned, publisher, subscription
 from tests.unit.verify.edits import (
     Edit,

@@ -9,14 +9,15 @@ import pytest
 from lifecycle.manifest.model import EndpointKind, Machine, Run, RunKind
 from lifecycle.manifest.qos import Durability, History, Liveliness, QosProfile, Reliability
 from lifecycle.network.nfe import UniqueRequirement
-from lifecycle.plan import Plan
 from lifecycle.plan.model import (
     ParticipantConnections,
+    Plan,
     PlannedParticipant,
     StaticParticipant,
 )
-from lifecycle.verify import Observation, Stage
 from lifecycle.verify.matcher import lay_out
+from lifecycle.verify.observation import Observation
+from lifecycle.verify.verdict import Stage
 from lifecycle.verify.view import (
     UNKNOWN_QOS,
     View,

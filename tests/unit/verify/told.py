@@ -5,7 +5,8 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Iterable
 
-from lifecycle.verify import Finding, rule
+from lifecycle.verify.rules import rule
+from lifecycle.verify.verdict import Finding
 
 
 def told(findings: Iterable[Finding]) -> str:

@@ -16,7 +16,7 @@ from lifecycle.network.nfe import (
     TransportProtocol,
     UniqueRequirement,
 )
-from lifecycle.plan import Plan
+from lifecycle.plan.model import Plan
 from lifecycle.programming.rules.rules import FlowRule, LeftOut
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import FlowReport

@@ -9,7 +9,7 @@ import pytest
 
 from lifecycle.network.five_qi import dscp_mapping
 from lifecycle.network.nfe import TransportProtocol
-from lifecycle.plan import PlannedNode
+from lifecycle.plan.model import PlannedNode
 from lifecycle.programming.rules.rules import FlowRule, asks, flow_rules, named, rules_digest
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import FlowReport
