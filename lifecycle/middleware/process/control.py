@@ -267,8 +267,8 @@ def check_descriptors(processes: int) -> None:
 
 _ADDRESS_BYTES = 512 * 2**20
 """What a participant and its threads map, each with a stack and a heap of its own."""
-_LEAST_ADDRESSES_KIB = 1_000_000
-"""With it the libraries, whose own heaps take less where there is less."""
+_LEAST_ADDRESSES_KIB = 1_400_000
+"""With it the libraries, numpy's threads included; their heaps take less where there is less."""
 
 
 def check_memory() -> None:
@@ -279,17 +279,25 @@ def check_memory() -> None:
     Raises:
         MiddlewareError: it may not; names the limit.
     """
+    soft, _ = resource.getrlimit(resource.RLIMIT_AS)
+    is_limited = soft != resource.RLIM_INFINITY
+    if not (is_limited and soft < _LEAST_ADDRESSES_KIB * 1024) and _may_map(_ADDRESS_BYTES):
+        return
+    used = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+    needed = max(_LEAST_ADDRESSES_KIB, (used * mmap.PAGESIZE + _ADDRESS_BYTES) // 1024)
+    has = f"{soft // 1024} KiB" if is_limited else "so little memory"
+    raise MiddlewareError(
+        f"cannot run with {has}: it takes {needed} KiB of addresses (RLIMIT_AS)",
+        hint=f"raise it (ulimit -v {needed}, LimitAS=)",
+    )
+
+
+def _may_map(size: int) -> bool:
     try:
-        mmap.mmap(-1, _ADDRESS_BYTES, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS, prot=0).close()
-    except OSError as error:
-        used = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
-        needed = max(_LEAST_ADDRESSES_KIB, (used * mmap.PAGESIZE + _ADDRESS_BYTES) // 1024)
-        soft, _ = resource.getrlimit(resource.RLIMIT_AS)
-        has = "so little memory" if soft == resource.RLIM_INFINITY else f"{soft // 1024} KiB"
-        raise MiddlewareError(
-            f"cannot run with {has}: it takes {needed} KiB of addresses (RLIMIT_AS)",
-            hint=f"raise it (ulimit -v {needed}, LimitAS=)",
-        ) from error
+        mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS, prot=0).close()
+    except OSError:
+        return False
+    return True
 
 
 def no_room_for_threads(count: int) -> MiddlewareError:

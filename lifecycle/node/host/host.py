@@ -17,8 +17,6 @@ from typing import NoReturn
 
 from lifecycle import codec, dataclasses
 from lifecycle.manifest.model import DiscoveryRange
-from lifecycle.middleware.fastdds.settings import unknown_versions
-from lifecycle.middleware.rcl.qos import load_type_support
 from lifecycle.node.host.control import HostChannel, HostSpec, give_up
 
 _PRELOADED = (
@@ -59,6 +57,9 @@ def preload(types: Iterable[str] = ()) -> None:
         types: interface types that nodes use besides; one that cannot be imported is left to the
             host that needs it, which reports it.
     """
+    from lifecycle.middleware.fastdds.settings import unknown_versions
+    from lifecycle.middleware.rcl.qos import load_type_support
+
     for name in _PRELOADED:
         importlib.import_module(name)
     for interface in _INTERFACES:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from collections.abc import Callable
 
 from tests.outside.case import NOBODY, VIOLATED, Case
@@ -106,7 +107,8 @@ def when_active(*words: str) -> Callable[[Run], None]:
 def stopped(run: Run) -> None:
     run.until_active()
     os.kill(run.pid_of("talker"), signal.SIGSTOP)
-    run.until_says("health.silent")
+    run.until_says("run.silent-node")
+    time.sleep(2.0)  # what lasts for more than 1 s counts
     os.kill(run.pid_of("talker"), signal.SIGCONT)
 
 

@@ -163,7 +163,7 @@ CASES = (
         attack=f"{_ENDED}after 0.2 s of being active",
         manifest=PAIR,
         verb=("up", "--strict", "--stop-after", "0.2"),
-        story=_announced(_nothing, at_most=4),
+        story=_announced(_nothing, at_most=6),
         exit_code=0,
         verdict=OK,
         before="a prober with a lease of 0.5 s and three of 20 s, none of which left",
@@ -173,7 +173,7 @@ CASES = (
         attack=f"{_ENDED}by Ctrl-C",
         manifest=PAIR,
         verb=("up", "--strict"),
-        story=_announced(_interrupted, at_most=4),
+        story=_announced(_interrupted, at_most=6),
         exit_code=130,
         before="a prober with a lease of 0.5 s, which did not leave",
     ),
@@ -181,7 +181,7 @@ CASES = (
         attack=f"{_ENDED}before the gate",
         manifest=PAIR,
         verb=("up", "--strict"),
-        story=_announced(_early, at_most=4),
+        story=_announced(_early, at_most=6),
         exit_code=143,
         before="a prober with a lease of 0.5 s, which did not leave",
     ),
@@ -189,7 +189,7 @@ CASES = (
         attack=f"{_ENDED}after 5 s",
         manifest=PAIR,
         verb=("up", "--strict", "--stop-after", "5"),
-        story=_announced(_nothing, at_most=4),
+        story=_announced(_nothing, at_most=6),
         exit_code=0,
         verdict=OK,
         before="a prober with a lease of 0.5 s, which did not leave",
@@ -249,7 +249,7 @@ CASES = (
             exit_code=0,
             before="the same",
         )
-        for limit in ("ulimit -n 64", "ulimit -v 1200000")
+        for limit in ("ulimit -n 64", "ulimit -v 1500000")
     ),
     Case(
         attack="status of a killed supervisor is the same in another time namespace",

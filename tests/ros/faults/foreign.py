@@ -88,8 +88,8 @@ def main() -> None:
     print("ready", flush=True)
     parent = os.getppid()
     # Bounded: if whoever started this dies without a signal, it must not outlive the test run.
-    while not end.wait(1.0) and os.getppid() == parent:
-        pass
+    while not end.is_set() and os.getppid() == parent:
+        rclpy.spin_once(node, timeout_sec=0.1)
     while servers:
         servers.pop().destroy()
     node.destroy_node()

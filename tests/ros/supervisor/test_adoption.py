@@ -52,17 +52,6 @@ def asked(run: Up) -> list[str]:
     return [each["operation"] for each in run.of_kind("request") if each["node"] == "/base"]
 
 
-def test_a_node_that_is_not_ours_is_asked_without_loading_numpy(
-    tmp_path: Path, fresh_domain: int
-) -> None:
-    with up(pair(tmp_path, fresh_domain, edit=_EDIT), runtime=tmp_path) as run:
-        run.until("system", reached="active")
-        assert asked(run) == ["configure", "connect", "activate"]
-        loaded = Path(f"/proc/{run.process.pid}/maps").read_text(encoding="utf-8")
-        assert "lifecycle_msgs" in loaded
-        assert "numpy" not in loaded
-
-
 @pytest.mark.thorough
 def test_a_node_is_not_touched_but_adopted_and_outlives_a_supervisor_that_is_killed(
     tmp_path: Path, fresh_domain: int, base: subprocess.Popen[str]
