@@ -89,14 +89,12 @@ class Fields:
     """A JSON object of an answer; what is read of it is checked first.
 
     Attributes:
-        asked: the request, "GET http://nef.example.net/…".
-        status: of the answer.
+        reply: the answer.
         values: the object.
         where: of the object in the answer, "[2]."; empty for the whole.
     """
 
-    asked: str
-    status: int
+    reply: Reply
     values: Mapping[str, Any]
     where: str = ""
 
@@ -175,7 +173,7 @@ class Fields:
             HttpError: always. The request may have taken effect.
         """
         is_there = f"{show(value)} is not {allowed}" if value is not None else "is missing"
-        raise unusable(self.asked, self.status, f"{self.where}{key}", is_there)
+        raise self.reply.unusable(f"{self.where}{key}", is_there)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -222,8 +220,8 @@ class Reply:
         if may_be_empty and body is None and not self.flaw:
             body = {}
         if self.flaw or not isinstance(body, dict):
-            raise self._unusable("a JSON object")
-        return Fields(asked=self.asked, status=self.status, values=body)
+            raise self._no_body("a JSON object")
+        return Fields(reply=self, values=body)
 
     def objects(self) -> tuple[Fields, ...]:
         """Return the body, which must be an array of JSON objects; none of it if it is gone.
@@ -234,16 +232,12 @@ class Reply:
         if self.gone:
             return ()
         if self.flaw or not isinstance(self.body, list):
-            raise self._unusable("a JSON array")
+            raise self._no_body("a JSON array")
         found = []
         for index, each in enumerate(self.body):
             if not isinstance(each, dict):
-                raise unusable(
-                    self.asked, self.status, f"[{index}]", f"{show(each)} is not a JSON object"
-                )
-            found.append(
-                Fields(asked=self.asked, status=self.status, values=each, where=f"[{index}].")
-            )
+                raise self.unusable(f"[{index}]", f"{show(each)} is not a JSON object")
+            found.append(Fields(reply=self, values=each, where=f"[{index}]."))
         return tuple(found)
 
     def created(self) -> str:
@@ -252,34 +246,26 @@ class Reply:
         Raises:
             HttpError: it is no URL, or its end cannot be an id.
         """
-        headers = {"Location": self.location}
-        return Fields(asked=self.asked, status=self.status, values=headers).link("Location")
+        return Fields(reply=self, values={"Location": self.location}).link("Location")
 
-    def _unusable(self, allowed: str) -> HttpError:
-        reason = f"is not {allowed}"
-        if self.flaw:
-            reason = self.flaw
-        elif self.body is not None:
-            reason = f"{show(self.body)} is not {allowed}"
-        return unusable(self.asked, self.status, "its body", reason)
+    def _no_body(self, allowed: str) -> HttpError:
+        there = "" if self.body is None else f"{show(self.body)} "
+        return self.unusable("its body", self.flaw or f"{there}is not {allowed}")
 
+    def unusable(self, field: str, reason: str) -> HttpError:
+        """Return the error for an answer that was understood as far as `field`.
 
-def unusable(asked: str, status: int, field: str, reason: str) -> HttpError:
-    """Return the error for an answer that was understood as far as `field`.
-
-    Args:
-        asked: the request.
-        status: of the answer.
-        field: "duration", "[2].self", "Location".
-        reason: follows the field, "'x' is not a string".
-    """
-    return HttpError(
-        f"cannot use the answer {status} to {asked}: {field}: {reason}",
-        status=status,
-        # Whatever the answer is worth, the server has taken the request.
-        uncertain=True,
-        hint="check that the url is that of such a server",
-    )
+        Args:
+            field: "duration", "[2].self", "Location".
+            reason: follows the field, "'x' is not a string".
+        """
+        return HttpError(
+            f"cannot use the answer {self.status} to {self.asked}: {field}: {reason}",
+            status=self.status,
+            # Whatever the answer is worth, the server has taken the request.
+            uncertain=True,
+            hint="check that the url is that of such a server",
+        )
 
 
 def show(value: object) -> str:
@@ -549,7 +535,6 @@ class Api:
         return HttpError(
             f"cannot {answer.asked}: {': '.join(word for word in words if word)}",
             status=answer.status,
-            cause=cause,
             uncertain=answer.status in _PASSING - {503} and method == "POST",
             hint=hint,
         )
@@ -621,13 +606,11 @@ def _no_number(text: str) -> NoReturn:
 
 
 def _with_hint(error: HttpError, asked_s: float, total_s: float) -> HttpError:
-    return HttpError(
-        error.message,
-        status=error.status,
-        cause=error.cause,
-        hint=f"the server asks to wait {asked_s:g} s, more than the {total_s:g} s that this waits "
-        "for; try again then",
+    error.hint = (
+        f"the server asks to wait {asked_s:g} s, more than the {total_s:g} s that this waits for; "
+        "try again then"
     )
+    return error
 
 
 def text_of(value: object, secret: str = "") -> str:

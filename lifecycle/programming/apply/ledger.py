@@ -29,9 +29,6 @@ from lifecycle.run_directory import (
     start_ticks,
 )
 
-FILE_NAME = LEDGER_NAME
-LOCK_NAME = LEDGER_LOCK_NAME
-
 _LOCK_S = 30.0
 """How long another process may keep the ledger: it talks to servers meanwhile."""
 
@@ -74,10 +71,6 @@ class TargetRecord:
     settings: str = ""
     entries: tuple[Entry, ...] = ()
 
-    def entry(self, key: str) -> Entry | None:
-        """Return the entry of a flow; None if there is none."""
-        return next((each for each in self.entries if each.key == key), None)
-
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class LedgerFile:
@@ -107,7 +100,7 @@ class Ledger:
 
     def __init__(self, directory: Path, system: str, *, owned: bool = False) -> None:
         self._directory = directory
-        self._path = directory / FILE_NAME
+        self._path = directory / LEDGER_NAME
         self.system = system
         self._owned = owned
 
@@ -120,7 +113,9 @@ class Ledger:
         """
         for each in (self._directory.parent, self._directory):
             _own_directory(each)
-        lock = os.open(self._directory / LOCK_NAME, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        lock = os.open(
+            self._directory / LEDGER_LOCK_NAME, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600
+        )
         try:
             deadline = time.monotonic() + _LOCK_S
             while not _locks(lock):
@@ -162,29 +157,25 @@ class Ledger:
 
     def put(self, record: TargetRecord) -> None:
         """Write down what is ours in one network, in place of what was written of it."""
-        self._write(self._others(record.target, record.scope), record)
+        self._write(record.target, record.scope, record)
 
     def drop(self, target: str, scope: str) -> None:
         """Nothing of ours is left in one network."""
-        self._write(self._others(target, scope), None)
+        self._write(target, scope)
 
-    def _others(self, target: str, scope: str) -> tuple[TargetRecord, ...]:
-        return tuple(
-            each for each in self.read().targets if (each.target, each.scope) != (target, scope)
-        )
-
-    def _write(self, others: tuple[TargetRecord, ...], record: TargetRecord | None) -> None:
-        targets = others if record is None else (*others, record)
+    def _write(self, target: str, scope: str, *instead: TargetRecord) -> None:
+        before = self.read()
+        others = [each for each in before.targets if (each.target, each.scope) != (target, scope)]
+        targets = (*others, *instead)
         if not targets:
             self._path.unlink(missing_ok=True)
             return
-        before = self.read()
         # What is applied manually after a supervisor has died is not the dead one's.
         owner = None if owner_is_dead(before) else before.owner
         if self._owned:
             pid = os.getpid()
             owner = ChildRecord(name="supervisor", pid=pid, start_ticks=start_ticks(pid) or 0)
-        part = self._path.with_name(f".{FILE_NAME}")
+        part = self._path.with_name(f".{LEDGER_NAME}")
         text = to_json(
             LedgerFile(system=self.system, owner=owner, boot_id=boot_id(), targets=targets)
         )
@@ -204,7 +195,7 @@ class Ledger:
 
 def has_ledger(directory: Path) -> bool:
     """Whether anything of ours may be left of the run in `directory`."""
-    return (directory / FILE_NAME).is_file()
+    return (directory / LEDGER_NAME).is_file()
 
 
 def owner_is_dead(file: LedgerFile) -> bool:

@@ -25,7 +25,6 @@ from lifecycle.plan.model import Plan, PlannedNode
 from lifecycle.programming.apply.ledger import Ledger, has_ledger, owner_is_dead
 from lifecycle.programming.apply.target import PartlyError, Target, TargetChanges
 from lifecycle.programming.apply.targets.registry import TargetOptions, Targets, target_kind
-from lifecycle.programming.apply.tool import Deadline
 from lifecycle.programming.rules.rules import FlowRule, LeftOut, RuleSet, SourceAddress, flow_rules
 from lifecycle.run_directory import is_held, run_name, runtime_root
 from lifecycle.verify.outcome import Outcome
@@ -120,29 +119,27 @@ class Programmer:
     Args:
         plan: of the system.
         targets: to keep in step.
-        ledger: of the system, which the targets write to.
+        made_by: what they are opened with: the ledger of the system, and the deadline.
         source_address: observes where publishers send from; None believes the manifest only.
         treatment: what flows get beyond what the manifest says.
-        made_by: holds the deadline.
     """
 
     def __init__(
         self,
         plan: Plan,
         targets: Sequence[Target],
-        ledger: Ledger,
+        made_by: Targets,
         *,
         source_address: SourceAddress | None = None,
         treatment: Treatment | None = None,
-        made_by: Targets | None = None,
     ) -> None:
         self._plan = plan
         self._targets = tuple(targets)
-        self._ledger = ledger
+        self._made_by = made_by
+        self._ledger = made_by.ledger
+        self._deadline = made_by.deadline
         self._source_address = source_address
         self._treatment = treatment or Treatment()
-        self._made_by = made_by
-        self._deadline = made_by.deadline if made_by is not None else Deadline()
         self._applied: tuple[FlowRule, ...] | None = None
         # What targets have, as far as is known: all of it once every target was brought up to date.
         self._programmed: dict[str, FlowRule] = {}
@@ -215,7 +212,8 @@ class Programmer:
             try:
                 done = _each(self._targets, apply)
             except LifecycleError:
-                made = {entry.key for each in self._ledger.read().targets for entry in each.entries}
+                listed = [entry for each in self._ledger.read().targets for entry in each.entries]
+                made = {each.key.rsplit(" ", 2)[0] for each in listed}  # without "to device"
                 self._programmed |= {key: each for key, each in by_key.items() if key in made}
                 raise
         self._applied, self._programmed = rules, by_key
@@ -237,7 +235,7 @@ class Programmer:
             PartlyError: something could not be removed, or not in time; it stays listed.
         """
         self._applied, self._programmed = None, {}
-        return _remove_all(self._ledger, self._made_by or Targets(self._ledger), within_s)
+        return _remove_all(self._made_by, within_s)
 
     def cancel(self) -> None:
         """From another thread: have what servers are asked fail at once, until `resume`."""
@@ -281,76 +279,65 @@ def open_programmer(
     return Programmer(
         plan,
         [each.open(targets) for each in options],
-        ledger,
+        targets,
         source_address=RouteSources(plan, machine),
         treatment=treatment,
-        made_by=targets,
     )
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Swept:
-    """What became of the leftovers.
-
-    Attributes:
-        removed: per target.
-        errors: what could not be removed, and why; it stays listed.
-    """
-
-    removed: tuple[TargetChanges, ...] = ()
-    errors: tuple[LifecycleError, ...] = ()
-
-
-def sweep_orphans(root: Path, *, own: str = "", within_s: float | None = None) -> Swept:
+def sweep_orphans(
+    root: Path,
+    report: Callable[[str], None],
+    *,
+    own: str = "",
+    within_s: float | None = None,
+) -> None:
     """Remove what the dead runs of this user left in networks.
 
     Args:
         root: directory of all run directories, see run_directory.runtime_root.
+        report: takes what was removed, and what could not be and stays listed, as text for people.
         own: name of the caller's own run, whose directory it holds itself.
         within_s: for all that servers are asked; None for the patience with each request.
     """
     until_s = math.inf if within_s is None else time.monotonic() + within_s
-    removed: list[TargetChanges] = []
-    errors: list[LifecycleError] = []
     for directory in sorted(root.iterdir()) if root.is_dir() else ():
         if not has_ledger(directory) or (directory.name != own and is_held(directory)):
             continue
         try:
-            removed += _sweep(directory, until_s - time.monotonic())
+            removal = Removal(directory)
+            if not removal.is_orphaned:
+                continue
+            for each in removal.close(within_s=until_s - time.monotonic()):
+                if each.changes:
+                    report(f"left by a killed supervisor: {each.render(done=True)}")
         except LifecycleError as error:
-            errors.append(error)
-    return Swept(removed=tuple(removed), errors=tuple(errors))
-
-
-def remove_run(directory: Path, *, within_s: float | None = None) -> tuple[TargetChanges, ...]:
-    """Remove everything that a run has in networks, also what was applied manually.
-
-    For `lifecycle down`.
-
-    Args:
-        directory: of the run.
-        within_s: for all that servers are asked; None for the patience with each request.
-
-    Raises:
-        ProgrammingError: something could not be removed; it stays listed.
-    """
-    if not has_ledger(directory):
-        return ()
-    return Removal(directory).close(within_s=within_s)
+            report(str(error))
 
 
 class Removal:
-    """Removes everything that a ledger lists, from one thread and cancelled from another.
+    """Removes everything of one run in networks, also what was applied manually.
+
+    One thread removes, another cancels.
 
     Args:
         directory: of the run.
+
+    Attributes:
+        is_orphaned: the supervisor that made it all is gone.
+
+    Raises:
+        ProgrammingError: the ledger cannot be read.
     """
 
     def __init__(self, directory: Path) -> None:
-        self._ledger = Ledger(directory, _system(directory))
-        self._targets = Targets(self._ledger)
+        file = Ledger(directory, "").read()
+        self.is_orphaned = owner_is_dead(file)
+        # The name as the ledger has it: that of a directory is made safe.
+        system = file.system or directory.name.partition("@")[0]
+        self._targets = Targets(Ledger(directory, system))
 
-    def close(self, *, within_s: float | None) -> tuple[TargetChanges, ...]:
+    def close(self, *, within_s: float | None = None) -> tuple[TargetChanges, ...]:
         """Remove it.
 
         Args:
@@ -359,29 +346,17 @@ class Removal:
         Raises:
             ProgrammingError: something could not be removed; it stays listed.
         """
-        return _remove_all(self._ledger, self._targets, within_s)
+        return _remove_all(self._targets, within_s)
 
     def cancel(self) -> None:
         """Have what servers are asked fail at once."""
         self._targets.deadline.cancel()
 
 
-def _remove_all(
-    ledger: Ledger, targets: Targets, within_s: float | None
-) -> tuple[TargetChanges, ...]:
-    with targets.deadline.within(within_s), ledger.locked():
-        records = ledger.read().targets
+def _remove_all(targets: Targets, within_s: float | None) -> tuple[TargetChanges, ...]:
+    with targets.deadline.within(within_s), targets.ledger.locked():
+        records = targets.ledger.read().targets
         return _each(records, lambda each: target_kind(each.target).restore(each, targets).remove())
-
-
-def _sweep(directory: Path, within_s: float) -> tuple[TargetChanges, ...]:
-    file = Ledger(directory, _system(directory)).read()
-    return remove_run(directory, within_s=within_s) if owner_is_dead(file) else ()
-
-
-def _system(directory: Path) -> str:
-    """The system's name as the ledger has it: a directory's name is made safe."""
-    return Ledger(directory, "").read().system or directory.name.partition("@")[0]
 
 
 def _with_held(

@@ -61,12 +61,14 @@ class Made:
 _S = TypeVar("_S", bound=ServerSettings)
 
 
-class Service(abc.ABC, Generic[_S]):
-    """One kind of thing at one server.
+class RemoteTarget(abc.ABC, Generic[_S]):
+    """One kind of thing at one server, see Target.
 
     Args:
         settings: of the server.
         api: at `settings.scope`.
+        ledger: of the system.
+        path: of the settings file, so that a later run can remove what this one leaves.
 
     Attributes:
         kind: name of the target: "nef", "camara".
@@ -76,18 +78,16 @@ class Service(abc.ABC, Generic[_S]):
     kind: ClassVar[str]
     collection: ClassVar[str]
 
-    def __init__(self, settings: _S, api: Api) -> None:
+    def __init__(self, settings: _S, api: Api, ledger: Ledger, path: str) -> None:
         self._settings = settings
         self._api = api
+        self._ledger = ledger
+        self._path = path
 
     @property
-    def scope(self) -> str:
-        """URL of the server."""
-        return self._api.url
-
-    def path(self, id_: str) -> str:
-        """Return the path of one thing."""
-        return f"{self.collection}/{as_segment(id_)}"
+    def name(self) -> str:
+        """The server."""
+        return f"{self.kind} at {self._api.url}"
 
     @staticmethod
     @abc.abstractmethod
@@ -114,6 +114,10 @@ class Service(abc.ABC, Generic[_S]):
         """Delete one; that it is gone already is no error."""
         self._api.request("DELETE", self.path(id_), may_be_gone=True)
 
+    def path(self, id_: str) -> str:
+        """Return the path of one thing."""
+        return f"{self.collection}/{as_segment(id_)}"
+
     def prolong(self, entry: Entry, body: Body) -> Made | None:  # noqa: ARG002 - what expires has it
         """Prolong one that is due; None if it is not, or never expires."""
         return None
@@ -122,39 +126,18 @@ class Service(abc.ABC, Generic[_S]):
         """Return seconds until it must be prolonged; None if never."""
         return None
 
-
-class RemoteTarget:
-    """A server, see Target.
-
-    Args:
-        service: asks it.
-        settings: of the server.
-        ledger: of the system.
-        path: of the settings file, so that a later run can remove what this one leaves.
-    """
-
-    def __init__(self, service: Service[_S], settings: _S, ledger: Ledger, path: str = "") -> None:
-        self._service: Service[Any] = service
-        self._settings = settings
-        self._ledger = ledger
-        self._path = path
-
-    @property
-    def name(self) -> str:
-        """The server."""
-        return f"{self._service.kind} at {self._service.scope}"
-
     def plan(self, rules: Sequence[FlowRule]) -> TargetChanges:
         """Compare rules, ledger and server; asks the server about each thing of ours."""
-        found = self._asked(rules)
+        found = self.requests(self._settings, rules)
         wanted = {each.key for each in found.requests}
+        entries = self._entries()
         changes = [
             FlowChange(kind=ChangeKind.DELETE, key=each.key, what=each.what)
-            for each in self._record().entries
+            for each in entries.values()
             if each.key not in wanted
         ]
         for each in found.requests:
-            kind, detail = self._compare(self._record().entry(each.key), each.body)
+            kind, detail = self._compare(entries.get(each.key), each.body)
             what = describe_rule(each.rule)
             changes.append(FlowChange(kind=kind, key=each.key, what=what, detail=detail))
         return TargetChanges(
@@ -167,7 +150,8 @@ class RemoteTarget:
         Raises:
             PartlyError: for some flows it failed; the others are done.
         """
-        bodies = {each.key: each.body for each in self._asked(rules).requests}
+        found = self.requests(self._settings, rules)
+        bodies = {each.key: each.body for each in found.requests}
         return self._carried_out(self.plan(rules), bodies)
 
     def _carried_out(self, planned: TargetChanges, bodies: Mapping[str, Body]) -> TargetChanges:
@@ -189,14 +173,11 @@ class RemoteTarget:
             )
         return made
 
-    def _asked(self, rules: Sequence[FlowRule]) -> Requests:
-        return self._service.requests(self._settings, rules)
-
     def dry_run(self, rules: Sequence[FlowRule]) -> str:
         """Return the bodies as JSON, one per flow; asks no server."""
         shown = [
             {"key": each.key, "flow": describe_rule(each.rule), "body": each.body}
-            for each in self._asked(rules).requests
+            for each in self.requests(self._settings, rules).requests
         ]
         return json.dumps(shown, indent=2, ensure_ascii=False) + "\n"
 
@@ -206,7 +187,7 @@ class RemoteTarget:
         Raises:
             PartlyError: some could not be deleted; they stay in the ledger.
         """
-        entries = [(each.key, each.what) for each in self._record().entries]
+        entries = [(each.key, each.what) for each in self._entries().values()]
         return self._carried_out(deletions(self.name, entries), {})
 
     def renew(self) -> float | None:
@@ -216,19 +197,19 @@ class RemoteTarget:
             PartlyError: something could not be prolonged and will expire or has expired.
         """
         errors: list[tuple[str, LifecycleError]] = []
-        for entry in self._record().entries:
+        for entry in self._entries().values():
             if not entry.id:
                 continue
             try:
-                made = self._service.prolong(entry, json.loads(entry.body))
+                made = self.prolong(entry, json.loads(entry.body))
             except LifecycleError as error:
                 errors.append((entry.key, error))
             else:
                 if made is not None:
                     self._note(dataclasses.replace(entry, id=made.id, expires_s=made.expires_s))
         if errors:
-            raise PartlyError(self.name, len(self._record().entries), errors)
-        due = [self._service.due_in_s(each) for each in self._record().entries]
+            raise PartlyError(self.name, len(self._entries()), errors)
+        due = [self.due_in_s(each) for each in self._entries().values()]
         return min((each for each in due if each is not None), default=None)
 
     def _compare(self, entry: Entry | None, body: Body) -> tuple[ChangeKind, str]:
@@ -236,13 +217,12 @@ class RemoteTarget:
             return ChangeKind.CREATE, ""
         asked: Body = json.loads(entry.body)
         if not entry.id:
-            found = self._service.find(asked)
+            found = self.find(asked)
             if found is None:
                 return ChangeKind.CREATE, "asked for before, but never made"
-            self._note(dataclasses.replace(entry, id=found.id))
-            entry = self._record().entry(entry.key)
-            assert entry is not None
-        seen = self._service.see(entry.id, asked)
+            entry = dataclasses.replace(entry, id=found.id)
+            self._note(entry)
+        seen = self.see(entry.id, asked)
         if seen is None:
             return ChangeKind.CREATE, "gone from the server"
         if seen.expires_s != entry.expires_s:
@@ -255,13 +235,13 @@ class RemoteTarget:
 
     def _make(self, change: FlowChange, body: Body) -> str:
         """Make one change; returns what is to be reported of it."""
-        entry = self._record().entry(change.key)
+        entry = self._entries().get(change.key)
         if change.kind is ChangeKind.DELETE:
             assert entry is not None
             self._delete(entry)
         elif change.kind is ChangeKind.UPDATE:
             assert entry is not None
-            made = self._service.update(entry.id, json.loads(entry.body), body)
+            made = self.update(entry.id, json.loads(entry.body), body)
             self._note(_entry(change, body, made))
             return made.detail
         elif change.kind is ChangeKind.CREATE:
@@ -271,13 +251,13 @@ class RemoteTarget:
     def _create(self, change: FlowChange, body: Body) -> str:
         self._note(_entry(change, body, None))
         try:
-            made = self._service.create(body)
+            made = self.create(body)
         except HttpError as error:
             if not error.uncertain:
                 self._forget(change.key)
                 raise
             try:
-                found = self._service.find(body)
+                found = self.find(body)
             except HttpError as second:
                 raise error from second
             if found is None:
@@ -290,30 +270,30 @@ class RemoteTarget:
     def _delete(self, entry: Entry) -> None:
         id_ = entry.id
         if not entry.id:
-            found = self._service.find(json.loads(entry.body))
+            found = self.find(json.loads(entry.body))
             id_ = "" if found is None else found.id
         if id_:
-            self._service.delete(id_)
+            self.delete(id_)
         self._forget(entry.key)
 
-    def _record(self) -> TargetRecord:
-        record = self._ledger.record(self._service.kind, self._service.scope)
-        return record or TargetRecord(
-            target=self._service.kind, scope=self._service.scope, settings=self._path
-        )
+    def _entries(self) -> dict[str, Entry]:
+        """What is ours there, by key."""
+        record = self._ledger.record(self.kind, self._api.url)
+        return {} if record is None else {each.key: each for each in record.entries}
 
     def _note(self, entry: Entry) -> None:
-        record = self._record()
-        others = tuple(each for each in record.entries if each.key != entry.key)
-        self._ledger.put(dataclasses.replace(record, settings=self._path, entries=(*others, entry)))
+        self._keep({**self._entries(), entry.key: entry})
 
     def _forget(self, key: str) -> None:
-        record = self._record()
-        left = tuple(each for each in record.entries if each.key != key)
-        if left:
-            self._ledger.put(dataclasses.replace(record, entries=left))
+        self._keep({each: entry for each, entry in self._entries().items() if each != key})
+
+    def _keep(self, entries: Mapping[str, Entry]) -> None:
+        scope, every = self._api.url, tuple(entries.values())
+        if every:
+            record = TargetRecord(target=self.kind, scope=scope, settings=self._path, entries=every)
+            self._ledger.put(record)
         else:
-            self._ledger.drop(record.target, record.scope)
+            self._ledger.drop(self.kind, scope)
 
 
 def _entry(change: FlowChange, body: Body, made: Made | None) -> Entry:
@@ -333,11 +313,11 @@ class ServerOptions(TargetOptions):
         path: of the file.
 
     Attributes:
-        service: asks it.
+        target: what keeps things there.
     """
 
     hint = "give --config FILE"
-    service: ClassVar[type[Service[Any]]]
+    target: ClassVar[type[RemoteTarget[Any]]]
 
     def __init__(self, path: str) -> None:
         self._path = path
@@ -353,9 +333,9 @@ class ServerOptions(TargetOptions):
         return cls(given["config"])
 
     @classmethod
-    def restore(cls, record: TargetRecord, means: Targets) -> RemoteTarget:
+    def restore(cls, record: TargetRecord, means: Targets) -> RemoteTarget[Any]:
         """Return the server of a record, if it is still that of the settings file."""
-        own = load_settings(record.settings, settings_types()).servers.get(cls.kind)
+        own = load_settings(record.settings, settings_types()).get(cls.kind)
         scope = "" if own is None else own.scope
         if scope != record.scope:
             raise SettingsError(
@@ -364,36 +344,36 @@ class ServerOptions(TargetOptions):
             )
         return cls(record.settings).open(means)
 
-    def open(self, means: Targets) -> RemoteTarget:
+    def open(self, means: Targets) -> RemoteTarget[Any]:
         """Return the server."""
-        path, own = self._own()
+        own = self._own()
         api = Api(
             own.scope,
             token=own.token,
             timeout_s=own.timeout_s,
-            ca_file=own.ca_file and str(Path(path).parent / own.ca_file),
+            ca_file=own.ca_file,
             patience=means.patience,
             clock=means.clock,
             deadline=means.deadline,
         )
-        return RemoteTarget(self.service(own, api), own, means.ledger, path)
+        return self.target(own, api, means.ledger, str(Path(self._path).absolute()))
 
     def export(self, rules: RuleSet, system: str) -> str:  # noqa: ARG002 - TargetOptions
         """Return the bodies as JSON: `{"subscriptions": [{key, flow, asks, body}], …}`."""
-        found = self.service.requests(self._own()[1], rules.rules)
-        return document(self.service.collection[1:], found, rules.left_out) + "\n"
+        found = self.target.requests(self._own(), rules.rules)
+        return document(self.target.collection[1:], found, rules.left_out) + "\n"
 
     def token_variables(self) -> frozenset[str]:
         """Return those of every server of the file."""
-        servers = load_settings(self._path, settings_types()).servers.values()
+        servers = load_settings(self._path, settings_types()).values()
         return frozenset(each.token.env for each in servers if each.token and each.token.env)
 
-    def _own(self) -> tuple[str, ServerSettings]:
-        """The absolute path of the file, and what it says of this server."""
-        settings = load_settings(self._path, settings_types())
-        own = settings.servers.get(self.kind)
+    def _own(self) -> ServerSettings:
+        """What the file says of this server."""
+        own = load_settings(self._path, settings_types()).get(self.kind)
         if own is None:
+            path = str(Path(self._path).absolute())
             raise SettingsError(
-                f"cannot program {self.kind}: settings {settings.path!r} have no key {self.kind!r}"
+                f"cannot program {self.kind}: settings {path!r} have no key {self.kind!r}"
             )
-        return settings.path, own
+        return own

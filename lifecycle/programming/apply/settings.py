@@ -32,7 +32,6 @@ from urllib.parse import urlsplit
 import msgspec
 import yaml
 
-from lifecycle import dataclasses
 from lifecycle.network.nfe import is_loopback
 from lifecycle.programming.apply.target import SettingsError
 
@@ -113,7 +112,8 @@ class ServerSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
 
     def __post_init__(self) -> None:
         _check_url(self.url, token=self.token)
-        _check_positive(self.timeout_s, "timeout_s")
+        if not 0 < self.timeout_s < float("inf"):
+            raise ValueError(f"cannot use timeout_s {self.timeout_s:g}; use a number > 0")
         self.check()
 
     def check(self) -> None:
@@ -129,25 +129,17 @@ class ServerSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
         return self.url.rstrip("/")
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Settings:
-    """The whole file.
-
-    Attributes:
-        path: of the file.
-        servers: by the names of their targets; of those that the file has.
-    """
-
-    path: str
-    servers: Mapping[str, ServerSettings]
-
-
-def load_settings(path: str | Path, types: Mapping[str, type[ServerSettings]]) -> Settings:
+def load_settings(
+    path: str | Path, types: Mapping[str, type[ServerSettings]]
+) -> dict[str, ServerSettings]:
     """Read a settings file, YAML or JSON.
 
     Args:
         path: of the file.
         types: of its keys, see registry.settings_types.
+
+    Returns:
+        By the names of their targets, those that the file has.
 
     Raises:
         SettingsError: it cannot be read, or a key or value is not allowed; says which.
@@ -179,19 +171,18 @@ def load_settings(path: str | Path, types: Mapping[str, type[ServerSettings]]) -
             "that is none"
         ) from None
     servers = {name: getattr(found, name) for name in types}
-    return Settings(
-        path=str(file.absolute()),
-        servers={name: _beside(each, file) for name, each in servers.items() if each is not None},
-    )
+    folder = file.absolute().parent
+    return {name: _beside(each, folder) for name, each in servers.items() if each is not None}
 
 
-def _beside(settings: ServerSettings, file: Path) -> ServerSettings:
-    """Make a relative token file one beside the settings file."""
-    token = settings.token
-    if token is None or not token.file:
-        return settings
-    placed = str(file.absolute().parent / token.file)
-    return msgspec.structs.replace(settings, token=Token(file=placed))
+def _beside(settings: ServerSettings, folder: Path) -> ServerSettings:
+    """Make relative files ones beside the settings file."""
+    token, ca_file = settings.token, settings.ca_file
+    if token is not None and token.file:
+        token = Token(file=str(folder / token.file))
+    if ca_file:
+        ca_file = str(folder / ca_file)
+    return msgspec.structs.replace(settings, token=token, ca_file=ca_file)
 
 
 def _readable(error: msgspec.ValidationError) -> str:
@@ -215,8 +206,3 @@ def _check_url(url: str, *, token: Token | None) -> None:
     local = parts.hostname == "localhost" or is_loopback(parts.hostname)
     if token is not None and parts.scheme == "http" and not local:
         raise ValueError(f"cannot send a token to {url!r}: anyone could read it; use https://")
-
-
-def _check_positive(value: float, key: str) -> None:
-    if not 0 < value < float("inf"):
-        raise ValueError(f"cannot use {key} {value:g}; use a number > 0")

@@ -171,7 +171,6 @@ class HttpError(ProgrammingError):
 
     Attributes:
         status: HTTP status; 0 if there was no answer.
-        cause: `cause` of problem+json (TS 29.122) or `code` of CAMARA; empty if none.
         uncertain: the request may have taken effect all the same.
     """
 
@@ -180,13 +179,11 @@ class HttpError(ProgrammingError):
         message: str,
         *,
         status: int = 0,
-        cause: str = "",
         uncertain: bool = False,
         hint: str = "",
     ) -> None:
         super().__init__(message, hint=hint)
         self.status = status
-        self.cause = cause
         self.uncertain = uncertain
 
 

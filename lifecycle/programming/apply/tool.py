@@ -17,7 +17,6 @@ import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Protocol
 
 from lifecycle import dataclasses
 from lifecycle.codec import from_json
@@ -56,19 +55,6 @@ class ToolOutput:
     stderr: str
 
 
-class Tool(Protocol):
-    """Runs one program to its end."""
-
-    def run(self, argv: Sequence[str], *, stdin: str = "") -> ToolOutput:
-        """Run it and return what it left, whatever its exit code.
-
-        Raises:
-            MissingFeatureError: it is not installed.
-            ProgrammingError: it does not end.
-        """
-        ...
-
-
 class HostTool:
     """Programs of this host.
 
@@ -80,7 +66,12 @@ class HostTool:
         self._prefix = tuple(prefix)
 
     def run(self, argv: Sequence[str], *, stdin: str = "") -> ToolOutput:
-        """Run it, see Tool."""
+        """Run a program to its end and return what it left, whatever its exit code.
+
+        Raises:
+            MissingFeatureError: it is not installed.
+            ProgrammingError: it does not end.
+        """
         # Distributions keep these in sbin, which is not on every user's path.
         path = f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"
         try:
@@ -111,7 +102,7 @@ class HostTool:
         return ToolOutput(returncode=done.returncode, stdout=done.stdout, stderr=done.stderr)
 
 
-def demand(tool: Tool, argv: Sequence[str], *, doing: str, stdin: str = "") -> str:
+def demand(tool: HostTool, argv: Sequence[str], *, doing: str, stdin: str = "") -> str:
     """Run a program that has to succeed and return what it printed.
 
     Args:
@@ -141,17 +132,19 @@ class Qdisc:
     root: bool = False
 
 
-def qdiscs_of(text: str, argv: Sequence[str], *, doing: str) -> tuple[Qdisc, ...]:
-    """Return the queueing disciplines that `tc -j qdisc show` printed.
+def qdiscs(tool: HostTool, *options: str, doing: str) -> tuple[Qdisc, ...]:
+    """Return the queueing disciplines that `tc -j qdisc show` lists.
 
     Args:
-        text: what it printed; nothing is an empty list.
-        argv: the command line.
-        doing: what fails if it is no such list, to follow "cannot".
+        tool: runs it.
+        options: which ones, such as `dev eth0`.
+        doing: what fails with it, to follow "cannot".
 
     Raises:
-        ProgrammingError: it is none.
+        ProgrammingError: it failed, or what it prints is no such list.
     """
+    argv = ("tc", "-j", "qdisc", "show", *options)
+    text = demand(tool, argv, doing=doing)
     try:
         return from_json(text.strip() or "[]", tuple[Qdisc, ...])
     except ValueError as error:
@@ -183,13 +176,9 @@ class Deadline:
     """Until when work may go on, and whether it is to end at once; without end until `within`.
 
     Safe to use from any thread: one works, another cancels.
-
-    Args:
-        now_s: monotonic seconds.
     """
 
-    def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:
-        self._now_s = now_s
+    def __init__(self) -> None:
         self._until_s = math.inf
         self._cancelled = False
         self._lock = threading.RLock()  # a signal may cancel whoever holds it
@@ -204,7 +193,7 @@ class Deadline:
         """
         outer_s = self._until_s
         if seconds is not None:
-            self._until_s = min(outer_s, self._now_s() + seconds)
+            self._until_s = min(outer_s, time.monotonic() + seconds)
         try:
             yield
         finally:
@@ -217,7 +206,7 @@ class Deadline:
 
     def left_s(self) -> float:
         """Return the seconds that are left: 0 if none are, infinity if there is no bound."""
-        return 0.0 if self._cancelled else max(0.0, self._until_s - self._now_s())
+        return 0.0 if self._cancelled else max(0.0, self._until_s - time.monotonic())
 
     def cancel(self) -> None:
         """Leave no time, and wake whatever waits; holds until `renew`."""

@@ -17,7 +17,7 @@ from typing import NamedTuple
 from lifecycle import dataclasses
 from lifecycle.network.dscp import code_points, describe, dscp_name
 from lifecycle.network.nfe import InternetProtocol
-from lifecycle.programming.rules.rules import FlowRule, LeftOut, asks, named
+from lifecycle.programming.rules.rules import FlowRule, LeftOut, named, remarks
 
 FAMILY = "inet"
 CHAIN = "post"
@@ -104,12 +104,17 @@ def render_nft(
         f"# Marks the verified flows of system {system}. Check without privilege:",
         "#   unshare -Urn nft -c -f FILE",
         "# Marking alone gives no priority: each hop must also queue by DSCP.",
-        *(f"# {line}" for line in _remarks(every, left_out)),
+        *remarks(every, left_out, why_unmarked),
     ]
     table = render_table(
         table_name(system), managed_comment(system, digest), [(each, marks(each)) for each in every]
     )
     return "\n".join(lines) + "\n" + table
+
+
+def why_unmarked(rule: FlowRule) -> str:
+    """Return why nothing is written into the packets of a rule; empty if something is."""
+    return "" if marks(rule) else "it has no DSCP and no flow label to set"
 
 
 def marks(rule: FlowRule) -> tuple[Action, ...]:
@@ -192,15 +197,6 @@ def render_table_removal(table: str) -> str:
     return f"add table {FAMILY} {table}\ndelete table {FAMILY} {table}\n"
 
 
-def render_nft_removal(system: str) -> str:
-    """Return commands for `nft -f` that remove the system's table, and do so if there is none.
-
-    Raises:
-        ValueError: the system's name is not one that a manifest may have.
-    """
-    return render_table_removal(table_name(system))
-
-
 def nft_keyword(dscp: int) -> str:
     """Return how nft spells a DSCP, as a keyword where nftables 1.0.6 knows one.
 
@@ -209,16 +205,6 @@ def nft_keyword(dscp: int) -> str:
     """
     name = dscp_name(dscp)
     return next((each.nft for each in code_points() if each.name == name), name)
-
-
-def _remarks(rules: Sequence[FlowRule], left_out: Sequence[LeftOut]) -> Iterator[str]:
-    for rule in rules:
-        yield f"{named(rule)}: {rule.describe()}: {asks(rule)}"
-    for each in left_out:
-        yield f"left out: {each}"
-    for rule in rules:
-        if rule.dscp is None and not rule.flow_label:
-            yield f"left out: {named(rule)}: it has no DSCP and no flow label to set"
 
 
 def _groups(actions: Iterable[tuple[FlowRule, Sequence[Action]]]) -> Iterator[_Group]:

@@ -440,6 +440,25 @@ def asks(rule: FlowRule) -> str:
     return ", ".join(found) or "nothing"
 
 
+def remarks(
+    rules: Sequence[FlowRule], left_out: Iterable[LeftOut], why_not: Callable[[FlowRule], str]
+) -> Iterator[str]:
+    """Return comment lines that say what an export has: its rules, and what is left out, and why.
+
+    Args:
+        rules: of verified flows.
+        left_out: flows without a rule.
+        why_not: why a rule is not expressed; empty if it is.
+    """
+    for rule in rules:
+        yield f"# {named(rule)}: {rule.describe()}: {asks(rule)}"
+    for each in left_out:
+        yield f"# left out: {each}"
+    for rule in rules:
+        if why := why_not(rule):
+            yield f"# left out: {named(rule)}: {why}"
+
+
 def rules_digest(rules: Iterable[FlowRule]) -> str:
     """Return sixteen hexadecimal digits that are equal for equal rules in equal order."""
     return hashlib.sha256(to_json(tuple(rules))).hexdigest()[:16]

@@ -30,10 +30,9 @@ from lifecycle.programming.rules.nftables import (
     Action,
     nft_keyword,
     render_table,
-    render_table_removal,
     table_name,
 )
-from lifecycle.programming.rules.rules import FlowRule, LeftOut, asks, named
+from lifecycle.programming.rules.rules import FlowRule, LeftOut, remarks
 
 DEFAULT_MINOR = 0xFFF
 """Minor number of the class that everything else goes to."""
@@ -232,21 +231,13 @@ class Queues:
     """What makes a device queue by class.
 
     Attributes:
-        classes: for `tc -batch`; below the qdisc, which is added first.
-        table: for `nft -f`.
-        digest: of the rules and classes: what the table's comment says.
+        batch: the lines for `tc -batch` where nothing of ours is there.
+        table: for `nft -f`; its comment has the digest of the classes.
     """
 
-    qdisc: str
-    classes: tuple[str, ...]
+    batch: str
     table: str
-    digest: str
     classes_digest: str
-
-    @property
-    def batch(self) -> str:
-        """The lines for `tc -batch` where nothing of ours is there."""
-        return "\n".join((self.qdisc, *self.classes)) + "\n"
 
 
 def tc_table_name(system: str, device: str) -> str:
@@ -290,14 +281,12 @@ def queues(rules: Iterable[FlowRule], settings: TcSettings, *, system: str) -> Q
 
     of_classes = _digest(*classes)
     digest = _digest(of_classes, table(""))
+    qdisc = (
+        f"qdisc add dev {settings.device} root handle {OWNED_HANDLE} htb default {DEFAULT_MINOR:#x}"
+    )
     return Queues(
-        qdisc=(
-            f"qdisc add dev {settings.device} root handle {OWNED_HANDLE} "
-            f"htb default {DEFAULT_MINOR:#x}"
-        ),
-        classes=classes,
+        batch="\n".join((qdisc, *classes)) + "\n",
         table=table(f"managed-by=lifecycle digest={digest} classes={of_classes}"),
-        digest=digest,
         classes_digest=of_classes,
     )
 
@@ -324,13 +313,7 @@ def render_tc(
     made = queues(every, settings, system=system)
     lines = [
         f"# Queues the verified flows of system {system} on {settings.device}: sh FILE",
-        *(f"# {named(each)}: {each.describe()}: {asks(each)}" for each in every),
-        *(f"# left out: {each}" for each in left_out),
-        *(
-            f"# left out: {named(each)}: {why}"
-            for each in every
-            if (why := why_not(each, settings))
-        ),
+        *remarks(every, left_out, lambda rule: why_not(rule, settings)),
         "set -e",
         "tc -batch - <<'END'",
         made.batch + "END",
@@ -346,11 +329,6 @@ def render_tc_removal(device: str) -> str:
     It fails, and removes nothing, if the device's root qdisc is not ours.
     """
     return f"qdisc del dev {device} root handle {OWNED_HANDLE}\n"
-
-
-def render_tc_table_removal(system: str, device: str) -> str:
-    """Return commands for `nft -f` that remove the device's table, and do so if there is none."""
-    return render_table_removal(tc_table_name(system, device))
 
 
 def why_not(rule: FlowRule, settings: TcSettings) -> str:

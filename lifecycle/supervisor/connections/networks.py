@@ -274,12 +274,11 @@ def open_networks(
         owned=True,
         treatment=options.treatment,
     )
-    swept = sweep_orphans(path.parent, own=path.name, within_s=_SWEEP_S)
-    for each in swept.removed:
-        if each.changes:
-            emit(Notice(message=f"left by a killed supervisor: {each.render(done=True)}"))
-    for error in swept.errors:
-        emit(Notice(message=str(error)))
+
+    def report(text: str) -> None:
+        emit(Notice(message=text))
+
+    sweep_orphans(path.parent, report, own=path.name, within_s=_SWEEP_S)
     return Networks(plan.system, path, emit, programmer)
 
 
@@ -295,7 +294,7 @@ def remove_programmed(directory: Path, within_s: float | None = None) -> tuple[s
     """
     if not (directory / LEDGER_NAME).is_file():
         return ()
-    from lifecycle.programming.apply.programmer import remove_run
+    from lifecycle.programming.apply.programmer import Removal
 
-    done = remove_run(directory, within_s=within_s)
+    done = Removal(directory).close(within_s=within_s)
     return tuple(each.render(done=True) for each in done if each.changes)

@@ -9,12 +9,13 @@ from __future__ import annotations
 import datetime as dt
 import re
 from collections.abc import Sequence
+from typing import Annotated
 
 import msgspec
 
 from lifecycle.programming.apply.http import Api, Fields, show, text_of
-from lifecycle.programming.apply.ledger import Entry
-from lifecycle.programming.apply.remote import Made, ServerOptions, Service
+from lifecycle.programming.apply.ledger import Entry, Ledger
+from lifecycle.programming.apply.remote import Made, RemoteTarget, ServerOptions
 from lifecycle.programming.apply.settings import ServerSettings
 from lifecycle.programming.apply.target import HttpError
 from lifecycle.programming.rules.mobile import (
@@ -41,6 +42,8 @@ _POLL_S = 0.25
 
 _STATUSES = ("REQUESTED", "AVAILABLE", "UNAVAILABLE")
 """QosStatus of QualityOnDemand 1.1.0."""
+
+_Moment = Annotated[dt.datetime, msgspec.Meta(tz=True)]
 
 _LONGEST_S = 2**31 - 1
 """Largest `duration`, an int32."""
@@ -114,14 +117,14 @@ def session(rule: FlowRule, end: DeviceEnd, settings: CamaraSettings) -> Body:
     }
 
 
-class CamaraService(Service[CamaraSettings]):
+class CamaraTarget(RemoteTarget[CamaraSettings]):
     """One QualityOnDemand interface."""
 
     kind = KIND
     collection = "/sessions"
 
-    def __init__(self, settings: CamaraSettings, api: Api) -> None:
-        super().__init__(settings, api)
+    def __init__(self, settings: CamaraSettings, api: Api, ledger: Ledger, path: str) -> None:
+        super().__init__(settings, api, ledger, path)
         self._expires: dict[str, tuple[float, float]] = {}
         """By key, when a session expires: since the epoch, and on the clock that goes forward."""
 
@@ -178,7 +181,7 @@ class CamaraService(Service[CamaraSettings]):
         reply = self._api.request("GET", self.path(id_), may_be_gone=True)
         return None if reply.gone else self._made(id_, reply.object(), body)
 
-    def update(self, id_: str, before: Body, body: Body) -> Made:  # noqa: ARG002 - Service
+    def update(self, id_: str, before: Body, body: Body) -> Made:  # noqa: ARG002 - RemoteTarget
         """Delete and create: a session cannot be changed, and two for one flow are a conflict."""
         self.delete(id_)
         return self.create(body)
@@ -252,10 +255,10 @@ class CamaraService(Service[CamaraSettings]):
         """When a session ends, seconds since the epoch; the latest it can, if nothing says when."""
         text = session.text("expiresAt")
         if text:
-            when = _parse_time(text)
-            if when is None:
+            try:
+                return msgspec.convert(text, _Moment).timestamp()
+            except msgspec.ValidationError:
                 session.refuse("expiresAt", "a date and time with a time zone (RFC 3339)", text)
-            return when
         return None if granted_s is None else self._api.clock.now_s() + granted_s
 
 
@@ -276,28 +279,12 @@ def _differs(asked: Body, seen: Fields, *, missing: bool = False) -> str:
     return ""
 
 
-def _parse_time(text: str) -> float | None:
-    """RFC 3339 as seconds since the epoch; None if it is not, or has no time zone."""
-    try:
-        # Python 3.10 reads neither Z nor fractions of other than 3 or 6 digits.
-        when = dt.datetime.fromisoformat(_plain_fraction(text.upper().replace("Z", "+00:00")))
-        return None if when.tzinfo is None else when.timestamp()
-    except (ValueError, OverflowError):
-        return None
-
-
-def _plain_fraction(text: str) -> str:
-    head, dot, rest = text.partition(".")
-    digits = len(rest) - len(rest.lstrip("0123456789"))
-    return f"{head}.{rest[:digits][:6]:0<6}{rest[digits:]}" if dot else text
-
-
 class CamaraOptions(ServerOptions):
     """A QualityOnDemand interface."""
 
     kind = KIND
     settings_type = CamaraSettings
-    service = CamaraService
+    target = CamaraTarget
 
 
 TARGET = CamaraOptions

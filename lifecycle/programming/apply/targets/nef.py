@@ -17,7 +17,7 @@ from typing import Any
 import msgspec
 
 from lifecycle.programming.apply.http import MERGE_PATCH, Fields, as_segment, show, text_of
-from lifecycle.programming.apply.remote import Made, ServerOptions, Service
+from lifecycle.programming.apply.remote import Made, RemoteTarget, ServerOptions
 from lifecycle.programming.apply.settings import ServerSettings
 from lifecycle.programming.apply.target import HttpError
 from lifecycle.programming.rules.mobile import (
@@ -127,7 +127,7 @@ def _filter(rule: FlowRule, end: DeviceEnd, settings: NefSettings) -> str:
     return f"permit {direction} {protocol} from {source} to {destination}"
 
 
-class NefService(Service[NefSettings]):
+class NefTarget(RemoteTarget[NefSettings]):
     """One NEF."""
 
     kind = KIND
@@ -260,7 +260,7 @@ class NefOptions(ServerOptions):
 
     kind = KIND
     settings_type = NefSettings
-    service = NefService
+    target = NefTarget
 
 
 TARGET = NefOptions

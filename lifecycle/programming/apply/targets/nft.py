@@ -6,7 +6,7 @@ Owns: when the table is written, and whose it is. Its contents are `rules.nftabl
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from lifecycle import dataclasses
@@ -23,14 +23,15 @@ from lifecycle.programming.apply.target import (
     describe_rule,
 )
 from lifecycle.programming.apply.targets.registry import TargetOptions, Targets
-from lifecycle.programming.apply.tool import HostTool, Tool, demand, failure, qdiscs_of
+from lifecycle.programming.apply.tool import HostTool, demand, failure, qdiscs
 from lifecycle.programming.rules.nftables import (
     FAMILY,
     element,
     parse_managed_comment,
     render_nft,
-    render_nft_removal,
+    render_table_removal,
     table_name,
+    why_unmarked,
 )
 from lifecycle.programming.rules.rules import FlowRule, RuleSet, named, rules_digest
 
@@ -56,7 +57,7 @@ class NftTable:
         tool: runs nft.
     """
 
-    def __init__(self, name: str, tool: Tool) -> None:
+    def __init__(self, name: str, tool: HostTool) -> None:
         self._name = name
         self._tool = tool
 
@@ -86,6 +87,10 @@ class NftTable:
     def write(self, text: str) -> None:
         """Replace it: nft takes a ruleset whole or not at all."""
         demand(self._tool, ["nft", "-f", "-"], doing=f"write {self}", stdin=text)
+
+    def remove(self) -> None:
+        """Remove it."""
+        self.write(render_table_removal(self._name))
 
 
 def compare(
@@ -148,7 +153,7 @@ class NftTarget:
         tool: runs nft.
     """
 
-    def __init__(self, system: str, ledger: Ledger, tool: Tool | None = None) -> None:
+    def __init__(self, system: str, ledger: Ledger, tool: HostTool | None = None) -> None:
         self._system = system
         self._scope = table_name(system)
         self._ledger = ledger
@@ -167,7 +172,7 @@ class NftTarget:
             NotOursError: a table of this name is not ours.
             PrivilegeError: reading needs the same privilege as writing.
         """
-        marking, left_out = _marking(rules)
+        marking, left_out = usable(rules, why_unmarked)
         listing = self._table.listing()
         detail = ""
         if not listing and self._ledger.record(KIND, self._scope) is not None:
@@ -181,7 +186,7 @@ class NftTarget:
 
     def apply(self, rules: Sequence[FlowRule]) -> TargetChanges:
         """Replace the table if anything differs."""
-        marking, left_out = _marking(rules)
+        marking, left_out = usable(rules, why_unmarked)
         if not marking:
             return dataclasses.replace(self.remove(), left_out=left_out)
         planned = self.plan(rules)
@@ -207,7 +212,7 @@ class NftTarget:
         Raises:
             ProgrammingError: nft refuses the ruleset.
         """
-        text = self._text(_marking(rules)[0])
+        text = self._text(usable(rules, why_unmarked)[0])
         check = ["nft", "-c", "-f", "-"]
         output = self._tool.run(check, stdin=text)
         if output.returncode == 0:
@@ -230,7 +235,7 @@ class NftTarget:
         listing = self._table.listing()
         names = list(dict.fromkeys(comment for *_, comment in _elements(listing)))
         if listing:
-            self._table.write(render_nft_removal(self._system))
+            self._table.remove()
         self._ledger.drop(KIND, self._scope)
         return deletions(self.name, [(each, "") for each in names])
 
@@ -252,15 +257,11 @@ class NftTarget:
         )
 
 
-def root_qdiscs(tool: Tool) -> tuple[tuple[str, str], ...]:
+def root_qdiscs(tool: HostTool) -> tuple[tuple[str, str], ...]:
     """Return (device, kind) of every root queueing discipline; empty where tc fails."""
-    argv = ["tc", "-j", "qdisc", "show"]
     try:
-        output = tool.run(argv)
-        found = qdiscs_of(output.stdout, argv, doing="list queueing disciplines")
+        found = qdiscs(tool, doing="list queueing disciplines")
     except ProgrammingError:
-        return ()
-    if output.returncode != 0:
         return ()
     return tuple((each.dev, each.kind) for each in found if each.root)
 
@@ -271,15 +272,15 @@ def _effect(kind: str) -> str:
     return "does not look at DSCP"
 
 
-def _marking(rules: Sequence[FlowRule]) -> tuple[tuple[FlowRule, ...], tuple[str, ...]]:
-    """The rules that set something in packets, and why the others do not."""
-    marking = tuple(each for each in rules if each.dscp is not None or each.flow_label)
-    left_out = tuple(
-        f"{each.key}: it has no DSCP and no flow label to set"
-        for each in rules
-        if each not in marking
+def usable(
+    rules: Iterable[FlowRule], why_not: Callable[[FlowRule], str]
+) -> tuple[tuple[FlowRule, ...], tuple[str, ...]]:
+    """Return the rules that `why_not` has no reason against, and the others with their reasons."""
+    reasons = [(each, why_not(each)) for each in rules]
+    return (
+        tuple(each for each, why in reasons if not why),
+        tuple(f"{each.key}: {why}" for each, why in reasons if why),
     )
-    return marking, left_out
 
 
 class NftOptions(TargetOptions):
@@ -300,7 +301,7 @@ class NftOptions(TargetOptions):
     def open(self, means: Targets) -> NftTarget:
         """Return the table of the ledger's system."""
         try:
-            return NftTarget(means.ledger.system, means.ledger, means.tool)
+            return NftTarget(means.ledger.system, means.ledger)
         except ValueError as error:
             raise UsageError(str(error)) from error
 

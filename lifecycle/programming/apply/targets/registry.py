@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from lifecycle.programming.apply.ledger import Ledger, TargetRecord
     from lifecycle.programming.apply.settings import ServerSettings
     from lifecycle.programming.apply.target import Target
-    from lifecycle.programming.apply.tool import Tool
     from lifecycle.programming.rules.rules import RuleSet
 
 TARGETS = ("nft", "tc", "nef", "camara")
@@ -85,7 +84,6 @@ class Targets:
 
     Args:
         ledger: of the system.
-        tool: runs nft and tc; None for this host.
         patience: with servers.
         clock: for servers.
 
@@ -97,14 +95,12 @@ class Targets:
         self,
         ledger: Ledger,
         *,
-        tool: Tool | None = None,
         patience: Patience | None = None,
         clock: Clock | None = None,
     ) -> None:
         from lifecycle.programming.apply.tool import Deadline
 
         self.ledger = ledger
-        self.tool = tool
         self.patience = patience
         self.clock = clock
         self.deadline = Deadline()

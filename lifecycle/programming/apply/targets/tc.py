@@ -22,9 +22,9 @@ from lifecycle.programming.apply.target import (
     TargetChanges,
     deletions,
 )
-from lifecycle.programming.apply.targets.nft import NftTable, compare
+from lifecycle.programming.apply.targets.nft import NftTable, compare, usable
 from lifecycle.programming.apply.targets.registry import TargetOptions, Targets
-from lifecycle.programming.apply.tool import HostTool, Tool, demand, failure, qdiscs_of
+from lifecycle.programming.apply.tool import HostTool, demand, qdiscs
 from lifecycle.programming.rules.rules import FlowRule, RuleSet
 from lifecycle.programming.rules.tc import (
     OWNED_HANDLE,
@@ -35,7 +35,6 @@ from lifecycle.programming.rules.tc import (
     queues,
     render_tc,
     render_tc_removal,
-    render_tc_table_removal,
     tc_table_name,
     why_not,
 )
@@ -87,7 +86,7 @@ class TcTarget:
     """
 
     def __init__(
-        self, system: str, settings: TcSettings, ledger: Ledger, tool: Tool | None = None
+        self, system: str, settings: TcSettings, ledger: Ledger, tool: HostTool | None = None
     ) -> None:
         self._system = system
         self._settings = settings
@@ -118,7 +117,8 @@ class TcTarget:
         if not planned.pending and recorded:
             return planned
         # Written first: a crash in between leaves nothing unknown.
-        self._ledger.put(TargetRecord(target=KIND, scope=self._settings.device))
+        device = self._settings.device
+        self._ledger.put(TargetRecord(target=KIND, scope=device))
         try:
             if classes_digest_of(listing) != wanted.classes_digest:
                 if listing or recorded:
@@ -126,7 +126,15 @@ class TcTarget:
                 self._batch(wanted.batch)
             self._table.write(wanted.table)
         except ProgrammingError as error:
-            raise self._taken_back(error, had=bool(listing) or recorded) from error
+            # `tc -batch` is not atomic: it stops at a line, and what came before stays.
+            try:
+                if listing or recorded or self._is_ours(self._root()):
+                    self._clear()
+            except ProgrammingError as left:
+                message = f"{error.message}; the qdisc {OWNED_HANDLE} on {device} is left: {left}"
+                raise type(error)(message, hint=error.hint) from error
+            self._ledger.drop(KIND, device)
+            raise
         return planned
 
     def dry_run(self, rules: Sequence[FlowRule]) -> str:
@@ -175,43 +183,19 @@ class TcTarget:
             listing,
         )
 
-    def _taken_back(self, error: ProgrammingError, *, had: bool) -> ProgrammingError:
-        """Remove what a batch began, and return the error that says what is left.
-
-        `tc -batch` is not atomic: it stops at the line that fails, and what came before stays.
-
-        Args:
-            error: why it stopped.
-            had: something of ours was there before.
-        """
-        device = self._settings.device
-        try:
-            if had or self._is_ours(self._root()):
-                self._clear()
-        except ProgrammingError as left:
-            message = f"{error.message}; the qdisc {OWNED_HANDLE} on {device} is left: {left}"
-            return type(error)(message, hint=error.hint)
-        self._ledger.drop(KIND, device)
-        return error
-
     def _clear(self) -> None:
         """Delete our qdisc and our table, where they are."""
-        device = self._settings.device
         if self._is_ours(self._root()):
-            self._batch(render_tc_removal(device))
+            self._batch(render_tc_removal(self._settings.device))
         if self._table.listing():
-            self._table.write(render_tc_table_removal(self._system, device))
+            self._table.remove()
 
     @staticmethod
     def _is_ours(root: tuple[str, str] | None) -> bool:
         return root is not None and root[1] == OWNED_HANDLE
 
     def _classed(self, rules: Sequence[FlowRule]) -> tuple[tuple[FlowRule, ...], tuple[str, ...]]:
-        reasons = {each.key: why_not(each, self._settings) for each in rules}
-        return (
-            tuple(each for each in rules if not reasons[each.key]),
-            tuple(f"{key}: {why}" for key, why in reasons.items() if why),
-        )
+        return usable(rules, lambda rule: why_not(rule, self._settings))
 
     def _recorded(self) -> bool:
         return self._ledger.record(KIND, self._settings.device) is not None
@@ -219,13 +203,12 @@ class TcTarget:
     def _root(self) -> tuple[str, str] | None:
         """(kind, handle) of the device's root qdisc; None if there is no such device."""
         device = self._settings.device
-        argv = ["tc", "-j", "qdisc", "show", "dev", device]
-        output = self._tool.run(argv)
-        if output.returncode != 0:
-            if _NO_DEVICE.search(output.stderr):
+        try:
+            listed = qdiscs(self._tool, "dev", device, doing=f"read {self.name}")
+        except ProgrammingError as error:
+            if _NO_DEVICE.search(error.message):
                 return None
-            raise failure(output, argv, doing=f"read {self.name}")
-        listed = qdiscs_of(output.stdout, argv, doing=f"read {self.name}")
+            raise
         found = next((each for each in listed if each.root), None)
         return (found.kind, found.handle) if found else ("noqueue", "0:")
 
@@ -307,7 +290,7 @@ class TcOptions(TargetOptions):
 
     def open(self, means: Targets) -> TcTarget:
         """Return the device."""
-        return TcTarget(means.ledger.system, self.settings, means.ledger, means.tool)
+        return TcTarget(means.ledger.system, self.settings, means.ledger)
 
     def export(self, rules: RuleSet, system: str) -> str:
         """Return the lines for tc and nft."""

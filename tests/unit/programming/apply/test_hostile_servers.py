@@ -396,7 +396,7 @@ def _programmer(path: Path, server: HostileServer, patience: Patience) -> Progra
     settings = nef_settings(server.url, devices=["10.77.0.1"], timeout_s=60)
     file = settings_file(path, nef=settings)
     target = target_kind("nef").read({"config": file}).open(targets)
-    return Programmer(plan(), [target], ledger, made_by=targets)
+    return Programmer(plan(), [target], targets)
 
 
 _VERDICT = Verdict(verdict=Outcome.OK, blocking=False, findings=(), flows=(report(),))

@@ -19,9 +19,9 @@ from lifecycle.programming.apply.ledger import (
 )
 from lifecycle.programming.apply.programmer import (
     Programmer,
+    Removal,
     RouteSources,
     Targets,
-    remove_run,
     route_source,
     sweep_orphans,
 )
@@ -40,12 +40,12 @@ from tests.unit.programming.apply.samples import (
     rule,
     settings_file,
 )
-from tests.unit.programming.apply.servers import NefServer
+from tests.unit.programming.apply.servers import Answer, NefServer
 from tests.unit.programming.rules.samples import nfe, plan, report
 
 
 def programmer(tmp_path: Path, *targets: FakeTarget) -> Programmer:
-    return Programmer(plan(), targets, ledger_in(tmp_path))
+    return Programmer(plan(), targets, Targets(ledger_in(tmp_path)))
 
 
 def test_flows_are_programmed_once_and_again_only_when_they_change(tmp_path: Path) -> None:
@@ -147,6 +147,22 @@ def test_what_no_target_took_is_not_held(tmp_path: Path) -> None:
     target.fails = ""
     programs.update([report(outcome=Outcome.VIOLATED)], hold=True)
     assert target.rules == ()
+
+
+def test_what_a_server_took_a_part_of_is_held(tmp_path: Path) -> None:
+    targets = Targets(ledger_in(tmp_path))
+    with NefServer() as server:
+        settings = nef_settings(server.url, devices=["source", "destination"])
+        options = target_kind("nef").read({"config": settings_file(tmp_path, nef=settings)})
+        programs = Programmer(plan(), [options.open(targets)], targets)
+        server.failures.append(("POST", Answer(status=400)))
+        with pytest.raises(PartlyError):
+            programs.update([report()], hold=True)
+        assert len(server.subscriptions) == 1
+
+        programs.update([report(outcome=Outcome.VIOLATED, source=())], hold=True)
+
+        assert len(server.subscriptions) == 2
 
 
 def test_without_hold_an_unverified_flow_loses_its_rule(tmp_path: Path) -> None:
@@ -301,12 +317,16 @@ def test_what_a_dead_run_left_at_a_server_is_swept_by_the_next(tmp_path: Path) -
     with NefServer() as server:
         directory = orphan(tmp_path, server, dead=True)
 
-        swept = sweep_orphans(directory.parent)
+        reports: list[str] = []
 
-        assert [each.render(done=True).partition("\n")[0] for each in swept.removed] == [
-            f"nef at {server.url}/3gpp-as-session-with-qos/v1/robots: 1 deleted, 0 unchanged"
+        sweep_orphans(directory.parent, reports.append)
+
+        assert [each.partition("\n")[0] for each in reports] == [
+            (
+                f"left by a killed supervisor: nef at {server.url}/3gpp-as-session-with-qos/v1/"
+                "robots: 1 deleted, 0 unchanged"
+            )
         ]
-        assert swept.errors == ()
         assert server.subscriptions == {}
         assert not (directory / "programmed.json").exists()
 
@@ -317,9 +337,9 @@ def test_what_somebody_applied_by_hand_is_not_swept_but_goes_down_with_the_syste
     with NefServer() as server:
         directory = orphan(tmp_path, server, dead=False)
 
-        assert sweep_orphans(directory.parent).removed == ()
+        sweep_orphans(directory.parent, pytest.fail)
         assert len(server.subscriptions) == 1
-        remove_run(directory)
+        Removal(directory).close()
         assert server.subscriptions == {}
 
 
@@ -330,7 +350,9 @@ def test_an_orphan_that_cannot_be_removed_is_told_and_stays_listed(
         directory = orphan(tmp_path, server, dead=True)
         monkeypatch.delenv("TEST_TOKEN")
 
-        swept = sweep_orphans(directory.parent)
+        reports: list[str] = []
 
-        assert "environment variable TEST_TOKEN: it is empty or not set" in str(swept.errors[0])
+        sweep_orphans(directory.parent, reports.append)
+
+        assert "environment variable TEST_TOKEN: it is empty or not set" in reports[0]
         assert (directory / "programmed.json").exists()

@@ -39,9 +39,9 @@ nef:
 def test_yaml_and_json_are_read_alike(tmp_path: Path) -> None:
     file = tmp_path / "targets.yaml"
     file.write_text(NEF_YAML)
-    of_yaml = load_settings(file, settings_types()).servers["nef"]
+    of_yaml = load_settings(file, settings_types())["nef"]
     same = nef_settings("https://nef.example.net", token={"file": "token.txt"})
-    of_json = load_settings(settings_file(tmp_path, nef=same), settings_types()).servers["nef"]
+    of_json = load_settings(settings_file(tmp_path, nef=same), settings_types())["nef"]
 
     assert of_yaml == of_json
     assert isinstance(of_yaml, NefSettings)
@@ -210,5 +210,5 @@ def test_the_settings_in_the_documentation_can_be_used(tmp_path: Path) -> None:
 
     settings = load_settings(file, settings_types())
 
-    assert set(settings.servers) == {"nef", "camara"}
-    assert settings.servers["camara"].token == Token(file=str(tmp_path / "camara.token"))
+    assert set(settings) == {"nef", "camara"}
+    assert settings["camara"].token == Token(file=str(tmp_path / "camara.token"))

@@ -14,8 +14,8 @@ from openapi_core import OpenAPI
 from openapi_core.testing import MockRequest
 from openapi_core.validation.request.exceptions import InvalidRequestBody
 
-from lifecycle.programming.apply.targets.camara import CamaraService, CamaraSettings
-from lifecycle.programming.apply.targets.nef import NefService, NefSettings, UplinkFilter
+from lifecycle.programming.apply.targets.camara import CamaraSettings, CamaraTarget
+from lifecycle.programming.apply.targets.nef import NefSettings, NefTarget, UplinkFilter
 from lifecycle.programming.rules.mobile import Requests, document
 from tests.unit.programming.rules.samples import EXPECTED, LEFT_OUT, RULES, VIDEO, rule
 
@@ -45,11 +45,11 @@ def camara(**rest: object) -> CamaraSettings:
 
 
 def nef_subscriptions(rules: object, settings: NefSettings) -> Requests:
-    return NefService.requests(settings, rules)
+    return NefTarget.requests(settings, rules)
 
 
 def camara_sessions(rules: object, settings: CamaraSettings) -> Requests:
-    return CamaraService.requests(settings, rules)
+    return CamaraTarget.requests(settings, rules)
 
 
 def cannot(message: str) -> object:

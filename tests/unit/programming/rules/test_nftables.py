@@ -15,7 +15,7 @@ from lifecycle.programming.rules.nftables import (
     nft_keyword,
     parse_managed_comment,
     render_nft,
-    render_nft_removal,
+    render_table_removal,
     table_name,
 )
 from tests.unit.programming.rules.samples import (
@@ -65,7 +65,7 @@ def test_applied_twice_there_is_one_table_and_removed_twice_there_is_none(
 ) -> None:
     ours, gone = tmp_path / "ours", tmp_path / "gone"
     ours.write_text(ruleset(), encoding="utf-8")
-    gone.write_text(render_nft_removal("teleop"), encoding="utf-8")
+    gone.write_text(render_table_removal(table_name("teleop")), encoding="utf-8")
     script = f"""set -e
 nft add table inet someone_else
 nft -f {ours}; nft list ruleset > {tmp_path}/once
@@ -80,7 +80,7 @@ nft -f {gone}; nft -f {gone}; nft list ruleset"""
 
 
 def test_a_removal_names_our_table_only() -> None:
-    assert render_nft_removal("teleop") == (
+    assert render_table_removal(table_name("teleop")) == (
         "add table inet flowqos_teleop\ndelete table inet flowqos_teleop\n"
     )
 
