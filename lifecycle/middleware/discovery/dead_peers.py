@@ -24,7 +24,6 @@ from __future__ import annotations
 
 import contextlib
 import ipaddress
-import os
 import socket
 import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -32,7 +31,7 @@ from pathlib import Path
 
 from lifecycle.middleware.discovery.messages import disposal
 from lifecycle.middleware.discovery.probe import ProbeTarget, probe_targets, send
-from lifecycle.middleware.fastdds.dscp import own_udp_socket, socket_descriptors
+from lifecycle.middleware.fastdds.dscp import own_udp_socket, sockets_here
 from lifecycle.middleware.fastdds.url_check import sockets_of
 from lifecycle.network.connection_url import ConnectionUrl
 from lifecycle.network.medium import UDP_UNICAST, Medium
@@ -60,9 +59,8 @@ def give_up_dead_connections() -> int:
     For a process that is about to end: an accepted connection that is shut down is not made again.
     """
     count = 0
-    for number in socket_descriptors():
-        # Closed since, or no socket any more.
-        with contextlib.suppress(OSError), socket.socket(fileno=os.dup(number)) as each:
+    for each in sockets_here():
+        with contextlib.suppress(OSError):  # closed since
             if each.type == socket.SOCK_STREAM and _is_dead(each):
                 each.shutdown(socket.SHUT_RDWR)
                 count += 1
@@ -79,11 +77,10 @@ def is_used(address: str, port: int) -> bool | None:
     Returns:
         None while that is open: there is no connection yet, or it has only just begun.
     """
-    for number in socket_descriptors():
-        # Closed since, no socket any more, or not connected yet.
-        with contextlib.suppress(OSError), socket.socket(fileno=os.dup(number)) as each:
-            if (each.family, each.type) != (socket.AF_INET, socket.SOCK_STREAM):
-                continue
+    for each in sockets_here():
+        if (each.family, each.type) != (socket.AF_INET, socket.SOCK_STREAM):
+            continue
+        with contextlib.suppress(OSError):  # not connected yet
             if each.getpeername() == (address, port):
                 return _is_used(each.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 256))
     return None

@@ -38,7 +38,7 @@ from lifecycle.middleware.discovery.probe import (
     sender_by,
     well_known_targets,
 )
-from lifecycle.middleware.fastdds.dscp import socket_descriptors
+from lifecycle.middleware.fastdds.dscp import sockets_here
 from lifecycle.middleware.fastdds.url_profile import (
     DISCOVERY_GROUP,
     UrlTransport,
@@ -210,9 +210,8 @@ def send_again_soon() -> int:
         How many sockets heed it: 0 before Linux 6.15, which has no such option.
     """
     count = 0
-    for number in socket_descriptors():
-        # Closed since, or no socket any more, or a kernel without the option.
-        with contextlib.suppress(OSError), socket.socket(fileno=os.dup(number)) as each:
+    for each in sockets_here():
+        with contextlib.suppress(OSError):  # closed since, or a kernel without the option
             if each.type == socket.SOCK_STREAM and each.family in {socket.AF_INET, socket.AF_INET6}:
                 each.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _GIVES_UP_S * 1000)
                 each.setsockopt(socket.IPPROTO_TCP, _TCP_RTO_MAX_MS, int(AT_MOST_S * 1000))

@@ -16,7 +16,6 @@ new peer changes them). TCP connections are opened later, are in no NFE list, an
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import ipaddress
 import os
 import socket
@@ -29,17 +28,6 @@ from lifecycle.network.ports import DG, participant_ports
 
 _FAMILY = {InternetProtocol.IPV4: socket.AF_INET, InternetProtocol.IPV6: socket.AF_INET6}
 _TYPE = {TransportProtocol.UDP: socket.SOCK_DGRAM, TransportProtocol.TCP: socket.SOCK_STREAM}
-
-
-def never_wait(nfes: Sequence[NetworkFlowEndpoint]) -> bool:
-    """Return whether every socket that `nfes` names is non-blocking (O_NONBLOCK, open(2)).
-
-    Raises:
-        MiddlewareError: no socket found.
-    """
-    with own_sockets(nfes) as sockets:
-        flags = [fcntl.fcntl(each.fileno(), fcntl.F_GETFL) for each in sockets]
-    return all(flag & os.O_NONBLOCK for flag in flags)
 
 
 @contextlib.contextmanager
@@ -60,19 +48,12 @@ def own_sockets(nfes: Sequence[NetworkFlowEndpoint]) -> Iterator[list[socket.soc
         if nfe.internet_protocol in _FAMILY and nfe.transport_protocol in _TYPE
     }
     with contextlib.ExitStack() as stack:
-        found = []
-        for number in socket_descriptors():
-            try:
-                duplicate = os.dup(number)
-            except OSError:  # another thread has closed it since
-                continue
-            try:
-                each = stack.enter_context(socket.socket(fileno=duplicate))
-            except OSError:  # the number is no socket any more
-                os.close(duplicate)
-                continue
-            if each.family in _FAMILY.values() and _key(each) in wanted:
-                found.append(each)
+        found = [
+            # Not by its own dup(), which would make the original wait where it must not.
+            stack.enter_context(socket.socket(fileno=os.dup(each.fileno())))
+            for each in sockets_here()
+            if each.family in _FAMILY.values() and _key(each) in wanted
+        ]
         if not found:
             listed = ", ".join(f"{nfe.internet_address}:{nfe.transport_port}" for nfe in nfes)
             raise MiddlewareError(
@@ -101,7 +82,16 @@ def own_udp_ports() -> frozenset[int]:
 
 
 def _own_udp_sockets() -> Iterator[socket.socket]:
-    """Yield duplicates of this process's UDP sockets; each is closed when the next is asked for."""
+    for each in sockets_here():
+        if each.type == socket.SOCK_DGRAM and each.family in _FAMILY.values():
+            yield each
+
+
+def sockets_here() -> Iterator[socket.socket]:
+    """Yield duplicates of this process's sockets; each is closed when the next is asked for.
+
+    What is set on a duplicate is set on the original.
+    """
     for number in socket_descriptors():
         with contextlib.suppress(OSError):  # closed since, or no socket any more
             duplicate = os.dup(number)
@@ -111,8 +101,7 @@ def _own_udp_sockets() -> Iterator[socket.socket]:
                 os.close(duplicate)
                 continue
             with each:
-                if each.type == socket.SOCK_DGRAM and each.family in _FAMILY.values():
-                    yield each
+                yield each
 
 
 def socket_descriptors() -> list[int]:

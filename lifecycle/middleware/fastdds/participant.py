@@ -31,7 +31,6 @@ from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.fastdds import dscp as marks
 from lifecycle.middleware.fastdds import nfe
-from lifecycle.middleware.fastdds.dscp import never_wait
 from lifecycle.middleware.fastdds.nfe import (
     has_shared_memory,
     senders_of,
@@ -190,14 +189,6 @@ class FlowParticipant:
         except BaseException:
             self.destroy()
             raise
-
-    @property
-    def network_flow_endpoints(self) -> tuple[NetworkFlowEndpoint, ...]:
-        """The NFEs of every publisher on this participant, as rmw lists them; none if it cannot.
-
-        rmw lists no shared memory for publishers; `has_shared_memory` says whether it is there.
-        """
-        return self._nfes
 
     def create_publisher(
         self,
@@ -374,14 +365,6 @@ class FlowParticipant:
             return marks.get_dscp(self._nfes)
         others = marks.get_dscps(self._nfes) - {self._dscp}
         return min(others, default=self._dscp)
-
-    def never_waits(self) -> bool:
-        """Return whether its sockets drop what finds their buffer full, asked of the kernel.
-
-        Raises:
-            MiddlewareError: it has no socket.
-        """
-        return never_wait(self._nfes)
 
     def destroy(self) -> None:
         """Destroy its endpoints, the hidden node and the participant; again is harmless.

@@ -84,7 +84,7 @@ class _FastDds:
 
     def __init__(self) -> None:
         try:
-            library = _shared_library()
+            _shared_library()
         except OSError as error:
             raise MiddlewareError(
                 f"cannot use Fast DDS, only {_KNOWN} is known: {error}", hint=abi.INSTALL
@@ -93,14 +93,12 @@ class _FastDds:
         code = ctypes.c_uint32  # ReturnCode_t is a trivially copyable class of one uint32_t
 
         def bind(symbol: str, result: Any, *arguments: Any) -> Any:
-            try:
-                function = getattr(library, symbol)
-            except AttributeError as error:
+            function = fast_dds_function(symbol, result, *arguments)
+            if function is None:
                 raise MiddlewareError(
                     f"cannot find {symbol!r} in {_LIBRARY}: only {_KNOWN} is known",
                     hint=abi.INSTALL,
-                ) from error
-            function.restype, function.argtypes = result, arguments
+                )
             return function
 
         self.factory = bind(f"_ZN{_FACTORY}12get_instanceEv", pointer)

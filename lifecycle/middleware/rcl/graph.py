@@ -794,23 +794,17 @@ def _topic_endpoint(
         if not node:
             return None
         package, _, base = info.type.replace("::dds_::", "::").replace("::", "/").rpartition("/")
-        return ObservedEndpoint(
-            kind=kind,
-            node=node,
-            name=topic,
-            type=f"{package}/{base.removesuffix('_')}" if package else base,
-            qos=info.qos,
-            gid=info.gid,
-            type_hash=info.type_hash,
-        )
-    wanted = node not in declared and names.looks_for(kind, topic)
-    if not wanted and is_noise_endpoint(kind, node, topic, info.type, ours=False):
-        return None
+        type_ = f"{package}/{base.removesuffix('_')}" if package else base
+    else:
+        type_ = info.type
+        wanted = node not in declared and names.looks_for(kind, topic)
+        if not wanted and is_noise_endpoint(kind, node, topic, type_, ours=False):
+            return None
     return ObservedEndpoint(
         kind=kind,
         node=node,
         name=topic,
-        type=info.type,
+        type=type_,
         qos=info.qos,
         gid=info.gid,
         type_hash=info.type_hash,

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from lifecycle_msgs.msg import TransitionEvent
 from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
-from rcl_interfaces.msg import Parameter, ParameterEvent, ParameterType, ParameterValue
+from rcl_interfaces.msg import ParameterEvent
 from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically
 from rclpy.clock import Clock, ClockType
-from rclpy.parameter import Parameter as RclpyParameter
+from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_profile_parameter_events
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
@@ -26,6 +26,7 @@ from std_srvs.srv import Trigger
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.rcl.graph import GraphObserver
 from lifecycle.middleware.services.parameters import (
+    TYPES,
     parameter_value,
     read_parameters,
     report_parameters,
@@ -53,6 +54,7 @@ _Reply = TypeVar("_Reply")
 _REREAD_S = 1.0
 _LEAST_S = 0.001
 _EVENT_DEPTH = 10
+_TRANSITIONS = "transition_event"
 _GOALS = {
     "configure": "inactive",
     "cleanup": "unconfigured",
@@ -74,9 +76,7 @@ class NodeClients:
     def __init__(self, observer: GraphObserver) -> None:
         self._observer = observer
         self._calls = ServiceCalls(observer)
-        self._transitions: dict[str, Subscription] = {}
-        self._parameter_events: Subscription | None = None
-        self._diagnostics: Subscription | None = None
+        self._subscriptions: dict[str, Subscription] = {}  # by topic
         self._diagnostics_timer: Timer | None = None
 
     async def get_state(self, node: str, *, timeout_s: float = TIMEOUT_S) -> str:
@@ -89,9 +89,7 @@ class NodeClients:
         Raises:
             ServiceUnansweredError: no such service, or no answer.
         """
-        response = await self._calls.call(
-            f"{node}/get_state", GetState, GetState.Request(), timeout_s=timeout_s, repeat=True
-        )
+        response = await self._ask(f"{node}/get_state", GetState, timeout_s)
         label: str = response.current_state.label
         return label
 
@@ -103,12 +101,8 @@ class NodeClients:
         Raises:
             ServiceUnansweredError: no such service, or no answer.
         """
-        response = await self._calls.call(
-            f"{node}/get_available_transitions",
-            GetAvailableTransitions,
-            GetAvailableTransitions.Request(),
-            timeout_s=timeout_s,
-            repeat=True,
+        response = await self._ask(
+            f"{node}/get_available_transitions", GetAvailableTransitions, timeout_s
         )
         return tuple(each.transition.label for each in response.available_transitions)
 
@@ -183,13 +177,9 @@ class NodeClients:
         service = f"{node}/get_configuration"
         if not expected and not self._observer.offers(node, service):
             return None
-        response = await self._calls.call(
-            service, Trigger, Trigger.Request(), timeout_s=timeout_s, repeat=True
-        )
+        response = await self._ask(service, Trigger, timeout_s)
         if not response.success:
-            raise MiddlewareError(
-                f"cannot read the configuration of {node!r}: it says {response.message!r}"
-            )
+            raise _refused(f"read the configuration of {node!r}", response.message)
         try:
             return decode_configuration(response.message, node)
         except ConfigurationError as error:
@@ -245,25 +235,23 @@ class NodeClients:
             remap_rules=[f"{source}:={target}" for source, target in node.remap],
             parameters=[each.to_parameter_msg() for each in _given_values(node).values()],
             extra_arguments=[
-                RclpyParameter(name, value=value).to_parameter_msg()
+                Parameter(name, value=value).to_parameter_msg()
                 for name, value in node.run.extra_arguments
             ],
         )
 
-        async def load() -> int:
+        async def ask(what: str, type_: type[Any], asked: object, refused: str) -> Any:
+            service = f"{container}/_container/{what}"
             response = await self._calls.call(
-                f"{container}/_container/load_node",
-                services.LoadNode,
-                request,
-                timeout_s=timeout_s,
-                repeat=False,
+                service, type_, asked, timeout_s=timeout_s, repeat=False
             )
             if not response.success:
-                raise MiddlewareError(
-                    f"cannot load {node.run.component!r} into {container!r}: "
-                    f"it says {response.error_message!r}"
-                )
-            return int(response.unique_id)
+                raise _refused(refused, response.error_message)
+            return response
+
+        async def load() -> int:
+            refused = f"load {node.run.component!r} into {container!r}"
+            return int((await ask("load_node", services.LoadNode, request, refused)).unique_id)
 
         async def loaded() -> int | None:
             there = await self._loaded(container, services) or {}
@@ -273,18 +261,9 @@ class NodeClients:
         number = await _reply(load(), loaded)
 
         async def ask_to_unload() -> bool:
-            answer = await self._calls.call(
-                f"{container}/_container/unload_node",
-                services.UnloadNode,
-                services.UnloadNode.Request(unique_id=number),
-                timeout_s=timeout_s,
-                repeat=False,
-            )
-            if not answer.success:
-                raise MiddlewareError(
-                    f"cannot unload {node.full_name!r} from {container!r}: "
-                    f"it says {answer.error_message!r}"
-                )
+            asked = services.UnloadNode.Request(unique_id=number)
+            refused = f"unload {node.full_name!r} from {container!r}"
+            await ask("unload_node", services.UnloadNode, asked, refused)
             return True
 
         async def unloaded() -> bool | None:
@@ -313,18 +292,13 @@ class NodeClients:
         }
         if not wanted:
             return
-        response = await self._calls.call(
-            f"{node}/set_parameters",
-            SetParameters,
-            SetParameters.Request(parameters=[each.to_parameter_msg() for each in wanted.values()]),
-            timeout_s=timeout_s,
-            repeat=True,
+        parameters = [each.to_parameter_msg() for each in wanted.values()]
+        response = await self._ask(
+            f"{node}/set_parameters", SetParameters, timeout_s, parameters=parameters
         )
         for name, result in zip(wanted, response.results, strict=False):
             if not result.successful:
-                raise MiddlewareError(
-                    f"cannot set parameter {name!r} of {node!r}: it says {result.reason!r}"
-                )
+                raise _refused(f"set parameter {name!r} of {node!r}", result.reason)
 
     async def set_parameters(
         self,
@@ -347,21 +321,18 @@ class NodeClients:
             MiddlewareError: it refuses, with its reason.
         """
         parameters = [
-            RclpyParameter(name, _PARAMETER_TYPES[types[name]], value).to_parameter_msg()
+            Parameter(name, TYPES[types[name]], value).to_parameter_msg()
             for name, value in values.items()
         ]
-        answer = await self._calls.call(
+        answer = await self._ask(
             f"{node}/set_parameters_atomically",
             SetParametersAtomically,
-            SetParametersAtomically.Request(parameters=parameters),
-            timeout_s=timeout_s,
-            repeat=True,
+            timeout_s,
+            parameters=parameters,
         )
         if not answer.result.successful:
             names = ", ".join(map(repr, values))
-            raise MiddlewareError(
-                f"cannot set {names} of {node!r} while it runs: it says {answer.result.reason!r}"
-            )
+            raise _refused(f"set {names} of {node!r} while it runs", answer.result.reason)
 
     async def answers(
         self, node: str, *, managed: bool, timeout_s: float, repeat: bool = False
@@ -374,15 +345,15 @@ class NodeClients:
             timeout_s: seconds, > 0.
             repeat: see ServiceCalls; else a reply that is lost is none.
         """
-        service, type_, request = (
-            (f"{node}/get_state", GetState, GetState.Request())
+        service, type_ = (
+            (f"{node}/get_state", GetState)
             if managed
-            else (f"{node}/get_parameters", GetParameters, GetParameters.Request())
+            else (f"{node}/get_parameters", GetParameters)
         )
         if not self._observer.offers(node, service):
             return None
         try:
-            await self._calls.call(service, type_, request, timeout_s=timeout_s, repeat=repeat)
+            await self._ask(service, type_, timeout_s, repeat=repeat)
         except ServiceUnansweredError as error:
             return False if error.found else None
         return True
@@ -414,23 +385,12 @@ class NodeClients:
         It is given the node's full name and the names of the parameters. Once: asking again
         changes nothing.
         """
-        if self._parameter_events is None:
 
-            def arrived(event: ParameterEvent) -> None:
-                changed = (
-                    *event.new_parameters,
-                    *event.changed_parameters,
-                    *event.deleted_parameters,
-                )
-                callback(event.node, frozenset(each.name for each in changed))
+        def arrived(event: ParameterEvent) -> None:
+            changed = (*event.new_parameters, *event.changed_parameters, *event.deleted_parameters)
+            callback(event.node, frozenset(each.name for each in changed))
 
-            self._parameter_events = self._observer.node.create_subscription(
-                ParameterEvent,
-                "/parameter_events",
-                arrived,
-                qos_profile_parameter_events,
-                callback_group=self._calls.group,
-            )
+        self._subscribe(ParameterEvent, "/parameter_events", arrived, qos_profile_parameter_events)
 
     def on_diagnostics(self, callback: Callable[[Sequence[tuple[str, int, str]]], None]) -> None:
         """Have `callback` called in the executor thread with each message on /diagnostics.
@@ -438,7 +398,7 @@ class NodeClients:
         It is given name, level and message of each entry; and each second none, so that it sees
         which are old. Once: asking again changes nothing.
         """
-        if self._diagnostics is not None:
+        if self._diagnostics_timer is not None:
             return
         from diagnostic_msgs.msg import DiagnosticArray  # few systems have use for it
 
@@ -447,10 +407,8 @@ class NodeClients:
             said = (each for each in message.status if not is_of_supervisor(each.hardware_id))
             callback([(each.name, each.level[0], each.message) for each in said])
 
+        self._subscribe(DiagnosticArray, "/diagnostics", arrived, _DIAGNOSTICS)
         node, group = self._observer.node, self._calls.group
-        self._diagnostics = node.create_subscription(
-            DiagnosticArray, "/diagnostics", arrived, _DIAGNOSTICS, callback_group=group
-        )
         self._diagnostics_timer = node.create_timer(
             1.0, lambda: callback(()), group, clock=Clock(clock_type=ClockType.STEADY_TIME)
         )
@@ -470,7 +428,7 @@ class NodeClients:
             ServiceUnansweredError: no such service, or no answer; all of these.
             MiddlewareError: the node refused, with its reason; all of these.
         """
-        await self._set(node, "connect_to", name, tuple(urls), timeout_s)
+        await self._set(node, "connect_to", name, list(urls), timeout_s)
 
     async def map_to(
         self, node: str, endpoint: str, connection: str, *, timeout_s: float = TIMEOUT_S
@@ -489,19 +447,14 @@ class NodeClients:
         await self._set(node, "remap", endpoint, name, timeout_s)
 
     async def _set(
-        self, node: str, operation: str, name: str, value: str | tuple[str, ...], timeout_s: float
+        self, node: str, operation: str, name: str, value: str | list[str], timeout_s: float
     ) -> None:
         """Call one of the services that take a name and a value, and say why if it is refused."""
-        if isinstance(value, str):
-            given = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=value)
-        else:
-            given = ParameterValue(
-                type=ParameterType.PARAMETER_STRING_ARRAY, string_array_value=list(value)
-            )
-        request = SetParameters.Request(parameters=[Parameter(name=name, value=given)])
+        type_ = TYPES["string" if isinstance(value, str) else "string_array"]
+        given = Parameter(name, type_, value).to_parameter_msg()
         # Each of them makes the same state again when it arrives twice.
-        response = await self._calls.call(
-            f"{node}/{operation}", SetParameters, request, timeout_s=timeout_s, repeat=True
+        response = await self._ask(
+            f"{node}/{operation}", SetParameters, timeout_s, parameters=[given]
         )
         if len(response.results) != 1:
             raise MiddlewareError(
@@ -509,52 +462,61 @@ class NodeClients:
                 f"{len(response.results)} results instead of one"
             )
         if not response.results[0].successful:
-            raise MiddlewareError(
-                f"cannot {operation} {name!r} of {node!r}: it says {response.results[0].reason!r}"
-            )
+            raise _refused(f"{operation} {name!r} of {node!r}", response.results[0].reason)
 
     def on_transition(self, node: str, callback: Callable[[], None]) -> None:
         """Have `callback` called in the executor thread after each transition of `node`.
 
         One callback per node, until `forget`; asking again for the same node changes nothing.
         """
-        if node not in self._transitions:
-            self._transitions[node] = self._observer.node.create_subscription(
-                TransitionEvent,
-                f"{node}/transition_event",
-                lambda _: callback(),
-                _EVENT_DEPTH,
-                callback_group=self._calls.group,
-            )
+        topic = f"{node}/{_TRANSITIONS}"
+        self._subscribe(TransitionEvent, topic, lambda _: callback(), _EVENT_DEPTH)
 
     def forget(self, node: str) -> None:
         """Drop the clients and the subscription of a node that left the graph."""
         self._calls.forget(f"{node}/")
-        if node in self._transitions:
-            self._observer.node.destroy_subscription(self._transitions.pop(node))
+        self._unsubscribe(f"{node}/{_TRANSITIONS}")
 
     def destroy(self) -> None:
         """Stop the executor thread and drop every client; again is harmless."""
         self._calls.destroy()
-        for node in tuple(self._transitions):
-            self.forget(node)
-        if self._diagnostics is not None and self._diagnostics_timer is not None:
+        if self._diagnostics_timer is not None:
             self._observer.node.destroy_timer(self._diagnostics_timer)
-            self._observer.node.destroy_subscription(self._diagnostics)
-            self._diagnostics = None
-        if self._parameter_events is not None:
-            self._observer.node.destroy_subscription(self._parameter_events)
-            self._parameter_events = None
+            self._diagnostics_timer = None
+        for topic in tuple(self._subscriptions):
+            self._unsubscribe(topic)
+
+    def _subscribe(
+        self, type_: type[Any], topic: str, callback: Callable[[Any], None], qos: QoSProfile | int
+    ) -> None:
+        """Subscribe once: asking again for the same topic changes nothing."""
+        if topic not in self._subscriptions:
+            self._subscriptions[topic] = self._observer.node.create_subscription(
+                type_, topic, callback, qos, callback_group=self._calls.group
+            )
+
+    def _unsubscribe(self, topic: str) -> None:
+        if topic in self._subscriptions:
+            self._observer.node.destroy_subscription(self._subscriptions.pop(topic))
+
+    async def _ask(
+        self,
+        service: str,
+        type_: type[Any],
+        timeout_s: float,
+        *,
+        repeat: bool = True,
+        **fields: Any,
+    ) -> Any:
+        """Send a request of these fields and return the response; raises as `ServiceCalls.call`."""
+        request = type_.Request(**fields)
+        return await self._calls.call(service, type_, request, timeout_s=timeout_s, repeat=repeat)
 
     async def _loaded(self, container: str, services: Any) -> dict[int, str] | None:
         """Return what a container has loaded, full names by number; None if it does not answer."""
         try:
-            there = await self._calls.call(
-                f"{container}/_container/list_nodes",
-                services.ListNodes,
-                services.ListNodes.Request(),
-                timeout_s=_REREAD_S,
-                repeat=True,
+            there = await self._ask(
+                f"{container}/_container/list_nodes", services.ListNodes, _REREAD_S
             )
         except ServiceUnansweredError:
             return None
@@ -591,17 +553,8 @@ async def _reply(
         pending.cancel()
 
 
-_PARAMETER_TYPES = {
-    "bool": RclpyParameter.Type.BOOL,
-    "int": RclpyParameter.Type.INTEGER,
-    "double": RclpyParameter.Type.DOUBLE,
-    "string": RclpyParameter.Type.STRING,
-    "bool_array": RclpyParameter.Type.BOOL_ARRAY,
-    "int_array": RclpyParameter.Type.INTEGER_ARRAY,
-    "double_array": RclpyParameter.Type.DOUBLE_ARRAY,
-    "string_array": RclpyParameter.Type.STRING_ARRAY,
-    "byte_array": RclpyParameter.Type.BYTE_ARRAY,
-}
+def _refused(what: str, reason: str) -> MiddlewareError:
+    return MiddlewareError(f"cannot {what}: it says {reason!r}")
 
 
 def _given_values(node: PlannedNode, has: Mapping[str, str] | None = None) -> dict[str, Any]:
@@ -617,7 +570,7 @@ def _given_values(node: PlannedNode, has: Mapping[str, str] | None = None) -> di
     given = {}
     for each in node.expected_parameters:
         word = (has or {}).get(each.name, "") if each.type == "array" else each.type
-        known = _PARAMETER_TYPES.get(word)
+        known = TYPES.get(word)
         if each.value is None or known is None or each.source == DEFAULT:
             continue
         if each.source == COMMAND and each.value != ():
@@ -627,11 +580,11 @@ def _given_values(node: PlannedNode, has: Mapping[str, str] | None = None) -> di
         value = each.raw
         if isinstance(value, tuple):
             value = [bytes((one,)) for one in value] if word == "byte_array" else list(value)
-        given[each.name] = RclpyParameter(each.name, known, value)
+        given[each.name] = Parameter(each.name, known, value)
     return given
 
 
-def _differs(has: ParameterReport, given: RclpyParameter) -> bool:
+def _differs(has: ParameterReport, given: Parameter) -> bool:
     """Whether a node has another value than it is given; what is not a number equals itself."""
     wanted = ParameterReport.of(
         has.name,

@@ -10,9 +10,9 @@ import array
 from collections.abc import Collection
 from typing import TYPE_CHECKING, Any
 
-from rcl_interfaces.msg import ParameterType
 from rcl_interfaces.msg import ParameterValue as ParameterValueMessage
 from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters
+from rclpy.parameter import Parameter, parameter_value_to_python
 
 from lifecycle.manifest.model import ParameterValue
 from lifecycle.verify.observation import ParameterReport
@@ -21,18 +21,20 @@ if TYPE_CHECKING:
     from lifecycle.export.captured import CapturedParameter
     from lifecycle.middleware.services.service_calls import ServiceCalls
 
-_TYPES = {
-    ParameterType.PARAMETER_BOOL: ("bool", "bool_value"),
-    ParameterType.PARAMETER_INTEGER: ("int", "integer_value"),
-    ParameterType.PARAMETER_DOUBLE: ("double", "double_value"),
-    ParameterType.PARAMETER_STRING: ("string", "string_value"),
-    ParameterType.PARAMETER_BYTE_ARRAY: ("byte_array", "byte_array_value"),
-    ParameterType.PARAMETER_BOOL_ARRAY: ("bool_array", "bool_array_value"),
-    ParameterType.PARAMETER_INTEGER_ARRAY: ("int_array", "integer_array_value"),
-    ParameterType.PARAMETER_DOUBLE_ARRAY: ("double_array", "double_array_value"),
-    ParameterType.PARAMETER_STRING_ARRAY: ("string_array", "string_array_value"),
+TYPES = {
+    "bool": Parameter.Type.BOOL,
+    "int": Parameter.Type.INTEGER,
+    "double": Parameter.Type.DOUBLE,
+    "string": Parameter.Type.STRING,
+    "byte_array": Parameter.Type.BYTE_ARRAY,
+    "bool_array": Parameter.Type.BOOL_ARRAY,
+    "int_array": Parameter.Type.INTEGER_ARRAY,
+    "double_array": Parameter.Type.DOUBLE_ARRAY,
+    "string_array": Parameter.Type.STRING_ARRAY,
 }
-"""rcl_interfaces/msg/ParameterType → our type name, and where ParameterValue holds the value."""
+"""Our type name → rclpy's type, whose value is rcl_interfaces/msg/ParameterType's."""
+
+_WORDS = {each.value: word for word, each in TYPES.items()}
 
 
 async def read_parameters(
@@ -110,7 +112,7 @@ async def _read(
 
 def type_word(type_: int) -> str:
     """Return our name of a rcl_interfaces/msg/ParameterType; empty for one that is not set."""
-    return _TYPES[type_][0] if type_ in _TYPES else ""
+    return _WORDS.get(type_, "")
 
 
 def parameter_value(value: Any) -> ParameterValue | None:
@@ -122,5 +124,4 @@ def parameter_value(value: Any) -> ParameterValue | None:
 
 
 def _value(message: Any) -> ParameterValue | None:
-    known = _TYPES.get(message.type)
-    return parameter_value(getattr(message, known[1])) if known else None
+    return parameter_value(parameter_value_to_python(message)) if message.type in _WORDS else None

@@ -27,7 +27,11 @@ from lifecycle.middleware.discovery.discovery_server import (
     discovery_server_command,
     discovery_server_listens,
 )
-from lifecycle.middleware.fastdds.nfe import get_network_flow_endpoints, has_shared_memory
+from lifecycle.middleware.fastdds.nfe import (
+    get_network_flow_endpoints,
+    has_shared_memory,
+    senders_of,
+)
 from lifecycle.middleware.fastdds.participant import FlowParticipant
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.middleware.fastdds.url_check import OpenSocket, open_sockets
@@ -126,7 +130,7 @@ def test_with_fixed_ports_these_are_all_sockets_there_are(
     with receiving, FlowParticipant("_out", "/", fresh_domain, connections=connect(other)) as out:
         listened = {(s.kind, s.address, s.port) for s in sockets if s.port not in UNIQUE}
         assert listened == {(kind, address, port) for port in ports[0:3]}
-        assert [nfe.transport_port for nfe in out.network_flow_endpoints] == [ports[5]]
+        assert [nfe.transport_port for nfe in senders_of(out.node)] == [ports[5]]
         exchange(out, receiving, wait_until)
 
 
@@ -140,7 +144,7 @@ def test_a_participant_of_shared_memory_has_no_ip_socket(
         sending = FlowParticipant("_out", "/", fresh_domain, connections=connect("shm://"))
     with receiving, sending:
         exchange(sending, receiving, wait_until)
-        assert (sending.has_shared_memory, sending.network_flow_endpoints) == (True, ())
+        assert (sending.has_shared_memory, senders_of(sending.node)) == (True, ())
     assert sockets == []
 
 

@@ -227,7 +227,7 @@ def test_a_publisher_on_its_own_participant_shares_no_port_with_the_node(
     with FlowParticipant("_camera_flow_0", "/robot", domain_id) as participant:
         unique = participant.create_publisher(String, "/robot/video", QOS)
         assert not ports(unique) & ports(shared)
-        assert get_network_flow_endpoints(unique) == participant.network_flow_endpoints
+        assert get_network_flow_endpoints(unique) == senders_of(participant.node)
         assert [each.topic_name for each in participant.node.publishers] == ["/robot/video"]
         spin_until(unique.get_subscription_count, node)
         unique.publish(String(data="frame"))
@@ -250,7 +250,7 @@ def test_sender_sockets_are_asked_for_once_in_the_life_of_a_participant(
 
         monkeypatch.setattr(nfe, "read_handle", ask)
         assert senders_of(other) == first
-        assert senders_of(participant.node) == participant.network_flow_endpoints != first
+        assert senders_of(participant.node) != first
         participant.ensure_dscp()
         assert participant.read_dscp() == 46
 
@@ -281,7 +281,7 @@ def test_a_marked_participant_sends_with_its_mark_over_udp(
         listener.bind(("127.0.0.1", 0))
         listener.settimeout(10)
         with FlowParticipant("_node_flow_0", "/", domain_id, dscp=46) as participant:
-            sender = next(iter(participant.network_flow_endpoints)).transport_port
+            sender = next(iter(senders_of(participant.node))).transport_port
             marks = []
             for number in (int(each.name) for each in Path("/proc/self/fd").iterdir()):
                 try:
@@ -301,10 +301,11 @@ def test_a_marked_participant_sends_with_its_mark_over_udp(
 _MARK = """
 import sys
 from lifecycle.errors import MiddlewareError
+from lifecycle.middleware.fastdds.nfe import senders_of
 from lifecycle.middleware.fastdds.participant import FlowParticipant
 try:
     with FlowParticipant("_node_flow_0", "/", int(sys.argv[1]), dscp=46) as participant:
-        print(sorted({nfe.internet_protocol.value for nfe in participant.network_flow_endpoints}))
+        print(sorted({nfe.internet_protocol.value for nfe in senders_of(participant.node)}))
         print(participant.read_dscp())
 except MiddlewareError as error:
     print(error)

@@ -20,10 +20,12 @@ from lifecycle import codec
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.fastdds import nfe
+from lifecycle.middleware.fastdds.dscp import own_sockets
 from lifecycle.middleware.fastdds.nfe import (
     SHARED_MEMORY,
     get_network_flow_endpoints,
     has_shared_memory,
+    senders_of,
 )
 from lifecycle.middleware.fastdds.participant import FlowParticipant
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
@@ -92,7 +94,7 @@ def sent(
             publisher.publish(String(data=text))
         assert other.lengths() == [len(text)] * COUNT
         seen = loopback.until_now()
-    mine = {nfe.transport_port for nfe in participant.network_flow_endpoints}
+    mine = {nfe.transport_port for nfe in senders_of(participant.node)}
     return [each for each in seen if each.source in mine or each.fragment]
 
 
@@ -102,7 +104,7 @@ def carrying(datagrams: list[Datagram], text: str = MARK) -> list[Datagram]:
 
 def source_of(participant: FlowParticipant) -> tuple[NetworkFlowEndpoint, ...]:
     """A publisher's NFEs as a node reports them."""
-    return participant.network_flow_endpoints + (SHARED_MEMORY,) * participant.has_shared_memory
+    return senders_of(participant.node) + (SHARED_MEMORY,) * participant.has_shared_memory
 
 
 # What Fast DDS 2.14 does between two processes of one host: shared memory exactly if both have it.
@@ -195,7 +197,7 @@ def test_chosen_transports_are_all_there_is_in_every_discovery_range(
         assert (chosen.has_shared_memory, plain.has_shared_memory) == (False, True)
         spelt = {
             f"{nfe.transport_protocol.value}{nfe.internet_protocol.value[2:]}"
-            for nfe in chosen.network_flow_endpoints
+            for nfe in senders_of(chosen.node)
         }
         assert spelt == set(transports)
         publisher = chosen.create_publisher(String, "/flow", QOS)
@@ -280,7 +282,9 @@ def test_sends_that_must_not_wait_go_by_sockets_that_do_not(
         ) as hasty,
         FlowParticipant("_patient", "/", domain_id, transports=transports) as wait_under_load,
     ):
-        assert (hasty.never_waits(), wait_under_load.never_waits()) == (True, False)
+        for participant, waits in ((hasty, False), (wait_under_load, True)):
+            with own_sockets(senders_of(participant.node)) as sockets:
+                assert {os.get_blocking(each.fileno()) for each in sockets} == {waits}
         assert hasty.has_shared_memory is (not transports)
 
 
@@ -303,7 +307,7 @@ def test_every_datagram_of_a_user_carries_the_dscp_from_the_first_on(
         first, *rest = carrying(seen)
         assert first.tos == 46 << 2
         assert {each.tos for each in rest} == {46 << 2}
-        mine = {nfe.transport_port for nfe in marked.network_flow_endpoints}
+        mine = {nfe.transport_port for nfe in senders_of(marked.node)}
         unmarked = [each for each in seen if each.source in mine and each.tos != 46 << 2]
         assert unmarked == [], "its discovery shares the sockets"
 
@@ -323,7 +327,7 @@ def test_a_mark_that_was_lost_is_set_again(domain_id: int) -> None:
 
     with FlowParticipant("_flow", "/", domain_id, dscp=46) as participant:
         participant.create_publisher(String, "/flow", QOS)
-        set_dscp(participant.network_flow_endpoints, 0)
+        set_dscp(senders_of(participant.node), 0)
         assert participant.read_dscp() == 0
         assert participant.read_dscp() == 0, "reading marks nothing"
         participant.ensure_dscp()
@@ -334,7 +338,7 @@ def test_one_socket_without_the_mark_is_what_is_read(domain_id: int) -> None:
     from lifecycle.middleware.fastdds.dscp import get_dscps, set_dscp
 
     with FlowParticipant("_flow", "/", domain_id, dscp=46, transports=BOTH) as participant:
-        nfes = participant.network_flow_endpoints
+        nfes = senders_of(participant.node)
         assert len(nfes) > 1
         for lost in (nfes[0], nfes[-1]):
             set_dscp([lost], 10)
@@ -350,7 +354,7 @@ def test_a_mark_that_was_lost_is_set_again_before_a_subscription_is_handed_out(
     from lifecycle.middleware.fastdds.dscp import set_dscp
 
     with FlowParticipant("_flow", "/", domain_id, dscp=46) as participant:
-        set_dscp(participant.network_flow_endpoints, 0)
+        set_dscp(senders_of(participant.node), 0)
         participant.create_subscription(String, "/flow", print, QOS)
         assert participant.read_dscp() == 46
 

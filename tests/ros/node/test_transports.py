@@ -16,6 +16,8 @@ from planning import built_with, planned, publisher, subscription
 from std_msgs.msg import String
 
 from lifecycle import LifecycleNode, codec
+from lifecycle.middleware.fastdds.dscp import own_sockets
+from lifecycle.middleware.fastdds.nfe import senders_of
 from lifecycle.middleware.fastdds.profiles import discovery_environment
 from lifecycle.network.nfe import NetworkFlowEndpoint, UniqueRequirement, is_ip
 from lifecycle.node.host.control import Event, Operation
@@ -77,7 +79,8 @@ def test_a_flow_that_needs_the_network_has_no_shared_memory_and_its_node_has(
     made = next(m for m in node.lifecycle.data_layer.mappings if m.endpoint.name == "video")
     assert made.connection is not None
     assert made.connection.participant is not None
-    assert made.connection.participant.never_waits()
+    with own_sockets(senders_of(made.connection.participant.node)) as sockets:
+        assert not any(os.get_blocking(each.fileno()) for each in sockets)
 
 
 def test_nodes_of_one_process_share_a_participant_exactly_if_their_transports_are_equal(
