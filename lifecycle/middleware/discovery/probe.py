@@ -42,7 +42,6 @@ from lifecycle.middleware.fastdds.profiles import PROFILE_NAME
 from lifecycle.middleware.fastdds.url_check import OpenSocket, open_sockets, udp_sockets
 from lifecycle.middleware.fastdds.url_profile import (
     DISCOVERY_GROUP,
-    LOCALHOST_PEERS_RANGE,
     UrlTransport,
     families,
     leaves_discovery_open,
@@ -50,7 +49,13 @@ from lifecycle.middleware.fastdds.url_profile import (
 from lifecycle.middleware.process.control import interface_addresses
 from lifecycle.network.connection_url import ConnectionUrl
 from lifecycle.network.medium import RMW_DISCOVERY, TRANSPORTS_VARIABLE, Medium
-from lifecycle.network.ports import DG, PARTICIPANTS_PER_DOMAIN, participant_ports, unicast_pairs
+from lifecycle.network.ports import (
+    DG,
+    LOCALHOST_PEERS_RANGE,
+    PARTICIPANTS_PER_DOMAIN,
+    participant_ports,
+    unicast_pairs,
+)
 
 RANGE_VARIABLE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 

@@ -42,9 +42,8 @@ from lifecycle.middleware.fastdds.participant_profile import (
 from lifecycle.middleware.fastdds.url_check import open_sockets
 from lifecycle.middleware.rcl import hidden_node
 from lifecycle.middleware.rcl.abi import is_known
-from lifecycle.middleware.rcl.hidden_node import forget_hidden, hidden_nodes, quiet_node
+from lifecycle.middleware.rcl.hidden_node import forget_hidden, quiet_node
 from lifecycle.middleware.rcl.qos import to_rclpy
-from lifecycle.network.connection_url import ConnectionUrl
 from lifecycle.network.medium import Medium
 from lifecycle.network.nfe import NetworkFlowEndpoint, UniqueRequirement
 from lifecycle.plan.model import ParticipantConnections
@@ -61,7 +60,11 @@ def one_dscp(dscp: int | None, settings: ParticipantSettings) -> int | None:
     Raises:
         MiddlewareError: by several, and differently; or for what has no UDP socket.
     """
-    if dscp is not None and settings.urls and not any(_is_udp(url) for url in settings.urls):
+    if (
+        dscp is not None
+        and settings.urls
+        and not any(url.transport.is_udp for url in settings.urls)
+    ):
         listed = " and ".join(repr(str(url)) for url in settings.urls)
         raise MiddlewareError(
             f"cannot mark what {listed} carries with DSCP {dscp}: {_UDP_ALONE}",
@@ -96,12 +99,6 @@ def uses_shared_memory(node: Node, settings: ParticipantSettings) -> bool:
     return has_shared_memory(node)
 
 
-def _is_udp(url: ConnectionUrl) -> bool:
-    return url.transport.is_udp
-
-
-__all__ = ["FlowParticipant", "hidden_nodes", "quiet_node"]
-
 _RELEASE_S = 0.2
 """An executor that waits for endpoints lets go of them within a millisecond of being woken."""
 
@@ -125,8 +122,6 @@ class FlowParticipant:
             RTPS, so that IP has nothing to fragment; 1400 fits Ethernet. None leaves it to the RMW.
         non_blocking_send: never wait for room in a socket's buffer: what finds it full is dropped,
             and lost unless the publisher is reliable.
-        arguments: ROS arguments of its context; none by default, because endpoint names come here
-            resolved and must not be remapped again.
         connections: what it is connected to and by; then `transports` must be empty.
         served: the node whose executor runs the callbacks of subscriptions, services and clients
             made here, gated by its callback groups; None leaves them to the executor of `node`.
@@ -148,7 +143,6 @@ class FlowParticipant:
         transports: Sequence[Medium] = (),
         max_datagram_bytes: int | None = None,
         non_blocking_send: bool = False,
-        arguments: Sequence[str] = (),
         connections: ParticipantConnections | None = None,
         served: Node | None = None,
     ) -> None:
@@ -169,9 +163,8 @@ class FlowParticipant:
         self._context: rclpy.Context | None
         self._nfes: tuple[NetworkFlowEndpoint, ...] = ()
         before = fixed_sockets(settings)
-        self._context, self.node = quiet_node(
-            name, namespace, domain_id, settings=settings, arguments=arguments
-        )
+        # Without ROS arguments: endpoint names come here resolved.
+        self._context, self.node = quiet_node(name, namespace, domain_id, settings=settings)
         self._fixed = fixed_sockets(settings) - before
         try:
             # Every publisher of a participant lists the same sender sockets; rclpy's parameter

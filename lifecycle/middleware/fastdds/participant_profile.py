@@ -15,7 +15,6 @@ of the table exist: who they are and where is announced, what they publish is no
 from __future__ import annotations
 
 import copy
-import ipaddress
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from xml.etree import ElementTree as ET
@@ -30,10 +29,12 @@ from lifecycle.middleware.fastdds.profiles import (
     announcements,
 )
 from lifecycle.middleware.fastdds.profiles import child as _child
+from lifecycle.middleware.fastdds.profiles import locator as _locator
 from lifecycle.middleware.fastdds.profiles import text as _text
 from lifecycle.network.connection_url import ConnectionUrl
 from lifecycle.network.connection_url import parse as parse_url
 from lifecycle.network.medium import RMW_DEFAULT, TRANSPORTS_VARIABLE, UDP_UNICAST, Medium
+from lifecycle.network.ports import LOCALHOST_PEERS_RANGE
 from lifecycle.plan.model import (
     GRAPH_TOPIC,
     GRAPH_TYPE,
@@ -151,7 +152,6 @@ DISCOVERY_SERVER_VARIABLE = "ROS_DISCOVERY_SERVER"
 """Makes every participant a client of that server."""
 
 
-_LOCALHOST_PEERS_RANGE = url_profile.LOCALHOST_PEERS_RANGE
 _IGNORE_ALL = ("FILTER_DIFFERENT_PROCESS", "FILTER_DIFFERENT_HOST", "FILTER_SAME_PROCESS")
 """Not the first two alone: a participant that has those makes no transports."""
 
@@ -207,7 +207,6 @@ class ParticipantSettings:
         transports: tuple[Medium, ...] = (),
         max_datagram_bytes: int | None = None,
         non_blocking_send: bool = False,
-        super_client: bool = False,
     ) -> ParticipantSettings:
         """Return the settings of a participant that is connected so.
 
@@ -224,7 +223,7 @@ class ParticipantSettings:
             max_datagram_bytes=min(sizes, default=None),
             non_blocking_send=non_blocking_send,
             urls=urls,
-            super_client=super_client or getattr(connections, "super_client", False),
+            super_client=connections.super_client,
             static_participants=connections.static_participants,
             static_name=connections.static_name,
         )
@@ -326,7 +325,8 @@ def default_profile(environment: Mapping[str, str] | None = None) -> DefaultProf
     files = []
     if current.get(PROFILES_FILE_VARIABLE):
         files.append(current[PROFILES_FILE_VARIABLE])
-    if current.get(_SKIP_DEFAULT_FILE_VARIABLE, "")[:1] != "1" and _has_default_file():
+    # Not by pathlib: what each host calls is copied into its own memory (docs/performance.md).
+    if current.get(_SKIP_DEFAULT_FILE_VARIABLE, "")[:1] != "1" and os.path.exists(DEFAULT_FILE):
         files.append(DEFAULT_FILE)
     found = None
     for file in files:
@@ -334,11 +334,6 @@ def default_profile(environment: Mapping[str, str] | None = None) -> DefaultProf
             name = element.get("profile_name", "")
             found = DefaultProfile(file=file, name=name, element=element)
     return found
-
-
-def _has_default_file() -> bool:
-    # Not by pathlib: what each host calls is copied into its own memory (docs/performance.md).
-    return os.path.exists(DEFAULT_FILE)
 
 
 def profile(
@@ -396,7 +391,7 @@ def profile(
         for kind in kinds:
             descriptor = _descriptor(f"{name}_{kind}", kind, settings)
             if localhost_peers is not None and kind.is_udp:
-                _text(descriptor, "maxInitialPeersRange", str(_LOCALHOST_PEERS_RANGE))
+                _text(descriptor, "maxInitialPeersRange", str(LOCALHOST_PEERS_RANGE))
             descriptors.append(descriptor)
             _text(chosen, "transport_id", f"{name}_{kind}")
         _text(rtps, "useBuiltinTransports", "false")
@@ -489,23 +484,14 @@ def _discover_as_localhost(
     # A unicast locator without address and port means "any" and keeps multicast from being added.
     listened = _child(builtin, "metatrafficUnicastLocatorList")
     for family in families:
-        ET.SubElement(ET.SubElement(listened, "locator"), family)
+        _locator(listened, family, "", None)
     searched = _child(builtin, "initialPeersList")
     for peer in peers:
-        for family in _families_of(peer, families):
-            _text(ET.SubElement(ET.SubElement(searched, "locator"), family), "address", peer)
+        for family in families:
+            if url_profile.may_be(peer, family):
+                _locator(searched, family, peer, None)
     for family in families:
-        locator = ET.SubElement(ET.SubElement(searched, "locator"), family)
-        _text(locator, "address", family.loopback)
-
-
-def _families_of(peer: str, families: list[Medium]) -> list[Medium]:
-    """Return the families a peer can be reached by; a name may be reached by any."""
-    try:
-        version = ipaddress.ip_address(peer).version
-    except ValueError:
-        return families
-    return [family for family in families if Medium(family).ip_version == version]
+        _locator(searched, family, family.loopback, None)
 
 
 def _set_property(rtps: ET.Element, name: str, value: str) -> None:

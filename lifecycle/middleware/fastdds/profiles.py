@@ -29,25 +29,17 @@ PROFILE_NAME = "lifecycle_quick_discovery"
 _FILE_NAME = "quick_discovery.xml"
 
 
-def discovery_profile(
-    *, announcements: int = 10, period_ms: int = 200, peers: Iterable[tuple[str, int]] = ()
-) -> str:
+_ANNOUNCEMENTS = 10
+_PERIOD_NS = 200_000_000
+
+
+def discovery_profile(*, peers: Iterable[tuple[str, int]] = ()) -> str:
     """Return the profile as XML, a default participant profile that only sets discovery.
 
     Args:
-        announcements: how often a new participant announces itself at once, > 0.
-        period_ms: between two of them, 1–999.
         peers: IP addresses and UDP ports that it is announced to; all of them, because they replace
             the groups by which Fast DDS otherwise does.
-
-    Raises:
-        ValueError: out of range.
     """
-    if announcements < 1 or not 1 <= period_ms <= 999:
-        raise ValueError(
-            f"cannot announce {announcements} times each {period_ms} ms: allowed are once or more, "
-            "each 1–999 ms"
-        )
     locators = "".join(
         f"<locator><{kind}><address>{address}</address><port>{port}</port></{kind}></locator>"
         for address, port in peers
@@ -59,8 +51,8 @@ def discovery_profile(
   <profiles>
     <participant profile_name="{PROFILE_NAME}" is_default_profile="true">
       <rtps><builtin><discovery_config><initialAnnouncements>
-        <count>{announcements}</count>
-        <period><nanosec>{period_ms * 1_000_000}</nanosec></period>
+        <count>{_ANNOUNCEMENTS}</count>
+        <period><nanosec>{_PERIOD_NS}</nanosec></period>
       </initialAnnouncements></discovery_config>{searched}</builtin></rtps>
     </participant>
   </profiles>

@@ -268,7 +268,7 @@ def _add_peers(
                 _locator(searched, family.kind, peer.address, peer.port)
         if family.udp:
             for peer in extra:
-                if _may_be(peer.address, family.kind):
+                if may_be(peer.address, family.kind):
                     _locator(searched, family.kind, peer.address, None)
             if loopback:
                 _locator(searched, family.kind, family.kind.loopback, None)
@@ -324,7 +324,7 @@ def _all_ports_fixed(found: Sequence[UrlTransport]) -> bool:
     )
 
 
-def _may_be(address: str, kind: Medium) -> bool:
+def may_be(address: str, kind: Medium) -> bool:
     """Whether a peer can be reached by a family; a name may be, by any."""
     try:
         version = ipaddress.ip_address(address).version
@@ -332,16 +332,6 @@ def _may_be(address: str, kind: Medium) -> bool:
         return True
     return kind.ip_version == version
 
-
-__all__ = [
-    "DISCOVERY_GROUP",
-    "LOCALHOST_PEERS_RANGE",
-    "TYPES",
-    "UrlTransport",
-    "add_urls",
-    "families",
-    "leaves_discovery_open",
-]
 
 TYPES = {Medium.UDPV4: "UDPv4", Medium.UDPV6: "UDPv6", Medium.TCPV4: "TCPv4", Medium.SHM: "SHM"}
 

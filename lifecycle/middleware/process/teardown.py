@@ -13,7 +13,7 @@ import logging
 import os
 import sys
 from collections.abc import Callable, Iterable
-from typing import NoReturn, Protocol
+from typing import Any, NoReturn
 
 from lifecycle.middleware.discovery.dead_peers import give_up_dead_connections
 from lifecycle.middleware.process.control import exit_after
@@ -21,29 +21,12 @@ from lifecycle.middleware.process.control import exit_after
 _logger = logging.getLogger(__name__)
 
 
-class _LeavingNode(Protocol):
-    @property
-    def waitables(self) -> Iterable[object]: ...
-
-    def destroy_node(self) -> None: ...
-
-
-class _Context(Protocol):
-    def try_shutdown(self) -> None: ...
-
-    def destroy(self) -> None: ...
-
-
-class _Destroyable(Protocol):
-    def destroy(self) -> None: ...
-
-
 def leave_and_exit(
     code: int,
     *,
-    nodes: Iterable[_LeavingNode] = (),
-    contexts: Iterable[_Context] = (),
-    participants: Iterable[_Destroyable] = (),
+    nodes: Iterable[Any] = (),
+    contexts: Iterable[Any] = (),
+    participants: Iterable[Any] = (),
     deadline_s: float = 2.0,
 ) -> NoReturn:
     """Destroy what is given, flush the standard streams and end the process; never returns.
@@ -79,7 +62,7 @@ def leave_and_exit(
         os._exit(code)
 
 
-def _release(node: _LeavingNode) -> None:
+def _release(node: Any) -> None:
     """Destroy a node and everything hanging on it that would keep its participant alive.
 
     rclpy's destroy_node forgets action servers and clients and a managed node's state machine;

@@ -58,7 +58,6 @@ from lifecycle.middleware.rcl.graph_queries import (
     EndpointInfo,
     endpoints_of,
     endpoints_of_node,
-    service_names,
     topic_endpoints,
 )
 from lifecycle.middleware.rcl.hidden_node import quiet_node
@@ -420,7 +419,7 @@ class GraphObserver:
     def prefix(self) -> str:
         """GUID prefix of its own participant, 24 hex digits; empty where that is not known."""
         homes = self._stale_node_filter.homes()
-        return next(iter(homes.get(self.node.get_fully_qualified_name(), ())), "")
+        return next(iter(homes.get(self._name, ())), "")
 
     def hosted(self, nodes: Iterable[str]) -> dict[str, bool]:
         """Return which nodes of this machine are in hosts of ours, see `process/hosted.py`.
@@ -429,7 +428,7 @@ class GraphObserver:
             nodes: fully qualified names; those on other machines are not in the result.
         """
         homes, found = self._stale_node_filter.homes(), {}
-        own = next(iter(homes.get(self.node.get_fully_qualified_name(), ())), "")
+        own = next(iter(homes.get(self._name, ())), "")
         for name in nodes:
             here = [each for each in homes.get(name, ()) if own and is_of_host(each, own)]
             if here:
@@ -445,14 +444,6 @@ class GraphObserver:
     def offers(self, node: str, service: str) -> bool:
         """Return whether discovery shows `service` (a fully qualified name) on `node`."""
         return service in self.services_of(node)
-
-    def service_names(self) -> frozenset[str]:
-        """Return the names of all services that have a server or a client, wherever that is.
-
-        Raises:
-            MiddlewareError: the graph cannot be read.
-        """
-        return service_names(self.node)
 
     def services_of(self, node: str) -> frozenset[str]:
         """Return the fully qualified names of the services that discovery shows on `node`."""

@@ -184,19 +184,6 @@ def _topics(node: Node) -> list[bytes]:
     return [topic for topic, _ in _names_and_types(node, query, "topics") or ()]
 
 
-def service_names(node: Node) -> frozenset[str]:
-    """Return the fully qualified names of all services that have a server or a client."""
-    if not abi.is_known():
-        with _read("services"):
-            return frozenset(name for name, _ in node.get_service_names_and_types())
-    library = _library()
-
-    def query(handle: int, result: object) -> int:
-        return int(library.services(handle, library.allocator, result))
-
-    return frozenset(_text(name) for name, _ in _names_and_types(node, query, "services") or ())
-
-
 def endpoints_of(
     node: Node, kind: EndpointKind, topic: str, *, no_mangle: bool = False
 ) -> list[EndpointInfo]:
@@ -247,14 +234,17 @@ def full_name(name: str, namespace: str) -> str:
 
 
 def fingerprint(node: Node) -> object:
-    """Return what differs whenever the graph that `node` sees has changed; None if unreadable."""
+    """Return what differs whenever the graph that `node` sees has changed; None if unreadable.
+
+    For an rcl that is not known.
+    """
     try:
         return (
             sorted(node_names(node)),
             sorted((kind.value, topic, info.gid) for kind, topic, info in topic_endpoints(node)),
-            service_names(node),
+            sorted(name for name, _ in node.get_service_names_and_types()),
         )
-    except MiddlewareError:
+    except (MiddlewareError, *_REFUSED):
         return None
 
 
@@ -421,9 +411,6 @@ class _Library:
         self.topics = abi.bind(
             *("rcl", "rcl_get_topic_names_and_types", ctypes.c_int),
             (pointer, pointer, flag, pointer),
-        )
-        self.services = abi.bind(
-            "rcl", "rcl_get_service_names_and_types", ctypes.c_int, (pointer,) * 3
         )
         self.names_and_types_fini = abi.bind(
             "rcl", "rcl_names_and_types_fini", ctypes.c_int, (pointer,)

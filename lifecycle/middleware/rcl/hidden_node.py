@@ -14,7 +14,7 @@ import itertools
 import os
 import typing
 import weakref
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import rclpy
@@ -49,7 +49,6 @@ def quiet_node(
     domain_id: int,
     *,
     settings: ParticipantSettings | None = None,
-    arguments: Sequence[str] = (),
 ) -> tuple[rclpy.Context, Node]:
     """Return a new context and on it a node with nothing of its own but parameter events.
 
@@ -62,7 +61,7 @@ def quiet_node(
     node: Node | None = None
     try:
         with discovery_by_profile(settings):
-            context.init(args=[*arguments, *enclave], domain_id=domain_id, initialize_logging=False)
+            context.init(args=[*enclave], domain_id=domain_id, initialize_logging=False)
         shared_memory = noting_shared_memory(context, is_new=True)
         with participant_settings(context, settings), shared_memory:
             node = Node(

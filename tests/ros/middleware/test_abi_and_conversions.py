@@ -113,7 +113,6 @@ def test_an_unknown_rcl_shows_the_same_graph(
         return (
             graph_queries.node_names(node),
             sorted(map(repr, graph_queries.topic_endpoints(node))),
-            graph_queries.service_names(node),
             [
                 sorted(graph_queries.endpoints_of_node(node, kind, "/node") or ())
                 for kind in graph_queries.EndpointKind

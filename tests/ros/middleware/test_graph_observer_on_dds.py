@@ -281,7 +281,7 @@ def test_of_a_node_that_leaves_the_services_of_the_node_interface_stay_its_own(
     node.create_publisher(String, "last", 10)
     last = (EndpointKind.PUBLISHER, "/leaving", "/last", "std_msgs/msg/String")
     wait_until(lambda: last in endpoints(observer))
-    wait_until(lambda: "/leaving/get_configuration" not in observer.service_names())
+    wait_until(lambda: "/leaving/get_configuration" not in observer.services_of("/leaving"))
     assert sorted(endpoints(observer), key=lambda each: each[1]) == [remap, last]
 
 

@@ -36,24 +36,14 @@ def test_leaving_and_sweeping_are_loaded_without_importing_rclpy() -> None:
 
 
 def test_the_profile_only_sets_announcements() -> None:
-    root = ET.fromstring(discovery_profile(announcements=7, period_ms=20))
+    root = ET.fromstring(discovery_profile())
     space = "{http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles}"
     (participant,) = root.iter(f"{space}participant")
     assert participant.get("is_default_profile") == "true"
     leaves = {
         each.tag.removeprefix(space): each.text for each in participant.iter() if not len(each)
     }
-    assert leaves == {"count": "7", "nanosec": "20000000"}
-
-
-@pytest.mark.parametrize(("announcements", "period_ms"), [(0, 50), (1, 0), (1, 1000)])
-def test_announcements_out_of_range_are_refused(announcements: int, period_ms: int) -> None:
-    with pytest.raises(ValueError, match="cannot announce") as refused:
-        discovery_profile(announcements=announcements, period_ms=period_ms)
-    assert str(refused.value) == (
-        f"cannot announce {announcements} times each {period_ms} ms: allowed are once or more, "
-        "each 1–999 ms"
-    )
+    assert leaves == {"count": "10", "nanosec": "200000000"}
 
 
 def test_the_environment_names_a_complete_file(tmp_path: Path) -> None:
