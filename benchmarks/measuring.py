@@ -21,7 +21,7 @@ from pathlib import Path
 
 import psutil
 
-from lifecycle.middleware.process.shared_memory import segments_of, sweep
+from lifecycle.middleware.process.shared_memory import sweep
 
 ROOT = Path(__file__).resolve().parents[1]
 GONE_S = 60.0
@@ -179,13 +179,12 @@ def _ended(process: subprocess.Popen[str]) -> Iterator[None]:
     finally:
         with contextlib.suppress(psutil.NoSuchProcess):
             seen = psutil.Process(process.pid).children(recursive=True)
-        segments = segments_of([each.pid for each in seen])
         process.kill()
         for each in seen:
             with contextlib.suppress(psutil.NoSuchProcess):
                 each.kill()
         psutil.wait_procs(seen, timeout=GONE_S)
-        sweep(segments)
+        sweep()
 
 
 @contextlib.contextmanager

@@ -15,6 +15,7 @@ from pathlib import Path
 
 _FOLDER = "/dev/shm/"
 _NAME = re.compile(r"(?:sem\.)?fastrtps_(\w+?)(?:_el|_sl|_mutex)?")
+_LOCK = re.compile(r"/dev/shm/(fastrtps_\w+_[es]l)")
 _MAPPED = re.compile(r"/dev/shm/(\S*fastrtps_\S+)")
 
 
@@ -28,6 +29,19 @@ def used_by(pids: Iterable[int]) -> set[str]:
                 with contextlib.suppress(OSError):
                     names.update(_MAPPED.findall(str(each.readlink())))
     return names
+
+
+def owned_by(pids: Iterable[int]) -> set[str]:
+    """Return the files of the groups of which these processes have the lock open."""
+    groups: set[str] = set()
+    for pid in pids:
+        with contextlib.suppress(OSError):
+            for each in Path(f"/proc/{pid}/fd").iterdir():
+                with contextlib.suppress(OSError):
+                    if found := _LOCK.fullmatch(str(each.readlink())):
+                        groups.add(_group(found[1]))
+    there = os.scandir(_FOLDER) if groups else ()
+    return {each.name for each in there if _group(each.name) in groups}
 
 
 def left_behind(only: Collection[str] | None = None) -> set[str]:

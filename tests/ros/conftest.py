@@ -27,9 +27,10 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
 from lifecycle.middleware.fastdds.profiles import discovery_environment
-from lifecycle.middleware.process.shared_memory import leftovers, segments_of
+from lifecycle.middleware.process.shared_memory import leftovers
 from lifecycle.pytest_plugin import claimed_domain
 from tests.second_try import SECOND_TRY
+from tests.shared_memory import owned_by
 
 BOUND_S = 30.0
 """Seconds that a wait for an event may take on a busy machine; it ends with the event."""
@@ -96,10 +97,10 @@ def _left(seen: _Seen) -> list[tuple[str, int]]:
 def _note_shared_memory(_shared_memory: _Seen, request: pytest.FixtureRequest) -> Iterator[None]:
     """Note what is used, and fail the test whose participants would haunt those that follow."""
     me = psutil.Process()
-    before = segments_of([me.pid])
+    before = owned_by([me.pid])
     yield
-    after = segments_of([me.pid])
-    used = after | segments_of([child.pid for child in me.children(recursive=True)])
+    after = owned_by([me.pid])
+    used = after | owned_by([child.pid for child in me.children(recursive=True)])
     for file in _files(used):
         _shared_memory.setdefault(file, "")
     for file in _left(_shared_memory):

@@ -21,7 +21,6 @@ from lifecycle_msgs.msg import TransitionEvent
 from rclpy.executors import SingleThreadedExecutor
 
 from lifecycle.middleware.fastdds.dscp import socket_descriptors
-from lifecycle.middleware.process.shared_memory import segments_of
 from lifecycle.middleware.rcl.graph import GraphObserver
 from lifecycle.plan.model import ParticipantConnections
 from lifecycle.supervisor.control.protocol import (
@@ -32,6 +31,7 @@ from lifecycle.supervisor.control.protocol import (
     ask,
 )
 from tests.ros.supervisor.running import BOUND_S, Event, Up
+from tests.shared_memory import owned_by
 from tests.soak.system import COMPOSITION, NAME
 
 ACTIVE = "active"
@@ -118,7 +118,7 @@ class Transitions:
         before = set(socket_descriptors())
         connections = ParticipantConnections(urls=("udpv4://127.0.0.1",))
         self._observer = GraphObserver(domain_id, connections)
-        if segments_of((os.getpid(),)):
+        if owned_by((os.getpid(),)):
             raise AssertionError("the observer shares memory with what it judges")
         node = self._observer.node
         self._subscriptions = {

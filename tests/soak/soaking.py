@@ -23,8 +23,9 @@ from pathlib import Path
 
 import psutil
 
-from lifecycle.middleware.process.shared_memory import leftovers, segments_of
+from lifecycle.middleware.process.shared_memory import leftovers
 from tests.ros.supervisor.running import ROOT, command, environment, left_of
+from tests.shared_memory import owned_by
 from tests.soak.model import (
     DIES,
     HANGS,
@@ -422,7 +423,7 @@ class Soaking:
             if early := self.transitions.activated(closed + 0.3, opened):
                 raise NotAsPromisedError(f"became active while an intruder was there: {early}")
         finally:
-            self._spare += tuple(segments_of([stranger.pid]))
+            self._spare += tuple(owned_by([stranger.pid]))
             stranger.kill() if sys.exc_info()[0] else stranger.terminate()
             stranger.wait(DOWN_S)
             assert stranger.stdout is not None

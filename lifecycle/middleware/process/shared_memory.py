@@ -33,7 +33,7 @@ import re
 import signal
 import struct
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 
 from lifecycle import dataclasses
@@ -119,20 +119,8 @@ class _SharedFile:
         return self.group.startswith(_PORT)
 
 
-def segments_of(pids: Iterable[int]) -> frozenset[str]:
-    """Return the names of the Fast DDS files that these processes own now.
-
-    Remember them while a process lives; `sweep` then removes what it left behind.
-    """
-    held = {inode for pid in pids for inode in _peek(_open_inodes, pid)}
-    names = _names() if held else {}
-    locks = _lock_files(names)
-    owned = frozenset(locks[inode] for inode in held & locks.keys())
-    return frozenset(name for name, (group, _) in names.items() if group in owned)
-
-
-def _locks() -> Iterator[tuple[int, _Inode]]:
-    """Yield who holds a lock on a whole file, and on which, of this PID namespace.
+def _locked() -> Iterator[_Inode]:
+    """Yield the files that somebody of this PID namespace has locked.
 
     Raises:
         OSError: /proc/locks cannot be read, see proc_locks(5).
@@ -141,7 +129,7 @@ def _locks() -> Iterator[tuple[int, _Inode]]:
         fields = line.split()
         if len(fields) >= _LOCK_FIELDS and fields[1] == "FLOCK":
             major, minor, inode = fields[5].split(":")
-            yield int(fields[4]), (os.makedev(int(major, 16), int(minor, 16)), int(inode))
+            yield os.makedev(int(major, 16), int(minor, 16)), int(inode)
 
 
 def check_room() -> None:
@@ -232,7 +220,7 @@ def disown_ports() -> tuple[str, ...]:
     used: set[_Inode] = set()
     if groups:
         with contextlib.suppress(OSError):  # each is tried then
-            used.update(inode for _, inode in _locks())
+            used.update(_locked())
     return tuple(
         sorted(
             group
@@ -367,21 +355,6 @@ def _claim(file: _SharedFile) -> Iterator[None]:
         os.close(descriptor)
 
 
-def _names() -> dict[str, tuple[str, _Inode]]:
-    """Return the names of all files, each with its group and inode; nothing is looked at but names.
-
-    Processes that were killed may have left tens of thousands.
-    """
-    device = _DIRECTORY.stat().st_dev if _DIRECTORY.is_dir() else 0
-    found = ((entry.name, _group(entry.name), entry.inode()) for entry in _listing(_DIRECTORY))
-    return {name: (group, (device, inode)) for name, group, inode in found if group}
-
-
-def _lock_files(names: Mapping[str, tuple[str, _Inode]]) -> dict[_Inode, str]:
-    """Return the group of each lock file."""
-    return {inode: group for name, (group, inode) in names.items() if name.endswith(_LOCKS)}
-
-
 def _files(is_wanted: Callable[[str], bool]) -> list[_SharedFile]:
     """Return the files of some groups."""
     found = []
@@ -427,21 +400,3 @@ def _listing(directory: Path) -> list[os.DirEntry[str]]:
 def _group(name: str) -> str:
     match = _FILE.fullmatch(name)
     return match["group"] if match else ""
-
-
-def _peek(look: Callable[[int], set[_Inode]], pid: int) -> set[_Inode]:
-    """Look into a process; nothing where it has ended or belongs to another user."""
-    try:
-        return look(pid)
-    except (FileNotFoundError, PermissionError, ProcessLookupError):
-        return set()
-
-
-def _open_inodes(pid: int) -> set[_Inode]:
-    found: set[_Inode] = set()
-    for entry in _listing(Path(f"/proc/{pid}/fd")):
-        with contextlib.suppress(FileNotFoundError):
-            if os.readlink(entry.path).startswith(f"{_DIRECTORY}/"):  # noqa: PTH115 - hot loop
-                status = entry.stat()
-                found.add((status.st_dev, status.st_ino))
-    return found

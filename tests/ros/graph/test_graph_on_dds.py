@@ -27,11 +27,12 @@ from lifecycle.graph.model import EventKind, GraphEvent, NodeLiveliness
 from lifecycle.graph.state import GraphState
 from lifecycle.manifest.loading import load
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.middleware.process.shared_memory import segments_of, sweep
+from lifecycle.middleware.process.shared_memory import sweep
 from lifecycle.plan.build import build_plan
 from lifecycle.verify.observation import EndpointReport, Identity, NodeConfiguration
 from lifecycle.verify.outcome import Outcome
 from tests.ros.supervisor.running import pair, up
+from tests.shared_memory import owned_by
 
 LIMIT_S = 30.0
 
@@ -75,7 +76,7 @@ def process(name: str, topic: str) -> Iterator[subprocess.Popen[str]]:
     try:
         assert started.stdout is not None
         assert started.stdout.readline() == "reporting\n"
-        _killed.update(segments_of([started.pid]))
+        _killed.update(owned_by([started.pid]))
         yield started
     finally:
         with contextlib.suppress(ProcessLookupError):

@@ -15,8 +15,9 @@ from fast_dds_words import without_fast_dds
 from std_msgs.msg import String
 
 from lifecycle.middleware.discovery.rediscovery import introduce
-from lifecycle.middleware.process.shared_memory import leftovers, segments_of, sweep
+from lifecycle.middleware.process.shared_memory import leftovers, sweep
 from lifecycle.middleware.rcl.graph import GraphObserver
+from tests.shared_memory import owned_by
 
 WaitUntil = Callable[..., None]
 
@@ -78,7 +79,7 @@ def test_leaving_tells_the_graph_and_leaves_no_shared_memory(
 ) -> None:
     with start() as process:
         wait_until(lambda: names(observer) == ["/managed", "/plain"])
-        ours = segments_of([process.pid])
+        ours = owned_by([process.pid])
         _, errors = process.communicate("leave\n", timeout=30)
     assert (process.returncode, without_fast_dds(errors)) == (5, [])
     # Told by the leaving process: an unannounced death would show after 20 s.
@@ -171,7 +172,7 @@ def test_the_sweep_spares_a_living_process_and_clears_up_after_a_killed_one(
 ) -> None:
     with start() as process:
         wait_until(lambda: "/plain" in names(observer))
-        ours = segments_of([process.pid])
+        ours = owned_by([process.pid])
         kinds = {re.sub(r"[0-9a-f]{16}|\d+", "#", name) for name in ours}
         assert kinds == {
             "fastrtps_#",

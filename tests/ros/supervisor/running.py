@@ -24,8 +24,9 @@ from typing import Any
 import psutil
 import yaml
 
-from lifecycle.middleware.process.shared_memory import leftovers, segments_of, sweep
+from lifecycle.middleware.process.shared_memory import leftovers, sweep
 from tests.installation import LIFECYCLE, modules
+from tests.shared_memory import owned_by
 
 ROOT = Path(__file__).parents[3]
 BOUND_S = 40.0
@@ -205,7 +206,7 @@ class Up:
 
     def note_segments(self) -> None:
         """Remember the shared memory of all processes that run now."""
-        seen = segments_of(each.pid for each in marked(self.mark))
+        seen = owned_by(each.pid for each in marked(self.mark))
         self.segments |= {name for name in seen if not _SHARED.search(name)}
 
     def of_kind(self, kind: str) -> list[Event]:
@@ -267,7 +268,7 @@ class Up:
         deadline = time.monotonic() + BOUND_S
         while alive := marked(self.mark):
             assert time.monotonic() < deadline, f"cannot be killed: {alive}"
-            used |= segments_of(each.pid for each in alive)
+            used |= owned_by(each.pid for each in alive)
             for each in alive:
                 with contextlib.suppress(psutil.NoSuchProcess, ProcessLookupError):
                     _kill(each, deadline)

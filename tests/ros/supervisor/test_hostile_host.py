@@ -16,9 +16,9 @@ from rclpy.node import Node
 from std_msgs.msg import String
 
 from lifecycle.errors import ExitCode
-from lifecycle.middleware.process.shared_memory import segments_of
 from lifecycle.run_directory import RUN_VARIABLE
 from tests.ros.supervisor.running import ROOT, Up, command, environment, marked, pair
+from tests.shared_memory import owned_by
 
 pytestmark = pytest.mark.thorough
 
@@ -53,7 +53,7 @@ def test_the_shared_memory_of_another_pid_namespace_is_left_alone(
         pytest.skip(f"no PID namespace can be made here: {error}")
     node = make_node("alive")
     publisher = node.create_publisher(String, "alive", 10)
-    owned = segments_of([os.getpid()])
+    owned = owned_by([os.getpid()])
     assert in_shared_memory(owned) == owned != set()
     run = Up(
         pair(tmp_path, domain_id, edit=OPEN),

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from lifecycle.middleware.process import shared_memory
-from lifecycle.middleware.process.shared_memory import disown_ports, leftovers, segments_of, sweep
+from lifecycle.middleware.process.shared_memory import disown_ports, leftovers, sweep
 from tests.builders import port_node
 
 SEGMENT = "fastrtps_0123456789abcdef"
@@ -221,17 +221,6 @@ def test_what_a_process_owns_is_not_waited_for(directory: Path) -> None:
     assert time.monotonic() - began_s < 30
 
 
-def test_a_process_owns_the_groups_whose_lock_file_it_has_open(directory: Path) -> None:
-    make(directory, *GROUP, SEGMENT, f"{SEGMENT}_el")
-    with (directory / f"{PORT}_el").open("rb"), (directory / SEGMENT).open("rb"):
-        assert segments_of([os.getpid()]) == frozenset(GROUP)
-    assert segments_of([os.getpid()]) == frozenset()
-
-
-def test_a_process_that_has_ended_owns_nothing() -> None:
-    assert segments_of([2**22 + 1]) == frozenset()
-
-
 @pytest.mark.parametrize(
     ("memory", "disowned"),
     [
@@ -260,7 +249,7 @@ def test_the_port_of_a_living_process_stays_as_it_is(
     directory: Path, monkeypatch: pytest.MonkeyPatch, are_listed: bool
 ) -> None:
     if not are_listed:  # those of another PID namespace, or where proc(5) has none
-        monkeypatch.setattr(shared_memory, "_locks", lambda: iter(()))
+        monkeypatch.setattr(shared_memory, "_locked", lambda: iter(()))
     make(directory, *GROUP)
     (directory / PORT).write_bytes(port_node())
     with (directory / f"{PORT}_el").open("rb") as owner:
@@ -287,7 +276,7 @@ def test_ports_are_let_go_of_where_the_kernel_lists_no_locks(
         raise PermissionError
         yield
 
-    monkeypatch.setattr(shared_memory, "_locks", refused)
+    monkeypatch.setattr(shared_memory, "_locked", refused)
     make(directory, *GROUP)
     (directory / PORT).write_bytes(port_node())
     assert disown_ports() == (PORT,)
@@ -297,4 +286,4 @@ def test_a_machine_without_shared_memory_has_nothing_to_sweep(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(shared_memory, "_DIRECTORY", tmp_path / "missing")
-    assert (sweep(ALL), leftovers(), segments_of([os.getpid()])) == ((), (), frozenset())
+    assert (sweep(ALL), leftovers()) == ((), ())
