@@ -4,18 +4,12 @@ Owns: which TCP connections of this process count as dead (not answered any more
 unused, read from the kernel (TCP_INFO of tcp(7)); and where the message is sent by which a
 participant leaves, for one whose process was killed and cannot say it. Must not import rclpy.
 
-Fast DDS 2.14 never returns from the destruction of a participant whose connection is cut: it waits
-for the thread that reads from it, which waits for the other end
-(TCPChannelResourceBasic::disconnect; measured: 5 of 5). Shutting the socket down wakes that thread.
-
-It also never uses a connection whose first answer arrived before the connecting thread had noted
-what to request next (BIND_CONNECTION_RESPONSE in RTCPMessageManager::processRTCPMessage; seen in
-packets: the request, its answer, and nothing more). Only another participant, on another port,
-helps then.
+Fast DDS 2.14 never returns from the destruction of a participant whose connection is cut, until its
+socket is shut down; and it never uses a connection whose first answer arrived before the connecting
+thread had noted what to request next: only another participant, on another port, helps then.
 
 Every participant that had discovered the dead one drops it and all of its endpoints as if it had
-left properly (Fast DDS 2.14: PDPListener::onNewCacheChangeAdded; measured: within a millisecond).
-Without the message, peers and observers show a killed process until its lease has run out, 20 s by
+left properly. Without the message, they show a killed process until its lease has run out, 20 s by
 default. A receiver cannot check who wrote the message, so callers must know that the process is
 dead, and that the participant was that process's.
 """

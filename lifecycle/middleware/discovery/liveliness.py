@@ -5,12 +5,9 @@ MANUAL_BY_TOPIC writer: it ends with SIGSTOP and SIGKILL, and does not arrive ov
 cut. The reader's lease is the longest allowed time between assertions (DDS 1.4 §2.2.3.11), so many
 of them may be lost between. A callback that holds the interpreter's lock for longer expires it too.
 
-Fast DDS 2.14 does not repeat an assertion that was lost on the way (measured: with one each 0.2 s,
-30 % loss and a lease of 0.9 s, five false alarms a minute), so it is asserted this often. It would
-assert an AUTOMATIC writer by itself, and hangs with it: its event thread then waits for the
-discovery's mutex, which the thread that removes a leaving peer's writer holds while waiting for the
-event thread (WLP::automatic_liveliness_assertion, WriterProxy::stop; seen in 1 of about 80
-take-downs of two hosts with six nodes each).
+Fast DDS 2.14 does not repeat an assertion that was lost on the way, so it is asserted this often.
+An AUTOMATIC writer would be asserted by Fast DDS's event thread, which stands still while a leaving
+peer's writer is removed.
 
 `PlanNotices` is the topic on which supervisors of one domain publish their plans, to detect
 conflicts. Its name holds no system: a supervisor that was started with another manifest must be
@@ -51,8 +48,7 @@ LEASE_S = 0.85
 that follows."""
 
 ASSERTED_EACH_S = 0.06
-"""Fourteen fit into LEASE_S. At 30 % loss all of them are lost once in thousands of runs of ten
-minutes; one takes about 150 bytes to each participant that has discovered us."""
+"""Fourteen fit into LEASE_S; one takes about 150 bytes to each participant that discovered us."""
 
 _LONGEST_NOTICE = 1 << 16
 """Characters of a notice; a line for each silent node."""
@@ -65,19 +61,22 @@ def node_topic(full_name: str) -> str:
     return f"{full_name}/_alive"
 
 
-_NOTICES = QoSProfile(
-    depth=1,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
-_PULSES = functools.partial(
-    QoSProfile,
+def _latched(depth: int) -> QoSProfile:
+    return QoSProfile(
+        depth=depth,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL,
+    )
+
+
+_NOTICES = _latched(1)
+_ASSERTED = QoSProfile(
     depth=1,
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.VOLATILE,
+    liveliness=LivelinessPolicy.MANUAL_BY_TOPIC,
     liveliness_lease_duration=Duration(nanoseconds=round(LEASE_S * 1e9)),
 )
-_ASSERTED = _PULSES(liveliness=LivelinessPolicy.MANUAL_BY_TOPIC)
 _no_publisher_events = functools.partial(PublisherEventCallbacks, use_default_callbacks=False)
 _no_subscription_events = functools.partial(SubscriptionEventCallbacks, use_default_callbacks=False)
 
@@ -288,18 +287,16 @@ class PlanNotices:
             String,
             PLANS_TOPIC,
             lambda message: on_notice(message.data),
-            _qos(_KEPT),
-            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+            _latched(_KEPT),
+            event_callbacks=_no_subscription_events(),
         )
         # rclpy's own methods: a managed node's would gate them.
         self._publisher = Node.create_publisher(
             node,
             String,
             PLANS_TOPIC,
-            _qos(1),
-            event_callbacks=PublisherEventCallbacks(
-                matched=self._matched, use_default_callbacks=False
-            ),
+            _NOTICES,
+            event_callbacks=_no_publisher_events(matched=self._matched),
         )
 
     def announce(self, text: str) -> None:
@@ -316,11 +313,3 @@ class PlanNotices:
         """Announce again: Fast DDS repeats what a newcomer lost after up to 3 s."""
         if info.current_count_change > 0 and self._text:
             self._publisher.publish(String(data=self._text))
-
-
-def _qos(depth: int) -> QoSProfile:
-    return QoSProfile(
-        depth=depth,
-        reliability=ReliabilityPolicy.RELIABLE,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL,
-    )

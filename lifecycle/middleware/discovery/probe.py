@@ -6,10 +6,9 @@ environment and for connection URLs. Shared memory, TCP and a discovery server c
 nothing is sent where the system's own discovery would send nothing. Must not import rclpy.
 
 Why: Fast DDS 2.14 sends a new participant's first announcement before it listens, so an answer on
-the same host arrives too early and is lost; the participant that answered stays quiet for its next
-3 s (measured: in about half of all tries). A gate that opens meanwhile has not seen that
-participant. An announcement sent once we do listen, under a GUID prefix of its own, is answered to
-our participant's port, and to a socket of ours that counts the participants.
+the same host is often lost, and the participant that answered stays quiet for its next 3 s: a gate
+that opens meanwhile has not seen it. An announcement sent once we do listen, under a GUID prefix of
+its own, is answered to our participant's port, and to a socket of ours that counts who answers.
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ from lifecycle.middleware.fastdds.url_profile import (
     leaves_discovery_open,
 )
 from lifecycle.middleware.process.control import interface_addresses
-from lifecycle.network.connection_url import ConnectionUrl
+from lifecycle.network.connection_url import ConnectionUrl, Peer
 from lifecycle.network.medium import RMW_DISCOVERY, TRANSPORTS_VARIABLE, Medium
 from lifecycle.network.ports import (
     DG,
@@ -409,8 +408,7 @@ def connects_first(urls: Sequence[ConnectionUrl], environment: Mapping[str, str]
 
     So it is with LARGE_DATA, where the range does not choose other transports, and with a file of
     profiles that has TCP. An answer by UDP says nothing then of what a participant has, and that it
-    tries to connect to one that does not exist delays it. Where it is not asked, and an observer
-    is announced once it listens, that took 0.3 s most times, and up to 3.8 s.
+    tries to connect to one that does not exist delays it.
     """
     if urls:
         return False
@@ -628,12 +626,7 @@ def _bound(family: UrlTransport) -> dict[str, tuple[str, ...]]:
 def _targets_of_peers(
     domain_id: int, family: UrlTransport, here: Mapping[str, tuple[str, ...]]
 ) -> tuple[ProbeTarget, ...]:
-    targets: list[ProbeTarget] = []
-    for peer in dict.fromkeys(peer for url in family.urls for peer in url.peers):
-        if peer.port is None:
-            targets += well_known_targets(domain_id, peer.address, LOCALHOST_PEERS_RANGE)
-        else:
-            targets.append(ProbeTarget(address=peer.address, port=peer.port))
+    targets = listed_targets(domain_id, family.peers, LOCALHOST_PEERS_RANGE)
     if all(url.multicast for url in family.urls):
         targets += group_targets(
             domain_id, family.kind, {n: each for n, each in here.items() if each}
@@ -645,10 +638,20 @@ def _probe_peers(domain_id: int, family: UrlTransport) -> Probe:
     here = _bound(family)
     targets = _targets_of_peers(domain_id, family, here)
     addresses = tuple(each for found in here.values() for each in found)
-    fixed = [url.metatraffic_port for url in family.urls if url.metatraffic_port]
-    output = next((url.output_port for url in family.urls if url.output_port), None)
-    receivers = fixed[:1] or discovery_ports(domain_id, family.kind)
-    return Probe(targets, addresses, receivers, output_port=output)
+    fixed = family.metatraffic_port
+    receivers = (fixed,) if fixed else discovery_ports(domain_id, family.kind)
+    return Probe(targets, addresses, receivers, output_port=family.output_port)
+
+
+def listed_targets(domain_id: int, peers: Iterable[Peer], participants: int) -> list[ProbeTarget]:
+    """Return where peers of URLs are: at their port, else at those of their first participants."""
+    targets: list[ProbeTarget] = []
+    for peer in peers:
+        if peer.port is None:
+            targets += well_known_targets(domain_id, peer.address, participants)
+        else:
+            targets.append(ProbeTarget(address=peer.address, port=peer.port))
+    return targets
 
 
 def well_known_targets(domain_id: int, address: str, participants: int) -> Iterator[ProbeTarget]:

@@ -27,12 +27,12 @@ from lifecycle.middleware.discovery.dead_peers import listening
 from lifecycle.middleware.discovery.messages import disposal
 from lifecycle.middleware.discovery.probe import (
     RANGE_VARIABLE,
-    ProbeTarget,
     addresses_of,
     ask,
     chosen_otherwise,
     discovery_ports,
     group_targets,
+    listed_targets,
     probe_targets,
     send,
     sender_by,
@@ -108,21 +108,15 @@ def _call_around(domain_id: int, kind: Medium, peers: Sequence[str]) -> None:
 def _call_listed(domain_id: int, family: UrlTransport) -> None:
     """Call the listed peers of other hosts, in the name of those of this one."""
     here = {a for found in addresses_of(family.kind, loopback=True).values() for a in found}
-    listed = dict.fromkeys(peer for url in family.urls for peer in url.peers)
+    listed = family.peers
     ours = [(url.address, url.metatraffic_port) for url in family.urls if url.address in here]
     ours += [(peer.address, peer.port) for peer in listed if peer.address in here]
     answered_at = [(address, port) for address, port in ours if port is not None]
-    targets: list[ProbeTarget] = []
-    for peer in listed:
-        if peer.address in here:
-            continue
-        if peer.port is None:
-            targets += well_known_targets(domain_id, peer.address, _PARTICIPANTS)
-        else:
-            targets.append(ProbeTarget(address=peer.address, port=peer.port))
+    elsewhere = (peer for peer in listed if peer.address not in here)
+    targets = listed_targets(domain_id, elsewhere, _PARTICIPANTS)
     if not answered_at or not targets:
         return
-    output = next((url.output_port for url in family.urls if url.output_port), None)
+    output = family.output_port
     if (own := sender_by(family.kind.socket_family, output)) is None:
         return
     with own as sender:
@@ -182,9 +176,7 @@ def republish_names(nodes: Iterable[Node]) -> None:
     rmw_fastrtps does so whenever a node or an endpoint is made or destroyed. Here it is a hidden
     node without endpoints, for a moment: when an endpoint ends, a discovery server of Fast DDS 2.14
     drops whatever it has not relayed yet of that participant's other endpoints, and never sends it
-    again (remove_related_alive_from_history_nts in PDPServer::process_disposals). What was made
-    while a link was cut arrives there together with what is said once it is back (measured: of 16
-    publishers 8 were never seen by the other host). Take one node of each participant.
+    again. Take one node of each participant.
     """
     for node in nodes:
         bare_node(node.context).destroy_when_not_in_use()

@@ -9,8 +9,8 @@ Fast DDS 2.14 has no DSCP setting, always lists 0 in its NFEs and exposes no soc
 option is what the kernel puts into packets. It needs no privilege.
 
 A participant's UDP sender sockets all exist before its first publisher does: Fast DDS looks for
-interfaces once, and opens none for one that appears later (measured: neither a new interface nor a
-new peer changes them). TCP connections are opened later, are in no NFE list, and are not marked.
+interfaces once, and opens none for one that appears later. TCP connections are opened later, are in
+no NFE list, and are not marked.
 """
 
 from __future__ import annotations

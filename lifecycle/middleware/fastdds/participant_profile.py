@@ -424,8 +424,7 @@ def without_shared_memory(environment: Mapping[str, str]) -> tuple[Medium, ...]:
     """Return Fast DDS's default transports but for shared memory; none where others are chosen.
 
     An observer of the graph needs no shared memory, and a process that is killed while it holds the
-    mutex of a port there blocks each process that sends to it for 10 s at a time, with the lock of
-    the writer that sends (SharedMemManager::Port::regenerate_port in Fast DDS 2.14).
+    mutex of a port there blocks each process that sends to it for 10 s at a time.
 
     Args:
         environment: of this process.

@@ -3,9 +3,8 @@
 Owns: the quick discovery profile, and text elements and locators as Fast DDS 2.14's XML parser
 reads them. Must not import rclpy.
 
-Fast DDS announces a new participant five times at 100 ms and then once each 3 s; when those five
-are lost or arrive too early, discovery stalls in steps of 3 s. Announcements for 2 s remove the
-stall. Each goes to every participant that is known already, so there are ten at 200 ms. The
+Fast DDS announces a new participant five times at 100 ms and then once each 3 s; where those five
+are lost or arrive too early, discovery stalls. Announcements for 2 s remove the stall. The
 environment is used, not Fast DDS's C++ API: the children of a supervisor, whatever they are written
 in, inherit it.
 """

@@ -414,9 +414,7 @@ def noting_shared_memory(context: Context, *, is_new: bool) -> Iterator[None]:
         is_new: it has no participant yet.
 
     To ask for it costs a subscription, which is announced and taken back while others discover the
-    participant. Of one in the same process another then lacks all its subscriptions for good, at
-    times: Fast DDS 2.14 delivers endpoints by function calls there, and never again. It was 1 of
-    560 processes with three participants that were made one after the other, and none of 8,000.
+    participant; then another one in the same process may lack all its subscriptions for good.
     """
     before = own_segments()
     yield

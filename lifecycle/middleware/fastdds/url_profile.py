@@ -47,6 +47,21 @@ class UrlTransport:
         return self.kind.is_udp
 
     @property
+    def peers(self) -> tuple[Peer, ...]:
+        """Who its URLs say is looked for, each once."""
+        return tuple(dict.fromkeys(peer for url in self.urls for peer in url.peers))
+
+    @property
+    def metatraffic_port(self) -> int | None:
+        """The port for discovery that its URLs name, if one does."""
+        return next((url.metatraffic_port for url in self.urls if url.metatraffic_port), None)
+
+    @property
+    def output_port(self) -> int | None:
+        """The port that its URLs say is sent from, if one does."""
+        return next((url.output_port for url in self.urls if url.output_port), None)
+
+    @property
     def unicast(self) -> tuple[ConnectionUrl, ...]:
         """Its URLs that are no groups."""
         return tuple(url for url in self.urls if not url.transport.is_group)
@@ -228,7 +243,7 @@ def _add_metatraffic(
     builtin: ET.Element, found: Sequence[UrlTransport], domain_id: int, *, multicast: bool
 ) -> None:
     """Say where discovery arrives, if Fast DDS would not do as asked by itself."""
-    fixed = any(url.metatraffic_port for family in found for url in family.urls)
+    fixed = any(family.metatraffic_port for family in found)
     tcp_alone = all(family.kind.is_tcp for family in found)
     udp = any(family.udp for family in found)
     if not (fixed or tcp_alone or (udp and not multicast)):
@@ -236,10 +251,9 @@ def _add_metatraffic(
     unicast = ET.SubElement(builtin, "metatrafficUnicastLocatorList")
     for family in found:
         if family.udp:
-            port = next((url.metatraffic_port for url in family.urls if url.metatraffic_port), None)
             addresses = dict.fromkeys(url.address for url in family.unicast) or {"": None}
             for address in addresses:
-                _locator(unicast, family.kind, address, port)
+                _locator(unicast, family.kind, address, family.metatraffic_port)
         elif family.kind.is_tcp:
             logical = participant_ports(domain_id, 0).discovery_unicast
             for url in family.urls:
@@ -261,7 +275,7 @@ def _add_peers(
 ) -> None:
     searched = ET.Element("initialPeersList")
     for family in found:
-        for peer in dict.fromkeys(peer for url in family.urls for peer in url.peers):
+        for peer in family.peers:
             if family.kind.is_tcp:
                 _tcp_locator(searched, family.kind, peer.address, peer.port, None)
             else:
@@ -317,7 +331,7 @@ def _all_ports_fixed(found: Sequence[UrlTransport]) -> bool:
     # Shared memory has ports of its own, which must stay free to move.
     return all(
         family.udp
-        and any(url.metatraffic_port for url in family.urls)
+        and family.metatraffic_port
         and family.unicast
         and all(url.port for url in family.unicast)
         for family in found
@@ -402,21 +416,18 @@ def _descriptor(
         ttl = next((url.ttl for url in family.urls if url.ttl is not None), None)
         if ttl is not None:
             _text(descriptor, "TTL", str(ttl))
-        output = next((url.output_port for url in family.urls if url.output_port), None)
-        if output is not None:
-            _text(descriptor, "output_port", str(output))
+        if family.output_port is not None:
+            _text(descriptor, "output_port", str(family.output_port))
         if non_blocking:
             _text(descriptor, "non_blocking_send", "true")
     if family.kind.is_network:
-        peers = [peer for url in family.urls for peer in url.peers]
-        wide = open_peers or any(peer.port is None for peer in peers)
+        wide = open_peers or any(peer.port is None for peer in family.peers)
         range_ = LOCALHOST_PEERS_RANGE if wide and family.udp else 1
         _text(descriptor, "maxInitialPeersRange", str(range_))
     if family.interfaces:
         allowed = ET.SubElement(descriptor, "interfaceWhiteList")
         for each in family.interfaces:
-            is_name = _is_name(each)
-            _text(allowed, "interface" if is_name else "address", each)
+            _text(allowed, "interface" if _is_name(each) else "address", each)
     if family.kind.is_tcp:
         _keep_dialling_whole(descriptor)
         ports = [url.port for url in family.urls if url.port]
@@ -428,11 +439,9 @@ def _descriptor(
 def _keep_dialling_whole(descriptor: ET.Element) -> None:
     """Keep the thread that finishes a connection from overtaking the one that began it.
 
-    Fast DDS 2.14 dials first and says then which port it wants inside the connection. If the answer
-    to the former comes in between, the connection stays unused for good: nothing is sent, nothing
-    closed (TCPTransportInterface::CreateInitialConnect, RTCPMessageManager::processRTCPMessage). On
-    a busy machine the thread that it wakes takes its processor over just then; a SCHED_BATCH thread
-    does not (sched(7)), and needs no privilege. Threads that receive are as always.
+    Fast DDS 2.14 dials first and says then which port it wants inside the connection; if the answer
+    to the former comes in between, the connection stays unused for good. A SCHED_BATCH
+    thread does not overtake then (sched(7)), and needs no privilege.
     """
     for tag, policy in (
         ("accept_thread", os.SCHED_BATCH),

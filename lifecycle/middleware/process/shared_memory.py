@@ -205,10 +205,8 @@ def disown_ports() -> tuple[str, ...]:
     """Have every sender let go of the ports of this user's processes that have been killed.
 
     Who has sent to a port keeps it mapped, and goes on sending there when another process has made
-    it anew: what it sends is lost. Fast DDS 2.14 has each sender look after its ports, by the
-    machine's clock, which takes two seconds, or an hour where that is set back by one
-    (SharedMemGlobal::Port::Watchdog). Here what it would note then is noted at once; where the
-    memory is not as in that version nothing is.
+    it anew: what it sends is lost. Fast DDS 2.14 lets go of it after two seconds or more; here it
+    does so at once. Where the memory is not as in that version nothing is done.
 
     Returns:
         Their names, sorted.

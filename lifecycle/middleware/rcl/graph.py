@@ -9,6 +9,7 @@ rmw_cyclonedds announce hashes since Iron.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 import re
 import threading
@@ -139,24 +140,19 @@ PATIENCE_S = 3.5
 """What Fast DDS lost on the way it sends again every 3 s."""
 
 _UNPROBED_S = 1.5
-"""Within so long all are seen where none can be asked, over shared memory or TCP.
-
-They announce themselves each 0.5 s, and TCP may lose the first of it (measured: up to 1.2 s).
-"""
+"""Within so long all are seen where none can be asked, over shared memory or TCP."""
 
 _UNCOUNTED_S = 0.6
-"""Within so long a probed participant is discovered, if we may not receive its answer (measured: up
-to 0.3 s)."""
+"""Within so long a probed participant is discovered, if we may not receive its answer."""
 
 _CONNECTED_S = 5.0
-"""Within so long all are seen that make TCP connections once they are discovered (measured: up to
-3.8 s)."""
+"""Within so long all are seen that make TCP connections once they are discovered."""
 
 _ANNOUNCED_BY_SERVER_S = 2.5
-"""Within so long a discovery server has announced all (measured: up to 1.6 s)."""
+"""Within so long a discovery server has announced all."""
 
 _AGREED_S = 5.0
-"""A server that listens agrees within 0.1 s, on a machine with both processors busy within 1 s."""
+"""A server that listens agrees within so long, on a busy machine too."""
 
 _NAMED_S = 0.2
 """Of a new participant endpoints are known first, and within so long of which nodes they are."""
@@ -652,25 +648,26 @@ class GraphObserver:
                 for part in ("send_goal", "cancel_goal", "get_result")
             ),
         ]
-        publishers, subscriptions = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
         for service in services:
-            shown: set[tuple[EndpointKind, str]] = set()
-            for kind, side, topic in (
-                (EndpointKind.SERVICE_SERVER, subscriptions, f"rq{service}Request"),
-                (EndpointKind.SERVICE_SERVER, publishers, f"rr{service}Reply"),
-                (EndpointKind.SERVICE_CLIENT, publishers, f"rq{service}Request"),
-                (EndpointKind.SERVICE_CLIENT, subscriptions, f"rr{service}Reply"),
+            found = _Service.of(self.node, service)
+            for kind, sides in (
+                (EndpointKind.SERVICE_SERVER, found.servers),
+                (EndpointKind.SERVICE_CLIENT, found.clients),
             ):
-                for info in endpoints_of(self.node, side, topic, no_mangle=True):
-                    node = known_node(info.node)
-                    if node not in unreported or (kind, info.gid[:_PREFIX_DIGITS]) in shown:
+                shown: set[str] = set()
+                for info in itertools.chain(*sides):
+                    node, prefix = known_node(info.node), info.gid[:_PREFIX_DIGITS]
+                    if node not in unreported or prefix in shown:
                         continue
                     if self._stale_node_filter.ignores(info.gid):
                         continue
-                    shown.add((kind, info.gid[:_PREFIX_DIGITS]))
-                    type_ = _service_type(info.type)
+                    shown.add(prefix)
                     yield ObservedEndpoint(
-                        kind=kind, node=node, name=service, type=type_, gid=info.gid
+                        kind=kind,
+                        node=node,
+                        name=service,
+                        type=_service_type(info.type),
+                        gid=info.gid,
                     )
 
     def _located(self, endpoints: Iterable[ObservedEndpoint]) -> Iterator[ObservedEndpoint]:

@@ -45,7 +45,7 @@ _logger = logging.getLogger(__name__)
 _FOR_EVER = -1
 _AGAIN_NS = tuple(round(each * 1e9) for each in (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0))
 """Pauses after a change, while a callback says that what it waits for may follow: discovery shows
-an endpoint a moment before it is matched (measured: 0.4 ms), and no event reports the match."""
+an endpoint a moment before it is matched, and no event reports the match."""
 _STOP = 1
 _GUARDS = 2
 _COMPARE_S = 0.25

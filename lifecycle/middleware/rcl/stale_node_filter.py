@@ -2,9 +2,7 @@
 
 Owns: `StaleNodeFilter`. rmw_dds_common learns node names from one topic and which participants left
 from discovery, in two threads: the last message of a leaving participant may be read after it was
-removed, and then its names stay for good (GraphCache::update_participant_entities enters it anew;
-measured: 1 of 792 leavings on a loaded machine, still there long after the lease of 20 s). A gate
-would take a restarted node for two.
+removed, and then its names stay for good. A gate would take a restarted node for two.
 """
 
 from __future__ import annotations
