@@ -26,7 +26,7 @@ from pathlib import Path
 from lifecycle.middleware.discovery.messages import disposal
 from lifecycle.middleware.discovery.probe import ProbeTarget, probe_targets, send
 from lifecycle.middleware.fastdds.dscp import own_udp_socket, sockets_here
-from lifecycle.middleware.fastdds.url_check import sockets_of
+from lifecycle.middleware.fastdds.url_check import udp_sockets_of
 from lifecycle.network.connection_url import ConnectionUrl
 from lifecycle.network.medium import UDP_UNICAST, Medium
 
@@ -185,7 +185,7 @@ def _asked(
 def listening(pids: Iterable[int]) -> dict[Medium, dict[ProbeTarget, int]]:
     """Return where processes of this host receive UDP, by medium; the values are their pids."""
     found: dict[Medium, dict[ProbeTarget, int]] = {kind: {} for kind in UDP_UNICAST}
-    for pid, sockets in sockets_of(pids, kinds=UDP_UNICAST).items():
+    for pid, sockets in udp_sockets_of(pids).items():
         for each in sockets:
             if each.kind not in found or ipaddress.ip_address(each.address).is_multicast:
                 continue

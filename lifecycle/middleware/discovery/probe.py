@@ -128,11 +128,6 @@ class Probe:
         if not self.counts:
             self.close()
 
-    @property
-    def asks(self) -> tuple[object, ...]:
-        """To where it is sent, and the addresses at which it is to be answered."""
-        return self._targets, self._addresses
-
     def silent(self) -> frozenset[int]:
         """Return the asked UDP ports of other processes on this host that no answer named so far.
 

@@ -92,13 +92,6 @@ def fixed_sockets(settings: ParticipantSettings) -> set[int]:
     return {each.inode for each in open_sockets() if each.port in ports} if ports else set()
 
 
-def uses_shared_memory(node: Node, settings: ParticipantSettings) -> bool:
-    """Return if it has the transport, without a probe that static discovery would not allow."""
-    if settings.urls:
-        return not all(url.transport.is_network for url in settings.urls)
-    return has_shared_memory(node)
-
-
 _RELEASE_S = 0.2
 """An executor that waits for endpoints lets go of them within a millisecond of being woken."""
 
@@ -178,7 +171,9 @@ class FlowParticipant:
             # It would share the sockets that are to be unique.
             self.node.destroy_publisher(probe)
             if is_known():
-                self.has_shared_memory = uses_shared_memory(self.node, settings)
+                # URLs say it, without a probe that static discovery would not allow.
+                said = [url.transport.is_network for url in settings.urls]
+                self.has_shared_memory = not all(said) if said else has_shared_memory(self.node)
         except BaseException:
             self.destroy()
             raise

@@ -123,6 +123,13 @@ class _FastDds:
         self.static: dict[tuple[bool, str], int] = {}
         self.lock = threading.RLock()
 
+    def load(self, xml: str) -> int:
+        """Make profiles known to this process; returns the code."""
+        # What the environment names comes first, as without us.
+        self.load_profiles(self.factory())
+        data = xml.encode()
+        return int(self.load_string(self.factory(), data, len(data)))
+
     @contextlib.contextmanager
     def copied_default(self) -> Iterator[int]:
         """Yield the address of a copy of the default QoS."""
@@ -235,11 +242,7 @@ def load_profile(name: str, xml: str) -> None:
     with dds.lock:
         if name in dds.loaded:
             return
-        # What the environment names comes first, as without us.
-        dds.load_profiles(dds.factory())
-        data = xml.encode()
-        result = dds.load_string(dds.factory(), data, len(data))
-        if result != _OK:
+        if (result := dds.load(xml)) != _OK:
             raise MiddlewareError(
                 f"cannot load participant profile {name!r}: Fast DDS refused it (code {result})"
             )
@@ -299,10 +302,7 @@ def load_endpoint_profiles(endpoints: Sequence[StaticEndpoint]) -> None:
                 )
         if not new:
             return
-        dds.load_profiles(dds.factory())
-        data = endpoint_profiles(new).encode()
-        result = dds.load_string(dds.factory(), data, len(data))
-        if result != _OK:
+        if (result := dds.load(endpoint_profiles(new))) != _OK:
             raise MiddlewareError(
                 f"cannot load endpoint profiles: Fast DDS refused them (code {result})",
                 hint="profiles of the environment's for the same topics must go",

@@ -108,19 +108,13 @@ def check_sockets(urls: Sequence[ConnectionUrl], opened: Sequence[OpenSocket]) -
             )
 
 
-def open_sockets(
-    pid: int | None = None, *, kinds: Collection[Medium] = _KINDS
-) -> tuple[OpenSocket, ...]:
-    """Return the UDP and listening TCP sockets of a process in our network namespace.
+def open_sockets(*, kinds: Collection[Medium] = _KINDS) -> tuple[OpenSocket, ...]:
+    """Return the UDP and listening TCP sockets of this process.
 
     Args:
-        pid: of the process; None for this one.
         kinds: only these; the kernel takes milliseconds to list the TCP sockets of a host.
-
-    Raises:
-        OSError: there is no such process, or it is not ours to look at.
     """
-    ours = set(_socket_inodes("self" if pid is None else str(pid)))
+    ours = set(_socket_inodes("self"))
     return tuple(each for each in _bound_sockets(kinds) if each.inode in ours)
 
 
@@ -130,16 +124,14 @@ def udp_sockets(*, of_others: bool = False) -> tuple[OpenSocket, ...]:
     return tuple(each for each in _bound_sockets(UDP_UNICAST) if each.inode not in ours)
 
 
-def sockets_of(
-    pids: Iterable[int], *, kinds: Collection[Medium] = _KINDS
-) -> dict[int, tuple[OpenSocket, ...]]:
-    """Return what `open_sockets` does of several; those that are gone, or not ours, have none."""
+def udp_sockets_of(pids: Iterable[int]) -> dict[int, tuple[OpenSocket, ...]]:
+    """Return the UDP sockets of processes; those that are gone, or not ours, have none."""
     inodes: dict[int, int] = {}
     for pid in pids:
         with contextlib.suppress(OSError):
             inodes |= dict.fromkeys(_socket_inodes(str(pid)), pid)
     found: dict[int, list[OpenSocket]] = {}
-    for each in _bound_sockets(kinds) if inodes else ():
+    for each in _bound_sockets(UDP_UNICAST) if inodes else ():
         if each.inode in inodes:
             found.setdefault(inodes[each.inode], []).append(each)
     return {pid: tuple(sockets) for pid, sockets in found.items()}

@@ -33,7 +33,7 @@ from pathlib import Path
 from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.process import stacks
-from lifecycle.middleware.process.control import CLOCK_MONOTONIC, TimerSpec, libc
+from lifecycle.middleware.process.control import TimerSpec, libc
 
 _TFD_NONBLOCK = 0o4000
 _TFD_CLOEXEC = 0o2000000
@@ -110,7 +110,7 @@ class BusySign:
         Raises:
             MiddlewareError: the kernel refused.
         """
-        timer = libc().timerfd_create(CLOCK_MONOTONIC, _TFD_NONBLOCK | _TFD_CLOEXEC)
+        timer = libc().timerfd_create(time.CLOCK_MONOTONIC, _TFD_NONBLOCK | _TFD_CLOEXEC)
         if timer < 0:
             raise MiddlewareError(
                 f"cannot use timerfd_create: {os.strerror(ctypes.get_errno())}",

@@ -16,12 +16,12 @@ import resource
 import signal
 import socket
 import threading
+import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from lifecycle.errors import MiddlewareError
 
-CLOCK_MONOTONIC = 1
 _NS = 1_000_000_000
 
 MACHINE_ID_VARIABLE = "LIFECYCLE_MACHINE_ID"
@@ -195,7 +195,7 @@ class _Timer:
     def __init__(self, event: _SignalEvent, seconds: float) -> None:
         create, self._arm = _timer_functions()
         self._timer = ctypes.c_void_p()
-        if create(CLOCK_MONOTONIC, ctypes.byref(event), ctypes.byref(self._timer)) != 0:
+        if create(time.CLOCK_MONOTONIC, ctypes.byref(event), ctypes.byref(self._timer)) != 0:
             raise _failed("timer_create")
         self._set(TimerSpec.once(round(seconds * 1e9)))
 

@@ -77,15 +77,11 @@ def quiet_node(
             node.destroy_node()
         context.try_shutdown()
         context.destroy()
-        hint = error.hint if isinstance(error, MiddlewareError) else _security_hint()
+        known = error if isinstance(error, MiddlewareError) else None
         raise MiddlewareError(
             f"cannot make a participant for {namespace.rstrip('/')}/{name} in domain {domain_id}: "
-            + (
-                error.message
-                if isinstance(error, MiddlewareError)
-                else " ".join(str(error).split())
-            ),
-            hint=hint,
+            + (known.message if known else " ".join(str(error).split())),
+            hint=known.hint if known else _security_hint(),
         ) from error
     with node.handle:
         resend_endpoints_soon(node.handle.pointer)
