@@ -12,8 +12,8 @@ from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.plan.model import ParticipantConnections
 
 
-def made(*urls: str, **options: bool) -> ET.Element:
-    settings = ParticipantSettings.of(ParticipantConnections(urls=urls), **options)
+def made(*urls: str, super_client: bool = False) -> ET.Element:
+    settings = ParticipantSettings.of(ParticipantConnections(urls=urls, super_client=super_client))
     text = profile("p", settings, domain_id=3, environment={})
     return ET.fromstring(text.replace(' xmlns="http://www.eprosima.com', ' x="'))
 
