@@ -177,10 +177,19 @@ class NegotiatedSource:
             return self._instructions
         self._judged = seen
         parties = [self._party(node, known.get(node.full_name)) for node in self._plan.nodes]
-        places = self._places(known)
+        # Which host a machine id means is learnt from the planned nodes; another is one of its own.
+        hosts = {
+            each.identity.machine_id: self._hosts.host(self._planned[name].machine)
+            for name, each in known.items()
+            if name in self._planned
+        }
         unplanned = [each for name, each in known.items() if name not in self._planned]
         parties += [
-            party_of(each, places(each), negotiated=self._negotiated(each.name))
+            party_of(
+                each,
+                hosts.get(machine := each.identity.machine_id, f"unknown host {machine}"),
+                negotiated=self._negotiated(each.name),
+            )
             for each in unplanned
         ]
         graph = negotiate(parties, self._wishes, self._terms, before=self.graph)
@@ -255,16 +264,6 @@ class NegotiatedSource:
     def _negotiated(self, key: str) -> frozenset[str]:
         return frozenset(each.name for each in self.graph.connections if each.node == key)
 
-    def _places(self, known: Mapping[str, NodeConfiguration]) -> _Places:
-        """Learn from the planned nodes which host a machine id means."""
-        return _Places(
-            {
-                each.identity.machine_id: self._hosts.host(self._planned[name].machine)
-                for name, each in known.items()
-                if name in self._planned
-            }
-        )
-
     def _declared(self, problems: Iterable[NegotiationProblem]) -> Iterable[NegotiationProblem]:
         """Leave out what concerns an undeclared node: the system does without it."""
         keys = {each.key for each in self._plan.nodes}
@@ -281,17 +280,6 @@ class NegotiatedSource:
                 for node in self._plan.nodes
             ),
         )
-
-
-class _Places:
-    """Hosts of nodes that no manifest places, by machine id; an unknown id is a host of its own."""
-
-    def __init__(self, hosts: Mapping[str, str]) -> None:
-        self._hosts = hosts
-
-    def __call__(self, configuration: NodeConfiguration) -> str:
-        machine = configuration.identity.machine_id
-        return self._hosts.get(machine, f"unknown host {machine}")
 
 
 def _with_made(node: PlannedNode, configuration: NodeConfiguration) -> PlannedNode:
@@ -345,7 +333,7 @@ def _unplanned_instructions(
         each.name for each in mine
     }
     for each in configuration.endpoints:
-        label = _label(each)
+        label = each.kind.spell(each.name or each.resolved)
         if label not in mapped and each.connection in gone and each.connection:
             mapped[label] = ""
     return Instructions(
@@ -353,11 +341,6 @@ def _unplanned_instructions(
         connections=tuple((each.name, ParticipantConnections(urls=each.urls)) for each in mine),
         mappings=tuple(mapped.items()),
     )
-
-
-def _label(report: EndpointReport) -> str:
-    kind: EndpointKind = report.kind
-    return kind.spell(report.name or report.resolved)
 
 
 def _words(problem: NegotiationProblem) -> str:

@@ -48,42 +48,6 @@ _SWEEP_S = 10.0
 """For servers to remove what dead runs left; what is not removed then stays listed."""
 
 
-async def remove(
-    removes: Programmer | Removal,
-    report: Callable[[str], None],
-    hurry: asyncio.Event | None,
-    worker: Worker,
-) -> None:
-    """Remove everything of one run, in a thread and within CLOSE_S for all servers together.
-
-    Args:
-        removes: see there.
-        report: takes what was done or failed, as text for people.
-        hurry: once set, no server is waited for any more.
-        worker: the thread.
-    """
-    hurry = hurry or asyncio.Event()
-    is_late = hurry.is_set()
-    within_s = _HURRIED_S if is_late else CLOSE_S
-    removing = asyncio.ensure_future(
-        worker.run(functools.partial(removes.close, within_s=within_s))
-    )
-    if not is_late:
-        hurried = asyncio.ensure_future(hurry.wait())
-        await asyncio.wait({removing, hurried}, return_when=asyncio.FIRST_COMPLETED)
-        await ended(hurried)
-        if not removing.done():
-            removes.cancel()
-    try:
-        done = await removing
-    except LifecycleError as error:
-        report(f"{error}\n{_STILL_THERE}")
-        return
-    for each in done:
-        if each.changes:
-            report(each.render(done=True))
-
-
 class Networks:
     """Networks of one run: the latest flows are programmed, in a thread.
 
@@ -156,11 +120,33 @@ class Networks:
             await self._stop()
         finally:
             if self._programmer is not None:
-                await remove(self._programmer, self._report, hurry, self._worker)
+                await self._remove(self._programmer, hurry or asyncio.Event())
             elif (self._directory / LEDGER_NAME).is_file():
                 from lifecycle.programming.apply.programmer import Removal
 
-                await remove(Removal(self._directory), self._report, hurry, self._worker)
+                await self._remove(Removal(self._directory), hurry or asyncio.Event())
+
+    async def _remove(self, removes: Programmer | Removal, hurry: asyncio.Event) -> None:
+        """Remove everything, in the thread and within CLOSE_S for all servers together."""
+        is_late = hurry.is_set()
+        within_s = _HURRIED_S if is_late else CLOSE_S
+        removing = asyncio.ensure_future(
+            self._worker.run(functools.partial(removes.close, within_s=within_s))
+        )
+        if not is_late:
+            hurried = asyncio.ensure_future(hurry.wait())
+            await asyncio.wait({removing, hurried}, return_when=asyncio.FIRST_COMPLETED)
+            await ended(hurried)
+            if not removing.done():
+                removes.cancel()
+        try:
+            done = await removing
+        except LifecycleError as error:
+            self._report(f"{error}\n{_STILL_THERE}")
+            return
+        for each in done:
+            if each.changes:
+                self._report(each.render(done=True))
 
     def _hear(self, event: Event) -> None:
         if self._begun and isinstance(event, VerdictChanged):

@@ -77,19 +77,14 @@ def check_installed(policy: Policy) -> None:
     Raises:
         MiddlewareError: a package is not installed.
     """
-    asked = policy.ros_interface_required and policy.ros_interface is not RosInterfaceAccess.OFF
-    if asked and (reason := _not_installed()):
-        value = policy.ros_interface.value
+    if not policy.ros_interface_required or policy.ros_interface is RosInterfaceAccess.OFF:
+        return
+    if lacking := [name for name in _PACKAGES if find_spec(name) is None]:
         raise MiddlewareError(
-            f"cannot offer 'policy: {{ros_interface: {value}}}': {reason}",
+            f"cannot offer 'policy: {{ros_interface: {policy.ros_interface.value}}}': no Python "
+            f"package {' or '.join(lacking)} is installed",
             hint="install it, or write 'policy: {ros_interface: off}'",
         )
-
-
-def _not_installed() -> str:
-    """Say which package is not installed that is needed; empty if all are."""
-    lacking = [name for name in _PACKAGES if find_spec(name) is None]
-    return f"no Python package {' or '.join(lacking)} is installed" if lacking else ""
 
 
 Answer = Callable[[bool, str], None]
@@ -141,61 +136,42 @@ class RosInterface:
         self._rules: set[str] = set()
         self._published: SystemStatus | None = None
         self._hurries = False
-        self._moved_s = 0.0
 
     def begin(self) -> None:
         """Wait from now on for the system to be active, or to be held up."""
         if self._opens:
-            self._goes_on()
+            self._in(HELD_UP_S, self._open)
 
     def on_event(self, event: Event) -> None:
         """Publish what changed; a listener of the run."""
         if self._offer is not None:
             if not self._hurries:
                 self._hurries = True  # changes come in bursts
-                self._publish_in(_BURST_S)
-        elif not self._opens:
-            pass
+                self._in(_BURST_S, self._publish)
         elif isinstance(event, Stopping):
-            self._wait(None)
-            self._opens = False
-        elif not self._was_active and isinstance(event, _ON_ITS_WAY):
+            self._stop()
+        elif self._opens and not self._was_active and isinstance(event, _ON_ITS_WAY):
             self._was_active = isinstance(event, SystemReached) and event.reached == ACTIVE
-            if self._was_active:
-                self._open_in(AFTER_ACTIVE_S)
-            else:
-                self._goes_on()
+            self._in(AFTER_ACTIVE_S if self._was_active else HELD_UP_S, self._open)
 
     def close(self) -> None:
         """Publish a last time, and offer nothing any more; again is harmless."""
-        self._wait(None)
-        self._opens = False
+        self._stop()
         offer, self._offer = self._offer, None
         if offer is not None:
             self._say(offer)
             offer.destroy()
 
-    def _open_in(self, wait_s: float) -> None:
-        self._wait(asyncio.get_running_loop().call_later(wait_s, self._open))
-
-    def _goes_on(self) -> None:
-        """Open once nothing has happened for `HELD_UP_S`; events only note when they came."""
-        loop = asyncio.get_running_loop()
-        self._moved_s = loop.time()
-        if self._due is None:
-            self._due = loop.call_later(HELD_UP_S, self._look)
-
-    def _look(self) -> None:
-        loop = asyncio.get_running_loop()
-        if loop.time() < (due_s := self._moved_s + HELD_UP_S):
-            self._due = loop.call_at(due_s, self._look)
-        else:
-            self._open()
-
-    def _wait(self, due: asyncio.TimerHandle | None) -> None:
+    def _in(self, wait_s: float, do: Callable[[], None]) -> None:
+        """Do something later, in place of what was to be done."""
         if self._due is not None:
             self._due.cancel()
-        self._due = due
+        self._due = asyncio.get_running_loop().call_later(wait_s, do)
+
+    def _stop(self) -> None:
+        self._opens = False
+        if self._due is not None:
+            self._due.cancel()
 
     def _open(self) -> None:
         self._opens = False
@@ -219,14 +195,11 @@ class RosInterface:
         else:
             self._publish()
 
-    def _publish_in(self, wait_s: float) -> None:
-        self._wait(asyncio.get_running_loop().call_later(wait_s, self._publish))
-
     def _publish(self) -> None:
         if self._offer is not None:
             self._hurries = False
             self._say(self._offer)
-            self._publish_in(EACH_S)
+            self._in(EACH_S, self._publish)
 
     def _say(self, offer: RosEntities) -> None:
         status = self._status()

@@ -5,13 +5,11 @@ Owns: how a status is drawn from the running system and its last verdict. Must n
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from lifecycle.manifest.model import RunKind, UniqueHow
 from lifecycle.supervisor.control.protocol import NodeStatus, SystemStatus
-from lifecycle.supervisor.processes.usage import ResourceUse, resource_use
+from lifecycle.supervisor.processes.usage import resource_use
 from lifecycle.verify.judge import not_ok
 from lifecycle.verify.verdict import Verdict
 
@@ -27,7 +25,6 @@ def node_status(
     *,
     elapsed_s: float = 0.0,
     schedule: RestartSchedule | None = None,
-    uses: Mapping[int, ResourceUse | None] = MappingProxyType({}),
 ) -> NodeStatus:
     """Return what is known of one node.
 
@@ -37,7 +34,6 @@ def node_status(
         silent: why nothing can be expected of it.
         elapsed_s: seconds since the supervisor started.
         schedule: knows of restarts.
-        uses: what processes use, by pid.
     """
     process = node.process
     runs = process is not None and process.pid != 0 and not process.is_gone
@@ -50,7 +46,7 @@ def node_status(
         for flow in (() if verdict is None else verdict.flows)
         if node.name in (flow.publisher, flow.subscription)
     ]
-    use = None if process is None else uses.get(process.pid)
+    use = resource_use(process.pid) if runs and process is not None else None
     external = node.planned.run.kind is RunKind.ATTACH
     return NodeStatus(
         node=node.name,
@@ -106,9 +102,6 @@ def system_status(
 ) -> SystemStatus:
     """Return what is known of the whole system, with what its processes use now."""
     silent = system.liveliness.silent
-    processes = {node.process for node in system.nodes.values() if node.process is not None}
-    living = [each for each in processes if each.pid and not each.is_gone]
-    uses = {each.pid: resource_use(each.pid) for each in living}
     return SystemStatus(
         system=system.plan.system,
         domain_id=system.plan.domain_id,
@@ -123,7 +116,6 @@ def system_status(
                 silent.get(node.name, ""),
                 elapsed_s=elapsed_s,
                 schedule=schedule,
-                uses=uses,
             )
             for node in system.nodes.values()
         ),

@@ -74,12 +74,10 @@ class PeerSupervisors:
         self._loop = asyncio.get_running_loop()
         self._closed = False
         self._known: list[_PeerSupervisor] = []
-        self._machines: list[_PeerSupervisor] = []
         self._watches: list[AliveSubscription] = []
         self._attached: tuple[str, ...] = ()
         self._announcements: list[AlivePublisher] = []
         self._said: Mapping[str, str] = {}
-        self._missing: dict[str, _PeerSupervisor] = {}
         self._calling: asyncio.Task[None] | None = None
         self._tasks: set[asyncio.Task[None]] = set()
 
@@ -92,8 +90,7 @@ class PeerSupervisors:
         for machine, nodes in remote.items():
             if machine:
                 what = f"the supervisor of machine {machine!r}"
-                self._machines.append(_PeerSupervisor(what, machine, tuple(nodes)))
-                listener = self._listener(self._machines[-1])
+                listener = self._listener(_PeerSupervisor(what, machine, tuple(nodes)))
                 self._watches.append(self._exchange.watch_machine(plan.system, machine, listener))
         self._attached = self._attached_nodes()
         for name in self._attached:
@@ -111,8 +108,6 @@ class PeerSupervisors:
         if self._attached == self._attached_nodes():
             return
         self._destroy()
-        self._machines.clear()
-        self._missing.clear()
         for peer in self._known:
             # The return of one that is no longer planned is never reported.
             for cause in (Cause.LOST, Cause.REPORTED):
@@ -130,7 +125,7 @@ class PeerSupervisors:
     @property
     def machines(self) -> frozenset[str]:
         """Machines whose supervisor is connected now."""
-        return frozenset(each.machine for each in self._machines if each.alive)
+        return frozenset(each.machine for each in self._known if each.machine and each.alive)
 
     async def close(self) -> None:
         """Leave, and stop watching."""
@@ -179,7 +174,6 @@ class PeerSupervisors:
             self._system.emit(MachineConnection(machine=peer.machine, established=False))
         detail = f"{peer.what} is not heard any more"
         self._system.liveliness.fell_silent(peer.nodes, Cause.LOST, detail)
-        self._missing[peer.what] = peer
         self._exchange.send_again_soon()
         self._start(self._have_hosts(Operation.SEND_AGAIN_SOON))
         if self._calling is None:
@@ -189,7 +183,6 @@ class PeerSupervisors:
         lost_s = 0.0
         if peer.lost_at_s is not None:
             lost_s = self._loop.time() - peer.lost_at_s
-            self._missing.pop(peer.what, None)
             # DDS may have forgotten the node names of participants that it lost for long.
             self._exchange.republish_names()
             self._start(self._have_hosts(Operation.REPUBLISH_NAMES))
@@ -239,8 +232,8 @@ class PeerSupervisors:
     async def _call(self) -> None:
         """Call out until no peer is missing."""
         machines = {each.name: each.address for each in self._system.plan.machines}
-        while self._missing:
-            names = (each.machine for each in self._missing.values())
+        while missing := [each for each in self._known if each.lost_at_s is not None]:
+            names = (each.machine for each in missing)
             self._exchange.call_out([a for name in names if (a := machines.get(name, ""))])
             await asyncio.sleep(CALL_EACH_S)
         self._calling = None

@@ -203,8 +203,7 @@ class StaleNodes:
         rediscover = repetition > len(INTRODUCED_AGAIN_S)
         if rediscover and known:
             return
-        pids = [each.pid for each in self._system.living if each is not process]
-        self._participant.introduce([process.pid], pids, rediscover=rediscover)
+        self._introduce(process, rediscover=rediscover)
         if repetition and process.channel is not None and not known:
             # Its endpoints may be matched and its name not be known: what it published before the
             # match is only repeated with the next heartbeat, 3 s later.
@@ -212,14 +211,19 @@ class StaleNodes:
             self._publishing.add(publishing)
             publishing.add_done_callback(self._publishing.discard)
         pauses = (*INTRODUCED_AGAIN_S, *[REDISCOVERED_S] * _REDISCOVERIES)
-        if repetition == len(pauses):
-            return
+        if repetition < len(pauses):
+            self._again(pauses[repetition], self._came_again, name, reach, repetition + 1)
 
+    def _introduce(self, process: ManagedProcess, *, rediscover: bool = False) -> None:
+        pids = [each.pid for each in self._system.living if each is not process]
+        self._participant.introduce([process.pid], pids, rediscover=rediscover)
+
+    def _again(self, after_s: float, do: Callable[..., None], *arguments: object) -> None:
         def again() -> None:
             self._later.discard(handle)
-            self._came_again(name, reach, repetition + 1)
+            do(*arguments)
 
-        handle = asyncio.get_running_loop().call_later(pauses[repetition], again)
+        handle = asyncio.get_running_loop().call_later(after_s, again)
         self._later.add(handle)
 
     def _meet(self, process: ManagedProcess) -> None:
@@ -235,8 +239,7 @@ class StaleNodes:
                     _TOGETHER_S, self._announce
                 )
         else:
-            pids = [each.pid for each in self._system.living if each is not process]
-            self._participant.introduce([process.pid], pids)
+            self._introduce(process)
 
     def _announce(self) -> None:
         self._announcing = None
@@ -273,16 +276,9 @@ class StaleNodes:
         ):
             return
         if process.pid:
-            pids = [each.pid for each in self._system.living if each is not process]
             rediscover = looks % round(REDISCOVERED_S / STARTING_S) == 0
-            self._participant.introduce([process.pid], pids, rediscover=rediscover)
-
-        def again() -> None:
-            self._later.discard(handle)
-            self._starts(process, looks + 1)
-
-        handle = asyncio.get_running_loop().call_later(STARTING_S, again)
-        self._later.add(handle)
+            self._introduce(process, rediscover=rediscover)
+        self._again(STARTING_S, self._starts, process, looks + 1)
 
     def close(self) -> None:
         """Repeat nothing any more."""
@@ -320,17 +316,12 @@ class StaleNodes:
         if every and (repetition < _ALWAYS or shown):
             pids = [each.pid for each in self._system.living]
             self._participant.discovery.remove_participants(every, pids)
-        if repetition == len(AGAIN_S) or self._closed:
-            return
+        if repetition < len(AGAIN_S):
+            self._again(AGAIN_S[repetition], self._remove_again, pid, every, repetition + 1)
 
-        def again() -> None:
-            self._later.discard(handle)
-            left = self._participant.discovery.participants_of(pid, nodes=(), reported=every)
-            self._remove(pid, every or left, left & (every or left), repetition + 1)
-
-        loop = asyncio.get_running_loop()
-        handle = loop.call_later(AGAIN_S[repetition], again)
-        self._later.add(handle)
+    def _remove_again(self, pid: int, every: frozenset[str], repetition: int) -> None:
+        left = self._participant.discovery.participants_of(pid, nodes=(), reported=every)
+        self._remove(pid, every or left, left & (every or left), repetition)
 
 
 def _reported(node: NodeRun) -> Iterable[str]:

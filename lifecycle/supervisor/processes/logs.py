@@ -1,14 +1,13 @@
 """Logs of a system's processes: output split into lines, kept, written to rotated files.
 
-Owns: `LineReader` (pipe → lines), `ProcessLog` (last lines of one process and its file, which is
-rotated), `LogDirectory` (what of a run's logs is missing) and where files go (`log_directory`, the
-ROS log directory convention). Must not import rclpy.
+Owns: `LineReader` (pipe → lines), `ProcessLog` (what one process wrote), `RotatedFile`,
+`LogDirectory` (what of a run's logs is missing) and where files go (`log_directory`, the ROS log
+directory convention). Must not import rclpy.
 """
 
 from __future__ import annotations
 
 import asyncio
-import collections
 import contextlib
 import datetime as dt
 import errno
@@ -31,7 +30,6 @@ LARGEST_LOG = 16 * 2**20
 _LARGEST_PIPE = 2**20
 """Bytes; /proc/sys/fs/pipe-max-size by default, pipe(7)."""
 
-_TAIL_LINES = 20
 _TRIED_AGAIN_S = 1.0
 """How often a log is tried that could not be written."""
 
@@ -319,10 +317,54 @@ class LogDirectory:
             self._say(f"{_missing(lost)} missing in {str(self.path)!r}: {self._why}")
 
 
-class ProcessLog:
-    """The output of one process: the last lines in memory, LARGEST_LOG of them in a file twice.
+class RotatedFile:
+    """A file of lines: one that is full becomes `NAME.1`, and replaces the one before.
 
-    A file that is full becomes `NAME.log.1`, and replaces the one before.
+    Args:
+        path: of the file.
+        mode: its permissions.
+        head: returns the line that each file begins with.
+    """
+
+    def __init__(self, path: Path, mode: int = 0o666, head: Callable[[], bytes] = bytes) -> None:
+        self.path = path
+        self._mode = mode
+        self._head = head
+        self._file: int | None = None
+        self._bytes = 0
+        self._torn = False
+
+    def open(self) -> int:
+        """Return its descriptor; the file, and its directory, are made where they are missing."""
+        if self._file is None:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC
+            self._file = os.open(self.path, flags, self._mode)
+            self._bytes = os.fstat(self._file).st_size
+        return self._file
+
+    def write(self, line: bytes, largest: int) -> None:
+        """Append a line, to a new file where this one would have more bytes than `largest`."""
+        if self._bytes and self._bytes + len(line) > largest:
+            self.path.replace(self.path.with_name(f"{self.path.name}.1"))
+            self.close()
+        file = self.open()
+        left = memoryview(b"\n" * self._torn + (b"" if self._bytes else self._head()) + line)
+        while left:
+            written = os.write(file, left)
+            self._bytes += written
+            left = left[written:]
+            self._torn = bool(left)
+
+    def close(self) -> None:
+        """Close it; the next line opens it again."""
+        if self._file is not None:
+            os.close(self._file)
+        self._file, self._bytes, self._torn = None, 0, False
+
+
+class ProcessLog:
+    """The output of one process, in two files of LARGEST_LOG at most.
 
     Args:
         directory: of the run.
@@ -335,13 +377,10 @@ class ProcessLog:
 
     def __init__(self, directory: LogDirectory, process: str, *, kept: bool = True) -> None:
         self._kept = kept
-        self._tail: collections.deque[str] = collections.deque(maxlen=_TAIL_LINES)
         self._directory = directory
         self._process = process
         self.path = directory.path / f"{process.replace('/', '.')}.log"
-        self._file: int | None = None
-        self._bytes = 0
-        self._torn = False
+        self._file = RotatedFile(self.path)
         self._failed_s = 0.0
         self._error: OSError | None = None
         self._lost = 0
@@ -353,18 +392,14 @@ class ProcessLog:
         if not self._kept:
             return
         try:
-            self._descriptor()
+            self._file.open()
         except OSError as error:
             self._fails(error, lines=0)
 
     def add(self, line: str) -> None:
-        """Keep one line."""
-        self._tail.append(line)
-        if self._open:
-            self._keep(line)
-
-    def _keep(self, line: str) -> None:
         """Write one line, and before it how many are missing there."""
+        if not self._open:
+            return
         now_s = time.monotonic()
         if self._error is not None and now_s - self._failed_s < _TRIED_AGAIN_S:
             self._lost += 1
@@ -390,48 +425,17 @@ class ProcessLog:
         self._directory.fails(self._process, error, lines=lines)
 
     def _write(self, line: str) -> None:
-        left = memoryview(("\n" * self._torn + line + "\n").encode(errors="backslashreplace"))
-        if self._bytes + len(left) > LARGEST_LOG and self._bytes:
-            self._rotate()
-        file = self._descriptor()
-        while left:
-            written = os.write(file, left)
-            self._bytes += written
-            left = left[written:]
-            self._torn = bool(left)
-
-    def _rotate(self) -> None:
-        self.path.replace(self.path.with_name(f"{self.path.name}.1"))
-        self._shut()
-        self._torn = False
-
-    def _descriptor(self) -> int:
-        if self._file is None:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC
-            self._file = os.open(self.path, flags, 0o666)
-            self._bytes = os.fstat(self._file).st_size
-        return self._file
+        self._file.write(f"{line}\n".encode(errors="backslashreplace"), LARGEST_LOG)
 
     @property
     def shown(self) -> str:
         """Its path for messages; empty where there is no file."""
         return str(self.path) if self._kept else ""
 
-    @property
-    def tail(self) -> tuple[str, ...]:
-        """The last lines, oldest first."""
-        return tuple(self._tail)
-
     def close(self) -> None:
         """Close the file."""
         self._open = False
-        self._shut()
-
-    def _shut(self) -> None:
-        if self._file is not None:
-            os.close(self._file)
-            self._file = None
+        self._file.close()
 
 
 _RCL_LINE = re.compile(r"(?:\x1b\[[\d;]*m)*\[[A-Z]+\] \[[\d.]+\] \[([^\]]+)\]: ")

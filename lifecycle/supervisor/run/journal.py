@@ -8,6 +8,7 @@ leaves all of it. A file that is full becomes `journal.jsonl.1`. Must not import
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -16,7 +17,7 @@ from typing import Annotated, Any
 
 from lifecycle import codec, dataclasses
 from lifecycle.codec import Count, says
-from lifecycle.supervisor.processes.logs import JOURNAL_NAME
+from lifecycle.supervisor.processes.logs import JOURNAL_NAME, RotatedFile
 from lifecycle.supervisor.run.events import Event, LogLine, VerdictChanged
 
 LARGEST_JOURNAL = 16 * 2**20
@@ -88,24 +89,22 @@ class Journal:
         self._clock = clock
         self._began = clock()
         self._waiting: list[bytes] | None = []
-        self._path: Path | None = None
-        self._file: int | None = None
-        self._bytes = 0
-        self._torn = False
+        self._file: RotatedFile | None = None
         self._failed_s: float | None = None
 
     @contextlib.contextmanager
     def writing(self, directory: Path) -> Iterator[None]:
         """Write into the directory of the run's logs meanwhile; what came before waits for it."""
-        self._path = directory / JOURNAL_NAME
+        head = functools.partial(self._line, run=self._run)
+        self._file = file = RotatedFile(directory / JOURNAL_NAME, 0o600, head)
         waiting, self._waiting = self._waiting or [], None
         for line in waiting:
             self._write(line)
         try:
             yield
         finally:
-            self._shut()
-            self._path = None
+            file.close()
+            self._file = None
 
     def on_event(self, event: Event) -> None:
         """Note an event; a listener of the run."""
@@ -127,40 +126,17 @@ class Journal:
         return codec.to_json({**now, **content}) + b"\n"
 
     def _write(self, line: bytes) -> None:
-        if self._path is None:
+        if self._file is None:
             return  # the run is over
         if self._failed_s is not None and self._clock() - self._failed_s < _TRIED_AGAIN_S:
             return
         try:
-            self._put(line)
+            self._file.write(line, LARGEST_JOURNAL)
             self._failed_s = None
         except OSError as error:
             first, self._failed_s = self._failed_s is None, self._clock()
             if first:
                 self._say(
-                    f"cannot write {str(self._path)!r}: {error.strerror}; the run goes on, and "
-                    "what happens meanwhile is missing there"
+                    f"cannot write {str(self._file.path)!r}: {error.strerror}; the run goes on, "
+                    "and what happens meanwhile is missing there"
                 )
-
-    def _put(self, line: bytes) -> None:
-        assert self._path is not None
-        if self._bytes >= LARGEST_JOURNAL:
-            self._path.replace(self._path.with_name(f"{self._path.name}.1"))
-            self._shut()
-        if self._file is None:
-            flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC
-            self._file = os.open(self._path, flags, 0o600)
-            self._bytes = os.fstat(self._file).st_size
-        if not self._bytes:
-            line = self._line(run=self._run) + line
-        data = memoryview(b"\n" * self._torn + line)
-        while data:
-            written = os.write(self._file, data)
-            self._bytes += written
-            data = data[written:]
-            self._torn = bool(data)
-
-    def _shut(self) -> None:
-        if self._file is not None:
-            os.close(self._file)
-        self._file, self._bytes, self._torn = None, 0, False

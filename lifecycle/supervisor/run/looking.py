@@ -52,6 +52,8 @@ if TYPE_CHECKING:
     from lifecycle.middleware.services.clients import NodeClients
 
 
+T = TypeVar("T")
+
 _ASK_AGAIN_S = 0.5
 """Nodes are asked again so long after: their matched counts change without a graph change ..."""
 
@@ -127,23 +129,30 @@ def running_plan(path: Path) -> Plan:
         raise UsageError(f"cannot ask {path.name!r}: its supervisor does not answer") from error
 
 
-async def following(plan: Plan, on_look: Callable[[JudgedSystem], None]) -> None:
-    """Look at every change and give what was seen and its verdict, until cancelled.
+async def _following(
+    plan: Plan, of: Callable[[JudgedSystem], T], on_change: Callable[[T], None]
+) -> None:
+    """Look at every change and give what `of` says of it, where that differs, until cancelled.
 
     What may pass by itself is given a moment to do so, see `GracePeriod`.
     """
+    told: T | None = None
     grace_period = GracePeriod()
     last: Verdict | None = None
     clock = asyncio.get_running_loop().time
     pause_s = _ASK_AGAIN_S
     with _looking(plan) as observer_participant:
         while True:
-            seen = await _see(plan, observer_participant)
+            observation = await observer_participant.graph.observe(plan)
+            seen = _judged(plan, observation, observer_participant)
             now, again_s = grace_period.after(last, seen.verdict, seen.plan, clock())
             if now != last or again_s is not None:
                 pause_s = _ASK_AGAIN_S
             last = now
-            on_look(dataclasses.replace(seen, verdict=last))
+            said = of(dataclasses.replace(seen, verdict=last))
+            if said != told:
+                told = said
+                on_change(said)
             if await _change(observer_participant, pause_s):
                 pause_s = _ASK_AGAIN_S
             else:
@@ -152,15 +161,7 @@ async def following(plan: Plan, on_look: Callable[[JudgedSystem], None]) -> None
 
 def follow_running(plan: Plan, on_verdict: Callable[[Verdict], None]) -> None:
     """Judge what runs and report each verdict that differs from the last, until interrupted."""
-    last: Verdict | None = None
-
-    def take(seen: JudgedSystem) -> None:
-        nonlocal last
-        if seen.verdict != last:
-            last = seen.verdict
-            on_verdict(last)
-
-    asyncio.run(following(plan, take))
+    asyncio.run(_following(plan, lambda seen: seen.verdict, on_verdict))
 
 
 def where(plan: Plan, rmw: str) -> str:
@@ -197,11 +198,6 @@ def _reported_to_supervisors(plan: Plan) -> tuple[NodeConfiguration, ...]:
             with contextlib.suppress(UsageError, TimeoutError):
                 found += look(root / name).observation.configurations
     return tuple(found)
-
-
-async def _see(plan: Plan, observer_participant: ObserverParticipant) -> JudgedSystem:
-    observation = await observer_participant.graph.observe(plan)
-    return _judged(plan, observation, observer_participant)
 
 
 def _judged(
@@ -267,9 +263,6 @@ async def _change(observer_participant: ObserverParticipant, timeout_s: float) -
     return True
 
 
-__all__ = ["JudgedSystem", "follow_running", "following", "judge_running", "where"]
-
-
 def supervisor_of(environment: Mapping[str, str], plan: Plan, machine: str) -> Path | None:
     """Return the run directory of the supervisor of a plan on this host; None without one."""
     path = runtime_root(environment) / run_name(plan, machine)
@@ -306,22 +299,16 @@ def attached_picture(plan: Plan, *, timeout_s: float) -> Picture:
     Raises:
         MiddlewareError: no participant can be made.
     """
-    seen = judge_running(plan, timeout_s=timeout_s, strict=False)
-    return build_picture(seen.plan, seen.observation, seen.verdict)
+    return _attached(judge_running(plan, timeout_s=timeout_s, strict=False))
 
 
 def attached_pictures(plan: Plan, on_picture: Callable[[Picture], None]) -> None:
     """Look from outside and give each picture that differs from the last, for ever."""
-    last: Picture | None = None
+    asyncio.run(_following(plan, _attached, on_picture))
 
-    def take(seen: JudgedSystem) -> None:
-        nonlocal last
-        picture = build_picture(seen.plan, seen.observation, seen.verdict)
-        if picture != last:
-            last = picture
-            on_picture(picture)
 
-    asyncio.run(following(plan, take))
+def _attached(seen: JudgedSystem) -> Picture:
+    return build_picture(seen.plan, seen.observation, seen.verdict)
 
 
 def _drawn(seen: SupervisorSnapshot) -> Picture:
@@ -347,8 +334,6 @@ def _supervised(status: SystemStatus) -> dict[str, Supervised]:
         for each in status.nodes
     }
 
-
-T = TypeVar("T")
 
 _logger = logging.getLogger(__name__)
 _ASK_S = 2.0

@@ -119,13 +119,13 @@ def test_a_full_file_makes_room_and_each_says_of_which_run_it_is(
 def test_what_cannot_be_written_is_said_once(kept: Kept, tmp_path: Path) -> None:
     full = tmp_path / "journal.jsonl"
     kept.say("kept")
-    kept.journal._shut()
+    kept.journal._file.close()
     full.rename(tmp_path / "journal.jsonl.1")
     full.symlink_to("/dev/full")
     for _ in range(3):
         kept.say("lost")
     full.unlink()
-    kept.journal._shut()
+    kept.journal._file.close()
     kept.say("kept again")
     assert len(kept.said) == 1
     assert "No space left on device; the run goes on" in kept.said[0]

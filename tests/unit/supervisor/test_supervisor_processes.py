@@ -171,7 +171,8 @@ async def test_a_program_that_does_not_exist_says_so_in_its_output(tmp_path: Pat
         process = await bench.start("/no/such/program")
         assert await process.ended == ProcessExit(status=127)
         await process.end(COMMAND_ESCALATION, asyncio.Event())
-        assert process.log.tail == ("cannot run '/no/such/program': No such file or directory",)
+        said = "cannot run '/no/such/program': No such file or directory\n"
+        assert process.log.path.read_text() == said
 
 
 async def test_a_process_that_ignores_sigint_and_sigterm_is_killed_with_its_group(
@@ -344,9 +345,9 @@ def test_what_a_log_misses_is_said_once_counted_and_written_where_it_is_missing(
     for each in (log, other):
         each.open()
         each.add("before")
-    files = [(each, os.dup(each._file)) for each in (log, other)]
+    files = [(each, os.dup(each._file.open())) for each in (log, other)]
     for each, _ in files:
-        os.dup2(full, each._file)
+        os.dup2(full, each._file.open())
         each.add("lost")
         each.add("lost")
     (line,) = said
@@ -355,7 +356,7 @@ def test_what_a_log_misses_is_said_once_counted_and_written_where_it_is_missing(
         "run goes on, and what is lost is counted"
     )
     for each, file in files:
-        os.dup2(file, each._file)
+        os.dup2(file, each._file.open())
         each.add("after")
         each.close()
         os.close(file)
@@ -372,9 +373,8 @@ def test_a_log_directory_that_cannot_be_made_is_said_and_fails_nothing(tmp_path:
     said: list[str] = []
     log = ProcessLog(LogDirectory(tmp_path / "file", said.append), "it")
     log.open()
-    log.add("still the last line of it")
+    log.add("nowhere to be written")
     log.close()
-    assert log.tail == ("still the last line of it",)
     (line,) = said
     assert "File exists" in line or "Not a directory" in line
 
