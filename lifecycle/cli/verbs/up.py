@@ -162,7 +162,7 @@ def command(
                         return up(
                             plan,
                             options,
-                            [listener],
+                            listener,
                             process=process,
                             ending=ending,
                             on_start=listener.watch,

@@ -35,6 +35,7 @@ from lifecycle.supervisor.processes.orphans import (
     children,
     descendants,
     end_left,
+    end_strays,
 )
 from lifecycle.supervisor.processes.process import ProcessExit, SpawnRequest, run_delay_s
 from lifecycle.supervisor.processes.scope import scope
@@ -263,6 +264,10 @@ class ForkServer:
             known: pids of what belonged to them before.
         """
         return await end_left(self._process.run_id, self, ended, self._living(), known)
+
+    async def end_strays(self) -> tuple[int, ...]:
+        """End, bounded, all that is left of the run but the fork server; return the pids."""
+        return await end_strays(self._process.run_id, self)
 
     def _living(self) -> set[int]:
         return {each.pid for each in self._children.values() if not each.exited.done()}

@@ -62,38 +62,24 @@ class _Orphan:
             signal.pidfd_send_signal(self.pidfd, number)
 
 
-def end_strays(
-    run_id: str,
-    fork_server: ForkServer | None = None,
-    grace_s: float = 0.5,
-    *,
-    spare: Collection[int] = (),
-) -> tuple[int, ...]:
+async def end_strays(run_id: str, family: ForkServer) -> tuple[int, ...]:
     """End everything that still belongs to a run, but for this process and the fork server itself.
 
     Args:
-        run_id: of the run; empty for none.
-        fork_server: what this process started them by; None if only the run's id shows it.
-        grace_s: seconds between SIGTERM and SIGKILL.
-        spare: processes that are left, with all that descends from them.
+        run_id: of the run.
+        family: all that the run has started.
 
     Returns:
         The pids that had to be ended.
     """
-    ended: list[int] = []
-    spared = {os.getpid()} if fork_server is None else {os.getpid(), fork_server.pid}
-    spared.update(*(Lineage().of(each) for each in spare))
-    # Again for what they started meanwhile.
+    ended: set[int] = set()
     for _ in range(_ROUNDS):
-        strays = set(_carrying(run_id)) if run_id else set()
-        if fork_server is not None:
-            strays |= fork_server.family()
-        found = _end(strays - spared, grace_s)
+        strays = _marked(run_id).keys() | family.family()
+        found = await _end(strays - {os.getpid(), family.pid}, _LEFT_S)
         if not found:
             break
-        ended += found
-    if fork_server is not None:
-        reap_adopted((fork_server.pid,))
+        ended.update(found)
+    reap_adopted((family.pid,))
     return tuple(sorted(ended))
 
 
@@ -116,28 +102,14 @@ async def end_left(
     Returns:
         The pids that had to be ended.
     """
-    found: list[int] = []
+    ended_here: set[int] = set()
     for _ in range(_ROUNDS):
         left = belonging(run_id, family, ended, living) | (set(known) & family.family())
-        orphans = _held(left)
-        try:
-            left_over = _living(orphans, 0.0)
-            found += [each.pid for each in left_over]
-            for number, wait_s in ((signal.SIGTERM, _LEFT_S), (signal.SIGKILL, KILL_S)):
-                for each in left_over:
-                    each.signal(number)
-                    each.signal(signal.SIGCONT)
-                deadline = time.monotonic() + wait_s
-                while (  # noqa: ASYNC110 - pidfds are polled
-                    left_over := _living(left_over, 0.0)
-                ) and time.monotonic() < deadline:
-                    await asyncio.sleep(_LOOK_S)
-        finally:
-            for each in orphans:
-                os.close(each.pidfd)
-        if not orphans:
+        found = await _end(left, _LEFT_S)
+        if not found:
             break
-    return tuple(sorted(set(found)))
+        ended_here.update(found)
+    return tuple(sorted(ended_here))
 
 
 def belonging(
@@ -185,15 +157,15 @@ def reap_adopted(spare: Iterable[int]) -> None:
 
 
 def end_run(record: RunRecord) -> tuple[int, ...]:
-    """End what is left of a run whose supervisor was killed; return the pids."""
+    """End what is left of a run whose supervisor was killed; return the pids. Blocks."""
     if record.boot_id != boot_id():
         return ()
     pids = {child.pid for child in record.children if is_process(child.pid, child.start_ticks)}
-    pids |= _carrying(record.run_id)
+    pids |= _marked(record.run_id).keys()
     for pid in tuple(pids):
         pids.update(descendants(pid))
     pids.discard(os.getpid())
-    return _end(pids, GRACE_S)
+    return asyncio.run(_end(pids, GRACE_S))
 
 
 def children() -> frozenset[int]:
@@ -245,11 +217,6 @@ class Lineage:
         return found
 
 
-def _carrying(run_id: str) -> set[int]:
-    """Pids of every process of ours whose environment carries the run's id."""
-    return set(_marked(run_id))
-
-
 def _marked(run_id: str) -> dict[int, str]:
     """Return the planned process whose name each process carries that carries the run's id."""
     mark = f"{RUN_VARIABLE}={run_id}".encode()
@@ -266,43 +233,32 @@ def _marked(run_id: str) -> dict[int, str]:
     return found
 
 
-def _held(pids: Iterable[int]) -> list[_Orphan]:
-    """Hold processes by their pidfds; the caller closes them."""
+async def _end(pids: Iterable[int], grace_s: float) -> tuple[int, ...]:
+    """End processes, bounded; return the pids of those that lived."""
     orphans = []
     for pid in pids:
         with contextlib.suppress(ProcessLookupError):
             orphans.append(_Orphan(pid, os.pidfd_open(pid)))
-    return orphans
-
-
-def _end(pids: Iterable[int], grace_s: float) -> tuple[int, ...]:
-    orphans = _held(pids)
     try:
-        left = _living(orphans, 0.0)
+        left = _living(orphans)
         ended = tuple(sorted(each.pid for each in left))
         for number, wait_s in ((signal.SIGTERM, grace_s), (signal.SIGKILL, KILL_S)):
             for each in left:
                 each.signal(number)
                 each.signal(signal.SIGCONT)  # a stopped process ends only once it goes on
-            left = _living(left, wait_s)
+            deadline = time.monotonic() + wait_s
+            while (left := _living(left)) and time.monotonic() < deadline:  # noqa: ASYNC110
+                await asyncio.sleep(_LOOK_S)
         return ended
     finally:
         for each in orphans:
             os.close(each.pidfd)
 
 
-def _living(orphans: list[_Orphan], wait_s: float) -> list[_Orphan]:
-    """Wait until all have ended or the time is up; return those that have not."""
-    deadline = time.monotonic() + wait_s
+def _living(orphans: list[_Orphan]) -> list[_Orphan]:
+    """Return those that have not ended: a pidfd can be read once its process has."""
     poll = select.poll()
-    left = {each.pidfd: each for each in orphans}
-    for pidfd in left:
-        poll.register(pidfd, select.POLLIN)
-    while left:
-        ready = poll.poll(max(0.0, deadline - time.monotonic()) * 1000)
-        if not ready:
-            break
-        for pidfd, _ in ready:
-            poll.unregister(pidfd)
-            del left[pidfd]
-    return list(left.values())
+    for each in orphans:
+        poll.register(each.pidfd, select.POLLIN)
+    ended = {pidfd for pidfd, _ in poll.poll(0)}
+    return [each for each in orphans if each.pidfd not in ended]

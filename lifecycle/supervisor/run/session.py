@@ -53,7 +53,7 @@ from lifecycle.supervisor.nodes.system import (
     System,
 )
 from lifecycle.supervisor.policy.schedule import RestartSchedule
-from lifecycle.supervisor.processes.orphans import end_strays, reap_adopted
+from lifecycle.supervisor.processes.orphans import reap_adopted
 from lifecycle.supervisor.run.events import (
     Emitter,
     LogLine,
@@ -62,7 +62,7 @@ from lifecycle.supervisor.run.events import (
     Stopping,
     SystemReached,
 )
-from lifecycle.supervisor.run.failure import StepFailedError, Worker, ended, with_failure
+from lifecycle.supervisor.run.failure import StepFailedError, ended, with_failure
 from lifecycle.supervisor.run.options import Until, UpOptions, UpResult
 from lifecycle.supervisor.run.records import Records
 from lifecycle.supervisor.run.shutdown import TakeDown
@@ -160,7 +160,6 @@ class Session:
         networks: programmed while the system is active.
         emit: where events go.
         ending: knows of signals that came before.
-        worker: for what blocks.
     """
 
     def __init__(
@@ -175,9 +174,7 @@ class Session:
         networks: Networks,
         emit: Emitter,
         ending: Ending,
-        worker: Worker,
     ) -> None:
-        self._worker = worker
         self._system = system
         self._options = options
         self._directory = directory
@@ -249,7 +246,7 @@ class Session:
             replanned=self._replanned,
             networks=networks,
             following=self._following,
-            outrun=self._outrun,
+            outrun=lambda: self._holding.outrun(),  # noqa: PLW0108 - it is made below
             spawner=fork_server,
             hurry=self._hurry,
             timeout_s=options.bring_up_s(len(system.processes)),
@@ -612,9 +609,9 @@ class Session:
             # After the last message has left, and before what runs below us is ended.
             await self._networks.close(self._hurry)
             await discovery_server.end(self._system, self._hurry)
-        left = await self._worker.run(end_strays, self._directory.run_id, self._fork_server)
-        if left:
-            self._emit(Notice(message=f"ended processes that were left behind: {_listed(left)}"))
+        if left := await self._fork_server.end_strays():
+            pids = ", ".join(map(str, left))
+            self._emit(Notice(message=f"ended processes that were left behind: {pids}"))
         self._system.logs.report_lost()
         if not self._stop.done():
             self._stop.cancel()
@@ -628,7 +625,7 @@ class Session:
         ends = self._ending.numbers
         for number in ends:
             loop.add_signal_handler(number, self._ended_by, number)
-        loop.add_signal_handler(signal.SIGCHLD, self._child_changed)
+        loop.add_signal_handler(signal.SIGCHLD, lambda: reap_adopted(self._fork_server.waited_for))
         if self._ending.number is not None:
             self._ended_by(self._ending.number)
         try:
@@ -638,14 +635,8 @@ class Session:
                 loop.remove_signal_handler(number)
             self._ending.resume()
 
-    def _child_changed(self) -> None:
-        reap_adopted(self._fork_server.waited_for)
-
     def _ended_by(self, number: int) -> None:
         self.stop(*ENDED_BY[number])
-
-    async def _outrun(self) -> None:
-        await self._holding.outrun()
 
     def _replanned(self, nodes: Iterable[str]) -> None:
         if self._authority is not None:
@@ -683,7 +674,3 @@ def _hurried(result: UpResult) -> UpResult:
     run = dataclasses.replace(run, reason=reason, exit_code=ExitCode.INTERRUPTED)
     verdict = dataclasses.replace(result.verdict, run=run)
     return dataclasses.replace(result, exit_code=ExitCode.INTERRUPTED, verdict=verdict)
-
-
-def _listed(pids: tuple[int, ...]) -> str:
-    return ", ".join(str(pid) for pid in pids)

@@ -14,11 +14,11 @@ import re
 import threading
 import time
 import traceback
-from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Iterator
 from pathlib import Path
 
 from lifecycle import dataclasses
-from lifecycle.errors import ExitCode, LifecycleError, MiddlewareError
+from lifecycle.errors import ExitCode, MiddlewareError
 from lifecycle.manifest.model import Authority, DataLayerSource, EndpointPolicy, RunKind
 from lifecycle.middleware.discovery.probe import discovery_peers, peers_environment
 from lifecycle.middleware.fastdds.profiles import discovery_environment
@@ -42,7 +42,7 @@ from lifecycle.run_directory import (
     runtime_root,
 )
 from lifecycle.supervisor.connections import discovery_server
-from lifecycle.supervisor.connections.networks import open_networks, token_variables
+from lifecycle.supervisor.connections.networks import open_networks
 from lifecycle.supervisor.control.protocol import SystemStatus
 from lifecycle.supervisor.control.ros_interface import check_installed
 from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
@@ -66,7 +66,7 @@ from lifecycle.supervisor.run.events import (
     Stopping,
     SystemReached,
 )
-from lifecycle.supervisor.run.failure import StepFailedError, Worker, never_connected, with_failure
+from lifecycle.supervisor.run.failure import StepFailedError, never_connected, with_failure
 from lifecycle.supervisor.run.journal import Journal
 from lifecycle.supervisor.run.options import (
     Until,
@@ -101,12 +101,12 @@ Conclude = Callable[[UpResult], ExitCode]
 def up(
     plan: Plan,
     options: UpOptions,
-    listeners: Iterable[Listener] = (),
+    listener: Listener,
     *,
-    process: ForkServerProcess | None = None,
-    ending: Ending | None = None,
-    on_start: Callable[[Callable[[], SystemStatus]], None] | None = None,
-    conclude: Conclude | None = None,
+    process: ForkServerProcess,
+    ending: Ending,
+    on_start: Callable[[Callable[[], SystemStatus]], None],
+    conclude: Conclude,
 ) -> UpResult:
     """Bring a system up, hold it, take it down. Blocks; call it from the main thread.
 
@@ -116,10 +116,10 @@ def up(
     Args:
         plan: what to bring up.
         options: how.
-        listeners: get every event, in this thread. One that raises gets nothing more; the run
+        listener: gets every event, in this thread. If it raises it gets nothing more; the run
             goes on to its end, and then what it raised is raised.
-        process: of a fork server that was started before; used and ended.
-        ending: has noted signals since before this call; entered by the caller.
+        process: of a fork server that was started before; used, and ended by the caller, too.
+        ending: entered by the caller, who has it note signals during this call.
         on_start: given the way to ask for the status, once there is a system.
         conclude: given how the run ended, once nothing of the system runs any more; returns the
             exit code. What it does not write may be lost: leaving the graph comes after it, and
@@ -132,57 +132,29 @@ def up(
         MiddlewareError: no participant can be made in the plan's domain.
         Ended: a signal asked for it before there was a session; nothing is left.
     """
-    guarded = tuple(_Guarded(each) for each in listeners)
-    with contextlib.ExitStack() as ours:
-        ending = ours.enter_context(Ending()) if ending is None else ending
-        with ending.noted():
-            result = _up(plan, options, guarded, process, ending, on_start, conclude)
-    for each in guarded:
-        if each.error is not None:
-            raise each.error
-    return result
-
-
-class _Guarded:
-    """A listener whose exception ends no more than itself, see `up`."""
-
-    def __init__(self, listener: Listener) -> None:
-        self._listener = listener
-        self.error: Exception | None = None
-
-    def __call__(self, event: Event) -> None:
-        if self.error is None:
-            try:
-                self._listener(event)
-            except Exception as error:  # noqa: BLE001 - it is not ours, and raised in the end
-                traceback.print_exc()
-                self.error = error
-
-
-def _up(  # noqa: PLR0917 - those of `up`, in its order
-    plan: Plan,
-    options: UpOptions,
-    listeners: Iterable[Listener],
-    process: ForkServerProcess | None,
-    ending: Ending,
-    on_start: Callable[[Callable[[], SystemStatus]], None] | None,
-    conclude: Conclude | None,
-) -> UpResult:
-    """Do what `up` says, where a signal is only noted."""
+    guarded = _Guarded(listener)
     processes = local_processes(plan, options.machine)
     service = ServiceManager.of(os.environ)
-    emit = _emitter((*listeners, service.on_event))
-    process = _preloading(process, plan, options, processes)
-    directory = _acquired(plan, options, process)
-    journal = _journal(plan, directory, emit)
+    emit = Emitter()
+    emit.listen(guarded)
+    emit.listen(service.on_event)
+    _preload(process, plan, processes)
+    directory = RunDirectory.acquire(
+        runtime_root(os.environ),
+        run_name(plan, options.machine),
+        process.run_id,
+        domain_id=plan.domain_id,
+    )
+    journal = Journal(
+        plan.system, directory.run_id, say=lambda message: emit(Notice(message=message))
+    )
+    emit.listen(journal.on_event)
     try:
         if directory.previous is not None:
             _clean_up_after(directory.previous, emit)
         # Servers may be asked to remove what dead runs left: that must not outlast a signal.
         with ending.raised() if options.program else contextlib.nullcontext():
             networks = open_networks(plan, options, directory, emit, environment=os.environ)
-        check_log_root(os.environ)
-        check_installed(plan.policy)
         _enter_graph(plan, options, directory)
 
         async def run(leaving: contextlib.AsyncExitStack) -> UpResult:
@@ -193,11 +165,12 @@ def _up(  # noqa: PLR0917 - those of `up`, in its order
                 emit=emit,
                 logs=logs,
                 processes=processes,
-                variables=_graph_variables(os.environ),
+                # What a fork server that was started before `_enter_graph` has to pass on.
+                variables=tuple((n, os.environ[n]) for n in _GRAPH_VARIABLES if n in os.environ),
             )
             leaving.enter_context(journal.writing(logs))
             fork_server = ForkServer(process)
-            worker = leaving.enter_context(_working(emit, logs, plan.system))
+            leaving.enter_context(_forgetting_runs(emit, logs, plan.system))
             records = Records(directory, system, fork_server, emit)
             leaving.callback(records.close)
             records.write()
@@ -218,11 +191,9 @@ def _up(  # noqa: PLR0917 - those of `up`, in its order
                     networks=networks,
                     emit=emit,
                     ending=ending,
-                    worker=worker,
                 )
                 leaving.push_async_callback(session.leave)
-                if on_start is not None:
-                    on_start(session.status)
+                on_start(session.status)
                 return await session.run()
             except StepFailedError as failure:
                 emit(failure.event())
@@ -234,42 +205,40 @@ def _up(  # noqa: PLR0917 - those of `up`, in its order
                 await discovery_server.end(system, asyncio.Event())
                 await fork_server.close()
 
-        return asyncio.run(_leaving_last(run, conclude))
+        result = asyncio.run(_leaving_last(run, conclude))
     finally:
         process.close()
         # Once our own participant is gone, too.
         sweep(within_s=_LET_GO_S)
         directory.release()
+    guarded.check()
+    return result
 
 
-def _acquired(plan: Plan, options: UpOptions, process: ForkServerProcess) -> RunDirectory:
-    try:
-        return RunDirectory.acquire(
-            runtime_root(os.environ),
-            run_name(plan, options.machine),
-            process.run_id,
-            domain_id=plan.domain_id,
-        )
-    except LifecycleError:
-        process.close()
-        raise
+class _Guarded:
+    """A listener whose exception ends no more than itself, see `up`."""
 
+    def __init__(self, listener: Listener) -> None:
+        self._listener = listener
+        self._error: Exception | None = None
 
-def _journal(plan: Plan, directory: RunDirectory, emit: Emitter) -> Journal:
-    journal = Journal(
-        plan.system, directory.run_id, say=lambda message: emit(Notice(message=message))
-    )
-    emit.listen(journal.on_event)
-    return journal
+    def __call__(self, event: Event) -> None:
+        if self._error is None:
+            try:
+                self._listener(event)
+            except Exception as error:  # noqa: BLE001 - it is not ours, and raised in the end
+                traceback.print_exc()
+                self._error = error
+
+    def check(self) -> None:
+        """Raise what the listener raised."""
+        if self._error is not None:
+            raise self._error
 
 
 @contextlib.contextmanager
-def _working(emit: Emitter, logs: Path, system: str) -> Iterator[Worker]:
-    """Yield a worker, and remove old logs once bring-up is over.
-
-    That is in a thread of its own: deaths, orders and the end of a run need the worker, and a disk
-    may be slow.
-    """
+def _forgetting_runs(emit: Emitter, logs: Path, system: str) -> Iterator[None]:
+    """Remove old logs once bring-up is over, in a thread of its own: a disk may be slow."""
     begun: list[threading.Thread] = []
 
     def on_event(event: Event) -> None:
@@ -281,8 +250,7 @@ def _working(emit: Emitter, logs: Path, system: str) -> Iterator[Worker]:
                 begun[0].start()
 
     emit.listen(on_event)
-    with contextlib.closing(Worker("lifecycle")) as worker:
-        yield worker
+    yield
     for each in begun:
         if each.is_alive():
             each.join(_FORGOTTEN_S)
@@ -292,15 +260,8 @@ _FORGOTTEN_S = 1.0
 """What is not removed then is left to the next run."""
 
 
-def _emitter(listeners: Iterable[Listener]) -> Emitter:
-    emit = Emitter()
-    for listener in listeners:
-        emit.listen(listener)
-    return emit
-
-
 async def _leaving_last(
-    run: Callable[[contextlib.AsyncExitStack], Awaitable[UpResult]], conclude: Conclude | None
+    run: Callable[[contextlib.AsyncExitStack], Awaitable[UpResult]], conclude: Conclude
 ) -> UpResult:
     """Run, and leave the graph once nothing of the system runs any more, bounded.
 
@@ -311,32 +272,18 @@ async def _leaving_last(
     leaving = contextlib.AsyncExitStack()
     try:
         result = await run(leaving)
-        if conclude is not None:
-            result = dataclasses.replace(result, exit_code=conclude(result))
-        exit_code = result.exit_code
-        return result
+        exit_code = conclude(result)
+        return dataclasses.replace(result, exit_code=exit_code)
     finally:
         with _ends_within(LEAVE_S, exit_code):
             await leaving.aclose()
 
 
-def _preloading(
-    process: ForkServerProcess | None,
-    plan: Plan,
-    options: UpOptions,
-    processes: Iterable[PlannedProcess],
-) -> ForkServerProcess:
+def _preload(process: ForkServerProcess, plan: Plan, processes: Iterable[PlannedProcess]) -> None:
     """Have a fork server load the interface types of our Python nodes, once for all of them."""
-    python = [each for each in processes if each.run.kind is RunKind.PYTHON]
-    if process is None:
-        process = ForkServerProcess(
-            preload=bool(python),
-            without=token_variables(options.program),
-            programs=bool(options.program),
-        )
+    python = (each for each in processes if each.run.kind is RunKind.PYTHON)
     nodes = (plan.node(key) for each in python for key in each.nodes)
     process.preload(dict.fromkeys(each.type for node in nodes for each in node.endpoints))
-    return process
 
 
 _LET_GO_S = 0.5
@@ -457,9 +404,12 @@ def _enter_graph(plan: Plan, options: UpOptions, directory: RunDirectory) -> Non
     """Place this process where the plan's nodes will be, and have participants found quickly.
 
     Raises:
-        MiddlewareError: it cannot have the threads of a participant. Fast DDS would end the process
-            then, or wait for ever.
+        UsageError: there can be no ROS log directory.
+        MiddlewareError: a package is missing, or it cannot have the threads of a participant. Fast
+            DDS would end the process then, or wait for ever.
     """
+    check_log_root(os.environ)
+    check_installed(plan.policy)
     # What was loaded stays. To look through all of it whenever garbage is collected takes 40 ms,
     # and once more at the very end, when who asked for the end waits for nothing else.
     gc.freeze()
@@ -477,11 +427,6 @@ def _enter_graph(plan: Plan, options: UpOptions, directory: RunDirectory) -> Non
     os.environ.update(peers_environment(hosts, os.environ))
     peers = discovery_peers(plan.domain_id, hosts, os.environ)
     os.environ.update(discovery_environment(directory.path, peers=peers))
-
-
-def _graph_variables(environment: Mapping[str, str]) -> tuple[tuple[str, str], ...]:
-    """What a fork server that was started before `_enter_graph` has to pass on."""
-    return tuple((name, environment[name]) for name in _GRAPH_VARIABLES if name in environment)
 
 
 _PREFIX = re.compile(r"[0-9a-f]{24}")

@@ -302,6 +302,7 @@ class FakeSpawner:
         self.starves: dict[str, float] = {}
         self.looked_at: list[str] = []
         self.ends_at: dict[str, int] = {}
+        self.strays: tuple[int, ...] = ()
         self.processes: dict[str, FakeProcess] = {}
         self.interfaces: dict[str, NodeConfiguration] = {}
         self.reports_changes = False
@@ -370,6 +371,9 @@ class FakeSpawner:
         """Nothing is left."""
         del ended, known
         return ()
+
+    async def end_strays(self) -> tuple[int, ...]:
+        return self.strays
 
     async def close(self) -> None:
         """Nothing to close."""

@@ -32,7 +32,6 @@ from lifecycle.supervisor.control.ros_interface import Entry
 from lifecycle.supervisor.health.peer_supervisors import Listener
 from lifecycle.supervisor.nodes.driver import NodeDriver, NodeInterfaceClient, ServiceDriver
 from lifecycle.supervisor.nodes.system import System
-from lifecycle.supervisor.processes.orphans import end_strays
 from lifecycle.supervisor.processes.process import ProcessExit
 from lifecycle.supervisor.run.events import (
     ConsequenceTaken,
@@ -56,7 +55,7 @@ from lifecycle.supervisor.run.events import (
     SystemReached,
     VerdictChanged,
 )
-from lifecycle.supervisor.run.failure import StepFailedError, Worker
+from lifecycle.supervisor.run.failure import StepFailedError
 from lifecycle.supervisor.run.history import journal_files, read_run
 from lifecycle.supervisor.run.journal import Journal
 from lifecycle.supervisor.run.options import UpOptions, UpResult
@@ -442,20 +441,6 @@ class FakeNetworks(Networks):
         self._log.append("networks restored")
 
 
-class InlineWorker(Worker):
-    """Does what blocks at once: a thread's time is not that of the loop.
-
-    Attributes:
-        strays: pids of what escaped, which is to be found and ended.
-    """
-
-    def __init__(self) -> None:
-        self.strays: tuple[int, ...] = ()
-
-    async def run(self, work: Callable[..., Any], *arguments: object) -> Any:
-        return self.strays if work is end_strays else work(*arguments)
-
-
 class _Story(list[str]):
     """Lines in the order in which they happen, which can be waited for.
 
@@ -575,7 +560,6 @@ class SessionWorld:
         self.hosts.log = self.story
         self.graph = FakeParticipant(self.hosts)
         self.networks = FakeNetworks(self.story)
-        self.worker = InlineWorker()
         self.ending = Ending()
         self.result: UpResult | None = None
         self.status: Callable[[], SystemStatus]
@@ -635,7 +619,6 @@ class SessionWorld:
                 networks=self.networks,
                 emit=self._emit,
                 ending=self.ending,
-                worker=self.worker,
             )
             self.status = session.status
             self.result = await _beside(session.run(), scenarios)

@@ -971,7 +971,7 @@ async def test_nodes_and_processes_that_resist_are_ended_within_limits(tmp_path:
 
 async def test_what_escaped_is_ended_and_named(tmp_path: Path) -> None:
     world = SessionWorld(CHAIN, tmp_path, stop_after_s=0.0)
-    world.worker.strays = (4711, 4712)
+    world.hosts.strays = (4711, 4712)
     await world.run()
     assert world.outline[-3:] == [
         "networks restored",
