@@ -22,7 +22,7 @@ from lifecycle.supervisor.control.protocol import ProcessState
 from lifecycle.supervisor.nodes.bring_up import died
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.process import COMMAND_ESCALATION, ManagedProcess
-from lifecycle.supervisor.run.failure import StepFailedError, finding_of
+from lifecycle.supervisor.run.failure import StepFailedError, ended, finding_of
 from lifecycle.verify.rules.run import DEADLINE, START_FAILED
 from lifecycle.verify.verdict import Finding
 
@@ -95,8 +95,8 @@ async def begin(system: System, spawner: ForkServer, *, ours: bool) -> None:
 async def end(system: System, hurry: asyncio.Event) -> None:
     """End it, if it is ours; nothing of the system may need it any more."""
     if system.server is not None:
-        ended = system.server.state is ProcessState.EXITED
-        await system.server.end(() if ended else COMMAND_ESCALATION, hurry)
+        is_over = system.server.state is ProcessState.EXITED
+        await system.server.end(() if is_over else COMMAND_ESCALATION, hurry)
 
 
 def findings(system: System) -> tuple[Finding, ...]:
@@ -143,8 +143,7 @@ async def _until_it_listens(planned: PlannedServer, process: ManagedProcess | No
             )
         listening.result()
     finally:
-        listening.cancel()
-        await asyncio.gather(listening, return_exceptions=True)
+        await ended(listening)
 
 
 async def _listening(planned: PlannedServer, pid: int) -> None:

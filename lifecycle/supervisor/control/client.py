@@ -47,9 +47,7 @@ def status(path: Path) -> SystemStatus:
         UsageError: it runs no more.
         TimeoutError: it does not answer.
     """
-    answer = _asked(path, Question(ask=ControlRequest.STATUS), STATUS_S, Answer)
-    if answer is None:
-        raise lost(path)
+    answer = _answered(path, Question(ask=ControlRequest.STATUS), STATUS_S, Answer)
     if answer.status is None:
         raise strange(path / _SOCKET, "it has no status")
     return answer.status
@@ -64,9 +62,7 @@ def look(path: Path) -> SupervisorSnapshot:
     """
     from lifecycle.supervisor.control.server import LookAnswer  # its types are a whole plan's
 
-    answer = _asked(path, Question(ask=ControlRequest.LOOK), STATUS_S, LookAnswer)
-    if answer is None:
-        raise lost(path)
+    answer = _answered(path, Question(ask=ControlRequest.LOOK), STATUS_S, LookAnswer)
     if answer.look is None:
         raise strange(path / _SOCKET, "it shows nothing")
     return answer.look
@@ -100,13 +96,17 @@ def order(path: Path, question: Question, timeout_s: float) -> Answer:
         UsageError: it runs no more.
         TimeoutError: it is not done after `timeout_s`; it goes on all the same.
     """
-    answer = _asked(path, question, timeout_s, Answer)
-    if answer is None:
-        raise lost(path)
+    answer = _answered(path, question, timeout_s, Answer)
     if answer.exit_code not in _ANSWERED:
         code = answer.exit_code
         why = "it has no exit code" if code is None else f"its exit code is {code}"
         raise strange(path / _SOCKET, why)
+    return answer
+
+
+def _answered(path: Path, question: Question, timeout_s: float, type_: type[A]) -> A:
+    if (answer := _asked(path, question, timeout_s, type_)) is None:
+        raise lost(path)
     return answer
 
 
@@ -144,7 +144,12 @@ def down(path: Path, timeout_s: float) -> ExitCode:
         answer = _asked(path, Question(ask=ControlRequest.DOWN), left_s, Answer)
     if answer is not None and answer.exit_code is None:
         raise strange(path / _SOCKET, "it has no exit code")
-    if answer is not None and _released(path, deadline):
+    if answer is not None:
+        # It has answered already, and is about to let go of its directory.
+        while is_held(path):
+            if time.monotonic() > deadline:
+                raise TimeoutError
+            time.sleep(_LOCK_CHECK_S)
         return ExitCode.OK
     from lifecycle.middleware.process.shared_memory import sweep
     from lifecycle.supervisor.connections.networks import remove_programmed
@@ -159,15 +164,6 @@ def down(path: Path, timeout_s: float) -> ExitCode:
     finally:
         directory.release()
     return ExitCode.OK
-
-
-def _released(path: Path, deadline: float) -> bool:
-    """Wait until the supervisor, which has answered already, has let go of its directory."""
-    while is_held(path):
-        if time.monotonic() > deadline:
-            raise TimeoutError
-        time.sleep(_LOCK_CHECK_S)
-    return True
 
 
 def _terminate(path: Path) -> None:

@@ -308,8 +308,11 @@ class Revisions:
         # Whoever has other ports by that has other connections, too, and is started again.
         found = tuple(each for each in change.differences if each.path != "order of nodes")
         self._check_surroundings(plan, found, what)
-        if change.ends_or_starts and _has_tcp(running, plan):
-            raise _refused_whole(what, _TCP)
+        urls = [*_urls(running), *_urls(plan)]
+        if change.ends_or_starts and any(parse(url).transport.is_tcp for url in urls):
+            raise _refused_whole(
+                what, "a TCP port that was used is not connected to again by who used it"
+            )
         for key in (*change.restarted, *change.removed):
             if (name := system.nodes[key].name) in system.adopted:
                 raise UsageError(
@@ -353,9 +356,6 @@ def _is_whole(plan: Plan) -> bool:
     )
 
 
-_TCP = "a TCP port that was used is not connected to again by who used it"
-
-
 def _refused_whole(what: str, why: str, lines: Iterable[str] = ()) -> UsageError:
     listed = "".join(f"\n{each}" for each in lines)
     return UsageError(
@@ -377,10 +377,6 @@ def _places(running: Plan, plan: Plan) -> Iterator[str]:
     ):
         if old != new:
             yield f"{what}: was {old}, is {new}"
-
-
-def _has_tcp(*plans: Plan) -> bool:
-    return any(parse(url).transport.is_tcp for each in plans for url in _urls(each))
 
 
 def said(change: PlanChange, running: Plan, plan: Plan, revision: int) -> ChangedNodes:

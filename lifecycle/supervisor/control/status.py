@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 def node_status(
     node: NodeRun,
     verdict: Verdict | None,
-    silent: str = "",
+    silent: str,
     *,
-    elapsed_s: float = 0.0,
-    schedule: RestartSchedule | None = None,
+    elapsed_s: float,
+    schedule: RestartSchedule,
 ) -> NodeStatus:
     """Return what is known of one node.
 
@@ -97,8 +97,8 @@ def system_status(
     phase: str,
     supervisor: int,
     elapsed_s: float,
-    schedule: RestartSchedule | None = None,
-    ends: str = "",
+    schedule: RestartSchedule,
+    ends: str,
 ) -> SystemStatus:
     """Return what is known of the whole system, with what its processes use now."""
     silent = system.liveliness.silent

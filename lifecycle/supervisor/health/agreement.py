@@ -24,7 +24,6 @@ from lifecycle.plan.comparison import (
     decode,
     encode,
     notice_of,
-    plan_checksum,
 )
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.nodes.system import System
@@ -78,9 +77,9 @@ class Agreement:
         )
         self._notices: PlanNotices | None = None
         self._run = os.urandom(8).hex()
+        self._said: PlanNotice | None = None
         self._known: list[PlanNotice] = []
         self._since: dict[str, float] = {}
-        self._checksum: tuple[Plan, str] | None = None
         self._again: asyncio.TimerHandle | None = None
 
     def open(self) -> None:
@@ -95,12 +94,13 @@ class Agreement:
         """Say that this is what we plan from now on."""
         self._plan = plan
         if self._notices is not None:
-            self._notices.announce(encode(self._notice()))
+            self._said = notice_of(plan, run=self._run, host=machine_id(), machines=self._own)
+            self._notices.announce(encode(self._said))
 
     def leave(self, reason: str) -> None:
         """Say that what comes is an orderly end, and why; begins with FAILED where a run failed."""
-        if self._notices is not None:
-            notice = dataclasses.replace(self._notice(), left=True, reason=" ".join(reason.split()))
+        if self._notices is not None and self._said is not None:
+            notice = dataclasses.replace(self._said, left=True, reason=" ".join(reason.split()))
             self._notices.announce(encode(notice))
 
     def close(self) -> None:
@@ -160,9 +160,6 @@ class Agreement:
             return verdict
         return dataclasses.replace(verdict, findings=tuple(map(explain, verdict.findings)))
 
-    def _notice(self) -> PlanNotice:
-        return notice_of(self._plan, run=self._run, host=machine_id(), machines=self._own)
-
     def _arrived(self, text: str) -> None:
         with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
             self._loop.call_soon_threadsafe(self._take, text)
@@ -187,11 +184,7 @@ class Agreement:
         self._system.touched.set()
 
     def _different(self) -> Iterator[Finding]:
-        if not self._known:
-            return
-        if self._checksum is None or self._checksum[0] is not self._plan:
-            self._checksum = self._plan, plan_checksum(self._plan)
-        ours = self._checksum[1]
+        ours = "" if self._said is None else self._said.checksum
         for notice in self._known:
             if notice.checksum == ours:
                 continue
@@ -225,17 +218,20 @@ class Agreement:
             left_s -= self._loop.time()
             if left_s > 0:
                 waits_s.append(left_s)
+            assert self._said is not None
             who = f"the supervisor of machine {machine!r}"
             yield PLAN_UNKNOWN.finding(
                 Outcome.VIOLATED if left_s > 0 else Outcome.UNVERIFIABLE,
                 subject=who,
-                expected=f"plan {plan_checksum(self._plan)}",
+                expected=f"plan {self._said.checksum}",
                 observed="not announced yet" if left_s > 0 else "not announced",
                 message=f"cannot tell whether {who} planned the same system: it has not said"
                 + (" so yet" if left_s > 0 else f" what it planned within {ANNOUNCED_S:g} s"),
             )
         if waits_s:
-            self._look_again(min(waits_s))
+            if self._again is not None:
+                self._again.cancel()
+            self._again = self._loop.call_later(min(waits_s), self._system.touched.set)
 
     def _says(self, machine: str, names: set[str]) -> bool:
         """Whether some notice is of a supervisor that runs the machine, or its nodes."""
@@ -244,11 +240,6 @@ class Agreement:
             or (each.system != self._plan.system and not names.isdisjoint(each.nodes))
             for each in self._known
         )
-
-    def _look_again(self, after_s: float) -> None:
-        if self._again is not None:
-            self._again.cancel()
-        self._again = self._loop.call_later(after_s, self._system.touched.set)
 
 
 def _who(notice: PlanNotice, system: str) -> str:

@@ -189,7 +189,7 @@ class ForkServer:
         """
         self._serves.clear()
         with self._asking():
-            self._process.socket.send(to_json(SERVES))
+            self._process.socket.send(SERVES.encode())
         if not await set_within(self._serves, _READY_S):
             raise BringUpError(f"the fork server does not answer within {_READY_S:g} s")
         self._check()
@@ -274,13 +274,9 @@ class ForkServer:
 
     def disown_ports(self) -> None:
         """Have all participants of this host send no more to ports whose process was killed."""
-        self._send(DISOWN)
-
-    def _send(self, message: str) -> None:
-        """Send what is not answered; one that has died is noticed elsewhere."""
-        if self._alive:
+        if self._alive:  # one that has died is noticed elsewhere
             with contextlib.suppress(OSError):
-                self._process.socket.send(message.encode())
+                self._process.socket.send(DISOWN.encode())
 
     def _reports(self) -> None:
         """Take one report; at end of file it is about to end."""
@@ -300,7 +296,7 @@ class ForkServer:
         if not data:
             return False
         report = from_json(data, ChildReport)
-        if report.id == SERVES.id:
+        if report.id == 0:
             self._serves.set()
         elif report.stopped is not None:
             if report.id in self._children:

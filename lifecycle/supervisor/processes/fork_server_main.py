@@ -21,7 +21,7 @@ import sys
 import time
 import traceback
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from typing import NoReturn
 
 from lifecycle import dataclasses
@@ -51,7 +51,7 @@ class ForkRequest:
     """Supervisor → fork server, with descriptors stdout, stderr and, if `control`, the channel.
 
     Attributes:
-        id: ≥ 1; 0 only asks whether the fork server serves, which answers with the same id.
+        id: ≥ 1.
         limits: see SpawnRequest.
         no_new_privileges: likewise.
         grace_s: seconds that the process gets to end by itself once the supervisor is gone.
@@ -67,16 +67,12 @@ class ForkRequest:
     grace_s: float = GRACE_S
 
 
-SERVES = ForkRequest(id=0, argv=(), environment=(), working_directory="", control=False)
-"""Forks nothing, see ForkRequest.id."""
-
-
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class ChildReport:
     """Fork server → supervisor: a child was forked (with its pidfd), stopped, continued or ended.
 
     Attributes:
-        id: of the ForkRequest.
+        id: of the ForkRequest; 0 answers SERVES.
         pid: of the child; 0 if it could not be forked.
         status: waitpid(2) status; None while it runs.
         error: why it could not be forked.
@@ -92,6 +88,9 @@ class ChildReport:
 
 DISOWN = "disown"
 """A message: have all let go of ports in shared memory whose process was killed; not answered."""
+
+SERVES = "serves"
+"""A message: say that you serve."""
 
 _CHILD_SIGNAL = -1
 _ENDED = os.WEXITED | os.WNOWAIT | os.WNOHANG
@@ -145,14 +144,13 @@ class _ForkServer:
         word, *lines = data.decode().split("\n")
         if word == DISOWN:
             disown_ports()
+        elif word == SERVES:
+            self._tell(ChildReport(id=0))
         elif word == PRELOAD:
             _preload(lines)
         return True
 
     def _fork(self, request: ForkRequest, descriptors: list[int]) -> None:
-        if request == SERVES:
-            self._tell(ChildReport(id=request.id))
-            return
         try:
             with warnings.catch_warnings():
                 # Python 3.12 warns of any other thread. Those here belong to the libraries that
@@ -318,21 +316,15 @@ def _reseed() -> None:
         numpy_random.seed()
 
 
-@contextlib.contextmanager
-def _pages_shared() -> Iterator[None]:
-    """Keep the pages of what is imported inside shared: a first collection would touch them."""
-    gc.disable()
-    yield
-    gc.freeze()
-    gc.enable()
-
-
 def _preload(types: Iterable[str]) -> None:
     """Import what every Python node has, and interface types."""
     from lifecycle.node.host.host import preload
 
-    with _pages_shared():
-        preload(types)
+    # A first collection would touch the pages of what is imported, and share them no more.
+    gc.disable()
+    preload(types)
+    gc.freeze()
+    gc.enable()
 
 
 def main() -> NoReturn:

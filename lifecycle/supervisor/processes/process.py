@@ -90,10 +90,6 @@ _CRASHES = (
 )
 
 
-def _ignore(is_stopped: bool) -> None:
-    """Ignore that it stopped or continues."""
-
-
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class SpawnRequest:
     """One process to start, in a session of its own.
@@ -121,13 +117,13 @@ class SpawnRequest:
     working_directory: str
     stdout: int
     stderr: int
-    control: int | None = None
-    on_stop: Callable[[bool], None] = _ignore
-    prefix: tuple[str, ...] = ()
-    limits: tuple[tuple[str, int], ...] = ()
-    no_new_privileges: bool = False
-    grace_s: float = GRACE_S
-    resources: Resources | None = None
+    control: int | None
+    on_stop: Callable[[bool], None]
+    prefix: tuple[str, ...]
+    limits: tuple[tuple[str, int], ...]
+    no_new_privileges: bool
+    grace_s: float
+    resources: Resources | None
 
 
 Escalation = Sequence[tuple[int, float]]
@@ -350,14 +346,15 @@ class ManagedProcess:
 
     async def _wait(self, wait_s: float, hurry: asyncio.Event | None) -> bool:
         """Wait for the end; False when `wait_s` passed or there is a hurry first."""
-        waits: list[asyncio.Future[object]] = [asyncio.ensure_future(asyncio.shield(self.ended))]
-        if hurry is not None:
-            waits.append(asyncio.ensure_future(hurry.wait()))
+        waits: set[asyncio.Future[Any]] = {self.ended}
+        hurried = None if hurry is None else asyncio.ensure_future(hurry.wait())
+        if hurried is not None:
+            waits.add(hurried)
         try:
             await asyncio.wait(waits, timeout=wait_s, return_when=asyncio.FIRST_COMPLETED)
         finally:
-            for each in waits:
-                each.cancel()
+            if hurried is not None:
+                hurried.cancel()
         return self.ended.done()
 
     @property

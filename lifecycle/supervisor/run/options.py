@@ -9,7 +9,7 @@ from __future__ import annotations
 import enum
 import ipaddress
 import socket
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 from lifecycle import dataclasses
@@ -180,12 +180,10 @@ def observer_connections(plan: Plan, machine: str = "") -> ParticipantConnection
     nodes = [each.connections for each in plan.nodes if each.machine in own]
     if not any(only_shared_memory(each) for each in nodes):
         return found
-    shared = tuple(each for each in found.urls if only_shared_memory(_connected_to(each)))
+    shared = tuple(
+        url for url in found.urls if only_shared_memory(ParticipantConnections(urls=(url,)))
+    )
     return dataclasses.replace(found, urls=shared or found.urls)
-
-
-def _connected_to(url: str) -> ParticipantConnections:
-    return ParticipantConnections(urls=(url,))
 
 
 def onlooker_connections(
@@ -203,7 +201,11 @@ def onlooker_connections(
     connections = observer_connections(plan)
     planned = [url for node in plan.nodes for url in urls_of(node)]
     said = [url for each in reported for report in each.connections for url in report.urls]
-    listening = {*_tcp_listeners([*planned, *said])}
+    listening = {
+        Peer(address=url.address, port=url.port)
+        for url in map(parse, [*planned, *said])
+        if url.transport.is_tcp and url.port and url.address
+    }
     urls = []
     for text in connections.urls:
         url = parse(text)
@@ -213,14 +215,6 @@ def onlooker_connections(
             url = dataclasses.replace(url, peers=tuple(sorted({*url.peers, *listening})))
         urls.append(str(url))
     return dataclasses.replace(connections, urls=tuple(urls))
-
-
-def _tcp_listeners(urls: Iterable[str]) -> Iterator[Peer]:
-    """Yield where participants with these URLs listen for TCP."""
-    for text in urls:
-        url = parse(text)
-        if url.transport.is_tcp and url.port and url.address:
-            yield Peer(address=url.address, port=url.port)
 
 
 def _own_addresses() -> set[str]:

@@ -29,7 +29,7 @@ from lifecycle.supervisor.processes.process import (
     wait_under_load,
 )
 from lifecycle.supervisor.run.events import Emitter, Notice, WiringChanged
-from lifecycle.supervisor.run.failure import StepFailedError
+from lifecycle.supervisor.run.failure import StepFailedError, ended
 
 _DEATH_S = 0.5
 """A channel that a host closed by itself usually means that it dies."""
@@ -119,8 +119,9 @@ class TakeDown:
 
         One that others asked to end, by SIGTERM say, shuts its nodes down before it ends.
         """
-        ended = process.ended.done() and not process.asked_to_end
-        if process not in self._lived or process.channel is None or not ended:
+        if process not in self._lived or process.channel is None:
+            return
+        if process.asked_to_end or not process.ended.done():
             return
         await asyncio.sleep(_WORDS_S)
         nodes = [self._system.nodes[key] for key in process.planned.nodes]
@@ -217,9 +218,9 @@ class TakeDown:
         request = asyncio.ensure_future(doing)
         hurry = asyncio.ensure_future(self._hurry.wait())
         waits: set[asyncio.Future[Any]] = {request, hurry}
-        ended = set() if node.process is None else {node.process.ended}
+        end = set() if node.process is None else {node.process.ended}
         try:
-            await wait_under_load(waits | ended, limit_s, node.run_delay_s)
+            await wait_under_load(waits | end, limit_s, node.run_delay_s)
             if not request.done() and node.is_gone:
                 return False
             if not request.done():
@@ -234,17 +235,15 @@ class TakeDown:
                 return False
             request.result()
         except BringUpError as error:
-            if ended and isinstance(error, ChannelClosedError):
-                await asyncio.wait(ended, timeout=_DEATH_S)
+            if end and isinstance(error, ChannelClosedError):
+                await asyncio.wait(end, timeout=_DEATH_S)
             if not node.is_gone:
                 self._emit(Notice(message=error.message))
             return False
         else:
             return True
         finally:
-            for each in (request, hurry):
-                each.cancel()
-            await asyncio.gather(request, hurry, return_exceptions=True)
+            await ended(request, hurry)
 
     async def _end(self, process: ManagedProcess) -> None:
         escalation = ESCALATION
