@@ -219,28 +219,31 @@ class ForkServer:
             return await self._forked(request)
         except (BringUpError, OSError) as error:
             message = error.message if isinstance(error, BringUpError) else str(error)
-            raise BringUpError(f"cannot start process {request.name!r}: {message}") from error
+            raise BringUpError(
+                f"cannot start process {request.planned.name!r}: {message}"
+            ) from error
 
     async def _forked(self, request: SpawnRequest) -> ForkServerChild:
         """Have it fork; raises BringUpError if it cannot."""
         self._next += 1
+        planned, run = request.planned, request.planned.run
         descriptors = [request.stdout, request.stderr]
-        limits = scope(request.resources)
-        argv = (*limits, *request.argv)
+        scoped = scope(run.resources)
+        argv = (*scoped, *planned.argv)
         if request.control is not None:
             descriptors.append(request.control)
             fresh = any(name.startswith(_FRESH_INTERPRETER) for name, _ in request.environment)
-            if fresh or request.prefix or limits:
+            if fresh or run.prefix or scoped:
                 host = (sys.executable, "-m", _HOST, "--control-fd", "{control}")
-                argv = (*limits, *request.prefix, *host)
+                argv = (*scoped, *run.prefix, *host)
         message = ForkRequest(
             id=self._next,
             argv=argv,
-            environment=(*request.environment, (PROCESS_VARIABLE, request.name)),
-            working_directory=request.working_directory,
+            environment=(*request.environment, (PROCESS_VARIABLE, planned.name)),
+            working_directory=run.working_directory,
             control=request.control is not None,
-            limits=request.limits,
-            no_new_privileges=request.no_new_privileges,
+            limits=() if run.limits is None else run.limits.resources(),
+            no_new_privileges=run.no_new_privileges,
             grace_s=request.grace_s,
         )
         born: asyncio.Future[ForkServerChild] = self._loop.create_future()

@@ -52,8 +52,11 @@ class ForkRequest:
 
     Attributes:
         id: ≥ 1.
-        limits: see SpawnRequest.
-        no_new_privileges: likewise.
+        argv: command line; empty for a process that serves the control channel as our node host.
+        environment: (name, value) on top of the fork server's own environment.
+        working_directory: empty for the fork server's own.
+        limits: (name, value) of setrlimit(2), `RLIMIT_NOFILE`.
+        no_new_privileges: see prctl(2), PR_SET_NO_NEW_PRIVS.
         grace_s: seconds that the process gets to end by itself once the supervisor is gone.
     """
 

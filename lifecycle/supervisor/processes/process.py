@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lifecycle import dataclasses
-from lifecycle.manifest.model import Output, Resources
+from lifecycle.manifest.model import Output
 from lifecycle.middleware.process.stacks import brief
 from lifecycle.plan.model import PlannedProcess
 from lifecycle.printable import log_line
@@ -95,35 +95,23 @@ class SpawnRequest:
     """One process to start, in a session of its own.
 
     Attributes:
-        name: of the planned process, for messages.
-        argv: command line; empty for a process that serves the control channel as our node host.
-        prefix: words before the command line of a host of ours; `argv` has those of a command.
+        planned: what the plan declares of it.
         environment: (name, value) on top of the spawner's own environment.
-        working_directory: empty for the spawner's own.
         stdout: descriptor; the spawner does not close it.
         stderr: descriptor.
         control: descriptor of the host's end of the control channel; None for a foreign command.
         on_stop: called with True when a signal stopped the process (signal(7), Stop), False when it
             continues.
-        limits: (name, value) of setrlimit(2), `RLIMIT_NOFILE`.
-        no_new_privileges: see prctl(2), PR_SET_NO_NEW_PRIVS.
         grace_s: seconds that it gets to end by itself should the supervisor be killed.
-        resources: that it and all that it starts may use together, see scope.py; None for all.
     """
 
-    name: str
-    argv: tuple[str, ...]
+    planned: PlannedProcess
     environment: tuple[tuple[str, str], ...]
-    working_directory: str
     stdout: int
     stderr: int
     control: int | None
     on_stop: Callable[[bool], None]
-    prefix: tuple[str, ...]
-    limits: tuple[tuple[str, int], ...]
-    no_new_privileges: bool
     grace_s: float
-    resources: Resources | None
 
 
 Escalation = Sequence[tuple[int, float]]
@@ -258,7 +246,6 @@ class ManagedProcess:
         ends: list[int] = []
         control = None
         own = dict(self.planned.environment)
-        limits = self.planned.run.limits
         try:
             for stream in ("stdout", "stderr"):
                 read, write = os.pipe()
@@ -269,19 +256,13 @@ class ManagedProcess:
                 control = await channel.open()
             self.child = await spawner.spawn(
                 SpawnRequest(
-                    name=self.name,
-                    argv=self.planned.argv,
+                    planned=self.planned,
                     environment=tuple({**dict(self._variables), **own}.items()),
-                    working_directory=self.planned.run.working_directory,
                     stdout=ends[0],
                     stderr=ends[1],
                     control=None if control is None else control.fileno(),
                     on_stop=self.on_stop,
-                    prefix=() if channel is None else self.planned.run.prefix,
-                    limits=() if limits is None else limits.resources(),
-                    no_new_privileges=self.planned.run.no_new_privileges,
                     grace_s=self._grace_s,
-                    resources=self.planned.run.resources,
                 )
             )
         finally:

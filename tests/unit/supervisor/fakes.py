@@ -155,7 +155,7 @@ class FakeProcess:
         self.exited: asyncio.Future[ProcessExit] = asyncio.get_running_loop().create_future()
         self.signals: list[int] = []
         self._spawner = spawner
-        self._name = request.name
+        self._name = request.planned.name
         self._stdout = os.dup(request.stdout)
         self._task: asyncio.Task[None] | None = None
         if request.control is not None:
@@ -357,7 +357,7 @@ class FakeSpawner:
         """Always."""
 
     async def spawn(self, request: SpawnRequest) -> FakeProcess:
-        process = self.processes[request.name] = FakeProcess(self, request)
+        process = self.processes[request.planned.name] = FakeProcess(self, request)
         return process
 
     def belonging(self, processes: Mapping[int, str]) -> frozenset[int]:

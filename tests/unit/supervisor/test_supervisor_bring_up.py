@@ -60,7 +60,7 @@ async def test_a_bring_up_that_was_cancelled_twice_starts_everything_anew_the_ne
     spawn, asked = world.spawner.spawn, []
 
     async def slow(request: SpawnRequest) -> FakeProcess:
-        asked.append(request.name)
+        asked.append(request.planned.name)
         if len(asked) > 2:
             return await spawn(request)
         try:
