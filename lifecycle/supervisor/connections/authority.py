@@ -319,6 +319,7 @@ class ConnectionAuthority:
         self,
     ) -> Iterable[tuple[str, NodeDriver | NodeInterfaceClient, NodeRun | None, NodeConfiguration]]:
         dead = self._system.dead()
+        remote = {each.name for each in self._system.remote.values()}
         for name in self._instructions:
             node = self._system.node_named(name)
             if node is not None:
@@ -329,14 +330,10 @@ class ConnectionAuthority:
                     continue  # it is verified as it was found
                 if configuration.connected and configuration.state in (INACTIVE, ACTIVE):
                     yield name, node.driver, node, configuration
-            elif name in self._others and name not in self._remote():
+            elif name in self._others and name not in remote:
                 configuration = self._others[name]
                 if configuration.state in (INACTIVE, ACTIVE):
                     yield name, self._interface_of(name), None, configuration
-
-    def _remote(self) -> frozenset[str]:
-        """Nodes of the plan that another supervisor wires."""
-        return frozenset(each.name for each in self._system.remote.values())
 
     async def _repair_node(
         self,

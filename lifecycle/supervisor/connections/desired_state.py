@@ -7,6 +7,7 @@ case of the first wiring, of a change and of making again what was lost. Pure.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Collection, Mapping
 
 from lifecycle import dataclasses
@@ -128,6 +129,7 @@ def steps(
         has: what is.
         ours: names of connections that this authority made; others are not its to break.
     """
+    step = functools.partial(Step, node=wanted.node)
     connections = dict(has.connections)
     made: list[Step] = []
     stale: set[str] = set()
@@ -136,40 +138,23 @@ def steps(
             continue
         if name in connections:
             stale.add(name)
-            made.append(_step(wanted, Operation.DISCONNECT_FROM, name))
-        made.append(_step(wanted, Operation.CONNECT_TO, name, connections=how))
+            made.append(step(operation=Operation.DISCONNECT_FROM, connection=name))
+        made.append(step(operation=Operation.CONNECT_TO, connection=name, connections=how))
     mappings: Mapping[str, str] = dict(has.mappings)
     for endpoint, name in wanted.mappings:
         if name in stale or mappings.get(endpoint) != name:
-            made.append(_step(wanted, Operation.MAP_TO, name, endpoint=endpoint))
+            made.append(step(operation=Operation.MAP_TO, connection=name, endpoint=endpoint))
     needed = {name for name, _ in wanted.connections}
     made += [
-        _step(wanted, Operation.DISCONNECT_FROM, name)
+        step(operation=Operation.DISCONNECT_FROM, connection=name)
         for name in connections
         if name in ours and name not in needed
     ]
     return tuple(made)
 
 
-def _step(
-    wanted: Instructions,
-    operation: Operation,
-    connection: str,
-    *,
-    connections: ParticipantConnections = ParticipantConnections(),
-    endpoint: str = "",
-) -> Step:
-    return Step(
-        node=wanted.node,
-        operation=operation,
-        connection=connection,
-        connections=connections,
-        endpoint=endpoint,
-    )
-
-
 def not_wired(subject: str, message: str) -> Finding:
-    """Return it.
+    """Return the finding that something could not be wired.
 
     Args:
         subject: fully qualified node name, or the system's name.

@@ -12,7 +12,7 @@ that were given out earlier, and those are in the nodes' reports.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 
 from lifecycle import dataclasses
 from lifecycle.manifest.model import Authority, DataLayerSource, EndpointKind, EndpointPolicy
@@ -30,7 +30,6 @@ from lifecycle.plan.model import (
 from lifecycle.plan.negotiation.data_layer import (
     DataLayerGraph,
     NegotiatedConnection,
-    NegotiationProblem,
     Party,
     PartyEndpoint,
 )
@@ -171,7 +170,8 @@ class NegotiatedSource:
 
     def instructions(self, known: Mapping[str, NodeConfiguration]) -> Mapping[str, Instructions]:
         """Return what each node must have, by full name, given what nodes report."""
-        known = {name: each for name, each in known.items() if self._takes_part(name)}
+        if self._plan.policy.undeclared_nodes is not EndpointPolicy.OPEN:
+            known = {name: each for name, each in known.items() if name in self._planned}
         seen = frozenset((each.name, each.checksum) for each in known.values())
         if seen == self._judged:
             return self._instructions
@@ -194,7 +194,13 @@ class NegotiatedSource:
         ]
         graph = negotiate(parties, self._wishes, self._terms, before=self.graph)
         before, self.graph = self.graph, graph
-        self.problems = tuple(map(_words, self._declared(graph.problems)))
+        # What concerns an undeclared node is left out: the system does without it.
+        keys = {each.key for each in self._plan.nodes}
+        self.problems = tuple(
+            f"{each.message}; {each.hint}" if each.hint else each.message
+            for each in graph.problems
+            if {each.publisher, each.subscription} <= keys
+        )
         self.expected = _with_flows(with_graph(self._grown(known), graph), graph)
         instructions = {
             node.full_name: planned_instructions(node)
@@ -247,10 +253,6 @@ class NegotiatedSource:
             for key in process.nodes
         }
 
-    def _takes_part(self, name: str) -> bool:
-        is_open = self._plan.policy.undeclared_nodes is EndpointPolicy.OPEN
-        return name in self._planned or is_open
-
     def _party(self, node: PlannedNode, configuration: NodeConfiguration | None) -> Party:
         if configuration is None:
             return party_of_node(node, self._hosts, rmw=self._rmw.get(node.key, self._plan.rmw))
@@ -263,11 +265,6 @@ class NegotiatedSource:
 
     def _negotiated(self, key: str) -> frozenset[str]:
         return frozenset(each.name for each in self.graph.connections if each.node == key)
-
-    def _declared(self, problems: Iterable[NegotiationProblem]) -> Iterable[NegotiationProblem]:
-        """Leave out what concerns an undeclared node: the system does without it."""
-        keys = {each.key for each in self._plan.nodes}
-        return (each for each in problems if {each.publisher, each.subscription} <= keys)
 
     def _grown(self, known: Mapping[str, NodeConfiguration]) -> Plan:
         """The plan with the endpoints that its nodes made in code, where they may."""
@@ -341,10 +338,6 @@ def _unplanned_instructions(
         connections=tuple((each.name, ParticipantConnections(urls=each.urls)) for each in mine),
         mappings=tuple(mapped.items()),
     )
-
-
-def _words(problem: NegotiationProblem) -> str:
-    return f"{problem.message}; {problem.hint}" if problem.hint else problem.message
 
 
 def is_negotiated(plan: Plan) -> bool:

@@ -131,11 +131,6 @@ class _Time:
         """Seconds that are left; negative once it is over."""
         return self.deadline - self._loop.time()
 
-    @property
-    def is_over(self) -> bool:
-        """Whether nothing is left of it."""
-        return self.left_s <= 0
-
     def shorten(self, left_s: float) -> None:
         """Have it over in so many seconds."""
         self.deadline = self._loop.time() + left_s
@@ -390,7 +385,7 @@ class Session:
                 stopping = "the system changed before every node was activated"
             elif self._gate_sequence.phase == "activating":
                 stopping = "what became active is not what was verified"
-            if self._time is not None and self._time.is_over:
+            if self._time is not None and self._time.left_s <= 0:
                 stopping = f"{stopping}, and {self._time}"
             reason = f"{stopping}; {not_ok(error.verdict) or error.verdict.verdict.value}"
         if end.why:
