@@ -202,14 +202,12 @@ class Agreement:
     def _unknown(self, observation: Observation) -> Iterator[Finding]:
         """Yield a finding for each machine that is there and has not said what it planned."""
         seen = {each.full_name for each in observation.nodes}
-        remote: dict[str, list[tuple[str, bool]]] = {}
-        for each in self._system.remote.values():
-            attached = each.planned.run.kind is RunKind.ATTACH
-            remote.setdefault(each.planned.machine, []).append((each.name, attached))
+        remote = [(each.name, each.planned) for each in self._system.remote.values()]
         waits_s: list[float] = []
-        for machine, found in remote.items():
-            names = {name for name, _ in found}
-            runs = {name for name, attached in found if not attached}
+        for machine in dict.fromkeys(planned.machine for _, planned in remote):
+            ours = [(name, planned.run) for name, planned in remote if planned.machine == machine]
+            names = {name for name, _ in ours}
+            runs = {name for name, run in ours if run.kind is not RunKind.ATTACH}
             there = machine in self._connected.machines or bool(runs & seen)
             if not machine or not there or self._says(machine, names):
                 self._since.pop(machine, None)

@@ -186,12 +186,14 @@ class LineReader:
         self._rest = b""
         self._loop = asyncio.get_running_loop()
         self._open = True
-        self.ended = self._loop.create_future()
         os.set_blocking(descriptor, False)
         self._loop.add_reader(descriptor, self._read)
 
     def drain(self) -> None:
-        """Read what is there: of a process that has ended, its last words."""
+        """Read what is there: of a process that has ended, its last words.
+
+        No more than a pipe holds: a process left behind may write faster than we read.
+        """
         for _ in range(_LARGEST_PIPE // LONGEST_LINE):
             if not self._open or not self._read():
                 return
@@ -203,7 +205,7 @@ class LineReader:
         except BlockingIOError:
             return False
         if not data:
-            self.close()
+            self._end()
             return False
         *lines, self._rest = (self._rest + data).split(b"\n")
         for line in lines:
@@ -217,24 +219,17 @@ class LineReader:
         self._on_line(line.rstrip(b"\r").decode("utf-8", errors="replace"))
 
     def close(self) -> None:
-        """Read what is there, give up the descriptor and emit an unfinished last line.
+        """Read what is there, give up the descriptor and emit an unfinished last line."""
+        self.drain()
+        self._end()
 
-        No more than a pipe holds: a process left behind may write faster than we read.
-        """
-        if not self._open:
-            return
-        self._open = False
-        self._loop.remove_reader(self._descriptor)
-        with contextlib.suppress(BlockingIOError):
-            for _ in range(_LARGEST_PIPE // LONGEST_LINE):
-                self._rest += os.read(self._descriptor, LONGEST_LINE)
-        os.close(self._descriptor)
-        for line in self._rest.split(b"\n"):
-            if line:
-                self._line(line)
-        self._rest = b""
-        if not self.ended.done():
-            self.ended.set_result(None)
+    def _end(self) -> None:
+        if self._open:
+            self._open = False
+            self._loop.remove_reader(self._descriptor)
+            os.close(self._descriptor)
+            if self._rest:
+                self._line(self._rest)
 
 
 class Traceback:

@@ -261,7 +261,14 @@ async def test_when_the_supervisor_vanishes_the_fork_server_ends_what_it_forked(
 async def test_lines_are_split_and_a_line_without_end_cannot_fill_the_memory() -> None:
     read, write = os.pipe()
     lines: list[str] = []
-    reader = LineReader(read, lines.append)
+    ended = asyncio.Event()
+
+    def take(line: str) -> None:
+        lines.append(line)
+        if line == "last":
+            ended.set()
+
+    LineReader(read, take)
     loop = asyncio.get_running_loop()
     data = b"one\r\ntwo\nth\xffree\n" + b"x" * (3 * LONGEST_LINE) + b"\nlast"
 
@@ -270,7 +277,7 @@ async def test_lines_are_split_and_a_line_without_end_cannot_fill_the_memory() -
             pipe.write(data)
 
     await loop.run_in_executor(None, fill)
-    await reader.ended
+    await ended.wait()
     assert lines[:3] == ["one", "two", "th\ufffdree"]
     assert max(len(line) for line in lines) == LONGEST_LINE
     assert sum(len(line) for line in lines[3:-1]) == 3 * LONGEST_LINE
