@@ -1,15 +1,15 @@
 """Drives one managed node: over our control channel, or through its lifecycle services.
 
-Owns: `NodeDriver` and its two kinds. The order of operations is bring_up.py's. Must not import
-rclpy; the services come from middleware/ behind a Protocol.
+Owns: `NodeDriver`, of two kinds. Deadlines are the caller's: every call may be cancelled. The order
+of operations is bring_up.py's. Must not import rclpy at run time.
 """
 
 from __future__ import annotations
 
 import asyncio
 import functools
-from collections.abc import Awaitable, Callable, Sequence
-from typing import Protocol
+from collections.abc import Awaitable
+from typing import TYPE_CHECKING
 
 from lifecycle import dataclasses
 from lifecycle.errors import BringUpError, MiddlewareError
@@ -19,6 +19,9 @@ from lifecycle.supervisor.connections.desired_state import Step
 from lifecycle.supervisor.gate.gate import Permit
 from lifecycle.supervisor.processes.control_channel import ControlChannel
 from lifecycle.verify.observation import NodeConfiguration
+
+if TYPE_CHECKING:
+    from lifecycle.middleware.services.clients import NodeClients
 
 ACTIVE = "active"
 INACTIVE = "inactive"
@@ -57,37 +60,6 @@ class ChangedError(BringUpError):
     """A node was not activated: it is not any more as it was when it was verified."""
 
 
-class NodeDriver(Protocol):
-    """Drives one managed node. Deadlines are the caller's: every call may be cancelled."""
-
-    async def start(self) -> NodeCondition:
-        """Wait until the node can be driven, and return its state."""
-
-    async def perform(self, operation: Operation, permit: Permit | None = None) -> NodeCondition:
-        """Do one operation.
-
-        Raises:
-            ChangedError: see there; what it is now is reported.
-            BringUpError: the node refused or failed, or cannot be reached.
-        """
-
-    async def configuration(self) -> NodeConfiguration | None:
-        """Read the node's configuration afresh; None where the node has no such interface."""
-
-    async def interface(self) -> NodeConfiguration | None:
-        """Read what the node can be wired by; None where it has no node interface."""
-
-    async def wire(self, step: Step) -> NodeConfiguration | None:
-        """Make one connection or mapping, or unmake one.
-
-        Returns:
-            The node's configuration after it, where the answer carries it.
-
-        Raises:
-            BringUpError: the node refused or failed, or cannot be reached.
-        """
-
-
 class ControlDriver:
     """Drives a node of our own host over the process's control channel."""
 
@@ -101,7 +73,12 @@ class ControlDriver:
         return NodeCondition(state=UNCONFIGURED)
 
     async def perform(self, operation: Operation, permit: Permit | None = None) -> NodeCondition:
-        """Send the operation and wait for the reply."""
+        """Send the operation and wait for the reply.
+
+        Raises:
+            ChangedError: see there; what it is now is reported.
+            BringUpError: the node refused or failed, or cannot be reached.
+        """
         reply = await self._channel.request(self._node, operation, permit)
         if not reply.ok:
             reason = reply.error or f"the node is {reply.state or 'in an unknown state'}"
@@ -112,15 +89,19 @@ class ControlDriver:
         )
 
     async def configuration(self) -> NodeConfiguration | None:
-        """Ask the host."""
+        """Ask the host for its configuration."""
         return (await self.perform(Operation.GET_CONFIGURATION)).configuration
 
     async def interface(self) -> NodeConfiguration | None:
-        """Ask the host."""
+        """Ask the host what the node can be wired by."""
         return await self.configuration()
 
     async def wire(self, step: Step) -> NodeConfiguration | None:
-        """Send the step and wait for the reply."""
+        """Send the step and wait for the reply.
+
+        Raises:
+            BringUpError: the node refused or failed, or cannot be reached.
+        """
         reply = await self._channel.request(
             self._node,
             step.operation,
@@ -131,47 +112,6 @@ class ControlDriver:
         if not reply.ok:
             raise BringUpError(f"cannot {step}: {reply.error or 'the node gives no reason'}")
         return reply.configuration
-
-
-class LifecycleClients(Protocol):
-    """Clients of other nodes' services, see lifecycle.middleware.NodeClients."""
-
-    async def get_state(self, node: str, *, timeout_s: float) -> str:
-        """Return the label of the node's state."""
-
-    async def get_available_transitions(self, node: str, *, timeout_s: float) -> tuple[str, ...]:
-        """Return the labels of the transitions that may be asked for now."""
-
-    async def change_state(
-        self,
-        node: str,
-        transition: str,
-        *,
-        timeout_s: float,
-        before: Callable[[], Awaitable[None]] | None = None,
-    ) -> bool:
-        """Ask for one transition; whether the node accepted and completed it.
-
-        Args:
-            node: fully qualified name.
-            transition: label.
-            timeout_s: seconds, > 0.
-            before: awaited when the request is about to leave; what it raises keeps it back.
-        """
-
-    async def get_configuration(self, node: str, *, timeout_s: float) -> NodeConfiguration | None:
-        """Return the node's configuration; None where it has no such interface."""
-
-    async def connect_to(
-        self, node: str, name: str, urls: Sequence[str], *, timeout_s: float
-    ) -> None:
-        """Make a connection; raises MiddlewareError with the node's reason."""
-
-    async def map_to(self, node: str, endpoint: str, connection: str, *, timeout_s: float) -> None:
-        """Map `publishers/video` onto a connection; raises MiddlewareError with the reason."""
-
-    async def disconnect(self, node: str, name: str, *, timeout_s: float) -> None:
-        """Unmake a connection; raises MiddlewareError with the node's reason."""
 
 
 _REACHED = {
@@ -198,18 +138,62 @@ _NESTED = (Operation.CONNECT, Operation.DISCONNECT)
 """Only our own nodes have these; a foreign node makes its data layer inside configure."""
 
 
-class ServiceDriver:
+class NodeInterfaceClient:
+    """Wires a node through its node interface, in whichever process it is.
+
+    Args:
+        services: clients.
+        node: fully qualified name.
+        timeout_s: seconds, > 0, for each request.
+    """
+
+    def __init__(self, services: NodeClients, node: str, timeout_s: float = _REQUEST_S) -> None:
+        self._services = services
+        self._node = node
+        self._timeout_s = timeout_s
+
+    async def interface(self) -> NodeConfiguration | None:
+        """Ask `~/get_configuration`; None where the node has none.
+
+        Raises:
+            BringUpError: it has one, which does not answer or cannot be read.
+        """
+        try:
+            return await self._services.get_configuration(self._node, timeout_s=self._timeout_s)
+        except MiddlewareError as error:
+            raise BringUpError(error.message, hint=error.hint) from error
+
+    async def wire(self, step: Step) -> NodeConfiguration | None:
+        """Call the node interface's service, and read what came of it.
+
+        Raises:
+            BringUpError: the node refused or failed, or did not answer.
+        """
+        services, limit_s = self._services, self._timeout_s
+        try:
+            if step.operation is Operation.CONNECT_TO:
+                urls = step.connections.urls
+                await services.connect_to(self._node, step.connection, urls, timeout_s=limit_s)
+            elif step.operation is Operation.MAP_TO:
+                end = step.endpoint
+                await services.map_to(self._node, end, step.connection, timeout_s=limit_s)
+            else:
+                await services.disconnect(self._node, step.connection, timeout_s=limit_s)
+        except MiddlewareError as error:
+            raise BringUpError(f"cannot {step}: {error.message}", hint=error.hint) from error
+        return await self.interface()
+
+
+class ServiceDriver(NodeInterfaceClient):
     """Drives a managed node that we do not host, whatever state it is in already.
 
     A request that was refused or not answered is judged by the state that is read afterwards; where
     somebody else moved the node meanwhile, it is asked again.
     """
 
-    def __init__(self, services: LifecycleClients, node: PlannedNode) -> None:
-        self._services = services
-        self._node = node.full_name
+    def __init__(self, services: NodeClients, node: PlannedNode) -> None:
+        super().__init__(services, node.full_name, node.timeouts.connect_s)
         self._timeouts = node.timeouts
-        self._interface = NodeInterfaceClient(services, node.full_name, node.timeouts.connect_s)
 
     async def start(self) -> NodeCondition:
         """Wait until the services answer."""
@@ -222,14 +206,6 @@ class ServiceDriver:
     async def configuration(self) -> NodeConfiguration | None:
         """Say None: observers read it from the graph where there is one."""
         return None
-
-    async def interface(self) -> NodeConfiguration | None:
-        """Ask `~/get_configuration`."""
-        return await self._interface.interface()
-
-    async def wire(self, step: Step) -> NodeConfiguration | None:
-        """Call the node interface's service, and read what came of it."""
-        return await self._interface.wire(step)
 
     async def _start(self) -> NodeCondition:
         return _standing(await self._settled(self._timeouts.start_s))
@@ -327,52 +303,7 @@ class ServiceDriver:
         }.get(operation, limits.cleanup_s)
 
 
-class NodeInterfaceClient:
-    """Wires a node through its node interface, in whichever process it is.
-
-    Args:
-        services: clients.
-        node: fully qualified name.
-        timeout_s: seconds, > 0, for each request.
-    """
-
-    def __init__(
-        self, services: LifecycleClients, node: str, timeout_s: float = _REQUEST_S
-    ) -> None:
-        self._services = services
-        self._node = node
-        self._timeout_s = timeout_s
-
-    async def interface(self) -> NodeConfiguration | None:
-        """Ask `~/get_configuration`; None where the node has none.
-
-        Raises:
-            BringUpError: it has one, which does not answer or cannot be read.
-        """
-        try:
-            return await self._services.get_configuration(self._node, timeout_s=self._timeout_s)
-        except MiddlewareError as error:
-            raise BringUpError(error.message, hint=error.hint) from error
-
-    async def wire(self, step: Step) -> NodeConfiguration | None:
-        """Call the node interface's service, and read what came of it.
-
-        Raises:
-            BringUpError: the node refused or failed, or did not answer.
-        """
-        services, limit_s = self._services, self._timeout_s
-        try:
-            if step.operation is Operation.CONNECT_TO:
-                urls = step.connections.urls
-                await services.connect_to(self._node, step.connection, urls, timeout_s=limit_s)
-            elif step.operation is Operation.MAP_TO:
-                end = step.endpoint
-                await services.map_to(self._node, end, step.connection, timeout_s=limit_s)
-            else:
-                await services.disconnect(self._node, step.connection, timeout_s=limit_s)
-        except MiddlewareError as error:
-            raise BringUpError(f"cannot {step}: {error.message}", hint=error.hint) from error
-        return await self.interface()
+NodeDriver = ControlDriver | ServiceDriver
 
 
 def _standing(state: str, *, already: bool = False) -> NodeCondition:

@@ -208,9 +208,16 @@ class NodeRun:
 
     def __init__(self, planned: PlannedNode, emit: Emitter) -> None:
         self.planned = planned
-        self.driver: NodeDriver | None = None
-        self.process: ManagedProcess | None = None
         self.reach = Reach.WAITING
+        self.found = ""
+        self.withheld = ""
+        self.changed = asyncio.Event()
+        self._emit = emit
+        self._begin(None)
+
+    def _begin(self, process: ManagedProcess | None) -> None:
+        self.driver: NodeDriver | None = None
+        self.process = process
         self.state = ""
         self.connected = False
         self.configuration: NodeConfiguration | None = None
@@ -219,31 +226,14 @@ class NodeRun:
         self.permit: Permit | None = None
         self.stuck = False
         self.connections: tuple[str, ...] = ()
-        self.found = ""
         self.reports_changes = False
         self.unload: Callable[[], Awaitable[None]] | None = None
         self.is_up = False
-        self.withheld = ""
         self.health: tuple[HealthReport | None, HealthReport | None] = (None, None)
-        self.changed = asyncio.Event()
-        self._emit = emit
 
     def renew(self, process: ManagedProcess | None) -> None:
         """Begin again, in a new process, after the node was taken down."""
-        self.driver = None
-        self.process = process
-        self.configuration = None
-        self.undo = []
-        self.permit = None
-        self.stuck = False
-        self.connections = ()
-        self.reports_changes = False
-        self.unload = None
-        self.is_up = False
-        self.health = (None, None)
-        self.doing = ""
-        self.connected = False
-        self.state = ""
+        self._begin(process)
         self.advance(Reach.WAITING)
 
     @property
@@ -419,7 +409,9 @@ class System:
         self.logs = LogDirectory(logs, lambda text: emit(Notice(message=text)))
         self._variables = variables
         self.processes = {
-            each.name: self._process(each) for each in own if each.run.kind is not RunKind.ATTACH
+            each.name: self.make_process(each)
+            for each in own
+            if each.run.kind is not RunKind.ATTACH
         }
         self.nodes = {
             key: NodeRun(plan.node(key), emit) for process in own for key in process.nodes
@@ -442,7 +434,8 @@ class System:
         nodes = [self.plan.node(key) for key in planned.nodes]
         return bool(nodes) and all(each.may_end for each in nodes)
 
-    def _process(self, planned: PlannedProcess) -> ManagedProcess:
+    def make_process(self, planned: PlannedProcess) -> ManagedProcess:
+        """Return a process of this run, not yet started."""
         nodes = [self.plan.node(key) for key in planned.nodes]
         return ManagedProcess(
             planned,
@@ -545,7 +538,7 @@ class System:
         for process in taken.processes:
             managed = kept.get(process.name)
             if managed is None and process.run.kind is not RunKind.ATTACH:
-                managed = self._process(process)
+                managed = self.make_process(process)
                 managed.joins = bool(kept)
             elif managed is not None:
                 # What it would be started with again: parameters may have been set since.
@@ -570,14 +563,10 @@ class System:
         for node in nodes:
             old = node.process
             if old is not None and old.name not in processes:
-                processes[old.name] = self._process(old.planned)
+                processes[old.name] = self.make_process(old.planned)
                 processes[old.name].is_restarted = True
             node.renew(None if old is None else processes[old.name])
         self.processes.update(processes)
-
-    def make_process(self, planned: PlannedProcess) -> ManagedProcess:
-        """Return a process of this run that no node lives in, not yet started."""
-        return self._process(planned)
 
     @property
     def living(self) -> tuple[ManagedProcess, ...]:

@@ -22,7 +22,7 @@ from lifecycle.supervisor.health.liveliness import Cause
 from lifecycle.supervisor.nodes.bring_up import died
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.policy.restart import RestartPolicy, group_of
-from lifecycle.supervisor.processes.process import ManagedProcess
+from lifecycle.supervisor.processes.process import ManagedProcess, ProcessExit
 from lifecycle.supervisor.run.events import (
     Emitter,
     Event,
@@ -343,8 +343,7 @@ class RestartSchedule:
         return record
 
     def _failed(self, cause: StepFailedError, process: ManagedProcess, now_s: float) -> Failed:
-        end = process.ended.result() if process.ended.done() else None
-        number = None if end is None else end.signal
+        end = process.ended.result() if process.ended.done() else ProcessExit()
         message = cause.message
         if barked := self._barked.pop(process.name, ""):
             message = f"{message}: {barked}"
@@ -352,8 +351,8 @@ class RestartSchedule:
             rule=cause.rule.id,
             subject=cause.subject,
             message=message,
-            exit_status=None if end is None else end.status,
-            signal="" if number is None else _signal_name(number),
+            exit_status=end.status,
+            signal=end.signal_name,
             elapsed_s=now_s,
             at=dt.datetime.now(dt.timezone.utc).isoformat(timespec="milliseconds"),
         )
@@ -430,10 +429,3 @@ class RestartSchedule:
             return
         self._barked[process.name] = f"its watchdog ended it after {limit_s:g} s, because {why}"
         process.child.signal(signal.SIGKILL)
-
-
-def _signal_name(number: int) -> str:
-    try:
-        return signal.Signals(number).name
-    except ValueError:
-        return str(number)

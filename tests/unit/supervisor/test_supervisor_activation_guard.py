@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import asyncio
 from pathlib import Path
-from typing import cast
 
 from lifecycle.manifest.model import RunKind
 from lifecycle.node.host.control import Operation
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.control.protocol import Reach
 from lifecycle.supervisor.gate.activation_guard import TRIES, ActivationGuard
-from lifecycle.supervisor.nodes.driver import LifecycleClients, ServiceDriver
+from lifecycle.supervisor.nodes.driver import ServiceDriver
 from lifecycle.supervisor.nodes.system import NodeRun
 from lifecycle.supervisor.run.events import Notice
 from lifecycle.verify.observation import Observation, ObservedNode
@@ -35,7 +34,7 @@ class _Bench:
         self.services = _Attached()
         self.guard = ActivationGuard(self.world.system)
         self.node: NodeRun = self.world.system.nodes["base"]
-        self.node.driver = ServiceDriver(cast("LifecycleClients", self.services), self.node.planned)
+        self.node.driver = ServiceDriver(self.services, self.node.planned)
         self.node.undo = [Operation.CONFIGURE, Operation.CONNECT]
         self.node.advance(Reach.CONNECTED)
 
