@@ -73,64 +73,46 @@ class RemoteNode:
             self.changed = asyncio.Event()
 
 
-class RemoteNodes:
-    """Looks at remote nodes while a node may wait for them."""
-
-    def __init__(
-        self,
-        plan: Plan,
-        nodes: Iterable[RemoteNode],
-        observer: Graph,
-        changes: ChangeCounter,
-    ) -> None:
-        self._nodes = tuple(nodes)
-        # Ours report by themselves: only these have to be asked.
-        self._plan = dataclasses.replace(plan, nodes=tuple(each.planned for each in self._nodes))
-        self._observer = observer
-        self._changes = changes
-
-    async def follow(self) -> None:
-        """Look at every change, until all have reached everything or this is cancelled."""
-        while not all(each.has_reached(each.awaited) for each in self._nodes):
-            count = self._changes.count
-            observation = await self._observer.observe(self._plan)
-            for each in self._nodes:
-                each.see(observation)
-            # One that was not there at all announces itself.
-            there = any(each.reached for each in self._nodes)
-            await self._changes.beyond(count, ASK_AGAIN_S if there else None)
+async def follow_remote(system: System, observer: Graph, changes: ChangeCounter) -> None:
+    """Look at every change, until the remote nodes that others wait for have reached everything."""
+    nodes = system.awaited()
+    # Ours report by themselves: only these have to be asked.
+    plan = dataclasses.replace(system.plan, nodes=tuple(each.planned for each in nodes))
+    while not all(each.has_reached(each.awaited) for each in nodes):
+        count = changes.count
+        observation = await observer.observe(plan)
+        for each in nodes:
+            each.see(observation)
+        # One that was not there at all announces itself.
+        there = any(each.reached for each in nodes)
+        await changes.beyond(count, ASK_AGAIN_S if there else None)
 
 
-class AwaitedHealth:
-    """Takes from the graph the health that others wait for, where no host of ours reports all."""
+async def follow_health(system: System, observer: Graph, changes: ChangeCounter) -> None:
+    """Take from the graph the health that others wait for, where no host of ours reports all.
 
-    def __init__(self, system: System, observer: Graph, changes: ChangeCounter) -> None:
-        self._system = system
-        self._observer = observer
-        self._changes = changes
-
-    async def follow(self) -> None:
-        """Look at every change, until this is cancelled; return at once if nobody waits so."""
-        nodes = self._system.nodes
-        keys = {
-            after.node
-            for node in nodes.values()
-            for after in node.planned.after
-            if after.condition is Condition.HEALTHY
-        }
-        awaited = [each for key, each in nodes.items() if key in keys and not each.reports_health]
-        if not awaited:
-            return
-        plan = dataclasses.replace(self._system.plan, nodes=tuple(each.planned for each in awaited))
-        while True:
-            count = self._changes.count
-            observation = await self._observer.observe(plan)
-            own = {each.name: _own_health(each) for each in observation.configurations}
-            published = {each.full_name: each.health for each in observation.nodes}
-            for each in awaited:
-                each.health = own.get(each.name), published.get(each.name)
-                each.wake()
-            await self._changes.beyond(count, ASK_AGAIN_S)
+    It looks at every change, until it is cancelled; it returns at once if nobody waits so.
+    """
+    keys = {
+        after.node
+        for node in system.nodes.values()
+        for after in node.planned.after
+        if after.condition is Condition.HEALTHY
+    }
+    awaited = [each for key, each in system.nodes.items() if key in keys]
+    awaited = [each for each in awaited if not each.reports_health]
+    if not awaited:
+        return
+    plan = dataclasses.replace(system.plan, nodes=tuple(each.planned for each in awaited))
+    while True:
+        count = changes.count
+        observation = await observer.observe(plan)
+        own = {each.name: _own_health(each) for each in observation.configurations}
+        published = {each.full_name: each.health for each in observation.nodes}
+        for each in awaited:
+            each.health = own.get(each.name), published.get(each.name)
+            each.wake()
+        await changes.beyond(count, ASK_AGAIN_S)
 
 
 def _conditions(planned: PlannedNode, observation: Observation) -> Iterable[Condition]:

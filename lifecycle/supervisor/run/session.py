@@ -47,10 +47,10 @@ from lifecycle.supervisor.health.process_monitor import (
 from lifecycle.supervisor.nodes.adoption import adopt, ran_before
 from lifecycle.supervisor.nodes.bring_up import BringUp
 from lifecycle.supervisor.nodes.system import (
-    AwaitedHealth,
     NodeRun,
-    RemoteNodes,
     System,
+    follow_health,
+    follow_remote,
 )
 from lifecycle.supervisor.policy.schedule import RestartSchedule
 from lifecycle.supervisor.processes.orphans import reap_adopted
@@ -224,10 +224,6 @@ class Session:
             alone=self._alone,
             unannounced=observer_participant.can_be_unannounced,
         )
-        self._remote_nodes = RemoteNodes(
-            system.plan, system.awaited(), observer_participant.graph, self._changes
-        )
-        self._awaited_health = AwaitedHealth(system, observer_participant.graph, self._changes)
         self._gate_sequence = GateSequence(
             system,
             bring_up=self._bring_up,
@@ -530,12 +526,11 @@ class Session:
     @contextlib.asynccontextmanager
     async def _following(self) -> AsyncIterator[None]:
         """Keep looking at the nodes of others, and at ours that others may drive, too."""
+        graph, changes = self._observer_participant.graph, self._changes
         followers = (
-            asyncio.ensure_future(self._remote_nodes.follow()),
-            asyncio.ensure_future(self._awaited_health.follow()),
-            asyncio.ensure_future(
-                self._guard.follow(self._observer_participant.graph, self._changes)
-            ),
+            asyncio.ensure_future(follow_remote(self._system, graph, changes)),
+            asyncio.ensure_future(follow_health(self._system, graph, changes)),
+            asyncio.ensure_future(self._guard.follow(graph, changes)),
         )
         try:
             yield

@@ -13,7 +13,7 @@ import pytest
 
 from lifecycle.manifest.model import Condition, Machine
 from lifecycle.plan.model import Plan
-from lifecycle.supervisor.nodes.system import RemoteNode, RemoteNodes, System
+from lifecycle.supervisor.nodes.system import RemoteNode, System, follow_remote
 from lifecycle.supervisor.run.failure import ended
 from lifecycle.supervisor.run.options import address_that_is_down
 from lifecycle.verify.observation import Observation, ObservedNode
@@ -99,7 +99,7 @@ def test_a_step_that_a_remote_node_holds_goes_on_once_that_is_seen(tmp_path: Pat
         await asyncio.sleep(0)
         doing = node.doing
         graph = _Graph(Observation(), _seen("inactive", connected=False), _seen("active"))
-        await RemoteNodes(plan, system.awaited(), graph, graph).follow()
+        await follow_remote(system, graph, graph)
         await asyncio.wait_for(waiting, 1.0)
         assert node.doing == ""
         assert system.machines == frozenset({""})
