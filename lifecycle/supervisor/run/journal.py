@@ -8,7 +8,6 @@ leaves all of it. A file that is full becomes `journal.jsonl.1`. Must not import
 from __future__ import annotations
 
 import contextlib
-import functools
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -95,8 +94,8 @@ class Journal:
     @contextlib.contextmanager
     def writing(self, directory: Path) -> Iterator[None]:
         """Write into the directory of the run's logs meanwhile; what came before waits for it."""
-        head = functools.partial(self._line, run=self._run)
-        self._file = file = RotatedFile(directory / JOURNAL_NAME, 0o600, head)
+        path = directory / JOURNAL_NAME
+        self._file = file = RotatedFile(path, 0o600, lambda: self._line(run=self._run))
         waiting, self._waiting = self._waiting or [], None
         for line in waiting:
             self._write(line)

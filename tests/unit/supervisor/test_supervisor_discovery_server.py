@@ -82,7 +82,7 @@ def test_it_runs_once_its_port_is_open_and_is_watched_like_any_process(
         await discovery_server.begin(system, spawner, ours=True)
         assert system.server is not None
         assert system.server.state is ProcessState.RUNNING
-        assert spawner.requests[0].argv[0] == "env"
+        assert spawner.requests[0].planned.argv[0] == "env"
         assert system.server in system.living
         death = asyncio.ensure_future(first_death(system, set()))
         spawner.processes["discovery_server"].end(ProcessExit(signal=9))
