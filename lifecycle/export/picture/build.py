@@ -34,10 +34,9 @@ UNKNOWN = "unknown node"
 """What the node of endpoints is called whose node is not known."""
 
 _STATES = {
-    "active": PicturedNodeState.ACTIVE,
-    "inactive": PicturedNodeState.INACTIVE,
-    "unconfigured": PicturedNodeState.UNCONFIGURED,
-    "finalized": PicturedNodeState.FINALIZED,
+    each.value: each
+    for each in PicturedNodeState
+    if each.value in ("active", "inactive", "unconfigured", "finalized")
 }
 _KINDS = (
     (LineKind.TOPIC, EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION),
@@ -45,12 +44,7 @@ _KINDS = (
     (LineKind.ACTION, EndpointKind.ACTION_CLIENT, EndpointKind.ACTION_SERVER),
 )
 _WORST_FIRST = (Presence.MISSING, Presence.UNDECLARED, Presence.PRESENT, Presence.PLANNED)
-_UNIQUE = {
-    None: "",
-    UniqueHow.NOT: "not unique",
-    UniqueHow.WEAKLY: "weakly unique",
-    UniqueHow.STRONGLY: "strongly unique",
-}
+_WORST_OUTCOME = (Outcome.VIOLATED, Outcome.UNVERIFIABLE, Outcome.OK)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -123,11 +117,9 @@ class _Builder:
 
     def nodes(self) -> Iterator[PicturedNode]:
         view = self._view
-        others = {name for name in view.observed if name not in view.planned}
-        others |= {each.node for each in view.foreign}
+        others = {*view.observed, *(each.node for each in view.foreign)} - {*view.planned}
         unknown = [""] if view.unattributed else []
-        for name in (*view.planned, *sorted(others), *unknown):
-            yield self._node(name)
+        yield from map(self._node, (*view.planned, *sorted(others), *unknown))
 
     def _node(self, name: str) -> PicturedNode:
         planned = self._view.planned.get(name)
@@ -147,7 +139,7 @@ class _Builder:
             machine=f"machine {planned.machine}{where}" if planned and planned.machine else "",
             process=planned.process if planned else "",
             pid=pid or None,
-            notes=tuple(self._notes(name, supervised)),
+            notes=tuple(self._notes(name, supervised.doing)),
             findings=self._numbers(lambda each: bool(name) and name in (each.node, each.subject)),
         )
 
@@ -169,7 +161,7 @@ class _Builder:
         asked = managed and presence is Presence.PRESENT
         return state.SILENT if asked or supervised.silent else state.UNKNOWN
 
-    def _notes(self, name: str, supervised: Supervised) -> Iterator[str]:
+    def _notes(self, name: str, doing: str) -> Iterator[str]:
         planned, observed = self._view.planned.get(name), self._view.observed.get(name)
         if planned is not None and planned.run.kind is RunKind.ATTACH:
             yield "started by others"
@@ -177,8 +169,8 @@ class _Builder:
             yield from (f"after {each.node} {each.condition.value}" for each in planned.after)
         if observed is not None and observed.count > 1:
             yield f"{observed.count} of this name"
-        if supervised.doing:
-            yield supervised.doing
+        if doing:
+            yield doing
 
     def lines(self) -> Iterator[PicturedLine]:
         rows: dict[tuple[EndpointKind, str], dict[PicturedEnd, str]] = {}
@@ -187,10 +179,8 @@ class _Builder:
         for line_kind, source_kind, target_kind in _KINDS:
             names = dict.fromkeys(n for kind, n in rows if kind in (source_kind, target_kind))
             for name in names:
-                sources, targets = (
-                    rows.get((source_kind, name), {}),
-                    rows.get((target_kind, name), {}),
-                )
+                sources = rows.get((source_kind, name), {})
+                targets = rows.get((target_kind, name), {})
                 yield PicturedLine(
                     kind=line_kind,
                     name=name,
@@ -237,14 +227,19 @@ class _Builder:
             subject = f"{name}: {source.node} → {target.node}"
             outcomes = [each.outcome for each in self.findings if each.subject == subject]
             notes = list(_demands(planned)) if planned else []
-            label, unique = _asked(planned) if planned and not self._verdict else ("", False)
+            label, unique = "", False
+            if planned and not self._verdict:
+                dscp = next((each.planned.dscp for each in planned.publishers), None)
+                label = _label(planned.planned.medium, dscp)
+                unique = planned.planned.unique is not UniqueHow.NOT
             if sent != taken:
                 notes.append("types differ")
                 outcomes += [Outcome.VIOLATED] if self._verdict else []
             if report is not None:
                 outcomes.append(report.outcome)
                 notes = [*(each.describe() for each in report.tuples), *notes]
-                label = _label(report.effective_transport, report.dscp, _UNIQUE[report.unique])
+                how = f"{report.unique.value} unique" if report.unique else ""
+                label = _label(report.effective_transport, report.dscp, how)
                 unique = report.unique in (UniqueHow.WEAKLY, UniqueHow.STRONGLY)
             found = {source.presence, target.presence}
             presence = next(each for each in _WORST_FIRST if each in found)
@@ -259,18 +254,9 @@ class _Builder:
             )
 
 
-_WORST_OUTCOME = (Outcome.VIOLATED, Outcome.UNVERIFIABLE, Outcome.OK)
-
-
 def _label(medium: str, dscp: int | None, unique: str = "") -> str:
     marked = "" if dscp is None else describe(dscp).partition(" = ")[0]
     return " · ".join(filter(None, (medium, marked, unique)))
-
-
-def _asked(flow: FlowView) -> tuple[str, bool]:
-    """Return what is to carry a planned flow, with which mark, and whether it is to be unique."""
-    dscp = next((each.planned.dscp for each in flow.publishers), None)
-    return _label(flow.planned.medium, dscp), flow.planned.unique is not UniqueHow.NOT
 
 
 def _demands(flow: FlowView) -> Iterator[str]:

@@ -189,11 +189,8 @@ REMARKS = {
 }
 """Said beside what is not as declared."""
 
-OUTCOMES = {
-    Outcome.OK: Appearance(symbol="✓", fill="#009e73", ink="#ffffff"),
-    Outcome.VIOLATED: Appearance(symbol="✗", fill="#b3261e", ink="#ffffff"),
-    Outcome.UNVERIFIABLE: Appearance(symbol="?", fill="#e69f00"),
-}
+OUTCOMES = {Outcome.OK: "✓", Outcome.VIOLATED: "✗", Outcome.UNVERIFIABLE: "?"}
+"""The symbol of each outcome."""
 
 
 def words(presence: Presence, notes: tuple[str, ...], findings: tuple[int, ...]) -> tuple[str, ...]:

@@ -8,12 +8,9 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
-from html import escape
 
-from lifecycle.export.picture.drawing import picture_to_svg
+from lifecycle.export.picture.drawing import escaped, picture_to_svg
 from lifecycle.export.picture.model import OUTCOMES, Picture
-from lifecycle.printable import one_line
-from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import Finding
 
 CSS = """\
@@ -38,12 +35,6 @@ filter.addEventListener("input", function () {
 });
 """
 
-_SAYS = {
-    Outcome.OK: "What runs is what was declared.",
-    Outcome.VIOLATED: "What runs is not what was declared.",
-    Outcome.UNVERIFIABLE: "Not everything could be verified.",
-}
-
 
 def picture_to_html(picture: Picture) -> str:
     """Return the whole page."""
@@ -56,28 +47,15 @@ def _page(picture: Picture) -> Iterator[str]:
         '<meta http-equiv="Content-Security-Policy" content="default-src \'none\'; '
         "style-src 'unsafe-inline'; script-src 'unsafe-inline'\">"
     )
-    yield f"<title>{_text(picture.title)}</title>\n<style>\n{CSS}</style>\n</head>\n<body>"
-    phase = f", {picture.phase}" if picture.phase else ""
-    yield f"<h1>{_text(picture.system)}</h1>"
-    yield f"<p>ROS domain {picture.domain_id}{_text(phase)}</p>"
-    if picture.verdict is None:
-        yield "<p>What is declared; whether it runs was not looked at.</p>"
-    else:
-        symbol = OUTCOMES[picture.verdict].symbol
-        yield (
-            f'<p class="verdict {picture.verdict.value}"><strong>{symbol} verdict '
-            f"{picture.verdict.value}</strong> {_SAYS[picture.verdict]}</p>"
-        )
+    yield f"<title>{escaped(picture.title)}</title>\n<style>\n{CSS}</style>\n</head>\n<body>"
+    if picture.verdict is not None:
+        verdict = picture.verdict.value
+        yield f'<p class="verdict {verdict}">{OUTCOMES[picture.verdict]} verdict {verdict}</p>'
     yield (
         '<p hidden><label for="filter">Show only what names </label>'
         '<input id="filter" type="search" autocomplete="off"></p>'
     )
     yield f'<div class="figure" tabindex="0">\n{picture_to_svg(picture)}</div>'
-    yield (
-        "<p>Each column is a node, each row a topic, service or action, from who publishes or asks "
-        "(●) to who subscribes or answers (▶). Dashed: missing; dotted: not declared; thick: a "
-        "unique flow.</p>"
-    )
     if picture.findings:
         heads = ("no.", "outcome", "rule", "what", "where")
         cells = "".join(f'<th scope="col">{each}</th>' for each in heads)
@@ -88,16 +66,12 @@ def _page(picture: Picture) -> Iterator[str]:
 
 
 def _finding(number: int, finding: Finding) -> str:
-    hint = f"<br><em>{_text(finding.hint)}</em>" if finding.hint else ""
+    hint = f"<br><em>{escaped(finding.hint)}</em>" if finding.hint else ""
     cells = (
-        f"{OUTCOMES[finding.outcome].symbol} {finding.outcome.value}",
-        f"<code>{_text(finding.rule)}</code>",
-        f"{_text(finding.message)}{hint}",
-        f"<code>{_text(finding.at)}</code>" if finding.at else "–",
+        f"{OUTCOMES[finding.outcome]} {finding.outcome.value}",
+        f"<code>{escaped(finding.rule)}</code>",
+        f"{escaped(finding.message)}{hint}",
+        f"<code>{escaped(finding.at)}</code>" if finding.at else "–",
     )
     rest = "".join(f"<td>{each}</td>" for each in cells)
     return f'<tr><th scope="row">⚠{number}</th>{rest}</tr>'
-
-
-def _text(words: str) -> str:
-    return escape(one_line(words))

@@ -37,13 +37,12 @@ def _document(picture: Picture) -> Iterator[str]:
     for line in picture.lines:
         yield ""
         yield f"  {line.kind.value} {line.name}  {' ≠ '.join(line.types)}"
-        yield from (f"    {_flow(each)}" for each in line.flows)
-        yield from _ends(line)
+        yield from (f"    {each}" for each in line_words(line))
     if picture.findings:
         yield ""
     for number, finding in enumerate(picture.findings, start=1):
-        symbol = OUTCOMES[finding.outcome].symbol
-        yield f"  ⚠{number} {symbol} {finding.outcome.value} {finding.rule}: " + (finding.message)
+        said = f"{OUTCOMES[finding.outcome]} {finding.outcome.value} {finding.rule}"
+        yield f"  ⚠{number} {said}: {finding.message}"
         if finding.hint:
             yield f"      {finding.hint}"
 
@@ -68,14 +67,16 @@ def _flow(flow: PicturedFlow) -> str:
     )
 
 
-def _ends(line: PicturedLine) -> Iterator[str]:
+def line_words(line: PicturedLine) -> Iterator[str]:
+    """Yield what is written below a line: its flows, and ends without one or with a remark."""
+    yield from map(_flow, line.flows)
     joined = {name for flow in line.flows for name in (flow.source, flow.target)}
     for ends, form in ((line.sources, "{} ──▶ nobody"), (line.targets, "nobody ──▶ {}")):
         for end in ends:
             said = ", ".join(words(end.presence, end.notes, end.findings))
             shown = end.node if end.node in joined else form.format(end.node)
             if said or end.node not in joined:
-                yield f"    {shown}" + (f"  ({said})" if said else "")
+                yield shown + (f"  ({said})" if said else "")
 
 
 def picture_to_mermaid(picture: Picture) -> str:

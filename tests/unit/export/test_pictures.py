@@ -169,9 +169,9 @@ def test_every_state_of_a_node_is_drawn(
 
 
 def test_states_differ_by_colour_and_by_symbol() -> None:
-    for looks in (STATES, OUTCOMES):
-        assert len({each.symbol for each in looks.values()}) == len(looks)
-        assert len({each.fill for each in looks.values()}) == len(looks)
+    assert len({each.symbol for each in STATES.values()}) == len(STATES)
+    assert len({each.fill for each in STATES.values()}) == len(STATES)
+    assert len({*OUTCOMES.values()}) == len(OUTCOMES)
 
 
 @EACH
