@@ -10,6 +10,7 @@ import contextlib
 import enum
 import errno
 import os
+from collections.abc import Collection
 
 
 class ExitCode(enum.IntEnum):
@@ -121,3 +122,24 @@ def _limit(name: str) -> str:
         if soft != resource.RLIM_INFINITY:
             return f" ({name} allows {soft})"
     return ""
+
+
+MAX_WORDS = 500
+"""Names among which a nearest one is looked for; among more it would take longer than it helps."""
+
+
+def nearest(word: str, known: Collection[str]) -> str:
+    """Return the known name that `word` was most probably meant to be; empty if none is near."""
+    if len(known) > MAX_WORDS:
+        return ""
+    spelled = {each.lower(): each for each in known}
+    import difflib  # only a mistake needs it
+
+    close = difflib.get_close_matches(word.lower(), spelled, n=1, cutoff=0.6)
+    return spelled[close[0]] if close else ""
+
+
+def did_you_mean(word: str, known: Collection[str]) -> str:
+    """Return a question for a hint; empty if no known name is near."""
+    found = nearest(word, known)
+    return f"did you mean {found!r}?" if found else ""

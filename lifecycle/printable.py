@@ -42,6 +42,12 @@ def json_text(text: str) -> str:
     return "".join(each if each == "\n" else _json_escaped(each) for each in text)
 
 
+def count(number: int, noun: str) -> str:
+    """Return a number and its noun: `1 node`, `2 nodes`, `3 processes`."""
+    ending = "" if number == 1 else "es" if noun.endswith("s") else "s"
+    return f"{number} {noun}{ending}"
+
+
 _GAP = "  "
 _LEAST = 24
 """Columns that the last cell keeps even when the others are wide."""

@@ -20,7 +20,7 @@ from click.shell_completion import CompletionItem
 
 from lifecycle.cli.completion import COMPLETE
 from lifecycle.cli.standard_streams import own_streams
-from lifecycle.errors import ExitCode, LifecycleError, UsageError, exhausted
+from lifecycle.errors import ExitCode, LifecycleError, UsageError, did_you_mean, exhausted
 from lifecycle.printable import lines
 
 VERBS: dict[str, str] = {
@@ -61,11 +61,8 @@ _PARTICIPANTS = frozenset({"up", "verify", "flows", "graph", "capture", "run"})
 _ORDERLY = frozenset({ExitCode.OK, ExitCode.VIOLATED, ExitCode.UNVERIFIABLE})
 """Exit codes that no exception becomes: what made participants has closed them itself."""
 
-
-_LINUX = _PARTICIPANTS | {
-    *("pause", "resume", "restart", "mode", "apply", "down", "status"),
-    *("logs", "history"),
-}
+_RUNS = {"pause", "resume", "restart", "mode", "apply", "down", "status", "logs", "history"}
+_LINUX = _PARTICIPANTS | _RUNS
 """Verbs that run nodes, or are about what runs or ran."""
 
 _NEEDS_ROS = (
@@ -119,10 +116,7 @@ class _Verbs(click.Group):
         if ctx.resilient_parsing:  # for shell completion
             return super().resolve_command(ctx, args)
         if args and args[0] not in VERBS and not args[0].startswith("-"):
-            from difflib import get_close_matches
-
-            close = get_close_matches(args[0], VERBS, n=1)
-            hint = f"did you mean {close[0]!r}?" if close else "lifecycle --help lists the verbs"
+            hint = did_you_mean(args[0], VERBS) or "lifecycle --help lists the verbs"
             raise UsageError(f"cannot find the verb {args[0]!r}", hint=hint)
         if args:
             _check_platform(args[0])
@@ -199,10 +193,8 @@ def program() -> int:
             gc.collect()  # what an error may have kept of a participant leaves the graph with it
         if holds_shared_memory():
             return code
-    # All is written, and the graph was left. Ending the interpreter takes longer than asking a
-    # supervisor, and 0.2 s where ROS was used: it takes rclpy's objects apart, and Fast DDS sleeps
-    # when it is unloaded. But only then it removes shared memory that it still has: of the port of
-    # a peer that was killed, for one.
+    # All is written, and the graph was left. Ending the interpreter takes 0.2 s where ROS was used;
+    # only that removes shared memory that Fast DDS still has, of a peer's port that was killed.
     os._exit(code)
 
 

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from lifecycle.plan.programs import Resolution
 
 F = TypeVar("F", bound=Callable[..., Any])
-Completer = Callable[[click.Context, click.Parameter, str], list[Any]]
 
 
 def manifest_arguments(function: F) -> F:

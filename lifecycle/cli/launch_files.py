@@ -24,8 +24,10 @@ from typing import Any
 
 from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError, UsageError
-from lifecycle.export.manifest_yaml import Noted, Tree, comment, to_yaml
+from lifecycle.export.manifest_yaml import Noted, Tree, comment, literal, to_yaml
+from lifecycle.export.programs import LOG_LEVELS
 from lifecycle.manifest.model import ParameterValue
+from lifecycle.manifest.names import free_name
 
 MAX_ENTITIES = 10_000
 """Actions of one launch description, those of files that it includes with them."""
@@ -259,13 +261,13 @@ class _Walk:
             run = {"package": package, "executable": executable}
         elif package:
             path = f"$(find-pkg-share {package})/../../lib/{package}/{executable}"
-            run = {"command": [path, *map(_literal, arguments)]}
+            run = {"command": [path, *map(literal, arguments)]}
         else:
-            run = {"command": [_literal(each) for each in (executable, *arguments)]}
+            run = {"command": [literal(each) for each in (executable, *arguments)]}
         description = getattr(action, "process_description", None)
         prefix = self._text(_private(description, "prefix"))
         if prefix:
-            run["prefix"] = [_literal(each) for each in shlex.split(prefix)]
+            run["prefix"] = [literal(each) for each in shlex.split(prefix)]
         output = _private(action, "output")
         output = "" if isinstance(output, dict) else self._text(output)
         if output in ("screen", "both"):  # launch's default is log
@@ -279,10 +281,10 @@ class _Walk:
         for name, value in _private(description, "additional_env") or ():
             environment[self._text(name)] = self._text(value)
         if environment:
-            run["environment"] = {name: _literal(each) for name, each in environment.items()}
+            run["environment"] = {name: literal(each) for name, each in environment.items()}
         folder = self._text(_private(description, "cwd"))
         if folder:
-            run["working_directory"] = _literal(folder)
+            run["working_directory"] = literal(folder)
         return run
 
     def _namespace(self, written: Any) -> str:
@@ -339,7 +341,7 @@ class _Walk:
         for word in rest:
             value = next(rest, "") if word in ("--log-level", "-r", "--remap") else ""
             source, separator, target = value.partition(":=")
-            if word == "--log-level" and value.lower() in _LEVELS:
+            if word == "--log-level" and value.lower() in LOG_LEVELS:
                 node.log_level = value.lower()
             elif word in ("-r", "--remap") and separator:
                 node.remap.setdefault(source, target)
@@ -403,9 +405,6 @@ class _Walk:
         return [type(action).__name__]
 
 
-_LEVELS = ("debug", "info", "warn", "error", "fatal")
-
-
 def _is_a(value: Any, *names: str) -> bool:
     return bool({each.__name__ for each in type(value).__mro__} & {*names})
 
@@ -422,10 +421,6 @@ def _private(value: Any, *names: str) -> Any:
             if found is not None:
                 return found
     return None
-
-
-def _literal(value: str) -> str:
-    return value.replace("$(", "$$(")
 
 
 def to_launched_manifest(
@@ -483,12 +478,7 @@ def _keys(nodes: Iterable[LaunchedNode]) -> list[str]:
         base = re.sub(r"\W", "_", base, flags=re.ASCII)
         base = base if base[0].isalpha() or base[0] == "_" else f"_{base}"
         in_namespace = "_".join(filter(None, (*node.namespace.strip("/").split("/"), base)))
-        key = base if base not in keys else in_namespace
-        number = 2
-        while key in keys:
-            key = f"{in_namespace}_{number}"
-            number += 1
-        keys.append(key)
+        keys.append(base if base not in keys else free_name(in_namespace, keys))
     return keys
 
 
@@ -504,26 +494,20 @@ def _tree(node: LaunchedNode, by_name: Mapping[str, str], folder: Path) -> Tree:
         tree["namespace"] = node.namespace
     if not node.managed:
         tree["managed"] = Noted(value=False, note=f"gap: {_NO_LIFECYCLE}")
-    files = [_literal(os.path.relpath(each, folder)) for each in node.parameter_files]
+    files = [literal(os.path.relpath(each, folder)) for each in node.parameter_files]
     if files:
         tree["parameter_files"] = files
     if node.parameters:
         tree["parameters"] = {
-            name: [_spelled(each) for each in value]
-            if isinstance(value, tuple)
-            else _spelled(value)
+            name: [literal(each) for each in value] if isinstance(value, tuple) else literal(value)
             for name, value in node.parameters.items()
         }
     if node.remap:
-        tree["remap"] = {source: _literal(target) for source, target in node.remap.items()}
+        tree["remap"] = {source: literal(target) for source, target in node.remap.items()}
     if node.log_level:
         tree["log_level"] = node.log_level
     tree["endpoints"] = Noted(value="open", note=f"gap: {_NO_INTERFACE}")
     return Noted(value=tree, note="; ".join(f"gap: {each}" for each in gaps)) if gaps else tree
-
-
-def _spelled(value: bool | float | str) -> bool | int | float | str:
-    return _literal(value) if isinstance(value, str) else value
 
 
 def gaps_of(found: Launched) -> Iterator[str]:

@@ -18,7 +18,7 @@ import click
 
 from lifecycle import dataclasses
 from lifecycle.errors import ExitCode, LifecycleError, UsageError, exhausted
-from lifecycle.printable import lines
+from lifecycle.printable import count, lines
 
 if TYPE_CHECKING:
     from lifecycle.plan.model import Plan
@@ -289,7 +289,7 @@ def _verdict_of(error: BaseException) -> Verdict:
     if isinstance(error, ManifestError):
         found = [each for each in error.diagnostics if each.severity is Severity.ERROR]
         return dataclasses.replace(
-            _unjudged(f"the manifest is invalid: {_errors(len(found))}", code),
+            _unjudged(f"the manifest is invalid: {count(len(found), 'error')}", code),
             verdict=Outcome.VIOLATED,
             findings=tuple(
                 Finding(
@@ -321,10 +321,6 @@ def _unjudged(reason: str, code: ExitCode) -> Verdict:
 
     run = RunEnd(reason=reason, reached=None, exit_code=code)
     return dataclasses.replace(NOT_JUDGED, run=run)
-
-
-def _errors(count: int) -> str:
-    return f"{count} error{'' if count == 1 else 's'}"
 
 
 def _is_file(path: Path) -> bool:

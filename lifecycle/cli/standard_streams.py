@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, NamedTuple, TextIO, cast
 import click
 
 from lifecycle.errors import ExitCode, MiddlewareError
+from lifecycle.printable import count
 
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
@@ -382,11 +383,8 @@ class _Lost(NamedTuple):
         return _Lost(self.lines + other[0], self.events + other[1])
 
     def __str__(self) -> str:
-        parts = [
-            f"{number} {noun}{'' if number == 1 else 's'}"
-            for number, noun in ((self.lines, "log line"), (self.events, "event"))
-            if number
-        ]
+        both = ((self.lines, "log line"), (self.events, "event"))
+        parts = [count(number, noun) for number, noun in both if number]
         return f"{' and '.join(parts)} {'is' if sum(self) == 1 else 'are'}"
 
 

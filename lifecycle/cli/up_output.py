@@ -20,7 +20,7 @@ import click
 
 from lifecycle.cli.standard_streams import Writer
 from lifecycle.node.host.control import Operation
-from lifecycle.printable import json_text, log_line, one_line
+from lifecycle.printable import count, json_text, log_line, one_line
 from lifecycle.supervisor.control.protocol import ProcessState, Reach, SystemStatus
 from lifecycle.supervisor.run.events import (
     ConsequenceTaken,
@@ -368,7 +368,7 @@ def _verdict_changed(event: VerdictChanged) -> str:
 
 def _gate_opened(event: GateOpened) -> str:
     trusted = f"; taken on trust: {event.trusted}" if event.trusted else ""
-    activating = f"activating {_count(len(event.nodes), 'node')}"
+    activating = f"activating {count(len(event.nodes), 'node')}"
     return f"gate open on verdict {event.outcome}: {activating}{trusted}"
 
 
@@ -386,7 +386,7 @@ def _failure(event: Failure) -> str:
 def _restart_scheduled(event: RestartScheduled) -> str:
     last = f"; its last line: {event.stderr}" if event.stderr else ""
     others = len(event.nodes) - 1
-    with_it = f" with {_count(others, 'other node')}" if others else ""
+    with_it = f" with {count(others, 'other node')}" if others else ""
     return f"{event.process} is started again in {event.in_s:.1f} s{with_it}{last}"
 
 
@@ -420,8 +420,8 @@ def _manifest_applied(event: ManifestApplied) -> str:
 
 _LINES: dict[type[Event], Callable[[Any], str]] = {
     RunStarted: lambda event: (
-        f"{event.system}: {_count(len(event.nodes), 'node')} in "
-        f"{_count(len(event.processes), 'process')}, domain {event.domain_id}, {event.rmw}, "
+        f"{event.system}: {count(len(event.nodes), 'node')} in "
+        f"{count(len(event.processes), 'process')}, domain {event.domain_id}, {event.rmw}, "
         f"discovery range {event.discovery_range}; logs in {event.log_directory}"
     ),
     ProcessChanged: _process_changed,
@@ -440,9 +440,9 @@ _LINES: dict[type[Event], Callable[[Any], str]] = {
     RestartScheduled: _restart_scheduled,
     Restarted: lambda event: (
         f"{event.process} is back {event.took_s:.2f} s after its failure; "
-        f"restarted {_count(event.restarts, 'time')}"
+        f"restarted {count(event.restarts, 'time')}"
     ),
-    GaveUp: lambda event: f"gave up {event.process} after {_count(len(event.history), 'failure')}",
+    GaveUp: lambda event: f"gave up {event.process} after {count(len(event.history), 'failure')}",
     ConsequenceTaken: _consequence_taken,
     ModeEntered: _mode_entered,
     ManifestApplied: _manifest_applied,
@@ -460,12 +460,7 @@ def verdict_line(verdict: Verdict) -> str:
     if why:
         return one_line(f"{text}; {why}")
     if verdict.flows:
-        text += f", {_count(len(verdict.flows), 'flow')}"
+        text += f", {count(len(verdict.flows), 'flow')}"
     if verdict.tolerated:
         text += f"; tolerated: {', '.join(each.describe() for each in verdict.tolerated)}"
     return one_line(text)
-
-
-def _count(number: int, noun: str) -> str:
-    ending = "" if number == 1 else "es" if noun.endswith("s") else "s"
-    return f"{number} {noun}{ending}"

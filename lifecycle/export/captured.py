@@ -21,6 +21,7 @@ from lifecycle.export.programs import (
 from lifecycle.manifest.checks.parameters import is_implicit
 from lifecycle.manifest.model import DiscoveryRange, EndpointKind, ParameterValue, TargetState
 from lifecycle.manifest.names import (
+    free_name,
     full_name_problem,
     name_problem,
     namespace_problem,
@@ -275,13 +276,11 @@ def _instances(nodes: Mapping[str, ObservedNode], programs: Programs) -> tuple[_
             program = next(iter(by_pid.values()))
             found.append(_Instance(node=node, name=name, program=program, gap=gap))
             continue
-        number, free = 1, name
+        free = name
         for pid, program in sorted(by_pid.items()):
             apart = frozenset(prefixes[pid]) if len(by_pid) > 1 else frozenset()
             found.append(_Instance(node=node, name=free, program=program, prefixes=apart))
-            while free in nodes or any(each.name == free for each in found):
-                number += 1
-                free = f"{name}_{number}"
+            free = free_name(name, {*nodes, *(each.name for each in found)})
     return tuple(map(_restartable, found))
 
 
@@ -349,12 +348,7 @@ def _keys(nodes: Iterable[str]) -> dict[str, str]:
     keys: dict[str, str] = {}
     for name, base in zip(names, bases, strict=True):
         key = base if bases.count(base) == 1 else name.strip("/").replace("/", "_")
-        number = 2
-        free = key
-        while free in keys.values():
-            free = f"{key}_{number}"
-            number += 1
-        keys[name] = free
+        keys[name] = free_name(key, keys.values())
     return keys
 
 
@@ -497,6 +491,11 @@ def can_be_given(parameter: CapturedParameter) -> bool:
     value = parameter.value
     if value is None or value == () or parameter.type == "byte_array":
         return False
+    return is_finite(value)
+
+
+def is_finite(value: ParameterValue) -> bool:
+    """Whether a manifest can hold a value: it has no infinite number in it, and no NaN."""
     values = value if isinstance(value, tuple) else (value,)
     return all(not isinstance(each, float) or math.isfinite(each) for each in values)
 
@@ -510,13 +509,9 @@ def _is_own(parameter: CapturedParameter) -> bool:
 def _endpoint(endpoint: ObservedEndpoint, reports: Iterable[EndpointReport]) -> CapturedEndpoint:
     report = _report_of(endpoint, reports)
     qos = endpoint.qos
-    if qos is not None and report is not None and report.qos is not None:
-        known = qos.history is not History.UNKNOWN
-        qos = (
-            qos
-            if known
-            else dataclasses.replace(qos, history=report.qos.history, depth=report.qos.depth)
-        )
+    reported = report.qos if report else None
+    if qos is not None and reported is not None and qos.history is History.UNKNOWN:
+        qos = dataclasses.replace(qos, history=reported.history, depth=reported.depth)
     return CapturedEndpoint(
         kind=endpoint.kind,
         name=endpoint.name,

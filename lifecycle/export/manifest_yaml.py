@@ -22,12 +22,12 @@ from lifecycle.export.captured import (
     CapturedParameter,
     CapturedSystem,
     can_be_given,
+    is_finite,
 )
 from lifecycle.export.programs import CapturedRun
 from lifecycle.manifest.model import (
     DiscoveryRange,
     EndpointKind,
-    ParameterValue,
     RosArguments,
     TargetState,
 )
@@ -168,7 +168,7 @@ def to_nodl(node: CapturedNode) -> str:
     tree: dict[str, Tree] = {
         "nodl_version": 2,
         "description": f"Captured from {node.full_name}",
-        **_interface(node, spell=_as_it_is),
+        **_interface(node, spell=lambda value: value),
     }
     return "\n".join([*gaps, to_yaml(tree)])
 
@@ -250,7 +250,7 @@ def _node(node: CapturedNode, reference: str) -> Tree:
             value="open", note=f"gap: it has several {several}; a manifest names each once"
         )
     tree.update(_given(node))
-    interface = reference or _interface(node, spell=_literal)
+    interface = reference or _interface(node, spell=literal)
     if interface:
         tree["interface"] = interface
     if flows := _flows(node):
@@ -301,7 +301,7 @@ def _given(node: CapturedNode) -> dict[str, Tree]:
     if run.parameter_files:
         tree["parameter_files"] = run.parameter_files
     values = {
-        each.name: _value(each, _literal) for each in node.parameters or () if can_be_given(each)
+        each.name: _value(each, literal) for each in node.parameters or () if can_be_given(each)
     }
     if values:
         tree["parameters"] = values
@@ -311,12 +311,10 @@ def _given(node: CapturedNode) -> dict[str, Tree]:
 
 
 def _run(run: CapturedRun) -> dict[str, Tree]:
-    tree: dict[str, Tree] = {"command": list(map(_literal, run.command))}
-    tree["working_directory"] = str(_literal(run.program.working_directory))
+    tree: dict[str, Tree] = {"command": list(map(literal, run.command))}
+    tree["working_directory"] = str(literal(run.program.working_directory))
     if run.program.environment:
-        tree["environment"] = {
-            name: str(_literal(value)) for name, value in run.program.environment
-        }
+        tree["environment"] = {name: str(literal(value)) for name, value in run.program.environment}
     if run.ros_args is not RosArguments.AUTO:
         tree["ros_args"] = run.ros_args.value
     return tree
@@ -389,7 +387,7 @@ def _parameter(parameter: CapturedParameter, spell: _Spell, *, given: bool) -> T
     value = parameter.value
     if given:
         pass  # beside the interface, where the node is given it
-    elif value is not None and _is_finite(value):
+    elif value is not None and is_finite(value):
         tree["default_value"] = Noted(value=_value(parameter, spell), note=f"gap: {_NOW}")
     elif value is not None:
         tree["type"] = Noted(value=parameter.type, note="gap: its value is not finite")
@@ -400,19 +398,9 @@ def _parameter(parameter: CapturedParameter, spell: _Spell, *, given: bool) -> T
     return tree
 
 
-def _is_finite(value: ParameterValue) -> bool:
-    values = value if isinstance(value, tuple) else (value,)
-    return all(not isinstance(each, float) or math.isfinite(each) for each in values)
-
-
-def _literal(value: Scalar) -> Scalar:
+def literal(value: Scalar) -> Scalar:
     """Spell a text so that a manifest takes nothing in it for a substitution."""
     return value.replace("$(", "$$(") if isinstance(value, str) else value
-
-
-def _as_it_is(value: Scalar) -> Scalar:
-    """Spell a text for NoDL, which knows no substitutions."""
-    return value
 
 
 def _flows(node: CapturedNode) -> dict[str, Tree]:

@@ -15,12 +15,12 @@ from pathlib import Path
 
 from lifecycle import dataclasses
 from lifecycle.manifest.model import EndpointKind, RosArguments
-from lifecycle.manifest.names import name_problem, node_name_problem, resolve
+from lifecycle.manifest.names import free_name, name_problem, node_name_problem, resolve
 
 _OURS = "lifecycle.supervisor.processes.fork_server_main"
 """In the command line of processes that `lifecycle up` has forked."""
 
-_LEVELS = ("debug", "info", "warn", "error", "fatal")
+LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
 _WORD = re.compile(r"[^A-Za-z0-9_]+")
 
 
@@ -130,7 +130,7 @@ def _taken_apart(run: CapturedRun, node: str, parameters: Collection[str]) -> Ca
             rest += [] if word.partition(":=")[0] in parameters else [option, word]
         elif option == "--params-file" and words:
             run = _with_file(run, words.pop(0))
-        elif option == "--log-level" and words and words[0].lower() in _LEVELS:
+        elif option == "--log-level" and words and words[0].lower() in LOG_LEVELS:
             run = dataclasses.replace(run, log_level=words.pop(0).lower())
         else:
             rest.append(option)
@@ -204,11 +204,7 @@ def process_names(shared: Mapping[int, CapturedProgram], taken: Collection[str])
     """
     names: dict[int, str] = {}
     for pid, program in shared.items():
-        base = _stem(program.argv)
-        free, number = base, 2
-        while free in names.values() or free in taken:
-            free, number = f"{base}_{number}", number + 1
-        names[pid] = free
+        names[pid] = free_name(_stem(program.argv), {*names.values(), *taken})
     return names
 
 

@@ -16,7 +16,12 @@ from collections.abc import Iterable
 
 from lifecycle import dataclasses
 from lifecycle.manifest.model import EndpointKind, RunKind
-from lifecycle.manifest.names import ALIVE_PULSE, DIAGNOSTICS_TOPIC, supervisor_alive_topic
+from lifecycle.manifest.names import (
+    ALIVE_PULSE,
+    DIAGNOSTICS_TOPIC,
+    free_name,
+    supervisor_alive_topic,
+)
 from lifecycle.plan.model import Plan, PlannedNode, PlannedProcess
 from lifecycle.verify.tool_filter import (
     GRAPH_TOPIC,
@@ -85,7 +90,7 @@ def enclaves_of(plan: Plan) -> tuple[Enclave, ...]:
     found: dict[str, Enclave] = {}
     chosen = {each.name: _chosen(each) for each in plan.processes}
     for process in plan.processes:
-        path = chosen[process.name] or _free(
+        path = chosen[process.name] or free_name(
             _path(plan.system, process.name), {*found, *chosen.values()}
         )
         profiles = tuple(_node_profile(plan.node(key)) for key in process.nodes)
@@ -97,7 +102,8 @@ def enclaves_of(plan: Plan) -> tuple[Enclave, ...]:
             chosen=bool(chosen[process.name]),
         )
     for machine in plan.machines:
-        path = _free(_path(plan.system, f"supervisor_{machine.name}"), found)
+        # A process may be named as a supervisor's enclave is.
+        path = free_name(_path(plan.system, f"supervisor_{machine.name}"), found)
         found[path] = Enclave(path=path, profiles=(_supervisor_profile(plan, machine.name),))
     return tuple(found.values())
 
@@ -197,13 +203,3 @@ def _token(name: str) -> str:
     """Return a name as one token of an enclave's path, which has the alphabet of namespaces."""
     plain = re.sub(r"[^A-Za-z0-9_]", "_", name)
     return plain if plain[:1].isalpha() or plain.startswith("_") else f"_{plain}"
-
-
-def _free(path: str, taken: Iterable[str]) -> str:
-    """Return a path that is not in use yet: a process may be named as a supervisor's enclave is."""
-    every = {*taken}
-    number = 2
-    free = path
-    while free in every:
-        free, number = f"{path}_{number}", number + 1
-    return free

@@ -24,7 +24,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from lifecycle import dataclasses
-from lifecycle.manifest.schema import nearest
+from lifecycle.errors import nearest
 
 _INDEX = Path("share", "ament_index", "resource_index")
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 import enum
 import functools
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 
 from lifecycle import dataclasses
 from lifecycle.errors import ExitCode, LifecycleError
@@ -177,6 +177,14 @@ def name_problem(name: str) -> str:
         (odd, f"a name holds letters, digits, '_' and '/' only{odd}"),
         (_digit_first(name), "no part of a name may start with a digit"),
     )
+
+
+def free_name(name: str, taken: Container[str]) -> str:
+    """Return a name that is not taken: `name`, or `name_2`, `name_3`, … where it is."""
+    free, number = name, 2
+    while free in taken:
+        free, number = f"{name}_{number}", number + 1
+    return free
 
 
 @functools.lru_cache(maxsize=1 << 16)  # every check of a large system asks again

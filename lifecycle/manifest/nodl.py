@@ -16,12 +16,13 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from lifecycle import dataclasses
+from lifecycle.errors import did_you_mean, nearest
 from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position, Severity
 from lifecycle.manifest.installed_types import find_resource, list_resources, search_prefixes
 from lifecycle.manifest.interface import build_inline
 from lifecycle.manifest.model import Endpoint, EndpointKind, Interface, ParameterDeclaration
 from lifecycle.manifest.qos import POLICIES
-from lifecycle.manifest.schema import did_you_mean, nearest, validate
+from lifecycle.manifest.schema import validate
 from lifecycle.manifest.yaml.document import Cursor, Document, Place, Value, error, warning
 from lifecycle.manifest.yaml.source import read_document
 from lifecycle.manifest.yaml.yaml_parser import quote

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lifecycle import dataclasses
+from lifecycle.errors import did_you_mean, nearest
 from lifecycle.manifest.diagnostics import Diagnostic
 from lifecycle.manifest.yaml.document import Document, Place, error
 from lifecycle.manifest.yaml.yaml_parser import (
@@ -120,27 +121,6 @@ _TYPES = {
     "object": "a mapping",
     "null": "null",
 }
-
-
-MAX_WORDS = 500
-"""Names among which a nearest one is looked for; among more it would take longer than it helps."""
-
-
-def nearest(word: str, known: Collection[str]) -> str:
-    """Return the known name that `word` was most probably meant to be; empty if none is near."""
-    if len(known) > MAX_WORDS:
-        return ""
-    spelled = {each.lower(): each for each in known}
-    import difflib  # only a mistake needs it
-
-    close = difflib.get_close_matches(word.lower(), spelled, n=1, cutoff=0.6)
-    return spelled[close[0]] if close else ""
-
-
-def did_you_mean(word: str, known: Collection[str]) -> str:
-    """Return a question for a hint; empty if no known name is near."""
-    found = nearest(word, known)
-    return f"did you mean {found!r}?" if found else ""
 
 
 def unknown_key(key: str, known: Iterable[str]) -> tuple[str, str]:

@@ -19,12 +19,12 @@ import contextlib
 import functools
 import ipaddress
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any
 from urllib.parse import parse_qsl, urlencode, urlsplit
 
 from lifecycle import dataclasses
-from lifecycle.errors import LifecycleError
+from lifecycle.errors import LifecycleError, did_you_mean
 from lifecycle.network.medium import SCHEMES, Medium
 
 _PORTS = range(1, 65536)
@@ -47,14 +47,6 @@ class Peer:
         """Return `10.77.0.2:7910` or `[fd77::2]:7910`."""
         host = f"[{self.address}]" if ":" in self.address else self.address
         return host if self.port is None else f"{host}:{self.port}"
-
-
-def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """Return a hint with the known name that is nearest; empty if none is near."""
-    import difflib  # only a mistake needs it
-
-    close = difflib.get_close_matches(word.lower(), list(known), n=1, cutoff=0.6)
-    return f"did you mean {close[0]!r}?" if close else ""
 
 
 def _number(allowed: range, name: str, value: str) -> int:

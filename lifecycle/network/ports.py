@@ -14,6 +14,7 @@ import enum
 from collections.abc import Callable
 
 from lifecycle import dataclasses
+from lifecycle.printable import count
 
 PB = 7400
 """Port base."""
@@ -351,8 +352,3 @@ def describe_domains(runs: tuple[range, ...]) -> str:
     """Return runs of domain ids for people: `0–101, 215–232`; `none` if there is none."""
     words = (str(run[0]) if len(run) == 1 else f"{run[0]}–{run[-1]}" for run in runs)
     return ", ".join(words) or "none"
-
-
-def count(number: int, noun: str) -> str:
-    """Return a number and its noun: `1 participant`, `2 participants`."""
-    return f"{number} {noun}" + ("" if number == 1 else "s")

@@ -15,10 +15,9 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 from lifecycle import dataclasses
-from lifecycle.errors import LifecycleError
+from lifecycle.errors import LifecycleError, did_you_mean
 from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.model import Authority, EndpointKind, Manifest, Node, Run, RunKind
-from lifecycle.manifest.schema import did_you_mean
 from lifecycle.manifest.yaml.document import error, warning
 from lifecycle.plan.model import PlanError
 from lifecycle.plan.participants import find_executable

@@ -18,9 +18,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from lifecycle import dataclasses
-from lifecycle.errors import LifecycleError
+from lifecycle.errors import LifecycleError, did_you_mean
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.manifest.schema import did_you_mean
 
 _MOST_BYTES = 4 * 2**20
 _MOST_IMPORTS = 20

@@ -29,7 +29,7 @@ from lifecycle.plan.model import (
     PlannedNode,
     PlannedProcess,
 )
-from lifecycle.printable import columns
+from lifecycle.printable import columns, count
 
 RMW_CHOOSES = "as the RMW chooses"
 
@@ -132,18 +132,14 @@ def render_text(plan: Plan, *, width: int = 100) -> str:
 
 def _headline(plan: Plan) -> str:
     counts = (
-        _count(len(plan.nodes), "node"),
-        _count(len(plan.processes), "process", "processes"),
-        _count(len(plan.flows), "flow"),
+        count(len(plan.nodes), "node"),
+        count(len(plan.processes), "process"),
+        count(len(plan.flows), "flow"),
     )
     return (
         f"system {plan.system}: {', '.join(counts)};"
         f" domain {plan.domain_id}, discovery range {plan.discovery_range.value}"
     )
-
-
-def _count(number: int, word: str, plural: str = "") -> str:
-    return f"{number} {word if number == 1 else plural or word + 's'}"
 
 
 def _processes(plan: Plan, width: int) -> list[str]:
@@ -305,7 +301,7 @@ def _ports(plan: Plan, width: int) -> list[str]:
         if machine.unique_subscriptions:
             ports = unique_flow_ports()
             lines.append(
-                f"    {_count(machine.unique_subscriptions, 'unique subscription')}:"
+                f"    {count(machine.unique_subscriptions, 'unique subscription')}:"
                 f" the first free of {ports[0]}–{ports[-1]}"
             )
     return lines

@@ -33,10 +33,9 @@ from lifecycle.errors import ExitCode, LifecycleError, UsageError
 from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position, Severity
 from lifecycle.manifest.loading import ArgumentDeclaration, declared_arguments, load
 from lifecycle.manifest.model import Manifest
-from lifecycle.network.ports import count
 from lifecycle.plan.build import check_plan, effective_domain
 from lifecycle.plan.programs import Resolution, UnresolvedProgram
-from lifecycle.printable import json_text, lines
+from lifecycle.printable import count, json_text, lines
 
 TESTS = {
     "document": ("yaml.", "manifest.", "nodl."),

@@ -25,7 +25,7 @@ from lifecycle.cli.common import (
 )
 from lifecycle.cli.completion import completing
 from lifecycle.errors import ExitCode, UsageError
-from lifecycle.printable import columns, json_text, lines, one_line
+from lifecycle.printable import columns, count, json_text, lines, one_line
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -93,7 +93,7 @@ def _history(node: NodeStatus) -> str:
     elif node.restarts and node.uptime_s is not None:
         parts.append(f"up for {node.uptime_s:.1f} s")
     if node.restarts:
-        parts.append(f"restarted {node.restarts} time{'s' * (node.restarts != 1)}")
+        parts.append(f"restarted {count(node.restarts, 'time')}")
     if (last := node.last_failure) is not None:
         stderr = f" ({last.stderr})" if last.stderr else ""
         parts.append(f"last failure {last.at}: {last.message}{stderr}")

@@ -49,8 +49,7 @@ def picture_to_svg(picture: Picture) -> str:
     """Return one drawing, complete in itself."""
     upright = len(picture.nodes) >= _UPRIGHT_FROM
     rows = [
-        [f"{line.kind.value} {' ≠ '.join(line.types)}", *line_words(line)]
-        for line in picture.lines
+        [f"{line.kind.value} {' ≠ '.join(line.types)}", *line_words(line)] for line in picture.lines
     ]
     quiet = _width([w for row in rows for w in row]) * 10 // 12
     left = max(quiet, _width([each.name for each in picture.lines]))

@@ -13,6 +13,7 @@ import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from lifecycle.errors import did_you_mean
 from lifecycle.manifest.checks.system import (
     DeclaredSystem,
     Resolved,
@@ -31,7 +32,6 @@ from lifecycle.manifest.model import (
     RunKind,
 )
 from lifecycle.manifest.qos import Certainty, Incompatibility, incompatibilities
-from lifecycle.manifest.schema import did_you_mean
 from lifecycle.manifest.yaml.document import error, warning
 from lifecycle.network.dscp import describe
 from lifecycle.network.medium import Medium

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from lifecycle.errors import did_you_mean
 from lifecycle.manifest.checks.system import DeclaredSystem, Resolved
 from lifecycle.manifest.diagnostics import Diagnostic
 from lifecycle.manifest.flows import FlowNeeds, ResolvedNeed
@@ -25,7 +26,6 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.manifest.names import full_name_problem
 from lifecycle.manifest.qos import Reliability
-from lifecycle.manifest.schema import did_you_mean
 from lifecycle.manifest.yaml.document import error, note, warning
 from lifecycle.network.dscp import MAX_DSCP, describe
 from lifecycle.network.five_qi import five_qi_of

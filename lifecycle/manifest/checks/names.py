@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from lifecycle.errors import LifecycleError
+from lifecycle.errors import LifecycleError, did_you_mean
 from lifecycle.manifest.checks.system import (
     DeclaredSystem,
     Resolved,
@@ -28,7 +28,6 @@ from lifecycle.manifest.names import (
     node_name_problem,
     parse_rule,
 )
-from lifecycle.manifest.schema import did_you_mean
 from lifecycle.manifest.yaml.document import error, note, warning
 
 _ANSWERING = (EndpointKind.SERVICE_SERVER, EndpointKind.ACTION_SERVER)

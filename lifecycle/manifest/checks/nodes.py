@@ -14,6 +14,7 @@ import functools
 import shlex
 from collections.abc import Iterator, Mapping
 
+from lifecycle.errors import did_you_mean
 from lifecycle.manifest.checks.system import DeclaredSystem, rmw_of
 from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.flows import FlowNeeds
@@ -36,7 +37,6 @@ from lifecycle.manifest.model import (
     TargetState,
 )
 from lifecycle.manifest.names import full_name_problem
-from lifecycle.manifest.schema import did_you_mean
 from lifecycle.manifest.yaml.document import error, note, warning
 from lifecycle.network.ports import (
     LOCALHOST_PARTICIPANTS,

@@ -23,11 +23,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 from lifecycle import dataclasses
+from lifecycle.errors import did_you_mean
 from lifecycle.manifest.checks.system import DeclaredSystem
 from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position, Severity
 from lifecycle.manifest.model import ModeParameter, Node, ParameterValue, RunKind
 from lifecycle.manifest.nodl import nearest_file
-from lifecycle.manifest.schema import did_you_mean
 from lifecycle.manifest.yaml.document import Document, Place, Value, error, note, warning
 from lifecycle.manifest.yaml.source import read_document
 from lifecycle.manifest.yaml.yaml_parser import INT64_MAX, INT64_MIN, not_finite, quote

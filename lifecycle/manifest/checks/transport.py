@@ -12,6 +12,7 @@ from __future__ import annotations
 import ipaddress
 from collections.abc import Iterator, Mapping
 
+from lifecycle.errors import did_you_mean
 from lifecycle.manifest.checks.system import DeclaredSystem, rmw_of
 from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.flows import FlowNeeds, ResolvedNeed
@@ -27,7 +28,6 @@ from lifecycle.manifest.model import (
     Node,
     RunKind,
 )
-from lifecycle.manifest.schema import did_you_mean
 from lifecycle.manifest.yaml.document import error, note, warning
 from lifecycle.network.medium import (
     DEFAULT_RMW,

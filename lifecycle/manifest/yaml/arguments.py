@@ -13,9 +13,8 @@ import re
 from collections.abc import Mapping
 
 from lifecycle import dataclasses
-from lifecycle.errors import LifecycleError
+from lifecycle.errors import LifecycleError, did_you_mean
 from lifecycle.manifest.diagnostics import Diagnostic
-from lifecycle.manifest.schema import did_you_mean
 from lifecycle.manifest.yaml.document import Cursor, Document, Place, Scalar, Value, error
 from lifecycle.manifest.yaml.substitutions import (
     NOWHERE,

@@ -11,12 +11,11 @@ import os
 from pathlib import Path
 
 from lifecycle import dataclasses
-from lifecycle.errors import LifecycleError
+from lifecycle.errors import LifecycleError, did_you_mean
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.interface import Findings
 from lifecycle.manifest.model import EndpointKind, Link, Machine, Manifest, Node, Run
 from lifecycle.manifest.names import resolve
-from lifecycle.manifest.schema import did_you_mean
 from lifecycle.manifest.yaml.document import Cursor, error
 from lifecycle.manifest.yaml.yaml_parser import quote
 

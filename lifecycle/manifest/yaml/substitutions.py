@@ -23,10 +23,9 @@ from pathlib import Path
 from typing import IO
 
 from lifecycle import dataclasses
-from lifecycle.errors import LifecycleError
+from lifecycle.errors import LifecycleError, did_you_mean
 from lifecycle.manifest.diagnostics import ManifestError
 from lifecycle.manifest.installed_types import find_resource, list_resources, search_prefixes
-from lifecycle.manifest.schema import did_you_mean
 from lifecycle.manifest.yaml.source import MAX_BYTES, decode, read_bytes
 from lifecycle.manifest.yaml.yaml_parser import quote
 

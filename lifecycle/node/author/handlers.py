@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TypeVar
 
 from lifecycle import dataclasses
-from lifecycle.errors import LifecycleError
+from lifecycle.errors import LifecycleError, nearest
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.plan.model import PlannedEndpoint
 
@@ -293,14 +293,6 @@ def _without_handler(
         f"cannot serve {noun} {endpoint.name!r} of {node}: no method of {node_class.__name__} is "
         f"decorated with {decorator}({endpoint.name!r}){hint}"
     )
-
-
-def nearest(name: str, candidates: Iterable[str]) -> str:
-    """Return the candidate spelt most like `name`, or "" if none is near."""
-    import difflib  # only a mistake needs it
-
-    found = difflib.get_close_matches(name, list(candidates), n=1, cutoff=0.6)
-    return found[0] if found else ""
 
 
 def alternatives(name: str, declared: Iterable[str]) -> str:

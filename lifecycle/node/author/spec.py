@@ -21,10 +21,9 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING, Any, Protocol
 
 from lifecycle import dataclasses
-from lifecycle.errors import BringUpError, LifecycleError
+from lifecycle.errors import BringUpError, LifecycleError, nearest
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import EndpointPolicy, Run, RunKind
-from lifecycle.node.author.handlers import nearest
 from lifecycle.plan.model import PlannedNode
 
 if TYPE_CHECKING:

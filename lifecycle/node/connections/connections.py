@@ -13,11 +13,10 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 from lifecycle import dataclasses
-from lifecycle.errors import LifecycleError, MiddlewareError
+from lifecycle.errors import LifecycleError, MiddlewareError, nearest
 from lifecycle.middleware.fastdds.nfe import has_shared_memory, senders_of
 from lifecycle.middleware.fastdds.participant import FlowParticipant
 from lifecycle.network.connection_url import ConnectionUrl
-from lifecycle.node.author.handlers import nearest
 from lifecycle.plan.model import ParticipantConnections, PlannedParticipant
 
 if TYPE_CHECKING:

@@ -22,9 +22,8 @@ from rclpy.event_handler import (
 from rclpy.publisher import Publisher
 
 from lifecycle import dataclasses
-from lifecycle.errors import LifecycleError
+from lifecycle.errors import LifecycleError, nearest
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.node.author.handlers import nearest
 from lifecycle.node.connections.connections import Connection
 from lifecycle.plan.model import PlannedEndpoint
 

@@ -12,8 +12,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Collection, Iterable, Iterator
 
-from lifecycle.errors import BringUpError, ExitCode, LifecycleError, UsageError
-from lifecycle.manifest.schema import did_you_mean
+from lifecycle.errors import BringUpError, ExitCode, LifecycleError, UsageError, did_you_mean
 from lifecycle.network.connection_url import parse
 from lifecycle.plan.build import with_files_of_now
 from lifecycle.plan.change import PlanChange, change_between
