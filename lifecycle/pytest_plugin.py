@@ -405,17 +405,12 @@ def lifecycle_node(
 def _planned(
     manifest: str | os.PathLike[str], node: str, arguments: Mapping[str, object], domain_id: int
 ) -> tuple[Plan, PlannedNode]:
-    from lifecycle.errors import UsageError
     from lifecycle.manifest.loading import load
-    from lifecycle.plan.build import build_plan
+    from lifecycle.plan.build import build_plan, find_node
 
     loaded = load(os.fspath(manifest), {name: str(value) for name, value in arguments.items()})
     plan = build_plan(loaded.manifest, domain_id=domain_id)
-    for each in plan.nodes:
-        if node in (each.key, each.full_name):
-            return plan, each
-    known = ", ".join(each.key for each in plan.nodes) or "none"
-    raise UsageError(f"cannot find node {node!r} in {plan.manifest_path}; its nodes: {known}")
+    return plan, find_node(plan, node)
 
 
 @pytest.hookimpl(wrapper=True)

@@ -265,19 +265,6 @@ class ReportFile:
             write_report(self._path, text)
 
 
-def exit_code_of(error: BaseException) -> ExitCode:
-    """Return the exit code of a command that ended by an exception."""
-    from lifecycle.supervisor.run.signals import Ended
-
-    if isinstance(error, LifecycleError | Ended):
-        return error.exit_code
-    if isinstance(error, KeyboardInterrupt | click.Abort):
-        return ExitCode.INTERRUPTED
-    if isinstance(error, click.ClickException):
-        return ExitCode.USAGE
-    return ExitCode.INTERNAL if (used_up := exhausted(error)) is None else used_up.exit_code
-
-
 def _verdict_of(error: BaseException) -> Verdict:
     """Return the verdict of a command that ended by an exception before anything was judged."""
     from lifecycle.manifest.diagnostics import ManifestError, Severity
@@ -285,11 +272,11 @@ def _verdict_of(error: BaseException) -> Verdict:
     from lifecycle.verify.outcome import Outcome
     from lifecycle.verify.verdict import Finding
 
-    code = exit_code_of(error)
     if isinstance(error, ManifestError):
         found = [each for each in error.diagnostics if each.severity is Severity.ERROR]
+        reason = f"the manifest is invalid: {count(len(found), 'error')}"
         return dataclasses.replace(
-            _unjudged(f"the manifest is invalid: {count(len(found), 'error')}", code),
+            _unjudged(reason, error.exit_code),
             verdict=Outcome.VIOLATED,
             findings=tuple(
                 Finding(
@@ -306,13 +293,15 @@ def _verdict_of(error: BaseException) -> Verdict:
             ),
         )
     if isinstance(error, Ended):
-        return _unjudged(error.reason, code)
+        return _unjudged(error.reason, error.exit_code)
     if isinstance(error, click.ClickException):
-        return _unjudged(error.format_message(), code)
+        return _unjudged(error.format_message(), ExitCode.USAGE)
     if isinstance(error, LifecycleError):
-        return _unjudged(str(error), code)
-    if code is ExitCode.INTERRUPTED:
-        return _unjudged("interrupted", code)
+        return _unjudged(str(error), error.exit_code)
+    if isinstance(error, KeyboardInterrupt | click.Abort):
+        return _unjudged("interrupted", ExitCode.INTERRUPTED)
+    used_up = exhausted(error)
+    code = ExitCode.INTERNAL if used_up is None else used_up.exit_code
     return _unjudged(f"a bug in lifecycle: {type(error).__name__}: {error}", code)
 
 

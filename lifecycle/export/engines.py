@@ -21,8 +21,8 @@ import yaml
 from lifecycle import dataclasses
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest.loading import THIS_HOST
-from lifecycle.manifest.model import Resources, Restart, Timeouts
-from lifecycle.plan.model import Plan, PlannedProcess
+from lifecycle.manifest.model import Restart, Timeouts
+from lifecycle.plan.model import Plan
 from lifecycle.printable import one_line
 from lifecycle.run_directory import run_name
 
@@ -108,14 +108,6 @@ class Deployment:
             if each.machine == machine or not machine
         )
 
-    def limited(self, machine: str) -> tuple[tuple[PlannedProcess, Resources], ...]:
-        """Return the processes of a machine that have `run.resources`."""
-        return tuple(
-            (each, each.run.resources)
-            for each in self.plan.processes
-            if each.run.resources is not None and (each.machine == machine or not machine)
-        )
-
     def probe(self, what: str) -> tuple[str, ...]:
         """Return the command that says, in a container, whether it is "live" or "ready"."""
         return ("lifecycle", "status", run_name(self.plan).rpartition("@")[0], "--probe", what)
@@ -158,6 +150,7 @@ def systemd(deployment: Deployment) -> dict[str, str]:
 
 def _systemd_unit(deployment: Deployment, machine: str) -> str:
     name = deployment.name(machine)
+    allowed = "CAP_NET_ADMIN" if deployment.programs_networks else ""
     service: list[tuple[str, object]] = [
         ("Type", "notify"),
         ("NotifyAccess", "main"),
@@ -178,26 +171,23 @@ def _systemd_unit(deployment: Deployment, machine: str) -> str:
         ("ProtectHome", "read-only"),
         ("RestrictSUIDSGID", "yes"),
         ("LockPersonality", "yes"),
-        *_systemd_capabilities(deployment),
+        ("CapabilityBoundingSet", allowed),
+        *([("AmbientCapabilities", allowed)] if allowed else []),
     ]
-    return _sections(
-        deployment,
-        machine,
-        Unit=[
+    sections = {
+        "Unit": [
             ("Description", _title(deployment, machine)),
             ("Wants", "network-online.target"),
             ("After", "network-online.target"),
         ],
-        Service=service,
-        Install=[("WantedBy", "multi-user.target")],
-    )
-
-
-def _systemd_capabilities(deployment: Deployment) -> Iterator[tuple[str, object]]:
-    allowed = "CAP_NET_ADMIN" if deployment.programs_networks else ""
-    yield "CapabilityBoundingSet", allowed
-    if allowed:
-        yield "AmbientCapabilities", allowed
+        "Service": service,
+        "Install": [("WantedBy", "multi-user.target")],
+    }
+    parts = [
+        f"[{name}]\n" + "".join(f"{key}={value}\n" for key, value in entries)
+        for name, entries in sections.items()
+    ]
+    return _head(deployment, machine) + "\n".join(parts)
 
 
 def _systemd_restart(deployment: Deployment, machine: str) -> Iterator[tuple[str, object]]:
@@ -219,15 +209,16 @@ def _refuse_resources(deployment: Deployment, machine: str) -> None:
     Raises:
         UsageError: it is to.
     """
-    for process, resources in deployment.limited(machine):
-        at = resources.at
-        raise UsageError(
-            f"{at.spelled}: cannot give process {process.name!r} its "
-            "'run.resources' in a container of Kubernetes: systemd limits what a process may use, "
-            "and does not run there",
-            hint="leave 'resources' out and limit the whole container (resources.limits), or write "
-            "a unit: lifecycle export systemd",
-        )
+    for process in deployment.plan.processes:
+        here = process.machine == machine or not machine
+        if here and process.run.resources is not None:
+            raise UsageError(
+                f"{process.run.resources.at.spelled}: cannot give process {process.name!r} its "
+                "'run.resources' in a container of Kubernetes: systemd limits what a process may "
+                "use, and does not run there",
+                hint="leave 'resources' out and limit the whole container (resources.limits), or "
+                "write a unit: lifecycle export systemd",
+            )
 
 
 _ENVIRONMENT = {"HOME": "/tmp", "ROS_LOG_DIR": "/tmp/log"}  # noqa: S108 - the container's own
@@ -236,8 +227,13 @@ _ENVIRONMENT = {"HOME": "/tmp", "ROS_LOG_DIR": "/tmp/log"}  # noqa: S108 - the c
 def kubernetes(deployment: Deployment) -> dict[str, str]:
     """Return the objects of each machine, by file name: one pod on the node of its name."""
     return {
-        f"{deployment.name(machine)}.yaml": _yaml(
-            deployment, machine, [_kubernetes_object(deployment, machine)]
+        f"{deployment.name(machine)}.yaml": _head(deployment, machine)
+        + yaml.dump(
+            _kubernetes_object(deployment, machine),
+            Dumper=_Plain,
+            sort_keys=False,
+            allow_unicode=True,
+            width=100,
         )
         for machine in deployment.machines
     }
@@ -250,10 +246,7 @@ def _kubernetes_object(deployment: Deployment, machine: str) -> dict[str, object
         "app.kubernetes.io/instance": name,
         "app.kubernetes.io/component": "supervisor",
     }
-    pod: dict[str, object] = {
-        "metadata": {"labels": labels},
-        "spec": _pod(deployment, machine),
-    }
+    spec = _pod(deployment, machine)
     if deployment.restarts(machine):
         # A supervisor that gives up is not started again by the engine; one that the machine
         # loses is, when the pod is applied again.
@@ -261,7 +254,7 @@ def _kubernetes_object(deployment: Deployment, machine: str) -> dict[str, object
             "apiVersion": "v1",
             "kind": "Pod",
             "metadata": {"name": name, "labels": labels},
-            "spec": {**_pod(deployment, machine), "restartPolicy": "Never"},
+            "spec": {**spec, "restartPolicy": "Never"},
         }
     return {
         "apiVersion": "apps/v1",
@@ -272,7 +265,7 @@ def _kubernetes_object(deployment: Deployment, machine: str) -> dict[str, object
             # Never two of a system in one domain.
             "strategy": {"type": "Recreate"},
             "selector": {"matchLabels": {"app.kubernetes.io/instance": name}},
-            "template": pod,
+            "template": {"metadata": {"labels": labels}, "spec": spec},
         },
     }
 
@@ -352,20 +345,6 @@ def _head(deployment: Deployment, machine: str) -> str:
         f"# {_title(deployment, machine)}.\n"
         f"# Written by lifecycle export from {source}; {by} restarts what fails.\n"
     )
-
-
-def _sections(deployment: Deployment, machine: str, **sections: list[tuple[str, object]]) -> str:
-    """Return a file in the syntax of systemd.syntax(7)."""
-    parts = [
-        f"[{name}]\n" + "".join(f"{key}={value}\n" for key, value in entries)
-        for name, entries in sections.items()
-    ]
-    return _head(deployment, machine) + "\n".join(parts)
-
-
-def _yaml(deployment: Deployment, machine: str, documents: list[dict[str, object]]) -> str:
-    text = yaml.dump_all(documents, Dumper=_Plain, sort_keys=False, allow_unicode=True, width=100)
-    return _head(deployment, machine) + text
 
 
 class _Plain(yaml.SafeDumper):

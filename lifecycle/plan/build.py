@@ -297,6 +297,19 @@ def started_by_others(plan: Plan, names: Collection[str]) -> Plan:
     return attached_to(plan, chosen)
 
 
+def find_node(plan: Plan, name: str) -> PlannedNode:
+    """Return the node with this key or fully qualified name.
+
+    Raises:
+        UsageError: there is none; says which there are.
+    """
+    for each in plan.nodes:
+        if name in {each.key, each.full_name}:
+            return each
+    known = ", ".join(each.key for each in plan.nodes) or "none"
+    raise UsageError(f"cannot find node {name!r} in {plan.manifest_path}; its nodes: {known}")
+
+
 def attached_to(plan: Plan, keys: Collection[str]) -> Plan:
     """Return a plan in which others run some nodes, as if the manifest attached to them.
 

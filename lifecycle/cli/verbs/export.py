@@ -210,9 +210,8 @@ def _up_options(more: str, *, container: bool) -> tuple[tuple[str, ...], float]:
             f"cannot take {given['assignments'][0]!r} from --up; "
             "write arguments of the manifest after the manifest"
         )
-    for name, why in _NOT_OF_ENGINES.items():
-        if given[name]:
-            raise UsageError(f"cannot use --{name.replace('_', '-')} in --up: {why}")
+    if given["machine"]:
+        raise UsageError("cannot use --machine in --up: each file names its machine")
     if given["until"] != "active":
         raise UsageError(
             f"cannot use --until {given['until']} in --up: only an active system is ever ready"
@@ -224,11 +223,6 @@ def _up_options(more: str, *, container: bool) -> tuple[tuple[str, ...], float]:
             hint="program them on the machine: lifecycle export systemd … --up '--program …'",
         )
     return words, given["timeout"] or 0.0
-
-
-_NOT_OF_ENGINES = {
-    "machine": "each file names its machine",
-}
 
 
 def _check_places(engine: str, *, at: str, program: str = "", image: str = "") -> None:

@@ -43,8 +43,7 @@ if TYPE_CHECKING:
     from lifecycle.programming.apply.programmer import Programmer, Treatment
     from lifecycle.programming.apply.target import TargetChanges
     from lifecycle.programming.apply.targets.registry import TargetOptions
-    from lifecycle.verify.verdict import FlowReport, Verdict
-
+    from lifecycle.verify.verdict import Verdict
 
 _HEADS = (
     "topic",
@@ -83,9 +82,13 @@ def render_flows(flows: Sequence[FlowReport], format_: str) -> str:
 
 def _rows(flow: FlowReport) -> Iterator[tuple[str, ...]]:
     pair = (flow.topic, flow.publisher, flow.subscription)
+    # What the data carry, and where that is known what the subscription acknowledges with.
+    dscp = "–" if flow.dscp is None else describe(flow.dscp)
+    dscp += "" if flow.reader_dscp is None else f"; back {describe(flow.reader_dscp)}"
+    five_qi = "–" if flow.five_qi is None else str(flow.five_qi)
     demands_and_verdict = (
-        _dscps(flow),
-        _five_qi(flow),
+        dscp,
+        f"{five_qi} (auto)" if flow.five_qi_reason else five_qi,
         "unknown" if flow.unique is None else _UNIQUE[flow.unique],
         " / ".join(each.value for each in flow.requirement),
         flow.demanded.value,
@@ -103,18 +106,6 @@ def _tuples(flow: FlowReport) -> Sequence[tuple[str, ...]]:
         for each in flow.tuples
     ]
     return found or [(_ends(flow.source), _ends(flow.destination), "–", "–")]
-
-
-def _dscps(flow: FlowReport) -> str:
-    """What the data carry, and where that is known what the subscription acknowledges with."""
-    data = "–" if flow.dscp is None else describe(flow.dscp)
-    return data if flow.reader_dscp is None else f"{data}; back {describe(flow.reader_dscp)}"
-
-
-def _five_qi(flow: FlowReport) -> str:
-    if flow.five_qi is None:
-        return "–"
-    return f"{flow.five_qi} (auto)" if flow.five_qi_reason else str(flow.five_qi)
 
 
 def _ends(nfes: Sequence[NetworkFlowEndpoint]) -> str:
@@ -154,8 +145,7 @@ class Export:
         except ValueError as error:
             raise UsageError(str(error), hint=self._network.hint) from error
         click.echo(text, nl=False)
-        for each in rules.left_out:
-            click.echo(lines(f"left out: {each}"), err=True)
+        _show_left_out(rules.left_out)
 
 
 _EMPTY_GRAPH_S = 1.5
@@ -199,14 +189,10 @@ def _show(
             hint="give --export, or use lifecycle flows apply",
         )
     plan = _plan_of(target, assignments)
-
-    def show(verdict: Verdict) -> None:
-        click.echo(render_flows(verdict.flows, format_))
-
     if watch:
         with Watched(whole=format_ == "text") as shown:
             follow_running(plan, lambda seen: shown.show(render_flows(seen.flows, format_)))
-        return ExitCode.OK  # `q`: only a key ends it
+        return ExitCode.OK
     asked = click.get_current_context().get_parameter_source("timeout")
     waits = asked is not click.core.ParameterSource.DEFAULT or supervisor_of(os.environ, plan, "")
     empty_graph_s = None if waits else _EMPTY_GRAPH_S
@@ -216,7 +202,7 @@ def _show(
     if exporter is not None:
         exporter.write(seen.plan, seen.verdict.flows)
     else:
-        show(seen.verdict)
+        click.echo(render_flows(seen.verdict.flows, format_))
     return exit_code(seen.verdict, strict=False)
 
 
@@ -252,9 +238,10 @@ def apply(
             _show_changes(programmer.update(flows), done=True)
         except PartlyError as error:
             if error.done:
-                error.hint = f"take back what was done: lifecycle flows remove {_spell(plan)}"
+                path = shlex.quote(plan.manifest_path)
+                error.hint = f"take back what was done: lifecycle flows remove {path}"
             raise
-    _show_left_out(programmer)
+    _show_left_out(programmer.left_out)
     return ExitCode.OK
 
 
@@ -273,7 +260,7 @@ def diff(
     programmer = _open(plan, options, treatment)
     changes = programmer.diff(flows)
     _show_changes(changes, done=False)
-    _show_left_out(programmer)
+    _show_left_out(programmer.left_out)
     return ExitCode.VIOLATED if any(each.pending for each in changes) else ExitCode.OK
 
 
@@ -369,10 +356,6 @@ def _judged(manifest: str, assignments: tuple[str, ...], timeout_s: float) -> tu
     return seen.plan, seen.verdict
 
 
-def _spell(plan: Plan) -> str:
-    return shlex.quote(plan.manifest_path)
-
-
 def _open(
     plan: Plan, options: Sequence[TargetOptions], treatment: Treatment | None = None
 ) -> Programmer:
@@ -386,9 +369,9 @@ def _show_changes(changes: Iterable[TargetChanges], *, done: bool) -> None:
         click.echo(each.render(done=done))
 
 
-def _show_left_out(programmer: Programmer) -> None:
+def _show_left_out(flows: Iterable[object]) -> None:
     """On stderr, beside a ruleset or bodies that go to a file."""
-    for each in programmer.left_out:
+    for each in flows:
         click.echo(lines(f"left out: {each}"), err=True)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -59,21 +58,35 @@ def command(
     there but not declared dotted and orange; findings stand at what they name. With --watch, text
     is drawn again on the terminal, and a file is replaced in one piece.
     """
-    _check_watched(format_, output, watch=watch)
+    if watch and output is None and format_ not in ("text", "json"):
+        raise UsageError(
+            f"cannot print one {format_} picture after another", hint="give --output FILE"
+        )
     path, plan = _found(target, assignments, machine)
-    with Watched(whole=watch and output is None and format_ == "text") as shown:
-        draw = _drawing(format_, output, shown)
-        if path is not None:
-            _supervised(path, draw, watch=watch)
-        elif plan is not None:
-            from lifecycle.supervisor.run.looking import attached_picture, attached_pictures
+    from lifecycle.supervisor.run import looking
 
-            if watch:
-                attached_pictures(plan, draw)
+    with Watched(whole=watch and output is None and format_ == "text") as shown:
+
+        def draw(picture: Picture) -> None:
+            text = render(picture, format_)
+            if output is not None:
+                write_picture(output, text)
             else:
-                picture = attached_picture(plan, timeout_s=timeout)
-                draw(picture)
-                _say_if_empty(picture, plan)
+                shown.show(text)
+
+        if path is not None:
+            with asking(path):
+                if not watch:
+                    draw(looking.supervised_picture(path))
+                else:
+                    for picture in looking.supervised_pictures(path):
+                        draw(picture)
+        elif plan is not None and watch:
+            looking.attached_pictures(plan, draw)
+        elif plan is not None:
+            picture = looking.attached_picture(plan, timeout_s=timeout)
+            draw(picture)
+            _say_if_empty(picture, plan)
     if path is not None and watch:
         click.echo(f"{path.name}: its supervisor has ended", err=True)
     return ExitCode.OK
@@ -102,38 +115,6 @@ def _found(
 
     plan = build_plan(load_manifest(target, assignments, quiet=True).manifest)
     return supervisor_of(os.environ, plan, machine), plan
-
-
-def _supervised(path: Path, draw: Callable[[Picture], None], *, watch: bool) -> None:
-    from lifecycle.supervisor.run.looking import supervised_picture, supervised_pictures
-
-    with asking(path):
-        if not watch:
-            draw(supervised_picture(path))
-            return
-        for picture in supervised_pictures(path):
-            draw(picture)
-
-
-def _check_watched(format_: str, output: Path | None, *, watch: bool) -> None:
-    """Refuse a picture that is no text and would be drawn over and over on one stream."""
-    if watch and output is None and format_ not in ("text", "json"):
-        raise UsageError(
-            f"cannot print one {format_} picture after another", hint="give --output FILE"
-        )
-
-
-def _drawing(format_: str, output: Path | None, shown: Watched) -> Callable[[Picture], None]:
-    """Return what shows or writes one picture."""
-
-    def draw(picture: Picture) -> None:
-        text = render(picture, format_)
-        if output is not None:
-            write_picture(output, text)
-        else:
-            shown.show(text)
-
-    return draw
 
 
 def render(picture: Picture, format_: str) -> str:

@@ -17,7 +17,7 @@ from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest.model import DiscoveryRange, Resources, RunKind
 from lifecycle.middleware.discovery.probe import peers_environment
 from lifecycle.middleware.process.control import limit_resources, refuse_new_privileges
-from lifecycle.plan.build import build_plan
+from lifecycle.plan.build import build_plan, find_node
 from lifecycle.plan.connections.hosts import reached_hosts
 from lifecycle.plan.model import Plan, PlannedNode
 
@@ -78,19 +78,6 @@ def _say_unlimited(name: str, resources: Resources) -> None:
             f"systemd-run --user --scope{properties} lifecycle run ...",
             err=True,
         )
-
-
-def find_node(plan: Plan, name: str) -> PlannedNode:
-    """Return the node with this key or fully qualified name.
-
-    Raises:
-        UsageError: there is none; says which there are.
-    """
-    for each in plan.nodes:
-        if name in {each.key, each.full_name}:
-            return each
-    known = ", ".join(each.key for each in plan.nodes) or "none"
-    raise UsageError(f"cannot find node {name!r} in {plan.manifest_path}; its nodes: {known}")
 
 
 def _run_class(plan: Plan, planned: PlannedNode, arguments: list[str], *, lifecycle: str) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -11,6 +12,9 @@ from lifecycle.cli.common import format_option, load_manifest, manifest_argument
 from lifecycle.cli.report import ReportFile, format_verdict, report_option, written_or_said
 from lifecycle.errors import ExitCode
 from lifecycle.printable import lines
+
+if TYPE_CHECKING:
+    from lifecycle.verify.verdict import Verdict
 
 
 @click.command("verify")
@@ -60,13 +64,11 @@ def command(  # noqa: PLR0917 - click passes options by name
     return exit_code(seen.verdict, strict=strict) or unwritten
 
 
-def exit_code(verdict: object, *, strict: bool) -> ExitCode:
+def exit_code(verdict: Verdict, *, strict: bool) -> ExitCode:
     """Return the exit code of a verdict."""
     from lifecycle.supervisor.gate.gate import closes
     from lifecycle.verify.outcome import Outcome
-    from lifecycle.verify.verdict import Verdict
 
-    assert isinstance(verdict, Verdict)
     if not closes(verdict, strict=strict):
         return ExitCode.OK
     violated = verdict.verdict is Outcome.VIOLATED

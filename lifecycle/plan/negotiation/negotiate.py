@@ -15,6 +15,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from lifecycle import dataclasses
 from lifecycle.manifest.model import EndpointKind, FlowTransport
+from lifecycle.manifest.names import free_name
 from lifecycle.network.connection_url import ConnectionUrl, parse
 from lifecycle.network.medium import CONNECTABLE, LOOPBACK, UDP_UNICAST, Medium, medium_of
 from lifecycle.plan.connections.hosts import (
@@ -135,11 +136,7 @@ def _drafts(wanted: Sequence[Wanted]) -> list[_Draft]:
     for (key, transports, group, alone), members in sorted(groups.items()):
         party = members[0].party
         taken = names.setdefault(key, set(party.connections))
-        name = _name(transports, group, alone)
-        number = 2
-        unique = name
-        while unique in taken:
-            unique, number = f"{name}_{number}", number + 1
+        unique = free_name(_name(transports, group, alone), taken)
         taken.add(unique)
         drafts.append(
             _Draft(party=party, name=unique, transports=transports, members=tuple(members))
