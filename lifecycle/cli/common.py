@@ -246,7 +246,7 @@ def target_plan(
 
 
 def network_options(flag: str, help_: str) -> Callable[[F], F]:
-    """Add the option that chooses networks to program, and those that say what each needs."""
+    """Add the option that chooses networks to program, what each needs, and what flows get."""
     return _network(
         click.option(flag, "targets", type=click.Choice(NETWORKS), multiple=True, help=help_)
     )
@@ -293,26 +293,21 @@ def _network(first: Callable[[F], F]) -> Callable[[F], F]:
             metavar="FILE",
             help="nef, camara: where the server is and where the token is.",
         ),
+        click.option(
+            "--dscp-from-5qi",
+            "mapping",
+            metavar="NAME|FILE",
+            default="",
+            help="Mark flows that have a 5QI and no DSCP by this mapping.",
+        ),
+        click.option(
+            "--flow-labels", is_flag=True, help="Give each IPv6 flow a flow label of its own."
+        ),
     )
 
     def add(function: F) -> F:
-        function = _treatment_options(function)
         for each in reversed(options):
             function = each(function)
         return function
 
     return add
-
-
-def _treatment_options(function: F) -> F:
-    """Add what flows get beyond the manifest; collect with `read_treatment`."""
-    function = click.option(
-        "--flow-labels", is_flag=True, help="Give each IPv6 flow a flow label of its own."
-    )(function)
-    return click.option(
-        "--dscp-from-5qi",
-        "mapping",
-        metavar="NAME|FILE",
-        default="",
-        help="Mark flows that have a 5QI and no DSCP by this mapping.",
-    )(function)

@@ -32,10 +32,6 @@ from lifecycle.manifest.names import free_name
 MAX_ENTITIES = 10_000
 """Actions of one launch description, those of files that it includes with them."""
 
-_INSTALL = (
-    "install the ros-DISTRO-{package} package of your ROS distribution and source its setup file; "
-    "PyPI has none"
-)
 _NO_INTERFACE = (
     "a launch file says nothing of its interface: lifecycle capture shows it once it runs"
 )
@@ -95,7 +91,16 @@ def evaluate(path: Path, arguments: Mapping[str, str]) -> Launched:
     Raises:
         UsageError: `launch` is not installed, there is no such file, or it cannot be evaluated.
     """
-    launch = _package("launch")
+    try:
+        launch = importlib.import_module("launch")
+    except ModuleNotFoundError as problem:
+        if problem.name != "launch":
+            raise
+        raise UsageError(
+            "cannot import a launch file: the Python package 'launch' is not installed here",
+            hint="install the ros-DISTRO-launch package of your ROS distribution and source its "
+            "setup file; PyPI has none",
+        ) from problem
     sources = importlib.import_module("launch.launch_description_sources")
     if not os.path.isfile(path):
         raise UsageError(f"cannot import {str(path)!r}: there is no such file")
@@ -132,19 +137,6 @@ def evaluate(path: Path, arguments: Mapping[str, str]) -> Launched:
     return walk.found
 
 
-def _package(name: str) -> Any:
-    try:
-        return importlib.import_module(name)
-    except ModuleNotFoundError as problem:
-        package = str(problem.name).partition(".")[0]
-        if not package.startswith("launch"):
-            raise
-        raise UsageError(
-            f"cannot import a launch file: the Python package {package!r} is not installed here",
-            hint=_INSTALL.format(package=package.replace("_", "-")),
-        ) from problem
-
-
 _READ = ("ExecuteLocal", "RegisterEventHandler", "TimerAction", "LoadComposableNodes")
 """Actions, by a class they inherit, that start something or wait: they are read, never executed."""
 
@@ -173,7 +165,7 @@ class _Walk:
         if self._left < 0:
             raise UsageError(f"cannot import more than {MAX_ENTITIES} actions of one launch file")
         kinds = [each.__name__ for each in type(entity).__mro__]
-        if "Action" in kinds and not self._holds(entity):
+        if "Action" in kinds and not self._holds(entity.condition):
             return
         if any(each in kinds for each in _READ):
             self._read(entity, kinds, notes)
@@ -190,8 +182,7 @@ class _Walk:
             for each in entity.visit(self._context) or ():
                 self.visit(each, notes)
 
-    def _holds(self, action: Any) -> bool:
-        condition = action.condition
+    def _holds(self, condition: Any) -> bool:
         return condition is None or bool(condition.evaluate(self._context))
 
     def _read(self, entity: Any, kinds: Sequence[str], notes: tuple[str, ...]) -> None:
@@ -362,8 +353,7 @@ class _Walk:
             self._component(each, container, notes)
 
     def _component(self, described: Any, container: str, notes: tuple[str, ...]) -> None:
-        condition = described.condition()
-        if condition is not None and not condition.evaluate(self._context):
+        if not self._holds(described.condition()):
             return
         package, plugin = self._text(described.package), self._text(described.node_plugin)
         node = LaunchedNode(

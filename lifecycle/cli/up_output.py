@@ -78,8 +78,15 @@ def output(format_: str, timings_until: str = "") -> Iterator[RunOutput]:
     A run neither waits for who reads it nor ends with him: what happens is in the control socket,
     the log files, the exit code and the report, too.
     """
+    writer = Writer(
+        sys.stdout.fileno(),
+        "standard output",
+        marker=_json_notice if format_ == "json" else "{}\n".format,
+        say=functools.partial(click.echo, err=True),
+        encoding=sys.stdout.encoding,
+    )
     with contextlib.ExitStack() as stack:
-        writer = stack.enter_context(stdout_writer(_json_notice if format_ == "json" else None))
+        stack.callback(writer.close)
         shown: RunOutput
         if format_ == "json":
             shown = JsonLines(writer)
@@ -90,26 +97,6 @@ def output(format_: str, timings_until: str = "") -> Iterator[RunOutput]:
         else:
             shown = PlainLines(writer)
         yield Timings(shown, until=timings_until) if timings_until else shown
-
-
-@contextlib.contextmanager
-def stdout_writer(notice: Callable[[str], str] | None) -> Iterator[Writer]:
-    """Give what writes to standard output without holding a run up.
-
-    Args:
-        notice: a line of the output that says what of it is missing; None for plain text.
-    """
-    writer = Writer(
-        sys.stdout.fileno(),
-        "standard output",
-        marker=notice or (lambda text: f"{text}\n"),
-        say=functools.partial(click.echo, err=True),
-        encoding=sys.stdout.encoding,
-    )
-    try:
-        yield writer
-    finally:
-        writer.close()
 
 
 def _json_line(event: Event) -> str:

@@ -186,14 +186,16 @@ def capture(
         elif not name or name not in nodes:
             unknown.append(endpoint)
     machines = _machines(configurations, chosen)
+    machines = machines if len(machines) > 1 else ()
     instances = _instances(chosen, programs or {})
     keys = _keys(each.name for each in instances)
+    apart = {each.node.full_name for each in instances if each.prefixes}
     shared = _shared(instances, keys)
     gaps = [unsettled] if unsettled else []
     gaps += [f"node {name} is left out: {why}" for name, why in illegal.items() if why]
     gaps += [
         f"{node.count} nodes are named {name}; "
-        + ("lifecycle up gives each a name of its own" if _apart(instances, name) else _ALIKE)
+        + ("lifecycle up gives each a name of its own" if name in apart else _ALIKE)
         for name, node in chosen.items()
         if node.count > 1
     ]
@@ -206,7 +208,7 @@ def capture(
         system=system,
         domain_id=domain_id,
         discovery_range=discovery_range,
-        machines=machines if len(machines) > 1 else (),
+        machines=machines,
         nodes=tuple(
             _node(
                 each,
@@ -214,10 +216,8 @@ def capture(
                 endpoints=[one for one in endpoints[each.node.full_name] if each.has(one)],
                 configuration=(own := configurations.get(each.node.full_name)),
                 parameters=_parameters(parameters.get(each.node.full_name), own),
-                why_not="it did not answer"
-                if each.node.full_name in parameters
-                else "it serves none",
-                machines=machines if len(machines) > 1 else (),
+                serves=each.node.full_name in parameters,
+                machines=machines,
                 process=shared.get(each.program.process_id, "") if each.program else "",
             )
             for each in instances
@@ -287,13 +287,8 @@ def _instances(nodes: Mapping[str, ObservedNode], programs: Programs) -> tuple[_
 def _restartable(instance: _Instance) -> _Instance:
     if instance.program is None or not instance.program.is_of_a_supervisor:
         return instance
-    return dataclasses.replace(
-        instance, program=None, gap="lifecycle up runs it: its own manifest says how it is started"
-    )
-
-
-def _apart(instances: Iterable[_Instance], name: str) -> bool:
-    return any(each.prefixes for each in instances if each.node.full_name == name)
+    gap = "lifecycle up runs it: its own manifest says how it is started"
+    return dataclasses.replace(instance, program=None, gap=gap)
 
 
 def _shared(instances: Iterable[_Instance], keys: Mapping[str, str]) -> dict[int, str]:
@@ -405,7 +400,7 @@ def _node(
     endpoints: Iterable[ObservedEndpoint],
     configuration: NodeConfiguration | None,
     parameters: tuple[CapturedParameter, ...] | None,
-    why_not: str,
+    serves: bool,
     machines: tuple[CapturedMachine, ...],
     process: str,
 ) -> CapturedNode:
@@ -432,7 +427,8 @@ def _node(
     if node.managed is None:
         gaps.append("nobody tells whether it is managed")
     if parameters is None:
-        gaps.append("its parameters are not known: " + why_not)
+        why = "it did not answer" if serves else "it serves none"
+        gaps.append(f"its parameters are not known: {why}")
     own = tuple(each for each in parameters or () if _is_own(each))
     run = None
     if instance.program is not None:
@@ -473,17 +469,14 @@ def _node(
         run=run,
         may_end=run is not None
         and not node.managed
-        and (run.program.has_ended or _only_asks(taken)),
+        and (run.program.has_ended or all(kind in _ASKING for kind, _ in taken)),
     )
 
 
 TARGETS = tuple(each.value for each in TargetState)
 """States that a manifest can ask for."""
 
-
-def _only_asks(endpoints: Iterable[tuple[EndpointKind, str]]) -> bool:
-    asking = (EndpointKind.SERVICE_CLIENT, EndpointKind.ACTION_CLIENT)
-    return all(kind in asking for kind, _ in endpoints)
+_ASKING = (EndpointKind.SERVICE_CLIENT, EndpointKind.ACTION_CLIENT)
 
 
 def can_be_given(parameter: CapturedParameter) -> bool:

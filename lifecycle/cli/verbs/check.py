@@ -181,8 +181,7 @@ _UNRESOLVED = "program.unresolved"
 
 
 def _result(rule: str, level: str, text: str, at: Position) -> Result:
-    where = at.spelled
-    return Result(rule=rule, level=level, text=text, subject=at.path, at=where)
+    return Result(rule=rule, level=level, text=text, subject=at.path, at=at.spelled)
 
 
 @click.command()

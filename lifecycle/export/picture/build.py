@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 
 from lifecycle import dataclasses
 from lifecycle.export.picture.model import (
-    REMARKS,
+    DASHES,
     LineKind,
     Picture,
     PicturedEnd,
@@ -241,14 +241,13 @@ class _Builder:
                 how = f"{report.unique.value} unique" if report.unique else ""
                 label = _label(report.effective_transport, report.dscp, how)
                 unique = report.unique in (UniqueHow.WEAKLY, UniqueHow.STRONGLY)
-            found = {source.presence, target.presence}
-            presence = next(each for each in _WORST_FIRST if each in found)
+            presence = min(source.presence, target.presence, key=_WORST_FIRST.index)
             yield PicturedFlow(
                 source=source.node,
                 target=target.node,
                 presence=presence,
-                outcome=next((each for each in _WORST_OUTCOME if each in outcomes), None),
-                label=presence.value if presence in REMARKS else label,
+                outcome=min(outcomes, key=_WORST_OUTCOME.index, default=None),
+                label=presence.value if presence in DASHES else label,
                 notes=tuple(notes),
                 unique=unique,
             )

@@ -17,9 +17,8 @@ from lifecycle.export.picture.model import (
     PicturedLine,
     PicturedNode,
     Presence,
-    words,
 )
-from lifecycle.export.picture.text import line_words
+from lifecycle.export.picture.text import line_words, words
 from lifecycle.printable import one_line
 
 _CHARACTER = 7.3
@@ -38,7 +37,6 @@ STYLE = """\
 .lc .flow{fill:none;stroke-width:2}
 .lc .unique{stroke-width:4}
 .lc .violated{fill:#b3261e}
-.lc .row.gone{opacity:.15}
 """ + "".join(
     f".lc .{each.value}{{stroke:{LINES[each]};stroke-dasharray:{DASHES.get(each, 'none')}}}\n"
     for each in Presence

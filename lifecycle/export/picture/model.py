@@ -182,19 +182,3 @@ LINES = {
 
 DASHES = {Presence.MISSING: "7 5", Presence.UNDECLARED: "2 4"}
 """SVG's stroke-dasharray: missing is dashed, undeclared is dotted."""
-
-REMARKS = {
-    Presence.MISSING: "declared, but missing",
-    Presence.UNDECLARED: "there, but not declared",
-}
-"""Said beside what is not as declared."""
-
-OUTCOMES = {Outcome.OK: "✓", Outcome.VIOLATED: "✗", Outcome.UNVERIFIABLE: "?"}
-"""The symbol of each outcome."""
-
-
-def words(presence: Presence, notes: tuple[str, ...], findings: tuple[int, ...]) -> tuple[str, ...]:
-    """Return all that is written beside something: its remark, its notes, `⚠1 ⚠4`."""
-    remark = (REMARKS[presence],) if presence in REMARKS else ()
-    warned = (" ".join(f"⚠{number}" for number in findings),) if findings else ()
-    return (*remark, *notes, *warned)

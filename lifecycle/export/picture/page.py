@@ -10,7 +10,8 @@ import itertools
 from collections.abc import Iterator
 
 from lifecycle.export.picture.drawing import escaped, picture_to_svg
-from lifecycle.export.picture.model import OUTCOMES, Picture
+from lifecycle.export.picture.model import Picture
+from lifecycle.export.picture.text import OUTCOMES
 from lifecycle.verify.verdict import Finding
 
 CSS = """\

@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from lifecycle.export.picture.model import (
     DASHES,
     LINES,
-    OUTCOMES,
     STATES,
     LineKind,
     Picture,
@@ -17,10 +16,18 @@ from lifecycle.export.picture.model import (
     PicturedLine,
     PicturedNode,
     Presence,
-    words,
 )
 from lifecycle.printable import columns, one_line
 from lifecycle.verify.outcome import Outcome
+
+_REMARKS = {
+    Presence.MISSING: "declared, but missing",
+    Presence.UNDECLARED: "there, but not declared",
+}
+"""Said beside what is not as declared."""
+
+OUTCOMES = {Outcome.OK: "✓", Outcome.VIOLATED: "✗", Outcome.UNVERIFIABLE: "?"}
+"""The symbol of each outcome."""
 
 _ARROWS = {Presence.MISSING: "╌╌▷", Presence.UNDECLARED: "··▶"}
 
@@ -45,6 +52,13 @@ def _document(picture: Picture) -> Iterator[str]:
         yield f"  ⚠{number} {said}: {finding.message}"
         if finding.hint:
             yield f"      {finding.hint}"
+
+
+def words(presence: Presence, notes: tuple[str, ...], findings: tuple[int, ...]) -> tuple[str, ...]:
+    """Return all that is written beside something: its remark, its notes, `⚠1 ⚠4`."""
+    remark = (_REMARKS[presence],) if presence in _REMARKS else ()
+    warned = (" ".join(f"⚠{number}" for number in findings),) if findings else ()
+    return (*remark, *notes, *warned)
 
 
 def _row(node: PicturedNode) -> tuple[str, ...]:

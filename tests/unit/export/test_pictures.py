@@ -27,13 +27,8 @@ from lifecycle.export.picture import (
     picture_to_text,
 )
 from lifecycle.export.picture.build import Supervised, planned_picture
-from lifecycle.export.picture.model import (
-    OUTCOMES,
-    STATES,
-    Picture,
-    PicturedNodeState,
-    Presence,
-)
+from lifecycle.export.picture.model import STATES, Picture, PicturedNodeState, Presence
+from lifecycle.export.picture.text import OUTCOMES
 from lifecycle.manifest.model import Condition
 from lifecycle.plan.build import build_plan
 from lifecycle.verify.observation import Observation, ObservedEndpoint, ObservedNode
