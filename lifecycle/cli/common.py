@@ -120,6 +120,15 @@ def load_manifest(
     return loaded
 
 
+def load_plan(
+    path: str, assignments: tuple[str, ...], *, quiet: bool = False, machine: str | None = None
+) -> Plan:
+    """Load a manifest as `load_manifest` does, and return its plan."""
+    from lifecycle.plan.build import build_plan
+
+    return build_plan(load_manifest(path, assignments, quiet=quiet, machine=machine).manifest)
+
+
 def resolve(manifest: Manifest, machine: str = "") -> Resolution:
     """Look for what the nodes of a manifest run, without running it.
 
@@ -135,6 +144,16 @@ def resolve(manifest: Manifest, machine: str = "") -> Resolution:
 
     own = own_machines(manifest, machine)
     return resolve_programs(manifest, environment=os.environ, is_ours=own.__contains__)
+
+
+def output_option(what: str) -> Callable[[F], F]:
+    """Add `--output FILE` to a verb that prints `what`."""
+    return click.option(
+        "--output",
+        type=click.Path(dir_okay=False, path_type=Path),
+        metavar="FILE",
+        help=f"Write the {what} there instead of printing it.",
+    )
 
 
 def write_text(path: Path, text: str) -> None:
@@ -239,9 +258,7 @@ def target_plan(
                 hint="arguments belong to a manifest; name its file",
             )
         return find_run(root, target), None
-    from lifecycle.plan.build import build_plan
-
-    plan = build_plan(load_manifest(target, assignments, quiet=True).manifest)
+    plan = load_plan(target, assignments, quiet=True)
     return find_run(root, run_name(plan, machine)), plan
 
 

@@ -15,7 +15,7 @@ from lifecycle import dataclasses
 from lifecycle.cli.common import (
     assignments_argument,
     format_option,
-    load_manifest,
+    load_plan,
     machine_option,
     timeout_option,
 )
@@ -98,9 +98,7 @@ def command(
     4 or 5 for a verdict, with 6 for a step. Exits with 2 where a running supervisor cannot take
     it, and with 0 once the system is active and verified by it.
     """
-    from lifecycle.plan.build import build_plan
-
-    plan = build_plan(load_manifest(manifest, assignments, machine=machine).manifest)
+    plan = load_plan(manifest, assignments, machine=machine)
     path = _run_of(plan, machine)
     said = _asked(path, plan, dry_run=True, timeout_s=0.0, wait_s=_SHOWN_S)
     as_text = format_ == "text"

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from lifecycle.cli.common import write_text
+from lifecycle.cli.common import output_option, write_text
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.printable import one_line
 
@@ -23,12 +23,7 @@ if TYPE_CHECKING:
     metavar="N",
     help="ROS domain to look at; default: ROS_DOMAIN_ID, else 0.",
 )
-@click.option(
-    "--output",
-    type=click.Path(dir_okay=False, path_type=Path),
-    metavar="FILE",
-    help="Write the manifest there instead of printing it.",
-)
+@output_option("manifest")
 @click.option(
     "--nodl-dir",
     type=click.Path(file_okay=False, path_type=Path),

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from lifecycle.cli.common import load_manifest, manifest_arguments, write_text
+from lifecycle.cli.common import load_plan, manifest_arguments, write_text
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest.model import EndpointPolicy
 from lifecycle.printable import lines
@@ -46,9 +46,8 @@ def sros2(manifest: str, assignments: tuple[str, ...], output: Path) -> int:
     security create_permission` makes signed permissions; the commands that are printed do that.
     """
     from lifecycle.export.sros2 import enclaves_of, render_policy
-    from lifecycle.plan.build import build_plan
 
-    plan = build_plan(load_manifest(manifest, assignments).manifest)
+    plan = load_plan(manifest, assignments)
     enclaves = enclaves_of(plan)
     _check_paths(enclaves)
     write_text(output / "policy.xml", render_policy(enclaves))
@@ -111,16 +110,13 @@ def _engine_command(engine: str) -> click.Command:
         **rest: str,
     ) -> int:
         from lifecycle.export.engines import ENGINES, Deployment
-        from lifecycle.plan.build import build_plan
 
         words, timeout_s = _up_options(more, container=engine in _CONTAINERS)
         _check_places(engine, at=at, **rest)
-        loaded = load_manifest(manifest, assignments, machine=None)
         here = str(Path(manifest).resolve())
         inside = f"/system/{Path(manifest).name}" if engine in _CONTAINERS else here
-        plan = build_plan(loaded.manifest)
         deployment = Deployment(
-            plan=plan,
+            plan=load_plan(manifest, assignments),
             manifest=at or inside,
             words=(*assignments, *words),
             image=rest.get("image", ""),

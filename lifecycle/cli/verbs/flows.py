@@ -20,7 +20,7 @@ from lifecycle.cli.common import (
     export_option,
     format_option,
     is_manifest,
-    load_manifest,
+    load_plan,
     manifest_arguments,
     network_options,
     target_argument,
@@ -209,7 +209,7 @@ def _show(
 def _plan_of(target: str, assignments: tuple[str, ...]) -> Plan:
     """Return the plan of a manifest, or that of a running system of this name."""
     if is_manifest(target) or target.endswith((".yaml", ".yml")):
-        return _plan(target, assignments)
+        return load_plan(target, assignments)
     from lifecycle.supervisor.run.looking import running_plan
 
     path, _ = target_plan(os.environ, target, assignments, "")
@@ -326,7 +326,7 @@ def diff_command(
 @manifest_arguments
 def remove_command(manifest: str, assignments: tuple[str, ...]) -> int:
     """Remove from networks everything that was applied for a system, running or not."""
-    return remove(_plan(manifest, assignments))
+    return remove(load_plan(manifest, assignments))
 
 
 def _asked(
@@ -341,16 +341,10 @@ def _asked(
     return options, read_treatment(mapping, label_flows=flow_labels)
 
 
-def _plan(manifest: str, assignments: tuple[str, ...]) -> Plan:
-    from lifecycle.plan.build import build_plan
-
-    return build_plan(load_manifest(manifest, assignments).manifest)
-
-
 def _judged(manifest: str, assignments: tuple[str, ...], timeout_s: float) -> tuple[Plan, Verdict]:
     from lifecycle.supervisor.run.looking import judge_running
 
-    seen = judge_running(_plan(manifest, assignments), timeout_s=timeout_s, strict=False)
+    seen = judge_running(load_plan(manifest, assignments), timeout_s=timeout_s, strict=False)
     for each in seen.notices:
         click.echo(lines(each), err=True)
     return seen.plan, seen.verdict

@@ -13,6 +13,8 @@ from lifecycle.cli.common import (
     asking,
     format_option,
     is_manifest,
+    load_plan,
+    output_option,
     target_arguments,
     target_run,
     timeout_option,
@@ -29,12 +31,7 @@ if TYPE_CHECKING:
 @click.command("graph")
 @target_arguments
 @format_option("text", "mermaid", "svg", "html", "json")
-@click.option(
-    "--output",
-    type=click.Path(dir_okay=False, path_type=Path),
-    metavar="FILE",
-    help="Write the picture there instead of printing it.",
-)
+@output_option("picture")
 @click.option("--watch", is_flag=True, help="Draw it again at every change; Ctrl-C ends.")
 @timeout_option(
     2.0,
@@ -109,11 +106,9 @@ def _found(
     """Return the run of a supervisor, or the plan to look for without one."""
     if not is_manifest(target):
         return target_run(os.environ, target, assignments, machine), None
-    from lifecycle.cli.common import load_manifest
-    from lifecycle.plan.build import build_plan
     from lifecycle.supervisor.run.looking import supervisor_of
 
-    plan = build_plan(load_manifest(target, assignments, quiet=True).manifest)
+    plan = load_plan(target, assignments, quiet=True)
     return supervisor_of(os.environ, plan, machine), plan
 
 

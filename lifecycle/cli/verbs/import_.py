@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from lifecycle.cli.common import parse_assignments, write_text
+from lifecycle.cli.common import output_option, parse_assignments, write_text
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest.diagnostics import ManifestError
 from lifecycle.manifest.loading import load
@@ -17,12 +17,7 @@ from lifecycle.printable import lines, one_line
 @click.command("import")
 @click.argument("launch_file", type=click.Path(path_type=Path), metavar="FILE.launch.(py|xml|yaml)")
 @click.argument("assignments", nargs=-1, metavar="[NAME:=VALUE]...")
-@click.option(
-    "--output",
-    type=click.Path(dir_okay=False, path_type=Path),
-    metavar="FILE",
-    help="Write the manifest there instead of printing it.",
-)
+@output_option("manifest")
 @click.option("--system", default="", help="Name to give the system; default: the file's.")
 def import_command(
     *, launch_file: Path, assignments: tuple[str, ...], output: Path | None, system: str

@@ -7,9 +7,8 @@ import shutil
 import click
 
 from lifecycle import codec
-from lifecycle.cli.common import format_option, load_manifest, manifest_arguments
+from lifecycle.cli.common import format_option, load_plan, manifest_arguments
 from lifecycle.errors import ExitCode
-from lifecycle.plan.build import build_plan
 from lifecycle.plan.model import Plan
 from lifecycle.plan.render import render_text
 from lifecycle.plan.secrets import without_secrets
@@ -24,9 +23,7 @@ def command(manifest: str, assignments: tuple[str, ...], format_: str) -> int:
     Starts nothing and needs no ROS. The other formats draw it, as `lifecycle graph` draws what runs
     beside it: mermaid for Markdown, svg and html for a browser.
     """
-    loaded = load_manifest(manifest, assignments)
-    plan = build_plan(loaded.manifest)
-    click.echo(render(plan, format_).rstrip("\n"))
+    click.echo(render(load_plan(manifest, assignments), format_).rstrip("\n"))
     return ExitCode.OK
 
 

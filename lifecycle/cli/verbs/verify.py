@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from lifecycle.cli.common import format_option, load_manifest, manifest_arguments, timeout_option
+from lifecycle.cli.common import format_option, load_plan, manifest_arguments, timeout_option
 from lifecycle.cli.report import ReportFile, format_verdict, report_option, written_or_said
 from lifecycle.errors import ExitCode
 from lifecycle.printable import lines
@@ -44,10 +44,9 @@ def command(  # noqa: PLR0917 - click passes options by name
             ReportFile(report, strict=strict) as written,
             ending.unmasked(),
         ):
-            from lifecycle.plan.build import build_plan
             from lifecycle.supervisor.run.looking import judge_running
 
-            plan = build_plan(load_manifest(manifest, assignments).manifest)
+            plan = load_plan(manifest, assignments)
             written.begin(plan)
             seen = judge_running(plan, timeout_s=timeout, strict=strict)
             with ending.noted():

@@ -33,11 +33,7 @@ from lifecycle.verify.view import FlowView, View
 UNKNOWN = "unknown node"
 """What the node of endpoints is called whose node is not known."""
 
-_STATES = {
-    each.value: each
-    for each in PicturedNodeState
-    if each.value in ("active", "inactive", "unconfigured", "finalized")
-}
+_PRIMARY_STATES = ("active", "inactive", "unconfigured", "finalized")
 _KINDS = (
     (LineKind.TOPIC, EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION),
     (LineKind.SERVICE, EndpointKind.SERVICE_CLIENT, EndpointKind.SERVICE_SERVER),
@@ -154,7 +150,8 @@ class _Builder:
             return state.MANAGED if self._view.planned[name].managed else state.PLAIN
         if said and not supervised.silent:
             is_connected = said == "inactive" and report is not None and report.connected
-            return state.CONNECTED if is_connected else _STATES.get(said, state.CHANGING)
+            named = state(said) if said in _PRIMARY_STATES else state.CHANGING
+            return state.CONNECTED if is_connected else named
         if managed is False and not supervised.silent:
             return state.PLAIN
         # A declared node was asked; an undeclared one was not.

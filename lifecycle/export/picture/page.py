@@ -6,13 +6,11 @@ only hides what does not have the words of the filter; without it everything is 
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator
 
 from lifecycle.export.picture.drawing import escaped, picture_to_svg
 from lifecycle.export.picture.model import Picture
 from lifecycle.export.picture.text import OUTCOMES
-from lifecycle.verify.verdict import Finding
 
 CSS = """\
 body{margin:0 1.5rem;font:15px/1.45 system-ui,sans-serif;color:#1b2733;background:#fff}
@@ -59,20 +57,17 @@ def _page(picture: Picture) -> Iterator[str]:
     yield f'<div class="figure" tabindex="0">\n{picture_to_svg(picture)}</div>'
     if picture.findings:
         heads = ("no.", "outcome", "rule", "what", "where")
-        cells = "".join(f'<th scope="col">{each}</th>' for each in heads)
-        yield f"<h2>Findings</h2>\n<table><thead><tr>{cells}</tr></thead><tbody>"
-        yield from itertools.starmap(_finding, enumerate(picture.findings, start=1))
+        head = "".join(f'<th scope="col">{each}</th>' for each in heads)
+        yield f"<h2>Findings</h2>\n<table><thead><tr>{head}</tr></thead><tbody>"
+        for number, finding in enumerate(picture.findings, start=1):
+            hint = f"<br><em>{escaped(finding.hint)}</em>" if finding.hint else ""
+            cells = (
+                f"{OUTCOMES[finding.outcome]} {finding.outcome.value}",
+                f"<code>{escaped(finding.rule)}</code>",
+                f"{escaped(finding.message)}{hint}",
+                f"<code>{escaped(finding.at)}</code>" if finding.at else "–",
+            )
+            rest = "".join(f"<td>{each}</td>" for each in cells)
+            yield f'<tr><th scope="row">⚠{number}</th>{rest}</tr>'
         yield "</tbody></table>"
     yield f"<script>\n{SCRIPT}</script>\n</body>\n</html>"
-
-
-def _finding(number: int, finding: Finding) -> str:
-    hint = f"<br><em>{escaped(finding.hint)}</em>" if finding.hint else ""
-    cells = (
-        f"{OUTCOMES[finding.outcome]} {finding.outcome.value}",
-        f"<code>{escaped(finding.rule)}</code>",
-        f"{escaped(finding.message)}{hint}",
-        f"<code>{escaped(finding.at)}</code>" if finding.at else "–",
-    )
-    rest = "".join(f"<td>{each}</td>" for each in cells)
-    return f'<tr><th scope="row">⚠{number}</th>{rest}</tr>'
