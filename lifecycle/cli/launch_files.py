@@ -32,11 +32,6 @@ from lifecycle.manifest.names import free_name
 MAX_ENTITIES = 10_000
 """Actions of one launch description, those of files that it includes with them."""
 
-_NO_INTERFACE = (
-    "a launch file says nothing of its interface: lifecycle capture shows it once it runs"
-)
-_NO_LIFECYCLE = "launch does not say whether it has a lifecycle; remove this line if it has"
-
 
 @dataclasses.dataclass(slots=True, kw_only=True)
 class LaunchedNode:
@@ -173,12 +168,11 @@ class _Walk:
             self._gap(
                 f"{kinds[0]}: it acts on what runs; `after:` of a node says what it waits for"
             )
+        elif "DeclareLaunchArgument" in kinds:
+            entity.execute(self._context)
+            value = self._context.launch_configurations.get(entity.name, "")
+            self.found.arguments[entity.name] = value
         else:
-            if "DeclareLaunchArgument" in kinds:
-                entity.execute(self._context)
-                value = self._context.launch_configurations.get(entity.name, "")
-                self.found.arguments[entity.name] = value
-                return
             for each in entity.visit(self._context) or ():
                 self.visit(each, notes)
 
@@ -199,7 +193,9 @@ class _Walk:
         elif "Node" in kinds:
             self._node(entity, kinds, notes)
         else:
-            words = self._command(entity)
+            words = [kinds[0]]
+            with contextlib.suppress(Exception):  # a word of it may depend on what runs
+                words = [self._text(each) for each in entity.cmd]
             self._gap(f"the process {shlex.join(words)!r} is no node: a manifest starts nodes only")
 
     def _handler(self, handler: Any, notes: tuple[str, ...]) -> None:
@@ -389,11 +385,6 @@ class _Walk:
             return "".join(self._text(each) for each in value)
         return str(value.perform(self._context))
 
-    def _command(self, action: Any) -> list[str]:
-        with contextlib.suppress(Exception):  # a word of it may depend on what runs
-            return [self._text(each) for each in action.cmd]
-        return [type(action).__name__]
-
 
 def _is_a(value: Any, *names: str) -> bool:
     return bool({each.__name__ for each in type(value).__mro__} & {*names})
@@ -483,7 +474,8 @@ def _tree(node: LaunchedNode, by_name: Mapping[str, str], folder: Path) -> Tree:
     if node.namespace != "/":
         tree["namespace"] = node.namespace
     if not node.managed:
-        tree["managed"] = Noted(value=False, note=f"gap: {_NO_LIFECYCLE}")
+        note = "launch does not say whether it has a lifecycle; remove this line if it has"
+        tree["managed"] = Noted(value=False, note=f"gap: {note}")
     files = [literal(os.path.relpath(each, folder)) for each in node.parameter_files]
     if files:
         tree["parameter_files"] = files
@@ -496,7 +488,8 @@ def _tree(node: LaunchedNode, by_name: Mapping[str, str], folder: Path) -> Tree:
         tree["remap"] = {source: literal(target) for source, target in node.remap.items()}
     if node.log_level:
         tree["log_level"] = node.log_level
-    tree["endpoints"] = Noted(value="open", note=f"gap: {_NO_INTERFACE}")
+    note = "a launch file says nothing of its interface: lifecycle capture shows it once it runs"
+    tree["endpoints"] = Noted(value="open", note=f"gap: {note}")
     return Noted(value=tree, note="; ".join(f"gap: {each}" for each in gaps)) if gaps else tree
 
 

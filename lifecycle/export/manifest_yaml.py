@@ -185,7 +185,6 @@ def _gaps(system: CapturedSystem) -> Iterable[str]:
             "not ours, so that machine, process, flows, DSCP, history and depth are not told: "
             + ", ".join(foreign)
         )
-    if foreign:
         yield "remaps cannot be seen: names are those in the graph, not those in the nodes' code"
 
 
@@ -214,32 +213,22 @@ def _policy(system: CapturedSystem) -> dict[str, Tree]:
         policy["undeclared_nodes"] = Noted(
             value="open", note="gap: nodes of other namespaces were left out"
         )
-    offered = {
-        (_OPPOSITE[each.kind], each.name)
-        for node in system.nodes
-        for each in node.endpoints
-        if each.kind in _OPPOSITE
+    ends = {(each.kind, each.name) for node in system.nodes for each in node.endpoints}
+    waiting = {
+        name for kind, name in ends if kind in _OFFERED and (_OFFERED[kind], name) not in ends
     }
-    waiting = sorted(
-        {
-            each.name
-            for node in system.nodes
-            for each in node.endpoints
-            if each.kind in _OPPOSITE.values() and (each.kind, each.name) not in offered
-        }
-    )
     if waiting:
-        policy["unpublished"] = Noted(
-            value="warning", note=f"gap: nobody offers {', '.join(waiting)}"
-        )
+        note = f"gap: nobody offers {', '.join(sorted(waiting))}"
+        policy["unpublished"] = Noted(value="warning", note=note)
     return policy
 
 
-_OPPOSITE = {
-    EndpointKind.PUBLISHER: EndpointKind.SUBSCRIPTION,
-    EndpointKind.SERVICE_SERVER: EndpointKind.SERVICE_CLIENT,
-    EndpointKind.ACTION_SERVER: EndpointKind.ACTION_CLIENT,
+_OFFERED = {
+    EndpointKind.SUBSCRIPTION: EndpointKind.PUBLISHER,
+    EndpointKind.SERVICE_CLIENT: EndpointKind.SERVICE_SERVER,
+    EndpointKind.ACTION_CLIENT: EndpointKind.ACTION_SERVER,
 }
+"""Who waits → by whom that is offered."""
 
 
 def _node(node: CapturedNode, reference: str) -> Tree:
@@ -311,8 +300,10 @@ def _given(node: CapturedNode) -> dict[str, Tree]:
 
 
 def _run(run: CapturedRun) -> dict[str, Tree]:
-    tree: dict[str, Tree] = {"command": list(map(literal, run.command))}
-    tree["working_directory"] = str(literal(run.program.working_directory))
+    tree: dict[str, Tree] = {
+        "command": list(map(literal, run.command)),
+        "working_directory": literal(run.program.working_directory),
+    }
     if run.program.environment:
         tree["environment"] = {name: str(literal(value)) for name, value in run.program.environment}
     if run.ros_args is not RosArguments.AUTO:
@@ -377,9 +368,8 @@ def _qos(qos: QosProfile, kind: EndpointKind) -> dict[str, Tree]:
 
 
 def _policy_value(value: str) -> Tree:
-    if value == "UNKNOWN":
-        return Noted(value=_UNKNOWN_POLICY, note="gap: not announced")
-    return value
+    unknown = Noted(value=_UNKNOWN_POLICY, note="gap: not announced")
+    return unknown if value == "UNKNOWN" else value
 
 
 def _parameter(parameter: CapturedParameter, spell: _Spell, *, given: bool) -> Tree:

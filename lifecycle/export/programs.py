@@ -79,10 +79,10 @@ def run_of(
     program: CapturedProgram,
     node: str,
     *,
-    process: str = "",
-    renamed: bool = False,
-    parameters: Collection[str] = (),
-    endpoints: Collection[tuple[EndpointKind, str]] = (),
+    process: str,
+    renamed: bool,
+    parameters: Collection[str],
+    endpoints: Collection[tuple[EndpointKind, str]],
 ) -> CapturedRun:
     """Return how to start the process of a node again.
 
@@ -153,46 +153,34 @@ def _remapped(run: CapturedRun, node: str, rule: str) -> CapturedRun | None:
 
 def _with_file(run: CapturedRun, word: str) -> CapturedRun:
     file = os.path.normpath(Path(run.program.working_directory) / word)
-    if _is_kept(file):
+    # launch makes such files, and removes them.
+    is_temporary = file.startswith(f"{tempfile.gettempdir()}/")
+    of_launch = is_temporary and Path(file).name.startswith("launch_params_")
+    if os.path.isfile(file) and not of_launch:
         return dataclasses.replace(run, parameter_files=(*run.parameter_files, file))
     gap = f"it was given the parameter file {word}, which does not stay"
     return dataclasses.replace(run, gaps=(*run.gaps, gap))
 
 
-def _is_kept(file: str) -> bool:
-    """Whether a parameter file is there, and is none that launch makes and removes."""
-    of_launch = Path(file).name.startswith("launch_params_")
-    in_temporary = file.startswith(f"{tempfile.gettempdir()}/")
-    return os.path.isfile(file) and not (of_launch and in_temporary)
-
-
 def _resolves(run: CapturedRun, node: str, endpoints: Iterable[tuple[EndpointKind, str]]) -> bool:
     """Whether every endpoint gets its name of now when the manifest's remaps are applied."""
-    return all(resolved(run, node, kind, name) == name for kind, name in endpoints)
+    return all(
+        _resolve(run, node, kind, declared_name(run, node, kind, name)) == name
+        for kind, name in endpoints
+    )
 
 
-def declared_name(run: CapturedRun | None, node: str, kind: EndpointKind, name: str) -> str:
+def declared_name(run: CapturedRun, node: str, kind: EndpointKind, name: str) -> str:
     """Return the name that a node uses for an endpoint; the full one where that is not known."""
-    for source, _ in run.remap if run else ():
+    for source, _ in run.remap:
         if not name_problem(source) and _resolve(run, node, kind, source) == name:
             return source
     return name
 
 
-def resolved(run: CapturedRun, node: str, kind: EndpointKind, name: str) -> str:
-    """Return where an endpoint of a name as it is declared ends up."""
-    return _resolve(run, node, kind, declared_name(run, node, kind, name))
-
-
-def _resolve(run: CapturedRun | None, node: str, kind: EndpointKind, name: str) -> str:
+def _resolve(run: CapturedRun, node: str, kind: EndpointKind, name: str) -> str:
     namespace, _, base = node.rpartition("/")
-    return resolve(
-        name,
-        node_name=base,
-        namespace=namespace or "/",
-        remap=run.remap if run else (),
-        kind=kind,
-    )
+    return resolve(name, node_name=base, namespace=namespace or "/", remap=run.remap, kind=kind)
 
 
 def process_names(shared: Mapping[int, CapturedProgram], taken: Collection[str]) -> dict[int, str]:
