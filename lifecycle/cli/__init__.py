@@ -70,15 +70,6 @@ _NEEDS_ROS = (
 )
 
 
-def _check_platform(verb: str) -> None:
-    """Refuse what only Linux has; raises UsageError."""
-    if verb in _LINUX and sys.platform != "linux":
-        raise UsageError(
-            f"cannot run 'lifecycle {verb}' on {sys.platform}: nodes are run and watched on Linux",
-            hint="what is about manifests works here: check, plan, export, import, init, schema",
-        )
-
-
 def _check_ros(verb: str) -> None:
     """Refuse a verb that needs ROS 2, before anything is imported for it.
 
@@ -118,8 +109,13 @@ class _Verbs(click.Group):
         if args and args[0] not in VERBS and not args[0].startswith("-"):
             hint = did_you_mean(args[0], VERBS) or "lifecycle --help lists the verbs"
             raise UsageError(f"cannot find the verb {args[0]!r}", hint=hint)
-        if args:
-            _check_platform(args[0])
+        if args and args[0] in _LINUX and sys.platform != "linux":
+            raise UsageError(
+                f"cannot run 'lifecycle {args[0]}' on {sys.platform}: nodes are run and watched on "
+                "Linux",
+                hint="what is about manifests works here: check, plan, export, import, init, "
+                "schema",
+            )
         if args and args[0] in _PARTICIPANTS and not {"-h", "--help"} & {*args}:
             _check_ros(args[0])
         return super().resolve_command(ctx, args)

@@ -1,7 +1,6 @@
 """A picture as SVG: a column for each node, a row for each topic, service or action. Pure.
 
-Nothing overlaps however much there is: columns are as wide as what is written in them, and upright
-where there are many.
+Columns are as wide as what is written in them, and upright where there are many.
 """
 
 from __future__ import annotations
@@ -67,7 +66,7 @@ def picture_to_svg(picture: Picture) -> str:
         drawn.append(
             f'<line class="life" x1="{middle}" y1="{top + tall}" x2="{middle}" y2="{bottom}"/>'
         )
-        drawn += _column(node, box, (x, top), (wide, tall), upright=upright)
+        drawn += _column(node, box, (x, top, wide, tall), upright=upright)
         x += wide + _GAP
     y = top + tall + _GAP
     for line, row, height in zip(picture.lines, rows, heights, strict=True):
@@ -93,14 +92,9 @@ def _box_words(node: PicturedNode) -> list[str]:
 
 
 def _column(
-    node: PicturedNode,
-    box: list[str],
-    at: tuple[float, float],
-    size: tuple[float, float],
-    *,
-    upright: bool,
+    node: PicturedNode, box: list[str], area: tuple[float, float, float, float], *, upright: bool
 ) -> Iterator[str]:
-    (x, y), (wide, tall), look = at, size, STATES[node.state]
+    (x, y, wide, tall), look = area, STATES[node.state]
     along, down, turn = (tall, tall, " rotate(-90)") if upright else (wide, 0, "")
     yield '<g class="column">'
     yield (
