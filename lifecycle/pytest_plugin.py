@@ -3,10 +3,7 @@
 Owns: `lifecycle_system` (`lifecycle up` in a process of its own, ended with the test),
 `lifecycle_node` (one node in the test's process, without a supervisor), `lifecycle_domain`, and
 what a failed test shows of them. pytest loads this module in every project (entry point pytest11):
-everything else is imported where it is used.
-
-Tests may run side by side (pytest-xdist): a domain is claimed by an abstract socket, which belongs
-to this network namespace and goes with the process that has it.
+everything else is imported where it is used. Tests may run side by side (pytest-xdist).
 """
 
 from __future__ import annotations

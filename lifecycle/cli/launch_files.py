@@ -2,11 +2,8 @@
 
 Owns: which actions of `launch` and `launch_ros` are carried out while one is evaluated (those that
 only set something for what follows), which are read instead of run (processes, nodes, timers, event
-handlers), and how each becomes a key of the manifest or a `gap:`. Needs the `launch` package, and
-`launch_ros` where the file has nodes; both are looked for when they are needed.
-
-A launch file in Python is a program, and evaluating it runs that program; so does a `Command`
-substitution. The processes that it describes are not started.
+handlers), and how each becomes a key of the manifest or a `gap:`. A launch file in Python is a
+program, which evaluating it runs, and so does a `Command` substitution.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """Standard output and error that are closed, full or not read, and what is lost then.
 
 Owns: `own_streams`, which keeps standard output for what a verb prints (Fast DDS 2.14 prints errors
-of TCP connections there, where they would end up among JSON lines or in a CSV file), and after
-which writing to either stream never raises; and `Writer`, by which a supervisor never waits for a
-reader.
+of TCP connections there), and after which writing to either stream never raises; and `Writer`, by
+which a supervisor never waits for a reader.
 """
 
 from __future__ import annotations

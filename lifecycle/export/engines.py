@@ -1,12 +1,10 @@
 """A plan as units and manifests of the engines that start programs: each machine's part as one.
 
-Owns: what systemd and Kubernetes are given so that the supervisor of a
-machine is started with it, is ready only once its system is active and verified, is ended when its
-event loop hangs, and is started again where that can help: by the engine where the manifest leaves
-that to it, never by both. Pure; nothing is asked of an engine.
+Owns: what systemd and Kubernetes are given so that the supervisor of a machine is started with it,
+is ready only once its system is active and verified, is ended when its event loop hangs, and is
+started again where that can help and the manifest leaves that to the engine. Pure.
 
-Sources: systemd.service(5), systemd.exec(5), systemd.resource-control(5);
-the Kubernetes API v1 and apps/v1.
+Sources: systemd.service(5), systemd.exec(5); the Kubernetes API v1 and apps/v1.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """Writes a captured system as a manifest in YAML, and its nodes as NoDL v2 documents.
 
 Owns: how captured facts are spelled in a manifest, with `# gap:` on every line whose value the
-graph does not show; and YAML text that reads back the same here, in YAML 1.1 and in YAML 1.2: when
-a scalar needs quotes, how comments are placed beside what they are about, and that the same data
-give the same text. What is written passes `lifecycle check`. Pure.
+graph does not show; and YAML text that reads back the same in YAML 1.1 and 1.2. What is written
+passes `lifecycle check`. Pure.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """`lifecycle flows`: show every network flow and how unique it is, export them, program networks.
 
-Owns: flows as a table, JSON or CSV: the columns of the table, and how unknown values read; for
-`--export` the step from options to what an export needs, and its refusals; and the subcommands
-`apply`, `diff` and `remove`. The exported texts and what is done to networks are programming's.
+Owns: flows as a table, JSON or CSV, `--export`, and the subcommands `apply`, `diff` and `remove`.
+The exported texts and what is done to networks are programming's.
 """
 
 from __future__ import annotations

@@ -180,7 +180,12 @@ def command(
 def _fork_server(program: tuple[TargetOptions, ...]) -> ForkServerProcess:
     from lifecycle.supervisor.processes.fork_server_process import ForkServerProcess
 
-    return ForkServerProcess(without=_tokens(program), programs=bool(program))
+    tokens: frozenset[str] = frozenset()
+    if program:  # their secrets, which nothing that is started shall have
+        from lifecycle.supervisor.connections.networks import token_variables
+
+        tokens = frozenset(token_variables(program))
+    return ForkServerProcess(without=tokens, programs=bool(program))
 
 
 def _finished(result: UpResult, listener: RunOutput, written: ReportFile) -> ExitCode:
@@ -197,15 +202,6 @@ def _networks(targets: tuple[str, ...], **given: Any) -> tuple[TargetOptions, ..
     from lifecycle.programming.apply.targets.registry import read_targets
 
     return read_targets(targets, given, option="--program")
-
-
-def _tokens(program: tuple[TargetOptions, ...]) -> frozenset[str]:
-    """Variables with secrets of networks, which nothing that is started shall have."""
-    if not program:
-        return frozenset()
-    from lifecycle.supervisor.connections.networks import token_variables
-
-    return frozenset(token_variables(program))
 
 
 def _treatment(targets: tuple[str, ...], *, mapping: str, flow_labels: bool) -> Treatment | None:
