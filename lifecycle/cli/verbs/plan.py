@@ -34,6 +34,6 @@ def render(plan: Plan, format_: str) -> str:
     if format_ == "json":
         return codec.to_json(without_secrets(plan)).decode()
     from lifecycle.export.picture import WRITERS
-    from lifecycle.export.picture.build import planned_picture
+    from lifecycle.export.picture.build import build_picture
 
-    return WRITERS[format_](planned_picture(plan))
+    return WRITERS[format_](build_picture(plan))

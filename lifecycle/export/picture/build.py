@@ -6,7 +6,7 @@ The matching of plan and observation is `verify`'s; nothing here judges again.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 
 from lifecycle import dataclasses
 from lifecycle.export.picture.model import (
@@ -27,7 +27,7 @@ from lifecycle.plan.model import Plan
 from lifecycle.verify.matcher import lay_out
 from lifecycle.verify.observation import Observation
 from lifecycle.verify.outcome import Outcome
-from lifecycle.verify.verdict import Finding, Stage, Verdict
+from lifecycle.verify.verdict import Stage, Verdict
 from lifecycle.verify.view import FlowView, View
 
 UNKNOWN = "unknown node"
@@ -62,8 +62,8 @@ class Supervised:
 
 def build_picture(
     plan: Plan,
-    observation: Observation,
-    verdict: Verdict | None,
+    observation: Observation | None = None,
+    verdict: Verdict | None = None,
     *,
     phase: str = "",
     supervised: Mapping[str, Supervised] | None = None,
@@ -72,12 +72,12 @@ def build_picture(
 
     Args:
         plan: what was declared.
-        observation: what is there; empty if nothing runs.
+        observation: what is there; empty if nothing runs, None for a plan alone.
         verdict: on the two; its findings are put at what they name. None for a plan alone.
         phase: of the supervisor; empty without one.
         supervised: by full node name, what a supervisor adds.
     """
-    view = lay_out(plan, observation, Stage.ACTIVE)
+    view = lay_out(plan, observation or Observation(), Stage.ACTIVE)
     builder = _Builder(view, verdict, supervised or {})
     return Picture(
         system=plan.system,
@@ -90,11 +90,6 @@ def build_picture(
     )
 
 
-def planned_picture(plan: Plan) -> Picture:
-    """Return the picture of a plan: everything that is declared, and nothing about what runs."""
-    return build_picture(plan, Observation(), None)
-
-
 class _Builder:
     def __init__(
         self, view: View, verdict: Verdict | None, supervised: Mapping[str, Supervised]
@@ -104,12 +99,10 @@ class _Builder:
         self._supervised = supervised
         self._absent = Presence.PLANNED if verdict is None else Presence.MISSING
         self.findings = verdict.findings if verdict else ()
+        self._numbered = tuple(enumerate(self.findings, start=1))
         self._planned_flows = {(e.planned.topic, *e.ends): e for e in view.flows}
         flows = verdict.flows if verdict else ()
         self._reports = {(each.topic, each.publisher, each.subscription): each for each in flows}
-
-    def _numbers(self, concerns: Callable[[Finding], bool]) -> tuple[int, ...]:
-        return tuple(n for n, each in enumerate(self.findings, start=1) if concerns(each))
 
     def nodes(self) -> Iterator[PicturedNode]:
         view = self._view
@@ -128,6 +121,7 @@ class _Builder:
         addresses = {each.name: each.address for each in self._view.plan.machines}
         address = addresses.get(planned.machine if planned else "", "")
         where = f" ({address})" if address else ""
+        numbers = (n for n, each in self._numbered if name and name in (each.node, each.subject))
         return PicturedNode(
             name=name or UNKNOWN,
             presence=presence,
@@ -135,8 +129,8 @@ class _Builder:
             machine=f"machine {planned.machine}{where}" if planned and planned.machine else "",
             process=planned.process if planned else "",
             pid=pid or None,
-            notes=tuple(self._notes(name, supervised.doing)),
-            findings=self._numbers(lambda each: bool(name) and name in (each.node, each.subject)),
+            notes=(*self._notes(name), *filter(None, [supervised.doing])),
+            findings=tuple(numbers),
         )
 
     def _state(self, name: str, presence: Presence, supervised: Supervised) -> PicturedNodeState:
@@ -149,16 +143,16 @@ class _Builder:
         if presence is Presence.PLANNED:
             return state.MANAGED if self._view.planned[name].managed else state.PLAIN
         if said and not supervised.silent:
-            is_connected = said == "inactive" and report is not None and report.connected
-            named = state(said) if said in _PRIMARY_STATES else state.CHANGING
-            return state.CONNECTED if is_connected else named
+            if said == "inactive" and report is not None and report.connected:
+                return state.CONNECTED
+            return state(said) if said in _PRIMARY_STATES else state.CHANGING
         if managed is False and not supervised.silent:
             return state.PLAIN
         # A declared node was asked; an undeclared one was not.
         asked = managed and presence is Presence.PRESENT
         return state.SILENT if asked or supervised.silent else state.UNKNOWN
 
-    def _notes(self, name: str, doing: str) -> Iterator[str]:
+    def _notes(self, name: str) -> Iterator[str]:
         planned, observed = self._view.planned.get(name), self._view.observed.get(name)
         if planned is not None and planned.run.kind is RunKind.ATTACH:
             yield "started by others"
@@ -166,16 +160,13 @@ class _Builder:
             yield from (f"after {each.node} {each.condition.value}" for each in planned.after)
         if observed is not None and observed.count > 1:
             yield f"{observed.count} of this name"
-        if doing:
-            yield doing
 
     def lines(self) -> Iterator[PicturedLine]:
         rows: dict[tuple[EndpointKind, str], dict[PicturedEnd, str]] = {}
         for kind, name, type_, end in self._ends():
             rows.setdefault((kind, name), {})[end] = type_
         for line_kind, source_kind, target_kind in _KINDS:
-            names = dict.fromkeys(n for kind, n in rows if kind in (source_kind, target_kind))
-            for name in names:
+            for name in dict.fromkeys(n for kind, n in rows if kind in (source_kind, target_kind)):
                 sources = rows.get((source_kind, name), {})
                 targets = rows.get((target_kind, name), {})
                 yield PicturedLine(
@@ -204,15 +195,13 @@ class _Builder:
     def _end(
         self, kind: EndpointKind, name: str, node: str, presence: Presence, notes: list[str]
     ) -> PicturedEnd:
-        def concerns(finding: Finding) -> bool:
-            its = finding.subject == name and finding.node in (node, "")
-            return its and finding.endpoint in (kind, None)
-
+        about = [(n, each) for n, each in self._numbered if each.subject == name]
+        about = [(n, each) for n, each in about if each.node in (node, "")]
         return PicturedEnd(
             node=node or UNKNOWN,
             presence=presence,
             notes=tuple(notes),
-            findings=self._numbers(concerns),
+            findings=tuple(n for n, each in about if each.endpoint in (kind, None)),
         )
 
     def _flows(

@@ -51,9 +51,8 @@ def picture_to_svg(picture: Picture) -> str:
     quiet = _width([w for row in rows for w in row]) * 10 // 12
     left = max(quiet, _width([each.name for each in picture.lines]))
     boxes = [_box_words(node) for node in picture.nodes]
-    longest = max((_width(box) for box in boxes), default=0)
-    deepest = max((len(box) for box in boxes), default=0) * _LINE + _GAP
-    tall = longest + _GAP if upright else deepest
+    sizes = [_width(box) if upright else len(box) * _LINE for box in boxes]
+    tall = max(sizes, default=0) + _GAP
     drawn = [f'<text class="head" x="{_GAP}" y="20">{escaped(picture.title)}</text>']
     centres: dict[str, float] = {}
     x, top = float(left + 2 * _GAP), 34
@@ -72,8 +71,7 @@ def picture_to_svg(picture: Picture) -> str:
     for line, row, height in zip(picture.lines, rows, heights, strict=True):
         drawn += _row(line, row, y, centres)
         y += height
-    width, height = round(x + _GAP), round(bottom + _GAP)
-    body = "\n".join(drawn)
+    width, height, body = round(x + _GAP), round(bottom + _GAP), "\n".join(drawn)
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" class="lc" role="img" width="{width}" '
         f'height="{height}" viewBox="0 0 {width} {height}" '

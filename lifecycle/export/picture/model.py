@@ -1,8 +1,7 @@
 """The picture of a system, as declared or as it runs: its types, colours and symbols. Pure.
 
-Types are JSON-able through `lifecycle.codec` (schema: schemas/graph.v1.schema.json). Colours are
-those of Okabe and Ito (*Color Universal Design*, 2008), which colour-blind readers can distinguish;
-each also has a symbol, and its label is written beside it.
+The schema of its JSON is schemas/graph.v1.schema.json. Colours are those of Okabe and Ito (*Color
+Universal Design*, 2008), which colour-blind readers can distinguish; each also has a symbol.
 """
 
 from __future__ import annotations

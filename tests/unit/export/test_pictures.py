@@ -26,7 +26,7 @@ from lifecycle.export.picture import (
     picture_to_svg,
     picture_to_text,
 )
-from lifecycle.export.picture.build import Supervised, planned_picture
+from lifecycle.export.picture.build import Supervised, build_picture
 from lifecycle.export.picture.model import STATES, Picture, PicturedNodeState, Presence
 from lifecycle.export.picture.text import OUTCOMES
 from lifecycle.manifest.model import Condition
@@ -41,7 +41,7 @@ from tests.unit.verify.perfect import perfect
 ROOT = Path(__file__).parents[3]
 SCHEMA = json.loads((ROOT / "schemas" / "graph.v1.schema.json").read_text(encoding="utf-8"))
 SVG = "{http://www.w3.org/2000/svg}"
-PICTURES = {"plan": planned_picture(article()), "small": small(), "large": large()}
+PICTURES = {"plan": build_picture(article()), "small": small(), "large": large()}
 EACH = pytest.mark.parametrize("picture", PICTURES.values(), ids=PICTURES)
 
 
@@ -103,7 +103,7 @@ def test_a_system_as_declared_has_every_flow_with_its_tuple_medium_dscp_and_uniq
 
 
 def test_a_plan_says_what_is_asked_and_no_word_on_what_runs() -> None:
-    picture = planned_picture(article())
+    picture = build_picture(article())
     assert (picture.title, picture.verdict) == ("system robot, domain 7", None)
     text = picture_to_text(picture)
     assert "/camera ──▶ /viewer  (udpv4 · EF, strongly unique demanded" in text
@@ -116,7 +116,7 @@ def test_a_plan_says_what_is_asked_and_no_word_on_what_runs() -> None:
 
 def test_what_a_node_waits_for_is_beside_it() -> None:
     plan = planned(node("lidar"), node("base", after=(("lidar", Condition.ACTIVE),)))
-    assert [each.notes for each in planned_picture(plan).nodes] == [(), ("after lidar active",)]
+    assert [each.notes for each in build_picture(plan).nodes] == [(), ("after lidar active",)]
 
 
 @pytest.mark.parametrize(
@@ -240,7 +240,7 @@ def test_nothing_of_a_graph_is_taken_for_markup(
 
 @given(st.text(max_size=20), st.text(max_size=20))
 def test_mermaid_quotes_what_it_is_given(system: str, name: str) -> None:
-    picture = planned_picture(article())
+    picture = build_picture(article())
     nodes = (dataclasses.replace(picture.nodes[0], notes=(name,)), *picture.nodes[1:])
     text = picture_to_mermaid(dataclasses.replace(picture, system=system, nodes=nodes))
     outside = re.sub(r'"[^"\n]*"', "", text.split("---\n", maxsplit=2)[2])
@@ -268,7 +268,7 @@ def test_a_picture_survives_json_and_fits_its_schema(picture: Picture) -> None:
 
 @pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
 def test_an_empty_system_has_a_picture(write: Callable[[Picture], str]) -> None:
-    assert "robot" in write(planned_picture(planned()))
+    assert "robot" in write(build_picture(planned()))
 
 
 def test_a_browser_draws_the_page(tmp_path: Path) -> None:
