@@ -30,8 +30,7 @@ from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import Stage, Verdict
 from lifecycle.verify.view import FlowView, View
 
-UNKNOWN = "unknown node"
-"""What the node of endpoints is called whose node is not known."""
+_UNKNOWN = "unknown node"
 
 _PRIMARY_STATES = ("active", "inactive", "unconfigured", "finalized")
 _KINDS = (
@@ -123,7 +122,7 @@ class _Builder:
         where = f" ({address})" if address else ""
         numbers = (n for n, each in self._numbered if name and name in (each.node, each.subject))
         return PicturedNode(
-            name=name or UNKNOWN,
+            name=name or _UNKNOWN,
             presence=presence,
             state=self._state(name, presence, supervised),
             machine=f"machine {planned.machine}{where}" if planned and planned.machine else "",
@@ -198,7 +197,7 @@ class _Builder:
         about = [(n, each) for n, each in self._numbered if each.subject == name]
         about = [(n, each) for n, each in about if each.node in (node, "")]
         return PicturedEnd(
-            node=node or UNKNOWN,
+            node=node or _UNKNOWN,
             presence=presence,
             notes=tuple(notes),
             findings=tuple(n for n, each in about if each.endpoint in (kind, None)),
