@@ -172,7 +172,7 @@ def _systemd_unit(deployment: Deployment, machine: str) -> str:
         ("CapabilityBoundingSet", allowed),
         *([("AmbientCapabilities", allowed)] if allowed else []),
     ]
-    sections = {
+    sections: dict[str, list[tuple[str, object]]] = {
         "Unit": [
             ("Description", _title(deployment, machine)),
             ("Wants", "network-online.target"),
