@@ -237,7 +237,6 @@ class GraphState:
         self._fetch = fetch
         self._callbacks: tuple[Callable[[GraphChange], None], ...] = ()
         self._unread: set[str] = set()
-        self._reads = 0
         self._stop: tuple[Remove, ...] = ()
         self._closed = False
         events.scheduler.post(self._begin)
@@ -307,11 +306,6 @@ class GraphState:
         return tuple(each for name in topics for each in self._links(name, _any, _any))
 
     # -- changes
-
-    @property
-    def reads(self) -> int:
-        """How many configurations were asked for so far."""
-        return self._reads
 
     def on_change(self, callback: Callable[[GraphChange], None]) -> Remove:
         """Have `callback` called in the scheduler with each change, after it is in force."""
@@ -456,7 +450,6 @@ class GraphState:
         if not record.must_read or self._closed:
             return
         token = record.begin()
-        self._reads += 1
         node = record.view.name
 
         def done(configuration: NodeConfiguration | None) -> None:

@@ -10,7 +10,6 @@ Touches the file system; needs no ROS.
 
 from __future__ import annotations
 
-import ipaddress
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -47,6 +46,7 @@ from lifecycle.manifest.yaml.substitutions import Programs, Surroundings, folder
 from lifecycle.manifest.yaml.yaml_parser import quote
 from lifecycle.network.dscp import TransportPriorityMapping
 from lifecycle.network.five_qi import DscpMapping, dscp_mappings, parse_mapping
+from lifecycle.network.nfe import parse_address
 
 _MAX_MAPPING_BYTES = 1_000_000
 
@@ -162,7 +162,7 @@ def _machines(root: Cursor, nodes: tuple[Node, ...], found: Findings) -> tuple[M
     machines = []
     for name, cursor in root.entries("machines"):
         address = cursor.text("address")
-        if address and not _is_address(address):
+        if address and parse_address(address) is None:
             at = root.document.at((*cursor.place, "address"))
             message = f"cannot use {quote(address)} as an address; it must be IPv4 or IPv6"
             hint = "look the name up: a plan must not depend on a name server"
@@ -173,14 +173,6 @@ def _machines(root: Cursor, nodes: tuple[Node, ...], found: Findings) -> tuple[M
         if here is not None:
             machines.append(Machine(name=THIS_HOST, at=here.at))
     return tuple(machines)
-
-
-def _is_address(text: str) -> bool:
-    try:
-        ipaddress.ip_address(text)
-    except ValueError:
-        return False
-    return True
 
 
 def _policy(root: Cursor) -> Policy:

@@ -53,7 +53,6 @@ class FiveQi:
     packet_error_rate: float
     max_data_burst_bytes: int | None
     averaging_window_ms: int | None
-    example_services: str
     first_release: int
     in_release_16: bool
     flagged: tuple[str, ...]
@@ -92,18 +91,13 @@ class Proposal:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class _FiveQiTable:
-    sources: dict[str, str]
     values: tuple[FiveQi, ...]
 
 
 @functools.cache
-def _table() -> _FiveQiTable:
-    return read_table("five_qi", _FiveQiTable)
-
-
 def five_qis() -> tuple[FiveQi, ...]:
     """Return the standardized 5QIs by rising value."""
-    return _table().values
+    return read_table("five_qi", _FiveQiTable).values
 
 
 def five_qi_of(value: int) -> FiveQi:
@@ -112,10 +106,10 @@ def five_qi_of(value: int) -> FiveQi:
     Raises:
         ValueError: not a standardized value.
     """
-    for each in _table().values:
+    for each in five_qis():
         if each.value == value:
             return each
-    known = ", ".join(str(each.value) for each in _table().values)
+    known = ", ".join(str(each.value) for each in five_qis())
     raise ValueError(f"cannot use 5QI {value}; standardized are {known}")
 
 

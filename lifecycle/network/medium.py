@@ -260,7 +260,7 @@ class FlowTransport(enum.Enum):
         return medium in also.get(self, ())
 
 
-ETHERNET_MTU = 1500
+_MTU = 1500
 """Bytes of IP packet that Ethernet carries, and that a path has unless one knows better."""
 
 SAFE_DATAGRAM_BYTES = 1400
@@ -274,14 +274,9 @@ RTPS_OVERHEAD_BYTES = 20 + 16 + 12 + 24 + 32
 (DDSI-RTPS 9.4)."""
 
 
-def max_unfragmented(*, ipv6: bool = False, mtu: int = ETHERNET_MTU) -> int:
-    """Return the largest UDP payload, bytes, that IP does not split: 1472 on Ethernet, IPv6 1452.
-
-    Args:
-        ipv6: an IPv6 header is 20 bytes longer.
-        mtu: of the path, >= 576.
-    """
-    return mtu - _IP_HEADER[ipv6] - _UDP_HEADER
+def max_unfragmented(*, ipv6: bool) -> int:
+    """Return the largest UDP payload, bytes, that Ethernet carries unsplit: 1472, IPv6 1452."""
+    return _MTU - _IP_HEADER[ipv6] - _UDP_HEADER
 
 
 def datagram_bytes(message_bytes: int) -> int:

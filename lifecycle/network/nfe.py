@@ -147,14 +147,6 @@ class UniqueRequirement(enum.Enum):
         return list(UniqueRequirement).index(self)
 
 
-class FlowUniqueness(enum.Enum):
-    """How unique a network flow is: by neither, one or both of its NFEs."""
-
-    NOT = "not"
-    WEAKLY = "weakly"
-    STRONGLY = "strongly"
-
-
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class NetworkFlowEndpoint:
     """The part of a network flow that belongs to one publisher or subscription.
@@ -258,28 +250,6 @@ def dissimilar(a: Nfe, b: Nfe) -> bool:
         other.internet_address,
         same_machine=machines[0] == machines[1] if all(machines) else None,
     )
-
-
-def meets(
-    demanded: FlowUniqueness, *, publisher: bool | None, subscription: bool | None
-) -> bool | None:
-    """Return whether a flow is at least as unique as demanded; None when that is unknown.
-
-    One end that is unique is enough for WEAKLY, whatever is not known of the other; one that is
-    not is enough to fail STRONGLY.
-
-    Args:
-        demanded: what is asked; NOT is always met.
-        publisher: whether the publisher's NFEs are unique.
-        subscription: the same of the subscription.
-    """
-    ends = (publisher, subscription)
-    if demanded is FlowUniqueness.NOT:
-        return True
-    decisive = demanded is FlowUniqueness.WEAKLY
-    if decisive in ends:
-        return decisive
-    return None if None in ends else not decisive
 
 
 def _plain(nfe: Nfe) -> NetworkFlowEndpoint:

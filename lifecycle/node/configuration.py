@@ -50,14 +50,13 @@ from lifecycle.plan.model import PlannedEndpoint, PlannedNode
 from lifecycle.plan.negotiation.data_layer import PARADIGMS, SERIALIZATIONS
 from lifecycle.verify.observation import EndpointReport, HealthReport, Identity, NodeConfiguration
 from lifecycle.verify.outcome import ConnectionReport
+from lifecycle.verify.tool_filter import PREFIX_DIGITS
 
 if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup
 
     from lifecycle.node.lifecycle.gate import Later
 
-
-__all__ = ["PARADIGMS", "SERIALIZATIONS", "transports"]
 
 _CONFIGURABLE_RMW = "rmw_fastrtps_cpp"
 _SHARED_MEMORY = "/dev/shm"  # noqa: S108 - what Fast DDS uses
@@ -112,10 +111,6 @@ def checksum(configuration: NodeConfiguration) -> str:
         ),
     )
     return hashlib.sha256(codec.to_json(stable)).hexdigest()[:_DIGITS]
-
-
-_GID_PREFIX_DIGITS = 24
-"""A DDS GUID is a 12-byte participant prefix and a 4-byte entity id (DDSI-RTPS §9.3.1)."""
 
 
 def endpoint_reports(
@@ -379,7 +374,7 @@ def _read_gid_prefix(node: Node) -> str:
         topic = node.resolve_topic_name(name)
         info = _own_endpoint(node, topic, EndpointKind.PUBLISHER)
         if info is not None:
-            return info.gid[:_GID_PREFIX_DIGITS]
+            return info.gid[:PREFIX_DIGITS]
     return ""
 
 
@@ -397,7 +392,7 @@ def _prefix_of(connection: Connection) -> str:
     for kind, (side, topic) in _SHOWN_BY.items():
         for each, _ in endpoints_of_node(node, kind, name) or ():
             infos = endpoints_of(node, side, topic.format(each), no_mangle=not kind.is_topic)
-            found.update(info.gid[:_GID_PREFIX_DIGITS] for info in infos if info.node == name)
+            found.update(info.gid[:PREFIX_DIGITS] for info in infos if info.node == name)
     return found.pop() if len(found) == 1 else ""
 
 

@@ -399,7 +399,10 @@ class Plan(SystemDeclaration):
         Raises:
             KeyError: no such key.
         """
-        return _by_key(self.nodes)[key]
+        for node in self.nodes:
+            if node.key == key:
+                return node
+        raise KeyError(key)
 
 
 def uses_sim_time(node: PlannedNode) -> bool:
@@ -440,22 +443,6 @@ def _with_parameters(node: PlannedNode, given: tuple[ExpectedParameter, ...]) ->
             *((each.name, each.value) for each in given if each.value is not None),
         ),
     )
-
-
-_INDEXES: dict[int, tuple[tuple[PlannedNode, ...], dict[str, PlannedNode]]] = {}
-_MOST_INDEXES = 4
-"""Plans that a program looks nodes up in at a time: what runs, and what replaces it."""
-
-
-def _by_key(nodes: tuple[PlannedNode, ...]) -> dict[str, PlannedNode]:
-    """Return nodes by key, the first of each; remembered by the identity of the frozen tuple."""
-    known = _INDEXES.get(id(nodes))
-    if known is None or known[0] is not nodes:
-        if len(_INDEXES) >= _MOST_INDEXES:
-            _INDEXES.clear()
-        known = (nodes, {node.key: node for node in reversed(nodes)})
-        _INDEXES[id(nodes)] = known
-    return known[1]
 
 
 class PlanError(LifecycleError):

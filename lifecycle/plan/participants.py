@@ -105,10 +105,13 @@ def command_line(nodes: Sequence[Node], environment: Mapping[str, str]) -> tuple
 
 
 def _ros_arguments(node: Node, *, alone: bool) -> Iterator[str]:
-    """Yield what one node asks for. Files precede values, because rcl lets the later one win."""
+    """Yield what one node asks for. Files precede values, because rcl lets the later one win.
+
+    Name and namespace are given where the manifest writes them.
+    """
     old = "" if alone else f"{node.key.rpartition('/')[2]}:"
     own = "" if alone else f"{node.name}:"
-    if is_given_name(node):
+    if node.where("name") is not node.at:
         yield from ("-r", f"{old}__node:={node.name}")
     if node.namespace != "/" or node.where("namespace") is not node.at:
         yield from ("-r", f"{own}__ns:={node.namespace}")
@@ -126,11 +129,6 @@ def _ros_arguments(node: Node, *, alone: bool) -> Iterator[str]:
 
 
 _NODE_PREFIX = re.compile(r"\w+:(?!//)", re.ASCII)
-
-
-def is_given_name(node: Node) -> bool:
-    """Whether the manifest writes the name of a node, so that its process is given it."""
-    return node.where("name") is not node.at
 
 
 def find_executable(run: Run, environment: Mapping[str, str], *, at: Position) -> str:

@@ -265,6 +265,7 @@ def _duration(duration_ns: int) -> str:
 
 def _flows(plan: Plan, width: int) -> list[str]:
     rows = []
+    names = {node.key: node.full_name for node in plan.nodes}
     for flow in plan.flows:
         needs = []
         if flow.unique is not UniqueHow.NOT:
@@ -273,7 +274,7 @@ def _flows(plan: Plan, width: int) -> list[str]:
             needs.append(f"at most {flow.max_delay_ms:g} ms")
         if flow.linked and not needs:
             needs.append("linked")
-        ends = f"{plan.node(flow.publisher).full_name} → {plan.node(flow.subscription).full_name}"
+        ends = f"{names[flow.publisher]} → {names[flow.subscription]}"
         by = f"{flow.medium} ({flow.medium_reason})" if flow.medium else flow.medium_reason
         told = filter(None, (by, ", ".join(needs)))
         rows.append((flow.topic, ends, "; ".join(told)))

@@ -24,14 +24,11 @@ _PASSWORD_IN_URL = re.compile(r"(?<=://)([^/?#@\s:]*):[^/@\s]+(?=@)")
 """RFC 3986 section 3.2.1, `user:password@`."""
 
 
-def is_secret(variable: str) -> bool:
-    """Return whether the name of an environment variable says that its value is secret."""
-    return _SECRET.search(variable) is not None
-
-
 def shown(variable: str, value: str) -> str:
     """Return the value of an environment variable as it may be shown."""
-    return REDACTED if is_secret(variable) else _PASSWORD_IN_URL.sub(rf"\1:{REDACTED}", value)
+    if _SECRET.search(variable):
+        return REDACTED
+    return _PASSWORD_IN_URL.sub(rf"\1:{REDACTED}", value)
 
 
 def without_secrets(plan: Plan) -> Plan:

@@ -20,6 +20,7 @@ from lifecycle.verify.observation import (
     ObservedNode,
 )
 from lifecycle.verify.tool_filter import (
+    PREFIX_DIGITS,
     DeclaredNames,
     action_part,
     fold_actions,
@@ -50,9 +51,6 @@ _TURNS = ((True, True), (True, False), (False, False))
 """Who chooses first among a node's endpoints: those whose type discovery shows as declared, those
 whose node reports it so, the rest. So one wrong type does not take another one's place. Each says
 whether the report, and what discovery shows, must have the declared type."""
-
-_PREFIX_DIGITS = 24
-"""A GUID begins with its participant's prefix of 12 bytes (DDSI-RTPS §9.3.1)."""
 
 
 def lay_out(
@@ -188,14 +186,14 @@ def _unknown(
     }
     by_participant: dict[str, dict[str, None]] = {}
     for gid, name in by_gid.items():
-        by_participant.setdefault(gid[:_PREFIX_DIGITS], {})[name] = None
+        by_participant.setdefault(gid[:PREFIX_DIGITS], {})[name] = None
     for endpoint in endpoints:
         node = by_gid.get(endpoint.gid, "")
         if not node and not endpoint.kind.is_topic:
             node = next(
                 (
                     each
-                    for each in by_participant.get(endpoint.gid[:_PREFIX_DIGITS], ())
+                    for each in by_participant.get(endpoint.gid[:PREFIX_DIGITS], ())
                     if (each, *(action_part(endpoint.kind, endpoint.name) or _place(endpoint)))
                     in names.ends
                 ),

@@ -132,7 +132,7 @@ NODE_TOPICS: Mapping[str, str] = {
 }
 """Topics that a node publishes under its own name, and their types."""
 
-_PREFIX_DIGITS = 24
+PREFIX_DIGITS = 24
 """A GUID begins with its participant's prefix of 12 bytes (DDSI-RTPS §9.3.1)."""
 
 _ACTION_PART = "/_action/"
@@ -158,7 +158,6 @@ _ACTION_SIDES = (
     (EndpointKind.ACTION_SERVER, _ACTION_SERVER_PARTS),
     (EndpointKind.ACTION_CLIENT, _ACTION_CLIENT_PARTS),
 )
-_SEND_GOAL_TYPE_SUFFIX = "_SendGoal"
 
 
 def tolerating_pattern(full_name: str, patterns: Collection[str] = TOLERATED_NODES) -> str:
@@ -445,7 +444,7 @@ _Claim = tuple[str, str]
 
 
 def _claim(endpoint: ObservedEndpoint) -> _Claim:
-    return endpoint.node, endpoint.gid[:_PREFIX_DIGITS]
+    return endpoint.node, endpoint.gid[:PREFIX_DIGITS]
 
 
 def _alive(plan: Plan) -> dict[tuple[str, str], str]:
@@ -703,7 +702,7 @@ class Owner:
 
     def has(self, endpoint: ObservedEndpoint) -> bool:
         """Return whether an endpoint of the hidden node is the owner's, as far as its GID says."""
-        return not endpoint.gid or endpoint.gid[:_PREFIX_DIGITS] in self.prefixes
+        return not endpoint.gid or endpoint.gid[:PREFIX_DIGITS] in self.prefixes
 
 
 def owners(nodes: Collection[str], reported: Iterable[NodeConfiguration]) -> dict[str, Owner]:
@@ -724,7 +723,7 @@ def owners(nodes: Collection[str], reported: Iterable[NodeConfiguration]) -> dic
         if each.name not in nodes or not hidden:
             continue
         prefixes = {one.prefix for one in each.connections}
-        prefixes |= {one.gid[:_PREFIX_DIGITS] for one in each.endpoints}
+        prefixes |= {one.gid[:PREFIX_DIGITS] for one in each.endpoints}
         owner = Owner(each.name, frozenset(prefixes - {""}))
         found |= {_beside(each.name, name): owner for name in hidden}
     return found

@@ -11,10 +11,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 from lifecycle import dataclasses
-from lifecycle.manifest.model import EndpointKind
+from lifecycle.manifest.model import EndpointKind, UniqueHow
 from lifecycle.network.nfe import (
     InternetProtocol,
     LocatedNfe,
@@ -28,6 +28,9 @@ from lifecycle.network.nfe import (
     located,
 )
 from lifecycle.verify.observation import EndpointReport, NodeConfiguration
+
+if TYPE_CHECKING:
+    from lifecycle.verify.view import Actual
 
 _SIDES = (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION)
 _SEVERAL = -1
@@ -64,14 +67,6 @@ def _entry(configuration: NodeConfiguration, report: EndpointReport, address: st
         nfes=nfes,
         judged=None if nfes is None else _that_count(nfes, address),
     )
-
-
-class ReportedEnd(Protocol):
-    """An endpoint with what its node reports of it."""
-
-    @property
-    def report(self) -> EndpointReport | None:
-        """The report; None if there is none."""
 
 
 class Uniqueness:
@@ -115,13 +110,13 @@ class Uniqueness:
                 if owners.setdefault(each, id(entry)) != id(entry):
                     owners[each] = _SEVERAL
 
-    def nfes(self, ends: Sequence[ReportedEnd]) -> tuple[NetworkFlowEndpoint, ...]:
+    def nfes(self, ends: Sequence[Actual]) -> tuple[NetworkFlowEndpoint, ...]:
         """Return the NFEs of endpoints, each once, with the DSCP that was read back."""
         entries = (self._entries.get(id(end.report)) for end in ends)
         found = (each.nfe for entry in entries if entry for each in entry.nfes or ())
         return tuple(dict.fromkeys(found))
 
-    def is_unique(self, end: ReportedEnd) -> bool | None:
+    def is_unique(self, end: Actual) -> bool | None:
         """Return whether an endpoint is unique; None when its NFEs are not known."""
         entry = self._entries.get(id(end.report))
         if entry is None:
@@ -145,12 +140,32 @@ class Uniqueness:
             return False  # the network sees nothing of it
         return None if (kind, entry.process) in self._unknown else True
 
-    def all_unique(self, ends: Sequence[ReportedEnd]) -> bool | None:
+    def all_unique(self, ends: Sequence[Actual]) -> bool | None:
         """Return whether each of several endpoints is unique; False if one is certainly not."""
         answers = [self.is_unique(end) for end in ends]
         if False in answers:
             return False
         return None if None in answers or not answers else True
+
+
+def meets(demanded: UniqueHow, *, publisher: bool | None, subscription: bool | None) -> bool | None:
+    """Return whether a flow is at least as unique as demanded; None when that is unknown.
+
+    One end that is unique is enough for WEAKLY, whatever is not known of the other; one that is
+    not is enough to fail STRONGLY.
+
+    Args:
+        demanded: what is asked; NOT is always met.
+        publisher: whether the publisher's NFEs are unique.
+        subscription: the same of the subscription.
+    """
+    ends = (publisher, subscription)
+    if demanded is UniqueHow.NOT:
+        return True
+    decisive = demanded is UniqueHow.WEAKLY
+    if decisive in ends:
+        return decisive
+    return None if None in ends else not decisive
 
 
 def _that_count(nfes: tuple[LocatedNfe, ...], address: str) -> tuple[LocatedNfe, ...]:

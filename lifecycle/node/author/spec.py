@@ -18,7 +18,7 @@ import os
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from lifecycle import dataclasses
 from lifecycle.errors import BringUpError, LifecycleError, nearest
@@ -28,6 +28,8 @@ from lifecycle.plan.model import PlannedNode
 
 if TYPE_CHECKING:
     from rclpy.context import Context
+
+    from lifecycle.node.host.foreign import Adoption
 
 
 class Mode(enum.Enum):
@@ -61,20 +63,13 @@ class Construction:
     constructed: Callable[[], None] = lambda: None
 
 
-class Constructions(Protocol):
-    """What a host says to each of several nodes, see host/foreign.py."""
-
-    def take(self, name: str, namespace: str | None) -> Construction | None:
-        """Return what is said to a node that its code calls so; None for nothing."""
-
-
-_CURRENT: contextvars.ContextVar[Construction | Constructions | None] = contextvars.ContextVar(
+_CURRENT: contextvars.ContextVar[Construction | Adoption | None] = contextvars.ContextVar(
     "lifecycle_construction", default=None
 )
 
 
 @contextlib.contextmanager
-def constructing(construction: Construction | Constructions) -> Iterator[None]:
+def constructing(construction: Construction | Adoption) -> Iterator[None]:
     """Make the next LifecycleNode that is constructed inside the block this one, or these."""
     token = _CURRENT.set(construction)
     try:

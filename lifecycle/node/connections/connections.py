@@ -111,10 +111,8 @@ class Connections:
                 return connection
         elif not name:
             return self.own
-        else:
-            for each in self.named:
-                if each.name == name:
-                    return each
+        elif (found := self.named_so(name)) is not None:
+            return found
         names = [each.name for each in self.named]
         near = nearest(name, names)
         listed = ", ".join(repr(each) for each in names) or "none but its own participant, ''"

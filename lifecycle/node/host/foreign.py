@@ -51,7 +51,7 @@ from lifecycle.node.author.node import LifecycleNode
 from lifecycle.node.author.spec import Construction, Mode, constructing, ros_arguments
 from lifecycle.node.configuration import ConfigurationChanges
 from lifecycle.node.connections.connections import Connection, Connections
-from lifecycle.node.connections.data_layer import serve_interface
+from lifecycle.node.connections.data_layer import NodeDataLayer, serve_interface
 from lifecycle.node.endpoints.mapping import MatchWatch
 from lifecycle.node.lifecycle.execution import SUCCESS, Result
 from lifecycle.node.lifecycle.gate import GatedPublisher, NodeGate
@@ -170,30 +170,6 @@ class HeldPublisher(GatedPublisher):
             )
 
 
-class Immovable:
-    """The node interface of a node that has none.
-
-    Args:
-        node: fully qualified name.
-    """
-
-    def __init__(self, node: str) -> None:
-        self._node = node
-
-    def map_to(self, endpoint: str, connection: str) -> NoReturn:
-        """Raise: its own code makes its endpoints.
-
-        Raises:
-            LifecycleError: always.
-        """
-        del endpoint, connection
-        raise LifecycleError(
-            f"cannot move the endpoints of {self._node}: its class is not a "
-            "lifecycle.LifecycleNode, and makes them itself",
-            hint="subclass lifecycle.LifecycleNode, or write data_layer.authority: nodes",
-        )
-
-
 class ForeignNode:
     """One hosted node of which the class is not ours; it offers the host what `Managed` does.
 
@@ -248,9 +224,8 @@ class ForeignNode:
         before = set(self._node.services)
         self._is_ours = True
         configuration.serve(self._node, self.get_configuration, self._group)
-        immovable: Any = Immovable(self.full_name)
         # With it a node is known to be one of ours.
-        serve_interface(self._node, immovable, self._group, "map_to")
+        serve_interface(self._node, cast("NodeDataLayer", self), self._group, "map_to")
         self._is_ours = False
         services = tuple(each for each in self._node.services if each not in before)
         self._watching.take_services(self._node, services)
@@ -458,12 +433,21 @@ class ForeignNode:
 
     @property
     def interface(self) -> Any:
-        """Raise: it has no node interface.
+        """Raise: it has no node interface; see `map_to`."""
+        self.map_to("", "")
+
+    def map_to(self, endpoint: str, connection: str) -> NoReturn:
+        """Raise: its own code makes its endpoints.
 
         Raises:
             LifecycleError: always.
         """
-        Immovable(self.full_name).map_to("", "")
+        del endpoint, connection
+        raise LifecycleError(
+            f"cannot move the endpoints of {self.full_name}: its class is not a "
+            "lifecycle.LifecycleNode, and makes them itself",
+            hint="subclass lifecycle.LifecycleNode, or write data_layer.authority: nodes",
+        )
 
     async def change_for_supervisor(self, operation: str) -> Result:
         """Do what the supervisor asked for; its activate is the gate's permit.

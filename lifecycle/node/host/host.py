@@ -78,9 +78,6 @@ def preload(types: Iterable[str] = ()) -> None:
             load_type_support(interface)
 
 
-__all__ = ["main", "preload", "serve"]
-
-
 def main(control_socket_fd: int) -> NoReturn:
     """Serve the control socket with this descriptor; never returns."""
     serve(socket.socket(fileno=control_socket_fd))

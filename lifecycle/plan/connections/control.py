@@ -206,7 +206,7 @@ def _urls(
     """Spell each participant's URL."""
     v6 = kind.ip_version == 6
     alone = {
-        key: fixed_url(kind, hosts.address(host, ipv6=v6), ports, ())
+        key: fixed_url(kind, hosts.address(host, ipv6=v6), ports)
         for key, (host, ports) in slots.items()
     }
     if server is not None:

@@ -342,24 +342,16 @@ def peers_by(transport: Medium, contacts: Iterable[Contact], *, host: str) -> tu
     )
 
 
-def fixed_url(
-    transport: Medium,
-    address: str,
-    ports: Sequence[int],
-    peers: Sequence[Peer],
-) -> ConnectionUrl:
-    """Return the URL of a participant that only these peers find.
+def fixed_url(transport: Medium, address: str, ports: Sequence[int]) -> ConnectionUrl:
+    """Return the URL of a participant that only its peers find, as yet without these.
 
     Args:
         transport: UDPV4, UDPV6 or TCPV4.
         address: own.
         ports: metatraffic, user data and source port for UDP; the listening port for TCP.
-        peers: what it looks for.
     """
     if transport.is_tcp:
-        return ConnectionUrl(
-            transport=transport, address=address, port=ports[0], peers=tuple(peers)
-        )
+        return ConnectionUrl(transport=transport, address=address, port=ports[0])
     metatraffic, user, output = ports
     return ConnectionUrl(
         transport=transport,
@@ -367,7 +359,6 @@ def fixed_url(
         port=user,
         metatraffic_port=metatraffic,
         output_port=output,
-        peers=tuple(peers),
         multicast=False,
     )
 

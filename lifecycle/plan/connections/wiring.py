@@ -454,7 +454,7 @@ def place_static(
         if _is_static(each)
     }
     bare = {
-        key: fixed_url(kind, hosts.address(host), taken, ()) for key, (host, taken) in ports.items()
+        key: fixed_url(kind, hosts.address(host), taken) for key, (host, taken) in ports.items()
     }
     contacts = {key: contacts_of(ports[key][0], (str(url),))[0] for key, url in bare.items()}
     table = tuple(_table(placed))

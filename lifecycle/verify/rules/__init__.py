@@ -42,10 +42,9 @@ _FAMILIES: tuple[tuple[tuple[Rule, ...], Callable[[View], Iterator[Finding]]], .
     (flows.RULES, flows.check),
     (flows.TRANSPORT_RULES, flows.check_transport),
     (flows.DSCP_RULES, flows.check_dscp),
-    (run.RULES, run.check),
 )
 
-RULES: tuple[Rule, ...] = tuple(rule for rules, _ in _FAMILIES for rule in rules)
+RULES: tuple[Rule, ...] = (*(rule for rules, _ in _FAMILIES for rule in rules), *run.RULES)
 """Every rule, in the order in which findings are reported."""
 
 CHECKS: tuple[Callable[[View], Iterator[Finding]], ...] = tuple(check for _, check in _FAMILIES)

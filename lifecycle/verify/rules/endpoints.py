@@ -114,7 +114,7 @@ def _declared(actual: Actual, *, absent: bool) -> Iterator[Finding]:
             message=f"cannot make the {word} {planned.name!r} of {node.full_name}:"
             f" {actual.report.error}",
         )
-    elif actual.observed is None and not absent and not _is_hidden(actual):
+    elif actual.observed is None and not absent and not (actual.unseen and actual.report is None):
         yield MISSING_ENDPOINT.on_endpoint(
             Outcome.VIOLATED,
             actual,
@@ -144,11 +144,6 @@ def _remapped(actual: Actual) -> str:
         f"{report.kind.value}/{report.name} is {report.resolved} now: is a remap wrong, or was "
         f"{actual.node.full_name}/remap called? the name '' gives back the declared one"
     )
-
-
-def _is_hidden(actual: Actual) -> bool:
-    """Return whether neither discovery nor a report could have shown the endpoint."""
-    return actual.unseen and actual.report is None
 
 
 def _unseen(

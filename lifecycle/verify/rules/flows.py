@@ -20,11 +20,9 @@ from lifecycle.manifest.model import EndpointKind, FlowTransport, Quantity, Uniq
 from lifecycle.network.dscp import describe
 from lifecycle.network.medium import NETWORK_MEDIA, Medium
 from lifecycle.network.nfe import (
-    FlowUniqueness,
     NetworkFlowEndpoint,
     TransportProtocol,
     UniqueRequirement,
-    meets,
 )
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import Heals, Rule
@@ -34,7 +32,7 @@ from lifecycle.verify.transport import (
     UNKNOWN,
     effective_transport,
 )
-from lifecycle.verify.uniqueness import Uniqueness
+from lifecycle.verify.uniqueness import Uniqueness, meets
 from lifecycle.verify.verdict import Finding
 from lifecycle.verify.view import Actual, FlowView, View, connection_of
 
@@ -169,7 +167,7 @@ def _strict(actual: Actual, uniqueness: Uniqueness) -> Iterator[Finding]:
             f" cannot be proven: {_why_unproven(actual)}",
         )
     elif unique is False:
-        shared = _spell_all(uniqueness.nfes((actual,)))
+        shared = ", ".join(dict.fromkeys(map(_spell, uniqueness.nfes((actual,)))))
         yield NOT_UNIQUE.on_endpoint(
             Outcome.VIOLATED,
             actual,
@@ -188,9 +186,7 @@ def _demanded(flow: FlowView, uniqueness: Uniqueness) -> Iterator[Finding]:
     how = flow.planned.unique.value
     publisher = uniqueness.all_unique(flow.publishers)
     subscription = uniqueness.all_unique(flow.subscriptions)
-    met = meets(
-        FlowUniqueness(flow.planned.unique.value), publisher=publisher, subscription=subscription
-    )
+    met = meets(flow.planned.unique, publisher=publisher, subscription=subscription)
     if met:
         return
     observed = f"publisher {_answer(publisher)}, subscription {_answer(subscription)}"
@@ -221,12 +217,8 @@ def _answer(unique: bool | None) -> str:
     return {True: "unique", False: "not unique", None: "unknown"}[unique]
 
 
-def _spell_all(nfes: tuple[NetworkFlowEndpoint, ...]) -> str:
-    """Spell NFEs for people: `udp 10.0.0.1:7412, shm`."""
-    return ", ".join(dict.fromkeys(_spell(each) for each in nfes))
-
-
 def _spell(nfe: NetworkFlowEndpoint) -> str:
+    """Spell an NFE for people: `udp 10.0.0.1:7412`, `shm`."""
     if nfe.transport_protocol is TransportProtocol.UNKNOWN:
         return nfe.medium
     address = nfe.internet_address

@@ -20,7 +20,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from lifecycle.manifest.model import EndpointKind, EndpointPolicy
 from lifecycle.manifest.names import DIAGNOSTICS_TOPIC
-from lifecycle.manifest.qos import Certainty, QosProfile, incompatibilities
+from lifecycle.manifest.qos import Certainty, incompatibilities
 from lifecycle.verify.observation import ObservedEndpoint
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
@@ -92,7 +92,8 @@ def obstacle(publisher: SeenEndpoint, subscription: SeenEndpoint) -> str:
     """Return why two ends cannot match at all (DDS 1.4 §2.2.2.5, §2.2.3); empty if they can."""
     if publisher.type != subscription.type:
         return f"the types differ, {publisher.type} and {subscription.type}"
-    if not _compatible(publisher.qos or UNKNOWN_QOS, subscription.qos or UNKNOWN_QOS):
+    offered, requested = publisher.qos or UNKNOWN_QOS, subscription.qos or UNKNOWN_QOS
+    if any(each.severity is Certainty.CERTAIN for each in incompatibilities(offered, requested)):
         return "the QoS is incompatible"
     return ""
 
@@ -299,13 +300,6 @@ def _possible(end: SeenEndpoint, others: Sequence[SeenEndpoint]) -> list[SeenEnd
         for other in others
         if not (obstacle(end, other) if publishes else obstacle(other, end))
     ]
-
-
-def _compatible(offered: QosProfile, requested: QosProfile) -> bool:
-    """Return whether nothing certain prevents a match."""
-    return all(
-        each.severity is not Certainty.CERTAIN for each in incompatibilities(offered, requested)
-    )
 
 
 def _end(actual: Actual) -> SeenEndpoint:

@@ -1,17 +1,13 @@
 """Rules about the run itself: what a supervisor finds while it brings a system up and holds it.
 
-Nothing here can be seen in an observation, so `check` finds nothing: the supervisor makes these
-findings and puts them into the run's last verdict, so that it names what went wrong. Pure.
+Nothing here can be seen in an observation: the supervisor makes these findings and puts them into
+the run's last verdict, so that it names what went wrong. Pure.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
-from lifecycle.verify.verdict import Finding
-from lifecycle.verify.view import View
 
 PROCESS_DIED = Rule(
     id="run.process-died",
@@ -101,12 +97,6 @@ RULES = (
     PLANS_DIFFER,
     PLAN_UNKNOWN,
 )
-
-
-def check(view: View) -> Iterator[Finding]:
-    """Find nothing: see above."""
-    del view
-    yield from ()
 
 
 def node_of(subject: str) -> str:

@@ -301,6 +301,7 @@ class System:
         self.scheduler = ManualScheduler()
         self.network = Network(self.scheduler, seed)
         self.nodes: dict[str, SimulatedNode] = {}
+        self.reads = 0
         self._random = random.Random(seed)
         self._instances = 0
 
@@ -325,6 +326,7 @@ class System:
 
         def fetch(name: str, done: object) -> None:
             assert callable(done)
+            self.reads += 1
             now_s = self.scheduler.now_s()
 
             def answer() -> None:

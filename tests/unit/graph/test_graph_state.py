@@ -61,9 +61,9 @@ def followed() -> Followed:
 
 
 def test_a_node_that_joins_is_read_once_and_heartbeats_read_nothing(followed: Followed) -> None:
-    assert followed.state.reads == 1
+    assert followed.system.reads == 1
     followed.system.scheduler.advance(60.0)
-    assert (followed.state.reads, followed.changes) == (1, [])
+    assert (followed.system.reads, followed.changes) == (1, [])
 
 
 def test_joining_and_being_read_are_two_changes() -> None:
@@ -89,15 +89,15 @@ def test_one_change_reads_one_node_however_many_there_are(followed: Followed) ->
     for number in range(50):
         followed.system.start(f"/n{number}", endpoints=2)
     followed.settle()
-    reads = followed.state.reads
+    reads = followed.system.reads
     followed.system.nodes["/n7"].remove_endpoint()
     followed.settle()
-    assert followed.state.reads == reads + 1
+    assert followed.system.reads == reads + 1
 
 
 def test_states_matches_and_connections_are_learnt_without_reading(followed: Followed) -> None:
     reporter = followed.system.nodes["/a"].reporter
-    reads = followed.state.reads
+    reads = followed.system.reads
     reporter.state_changed("active", connected=True)
     assert followed.change().state_changed
     reporter.connection_established("net", ("shm://",))
@@ -117,7 +117,7 @@ def test_states_matches_and_connections_are_learnt_without_reading(followed: Fol
     reporter.mapping_lost("publishers/e0", "net", error="unplugged")
     (mapped,) = followed.change().endpoints.changed
     assert (mapped.connection, mapped.mapped, mapped.error) == ("", False, "unplugged")
-    assert followed.state.reads == reads
+    assert followed.system.reads == reads
 
 
 def test_an_endpoint_that_is_handed_over_stays_where_it_is_when_the_old_connection_loses_it(

@@ -9,7 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lifecycle.network.nfe import (
-    FlowUniqueness,
     InternetProtocol,
     LocatedNfe,
     NetworkFlowEndpoint,
@@ -18,7 +17,6 @@ from lifecycle.network.nfe import (
     dissimilar,
     is_ip,
     located,
-    meets,
 )
 
 SHARED_MEMORY = NetworkFlowEndpoint(
@@ -107,26 +105,6 @@ def test_what_was_read_back_from_the_sockets_replaces_the_dscp_that_the_rmw_repo
     assert found is not None
     assert found[0] == LocatedNfe(machine_id="robot", nfe=udp("0.0.0.0", 45000, dscp=46))
     assert located(None, "robot", dscp=46) is None
-
-
-@pytest.mark.parametrize(
-    ("publisher", "subscription", "weakly", "strongly"),
-    [
-        (True, True, True, True),
-        (True, False, True, False),
-        (False, False, False, False),
-        (True, None, True, None),
-        (False, None, None, False),
-        (None, None, None, None),
-    ],
-)
-def test_a_demand_is_met_not_met_or_cannot_be_told(
-    *, publisher: bool | None, subscription: bool | None, weakly: bool | None, strongly: bool | None
-) -> None:
-    for a, b in ((publisher, subscription), (subscription, publisher)):
-        assert meets(FlowUniqueness.NOT, publisher=a, subscription=b) is True
-        assert meets(FlowUniqueness.WEAKLY, publisher=a, subscription=b) is weakly
-        assert meets(FlowUniqueness.STRONGLY, publisher=a, subscription=b) is strongly
 
 
 def test_the_requirement_has_the_articles_four_values_in_its_order() -> None:

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lifecycle.manifest.model import EndpointKind
+from lifecycle.manifest.model import EndpointKind, UniqueHow
 from lifecycle.network.nfe import (
     InternetProtocol,
     NetworkFlowEndpoint,
@@ -20,7 +20,7 @@ from lifecycle.network.nfe import (
 from lifecycle.plan.model import Plan
 from lifecycle.verify.matcher import lay_out
 from lifecycle.verify.observation import Identity
-from lifecycle.verify.uniqueness import Uniqueness
+from lifecycle.verify.uniqueness import Uniqueness, meets
 from lifecycle.verify.verdict import Stage
 from lifecycle.verify.view import Actual
 from tests.builders import (
@@ -347,3 +347,23 @@ def test_answers_are_those_of_comparing_every_endpoint_with_every_other(ends):
         ]
         end = dataclasses.replace(END, report=reports[index])
         assert uniqueness.is_unique(end) is by_comparing(located(nfes, process[0]), others)
+
+
+@pytest.mark.parametrize(
+    ("publisher", "subscription", "weakly", "strongly"),
+    [
+        (True, True, True, True),
+        (True, False, True, False),
+        (False, False, False, False),
+        (True, None, True, None),
+        (False, None, None, False),
+        (None, None, None, None),
+    ],
+)
+def test_a_demand_is_met_not_met_or_cannot_be_told(
+    *, publisher: bool | None, subscription: bool | None, weakly: bool | None, strongly: bool | None
+) -> None:
+    for a, b in ((publisher, subscription), (subscription, publisher)):
+        assert meets(UniqueHow.NOT, publisher=a, subscription=b) is True
+        assert meets(UniqueHow.WEAKLY, publisher=a, subscription=b) is weakly
+        assert meets(UniqueHow.STRONGLY, publisher=a, subscription=b) is strongly
