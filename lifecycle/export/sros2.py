@@ -19,24 +19,20 @@ from lifecycle.manifest.model import EndpointKind, RunKind
 from lifecycle.manifest.names import (
     ALIVE_PULSE,
     DIAGNOSTICS_TOPIC,
+    MANAGED_SERVICES,
+    NODE_SERVICES,
+    OUR_SERVICES,
     free_name,
     supervisor_alive_topic,
 )
 from lifecycle.plan.model import Plan, PlannedNode, PlannedProcess
-from lifecycle.verify.tool_filter import (
-    GRAPH_TOPIC,
-    NODE_SERVICES,
-    OUR_SERVICES,
-    supervisor_endpoints,
-)
+from lifecycle.verify.tool_filter import GRAPH_TOPIC, supervisor_endpoints
 
 OVERRIDE = "ROS_SECURITY_ENCLAVE_OVERRIDE"
 """The variable by which rcl takes an enclave for every context of a process."""
 
 PLANS_TOPIC = "/_lifecycle/plans"
 """Where supervisors announce their plans (lifecycle.middleware.discovery.liveliness)."""
-
-_MANAGED = frozenset(name for name, type_ in NODE_SERVICES.items() if "lifecycle_msgs" in type_)
 
 _GRANTS = {
     EndpointKind.PUBLISHER: ("topic", "publish"),
@@ -131,7 +127,7 @@ def _node_profile(node: PlannedNode) -> Profile:
     services = {
         name
         for name in (*NODE_SERVICES, *OUR_SERVICES)
-        if node.managed or name not in {*_MANAGED, *OUR_SERVICES}
+        if node.managed or name not in {*MANAGED_SERVICES, *OUR_SERVICES}
     }
     services |= {name for name in OUR_SERVICES if node.holds}
     allowed = {(each.kind, each.resolved) for each in node.endpoints}
@@ -164,7 +160,7 @@ def _supervisor_profile(plan: Plan, machine: str) -> Profile:
     for node in plan.nodes:
         names = {*NODE_SERVICES, *(OUR_SERVICES if node.holds else ())}
         if not node.managed:
-            names -= _MANAGED
+            names -= MANAGED_SERVICES
         allowed |= {(EndpointKind.SERVICE_CLIENT, f"{node.full_name}/{name}") for name in names}
         if node.managed:
             allowed |= {(EndpointKind.SUBSCRIPTION, each) for each in _node_topics(node)}

@@ -337,10 +337,7 @@ class FlowNeeds:
         own = (None, None, self.node_transports(node), False)
         for endpoint in node.interface.endpoints:
             each = self.of(node.key, endpoint.kind, endpoint.name)
-            if each is None or endpoint.kind not in (
-                EndpointKind.PUBLISHER,
-                EndpointKind.SUBSCRIPTION,
-            ):
+            if each is None or not endpoint.kind.is_topic:
                 continue
             if endpoint.kind is EndpointKind.SUBSCRIPTION:
                 if each.dscp is not None:

@@ -41,6 +41,16 @@ class EndpointKind(enum.Enum):
         """Whether it is an end of a topic: a publisher or a subscription."""
         return self in (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION)
 
+    @property
+    def is_action(self) -> bool:
+        """Whether it is a server or a client of an action."""
+        return self in (EndpointKind.ACTION_SERVER, EndpointKind.ACTION_CLIENT)
+
+    @property
+    def meets_in(self) -> str:
+        """What it is an end of, "topic", "service" or "action": these do not see each other."""
+        return "topic" if self.is_topic else "action" if self.is_action else "service"
+
     def spell(self, name: str) -> str:
         """Return how requests and messages call an endpoint of a node, `publishers/video`."""
         return f"{self.value}/{name}"

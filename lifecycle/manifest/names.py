@@ -5,7 +5,7 @@ rcl_validate_topic_name, rcl_expand_topic_name and the order in which rcl applie
 of a remap rule of `ros2 run … --ros-args -r RULE`, as rcl's argument parser has it
 (rcl/arguments.c, rcl/lexer.c): `[node:][rostopic://|rosservice://]from:=to`, `[node:]__node:=name`,
 `[node:]__ns:=/namespace`. plan/ resolves every endpoint through `resolve`. Also the
-names that a supervisor has in ROS. Pure.
+services that every node has, and the names that a supervisor has in ROS. Pure.
 """
 
 from __future__ import annotations
@@ -115,8 +115,6 @@ ACTION_TOPICS = ("feedback", "status")
 _NOT_IN = {"": re.compile(r"[^A-Za-z0-9_]"), "/": re.compile(r"[^A-Za-z0-9_/]")}
 _SUBSTITUTION = re.compile(r"\{([^{}]*)\}")
 _KNOWN_SUBSTITUTIONS = ("node", "ns", "namespace")
-
-_ACTIONS = (EndpointKind.ACTION_SERVER, EndpointKind.ACTION_CLIENT)
 
 
 class NameNotLegalError(LifecycleError):
@@ -248,7 +246,7 @@ def resolve(
     """
     rules = [parse_rule(match, replacement) for match, replacement in remap]
     expanded = expand(name, node_name, namespace)
-    if kind in _ACTIONS:
+    if kind.is_action:
         return _resolve_action(name, expanded, rules, node_name, namespace)
     names = RemapKind.TOPIC if kind.is_topic else RemapKind.SERVICE
     return _remap(expanded, rules, names, node_name, namespace)
@@ -359,6 +357,39 @@ def _odd(text: str, allowed: str) -> str:
     found = _NOT_IN[allowed].search(text)
     return f", not {found[0]!r}" if found else ""
 
+
+NODE_SERVICES: Mapping[str, str] = {
+    "describe_parameters": "rcl_interfaces/srv/DescribeParameters",
+    "get_parameter_types": "rcl_interfaces/srv/GetParameterTypes",
+    "get_parameters": "rcl_interfaces/srv/GetParameters",
+    "list_parameters": "rcl_interfaces/srv/ListParameters",
+    "set_parameters": "rcl_interfaces/srv/SetParameters",
+    "set_parameters_atomically": "rcl_interfaces/srv/SetParametersAtomically",
+    "get_type_description": "type_description_interfaces/srv/GetTypeDescription",
+    "get_logger_levels": "rcl_interfaces/srv/GetLoggerLevels",
+    "set_logger_levels": "rcl_interfaces/srv/SetLoggerLevels",
+    "change_state": "lifecycle_msgs/srv/ChangeState",
+    "get_state": "lifecycle_msgs/srv/GetState",
+    "get_available_states": "lifecycle_msgs/srv/GetAvailableStates",
+    "get_available_transitions": "lifecycle_msgs/srv/GetAvailableTransitions",
+    "get_transition_graph": "lifecycle_msgs/srv/GetAvailableTransitions",
+}
+"""Services that client libraries offer under a node's own name, `~/get_state`, and their types."""
+
+MANAGED_SERVICES = frozenset(
+    name for name, type_ in NODE_SERVICES.items() if type_.startswith("lifecycle_msgs/")
+)
+"""Those of them that managed nodes alone have."""
+
+OUR_SERVICES: Mapping[str, str] = {
+    "get_configuration": "std_srvs/srv/Trigger",
+    "connect_to": "rcl_interfaces/srv/SetParameters",
+    "map_to": "rcl_interfaces/srv/SetParameters",
+    "disconnect": "rcl_interfaces/srv/SetParameters",
+    "remap": "rcl_interfaces/srv/SetParameters",
+}
+"""Services that nodes of ours offer besides. The names are common and the types standard: a node
+counts as ours only with the two that no other node has together (`verify.tool_filter.OURS_BY`)."""
 
 DIAGNOSTICS_TOPIC = "/diagnostics"
 SUPERVISORS = "/lifecycle/"

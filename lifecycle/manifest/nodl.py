@@ -85,11 +85,10 @@ class _Reader:
     def _endpoint(self, kind: EndpointKind, place: Place, value: Value) -> Value:
         if not isinstance(value.data, Mapping):
             return value
-        is_action = kind in (EndpointKind.ACTION_SERVER, EndpointKind.ACTION_CLIENT)
-        known = ("name", "type", "description", *(() if is_action else ("qos",)))
+        known = ("name", "type", "description", *(() if kind.is_action else ("qos",)))
         entries = self._entries(place, value, known)
         if (type_ := entries.get("type")) and type_.text.count("/") == 1:
-            word = "msg" if kind.is_topic else "action" if is_action else "srv"
+            word = "msg" if kind.is_topic else "action" if kind.is_action else "srv"
             entries["type"] = _text(type_, type_.text.replace("/", f"/{word}/"))
         if kind.is_topic and "qos" not in entries:
             self._error(place, f"cannot do without the key 'qos' in a {kind.noun}")

@@ -22,6 +22,8 @@ from lifecycle.manifest.names import (
     ALIVE_PULSE,
     DIAGNOSTICS_TOPIC,
     MODE_SERVICE,
+    NODE_SERVICES,
+    OUR_SERVICES,
     SUPERVISOR_STATUS,
     SUPERVISORS,
     supervisor_alive_topic,
@@ -86,24 +88,6 @@ NOISE_TOPICS: Mapping[tuple[EndpointKind, str], str] = {
 _SERVICE_EVENT = "/_service_event"
 """What a service or client says of its calls once its introspection is configured (REP-2012)."""
 
-NODE_SERVICES: Mapping[str, str] = {
-    "describe_parameters": "rcl_interfaces/srv/DescribeParameters",
-    "get_parameter_types": "rcl_interfaces/srv/GetParameterTypes",
-    "get_parameters": "rcl_interfaces/srv/GetParameters",
-    "list_parameters": "rcl_interfaces/srv/ListParameters",
-    "set_parameters": "rcl_interfaces/srv/SetParameters",
-    "set_parameters_atomically": "rcl_interfaces/srv/SetParametersAtomically",
-    "get_type_description": "type_description_interfaces/srv/GetTypeDescription",
-    "get_logger_levels": "rcl_interfaces/srv/GetLoggerLevels",
-    "set_logger_levels": "rcl_interfaces/srv/SetLoggerLevels",
-    "change_state": "lifecycle_msgs/srv/ChangeState",
-    "get_state": "lifecycle_msgs/srv/GetState",
-    "get_available_states": "lifecycle_msgs/srv/GetAvailableStates",
-    "get_available_transitions": "lifecycle_msgs/srv/GetAvailableTransitions",
-    "get_transition_graph": "lifecycle_msgs/srv/GetAvailableTransitions",
-}
-"""Services that client libraries offer under a node's own name, `~/get_state`, and their types."""
-
 _CONTAINER = "/_container"
 _CONTAINER_SERVICES: Mapping[str, str] = {
     "load_node": "composition_interfaces/srv/LoadNode",
@@ -111,16 +95,6 @@ _CONTAINER_SERVICES: Mapping[str, str] = {
     "list_nodes": "composition_interfaces/srv/ListNodes",
 }
 """Services of component containers, `~/_container/load_node` (rclcpp_components)."""
-
-OUR_SERVICES: Mapping[str, str] = {
-    "get_configuration": "std_srvs/srv/Trigger",
-    "connect_to": "rcl_interfaces/srv/SetParameters",
-    "map_to": "rcl_interfaces/srv/SetParameters",
-    "disconnect": "rcl_interfaces/srv/SetParameters",
-    "remap": "rcl_interfaces/srv/SetParameters",
-}
-"""Services that nodes of ours offer besides. The names are common and the types standard, so
-that a node counts as ours only with the two that no other node has together, `OURS_BY`."""
 
 OURS_BY = frozenset({"get_configuration", "map_to"})
 """Who offers both under its own name is a node of ours."""

@@ -32,7 +32,6 @@ from lifecycle.verify.observation import EndpointReport, NodeConfiguration
 if TYPE_CHECKING:
     from lifecycle.verify.view import Actual
 
-_SIDES = (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION)
 _SEVERAL = -1
 """Instead of the one endpoint that has an NFE."""
 
@@ -95,7 +94,7 @@ class Uniqueness:
         for configuration in self._configurations:
             address = addresses.get(configuration.name, "")
             for report in configuration.endpoints:
-                if report.kind in _SIDES and not report.error:
+                if report.kind.is_topic and not report.error:
                     entry = self._entries[id(report)] = _entry(configuration, report, address)
                     self._all.append(entry)
                     self._add(entry)

@@ -374,21 +374,13 @@ def _remedy(each: Incompatibility) -> str:
     return f"offer {each.requested} there, or request {each.offered} here"
 
 
-FAMILIES = {
-    "topic": (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION),
-    "service": (EndpointKind.SERVICE_SERVER, EndpointKind.SERVICE_CLIENT),
-    "action": (EndpointKind.ACTION_SERVER, EndpointKind.ACTION_CLIENT),
-}
-"""The kinds that meet under one name; topics, services and actions do not see each other."""
-
-
 def check_types(system: DeclaredSystem, prefixes: Sequence[Path]) -> Iterator[Diagnostic]:
     """Yield findings about types."""
     yield from _missing(system, prefixes)
-    for family, kinds in FAMILIES.items():
+    for family in ("topic", "service", "action"):
         by_name: dict[str, list[Resolved]] = {}
         for each in system.endpoints:
-            if each.endpoint.kind in kinds:
+            if each.endpoint.kind.meets_in == family:
                 by_name.setdefault(each.name, []).append(each)
         for name, ends in by_name.items():
             yield from _mismatches(family, name, ends)

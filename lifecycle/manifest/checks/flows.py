@@ -61,7 +61,7 @@ def _endpoint(node: Node, need: FlowNeed) -> Iterator[Diagnostic]:
         None,
     )
     hint = did_you_mean(need.name, declared)
-    if other in (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION):
+    if other is not None and other.is_topic:
         hint = f"it is a {other.noun}: move it to 'flows.{other.value}'"
     elif other is not None:
         hint = f"it is a {other.noun}; only publishers and subscriptions have flow needs"

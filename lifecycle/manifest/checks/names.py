@@ -104,9 +104,6 @@ def _remapped(each: Resolved) -> bool:
     return expand(each.endpoint.name, each.node.name, each.node.namespace) != each.name
 
 
-_ACTIONS = (EndpointKind.ACTION_SERVER, EndpointKind.ACTION_CLIENT)
-
-
 def check_remaps(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about remap rules."""
     resolved: dict[str, list[Resolved]] = {}
@@ -168,7 +165,7 @@ def _graph_names(node: Node) -> list[tuple[str, RemapKind]]:
     names = []
     for endpoint in node.interface.endpoints:
         expanded = _expanded(node, endpoint.name)
-        if endpoint.kind in _ACTIONS:
+        if endpoint.kind.is_action:
             names += [(name, _remap_kind(hidden)) for name, hidden in hidden_names(expanded)]
         else:
             names.append((expanded, _remap_kind(endpoint.kind)))
@@ -195,7 +192,7 @@ def _never_matches(
 ) -> Iterator[Diagnostic]:
     at = _place(node, match)
     wanted = _expanded(node, rule.match)
-    actions = [each.name for each in node.interface.endpoints if each.kind in _ACTIONS]
+    actions = [each.name for each in node.interface.endpoints if each.kind.is_action]
     if not wanted:
         return
     if any(_expanded(node, name) == wanted for name in actions):

@@ -26,6 +26,9 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.manifest.names import (
     DIAGNOSTICS_TOPIC,
+    MANAGED_SERVICES,
+    NODE_SERVICES,
+    OUR_SERVICES,
     RemapRule,
     parse_rule,
     resolve,
@@ -172,27 +175,8 @@ def read_rule(match: str, replacement: str) -> RemapRule | LifecycleError:
         return problem
 
 
-_EVERY_NODE = (
-    (EndpointKind.SERVICE_SERVER, "describe_parameters"),
-    (EndpointKind.SERVICE_SERVER, "get_parameter_types"),
-    (EndpointKind.SERVICE_SERVER, "get_parameters"),
-    (EndpointKind.SERVICE_SERVER, "get_type_description"),
-    (EndpointKind.SERVICE_SERVER, "list_parameters"),
-    (EndpointKind.SERVICE_SERVER, "set_parameters"),
-    (EndpointKind.SERVICE_SERVER, "set_parameters_atomically"),
-)
-_MANAGED_NODE = (
-    (EndpointKind.PUBLISHER, "transition_event"),
-    (EndpointKind.SERVICE_SERVER, "change_state"),
-    (EndpointKind.SERVICE_SERVER, "get_available_states"),
-    (EndpointKind.SERVICE_SERVER, "get_available_transitions"),
-    (EndpointKind.SERVICE_SERVER, "get_state"),
-    (EndpointKind.SERVICE_SERVER, "get_transition_graph"),
-)
-_OWN_NODE = tuple(
-    (EndpointKind.SERVICE_SERVER, name)
-    for name in ("connect_to", "disconnect", "get_configuration", "map_to", "remap")
-)
+_NOT_BY_DEFAULT = ("get_logger_levels", "set_logger_levels")
+"""Services that a node has only if its code asks for them."""
 
 _OF_THE_GRAPH = (
     (EndpointKind.PUBLISHER, "/parameter_events"),
@@ -213,8 +197,11 @@ def implicit_names(system: DeclaredSystem) -> frozenset[tuple[EndpointKind, str]
     names = set(_OF_THE_GRAPH)
     names.update(_of_supervisors(system.manifest))
     for node in system.manifest.nodes:
-        own = (*_EVERY_NODE, *(_MANAGED_NODE if node.managed else ()), *_OWN_NODE)
-        names.update((kind, f"{node.full_name}/{name}") for kind, name in own)
+        left_out = {*_NOT_BY_DEFAULT, *(() if node.managed else MANAGED_SERVICES)}
+        services = {*NODE_SERVICES, *OUR_SERVICES} - left_out
+        names.update((EndpointKind.SERVICE_SERVER, f"{node.full_name}/{each}") for each in services)
+        if node.managed:
+            names.add((EndpointKind.PUBLISHER, f"{node.full_name}/transition_event"))
     return frozenset(names)
 
 

@@ -189,12 +189,11 @@ class Declarations(Node):  # type: ignore[misc]  # rclpy is not typed
         callback: Callable[..., Any] | None = None,
         hints: tuple[bool | None, int | None] = (None, None),
     ) -> None:
-        topic = kind in {EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION}
         resolve: Callable[[str], str]
-        if kind in {EndpointKind.ACTION_SERVER, EndpointKind.ACTION_CLIENT}:
+        if kind.is_action:
             resolve = functools.partial(resolve_action_name, self)
         else:
-            resolve = self.resolve_topic_name if topic else self.resolve_service_name
+            resolve = self.resolve_topic_name if kind.is_topic else self.resolve_service_name
         endpoint = PlannedEndpoint(
             kind=kind,
             name=name,

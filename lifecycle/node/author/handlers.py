@@ -13,7 +13,6 @@ from typing import Any, TypeVar
 from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError, nearest
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.manifest.schema import nearest
 from lifecycle.plan.model import PlannedEndpoint
 
 F = TypeVar("F", bound=Callable[..., Any])

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from lifecycle.node.lifecycle.services import Turns
 
 CLIENTS = frozenset({EndpointKind.SERVICE_CLIENT, EndpointKind.ACTION_CLIENT})
-_ACTIONS = frozenset({EndpointKind.ACTION_SERVER, EndpointKind.ACTION_CLIENT})
 
 
 class Maker:
@@ -94,7 +93,7 @@ class Maker:
             for event in getattr(entity, "event_handlers", ()):
                 self._node.remove_waitable(event)
             participant.destroy_endpoint(entity)
-        elif endpoint.kind in _ACTIONS:
+        elif endpoint.kind.is_action:
             entity.destroy()
         elif endpoint.kind is EndpointKind.PUBLISHER:
             self._node.destroy_publisher(entity)
@@ -256,7 +255,7 @@ class Maker:
             return mapping.name or endpoint.name
         if endpoint.kind.is_topic:
             return str(self._node.resolve_topic_name(endpoint.name))
-        if endpoint.kind in _ACTIONS:
+        if endpoint.kind.is_action:
             return resolve_action_name(self._node, endpoint.name)
         return str(self._node.resolve_service_name(endpoint.name))
 

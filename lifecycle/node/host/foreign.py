@@ -262,7 +262,7 @@ class ForeignNode:
         callback = getattr(entity, "callback", None) if kind is EndpointKind.SUBSCRIPTION else None
         if isinstance(getattr(callback, "__self__", None), TimeSource):
             return  # /clock belongs to rclpy
-        if kind in (EndpointKind.ACTION_SERVER, EndpointKind.ACTION_CLIENT):
+        if kind.is_action:
             entity.action_name = resolve_action_name(self._node, entity.action_name)
         if kind is EndpointKind.PUBLISHER:
             self._gate.add(entity, HeldPublisher(entity, self._node.get_logger().warning))

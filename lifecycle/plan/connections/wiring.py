@@ -78,7 +78,6 @@ _SERVERS = {
     EndpointKind.SERVICE_CLIENT: EndpointKind.SERVICE_SERVER,
     EndpointKind.ACTION_CLIENT: EndpointKind.ACTION_SERVER,
 }
-_WORDS = {EndpointKind.SERVICE_CLIENT: "service", EndpointKind.ACTION_CLIENT: "action"}
 
 _End = tuple[PlannedNode, PlannedEndpoint]
 
@@ -135,7 +134,7 @@ def _services(
                 if not mine or not theirs or carried(mine, theirs, same_host=near):
                     continue
                 message = (
-                    f"cannot call {_WORDS[each.kind]} {each.resolved!r} of {other.key!r} from "
+                    f"cannot call {each.kind.meets_in} {each.resolved!r} of {other.key!r} from "
                     f"{node.key!r}: the client's participant has {', '.join(mine)}, the server's "
                     f"{', '.join(theirs)}, and they are on {'one host' if near else 'two hosts'}"
                 )

@@ -52,16 +52,6 @@ UNSEEN_ENDPOINT = Rule(
     concerns_flow=True,
     heals=Heals.WITH_TIME,
 )
-MEETS = {
-    EndpointKind.PUBLISHER: "topic",
-    EndpointKind.SUBSCRIPTION: "topic",
-    EndpointKind.SERVICE_SERVER: "service",
-    EndpointKind.SERVICE_CLIENT: "service",
-    EndpointKind.ACTION_SERVER: "action",
-    EndpointKind.ACTION_CLIENT: "action",
-}
-"""Kinds that meet under one name: topics, services and actions do not see each other."""
-
 
 UNDECLARED = {
     kind: Rule(
@@ -249,14 +239,14 @@ def _conflicts(view: View) -> Iterator[Finding]:
     types: dict[tuple[str, str], dict[str, None]] = {}  # in plan order
     for actual in view.actual:
         planned = actual.planned
-        types.setdefault((MEETS[planned.kind], planned.resolved), {})[planned.type] = None
+        types.setdefault((planned.kind.meets_in, planned.resolved), {})[planned.type] = None
     others = (*view.undeclared, *view.foreign, *view.unattributed)
     undeclared: tuple[SeenEndpoint | ObservedEndpoint, ...] = (
         *(each for each in view.seen if each.planned is None),
         *(each for each in others if not each.kind.is_topic),
     )
     for seen in undeclared:
-        what = MEETS[seen.kind]
+        what = seen.kind.meets_in
         declared = types.get((what, seen.name))
         if declared is None or seen.type in declared:
             continue
@@ -359,7 +349,7 @@ def differ(one: str, other: str) -> bool:
 
 def _place(end: SeenEndpoint | ObservedEndpoint | PlannedEndpoint) -> _Place:
     name = end.resolved if isinstance(end, PlannedEndpoint) else end.name
-    return MEETS[end.kind], name, end.type
+    return end.kind.meets_in, name, end.type
 
 
 def _differs(place: _Place, end: _End, expected: str, source: str) -> Finding:

@@ -389,7 +389,7 @@ def _judge_client(client: Actual, server: str, *, count: int) -> Iterator[Findin
         expected="matched",
         observed=reason,
         message=f"cannot {verb} {node} → {server} {state} on"
-        f" {client.planned.kind.noun.partition(' ')[0]} {name}: {reason}",
+        f" {client.planned.kind.meets_in} {name}: {reason}",
         at=client.planned.at,
         node=node,
         endpoint=client.planned.kind,
