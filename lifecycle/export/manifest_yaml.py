@@ -214,20 +214,12 @@ def _policy(system: CapturedSystem) -> dict[str, Tree]:
         )
     ends = {(each.kind, each.name) for node in system.nodes for each in node.endpoints}
     waiting = {
-        name for kind, name in ends if kind in _OFFERED and (_OFFERED[kind], name) not in ends
+        name for kind, name in ends if not kind.offers and (kind.other_end, name) not in ends
     }
     if waiting:
         note = f"gap: nobody offers {', '.join(sorted(waiting))}"
         policy["unpublished"] = Noted(value="warning", note=note)
     return policy
-
-
-_OFFERED = {
-    EndpointKind.SUBSCRIPTION: EndpointKind.PUBLISHER,
-    EndpointKind.SERVICE_CLIENT: EndpointKind.SERVICE_SERVER,
-    EndpointKind.ACTION_CLIENT: EndpointKind.ACTION_SERVER,
-}
-"""Who waits → by whom that is offered."""
 
 
 def _node(node: CapturedNode, reference: str) -> Tree:

@@ -51,9 +51,29 @@ class EndpointKind(enum.Enum):
         """What it is an end of, "topic", "service" or "action": these do not see each other."""
         return "topic" if self.is_topic else "action" if self.is_action else "service"
 
+    @property
+    def offers(self) -> bool:
+        """Whether it feeds or serves others, as publishers and servers do; the rest asks."""
+        return self is EndpointKind.PUBLISHER or self.value.endswith("_servers")
+
+    @property
+    def other_end(self) -> EndpointKind:
+        """The kind that it meets: of a publisher a subscription, of a client its server."""
+        return _OTHER_ENDS[self]
+
     def spell(self, name: str) -> str:
         """Return how requests and messages call an endpoint of a node, `publishers/video`."""
         return f"{self.value}/{name}"
+
+
+_OTHER_ENDS = {
+    EndpointKind.PUBLISHER: EndpointKind.SUBSCRIPTION,
+    EndpointKind.SUBSCRIPTION: EndpointKind.PUBLISHER,
+    EndpointKind.SERVICE_SERVER: EndpointKind.SERVICE_CLIENT,
+    EndpointKind.SERVICE_CLIENT: EndpointKind.SERVICE_SERVER,
+    EndpointKind.ACTION_SERVER: EndpointKind.ACTION_CLIENT,
+    EndpointKind.ACTION_CLIENT: EndpointKind.ACTION_SERVER,
+}
 
 
 class RunKind(enum.Enum):

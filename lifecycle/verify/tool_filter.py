@@ -165,18 +165,9 @@ def _compiled(pattern: str) -> re.Pattern[str]:
     return re.compile(re.escape(pattern).replace(r"\*", ".*").replace(r"\?", "."))
 
 
-_NAMESPACES: Mapping[EndpointKind, EndpointKind] = {
-    EndpointKind.PUBLISHER: EndpointKind.PUBLISHER,
-    EndpointKind.SUBSCRIPTION: EndpointKind.PUBLISHER,
-    EndpointKind.SERVICE_SERVER: EndpointKind.SERVICE_SERVER,
-    EndpointKind.SERVICE_CLIENT: EndpointKind.SERVICE_SERVER,
-    EndpointKind.ACTION_SERVER: EndpointKind.ACTION_SERVER,
-    EndpointKind.ACTION_CLIENT: EndpointKind.ACTION_SERVER,
-}
-"""Kinds that meet under one name, by the one that offers."""
-
-OFFERS = frozenset(_NAMESPACES.values())
-"""Kinds of endpoint that feed or serve others; the rest only listens, or asks."""
+def _offering(kind: EndpointKind) -> EndpointKind:
+    """Return the kind that offers under the name by which an endpoint of this one meets it."""
+    return kind if kind.offers else kind.other_end
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -212,7 +203,7 @@ class DeclaredNames:
             for node in plan.nodes
             for each in node.endpoints
         )
-        names = frozenset((_NAMESPACES[kind], name) for _, kind, name in ends)
+        names = frozenset((_offering(kind), name) for _, kind, name in ends)
         of_supervisors = frozenset(
             (kind, name)
             for prefix in supervisor_prefixes(plan)
@@ -231,16 +222,16 @@ class DeclaredNames:
 
     def of_kind(self, kind: EndpointKind) -> tuple[str, ...]:
         """Return the declared names under which endpoints of a kind meet, sorted."""
-        return tuple(sorted(name for each, name in self.names if each is _NAMESPACES[kind]))
+        return tuple(sorted(name for each, name in self.names if each is _offering(kind)))
 
     def has(self, kind: EndpointKind, name: str) -> bool:
         """Return whether an endpoint meets declared ones; a part of an action, that action's."""
         part = action_part(kind, name)
-        return (_NAMESPACES[kind], name) in self.names or (part is not None and self.has(*part))
+        return (_offering(kind), name) in self.names or (part is not None and self.has(*part))
 
     def fed_by(self, kind: EndpointKind, name: str) -> bool:
         """Return whether an endpoint of an undeclared node would feed or serve the system."""
-        if kind not in OFFERS or (kind, name) in NOISE_TOPICS:
+        if not kind.offers or (kind, name) in NOISE_TOPICS:
             return False
         return (
             self.has(kind, name) or self._is_own(kind, name) or self.is_of_supervisors(kind, name)

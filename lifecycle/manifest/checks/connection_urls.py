@@ -236,19 +236,15 @@ def _remote_nodes(
     system: DeclaredSystem, node: Node, kind: EndpointKind, name: str
 ) -> Iterator[str]:
     """Yield nodes of other hosts that have the other end of a topic."""
-    other = {
-        EndpointKind.PUBLISHER: EndpointKind.SUBSCRIPTION,
-        EndpointKind.SUBSCRIPTION: EndpointKind.PUBLISHER,
-    }.get(kind)
     mine = [
         each.name
         for each in system.endpoints
         if each.node.key == node.key and (each.endpoint.kind, each.endpoint.name) == (kind, name)
     ]
-    if other is None or not mine:
+    if not kind.is_topic or not mine:
         return
     host = system.manifest.address_of(node.machine)
-    for each in system.named(other, mine[0]):
+    for each in system.named(kind.other_end, mine[0]):
         if system.manifest.address_of(each.node.machine) != host:
             yield each.node.key
 

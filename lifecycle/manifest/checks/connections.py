@@ -36,20 +36,13 @@ from lifecycle.manifest.yaml.document import error, warning
 from lifecycle.network.dscp import describe
 from lifecycle.network.medium import Medium
 
-_OTHER_END = {
-    EndpointKind.SUBSCRIPTION: EndpointKind.PUBLISHER,
-    EndpointKind.PUBLISHER: EndpointKind.SUBSCRIPTION,
-    EndpointKind.SERVICE_CLIENT: EndpointKind.SERVICE_SERVER,
-    EndpointKind.ACTION_CLIENT: EndpointKind.ACTION_SERVER,
-}
-"""Kinds that make no sense alone. A server without a client is an offer."""
-
 _RULES = {
     EndpointKind.SUBSCRIPTION: "check.unpublished",
     EndpointKind.PUBLISHER: "check.unheard",
     EndpointKind.SERVICE_CLIENT: "check.no-server",
     EndpointKind.ACTION_CLIENT: "check.no-server",
 }
+"""Kinds that make no sense alone. A server without a client is an offer."""
 
 
 def check_counterparts(system: DeclaredSystem) -> Iterator[Diagnostic]:
@@ -57,8 +50,8 @@ def check_counterparts(system: DeclaredSystem) -> Iterator[Diagnostic]:
     implicit = implicit_names(system)
     for each in system.endpoints:
         kind = each.endpoint.kind
-        other = _OTHER_END.get(kind)
-        if other is None or system.named(other, each.name) or (other, each.name) in implicit:
+        other = kind.other_end
+        if kind not in _RULES or system.named(other, each.name) or (other, each.name) in implicit:
             continue
         severity = _severity(system, kind)
         if severity is not None:

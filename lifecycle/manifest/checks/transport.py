@@ -328,10 +328,7 @@ def _wish(
         )
         hint = "use 'transport: tcpv4', or remove 'lossy: false'"
         yield error(_RULE, need.at, message, hint)
-    other = (
-        EndpointKind.SUBSCRIPTION if need.kind is EndpointKind.PUBLISHER else EndpointKind.PUBLISHER
-    )
-    for end in system.named(other, each.topic):
+    for end in system.named(need.kind.other_end, each.topic):
         ends = (node, end.node) if need.kind is EndpointKind.PUBLISHER else (end.node, node)
         yield from _pair(system, ends, each.topic, need.transport, need.at)
 

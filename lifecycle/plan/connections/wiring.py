@@ -74,11 +74,6 @@ from lifecycle.plan.negotiation.parties import (
     written_ports,
 )
 
-_SERVERS = {
-    EndpointKind.SERVICE_CLIENT: EndpointKind.SERVICE_SERVER,
-    EndpointKind.ACTION_CLIENT: EndpointKind.ACTION_SERVER,
-}
-
 _End = tuple[PlannedNode, PlannedEndpoint]
 
 
@@ -125,10 +120,9 @@ def _services(
             servers.setdefault((each.kind, each.resolved), []).append((node, each))
     for node in nodes:
         for each in node.endpoints:
-            wanted = _SERVERS.get(each.kind)
-            if wanted is None:
+            if each.kind.is_topic or each.kind.offers:
                 continue
-            for other, server in servers.get((wanted, each.resolved), ()):
+            for other, server in servers.get((each.kind.other_end, each.resolved), ()):
                 mine, theirs = carriers(node, each), carriers(other, server)
                 near = parties[node.key].host == parties[other.key].host
                 if not mine or not theirs or carried(mine, theirs, same_host=near):

@@ -16,7 +16,7 @@ from lifecycle.plan.model import PlannedEndpoint
 from lifecycle.verify.observation import ObservedEndpoint
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
-from lifecycle.verify.tool_filter import OFFERS, action_part, part_type
+from lifecycle.verify.tool_filter import action_part, part_type
 from lifecycle.verify.verdict import Finding
 from lifecycle.verify.view import Actual, SeenEndpoint, View
 
@@ -58,15 +58,11 @@ UNDECLARED = {
         id=f"graph.undeclared-{kind.noun.replace(' ', '-')}",
         meaning=f"a declared node has {'an' if kind.noun.startswith('a') else 'a'} {kind.noun}"
         " that the manifest does not declare"
-        + (", or a tool has one under a declared name" if kind in OFFERS else ""),
+        + (", or a tool has one under a declared name" if kind.offers else ""),
         outcomes=(Outcome.VIOLATED,),
         fix="declare it in the node's interface, remove it, or set `endpoints: open` on the node",
     )
     for kind in EndpointKind
-}
-_OTHER = {
-    EndpointKind.PUBLISHER: EndpointKind.SUBSCRIPTION,
-    EndpointKind.SUBSCRIPTION: EndpointKind.PUBLISHER,
 }
 
 RULES = (
@@ -149,7 +145,7 @@ def _unseen(
     elif report.matched is None:
         reason = "discovery does not show it here, and nobody counts whom it is matched with"
     else:
-        known = known_ends[planned.resolved, _OTHER.get(planned.kind)]
+        known = known_ends[planned.resolved, planned.kind.other_end]
         more = report.matched - known
         if more <= 0 or view.plan.policy.undeclared_nodes is EndpointPolicy.OPEN:
             return
