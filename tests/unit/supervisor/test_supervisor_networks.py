@@ -53,15 +53,16 @@ class FakePrograms:
         topics = tuple(each.topic for each in flows)
         if topics in self.seen:
             return ()
-        self._loop.call_soon_threadsafe(self.asked.set)
         if self.fail:
             self.fail -= 1
+            self._loop.call_soon_threadsafe(self.asked.set)
             raise PrivilegeError(
                 "cannot write nft table inet flowqos_s: 'nft -f -' needs CAP_NET_ADMIN in this "
                 "network namespace",
                 hint="run this command as root",
             )
         self.seen.append(topics)
+        self._loop.call_soon_threadsafe(self.asked.set)  # last: who is woken looks at `seen`
         change = FlowChange(kind=ChangeKind.CREATE, key="k", what="w")
         return (TargetChanges(target="fake", changes=(change,)),)
 
