@@ -249,13 +249,6 @@ def test_interfaces_are_found_by_their_ros_names() -> None:
     ("name", "message"),
     [
         (
-            "std_msgs/String",
-            (
-                "cannot read interface type 'std_msgs/String': write package/msg/Type, "
-                "package/srv/Type or package/action/Type"
-            ),
-        ),
-        (
             "std_msgs/msg/Strin",
             (
                 "cannot find interface type 'std_msgs/msg/Strin': package 'std_msgs' has no msg "
@@ -267,13 +260,6 @@ def test_interfaces_are_found_by_their_ros_names() -> None:
             (
                 "cannot find interface type 'my_robot/msg/Arm': no package 'my_robot' with msg "
                 "interfaces is installed; install my_robot, or source the workspace that has it"
-            ),
-        ),
-        (
-            "std_msgs/srv/Reset",
-            (
-                "cannot find interface type 'std_msgs/srv/Reset': no package 'std_msgs' with srv "
-                "interfaces is installed; install std_msgs, or source the workspace that has it"
             ),
         ),
         (

@@ -63,17 +63,6 @@ def ignore(_: String) -> None:
     pass
 
 
-def test_plain_subscriptions_of_one_participant_share_their_port(make_node: MakeNode) -> None:
-    node, other = make_node("one"), make_node("two")
-    subscriptions = [
-        each.create_subscription(String, topic, ignore, 10)
-        for each in (node, other)
-        for topic in ("/a", "/b")
-    ]
-    assert len(ports(subscriptions[0])) == 1
-    assert all(ports(each) == ports(subscriptions[0]) for each in subscriptions)
-
-
 def test_strictly_unique_subscriptions_each_get_a_port_of_their_own(make_node: MakeNode) -> None:
     node, other = make_node("one"), make_node("two")
     plain = node.create_subscription(String, "/a", ignore, 10)
@@ -348,14 +337,3 @@ def test_ipv6_sockets_are_marked_by_their_traffic_class(domain_id: int, tmp_path
         "['ipv4', 'ipv6']",
         "46",
     ]
-
-
-def test_twenty_participants_come_and_go_without_a_trace(
-    domain_id: int, wait_until: WaitUntil
-) -> None:
-    before = descriptors()
-    for number in range(20):
-        with FlowParticipant(f"_flow_{number}", "/", domain_id, dscp=10) as participant:
-            participant.create_publisher(String, "/a", QOS)
-    del participant
-    wait_until(lambda: descriptors() <= before)

@@ -226,20 +226,6 @@ def test_a_long_message_leaves_in_datagrams_of_the_size_that_was_asked_for(
     assert not any(each.fragment for each in datagrams)
 
 
-@on_the_wire
-def test_without_a_size_a_long_message_leaves_in_one_datagram(
-    domain_id: int, wait_until: WaitUntil
-) -> None:
-    text = "x" * 10_000
-    with (
-        peer(domain_id) as other,
-        FlowParticipant("_flow", "/", domain_id, transports=UDP) as participant,
-    ):
-        datagrams = carrying(sent(participant, other, wait_until, text), text)
-    assert len(datagrams) >= COUNT
-    assert all(len(each.payload) > len(text) for each in datagrams)
-
-
 def test_a_participant_of_small_datagrams_still_receives_large_ones(
     domain_id: int, make_node: MakeNode, spin_until: SpinUntil
 ) -> None:
@@ -310,28 +296,6 @@ def test_every_datagram_of_a_user_carries_the_dscp_from_the_first_on(
         mine = {nfe.transport_port for nfe in senders_of(marked.node)}
         unmarked = [each for each in seen if each.source in mine and each.tos != 46 << 2]
         assert unmarked == [], "its discovery shares the sockets"
-
-
-@on_the_wire
-def test_a_participant_without_a_dscp_sends_none(domain_id: int, wait_until: WaitUntil) -> None:
-    with (
-        peer(domain_id) as other,
-        FlowParticipant("_flow", "/", domain_id, transports=UDP) as participant,
-    ):
-        datagrams = sent(participant, other, wait_until)
-    assert {each.tos for each in datagrams} == {0}
-
-
-def test_a_mark_that_was_lost_is_set_again(domain_id: int) -> None:
-    from lifecycle.middleware.fastdds.dscp import set_dscp
-
-    with FlowParticipant("_flow", "/", domain_id, dscp=46) as participant:
-        participant.create_publisher(String, "/flow", QOS)
-        set_dscp(senders_of(participant.node), 0)
-        assert participant.read_dscp() == 0
-        assert participant.read_dscp() == 0, "reading marks nothing"
-        participant.ensure_dscp()
-        assert participant.read_dscp() == 46
 
 
 def test_one_socket_without_the_mark_is_what_is_read(domain_id: int) -> None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import jsonschema
@@ -108,28 +106,6 @@ def test_json_fits_its_schema(
     assert report["ok"] is (code == 0)
     assert report["manifest"] == path
     assert [each["rule"] for each in report["diagnostics"]] == rules
-
-
-def test_checking_imports_nothing_of_ros() -> None:
-    program = f"""
-import sys
-from lifecycle.cli import main
-from lifecycle.cli.verbs import check
-code = main(["check", {str(ROOT / "manifests" / "first_node.lifecycle.yaml")!r}])
-heavy = ("rclpy", "rcl_interfaces", "lifecycle_msgs", "sensor_msgs", "std_msgs", "ctypes.util")
-print(sorted(name for name in heavy if name in sys.modules))
-sys.exit(code)
-"""
-    done = subprocess.run(
-        [sys.executable, "-c", program],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
-    assert done.stdout.splitlines() == ["first_node: 2 nodes, 2 endpoints, 0 links: ok", "[]"]
-    assert done.returncode == 0
 
 
 @pytest.mark.usefixtures("without_programs")

@@ -130,16 +130,6 @@ def test_what_fails_is_restarted_by_one_of_both(restarts: bool, unit: str) -> No
     assert pod.get("restartPolicy") == ("Never" if restarts else None)
 
 
-def test_a_manifest_that_restarts_a_node_leaves_the_engine_its_supervisor(tmp_path: Path) -> None:
-    manifest = tmp_path / "robot.lifecycle.yaml"
-    manifest.write_text(
-        "manifest_version: 1\nsystem: robot\nnodes:\n"
-        '  camera: {run: {python: "a:B"}, restart: on-failure}\n'
-    )
-    (text,) = exported(tmp_path / "out", "systemd", str(manifest)).values()
-    assert sections(text)["Service"]["Restart"] == "on-abnormal"
-
-
 LIMITED = """
 manifest_version: 1
 system: limited

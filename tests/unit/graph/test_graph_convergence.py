@@ -124,14 +124,6 @@ def converges(network: dict[str, Any], happens: list[tuple[str, str, int, float]
 
 
 @settings(max_examples=150, deadline=None)
-@given(network=NETWORKS, happens=happenings(*CHANGES))
-def test_changes_are_learnt_whatever_the_network_does(
-    network: dict[str, Any], happens: list[tuple[str, str, int, float]]
-) -> None:
-    converges(network, happens)
-
-
-@settings(max_examples=150, deadline=None)
 @given(network=NETWORKS, happens=happenings(*COMINGS_AND_GOINGS, *CHANGES))
 def test_nodes_that_come_and_go_are_learnt_whatever_the_network_does(
     network: dict[str, Any], happens: list[tuple[str, str, int, float]]

@@ -257,12 +257,6 @@ def test_a_match_of_which_no_message_tells_is_not_kept(followed: Followed) -> No
     assert seen.endpoints == (dataclasses.replace(client, server_matched=None),)
 
 
-def test_a_state_that_begins_late_learns_who_is_there_already(followed: Followed) -> None:
-    late = Reader(followed.system)
-    followed.settle()
-    assert late.state.nodes() == followed.state.nodes()
-
-
 UDP = NetworkFlowEndpoint(
     transport_protocol=TransportProtocol.UDP,
     internet_protocol=InternetProtocol.IPV4,

@@ -359,15 +359,6 @@ def test_who_has_left_is_called_back_no_more(graph: FakeGraph, clients: FakeClie
     assert graph.callbacks == []
 
 
-def test_an_observation_does_not_share_what_the_graph_keeps(
-    observer: Observer, graph: FakeGraph, clients: FakeClients
-) -> None:
-    graph.nodes, clients.states = managed("/a"), {"/a": "active"}
-    run(observer.observe(plan("a")))
-    assert graph.nodes == managed("/a")
-    assert dataclasses.replace(graph.nodes[0], state="active") != graph.nodes[0]
-
-
 def test_an_observation_waits_for_who_answered_and_is_not_seen_yet() -> None:
     graph = FakeGraph()
     graph.arriving = [(), (), (ObservedNode(full_name="/stranger"),)]

@@ -17,7 +17,7 @@ from lifecycle.graph.reporter import GraphReporter
 from lifecycle.graph.scheduler import LoopScheduler
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.verify.judge import verify
-from lifecycle.verify.observation import EndpointReport, ObservedEndpoint, ObservedNode
+from lifecycle.verify.observation import EndpointReport, ObservedNode
 from lifecycle.verify.verdict import Stage
 from tests.unit.graph.simulated import Network, every
 from tests.unit.graph.test_observer import FakeClients, FakeGraph, configuration, plan
@@ -27,9 +27,6 @@ OUT = EndpointReport(
     kind=EndpointKind.PUBLISHER, name="out", resolved="/out", type="std_msgs/msg/String"
 )
 ITS_OWN = dataclasses.replace(configuration("/it"), endpoints=(OUT,), checksum="1")
-SHOWN = ObservedEndpoint(
-    kind=EndpointKind.PUBLISHER, node="/it", name="/shown", type="std_msgs/msg/String"
-)
 
 
 class World:
@@ -75,61 +72,6 @@ def test_a_node_that_reports_is_asked_although_its_services_are_not_shown_yet() 
         assert joined is not None
         assert (joined.incarnation, joined.configuration) == (reporter.incarnation, ITS_OWN)
         reporter.left()
-
-    in_world(main)
-
-
-def test_a_node_that_reports_nothing_is_what_discovery_shows_of_it() -> None:
-    async def main(world: World) -> None:
-        world.graph.nodes = (
-            ObservedNode(full_name="/it"),
-            ObservedNode(full_name="/_hidden"),
-            ObservedNode(full_name="/rviz2"),
-        )
-        world.graph.endpoints = (SHOWN,)
-        await world.settle()
-        assert [each.name for each in world.state.nodes()] == ["/it"]
-        assert world.topics() == ("/shown",)
-        world.graph.endpoints = ()
-        world.graph.change()
-        await world.settle()
-        assert world.topics() == ()
-        world.graph.nodes = ()
-        world.graph.change()
-        await world.settle()
-        assert world.state.nodes() == ()
-        assert world.clients.forgotten == ["/it"]
-
-    in_world(main)
-
-
-def test_a_node_of_ours_without_messages_is_read_again_when_what_is_beside_it_changes() -> None:
-    async def main(world: World) -> None:
-        world.graph.nodes = (ObservedNode(full_name="/it"),)
-        world.graph.offered = {"/it/get_configuration"}
-        world.clients.configurations["/it"] = ITS_OWN
-        await world.settle()
-        assert world.topics() == ("/out",)
-        moved = dataclasses.replace(ITS_OWN, endpoints=(dataclasses.replace(OUT, resolved="/n"),))
-        world.clients.configurations["/it"] = moved
-        world.graph.nodes += (ObservedNode(full_name="/_it_net"),)
-        world.graph.change()
-        await world.settle()
-        assert world.topics() == ("/n",)
-
-    in_world(main)
-
-
-def test_the_state_of_a_foreign_managed_node_is_followed() -> None:
-    async def main(world: World) -> None:
-        world.graph.nodes = (ObservedNode(full_name="/it", managed=True),)
-        world.clients.states["/it"] = "unconfigured"
-        await world.settle()
-        assert [each.state for each in world.state.nodes()] == ["unconfigured"]
-        world.clients.states["/it"] = "inactive"
-        world.clients.followed["/it"]()
-        await world.settle()
-        assert [each.state for each in world.state.nodes()] == ["inactive"]
 
     in_world(main)
 

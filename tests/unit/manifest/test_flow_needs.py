@@ -284,29 +284,11 @@ def resolved(flow: FlowNeed, *links: object):
     return FlowNeeds(manifest(only, links=links), []).of("n", PUB, "a")
 
 
-def test_auto_proposes_a_class_from_what_is_declared_and_says_why():
-    each = resolved(need(PUB, "a", five_qi_auto=True, max_delay_ms=10.0, loss=1e-4, rate_hz=10.0))
-    assert each.five_qi == 82
-    assert each.flow_class.reason == (
-        "5QI 82 (Delay-critical GBR): delay budget 10 ms <= 10 ms, error rate 0.0001 <= 0.0001; "
-        "the least demanding class of Release 16 that fits"
-    )
-
-
 def test_auto_takes_the_shortest_delay_of_the_links_of_its_topic():
     links = [link("/a", "n", "x", max_delay_ms=300.0), link("/a", "n", "y", max_delay_ms=100.0)]
     each = resolved(need(PUB, "a", five_qi_auto=True), *links)
     assert each.max_delay_ms == 100.0
     assert "delay budget 100 ms <= 100 ms" in each.flow_class.reason
-
-
-def test_auto_without_a_delay_proposes_nothing():
-    each = resolved(need(PUB, "a", five_qi_auto=True, loss=0.1))
-    assert each.five_qi is None
-    assert each.flow_class.problem == (
-        "cannot propose a 5QI for 'a': no max_delay_ms is declared",
-        "add 'max_delay_ms', or a link of its topic that has one",
-    )
 
 
 def test_a_declared_rate_asks_for_a_class_that_guarantees_one():

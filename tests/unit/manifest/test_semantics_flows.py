@@ -118,16 +118,6 @@ def test_sixty_four_publishers_can_be_told_apart_by_dscp_alone() -> None:
     assert check(streams(64, need=MARKED)) == ()
 
 
-def test_the_sixty_fifth_publisher_with_only_a_dscp_is_refused_by_name() -> None:
-    assert [str(each) for each in check(streams(65, need=MARKED))] == [
-        (
-            f"{FILE}:65:1: cannot tell publisher '/s64' of 'n64' apart by its DSCP: it is number "
-            "65 of 65 that have nothing else, and a DSCP has 64 values; ask for 'unique: "
-            "strictly_required', or give each a DSCP of its own"
-        )
-    ]
-
-
 def test_publishers_that_ask_to_be_unique_do_not_rely_on_their_dscp() -> None:
     need = dataclasses.replace(MARKED, unique=UniqueRequirement.OPTIONALLY_REQUIRED)
     assert check(streams(70, need=need)) == ()

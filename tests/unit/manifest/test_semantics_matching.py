@@ -46,61 +46,8 @@ def test_one_preset_at_both_ends_always_matches(findings: Findings, qos: str) ->
     assert findings(pair(qos, qos)) == []
 
 
-@pytest.mark.parametrize(
-    ("offered", "requested", "remedy"),
-    [
-        (
-            "{deadline_ns: 5}",
-            "{deadline_ns: 4}",
-            (
-                "deadline is offered 5 ns and requested 4 ns; "
-                "offer at most 4 ns there, or request at least 5 ns here"
-            ),
-        ),
-        (
-            "default",
-            "{deadline_ns: 4}",
-            (
-                "deadline is offered infinite and requested 4 ns; "
-                "offer at most 4 ns there, or request none here"
-            ),
-        ),
-        (
-            "{durability: VOLATILE}",
-            "{durability: TRANSIENT_LOCAL}",
-            (
-                "durability is offered VOLATILE and requested TRANSIENT_LOCAL; "
-                "offer TRANSIENT_LOCAL there, or request VOLATILE here"
-            ),
-        ),
-    ],
-)
-def test_a_mismatch_names_policy_both_ends_and_the_remedy(
-    findings: Findings, offered: str, requested: str, remedy: str
-) -> None:
-    assert findings(pair(offered, requested)) == [
-        (
-            "check.qos-incompatible 12:23: nodes.listener.interface.subscriptions[0]: "
-            f"cannot match publisher 'a' of node 'talker' (8:20) on '/a': {remedy}"
-        )
-    ]
-
-
 def test_an_untold_liveliness_is_no_reason_to_doubt(findings: Findings) -> None:
     assert findings(pair("sensor_data", "{preset: sensor_data, liveliness: AUTOMATIC}")) == []
-
-
-def test_an_untold_liveliness_is_doubtful_where_a_manual_one_is_requested(
-    findings: Findings,
-) -> None:
-    assert findings(pair("default", "{liveliness: MANUAL_BY_TOPIC}")) == [
-        (
-            "check.qos-doubtful 12:23: warning: nodes.listener.interface.subscriptions[0]: "
-            "cannot tell whether this matches publisher 'a' of node 'talker' (8:20) on '/a': "
-            "liveliness is offered SYSTEM_DEFAULT and requested MANUAL_BY_TOPIC; "
-            "write the values at both ends"
-        )
-    ]
 
 
 def test_ends_of_different_types_are_not_compared_further(findings: Findings) -> None:

@@ -29,21 +29,8 @@ def circles(edges: dict[str, list[str]]) -> list[str]:
     return [each.message.rpartition(": ")[2] for each in found if each.rule == "check.after-cycle"]
 
 
-def test_a_circle_is_shown_as_a_path() -> None:
-    assert circles({"a": ["b"], "b": ["c"], "c": ["a"]}) == ["a → b → c → a"]
-
-
 def test_a_circle_is_shown_without_the_way_that_leads_to_it() -> None:
     assert circles({"in": ["a"], "a": ["b"], "b": ["a"]}) == ["a → b → a"]
-
-
-def test_every_circle_is_shown() -> None:
-    edges = {"a": ["b"], "b": ["a"], "c": ["d"], "d": ["c"]}
-    assert circles(edges) == ["a → b → a", "c → d → c"]
-
-
-def test_a_diamond_is_no_circle() -> None:
-    assert circles({"a": ["b", "c"], "b": ["d"], "c": ["d"], "d": []}) == []
 
 
 def test_a_chain_of_ten_thousand_nodes_is_no_problem() -> None:

@@ -47,15 +47,6 @@ def test_an_endless_device_is_refused() -> None:
     assert _message("/dev/zero") == expected
 
 
-def test_a_file_that_opens_and_cannot_be_read_is_refused() -> None:
-    """As on a network file system that has gone away; the first page of memory is never there."""
-    assert (
-        _message("/proc/self/mem")
-        == "cannot read a file that the kernel makes up (/proc, /sys) as a "
-        "manifest; name a regular file"
-    )
-
-
 def test_a_socket_cannot_be_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)  # the path of a socket is short
     with socket.socket(socket.AF_UNIX) as server:

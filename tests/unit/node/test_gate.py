@@ -67,13 +67,6 @@ def test_a_closed_publisher_drops_and_says_so_once_per_inactive_period() -> None
     assert warnings == [said, said]
 
 
-def test_an_open_publisher_is_the_publisher_itself() -> None:
-    gate, publisher = NodeGate(), FakePublisher()
-    gate.add(publisher, GatedPublisher(publisher, pytest.fail))
-    gate.open()
-    assert "publish" not in vars(publisher)
-
-
 def test_an_entity_made_while_active_is_open_at_once() -> None:
     gate, publisher = NodeGate(), FakePublisher()
     gate.open()
@@ -97,18 +90,6 @@ def test_a_removed_entity_is_left_alone() -> None:
     gate.remove(timer)
     gate.open()
     assert not timer.running
-
-
-def test_messages_reach_the_callback_only_while_open() -> None:
-    received: list[object] = []
-    gate, subscription = NodeGate(), FakeSubscription(received.append)
-    gate.add_subscription(subscription, at_once)
-    subscription.callback("early")
-    gate.open()
-    subscription.callback("now")
-    gate.close()
-    subscription.callback("late")
-    assert received == ["now"]
 
 
 def test_gating_a_subscription_twice_keeps_the_users_callback() -> None:
@@ -159,16 +140,6 @@ def test_kept_samples_wait_on_if_the_gate_closes_before_they_are_delivered() -> 
     gate.open()
     at_once(tasks[1])
     assert received == ["map"]
-
-
-def test_a_timer_runs_only_while_open() -> None:
-    gate, timer = NodeGate(), FakeTimer()
-    gate.add(timer, GatedTimer(timer, wanted=True))
-    assert not timer.running
-    gate.open()
-    assert timer.running
-    gate.close()
-    assert not timer.running
 
 
 def test_a_timer_that_the_user_cancelled_stays_cancelled() -> None:

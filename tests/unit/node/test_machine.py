@@ -235,14 +235,6 @@ def test_available_transitions_are_what_can_be_asked_for_here(
     assert [t.label for t in machine_in(state).available_transitions()] == labels
 
 
-def test_a_label_wins_over_an_id_as_in_rcl() -> None:
-    machine = machine_in(NodeState.UNCONFIGURED)
-    assert machine.resolve(1, "shutdown") is TransitionRequest.SHUTDOWN
-    assert machine.resolve(5, "") is TransitionRequest.SHUTDOWN
-    assert machine.resolve(1, "no such label") is None
-    assert machine.resolve(0) is None
-
-
 def test_nobody_outside_may_finish_a_transition() -> None:
     machine = machine_in(NodeState.CONFIGURING)
     assert machine.resolve(10) is None

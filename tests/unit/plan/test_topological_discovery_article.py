@@ -13,7 +13,6 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.manifest.diagnostics import ManifestError
 from lifecycle.manifest.loading import load
 from lifecycle.manifest.model import (
     Authority,
@@ -22,12 +21,10 @@ from lifecycle.manifest.model import (
     Discovery,
     DiscoveryMode,
     EndpointKind,
-    EndpointPolicy,
     FlowTransport,
     Machine,
-    Policy,
 )
-from lifecycle.network.connection_url import ConnectionUrlError, parse
+from lifecycle.network.connection_url import parse
 from lifecycle.network.medium import Medium
 from lifecycle.node.host.control import Operation
 from lifecycle.plan.build import build_plan
@@ -251,34 +248,6 @@ def test_the_articles_url_is_a_multicast_group_and_a_port():
     )
 
 
-def test_a_transport_that_is_not_offered_is_refused_with_those_that_are():
-    with pytest.raises(ConnectionUrlError) as refused:
-        parse("zmq_pgm://225.82.79.83:11311/")
-    assert refused.value.message == (
-        "cannot read connection URL 'zmq_pgm://225.82.79.83:11311/': unknown transport "
-        "'zmq_pgm'; "
-        "allowed: udpv4, udpv6, udpm, tcpv4, shm"
-    )
-
-
-def test_an_instruction_to_map_what_the_node_does_not_have_is_refused_before_anything_runs(
-    tmp_path: Path,
-):
-    path = tmp_path / "wrong.lifecycle.yaml"
-    path.write_text(INSTRUCTIONS.replace("[/foo, /bar]", "[/foo, /baz]"), encoding="utf-8")
-    with pytest.raises(ManifestError) as refused:
-        load(path, environment={})
-    assert str(refused.value) == (
-        f"{path}:17:37: nodes.n.connections.data.map.subscriptions[1]: cannot map subscription "
-        "'/baz' onto 'data': 'n' declares no such endpoint; did you mean '/bar'?"
-    )
-
-
-def test_the_same_instructions_whenever_they_are_read(instructed: Plan, tmp_path: Path):
-    again = load(tmp_path / "instructions.lifecycle.yaml", environment={})
-    assert build_plan(again.manifest, environment={}) == instructed
-
-
 # --- who decides: node configurations, a static list, hints
 
 
@@ -389,19 +358,6 @@ def intelligent(**data_layer: object) -> Plan:
     )
 
 
-def test_intelligent_multicast_is_a_group_with_ttl_0_here_and_tcp_to_other_machines():
-    plan = intelligent()
-    assert {each.subscription: each.medium for each in plan.flows} == {
-        "near": "udpm",
-        "nearer": "udpm",
-        "far": "tcpv4",
-    }
-    (connection,) = plan.node("talker").participants
-    group, tcp = (parse(each) for each in connection.connections.urls)
-    assert (group.transport, group.ttl) == (Medium.UDPM, 0)
-    assert tcp.transport is Medium.TCPV4
-
-
 def test_everybody_who_negotiates_from_the_same_configurations_comes_to_the_same_graph():
     """So no master is needed: each supervisor, or each node, may decide for itself."""
     plan = intelligent(authority=Authority.SUPERVISOR, source=DataLayerSource.DYNAMIC, events=True)
@@ -412,39 +368,3 @@ def test_everybody_who_negotiates_from_the_same_configurations_comes_to_the_same
         outcomes.append((source.instructions({each.name: each for each in order}), source.expected))
     assert outcomes[0] == outcomes[1]
     assert {each.medium for each in outcomes[0][1].flows} == {"udpm", "tcpv4"}
-
-
-def test_a_client_server_master_makes_no_choice_and_every_flow_is_tcp():
-    plan = planned(
-        node("p", publisher("t"), machine="m1"),
-        node("s", subscription("t"), machine="m2"),
-        links=[link("/t", "p", "s", transport=FlowTransport.TCPV4)],
-        machines=MACHINES,
-        discovery=Discovery(mode=DiscoveryMode.SERVER, server_machine="m1"),
-    )
-    assert plan.server is not None
-    assert [each.medium for each in plan.flows] == ["tcpv4"]
-    for each in plan.nodes:
-        (url,) = (parse(text) for text in each.connections.urls)
-        assert (url.transport, url.server) == (
-            Medium.TCPV4,
-            parse(plan.node("p").connections.urls[0]).server,
-        )
-
-
-def test_a_node_that_joins_is_negotiated_with_and_nothing_else_is_touched():
-    plan = dataclasses.replace(
-        pair(needs=[need(PUB, "t", transport=FlowTransport.TCPV4)]),
-        policy=Policy(undeclared_nodes=EndpointPolicy.OPEN),
-    )
-    source = NegotiatedSource(plan)
-    known = {each.full_name: configured(plan, each.key) for each in plan.nodes}
-    before = source.instructions(known)
-    guest = dataclasses.replace(
-        configured(plan, "s"),
-        identity=Identity(machine_id="elsewhere", process_id=9, node_id="guest@1"),
-        name="/guest",
-    )
-    after = source.instructions({**known, "/guest": guest})
-    assert [len(after["/guest"].connections), len(after["/guest"].mappings)] == [1, 1]
-    assert {name: after[name] for name in before} == before

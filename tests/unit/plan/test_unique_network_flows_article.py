@@ -98,12 +98,6 @@ def test_the_example_with_unique_flows_tells_p1_s1_from_p2_s2():
     assert not set(video.destination) & set(battery.destination)
 
 
-def test_default_latency_for_both_or_low_latency_for_both_is_refused_as_the_link_is_not_unique():
-    links = [link("/video", "n1", "n2", unique=UniqueHow.WEAKLY, max_delay_ms=5.0)]
-    (found,) = check(devices(unique=NOT, links=links), environment={})
-    assert found.rule == "check.link-not-unique"
-
-
 # --- unique_network_flow_endpoints_requirement_t
 
 
@@ -216,12 +210,6 @@ def test_the_article_s_snippet_of_sub_x_sub_y_and_pub_z():
 # --- what an RMW may do: port, flow label, DSCP
 
 
-def test_candidate_unique_transport_port_is_what_the_planner_takes():
-    plan = build_plan(one(STRICTLY), environment={})
-    assert [each.reason for each in plan.nodes[0].participants] == ["unique publisher a"]
-    assert [each.dscp for each in plan.nodes[0].participants] == [None]
-
-
 def test_candidate_ipv6_flow_label_tells_two_equal_5_tuples_apart():
     def labelled(label: int) -> tuple[NetworkFlowEndpoint, ...]:
         return (
@@ -260,22 +248,6 @@ def identified(count: int, **rest: object) -> Manifest:
         ),
         network=Network(flow_identification=FlowIdentification.DSCP, at=at(2)),
         **rest,
-    )
-
-
-def test_candidate_dscp_as_a_last_resort_warns_of_misinterpretation_and_erasure():
-    (found,) = [
-        each
-        for each in check(identified(2), environment={})
-        if each.rule == "check.dscp-repurposed"
-    ]
-    assert found.message == (
-        "cannot be sure that the network takes 2 of 64 DSCP values for identifiers: routers read "
-        "them as classes, and may reset or erase them"
-    )
-    assert found.hint == (
-        "tell those who run the network and configure each router on the way, or use "
-        "'flow_identification: participant'"
     )
 
 
@@ -328,20 +300,3 @@ def test_alternative_2_a_6_tuple_by_dscp_gives_each_publisher_a_value_of_its_own
     assert plan.nodes[0].participants[0].reason == (
         "unique publisher p marked DSCP 3 = TOS 12 (0x0c)"
     )
-
-
-def test_alternative_3_ds_based_qos_marks_classes_and_needs_no_unique_flow():
-    system = manifest(
-        node(
-            "n",
-            publisher("video", EMPTY),
-            publisher("audio", EMPTY),
-            publisher("battery", EMPTY),
-            needs=[need(PUB, "video", dscp=46), need(PUB, "audio", dscp=46)],
-        )
-    )
-    plan = build_plan(system, environment={})
-    assert [(each.dscp, each.reason) for each in plan.nodes[0].participants] == [
-        (46, "publishers video, audio marked EF = DSCP 46 = TOS 184 (0xb8)")
-    ]
-    assert [each.unique for each in plan.nodes[0].endpoints] == [NOT] * 3

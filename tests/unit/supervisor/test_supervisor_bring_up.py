@@ -208,21 +208,6 @@ def _activates(request: RequestSent) -> bool:
     return request.operation is Operation.ACTIVATE
 
 
-async def test_a_failed_transition_ends_the_bring_up_with_the_nodes_own_reason(
-    tmp_path: Path,
-) -> None:
-    world = _world(tmp_path, planned_node("a"), planned_node("b"))
-    world.spawner.ways["/a configure"] = "on_configure raised ValueError: no camera"
-    with pytest.raises(StepFailedError) as caught:
-        await world.bring_up.connect(LIMIT_S)
-    assert caught.value.rule.id == "run.transition-failed"
-    assert caught.value.subject == "/a"
-    assert caught.value.message == (
-        "cannot configure '/a': on_configure raised ValueError: no camera"
-    )
-    await _down(world)
-
-
 async def test_a_process_that_dies_says_what_its_node_was_doing_and_its_last_words(
     tmp_path: Path,
 ) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
-import os
 import socket
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,8 +13,6 @@ import pytest
 from lifecycle.network.connection_url import parse
 from lifecycle.plan.model import ParticipantConnections, Plan, PlannedServer
 from lifecycle.supervisor.connections import discovery_server
-from lifecycle.supervisor.control.protocol import ProcessState
-from lifecycle.supervisor.health.process_monitor import first_death
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.process import ProcessExit
 from lifecycle.supervisor.run.failure import StepFailedError
@@ -51,45 +48,11 @@ def world(plan: Plan, directory: Path) -> tuple[System, FakeSpawner]:
     return made.system, made.spawner
 
 
-class _PidOfOurs(FakeSpawner):
-    """Starts nothing, listens, and says that it is this process: its sockets are the server's."""
-
-    def __init__(self, listens: socket.socket) -> None:
-        super().__init__()
-        self.listens = listens
-
-    async def spawn(self, request):  # type: ignore[no-untyped-def]
-        process = await super().spawn(request)
-        self.listens.listen()
-        process.pid = os.getpid()
-        self.requests = [request]
-        return process
-
-
 class _EndsAtOnce(FakeSpawner):
     async def spawn(self, request):  # type: ignore[no-untyped-def]
         process = await super().spawn(request)
         process.end(ProcessExit(status=1))
         return process
-
-
-def test_it_runs_once_its_port_is_open_and_is_watched_like_any_process(
-    tmp_path: Path, listener: socket.socket
-) -> None:
-    async def main() -> None:
-        system, _ = world(served(listener.getsockname()[1]), tmp_path)
-        spawner = _PidOfOurs(listener)
-        await discovery_server.begin(system, spawner, ours=True)
-        assert system.server is not None
-        assert system.server.state is ProcessState.RUNNING
-        assert spawner.requests[0].planned.argv[0] == "env"
-        assert system.server in system.living
-        death = asyncio.ensure_future(first_death(system, set()))
-        spawner.processes["discovery_server"].end(ProcessExit(signal=9))
-        assert await asyncio.wait_for(death, 5) is system.server
-        await discovery_server.end(system, asyncio.Event())  # it has ended already
-
-    asyncio.run(main())
 
 
 def test_a_port_that_somebody_has_is_refused_before_the_server_seems_to_run(
@@ -156,15 +119,6 @@ def test_the_server_of_another_machine_may_come_later(
         await discovery_server.begin(system, spawner, ours=False)
         assert system.server is None
         assert spawner.processes == {}
-
-    asyncio.run(main())
-
-
-def test_a_plan_without_a_server_starts_none(tmp_path: Path) -> None:
-    async def main() -> None:
-        system, spawner = world(plan_of(planned_node("a")), tmp_path)
-        await discovery_server.begin(system, spawner, ours=True)
-        assert (system.server, spawner.processes) == (None, {})
 
     asyncio.run(main())
 

@@ -138,16 +138,6 @@ def test_a_guest_that_leaves_leaves_nothing_behind() -> None:
     assert source.instructions(known(TALKER, LISTENER)).keys() == alone.keys()
 
 
-def test_what_cannot_be_connected_is_told_with_what_both_have() -> None:
-    source = NegotiatedSource(plan_of(transport=FlowTransport.TCPV4))
-    poor = dataclasses.replace(LISTENER, transports=("udpv4", "shm"))
-    source.instructions(known(TALKER, poor))
-    (problem,) = source.problems
-    assert problem.startswith("cannot carry '/chatter' from 'talker' to 'listener' by tcpv4")
-    assert "'talker' can be connected by shm, udpv4, udpv6, udpm, tcpv4" in problem
-    assert "'listener' by udpv4, shm" in problem
-
-
 def test_a_guest_that_cannot_be_connected_is_no_problem_of_the_system() -> None:
     source = NegotiatedSource(plan_of(transport=FlowTransport.TCPV4))
     guest = configured("/guest", (SUB, "chatter"), transports=("udpv4",))

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.errors import BringUpError, ExitCode, UsageError
+from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest.model import Condition, RunKind
 from lifecycle.supervisor.control.client import look, order
 from lifecycle.supervisor.control.orders import (
@@ -158,21 +158,5 @@ async def test_nodes_are_deactivated_in_reverse_order_and_come_up_anew_in_new_pr
     assert (camera.reach, viewer.reach) == (Reach.WAITING, Reach.CONNECTED)
     await world.bring_up.connect(30.0, (camera,))
     assert camera.reach is Reach.CONNECTED
-    await world.bring_up.close()
-    await TakeDown(world.system, world.emit, asyncio.Event()).run()
-
-
-async def test_a_permit_of_an_earlier_gate_activates_nothing_after_a_pause(tmp_path: Path) -> None:
-    world = World(plan_of(planned_node("camera")), tmp_path)
-    gate = Gate(strict=False)
-    await world.bring_up.connect(30.0)
-    permit = gate.judge(verdict_of(Outcome.OK))
-    await world.bring_up.activate(permit, 30.0)
-    gate.close()
-    await world.bring_up.deactivate()
-    before = len(world.log)
-    with pytest.raises(BringUpError, match="the gate was closed again before this request"):
-        await world.bring_up.activate(permit, 30.0)
-    assert world.log[before:] == []
     await world.bring_up.close()
     await TakeDown(world.system, world.emit, asyncio.Event()).run()

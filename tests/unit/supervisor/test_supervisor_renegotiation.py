@@ -53,14 +53,6 @@ def seen(now: dict[str, NodeConfiguration]) -> Observation:
 
 
 @pytest.mark.parametrize("way", OTHER_WAYS, ids=lambda each: each.value)
-def test_an_onlooker_expects_what_the_authority_does(way: FlowTransport) -> None:
-    plan = plan_of(transport=way)
-    authority = NegotiatedSource(plan)
-    now = wired_by(authority, TALKER, LISTENER)
-    assert Expectation.of(plan, seen(now)) == Expectation(plan=authority.expected)
-
-
-@pytest.mark.parametrize("way", OTHER_WAYS, ids=lambda each: each.value)
 def test_it_does_so_too_after_guests_came_and_went(way: FlowTransport) -> None:
     plan = plan_of(transport=way)
     authority = NegotiatedSource(plan)

@@ -246,14 +246,7 @@ async def test_a_node_that_dies_during_bring_up_comes_again_while_the_others_wai
         world.hosts.ways.clear()
 
     await world.run(heal())
-    assert (
-        world.since("[backoff]")[-7 - len(DOWN) :][:2]
-        == [
-            "[system] active at 1.0 s",
-            "[restarted] camera (1)",
-        ]
-        or "[restarted] camera (1)" in world.outline
-    )
+    assert "[restarted] camera (1)" in world.outline
     assert world.outline.count("viewer start") == 1
     assert world.outline.count("/viewer configure") == 1
     assert world.story[-1] == "[stopped] 0"

@@ -664,15 +664,6 @@ def test_an_open_world_still_compares_a_foreign_end_of_a_service_or_action(kind,
     assert findings_after(same, plan=plan) == []
 
 
-def test_a_client_that_counts_no_server_is_told_of_at_its_declaration():
-    finding = the_finding(change_report(CLIENT, "/robot/camera/calibrate", server_matched=False))
-    assert finding.message == (
-        "cannot see /viewer → /robot/camera matched on service /robot/camera/calibrate: the client"
-        " counts no server as available"
-    )
-    assert (finding.node, finding.endpoint) == ("/viewer", CLIENT)
-
-
 def test_of_a_foreign_client_it_is_enough_that_its_server_is_there():
     reset = endpoint(CLIENT, "reset", "std_srvs/srv/Trigger", qos=None)
     plan = planned(
@@ -791,33 +782,9 @@ def test_a_foreign_depth_is_unverifiable_under_fast_dds():
     ]
 
 
-def test_a_foreign_managed_node_of_unknown_state_is_unverifiable():
-    finding = the_finding(change_node("/talker", state=None, managed=None), plan=foreign())
-    assert (finding.rule, finding.outcome) == ("state.unverifiable", Outcome.UNVERIFIABLE)
-    assert finding.message == "cannot verify the state of node /talker: nobody tells it"
-
-
-def test_a_foreign_node_that_offers_no_lifecycle_services_is_violated():
-    finding = the_finding(change_node("/talker", state=None, managed=False), plan=foreign())
-    assert (finding.rule, finding.outcome) == ("state.wrong-state", Outcome.VIOLATED)
-    assert finding.message == "cannot accept node /talker: it offers no lifecycle services"
-
-
 def test_a_plain_node_has_no_state_to_judge():
     edit = change_node("/listener", state=None, managed=False)
     assert findings_after(edit, plan=foreign()) == []
-
-
-def test_a_foreign_node_that_strictly_requires_a_unique_flow_is_violated():
-    """Strictly required is not met by what nobody can prove."""
-    strictly = need(PUB, "chatter", UniqueRequirement.STRICTLY_REQUIRED)
-    finding = the_finding(lambda seen: seen, plan=foreign(needs=[strictly]))
-    assert (finding.rule, finding.outcome) == ("flow.unverifiable", Outcome.VIOLATED)
-    assert finding.message == (
-        "cannot accept the publisher of /chatter in /talker: it strictly requires a unique network"
-        " flow, which cannot be proven: /talker does not report its network flow endpoints"
-    )
-    assert "unique: optionally_required" in finding.hint
 
 
 def test_a_link_demands_what_is_violated_when_it_cannot_be_proven():
@@ -1028,28 +995,9 @@ def test_two_ends_that_agree_on_another_definition_than_the_installed_are_violat
     assert found == [("graph.type-definition-differs", "violated", "/chatter")] * 2
 
 
-def test_an_end_that_announces_no_hash_is_unverifiable_once_for_its_node():
-    finding = the_finding(hashes("", HERE), plan=defined(HERE))
-    assert (finding.outcome, finding.subject) == (Outcome.UNVERIFIABLE, "/talker")
-    assert finding.message == (
-        "cannot verify which definitions /talker uses on /chatter (publisher): it announces no type"
-        " hashes"
-    )
-
-
 def test_without_any_hash_there_is_nothing_to_compare():
     assert findings_after(hashes("", ""), plan=defined("")) == []
     assert findings_after(hashes(None, None), plan=defined(HERE)) == []
-
-
-def test_an_undeclared_end_of_another_definition_is_violated_where_such_may_be():
-    plan = dataclasses.replace(defined(HERE), policy=Policy(undeclared_nodes=EndpointPolicy.OPEN))
-    edit = both(
-        hashes(HERE, HERE), add_endpoint(PUB, "/other", "/chatter", gid="99", type_hash=OTHER)
-    )
-    assert ("graph.type-definition-differs", "violated", "/chatter") in findings_after(
-        edit, plan=plan
-    )
 
 
 # --- what findings say

@@ -64,23 +64,6 @@ def reasons(found: object) -> list[str]:
 # --- NEF
 
 
-def test_a_flow_to_a_device_is_a_subscription_with_one_filter_towards_it() -> None:
-    (request,) = nef_subscriptions([VIDEO], nef()).requests
-    assert request.key == "/video /robot/camera → /viewer udp 10.9.0.2 to device"
-    assert request.body == {
-        "supportedFeatures": "0",
-        "notificationDestination": "https://robots.example.net/events",
-        "ueIpv4Addr": "10.9.0.2",
-        "flowInfo": [
-            {
-                "flowId": 1,
-                "flowDescriptions": ["permit out 17 from 10.9.0.1 17900 to 10.9.0.2 17910"],
-            }
-        ],
-        "qosReference": "robot-control",
-    }
-
-
 def filters(body: dict[str, object]) -> list[str]:
     (flow,) = body["flowInfo"]
     return flow["flowDescriptions"]
@@ -261,17 +244,9 @@ def test_camaras_document_would_notice_a_wrong_session(
         post(openapi, {**request.body, **change})
 
 
-def test_a_session_is_a_device_a_server_and_a_port_at_each() -> None:
-    (request,) = camara_sessions([VIDEO], camara(sink="https://x.example/")).requests
-    assert request.body == {
-        "device": {"ipv4Address": {"publicAddress": "10.9.0.2", "privateAddress": "10.9.0.2"}},
-        "applicationServer": {"ipv4Address": "10.9.0.1"},
-        "devicePorts": {"ports": [17910]},
-        "applicationServerPorts": {"ports": [17900]},
-        "qosProfile": "QOS_E",
-        "sink": "https://x.example/",
-        "duration": 3600,
-    }
+def test_a_sink_is_named_where_there_is_one() -> None:
+    (request,) = camara_sessions([VIDEO], VARIANTS["with a sink"]).requests
+    assert request.body["sink"] == "https://robots.example.net/events"
 
 
 @pytest.mark.parametrize(

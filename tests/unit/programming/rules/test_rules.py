@@ -189,17 +189,9 @@ def test_flow_labels_are_given_to_ipv6_only_and_stay_with_the_5_tuple() -> None:
             {"transport_protocol": TransportProtocol.UNKNOWN},
             "cannot match protocol 'unknown'; use udp or tcp",
         ),
-        ({"source_port": 0}, "cannot use port 0; use 1 to 65535"),
         (
             {"destination_address": "viewer"},
             "cannot use address 'viewer'; use one IPv4 or IPv6 address, such as 10.77.0.1",
-        ),
-        (
-            {"destination_address": "0.0.0.0"},
-            (
-                "cannot use address '0.0.0.0': it is every address of its host; use one unicast "
-                "address"
-            ),
         ),
         (
             {"destination_address": "fe80::1%eth0"},
