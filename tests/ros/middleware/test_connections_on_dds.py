@@ -227,18 +227,6 @@ def test_a_fixed_port_that_is_taken_is_an_error_that_names_it(
     capfd.readouterr()  # Fast DDS's own words
 
 
-def test_a_tcp_port_that_is_taken_is_an_error_that_names_it(
-    fresh_domain: int, ports: list[int], capfd: pytest.CaptureFixture[str]
-) -> None:
-    url = f"tcpv4://127.0.0.1:{ports[0]}"
-    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as taken:
-        taken.bind(("127.0.0.1", ports[0]))
-        taken.listen()
-        with pytest.raises(MiddlewareError, match=rf"TCP 127\.0\.0\.1:{ports[0]} is not free"):
-            FlowParticipant("_late", "/", fresh_domain, connections=connect(url))
-    capfd.readouterr()
-
-
 def test_a_mark_that_no_url_could_carry_is_an_error_that_lists_them(fresh_domain: int) -> None:
     urls = ("tcpv4://127.0.0.1:21099", "shm://")
     with pytest.raises(MiddlewareError) as refused:
@@ -247,14 +235,6 @@ def test_a_mark_that_no_url_could_carry_is_an_error_that_lists_them(fresh_domain
         "cannot mark what 'tcpv4://127.0.0.1:21099' and 'shm://' carries with DSCP 46: only UDP "
         "sockets can be marked; remove the mark, or carry it by udpv4://"
     )
-
-
-def test_an_address_of_another_host_is_an_error_that_lists_our_own(fresh_domain: int) -> None:
-    with pytest.raises(MiddlewareError) as refused:
-        FlowParticipant("_far", "/", fresh_domain, connections=connect("udpv4://192.0.2.77:7911"))
-    message = str(refused.value)
-    assert "cannot connect by 'udpv4://192.0.2.77:7911': this host has no address" in message
-    assert "127.0.0.1" in message
 
 
 def test_ports_are_free_again_when_destroy_returns(

@@ -257,14 +257,6 @@ def test_a_node_that_comes_again_beside_a_ghost_of_its_name_has_its_own_services
                 node.destroy_node()
 
 
-def test_a_managed_node_is_told_by_its_services(
-    observer: GraphObserver, context: rclpy.Context, wait_until: WaitUntil
-) -> None:
-    node = ManagedNode("managed", context=context)
-    wait_until(lambda: "/managed" in nodes(observer) and nodes(observer)["/managed"].managed)
-    node.destroy_node()
-
-
 def test_of_a_node_that_leaves_the_services_of_the_node_interface_stay_its_own(
     observer: GraphObserver, make_node: MakeNode, wait_until: WaitUntil
 ) -> None:

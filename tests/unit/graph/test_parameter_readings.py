@@ -246,12 +246,3 @@ def test_a_node_that_left_or_reports_by_itself_is_read_no_more() -> None:
         assert reader.woken == 1
 
     reading(test)
-
-
-def test_nothing_is_subscribed_to_where_nothing_is_judged() -> None:
-    async def test() -> None:
-        services = Services()
-        ParameterReadings(services, lambda: None).listen({})
-        assert services.listeners == []
-
-    run(test())

@@ -20,21 +20,6 @@ from lifecycle.network.ports import participant_ports
 VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 
 
-def test_leaving_and_sweeping_are_loaded_without_importing_rclpy() -> None:
-    look = (
-        "import sys; import "
-        "lifecycle.middleware.fastdds.profiles, "
-        "lifecycle.middleware.process.control, "
-        "lifecycle.middleware.process.shared_memory, "
-        "lifecycle.middleware.process.teardown; "
-        "print('rclpy' in sys.modules)"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", look], check=True, capture_output=True, text=True, timeout=30
-    )
-    assert done.stdout == "False\n"
-
-
 def test_the_profile_only_sets_announcements() -> None:
     root = ET.fromstring(discovery_profile())
     space = "{http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles}"

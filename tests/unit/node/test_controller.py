@@ -7,14 +7,12 @@ from typing import Any
 
 import pytest
 
-from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import Timeouts
 from lifecycle.node.lifecycle.controller import Controller
 from lifecycle.node.lifecycle.execution import Result
 from lifecycle.node.lifecycle.machine import (
     CallbackOutcome,
     NodeState,
-    RefusedError,
     TransitionRequest,
 )
 
@@ -209,18 +207,6 @@ def test_an_error_runs_on_error_and_takes_everything_down(
     assert controller.machine.state is ends
 
 
-def test_an_endpoint_that_cannot_be_made_fails_the_transition_with_the_reason(
-    controller: Controller, node: FakeNode
-) -> None:
-    bring(controller, node, TransitionRequest.CONFIGURE)
-    node.fail["make"] = LifecycleError("cannot connect publisher 'video': not supported")
-    result = run(controller.change(TransitionRequest.ACTIVATE))
-    assert result.outcome is CallbackOutcome.FAILURE
-    assert result.error == "cannot connect publisher 'video': not supported"
-    assert node.did == ["make"]
-    assert controller.machine.state is NodeState.INACTIVE_DISCONNECTED
-
-
 def test_a_bug_of_ours_is_an_error_and_not_a_stuck_node(
     controller: Controller, node: FakeNode
 ) -> None:
@@ -239,23 +225,6 @@ class Turns:
     def __await__(self) -> Generator[None, None, None]:
         while not self.done:
             yield
-
-
-def test_a_second_request_is_refused_while_one_runs(controller: Controller, node: FakeNode) -> None:
-    turns = Turns()
-
-    async def on_configure() -> None:
-        await turns
-
-    node.callbacks["on_configure"] = on_configure
-    first = controller.change(TransitionRequest.CONFIGURE)
-    first.send(None)
-    for request in TransitionRequest:
-        with pytest.raises(RefusedError, match="one transition at a time"):
-            run(controller.change(request))
-    turns.done = True
-    assert run(first).outcome is CallbackOutcome.SUCCESS
-    assert node.did == ["prepare", "on_configure", "wake in 10 s", "call off"]
 
 
 def test_shutting_down_cancels_what_runs_first(controller: Controller, node: FakeNode) -> None:

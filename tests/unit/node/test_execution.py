@@ -76,16 +76,6 @@ def test_a_callback_may_take_the_state_or_not() -> None:
     assert seen == ["state"]
 
 
-def test_an_exception_is_an_error_with_its_traceback() -> None:
-    def on_configure() -> None:
-        raise OSError("no such camera")
-
-    result = drive(on_configure)
-    assert result.outcome is CallbackOutcome.ERROR
-    assert result.error == "/camera: on_configure raised OSError: no such camera"
-    assert 'raise OSError("no such camera")' in result.trace
-
-
 def test_awaiting_asyncio_says_that_there_is_no_loop_and_what_to_await() -> None:
     async def naps(state: str) -> None:
         await asyncio.sleep(0.1)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
-import os
-import signal
 import socket
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -13,21 +11,15 @@ from pathlib import Path
 import pytest
 
 from lifecycle.cli.up_output import describe
-from lifecycle.codec import from_json, to_json
 from lifecycle.manifest.model import DiscoveryRange, Machine, Run, RunKind, Timeouts
 from lifecycle.middleware.process.busy_timer import BusySign, Overdue
 from lifecycle.node.host.control import SIGN_DESCRIPTORS, HostSpec, Operation
-from lifecycle.node.host.control import Event as HostEvent
-from lifecycle.plan.model import Plan, PlannedProcess
+from lifecycle.plan.model import Plan
 from lifecycle.supervisor.gate.verification_loop import without_nodes
 from lifecycle.supervisor.health.liveliness import Cause, NodeArrivals, SilenceMonitor
 from lifecycle.supervisor.health.peer_supervisors import CALL_EACH_S, Listener, PeerSupervisors
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.control_channel import ChannelClosedError, ControlChannel
-from lifecycle.supervisor.processes.fork_server import ForkServer
-from lifecycle.supervisor.processes.fork_server_process import ForkServerProcess
-from lifecycle.supervisor.processes.logs import LogDirectory
-from lifecycle.supervisor.processes.process import ManagedProcess
 from lifecycle.supervisor.run.events import (
     Emitter,
     Event,
@@ -451,40 +443,6 @@ async def test_a_loss_has_us_and_our_hosts_prepare_and_after_it_tell_our_names_a
         await process.end(((9, 5.0),), asyncio.Event())
 
 
-def test_a_channel_tells_that_its_host_hangs_and_when_it_came_back() -> None:
-    async def test() -> None:
-        told: asyncio.Queue[Overdue | None] = asyncio.Queue()
-        spec = HostSpec(
-            system="robot",
-            process="p",
-            domain_id=0,
-            discovery_range=DiscoveryRange.LOCALHOST,
-            nodes=(
-                planned_node("quick", timeouts=Timeouts(silent_s=0.01)),
-                planned_node("slow", timeouts=Timeouts(silent_s=0.05)),
-            ),
-        )
-        channel = ControlChannel(spec, lambda _: None, told.put_nowait)
-        theirs = await channel.open()
-        first, descriptors, _, _ = socket.recv_fds(theirs, 1, SIGN_DESCRIPTORS)
-        assert from_json(first + theirs.makefile("rb").readline(), HostSpec) == spec
-        sign = BusySign(*descriptors)
-        assert sign.limit_s == 0.05
-        sign.begin()
-        # On a busy machine this thread may wait for a processor first, and say so.
-        while (why := await asyncio.wait_for(told.get(), 10)) is Overdue.UNSERVED:
-            pass
-        assert why is Overdue.HANGS
-        assert sign.end() is not None
-        theirs.sendall(to_json(HostEvent(kind="beat")) + b"\n")
-        assert await asyncio.wait_for(told.get(), 10) is None
-        sign.close()
-        theirs.close()
-        await channel.close()
-
-    asyncio.run(test())
-
-
 def test_a_process_that_was_killed_while_it_was_busy_does_not_hang() -> None:
     """Its nodes may run again in another one, when the limit of the first is over."""
 
@@ -535,31 +493,5 @@ def test_closing_a_channel_closes_its_busy_sign(tmp_path: Path) -> None:
             theirs.close()
             await channel.close()
         assert open_descriptors() <= before
-
-    asyncio.run(test())
-
-
-def test_a_fork_server_tells_that_a_process_was_stopped_and_continues(tmp_path: Path) -> None:
-    async def test() -> None:
-        told: asyncio.Queue[bool] = asyncio.Queue()
-        fork_server = ForkServer(ForkServerProcess(preload=False))
-        argv = ("sleep", "60")
-        planned = PlannedProcess(
-            name="it",
-            machine="",
-            run=Run(kind=RunKind.COMMAND, command=argv),
-            nodes=("it",),
-            argv=argv,
-        )
-        process = ManagedProcess(planned, logs=LogDirectory(tmp_path, print), emit=Emitter())
-        process.on_stop = told.put_nowait
-        await process.spawn(fork_server, None)
-        for number, expected in ((signal.SIGSTOP, True), (signal.SIGCONT, False)) * 2:
-            os.kill(process.pid, number)
-            assert await asyncio.wait_for(told.get(), 10) is expected
-        assert not process.ended.done()
-        await process.end(((signal.SIGKILL, 10.0),), asyncio.Event())
-        await fork_server.close()
-        assert told.empty()
 
     asyncio.run(test())

@@ -19,14 +19,11 @@ from lifecycle.supervisor.control.orders import (
     Order,
     check_order,
 )
-from lifecycle.supervisor.control.protocol import Answer, ControlRequest, Question, Reach
+from lifecycle.supervisor.control.protocol import Answer, ControlRequest, Question
 from lifecycle.supervisor.control.server import ControlServer, SupervisorSnapshot, follow
-from lifecycle.supervisor.gate.gate import Gate
-from lifecycle.supervisor.run.shutdown import TakeDown
 from lifecycle.verify.observation import Observation
-from lifecycle.verify.outcome import Outcome
 from tests.builders import plan_of, planned_node
-from tests.unit.supervisor.fakes import World, verdict_of
+from tests.unit.supervisor.fakes import World
 from tests.unit.test_run_directory import STATUS
 
 PLAN = plan_of(
@@ -129,34 +126,3 @@ def test_the_control_socket_looks_follows_and_orders(tmp_path: Path) -> None:
         assert heard == [seen, seen]
 
     asyncio.run(test())
-
-
-async def test_nodes_are_deactivated_in_reverse_order_and_come_up_anew_in_new_processes(
-    tmp_path: Path,
-) -> None:
-    plan = plan_of(
-        planned_node("camera"), planned_node("viewer", after={"camera": Condition.ACTIVE})
-    )
-    world = World(plan, tmp_path)
-    gate = Gate(strict=False)
-    await world.bring_up.connect(30.0)
-    await world.bring_up.activate(gate.judge(verdict_of(Outcome.OK)), 30.0)
-    world.spawner.takes_s["/viewer deactivate"] = 3.0
-    before = len(world.log)
-    await world.bring_up.deactivate()
-    assert world.log[before:] == ["/viewer deactivate", "/camera deactivate"]
-    assert {node.reach for node in world.system.nodes.values()} == {Reach.CONNECTED}
-
-    camera, viewer = world.system.nodes["camera"], world.system.nodes["viewer"]
-    old = camera.process
-    before = len(world.log)
-    await TakeDown(world.system, world.emit, asyncio.Event(), nodes=(camera,)).run()
-    assert [each for each in world.log[before:] if "viewer" in each] == []
-    world.system.renew((camera,))
-    assert camera.process is not old
-    assert world.system.processes["camera"] is camera.process
-    assert (camera.reach, viewer.reach) == (Reach.WAITING, Reach.CONNECTED)
-    await world.bring_up.connect(30.0, (camera,))
-    assert camera.reach is Reach.CONNECTED
-    await world.bring_up.close()
-    await TakeDown(world.system, world.emit, asyncio.Event()).run()

@@ -40,7 +40,7 @@ from lifecycle.supervisor.connections.desired_state import (
     wired,
 )
 from lifecycle.supervisor.nodes.bring_up import BringUp
-from lifecycle.supervisor.run.events import Notice, WiringChanged, WiringLost
+from lifecycle.supervisor.run.events import Notice, WiringChanged
 from lifecycle.supervisor.run.failure import StepFailedError
 from lifecycle.supervisor.run.shutdown import TakeDown
 from lifecycle.verify.observation import NodeConfiguration, Observation
@@ -96,37 +96,17 @@ class ChangingSource(PlannedSource):
         return self.now
 
 
-class FakeHand:
-    """A node interface that somebody else's node offers."""
-
-    def __init__(self, interface: NodeConfiguration) -> None:
-        self.now = interface
-        self.made: list[str] = []
-
-    async def interface(self) -> NodeConfiguration:
-        return self.now
-
-    async def wire(self, step: Step) -> NodeConfiguration:
-        self.made.append(str(step))
-        self.now = rewired(
-            self.now,
-            step.operation,
-            connection=step.connection,
-            urls=step.connections.urls,
-            endpoint=step.endpoint,
-        )
-        return self.now
-
-
 class Wiring:
     """A world whose bring-up has an authority."""
 
     def __init__(self, plan: Plan, directory: Path) -> None:
         self.world = World(plan, directory)
         self.source = ChangingSource(plan)
-        self.hands: dict[str, FakeHand] = {}
         self.authority = ConnectionAuthority(
-            self.world.system, self.source, self.world.emit, interface_of=self._hand
+            self.world.system,
+            self.source,
+            self.world.emit,
+            interface_of=lambda name: pytest.fail(f"{name} is nobody that is known"),
         )
         self.world.bring_up = BringUp(
             self.world.system,
@@ -140,9 +120,6 @@ class Wiring:
             self.world.spawner.interfaces[node.full_name] = interface_of(
                 node.full_name, "publishers/out", "subscriptions/in"
             )
-
-    def _hand(self, name: str) -> FakeHand:
-        return self.hands[name]
 
     def told(self, node: str) -> list[str]:
         """What a hosted node was asked, in order."""
@@ -275,22 +252,6 @@ async def test_capabilities_that_do_not_fit_end_bring_up(tmp_path: Path) -> None
     await wiring.down()
 
 
-async def test_a_lost_connection_is_told_and_made_again_with_its_mappings(tmp_path: Path) -> None:
-    wiring = Wiring(wired_plan(wired_node("a"), events=True), tmp_path)
-    await wiring.world.bring_up.connect(LIMIT_S)
-    wiring.report("/a")
-    wiring.look()
-    await settle()
-    before = len(wiring.told("/a"))
-    wiring.lose("/a", "net")
-    wiring.look()
-    await settle()
-    assert wiring.told("/a")[before:] == ["connect_to net", "map_to publishers/out net"]
-    assert wiring.world.heard(WiringLost) == [WiringLost(node="/a", connection="net")]
-    assert wiring.authority.findings() == ()
-    await wiring.down()
-
-
 async def test_without_events_nobody_is_watched(tmp_path: Path) -> None:
     wiring = Wiring(wired_plan(wired_node("a"), events=False), tmp_path)
     await wiring.world.bring_up.connect(LIMIT_S)
@@ -399,27 +360,6 @@ async def test_a_negotiation_that_fails_while_running_is_a_finding_until_it_succ
     wiring.look()
     assert wiring.authority.findings() == ()
     await wiring.down()
-
-
-async def test_an_undeclared_node_that_joins_is_wired_never_activated_and_released_in_the_end(
-    tmp_path: Path,
-) -> None:
-    wiring = Wiring(wired_plan(wired_node("a"), source=DataLayerSource.DYNAMIC), tmp_path)
-    await wiring.world.bring_up.connect(LIMIT_S)
-    guest = interface_of("/guest", "subscriptions/out")
-    wiring.hands["/guest"] = FakeHand(guest)
-    wiring.source.now["/guest"] = Instructions(
-        node="/guest", connections=(("net", NET),), mappings=(("subscriptions/out", "net"),)
-    )
-    wiring.look(guest)
-    await settle()
-    assert wiring.source.known[-1] == {"/a", "/guest"}
-    assert wiring.hands["/guest"].made == [
-        f"connect '/guest' to 'net' ({URL})",
-        "map 'subscriptions/out' of '/guest' to connection 'net'",
-    ]
-    await wiring.down()
-    assert wiring.hands["/guest"].made[2:] == ["disconnect '/guest' from 'net'"]
 
 
 async def test_a_foreign_node_without_a_node_interface_cannot_be_connected(tmp_path: Path) -> None:

@@ -98,13 +98,6 @@ def test_a_key_that_is_no_5qi_is_refused_where_it_stands(tmp_path: Path) -> None
     )
 
 
-def test_a_sink_must_be_https(tmp_path: Path) -> None:
-    settings = camara_settings("https://api.example.net/qod", sink="http://x.example/s")
-
-    with pytest.raises(SettingsError, match=r"cannot use sink 'http://x\.example/s'"):
-        load_settings(settings_file(tmp_path, camara=settings), settings_types())
-
-
 def test_text_that_is_no_yaml_is_not_quoted_for_it_may_hold_a_token(tmp_path: Path) -> None:
     file = tmp_path / "targets.yaml"
     file.write_text("nef: {token: hunter2\n  x: [")
