@@ -460,14 +460,6 @@ def test_includes_end_at_a_depth_and_a_number(tmp_path: Path) -> None:
         load(tmp_path / "tree.lifecycle.yaml")
 
 
-def test_a_process_that_only_needs_the_types_imports_neither_yaml_nor_json_schema() -> None:
-    program = "import sys, lifecycle.manifest; print({'yaml', 'jsonschema'} & set(sys.modules))"
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True
-    )
-    assert done.stdout == "set()\n"
-
-
 def test_no_module_takes_the_place_of_yaml_until_that_is_loaded() -> None:
     # Python forgets an error, an interrupt too, that loads such a one when others import it.
     program = (

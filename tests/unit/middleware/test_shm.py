@@ -109,12 +109,6 @@ def test_a_held_lock_keeps_its_group(directory: Path, kind: str, how: int) -> No
     assert sweep(ALL) == (SEGMENT, lock)
 
 
-def test_what_is_mapped_is_in_use(directory: Path) -> None:
-    make(directory, *GROUP, SEGMENT)
-    with mapped(directory / PORT), mapped(directory / SEGMENT):
-        assert sweep(ALL) == ()
-
-
 def test_a_dead_owners_segment_goes_although_a_reader_still_maps_it(directory: Path) -> None:
     make(directory, SEGMENT, f"{SEGMENT}_el")
     with mapped(directory / SEGMENT) as address:
@@ -252,17 +246,6 @@ def test_the_port_of_a_living_process_stays_as_it_is(
         fcntl.flock(owner, fcntl.LOCK_EX)
         assert disown_ports() == ()
     assert disown_ports() == (PORT,)
-
-
-def test_a_port_that_is_locked_is_not_opened(
-    directory: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    make(directory, *GROUP)
-    (directory / PORT).write_bytes(port_node())
-    monkeypatch.setattr(shared_memory, "_port_flags", lambda *_: pytest.fail("it is opened"))
-    with (directory / f"{PORT}_el").open("rb") as owner:
-        fcntl.flock(owner, fcntl.LOCK_EX)
-        assert disown_ports() == ()
 
 
 def test_ports_are_let_go_of_where_the_kernel_lists_no_locks(
