@@ -1,4 +1,4 @@
-"""The arrows of ARCHITECTURE.md, held by import-linter and by a clean interpreter."""
+"""What modules import and name, where import-linter does not look."""
 
 from __future__ import annotations
 

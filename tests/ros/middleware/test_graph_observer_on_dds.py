@@ -155,42 +155,53 @@ def test_two_nodes_of_one_name_count_twice(
     )
 
 
+def homes(observer: GraphObserver) -> list[str]:
+    """Participants that have a node `/twin`, by what they publish."""
+    events = endpoints_of(observer.node, EndpointKind.PUBLISHER, "/parameter_events")
+    return [each.gid[:24] for each in events if each.node == "/twin"]
+
+
+def home_of_one_that_left(observer: GraphObserver, domain_id: int, wait_until: WaitUntil) -> str:
+    """Return the participant of a `/twin` that came and has left."""
+    with a_node(domain_id, "twin"):
+        wait_until(lambda: homes(observer))
+        gone = homes(observer)[0]
+        wait_until(lambda: "/twin" in nodes(observer))
+    wait_until(lambda: "/twin" not in nodes(observer))
+    return gone
+
+
+@contextlib.contextmanager
+def a_ghost(domain_id: int, participant: str, name: str) -> Iterator[None]:
+    """Have another process say that a participant that has left still has a node."""
+    claim = [
+        *(sys.executable, BARE_DDS, "--write", "rt/said:std_msgs::msg::dds_::String_"),
+        *("--node", "/", "bare", "--ghost", participant, "/", name),
+    ]
+    environment = {**os.environ, "ROS_DOMAIN_ID": str(domain_id)}
+    with subprocess.Popen(claim, cwd=ROOT, env=environment) as claims:
+        try:
+            yield
+        finally:
+            claims.terminate()
+
+
 def test_a_ghost_is_not_counted_beside_participants_of_connections(
     observer: GraphObserver, domain_id: int, wait_until: WaitUntil
 ) -> None:
     """rmw_dds_common keeps the names of a participant that is heard once more after it has left."""
-
-    def homes() -> list[str]:
-        events = endpoints_of(observer.node, EndpointKind.PUBLISHER, "/parameter_events")
-        return [each.gid[:24] for each in events if each.node == "/twin"]
-
-    def home() -> str:
-        wait_until(homes)
-        return homes()[0]
-
-    with a_node(domain_id, "twin"):
-        gone = home()
-        wait_until(lambda: "/twin" in nodes(observer))
-    wait_until(lambda: "/twin" not in nodes(observer))
-    ghost = [
-        *(sys.executable, BARE_DDS, "--write", "rt/said:std_msgs::msg::dds_::String_"),
-        *("--node", "/", "bare", "--ghost", gone, "/", "twin"),
-    ]
+    gone = home_of_one_that_left(observer, domain_id, wait_until)
     with (
         FlowParticipant("_twin_flow_0", "/", domain_id) as participant,
         a_node(domain_id, "twin"),
-        subprocess.Popen(
-            ghost, cwd=ROOT, env={**os.environ, "ROS_DOMAIN_ID": str(domain_id)}
-        ) as claims,
+        a_ghost(domain_id, gone, "twin"),
     ):
-        try:
-            participant.create_publisher(String, "/video", QosProfile())
-            assert home() != gone
-            wait_until(lambda: node_names(observer.node).count("/twin") == 2)
-            wait_until(lambda: "/bare" in nodes(observer) and nodes(observer)["/twin"].count == 1)
-            assert node_names(observer.node).count("/twin") == 2
-        finally:
-            claims.terminate()
+        participant.create_publisher(String, "/video", QosProfile())
+        wait_until(lambda: homes(observer))
+        assert homes(observer)[0] != gone
+        wait_until(lambda: node_names(observer.node).count("/twin") == 2)
+        wait_until(lambda: "/bare" in nodes(observer) and nodes(observer)["/twin"].count == 1)
+        assert node_names(observer.node).count("/twin") == 2
 
 
 def test_a_ghost_of_a_node_that_was_never_seen_is_nobody_once_its_process_has_ended(
@@ -203,58 +214,28 @@ def test_a_ghost_of_a_node_that_was_never_seen_is_nobody_once_its_process_has_en
     pid_digits = (process.pid & 0xFFFF).to_bytes(2, "little").hex()
     gone = observer.prefix[:8] + pid_digits + "00000001" + "0000"
     assert len(gone) == 24
-    ghost = [
-        *(sys.executable, BARE_DDS, "--write", "rt/said:std_msgs::msg::dds_::String_"),
-        *("--node", "/", "bare", "--ghost", gone, "/", "brief"),
-    ]
-    with subprocess.Popen(
-        ghost, cwd=ROOT, env={**os.environ, "ROS_DOMAIN_ID": str(domain_id)}
-    ) as claims:
-        try:
-            wait_until(lambda: "/brief" in node_names(observer.node))
-            wait_until(lambda: {"/bare", "/brief"} <= nodes(observer).keys())
-            found = observer.participants_of(process.pid, nodes=["/brief"], reported=[gone])
-            assert found == frozenset()
-            wait_until(lambda: "/bare" in nodes(observer) and "/brief" not in nodes(observer))
-            assert "/brief" in node_names(observer.node)
-        finally:
-            claims.terminate()
+    with a_ghost(domain_id, gone, "brief"):
+        wait_until(lambda: "/brief" in node_names(observer.node))
+        wait_until(lambda: {"/bare", "/brief"} <= nodes(observer).keys())
+        found = observer.participants_of(process.pid, nodes=["/brief"], reported=[gone])
+        assert found == frozenset()
+        wait_until(lambda: "/bare" in nodes(observer) and "/brief" not in nodes(observer))
+        assert "/brief" in node_names(observer.node)
 
 
 def test_a_node_that_comes_again_beside_a_ghost_of_its_name_has_its_own_services(
     observer: GraphObserver, context: rclpy.Context, domain_id: int, wait_until: WaitUntil
 ) -> None:
-    def homes() -> list[str]:
-        events = endpoints_of(observer.node, EndpointKind.PUBLISHER, "/parameter_events")
-        return [each.gid[:24] for each in events if each.node == "/twin"]
-
-    with a_node(domain_id, "twin"):
-        wait_until(homes)
-        gone = homes()[0]
-        wait_until(lambda: "/twin" in nodes(observer))
-    wait_until(lambda: "/twin" not in nodes(observer))
-    ghost = [
-        *(sys.executable, BARE_DDS, "--write", "rt/said:std_msgs::msg::dds_::String_"),
-        *("--node", "/", "bare", "--ghost", gone, "/", "twin"),
-    ]
-    with subprocess.Popen(
-        ghost, cwd=ROOT, env={**os.environ, "ROS_DOMAIN_ID": str(domain_id)}
-    ) as claims:
-        node = None
+    gone = home_of_one_that_left(observer, domain_id, wait_until)
+    with a_ghost(domain_id, gone, "twin"):
+        wait_until(lambda: node_names(observer.node).count("/twin") == 1)
+        node = ManagedNode("twin", context=context)
         try:
-            wait_until(lambda: node_names(observer.node).count("/twin") == 1)
-            node = ManagedNode("twin", context=context)
             wait_until(lambda: node_names(observer.node).count("/twin") == 2)
-            wait_until(
-                lambda: (
-                    nodes(observer).get("/twin")
-                    == ObservedNode(full_name="/twin", count=1, managed=True)
-                )
-            )
+            alone = ObservedNode(full_name="/twin", count=1, managed=True)
+            wait_until(lambda: nodes(observer).get("/twin") == alone)
         finally:
-            claims.terminate()
-            if node is not None:
-                node.destroy_node()
+            node.destroy_node()
 
 
 def test_of_a_node_that_leaves_the_services_of_the_node_interface_stay_its_own(
