@@ -34,7 +34,12 @@ from lifecycle.manifest.model import (
     UniqueHow,
 )
 from lifecycle.manifest.qos import QosProfile, Reliability
-from lifecycle.network.nfe import UniqueRequirement
+from lifecycle.network.nfe import (
+    InternetProtocol,
+    NetworkFlowEndpoint,
+    TransportProtocol,
+    UniqueRequirement,
+)
 from lifecycle.plan.build import build_plan
 from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedNode, PlannedProcess
 from lifecycle.verify.observation import EndpointReport, Identity, NodeConfiguration
@@ -269,3 +274,28 @@ def port_node(
     """Return a port in shared memory, as far as it is looked at, as Fast DDS 2.14.5 writes it."""
     node = struct.pack("=7I", port if number is None else number, 1, 1000, wait_ms, 512, 1, flags)
     return struct.pack("=I", port) + bytes(272) + node + bytes(1024)
+
+
+def nfe(
+    address: str,
+    port: int,
+    transport: TransportProtocol = TransportProtocol.UDP,
+    **rest: int,
+) -> NetworkFlowEndpoint:
+    """A network flow endpoint of the address's family."""
+    return NetworkFlowEndpoint(
+        transport_protocol=transport,
+        internet_protocol=InternetProtocol.IPV6 if ":" in address else InternetProtocol.IPV4,
+        transport_port=port,
+        internet_address=address,
+        **rest,
+    )
+
+
+def shared_memory(port: int = 0) -> NetworkFlowEndpoint:
+    """What an endpoint lists for shared memory."""
+    return NetworkFlowEndpoint(
+        transport_protocol=TransportProtocol.UNKNOWN,
+        internet_protocol=InternetProtocol.UNKNOWN,
+        transport_port=port,
+    )

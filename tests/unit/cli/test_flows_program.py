@@ -14,9 +14,10 @@ from lifecycle.errors import ExitCode, UsageError
 from lifecycle.programming.apply.programmer import read_treatment
 from lifecycle.programming.apply.target import MissingFeatureError
 from lifecycle.programming.apply.targets.registry import TargetOptions, read_targets, target_kind
+from tests.builders import nfe
 from tests.unit.programming.apply.samples import nef_settings, settings_file
 from tests.unit.programming.apply.servers import TOKEN, NefServer
-from tests.unit.programming.rules.samples import nfe, plan, report
+from tests.unit.programming.rules.samples import plan, report
 
 SUBCOMMANDS = (flows_verb.apply_command, flows_verb.diff_command, flows_verb.remove_command)
 

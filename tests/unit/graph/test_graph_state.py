@@ -23,9 +23,10 @@ from lifecycle.graph.model import End, GraphChange, NodeLiveliness, NodeView, li
 from lifecycle.graph.state import GraphState
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import QosProfile, Reliability
-from lifecycle.network.nfe import InternetProtocol, NetworkFlowEndpoint, TransportProtocol
+from lifecycle.network.nfe import TransportProtocol
 from lifecycle.verify.observation import EndpointReport, Identity, NodeConfiguration
 from lifecycle.verify.outcome import Outcome
+from tests.builders import nfe
 
 PUBLISHER, SUBSCRIPTION = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
 
@@ -257,12 +258,7 @@ def test_a_match_of_which_no_message_tells_is_not_kept(followed: Followed) -> No
     assert seen.endpoints == (dataclasses.replace(client, server_matched=None),)
 
 
-UDP = NetworkFlowEndpoint(
-    transport_protocol=TransportProtocol.UDP,
-    internet_protocol=InternetProtocol.IPV4,
-    transport_port=7411,
-    internet_address="10.0.0.2",
-)
+UDP = nfe("10.0.0.2", 7411)
 TCP = dataclasses.replace(UDP, transport_protocol=TransportProtocol.TCP)
 
 

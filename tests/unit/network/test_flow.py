@@ -12,26 +12,10 @@ from lifecycle.network.nfe import (
     TransportProtocol,
     flow_tuples,
 )
+from tests.builders import nfe, shared_memory
 
 IPV4, IPV6 = InternetProtocol.IPV4, InternetProtocol.IPV6
 UDP, TCP = TransportProtocol.UDP, TransportProtocol.TCP
-SHARED_MEMORY = NetworkFlowEndpoint(
-    transport_protocol=TransportProtocol.UNKNOWN,
-    internet_protocol=InternetProtocol.UNKNOWN,
-    transport_port=0,
-)
-
-
-def nfe(
-    address: str, port: int, transport: TransportProtocol = UDP, **rest: int
-) -> NetworkFlowEndpoint:
-    return NetworkFlowEndpoint(
-        transport_protocol=transport,
-        internet_protocol=IPV6 if ":" in address else IPV4,
-        transport_port=port,
-        internet_address=address,
-        **rest,
-    )
 
 
 def ends(flow: FlowTuple) -> tuple[str, int, str, int]:
@@ -69,8 +53,8 @@ def test_a_flow_is_written_as_its_5_tuple_and_on_ipv6_with_its_label() -> None:
 
 
 def test_fast_dds_sends_unicast_from_its_wildcard_socket() -> None:
-    source = [SHARED_MEMORY, nfe("0.0.0.0", 45000), nfe("10.0.0.1", 45001)]
-    (flow,) = flow_tuples(source, [SHARED_MEMORY, nfe("10.0.0.2", 7000)])
+    source = [shared_memory(), nfe("0.0.0.0", 45000), nfe("10.0.0.1", 45001)]
+    (flow,) = flow_tuples(source, [shared_memory(), nfe("10.0.0.2", 7000)])
     assert ends(flow) == ("0.0.0.0", 45000, "10.0.0.2", 7000)
 
 
@@ -98,11 +82,11 @@ def test_loopback_talks_to_loopback_only() -> None:
 def test_protocols_do_not_mix_and_shared_memory_forms_no_flow() -> None:
     assert flow_tuples([nfe("10.0.0.1", 1)], [nfe("10.0.0.2", 2, TCP)]) == ()
     assert flow_tuples([nfe("10.0.0.1", 1)], [nfe("fd09::2", 2)]) == ()
-    assert flow_tuples([SHARED_MEMORY], [SHARED_MEMORY]) == ()
+    assert flow_tuples([shared_memory()], [shared_memory()]) == ()
 
 
 NFES = st.lists(
-    st.just(SHARED_MEMORY)
+    st.just(shared_memory())
     | st.builds(
         nfe,
         st.sampled_from(("0.0.0.0", "127.0.0.1", "10.0.0.1", "239.255.0.1", "::", "fd09::1")),

@@ -18,23 +18,7 @@ from lifecycle.network.nfe import (
     is_ip,
     located,
 )
-
-SHARED_MEMORY = NetworkFlowEndpoint(
-    transport_protocol=TransportProtocol.UNKNOWN,
-    internet_protocol=InternetProtocol.UNKNOWN,
-    transport_port=0,
-)
-
-
-def udp(address: str, port: int, *, dscp: int = 0, flow_label: int = 0) -> NetworkFlowEndpoint:
-    return NetworkFlowEndpoint(
-        transport_protocol=TransportProtocol.UDP,
-        internet_protocol=InternetProtocol.IPV6 if ":" in address else InternetProtocol.IPV4,
-        transport_port=port,
-        internet_address=address,
-        dscp=dscp,
-        flow_label=flow_label,
-    )
+from tests.builders import nfe, shared_memory
 
 
 def at(machine: str, *nfes: NetworkFlowEndpoint) -> tuple[LocatedNfe, ...]:
@@ -43,7 +27,7 @@ def at(machine: str, *nfes: NetworkFlowEndpoint) -> tuple[LocatedNfe, ...]:
     return found
 
 
-BASE = udp("fd09::1", 7411, dscp=0, flow_label=0)
+BASE = nfe("fd09::1", 7411, dscp=0, flow_label=0)
 
 
 @pytest.mark.parametrize(
@@ -65,11 +49,11 @@ def test_a_difference_in_one_resource_makes_two_nfes_dissimilar(change: dict[str
 
 
 def test_shared_memory_is_no_ip_flow() -> None:
-    assert not is_ip(SHARED_MEMORY)
-    assert not is_ip(at("robot", SHARED_MEMORY)[0])
+    assert not is_ip(shared_memory())
+    assert not is_ip(at("robot", shared_memory())[0])
 
 
-WILDCARD = at("robot", udp("0.0.0.0", 45000))[0]
+WILDCARD = at("robot", nfe("0.0.0.0", 45000))[0]
 
 
 @pytest.mark.parametrize(
@@ -84,26 +68,26 @@ WILDCARD = at("robot", udp("0.0.0.0", 45000))[0]
 def test_a_wildcard_covers_every_address_of_its_own_machine(
     machine: str, address: str, differs: bool
 ) -> None:
-    assert dissimilar(WILDCARD, at(machine, udp(address, 45000))[0]) is differs
+    assert dissimilar(WILDCARD, at(machine, nfe(address, 45000))[0]) is differs
 
 
 @pytest.mark.parametrize(("address", "differs"), [("10.0.0.2", True), ("10.0.0.1", False)])
 def test_the_same_port_on_two_machines_is_dissimilar_only_if_the_addresses_differ(
     address: str, differs: bool
 ) -> None:
-    robot, operator = at("robot", udp("10.0.0.1", 7411)), at("operator", udp(address, 7411))
+    robot, operator = at("robot", nfe("10.0.0.1", 7411)), at("operator", nfe(address, 7411))
     assert dissimilar(robot[0], operator[0]) is differs
 
 
 def test_without_a_machine_two_wildcards_may_be_the_same() -> None:
-    assert not dissimilar(udp("0.0.0.0", 45000), udp("0.0.0.0", 45000))
-    assert not dissimilar(at("robot", udp("0.0.0.0", 45000))[0], udp("10.0.0.1", 45000))
+    assert not dissimilar(nfe("0.0.0.0", 45000), nfe("0.0.0.0", 45000))
+    assert not dissimilar(at("robot", nfe("0.0.0.0", 45000))[0], nfe("10.0.0.1", 45000))
 
 
 def test_what_was_read_back_from_the_sockets_replaces_the_dscp_that_the_rmw_reports() -> None:
-    found = located([udp("0.0.0.0", 45000)], "robot", dscp=46)
+    found = located([nfe("0.0.0.0", 45000)], "robot", dscp=46)
     assert found is not None
-    assert found[0] == LocatedNfe(machine_id="robot", nfe=udp("0.0.0.0", 45000, dscp=46))
+    assert found[0] == LocatedNfe(machine_id="robot", nfe=nfe("0.0.0.0", 45000, dscp=46))
     assert located(None, "robot", dscp=46) is None
 
 
@@ -121,7 +105,7 @@ NFES = st.builds(
     LocatedNfe,
     machine_id=st.sampled_from(("", "robot", "operator")),
     nfe=st.builds(
-        udp,
+        nfe,
         st.sampled_from(ADDRESSES),
         st.integers(1, 2),
         dscp=st.integers(0, 1),
@@ -139,9 +123,9 @@ def test_dissimilarity_is_symmetric_and_nothing_is_dissimilar_to_itself(
 
 
 def test_an_endpoint_is_described_as_its_socket_or_as_shared_memory() -> None:
-    assert udp("10.0.0.1", 7411).describe() == "10.0.0.1:7411"
-    assert udp("fd09::1", 7411).describe() == "[fd09::1]:7411"
-    assert SHARED_MEMORY.describe() == "shm"
+    assert nfe("10.0.0.1", 7411).describe() == "10.0.0.1:7411"
+    assert nfe("fd09::1", 7411).describe() == "[fd09::1]:7411"
+    assert shared_memory().describe() == "shm"
 
 
 @pytest.mark.parametrize(

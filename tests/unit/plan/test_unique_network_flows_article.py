@@ -21,9 +21,7 @@ from lifecycle.manifest.model import (
     UniqueHow,
 )
 from lifecycle.network.nfe import (
-    InternetProtocol,
     NetworkFlowEndpoint,
-    TransportProtocol,
     UniqueRequirement,
 )
 from lifecycle.plan.build import build_plan
@@ -31,7 +29,7 @@ from lifecycle.plan.model import PlanError
 from lifecycle.verify.judge import verify
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import Stage
-from tests.builders import at, link, manifest, need, node, publisher, subscription
+from tests.builders import at, link, manifest, need, nfe, node, publisher, subscription
 from tests.unit.verify.edits import change_report
 from tests.unit.verify.perfect import perfect
 
@@ -120,14 +118,7 @@ SHARED = (
         change_report(
             kind,
             name,
-            nfes=(
-                NetworkFlowEndpoint(
-                    transport_protocol=TransportProtocol.UDP,
-                    internet_protocol=InternetProtocol.IPV4,
-                    transport_port=7411,
-                    internet_address="127.0.0.1",
-                ),
-            ),
+            nfes=(nfe("127.0.0.1", 7411),),
         )
         for kind, name in ((PUB, "/a"), (PUB, "/b"), (SUB, "/c"), (SUB, "/d"))
     ),
@@ -172,14 +163,7 @@ def test_unique_network_flow_endpoints_system_default_reports_what_came_of_it():
     side_loaded = change_report(
         SUB,
         "/c",
-        nfes=(
-            NetworkFlowEndpoint(
-                transport_protocol=TransportProtocol.UDP,
-                internet_protocol=InternetProtocol.IPV4,
-                transport_port=7042,
-                internet_address="127.0.0.1",
-            ),
-        ),
+        nfes=(nfe("127.0.0.1", 7042),),
     )
     (left_alone,) = verdict_of(system).flows
     (loaded,) = verdict_of(system, side_loaded).flows
@@ -212,15 +196,7 @@ def test_the_article_s_snippet_of_sub_x_sub_y_and_pub_z():
 
 def test_candidate_ipv6_flow_label_tells_two_equal_5_tuples_apart():
     def labelled(label: int) -> tuple[NetworkFlowEndpoint, ...]:
-        return (
-            NetworkFlowEndpoint(
-                transport_protocol=TransportProtocol.UDP,
-                internet_protocol=InternetProtocol.IPV6,
-                transport_port=40000,
-                internet_address="fd00::1",
-                flow_label=label,
-            ),
-        )
+        return (nfe("fd00::1", 40000, flow_label=label),)
 
     system = one(STRICTLY)
     same = (change_report(PUB, "/a", nfes=labelled(1)), change_report(PUB, "/b", nfes=labelled(1)))

@@ -19,8 +19,6 @@ from lifecycle.cli.verbs.flows import render_flows
 from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import UniqueHow
 from lifecycle.network.nfe import (
-    InternetProtocol,
-    NetworkFlowEndpoint,
     TransportProtocol,
     UniqueRequirement,
 )
@@ -44,6 +42,7 @@ from lifecycle.supervisor.run.options import UpResult
 from lifecycle.verify.outcome import ConnectionReport, Outcome
 from lifecycle.verify.report import to_json
 from lifecycle.verify.verdict import FlowReport, Stage
+from tests.builders import nfe
 from tests.unit.supervisor.fakes import verdict_of
 
 EVENTS: tuple[Event, ...] = (
@@ -346,21 +345,12 @@ def test_a_status_is_a_head_and_a_line_for_each_node() -> None:
     )
 
 
-def _nfe(port: int, protocol: TransportProtocol = TransportProtocol.UDP) -> NetworkFlowEndpoint:
-    return NetworkFlowEndpoint(
-        transport_protocol=protocol,
-        internet_protocol=InternetProtocol.IPV4,
-        transport_port=port,
-        internet_address="10.0.0.1",
-    )
-
-
 FLOW = FlowReport(
     topic="/video",
     publisher="/camera",
     subscription="/viewer",
-    source=(_nfe(40000),),
-    destination=(_nfe(7000), _nfe(7000, TransportProtocol.UNKNOWN)),
+    source=(nfe("10.0.0.1", 40000),),
+    destination=(nfe("10.0.0.1", 7000), nfe("10.0.0.1", 7000, TransportProtocol.UNKNOWN)),
     unique=UniqueHow.STRONGLY,
     dscp=46,
     requirement=(UniqueRequirement.STRICTLY_REQUIRED, UniqueRequirement.NOT_REQUIRED),
@@ -402,24 +392,14 @@ def test_a_flow_shows_its_tuple_dscp_and_tos_requirement_and_verdict() -> None:
     assert json.loads(render_flows([FLOW], "json"))[0]["topic"] == "/video"
 
 
-def _nfe6(address: str, port: int, flow_label: int = 0) -> NetworkFlowEndpoint:
-    return NetworkFlowEndpoint(
-        transport_protocol=TransportProtocol.UDP,
-        internet_protocol=InternetProtocol.IPV6,
-        transport_port=port,
-        flow_label=flow_label,
-        internet_address=address,
-    )
-
-
 @pytest.mark.parametrize(
     ("label", "word"), [(0x12345, "0x12345"), (0xABC, "0x00abc"), (0, "unset")]
 )
 def test_an_ipv6_flow_shows_its_3_tuple_alike_in_every_format(label: int, word: str) -> None:
     flow = dataclasses.replace(
         FLOW,
-        source=(_nfe6("fd00::1", 7411, label),),
-        destination=(_nfe6("fd00::2", 7000), _nfe6("fd00::3", 7000)),
+        source=(nfe("fd00::1", 7411, flow_label=label),),
+        destination=(nfe("fd00::2", 7000), nfe("fd00::3", 7000)),
         effective_transport="udpv6",
     )
     head, *rows = render_flows([flow], "text").splitlines()
@@ -443,7 +423,7 @@ def test_an_ipv6_flow_shows_its_3_tuple_alike_in_every_format(label: int, word: 
 
 
 def test_ends_that_form_no_ip_flow_are_shown_as_what_they_tell() -> None:
-    memory = _nfe(7000, TransportProtocol.UNKNOWN)
+    memory = nfe("10.0.0.1", 7000, TransportProtocol.UNKNOWN)
     flow = dataclasses.replace(FLOW, source=(memory,), destination=())
     (_, row) = render_flows([flow], "text").splitlines()
     assert " ".join(row.split()).startswith("/video /camera /viewer shm unknown – – EF = DSCP 46")

@@ -19,9 +19,7 @@ from lifecycle.manifest.qos import (
     Reliability,
 )
 from lifecycle.network.nfe import (
-    InternetProtocol,
     NetworkFlowEndpoint,
-    TransportProtocol,
     UniqueRequirement,
 )
 from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedNode, PlannedParticipant
@@ -37,6 +35,7 @@ from lifecycle.verify.observation import (
 from lifecycle.verify.outcome import ConnectionReport
 from lifecycle.verify.verdict import Stage
 from lifecycle.verify.view import connection_of
+from tests.builders import nfe, shared_memory
 
 _TOPIC_KINDS = (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION)
 _OWN_FLOW = (UniqueRequirement.STRICTLY_REQUIRED, UniqueRequirement.OPTIONALLY_REQUIRED)
@@ -231,18 +230,8 @@ def _nfes(places: _Places, node: PlannedNode, index: int) -> tuple[NetworkFlowEn
         address, port = _address(places, node), 7000 + 20 * number + index
     else:
         address, port = _address(places, node), 7411 + 2 * process
-    shared_memory = NetworkFlowEndpoint(
-        transport_protocol=TransportProtocol.UNKNOWN,
-        internet_protocol=InternetProtocol.UNKNOWN,
-        transport_port=port,
-    )
-    udp = NetworkFlowEndpoint(
-        transport_protocol=TransportProtocol.UDP,
-        internet_protocol=InternetProtocol.IPV4,
-        transport_port=port,
-        internet_address=address,
-    )
-    return (udp,) if _transports(node, planned) else (shared_memory, udp)
+    udp = nfe(address, port)
+    return (udp,) if _transports(node, planned) else (shared_memory(port), udp)
 
 
 def _transports(node: PlannedNode, planned: PlannedEndpoint) -> tuple[str, ...]:

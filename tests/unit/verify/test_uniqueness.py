@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -10,7 +11,6 @@ from hypothesis import strategies as st
 
 from lifecycle.manifest.model import EndpointKind, UniqueHow
 from lifecycle.network.nfe import (
-    InternetProtocol,
     NetworkFlowEndpoint,
     TransportProtocol,
     dissimilar,
@@ -23,6 +23,7 @@ from lifecycle.verify.observation import Identity
 from lifecycle.verify.uniqueness import Uniqueness, meets
 from lifecycle.verify.verdict import Stage
 from lifecycle.verify.view import Actual
+from tests import builders
 from tests.builders import (
     configuration,
     endpoint,
@@ -44,26 +45,11 @@ from tests.unit.verify.perfect import perfect
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
 
 
-def nfe(
-    port: int,
-    address: str = "10.0.0.1",
-    transport: TransportProtocol = TransportProtocol.UDP,
-    dscp: int = 0,
-) -> NetworkFlowEndpoint:
-    return NetworkFlowEndpoint(
-        transport_protocol=transport,
-        internet_protocol=InternetProtocol.IPV6 if ":" in address else InternetProtocol.IPV4,
-        transport_port=port,
-        internet_address=address,
-        dscp=dscp,
-    )
+def nfe(port: int, address: str = "10.0.0.1", **rest: Any) -> NetworkFlowEndpoint:
+    return builders.nfe(address, port, **rest)
 
 
-SHM = NetworkFlowEndpoint(
-    transport_protocol=TransportProtocol.UNKNOWN,
-    internet_protocol=InternetProtocol.UNKNOWN,
-    transport_port=1,
-)
+SHM = builders.shared_memory(1)
 TCP = TransportProtocol.TCP
 
 

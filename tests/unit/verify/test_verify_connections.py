@@ -17,14 +17,14 @@ from lifecycle.manifest.model import (
     Run,
     RunKind,
 )
-from lifecycle.network.nfe import InternetProtocol, NetworkFlowEndpoint, TransportProtocol
+from lifecycle.network.nfe import TransportProtocol
 from lifecycle.plan.model import ParticipantConnections, Plan, PlannedNode, PlannedParticipant
 from lifecycle.verify.judge import verify
 from lifecycle.verify.observation import Observation
 from lifecycle.verify.outcome import ConnectionReport, Outcome
 from lifecycle.verify.report import render_text, to_json
 from lifecycle.verify.verdict import Finding, OpenEndpoint, Stage
-from tests.builders import at, link, node, planned, publisher, subscription
+from tests.builders import at, link, nfe, node, planned, publisher, subscription
 from tests.unit.verify.edits import (
     Edit,
     add_endpoint,
@@ -40,15 +40,6 @@ from tests.unit.verify.perfect import perfect
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
 URL = "udpv4://10.77.0.1:7911?multicast=off&peer=10.77.0.2:7910"
 FLOW = "/video: /camera → /viewer"
-
-
-def udp(address: str, port: int = 7911) -> NetworkFlowEndpoint:
-    return NetworkFlowEndpoint(
-        transport_protocol=TransportProtocol.UDP,
-        internet_protocol=InternetProtocol.IPV4,
-        transport_port=port,
-        internet_address=address,
-    )
 
 
 def connected(each: PlannedNode, *urls: str) -> PlannedNode:
@@ -490,7 +481,7 @@ def test_a_node_of_our_own_machine_is_never_beyond_reach() -> None:
 
 # --- what carries a flow
 
-WITH_UDP = change_report(PUB, "/video", nfes=(udp("0.0.0.0", 40000),))
+WITH_UDP = change_report(PUB, "/video", nfes=(nfe("0.0.0.0", 40000),))
 
 
 @pytest.mark.parametrize(
@@ -528,13 +519,8 @@ def test_an_endpoint_without_any_nfe_goes_by_what_it_was_connected_to() -> None:
     plan = plan_of(medium="tcpv4")
     camera = connected(plan.nodes[0], "tcpv4://10.77.0.1:5100")
     plan = dataclasses.replace(plan, nodes=(camera, plan.nodes[1]))
-    tcp = NetworkFlowEndpoint(
-        transport_protocol=TransportProtocol.TCP,
-        internet_protocol=InternetProtocol.IPV4,
-        transport_port=5101,
-        internet_address="10.77.0.2",
-    )
-    for listed in ((), (udp("0.0.0.0", 40000),)):
+    tcp = nfe("10.77.0.2", 5101, TransportProtocol.TCP)
+    for listed in ((), (nfe("0.0.0.0", 40000),)):
         dialling = both(
             change_report(PUB, "/video", nfes=listed), change_report(SUB, "/video", nfes=(tcp,))
         )

@@ -6,9 +6,6 @@ import pytest
 
 from lifecycle.manifest.model import EndpointKind, Quantity, UniqueHow
 from lifecycle.network.nfe import (
-    InternetProtocol,
-    NetworkFlowEndpoint,
-    TransportProtocol,
     UniqueRequirement,
 )
 from lifecycle.plan.build import build_plan
@@ -17,7 +14,18 @@ from lifecycle.verify.judge import verify
 from lifecycle.verify.observation import Observation
 from lifecycle.verify.outcome import ConnectionReport, Outcome
 from lifecycle.verify.verdict import Finding, FlowReport, Stage
-from tests.builders import at, link, need, node, planned, publisher, subscription, teleop
+from tests.builders import (
+    at,
+    link,
+    need,
+    nfe,
+    node,
+    planned,
+    publisher,
+    shared_memory,
+    subscription,
+    teleop,
+)
 from tests.unit.verify.edits import (
     Edit,
     both,
@@ -229,22 +237,6 @@ UNVERIFIABLE_FIX = (
 )
 
 
-def nfe(port: int, address: str = "0.0.0.0") -> NetworkFlowEndpoint:
-    return NetworkFlowEndpoint(
-        transport_protocol=TransportProtocol.UDP,
-        internet_protocol=InternetProtocol.IPV6 if ":" in address else InternetProtocol.IPV4,
-        transport_port=port,
-        internet_address=address,
-    )
-
-
-SHM = NetworkFlowEndpoint(
-    transport_protocol=TransportProtocol.UNKNOWN,
-    internet_protocol=InternetProtocol.UNKNOWN,
-    transport_port=1,
-)
-
-
 def of_flows(edit: Edit, plan: Plan) -> list[Finding]:
     """The findings of the rules on flows."""
     verdict = verify(plan, edit(perfect(plan)), stage=Stage.CONNECTED)
@@ -276,9 +268,19 @@ def carried(node: str, topic: str) -> Edit:
     return edit
 
 
+SHM, ONE = shared_memory(1), nfe("0.0.0.0", 40000)
 SHARED = both(
-    change_report(PUB, "/a", nfes=(SHM, nfe(40000), nfe(40000), nfe(40001, "fd00::1"))),
-    change_report(PUB, "/b", nfes=(SHM, nfe(40000))),
+    change_report(
+        PUB,
+        "/a",
+        nfes=(
+            shared_memory(1),
+            nfe("0.0.0.0", 40000),
+            nfe("0.0.0.0", 40000),
+            nfe("fd00::1", 40001),
+        ),
+    ),
+    change_report(PUB, "/b", nfes=(shared_memory(1), nfe("0.0.0.0", 40000))),
 )
 
 
@@ -346,7 +348,7 @@ def test_a_strict_endpoint_whose_flow_cannot_be_proven_is_told_whole(edit: Edit,
     [
         change_report(PUB, "/a", nfes=()),
         change_report(PUB, "/a", error="refused", nfes=None),
-        change_report(PUB, "/a", error="refused", nfes=(nfe(40000),)),
+        change_report(PUB, "/a", error="refused", nfes=(nfe("0.0.0.0", 40000),)),
         both(drop_endpoint(PUB, "/a"), drop_report("/one")),
     ],
 )
@@ -360,8 +362,8 @@ def test_one_endpoint_that_says_nothing_does_not_end_the_judgement_of_the_others
         node("two", subscription("c"), subscription("d"), needs=[need(SUB, "d", STRICTLY)]),
     )
     edit = both(
-        change_report(PUB, "/a", nfes=(nfe(1),)),
-        change_report(PUB, "/b", nfes=(nfe(1),)),
+        change_report(PUB, "/a", nfes=(nfe("0.0.0.0", 1),)),
+        change_report(PUB, "/b", nfes=(nfe("0.0.0.0", 1),)),
         change_report(SUB, "/c", nfes=()),
         change_report(SUB, "/d", nfes=None),
     )

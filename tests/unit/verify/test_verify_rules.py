@@ -24,9 +24,6 @@ from lifecycle.manifest.qos import (
     not_written,
 )
 from lifecycle.network.nfe import (
-    InternetProtocol,
-    NetworkFlowEndpoint,
-    TransportProtocol,
     UniqueRequirement,
 )
 from lifecycle.plan.build import build_plan
@@ -43,6 +40,7 @@ from tests.builders import (
     endpoint,
     link,
     need,
+    nfe,
     node,
     planned,
     publisher,
@@ -76,15 +74,6 @@ CALIBRATE = "/robot/camera/calibrate: /viewer → /robot/camera"
 ATTACH = Run(kind=RunKind.ATTACH)
 
 PLAN = build_plan(teleop(), environment={})
-
-
-def udp(port: int, address: str = "0.0.0.0") -> NetworkFlowEndpoint:
-    return NetworkFlowEndpoint(
-        transport_protocol=TransportProtocol.UDP,
-        internet_protocol=InternetProtocol.IPV4,
-        transport_port=port,
-        internet_address=address,
-    )
 
 
 def findings_after(
@@ -405,8 +394,8 @@ FIRES: dict[str, tuple[Edit, list[tuple[str, str, str]]]] = {
     ),
     "a strict publisher that shares its socket": (
         both(
-            change_report(PUB, VIDEO, nfes=(udp(40000),), dscp=46),
-            change_report(PUB, STATUS, nfes=(udp(40000),), dscp=46),
+            change_report(PUB, VIDEO, nfes=(nfe("0.0.0.0", 40000),), dscp=46),
+            change_report(PUB, STATUS, nfes=(nfe("0.0.0.0", 40000),), dscp=46),
         ),
         [
             ("flow.not-unique", "violated", VIDEO),
@@ -415,8 +404,8 @@ FIRES: dict[str, tuple[Edit, list[tuple[str, str, str]]]] = {
     ),
     "a strict subscription that shares its socket": (
         both(
-            change_report(SUB, VIDEO, nfes=(udp(7413, "10.77.0.2"),)),
-            change_report(SUB, STATUS, nfes=(udp(7413, "10.77.0.2"),)),
+            change_report(SUB, VIDEO, nfes=(nfe("10.77.0.2", 7413),)),
+            change_report(SUB, STATUS, nfes=(nfe("10.77.0.2", 7413),)),
         ),
         [
             ("flow.not-unique", "violated", VIDEO),

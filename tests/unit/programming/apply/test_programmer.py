@@ -33,6 +33,7 @@ from lifecycle.programming.apply.target import (
 from lifecycle.programming.apply.targets.registry import target_kind
 from lifecycle.programming.rules.rules import flow_rules
 from lifecycle.verify.outcome import Outcome
+from tests.builders import nfe
 from tests.unit.programming.apply.fakes import FakeTarget
 from tests.unit.programming.apply.samples import (
     ledger_in,
@@ -40,8 +41,8 @@ from tests.unit.programming.apply.samples import (
     rule,
     settings_file,
 )
-from tests.unit.programming.apply.servers import Answer, NefServer
-from tests.unit.programming.rules.samples import nfe, plan, report
+from tests.unit.programming.apply.servers import NefServer
+from tests.unit.programming.rules.samples import plan, report
 
 
 def programmer(tmp_path: Path, *targets: FakeTarget) -> Programmer:

@@ -11,8 +11,6 @@ import pytest
 
 from lifecycle.manifest.model import EndpointKind, Machine, UniqueHow
 from lifecycle.network.nfe import (
-    InternetProtocol,
-    NetworkFlowEndpoint,
     TransportProtocol,
     UniqueRequirement,
 )
@@ -20,7 +18,7 @@ from lifecycle.plan.model import Plan
 from lifecycle.programming.rules.rules import FlowRule, LeftOut
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import FlowReport
-from tests.builders import at, need, node, planned, publisher, subscription
+from tests.builders import at, need, nfe, node, planned, publisher, shared_memory, subscription
 
 EXPECTED = Path(__file__).parent / "expected"
 
@@ -61,25 +59,6 @@ LEFT_OUT = (
 )
 
 
-def nfe(address: str, port: int, **rest: object) -> NetworkFlowEndpoint:
-    """A UDP endpoint of the address's family."""
-    v6 = ":" in address
-    return NetworkFlowEndpoint(
-        transport_protocol=TransportProtocol.UDP,
-        internet_protocol=InternetProtocol.IPV6 if v6 else InternetProtocol.IPV4,
-        transport_port=port,
-        internet_address=address,
-        **rest,
-    )
-
-
-SHM = NetworkFlowEndpoint(
-    transport_protocol=TransportProtocol.UNKNOWN,
-    internet_protocol=InternetProtocol.UNKNOWN,
-    transport_port=0,
-)
-
-
 def report(topic: str = "/robot/video", **rest: object) -> FlowReport:
     """A verified flow from the camera to the viewer."""
     ordinary = FlowReport(
@@ -96,6 +75,9 @@ def report(topic: str = "/robot/video", **rest: object) -> FlowReport:
         outcome=Outcome.OK,
     )
     return dataclasses.replace(ordinary, **rest)
+
+
+SHM = shared_memory()
 
 
 def plan(*, robot: str = "10.77.0.1", operator: str = "10.77.0.2") -> Plan:

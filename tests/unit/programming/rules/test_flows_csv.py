@@ -9,30 +9,19 @@ import io
 from lifecycle.manifest.model import UniqueHow
 from lifecycle.network.nfe import (
     InternetProtocol,
-    NetworkFlowEndpoint,
-    TransportProtocol,
     UniqueRequirement,
 )
 from lifecycle.programming.rules.flows_csv import COLUMNS, flows_to_csv
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import FlowReport
-
-
-def udp(address: str, port: int) -> NetworkFlowEndpoint:
-    return NetworkFlowEndpoint(
-        transport_protocol=TransportProtocol.UDP,
-        internet_protocol=InternetProtocol.IPV4,
-        transport_port=port,
-        internet_address=address,
-    )
-
+from tests.builders import nfe
 
 VIDEO = FlowReport(
     topic="/robot/video",
     publisher="/robot/camera",
     subscription="/viewer",
-    source=(udp("0.0.0.0", 45000), udp("10.0.0.1", 45001)),
-    destination=(udp("10.0.0.2", 7001),),
+    source=(nfe("0.0.0.0", 45000), nfe("10.0.0.1", 45001)),
+    destination=(nfe("10.0.0.2", 7001),),
     unique=UniqueHow.STRONGLY,
     dscp=46,
     requirement=(UniqueRequirement.STRICTLY_REQUIRED, UniqueRequirement.NOT_REQUIRED),
@@ -61,16 +50,16 @@ def test_a_flow_is_one_line_with_its_5_tuple_dscp_and_verdict() -> None:
 
 
 def test_a_pair_with_several_flows_has_one_line_each() -> None:
-    report = dataclasses.replace(VIDEO, destination=(udp("10.0.0.2", 7001), udp("10.1.0.2", 7001)))
+    report = dataclasses.replace(VIDEO, destination=(nfe("10.0.0.2", 7001), nfe("10.1.0.2", 7001)))
     assert [row["destination_address"] for row in rows(report)] == ["10.0.0.2", "10.1.0.2"]
 
 
 def test_an_ipv6_flow_has_its_label_in_five_hex_digits_or_says_that_none_is_set() -> None:
     def cell(flow_label: int) -> str:
         source = dataclasses.replace(
-            udp("fd00::1", 7411), internet_protocol=InternetProtocol.IPV6, flow_label=flow_label
+            nfe("fd00::1", 7411), internet_protocol=InternetProtocol.IPV6, flow_label=flow_label
         )
-        end = dataclasses.replace(udp("fd00::2", 7000), internet_protocol=InternetProtocol.IPV6)
+        end = dataclasses.replace(nfe("fd00::2", 7000), internet_protocol=InternetProtocol.IPV6)
         (row,) = rows(dataclasses.replace(VIDEO, source=(source,), destination=(end,)))
         return row["flow_label"]
 

@@ -13,7 +13,8 @@ from lifecycle.plan.model import PlannedNode
 from lifecycle.programming.rules.rules import FlowRule, asks, flow_rules, named, rules_digest
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import FlowReport
-from tests.unit.programming.rules.samples import SHM, VIDEO, nfe, plan, report, rule
+from tests.builders import nfe
+from tests.unit.programming.rules.samples import SHM, VIDEO, plan, report, rule
 
 
 def left(*reports: FlowReport, **rest: object) -> list[str]:
