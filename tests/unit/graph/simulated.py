@@ -8,6 +8,7 @@ import itertools
 import random
 from collections import deque
 from collections.abc import Callable, Iterable
+from typing import Any
 
 from lifecycle.graph.events import GraphEvents
 from lifecycle.graph.reporter import GraphReporter
@@ -15,8 +16,9 @@ from lifecycle.graph.scheduler import Remove, Scheduler
 from lifecycle.graph.state import Fetch, GraphState
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.node.configuration import checksum
-from lifecycle.verify.observation import EndpointReport, Identity, NodeConfiguration
+from lifecycle.verify.observation import EndpointReport, NodeConfiguration
 from lifecycle.verify.outcome import ConnectionReport
+from tests import builders
 
 PERIOD_S = 2.0
 SILENT_AFTER_S = 7.0
@@ -169,25 +171,9 @@ def endpoint(number: int, topic: str, kind: EndpointKind = KINDS[0]) -> Endpoint
     )
 
 
-def configuration(
-    name: str,
-    *endpoints: EndpointReport,
-    process_id: int = 1,
-    state: str = "inactive",
-    connections: tuple[ConnectionReport, ...] = (),
-) -> NodeConfiguration:
-    made = NodeConfiguration(
-        identity=Identity(machine_id="m", process_id=process_id, node_id=f"{name}@{process_id}"),
-        name=name,
-        state=state,
-        connected=True,
-        rmw="rmw_fastrtps_cpp",
-        transports=("udpv4",),
-        serializations=("cdr",),
-        paradigms=("publish-subscribe",),
-        endpoints=endpoints,
-        connections=connections,
-    )
+def configuration(name: str, *endpoints: EndpointReport, **rest: Any) -> NodeConfiguration:
+    """What a node says of itself, with its checksum."""
+    made = builders.configuration(name, *endpoints, **rest)
     return dataclasses.replace(made, checksum=checksum(made))
 
 
