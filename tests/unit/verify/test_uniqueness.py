@@ -45,8 +45,8 @@ from tests.unit.verify.perfect import perfect
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
 
 
-def nfe(port: int, address: str = "10.0.0.1", **rest: Any) -> NetworkFlowEndpoint:
-    return builders.nfe(address, port, **rest)
+def nfe(port: int, address: str = "10.0.0.1", *how: Any, **rest: Any) -> NetworkFlowEndpoint:
+    return builders.nfe(address, port, *how, **rest)
 
 
 SHM = builders.shared_memory(1)
