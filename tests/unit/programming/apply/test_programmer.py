@@ -41,7 +41,7 @@ from tests.unit.programming.apply.samples import (
     rule,
     settings_file,
 )
-from tests.unit.programming.apply.servers import NefServer
+from tests.unit.programming.apply.servers import Answer, NefServer
 from tests.unit.programming.rules.samples import plan, report
 
 
