@@ -7,18 +7,25 @@ from __future__ import annotations
 
 import re
 import shlex
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from lifecycle.cli.common import load_plan, manifest_arguments, write_text
+from lifecycle.cli.common import F, load_plan, manifest_arguments, write_text
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest.model import EndpointPolicy
 from lifecycle.printable import lines
 
 if TYPE_CHECKING:
     from lifecycle.export.sros2 import Enclave
+
+
+def _into(help_: str) -> Callable[[F], F]:
+    """Add `--output DIR`."""
+    folder = click.Path(path_type=Path)
+    return click.option("-o", "--output", type=folder, required=True, metavar="DIR", help=help_)
 
 
 @click.group("export")
@@ -31,14 +38,7 @@ def command() -> None:
 
 @command.command("sros2")
 @manifest_arguments
-@click.option(
-    "-o",
-    "--output",
-    type=click.Path(path_type=Path),
-    required=True,
-    metavar="DIR",
-    help="Write policy.xml there; one that is there is replaced.",
-)
+@_into("Write policy.xml there; one that is there is replaced.")
 def sros2(manifest: str, assignments: tuple[str, ...], output: Path) -> int:
     """Write access control for ROS 2 security: only what the manifest declares is allowed.
 
@@ -79,14 +79,7 @@ _CONTAINERS = frozenset(_WRITTEN_FOR) - {"systemd"}
 
 def _engine_command(engine: str) -> click.Command:
     @manifest_arguments
-    @click.option(
-        "-o",
-        "--output",
-        type=click.Path(path_type=Path),
-        required=True,
-        metavar="DIR",
-        help="Write a file for each machine there; one of its name is replaced.",
-    )
+    @_into("Write a file for each machine there; one of its name is replaced.")
     @click.option(
         "--at",
         default="",
