@@ -13,7 +13,7 @@ import os
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -44,11 +44,10 @@ class NotAsPromisedError(AssertionError):
 class Watched(Up):
     """A `lifecycle up` whose events can be waited for together with their times."""
 
-    def __init__(self, manifest: Path, *, runtime: Path, variables: Mapping[str, str]) -> None:
+    def __init__(self, manifest: Path, *, runtime: Path) -> None:
         self.times: list[float] = []
         self._came = threading.Condition()
-        more = {"PYTHONPATH": str(COMPOSITION), **variables}
-        super().__init__(manifest, runtime=runtime, variables=more)
+        super().__init__(manifest, runtime=runtime, variables={"PYTHONPATH": str(COMPOSITION)})
 
     def _read(self) -> None:
         assert self.process.stdout is not None
