@@ -436,7 +436,6 @@ def _match_end(end: End) -> SeenEndpoint:
         name=endpoint.resolved,
         type=endpoint.type,
         qos=endpoint.qos,
-        gid=endpoint.gid,
         report=endpoint,
     )
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import importlib
 from typing import TYPE_CHECKING
+
+from lifecycle.public import public_name
 
 if TYPE_CHECKING:
     from lifecycle.verify.judge import verify as verify
@@ -21,7 +22,4 @@ _PUBLIC: dict[str, tuple[str, ...]] = {
 
 def __getattr__(name: str) -> object:
     """Load the module of a public name on first use (PEP 562)."""
-    for module, names in _PUBLIC.items():
-        if name in names:
-            return getattr(importlib.import_module(module), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return public_name(__name__, _PUBLIC, name)

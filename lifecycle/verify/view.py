@@ -80,7 +80,6 @@ class SeenEndpoint:
         report: what its node says; None if it says nothing.
         planned: its declaration; None if there is none.
         type_hash: as `ObservedEndpoint` has it.
-        gid: hex; empty where it is not known.
         expected: it is one that the system has for good, so that whatever can match it must; a
             tool's may be matched or not.
     """
@@ -93,7 +92,6 @@ class SeenEndpoint:
     report: EndpointReport | None = None
     planned: PlannedEndpoint | None = None
     type_hash: str | None = None
-    gid: str = ""
     expected: bool = True
 
 

@@ -311,7 +311,6 @@ def _end(actual: Actual) -> SeenEndpoint:
         name=actual.planned.resolved,
         type=shown.type if shown else actual.planned.type,
         qos=actual_qos(shown.qos if shown else None, report.qos if report else None),
-        gid=(shown.gid if shown else "") or (report.gid if report else ""),
         report=report,
     )
 
