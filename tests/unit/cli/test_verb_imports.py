@@ -40,6 +40,7 @@ TO_ASK = {
     "lifecycle.dataclasses",
     "lifecycle.errors",
     "lifecycle.printable",
+    "lifecycle.public",
     "lifecycle.run_directory",
     "lifecycle.supervisor",
     "lifecycle.supervisor.control",
