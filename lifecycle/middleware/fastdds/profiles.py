@@ -7,6 +7,10 @@ Fast DDS announces a new participant five times at 100 ms and then once each 3 s
 are lost or arrive too early, discovery stalls. Announcements for 2 s remove the stall. The
 environment is used, not Fast DDS's C++ API: the children of a supervisor, whatever they are written
 in, inherit it.
+
+Endpoints are sent to each participant by itself unless a profile asks for multicast
+(`avoid_builtin_multicast`): of fifty processes on one host, each endpoint and each heartbeat fifty
+times (docs/performance.md has the measurement).
 """
 
 from __future__ import annotations
@@ -32,12 +36,17 @@ _ANNOUNCEMENTS = 10
 _PERIOD_NS = 200_000_000
 
 
-def discovery_profile(*, peers: Iterable[tuple[str, int]] = ()) -> str:
+def discovery_profile(
+    *, peers: Iterable[tuple[str, int]] = (), multicast_endpoints: bool = False
+) -> str:
     """Return the profile as XML, a default participant profile that only sets discovery.
 
     Args:
         peers: IP addresses and UDP ports that it is announced to; all of them, because they replace
             the groups by which Fast DDS otherwise does.
+        multicast_endpoints: endpoints are sent once by multicast to all participants that listen to
+            it, and not to each. Only where all that have to find each other are on this host:
+            routers pass no multicast, and WLANs send it slowly.
     """
     locators = "".join(
         f"<locator><{kind}><address>{address}</address><port>{port}</port></{kind}></locator>"
@@ -45,6 +54,8 @@ def discovery_profile(*, peers: Iterable[tuple[str, int]] = ()) -> str:
         for kind in (udp_to(address),)
     )
     searched = f"<initialPeersList>{locators}</initialPeersList>" if locators else ""
+    avoided = "<avoid_builtin_multicast>false</avoid_builtin_multicast>"
+    together = avoided if multicast_endpoints else ""
     return f"""<?xml version="1.0" encoding="UTF-8"?>
 <dds xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
   <profiles>
@@ -52,7 +63,7 @@ def discovery_profile(*, peers: Iterable[tuple[str, int]] = ()) -> str:
       <rtps><builtin><discovery_config><initialAnnouncements>
         <count>{_ANNOUNCEMENTS}</count>
         <period><nanosec>{_PERIOD_NS}</nanosec></period>
-      </initialAnnouncements></discovery_config>{searched}</builtin></rtps>
+      </initialAnnouncements></discovery_config>{together}{searched}</builtin></rtps>
     </participant>
   </profiles>
 </dds>
@@ -64,6 +75,7 @@ def discovery_environment(
     environment: Mapping[str, str] | None = None,
     *,
     peers: Iterable[tuple[str, int]] = (),
+    multicast_endpoints: bool = False,
 ) -> dict[str, str]:
     """Write the profile into `directory` and return the variables that apply it.
 
@@ -74,6 +86,7 @@ def discovery_environment(
         directory: exists; it must outlive every process that is given the variables.
         environment: what those processes otherwise get; None for this process's.
         peers: see `discovery_profile`.
+        multicast_endpoints: likewise.
 
     Raises:
         MiddlewareError: the file cannot be written.
@@ -85,7 +98,8 @@ def discovery_environment(
     # Renamed into place: a process that starts meanwhile reads the whole file or an older one.
     part = path.with_name(f".{_FILE_NAME}.{os.getpid()}")
     try:
-        part.write_text(discovery_profile(peers=peers), encoding="utf-8")
+        xml = discovery_profile(peers=peers, multicast_endpoints=multicast_endpoints)
+        part.write_text(xml, encoding="utf-8")
         part.replace(path)
     except OSError as error:
         raise MiddlewareError(

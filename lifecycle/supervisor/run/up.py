@@ -426,7 +426,11 @@ def _enter_graph(plan: Plan, options: UpOptions, directory: RunDirectory) -> Non
     hosts = reached_hosts(plan, own)
     os.environ.update(peers_environment(hosts, os.environ))
     peers = discovery_peers(plan.domain_id, hosts, os.environ)
-    os.environ.update(discovery_environment(directory.path, peers=peers))
+    is_one_host = own.issuperset(each.machine for each in plan.nodes)
+    multicast = is_one_host and not os.environ.get("ROS_STATIC_PEERS")
+    os.environ.update(
+        discovery_environment(directory.path, peers=peers, multicast_endpoints=multicast)
+    )
 
 
 _PREFIX = re.compile(r"[0-9a-f]{24}")

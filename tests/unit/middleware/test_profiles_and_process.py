@@ -31,6 +31,12 @@ def test_the_profile_only_sets_announcements() -> None:
     assert leaves == {"count": "10", "nanosec": "200000000"}
 
 
+def test_endpoints_are_sent_by_multicast_where_it_is_asked_for() -> None:
+    root = ET.fromstring(discovery_profile(multicast_endpoints=True))
+    (avoided,) = (each for each in root.iter() if each.tag.endswith("avoid_builtin_multicast"))
+    assert avoided.text == "false"
+
+
 def test_the_environment_names_a_complete_file(tmp_path: Path) -> None:
     environment = discovery_environment(tmp_path, {})
     assert environment == {VARIABLE: str(tmp_path / "quick_discovery.xml")}
