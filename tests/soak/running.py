@@ -20,7 +20,7 @@ from typing import Any
 from lifecycle_msgs.msg import TransitionEvent
 from rclpy.executors import SingleThreadedExecutor
 
-from lifecycle.middleware.fastdds.dscp import socket_descriptors
+from lifecycle.middleware.fastdds.sockets import socket_descriptors
 from lifecycle.middleware.rcl.graph import GraphObserver
 from lifecycle.plan.model import ParticipantConnections
 from lifecycle.supervisor.control.protocol import (

@@ -25,8 +25,7 @@ from pathlib import Path
 
 from lifecycle.middleware.discovery.messages import disposal
 from lifecycle.middleware.discovery.probe import ProbeTarget, probe_targets, send
-from lifecycle.middleware.fastdds.dscp import own_udp_socket, sockets_here
-from lifecycle.middleware.fastdds.url_check import udp_sockets_of
+from lifecycle.middleware.fastdds.sockets import own_udp_socket, sockets_here, udp_sockets_of
 from lifecycle.network.connection_url import ConnectionUrl
 from lifecycle.network.medium import UDP_UNICAST, Medium
 

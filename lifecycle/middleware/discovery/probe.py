@@ -32,13 +32,18 @@ from lifecycle.middleware.discovery.messages import (
     disposal,
     new_prefix,
 )
-from lifecycle.middleware.fastdds.dscp import own_udp_ports, own_udp_socket
 from lifecycle.middleware.fastdds.participant_profile import (
     DISCOVERY_SERVER_VARIABLE,
     default_profile,
 )
 from lifecycle.middleware.fastdds.profiles import PROFILE_NAME
-from lifecycle.middleware.fastdds.url_check import OpenSocket, open_sockets, udp_sockets
+from lifecycle.middleware.fastdds.sockets import (
+    OpenSocket,
+    open_sockets,
+    own_udp_ports,
+    own_udp_socket,
+    udp_sockets,
+)
 from lifecycle.middleware.fastdds.url_profile import (
     DISCOVERY_GROUP,
     UrlTransport,
@@ -340,7 +345,7 @@ def discovery_ports(domain_id: int, kind: Medium = RMW_DISCOVERY) -> tuple[int, 
     """
     first = participant_ports(domain_id, 0).discovery_unicast
     last = participant_ports(domain_id, 0).discovery_multicast + DG
-    ports = {each.port for each in open_sockets(kinds=(kind,))}
+    ports = {each.port for each in open_sockets() if each.kind == kind}
     return tuple(sorted(p for p in ports if first <= p < last and (p - first) % 2 == 0))
 
 

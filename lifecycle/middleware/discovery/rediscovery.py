@@ -38,7 +38,7 @@ from lifecycle.middleware.discovery.probe import (
     sender_by,
     well_known_targets,
 )
-from lifecycle.middleware.fastdds.dscp import sockets_here
+from lifecycle.middleware.fastdds.sockets import sockets_here
 from lifecycle.middleware.fastdds.url_profile import (
     DISCOVERY_GROUP,
     UrlTransport,

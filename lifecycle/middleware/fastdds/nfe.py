@@ -7,7 +7,7 @@ nor an event ever sees the handle while it changes. See *Unique Network Flows*
 (rmw_unique_network_flow_endpoints_requirement_t).
 An NFE list says which network resources an endpoint may
 use, not which transport carried a message; `dscp` and `flow_label` in it are always 0 with
-Fast DDS (see `lifecycle.middleware.fastdds.dscp` for the value the kernel really uses).
+Fast DDS (see `lifecycle.middleware.fastdds.sockets` for the value the kernel really uses).
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ _SENDERS: weakref.WeakKeyDictionary[Context, tuple[NetworkFlowEndpoint, ...]] = 
 def senders_of(node: Node) -> tuple[NetworkFlowEndpoint, ...]:
     """Return the sender sockets of a node's participant, which all its publishers have.
 
-    They do not change (see `lifecycle.middleware.fastdds.dscp`), and are asked for once in a
+    They do not change (see `lifecycle.middleware.fastdds.sockets`), and are asked for once in a
     participant's life: do so before it has peers. Fast DDS 2.14 keeps them in a list with its
     senders by shared memory and TCP, which a thread of discovery extends when the first peer that
     has these is matched, and lists them without the lock

@@ -29,8 +29,7 @@ from rclpy.subscription import Subscription
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.qos import QosProfile
-from lifecycle.middleware.fastdds import dscp as marks
-from lifecycle.middleware.fastdds import nfe
+from lifecycle.middleware.fastdds import nfe, sockets
 from lifecycle.middleware.fastdds.nfe import (
     has_shared_memory,
     senders_of,
@@ -39,7 +38,7 @@ from lifecycle.middleware.fastdds.participant_profile import (
     ParticipantSettings,
     find_endpoint,
 )
-from lifecycle.middleware.fastdds.url_check import open_sockets
+from lifecycle.middleware.fastdds.sockets import open_sockets
 from lifecycle.middleware.rcl import hidden_node
 from lifecycle.middleware.rcl.abi import is_known
 from lifecycle.middleware.rcl.hidden_node import forget_hidden, quiet_node
@@ -140,7 +139,7 @@ class FlowParticipant:
         served: Node | None = None,
     ) -> None:
         if dscp is not None:
-            marks.check_dscp(dscp)
+            sockets.check_dscp(dscp)
         settings = ParticipantSettings.of(
             connections or ParticipantConnections(),
             transports=tuple(transports),
@@ -167,7 +166,7 @@ class FlowParticipant:
             if dscp is not None or is_known():
                 self._nfes = senders_of(self.node)
             if dscp is not None:
-                marks.set_dscp(self._nfes, dscp)
+                sockets.set_dscp(self._nfes, dscp)
             # It would share the sockets that are to be unique.
             self.node.destroy_publisher(probe)
             if is_known():
@@ -330,15 +329,15 @@ class FlowParticipant:
 
         It is called before a publisher or subscription is handed out, and by no reading: what reads
         and marks at once finds every mark in place. No socket of Fast DDS 2.14 opens later (see
-        `lifecycle.middleware.fastdds.dscp`).
+        `lifecycle.middleware.fastdds.sockets`).
 
         Raises:
             MiddlewareError: the mark cannot be set.
         """
         if self._context is None or self._dscp is None:
             return
-        if marks.get_dscps(self._nfes) != {self._dscp}:
-            marks.set_dscp(self._nfes, self._dscp)
+        if sockets.get_dscps(self._nfes) != {self._dscp}:
+            sockets.set_dscp(self._nfes, self._dscp)
 
     def read_dscp(self) -> int:
         """Return the DSCP (0–63) the kernel puts on what this participant sends; marks nothing.
@@ -350,8 +349,8 @@ class FlowParticipant:
             MiddlewareError: it has no socket, or its sockets differ and none was to be marked.
         """
         if self._dscp is None:
-            return marks.get_dscp(self._nfes)
-        others = marks.get_dscps(self._nfes) - {self._dscp}
+            return sockets.get_dscp(self._nfes)
+        others = sockets.get_dscps(self._nfes) - {self._dscp}
         return min(others, default=self._dscp)
 
     def destroy(self) -> None:

@@ -42,13 +42,12 @@ from lifecycle.middleware.fastdds.participant_profile import (
     without_shared_memory,
 )
 from lifecycle.middleware.fastdds.profiles import PROFILE_NAME
-from lifecycle.middleware.fastdds.url_check import (
+from lifecycle.middleware.fastdds.sockets import (
     check_free,
     check_host,
     check_sockets,
     open_sockets,
 )
-from lifecycle.middleware.fastdds.url_profile import families
 from lifecycle.middleware.process.shared_memory import own_segments
 from lifecycle.middleware.rcl import abi
 from lifecycle.plan.model import StaticEndpoint
@@ -474,10 +473,9 @@ def participant_settings(context: Context, settings: ParticipantSettings) -> Ite
             return
         # Under the lock of the default profile: no participant of ours is made in between.
         check_free(settings.urls)
-        kinds = [family.kind for family in families(settings.urls)]
-        before = {each.inode for each in open_sockets(kinds=kinds)}
+        before = {each.inode for each in open_sockets()}
         yield
-        opened = [each for each in open_sockets(kinds=kinds) if each.inode not in before]
+        opened = [each for each in open_sockets() if each.inode not in before]
         check_sockets(settings.urls, opened)
 
 

@@ -50,7 +50,7 @@ from lifecycle.middleware.fastdds.participant_profile import (
     ParticipantSettings,
 )
 from lifecycle.middleware.fastdds.settings import observer_settings
-from lifecycle.middleware.fastdds.url_check import OpenSocket
+from lifecycle.middleware.fastdds.sockets import OpenSocket
 from lifecycle.middleware.process.hosted import is_vouched_for
 from lifecycle.middleware.process.process_table import programs_of
 from lifecycle.middleware.rcl.graph_changes import GraphGuard, on_graph_change

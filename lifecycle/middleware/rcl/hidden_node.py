@@ -27,7 +27,6 @@ from rclpy.subscription import Subscription
 from rclpy.waitable import Waitable
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.fastdds.dscp import widen_discovery_buffers
 from lifecycle.middleware.fastdds.endpoint_discovery import (
     SOON_S,
     resend_endpoints_soon,
@@ -39,6 +38,7 @@ from lifecycle.middleware.fastdds.settings import (
     noting_shared_memory,
     participant_settings,
 )
+from lifecycle.middleware.fastdds.sockets import widen_discovery_buffers
 
 _hidden: weakref.WeakSet[Node] = weakref.WeakSet()
 

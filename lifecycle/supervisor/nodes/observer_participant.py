@@ -74,7 +74,7 @@ class ObserverParticipant:
             MiddlewareError: it cannot be made.
         """
         from lifecycle.graph.graph import Graph
-        from lifecycle.middleware.fastdds.dscp import widen_discovery_buffers
+        from lifecycle.middleware.fastdds.sockets import widen_discovery_buffers
 
         graph = Graph.in_loop(
             domain_id,

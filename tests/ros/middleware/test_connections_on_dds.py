@@ -34,7 +34,7 @@ from lifecycle.middleware.fastdds.nfe import (
 )
 from lifecycle.middleware.fastdds.participant import FlowParticipant
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
-from lifecycle.middleware.fastdds.url_check import OpenSocket, open_sockets
+from lifecycle.middleware.fastdds.sockets import OpenSocket, open_sockets
 from lifecycle.middleware.rcl.graph import GraphObserver
 from lifecycle.network.connection_url import ConnectionUrl
 from lifecycle.plan.model import (

@@ -19,7 +19,6 @@ from std_msgs.msg import String
 
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.fastdds import nfe
-from lifecycle.middleware.fastdds.dscp import get_dscp
 from lifecycle.middleware.fastdds.nfe import (
     UniqueFlowNotFeasible,
     create_publisher,
@@ -28,6 +27,7 @@ from lifecycle.middleware.fastdds.nfe import (
     senders_of,
 )
 from lifecycle.middleware.fastdds.participant import FlowParticipant
+from lifecycle.middleware.fastdds.sockets import get_dscp
 from lifecycle.network.nfe import TransportProtocol, UniqueRequirement
 
 MakeNode = Callable[..., Node]

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from free_ports import free_ports
 
-from lifecycle.middleware.fastdds.url_check import open_sockets
+from lifecycle.middleware.fastdds.sockets import open_sockets
 from lifecycle.middleware.rcl.graph import GraphObserver
 from lifecycle.plan.model import ParticipantConnections
 

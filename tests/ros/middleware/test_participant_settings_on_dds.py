@@ -20,7 +20,6 @@ from lifecycle import codec
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.fastdds import nfe
-from lifecycle.middleware.fastdds.dscp import own_sockets
 from lifecycle.middleware.fastdds.nfe import (
     SHARED_MEMORY,
     get_network_flow_endpoints,
@@ -30,6 +29,7 @@ from lifecycle.middleware.fastdds.nfe import (
 from lifecycle.middleware.fastdds.participant import FlowParticipant
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.middleware.fastdds.settings import participant_settings
+from lifecycle.middleware.fastdds.sockets import own_sockets
 from lifecycle.network.nfe import NetworkFlowEndpoint, TransportProtocol
 from lifecycle.verify.observation import Identity
 from lifecycle.verify.transport import carrier
@@ -299,7 +299,7 @@ def test_every_datagram_of_a_user_carries_the_dscp_from_the_first_on(
 
 
 def test_one_socket_without_the_mark_is_what_is_read(domain_id: int) -> None:
-    from lifecycle.middleware.fastdds.dscp import get_dscps, set_dscp
+    from lifecycle.middleware.fastdds.sockets import get_dscps, set_dscp
 
     with FlowParticipant("_flow", "/", domain_id, dscp=46, transports=BOTH) as participant:
         nfes = senders_of(participant.node)
@@ -315,7 +315,7 @@ def test_one_socket_without_the_mark_is_what_is_read(domain_id: int) -> None:
 def test_a_mark_that_was_lost_is_set_again_before_a_subscription_is_handed_out(
     domain_id: int,
 ) -> None:
-    from lifecycle.middleware.fastdds.dscp import set_dscp
+    from lifecycle.middleware.fastdds.sockets import set_dscp
 
     with FlowParticipant("_flow", "/", domain_id, dscp=46) as participant:
         set_dscp(senders_of(participant.node), 0)

@@ -16,9 +16,9 @@ from planning import built_with, planned, publisher, subscription
 from std_msgs.msg import String
 
 from lifecycle import LifecycleNode, codec
-from lifecycle.middleware.fastdds.dscp import own_sockets
 from lifecycle.middleware.fastdds.nfe import senders_of
 from lifecycle.middleware.fastdds.profiles import discovery_environment
+from lifecycle.middleware.fastdds.sockets import own_sockets
 from lifecycle.network.nfe import NetworkFlowEndpoint, UniqueRequirement, is_ip
 from lifecycle.node.host.control import Event, Operation
 from lifecycle.plan.model import PlannedParticipant

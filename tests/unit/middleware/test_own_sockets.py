@@ -7,7 +7,7 @@ import socket
 
 import pytest
 
-from lifecycle.middleware.fastdds.dscp import own_udp_ports, own_udp_socket
+from lifecycle.middleware.fastdds.sockets import own_udp_ports, own_udp_socket
 from lifecycle.middleware.process.shared_memory import open_files
 
 

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.fastdds.dscp import widen_discovery_buffers
 from lifecycle.middleware.fastdds.profiles import discovery_environment, discovery_profile
+from lifecycle.middleware.fastdds.sockets import widen_discovery_buffers
 from lifecycle.middleware.process.control import exit_after
 from lifecycle.network.ports import participant_ports
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.fastdds.url_check import (
+from lifecycle.middleware.fastdds.sockets import (
     OpenSocket,
     check_free,
     check_host,

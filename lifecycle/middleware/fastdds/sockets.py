@@ -1,0 +1,417 @@
+"""Sockets of this process and host: ports of connection URLs, DSCP of participants, buffers.
+
+Owns: what a host must have before a participant is made from connection URLs, and what the
+participant's sockets must be afterwards; the socket options IP_TOS and IPV6_TCLASS (ip(7), ipv6(7),
+RFC 2474) on the sockets that a participant sends from; the receive buffers of those on which it
+receives discovery. Linux: sockets are found among a process's descriptors and in proc(5). Must not
+import rclpy.
+
+Fast DDS says nothing when a fixed port is taken or a whitelist matches nothing: the participant
+exists and receives nothing. Fast DDS 2.14 has no DSCP setting, always lists 0 in its network flow
+endpoints (NFEs) and exposes no socket; the socket option is what the kernel puts into packets. It
+needs no privilege. A participant's UDP sender sockets all exist before its first publisher does.
+TCP connections are opened later, are in no NFE list, and are not marked.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ipaddress
+import os
+import socket
+import struct
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+
+from lifecycle import dataclasses
+from lifecycle.errors import MiddlewareError
+from lifecycle.middleware.fastdds.url_profile import UrlTransport, families
+from lifecycle.middleware.process.control import interface_addresses
+from lifecycle.middleware.process.shared_memory import open_files
+from lifecycle.network.connection_url import ConnectionUrl
+from lifecycle.network.medium import CONNECTABLE, UDP_UNICAST, Medium
+from lifecycle.network.nfe import InternetProtocol, NetworkFlowEndpoint, TransportProtocol
+from lifecycle.network.ports import DG, participant_ports
+
+_TYPE = {True: socket.SOCK_STREAM, False: socket.SOCK_DGRAM}  # by Medium.is_tcp
+_KINDS = {
+    (each.socket_family, _TYPE[each.is_tcp]): each
+    for each in CONNECTABLE
+    if each.is_network and not each.is_group
+}
+_FAMILIES = {InternetProtocol.IPV4: socket.AF_INET, InternetProtocol.IPV6: socket.AF_INET6}
+_TYPES = {TransportProtocol.UDP: socket.SOCK_DGRAM, TransportProtocol.TCP: socket.SOCK_STREAM}
+_DSCP_OPTION = {
+    socket.AF_INET: (socket.IPPROTO_IP, socket.IP_TOS),
+    socket.AF_INET6: (socket.IPPROTO_IPV6, socket.IPV6_TCLASS),
+}
+_MAX_DSCP = 63
+_DISCOVERY_BYTES = 1 << 22
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class OpenSocket:
+    """A bound UDP or listening TCP socket of a process.
+
+    Attributes:
+        inode: identifies it for as long as it is open.
+        kind: UDPV4, UDPV6 or TCPV4.
+        address: what it is bound to.
+        port: 1–65535.
+    """
+
+    inode: int
+    kind: Medium
+    address: str
+    port: int
+
+
+def sockets_here() -> Iterator[socket.socket]:
+    """Yield duplicates of this process's sockets; each is closed when the next is asked for.
+
+    What is set on a duplicate is set on the original.
+    """
+    for number in socket_descriptors():
+        with contextlib.suppress(OSError):  # closed since, or no socket any more
+            duplicate = os.dup(number)
+            try:
+                each = socket.socket(fileno=duplicate)
+            except OSError:
+                os.close(duplicate)
+                continue
+            with each:
+                yield each
+
+
+def socket_descriptors() -> list[int]:
+    """Return the descriptors of this process that are sockets."""
+    return [number for number, to in open_files() if to.startswith("socket:")]
+
+
+def open_sockets() -> tuple[OpenSocket, ...]:
+    """Return the bound UDP and listening TCP sockets of this process."""
+    found: dict[OpenSocket, None] = {}
+    for each in sockets_here():
+        kind = _KINDS.get((each.family, each.type))
+        if kind is None:
+            continue
+        address, port = each.getsockname()[:2]
+        is_open = not kind.is_tcp or each.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN)
+        if port and is_open:
+            inode = os.fstat(each.fileno()).st_ino
+            found[OpenSocket(inode=inode, kind=kind, address=_address(address), port=port)] = None
+    return tuple(found)
+
+
+def own_udp_ports() -> frozenset[int]:
+    """Return the ports of this process's UDP sockets."""
+    return frozenset(each.port for each in open_sockets() if each.kind.is_udp)
+
+
+def own_udp_socket(family: int, port: int) -> socket.socket | None:
+    """Return a duplicate of a UDP socket of this process that has this port; None if none has.
+
+    What is set on it is set on the original. Close it.
+    """
+    for each in _own_udp_sockets():
+        if each.family == family and each.getsockname()[1] == port:
+            return _duplicate(each)
+    return None
+
+
+def udp_sockets(*, of_others: bool = False) -> tuple[OpenSocket, ...]:
+    """Return the UDP sockets of our network namespace, or only those that others have."""
+    ours = set(_socket_inodes("self")) if of_others else set[int]()
+    return tuple(each for each in _listed() if each.inode not in ours)
+
+
+def udp_sockets_of(pids: Iterable[int]) -> dict[int, tuple[OpenSocket, ...]]:
+    """Return the UDP sockets of processes; those that are gone, or not ours, have none."""
+    inodes: dict[int, int] = {}
+    for pid in pids:
+        with contextlib.suppress(OSError):
+            inodes |= dict.fromkeys(_socket_inodes(str(pid)), pid)
+    found: dict[int, list[OpenSocket]] = {}
+    for each in _listed() if inodes else ():
+        if each.inode in inodes:
+            found.setdefault(inodes[each.inode], []).append(each)
+    return {pid: tuple(sockets) for pid, sockets in found.items()}
+
+
+def check_host(urls: Sequence[ConnectionUrl]) -> None:
+    """Refuse URLs whose own address or interface this host has not.
+
+    Raises:
+        MiddlewareError: names the URL and what there is.
+    """
+    names = {name for _, name in socket.if_nameindex()}
+    addresses = {text for _, text in interface_addresses(socket.AF_INET, socket.AF_INET6)}
+    for url in urls:
+        wanted = [each for each in url.interfaces if each not in names]
+        group = url.transport.is_group
+        if url.address and not group and not ipaddress.ip_address(url.address).is_unspecified:
+            wanted.append(url.address)
+        for each in wanted:
+            if each.partition("%")[0] not in addresses:
+                there = ", ".join(sorted(addresses | (names if each in url.interfaces else set())))
+                raise MiddlewareError(
+                    f"cannot connect by {str(url)!r}: this host has no address {each!r}; it has "
+                    f"{there}",
+                    hint="`ip address` lists them; check the machine's address in the manifest",
+                )
+
+
+def check_free(urls: Sequence[ConnectionUrl]) -> None:
+    """Refuse URLs with a port that is taken, before a participant is made of them.
+
+    Fast DDS 2.14 hangs for ever in the destruction of a participant that could not listen on its
+    TCP port, so that must not be found out afterwards.
+
+    Raises:
+        MiddlewareError: names the URL and the port.
+    """
+    for family in families(urls):
+        for url, what, port in _ports(family):
+            group = url.transport.is_group
+            if group and port == url.port:
+                continue  # a group's port is shared
+            if not _is_free(family.kind, "" if group else url.address, port):
+                raise _taken(url, what, port)
+
+
+def check_sockets(urls: Sequence[ConnectionUrl], opened: Sequence[OpenSocket]) -> None:
+    """Refuse a participant that has not all the ports of its URLs.
+
+    Args:
+        urls: that it was made from.
+        opened: the sockets that were opened for it.
+
+    Raises:
+        MiddlewareError: names the URL and the port that another process has.
+    """
+    for family in families(urls):
+        ports = {each.port for each in opened if each.kind == family.kind}
+        for url, what, port in _ports(family):
+            if port not in ports:
+                raise _taken(url, what, port)
+        if family.udp and not ports:
+            raise MiddlewareError(
+                f"cannot connect by {str(family.urls[0])!r}: Fast DDS opened no socket for it"
+            )
+
+
+@contextlib.contextmanager
+def own_sockets(nfes: Sequence[NetworkFlowEndpoint]) -> Iterator[list[socket.socket]]:
+    """Yield duplicates of this process's sockets that `nfes` names; they are closed afterwards.
+
+    Raises:
+        MiddlewareError: there is none.
+    """
+    wanted = {
+        (family, type_, _address(nfe.internet_address), nfe.transport_port)
+        for nfe in nfes
+        if (family := _FAMILIES.get(nfe.internet_protocol)) is not None
+        and (type_ := _TYPES.get(nfe.transport_protocol)) is not None
+    }
+    with contextlib.ExitStack() as stack:
+        found = []
+        for each in sockets_here():
+            if each.family not in _DSCP_OPTION:
+                continue
+            address, port = each.getsockname()[:2]
+            if (each.family, each.type, _address(address), port) in wanted:
+                found.append(stack.enter_context(_duplicate(each)))
+        if not found:
+            listed = ", ".join(f"{nfe.internet_address}:{nfe.transport_port}" for nfe in nfes)
+            raise MiddlewareError(
+                f"cannot find the sockets of this publisher among network flow endpoints "
+                f"[{listed}]: it has no UDP or TCP socket in this process",
+                hint="a publisher that only has shared memory cannot be marked",
+            )
+        yield found
+
+
+def set_dscp(nfes: Sequence[NetworkFlowEndpoint], dscp: int) -> None:
+    """Mark every socket of this process that `nfes` names, and read the marks back.
+
+    The mark is the socket's: everything the participant sends from it carries the mark, its
+    discovery as well. The two ECN bits of the byte stay 0.
+
+    Args:
+        nfes: of a publisher of this process.
+        dscp: 0–63.
+
+    Raises:
+        MiddlewareError: `dscp` out of range, no socket found, or the kernel kept another value.
+    """
+    check_dscp(dscp)
+    with own_sockets(nfes) as sockets:
+        for each in sockets:
+            option = _DSCP_OPTION[each.family]
+            try:
+                each.setsockopt(*option, dscp << 2)
+            except OSError as error:
+                raise MiddlewareError(
+                    f"cannot set DSCP {dscp} on {_where(each)}: {error.strerror}"
+                ) from error
+            if (kept := each.getsockopt(*option) >> 2) != dscp:
+                raise MiddlewareError(f"cannot set DSCP {dscp}: the kernel keeps {kept}")
+
+
+def get_dscp(nfes: Sequence[NetworkFlowEndpoint]) -> int:
+    """Return the DSCP (0–63) that the sockets named by `nfes` send with, asked of the kernel.
+
+    Raises:
+        MiddlewareError: no socket found, or they differ.
+    """
+    values = _read(nfes)
+    distinct = set(values.values())
+    if len(distinct) != 1:
+        raise MiddlewareError(
+            "cannot tell one DSCP: "
+            + ", ".join(f"{name} sends with {value}" for name, value in sorted(values.items()))
+        )
+    return distinct.pop()
+
+
+def get_dscps(nfes: Sequence[NetworkFlowEndpoint]) -> set[int]:
+    """Return every DSCP that the sockets named by `nfes` send with; one if all are marked alike.
+
+    Raises:
+        MiddlewareError: no socket found.
+    """
+    return set(_read(nfes).values())
+
+
+def check_dscp(dscp: int) -> None:
+    """Refuse what is not a DSCP, a TOS byte with ECN bits in particular.
+
+    Raises:
+        MiddlewareError: `dscp` is not 0–63.
+    """
+    if 0 <= dscp <= _MAX_DSCP:
+        return
+    hint = ""
+    if _MAX_DSCP < dscp <= 0xFF:
+        hint = f"as a TOS byte, {dscp} is DSCP {dscp >> 2}"
+        if dscp & 3:
+            hint += " with ECN bits set, which belong to the network (RFC 3168)"
+    raise MiddlewareError(f"cannot use DSCP {dscp}: allowed are 0–{_MAX_DSCP}", hint=hint)
+
+
+def widen_discovery_buffers(domain_id: int) -> int:
+    """Give the sockets on which this process receives discovery room for many participants.
+
+    Fast DDS 2.14 leaves them the system's default, which holds some 160 small datagrams: twenty
+    participants that announce their endpoints send four times as many, and what is lost is sent
+    again. Data keep their buffers: what waits in a large one is late. The kernel gives twice what
+    is asked for, and no more than twice net.core.rmem_max (socket(7)).
+
+    Args:
+        domain_id: 0–232; other ports than discovery's own of this domain stay as they are.
+
+    Returns:
+        How many sockets have more room than before.
+    """
+    first = participant_ports(domain_id, 0).discovery_multicast
+    ports = range(first, first + DG, 2)
+    count = 0
+    for each in _own_udp_sockets():
+        before = each.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
+        if before < _DISCOVERY_BYTES and each.getsockname()[1] in ports:
+            each.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _DISCOVERY_BYTES)
+            count += each.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) > before
+    return count
+
+
+def _own_udp_sockets() -> Iterator[socket.socket]:
+    for each in sockets_here():
+        if each.type == socket.SOCK_DGRAM and each.family in _DSCP_OPTION:
+            yield each
+
+
+def _duplicate(each: socket.socket) -> socket.socket:
+    # Not by its own dup(), which would make the original wait where it must not.
+    return socket.socket(fileno=os.dup(each.fileno()))
+
+
+def _address(text: str) -> str:
+    try:
+        # A scope (fe80::1%eth0) distinguishes interfaces; rmw leaves it out.
+        return str(ipaddress.ip_address(text.partition("%")[0]))
+    except ValueError:
+        return text
+
+
+def _where(each: socket.socket) -> str:
+    address, port = each.getsockname()[:2]
+    return f"{address}:{port}"
+
+
+def _read(nfes: Sequence[NetworkFlowEndpoint]) -> dict[str, int]:
+    with own_sockets(nfes) as sockets:
+        return {_where(each): each.getsockopt(*_DSCP_OPTION[each.family]) >> 2 for each in sockets}
+
+
+def _is_free(kind: Medium, address: str, port: int) -> bool:
+    with socket.socket(kind.socket_family, _TYPE[kind.is_tcp]) as probe:
+        if kind.is_tcp:  # as Fast DDS does: connections that are over are not in the way
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        if kind.ip_version == 6:
+            probe.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+        try:
+            probe.bind((address or kind.any_address, port))
+            if kind.is_tcp:
+                probe.listen()
+        except OSError:
+            return False
+    return True
+
+
+def _taken(url: ConnectionUrl, what: str, port: int) -> MiddlewareError:
+    where = f"{url.address}:{port}" if url.address else f"port {port}"
+    return MiddlewareError(
+        f"cannot connect by {str(url)!r}: {what} {where} is not free on this host",
+        hint="end who has it (`ss -lnp`), or choose another port",
+    )
+
+
+def _ports(family: UrlTransport) -> Iterator[tuple[ConnectionUrl, str, int]]:
+    """Yield each port that a URL fixes, with the URL and what the port is."""
+    protocol = "TCP" if family.kind.is_tcp else "UDP"
+    for url in family.urls:
+        for what, port in (
+            (protocol, url.port),
+            (f"{protocol} metatraffic port", url.metatraffic_port),
+            (f"{protocol} output port", url.output_port),
+        ):
+            if port is not None:
+                yield url, what, port
+
+
+def _listed() -> Iterator[OpenSocket]:
+    """Yield the bound UDP sockets of our network namespace, proc_net_udp.txt of Linux."""
+    for kind in UDP_UNICAST:
+        table = Path("/proc/thread-self/net", "udp6" if kind.ip_version == 6 else "udp")
+        with contextlib.suppress(FileNotFoundError):  # a kernel without IPv6
+            for line in table.read_text(encoding="ascii").splitlines()[1:]:
+                fields = line.split()
+                address, _, port = fields[1].partition(":")
+                # An address is written as 32-bit integers in the host's byte order.
+                words = [int(address[at : at + 8], 16) for at in range(0, len(address), 8)]
+                packed = struct.pack(f"={len(words)}I", *words)
+                if int(port, 16):
+                    yield OpenSocket(
+                        inode=int(fields[9]),
+                        kind=kind,
+                        address=socket.inet_ntop(kind.socket_family, packed),
+                        port=int(port, 16),
+                    )
+
+
+def _socket_inodes(process: str) -> Iterator[int]:
+    for descriptor in Path("/proc", process, "fd").iterdir():
+        with contextlib.suppress(OSError):  # closed meanwhile
+            target = str(descriptor.readlink())
+            if target.startswith("socket:["):
+                yield int(target[len("socket:[") : -1])
