@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import ipaddress
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from xml.etree import ElementTree as ET
 
 from lifecycle import dataclasses
@@ -25,6 +25,32 @@ from lifecycle.middleware.fastdds.profiles import text as _text
 from lifecycle.network.connection_url import ConnectionUrl, Peer
 from lifecycle.network.medium import Medium, udp_to
 from lifecycle.network.ports import LOCALHOST_PEERS_RANGE, participant_ports
+
+DISCOVERY_GROUP = {Medium.UDPV4: "239.255.0.1", Medium.UDPV6: "ff1e::ffff:efff:1"}
+"""Where Fast DDS 2.14 announces participants by multicast."""
+
+TYPES = {Medium.UDPV4: "UDPv4", Medium.UDPV6: "UDPv6", Medium.TCPV4: "TCPv4", Medium.SHM: "SHM"}
+"""What a profile calls the transports."""
+
+_ANNOUNCED_NS = 500_000_000
+"""A participant announces itself this often where it cannot be probed.
+
+Over TCP Fast DDS 2.14 sends nothing while a connection or a port in it is being agreed on, and
+dials again only when there is something to send: what gets lost so comes with the next
+announcement, or with the one after it, which by default is 3 s later.
+"""
+
+_SERVER_ID_BYTE = 2
+"""`fast-discovery-server -i ID` writes ID into the third byte of its GUID prefix."""
+
+_UNICAST, _GROUPS = _DATA = ("defaultUnicastLocatorList", "defaultMulticastLocatorList")
+_DISCOVERY_UNICAST, _DISCOVERY_GROUPS, _SEARCHED, *_ = _DISCOVERY = (
+    "metatrafficUnicastLocatorList",
+    "metatrafficMulticastLocatorList",
+    "initialPeersList",
+    "avoid_builtin_multicast",
+    "mutation_tries",
+)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,16 +87,6 @@ class UrlTransport:
         """The port that its URLs say is sent from, if one does."""
         return next((url.output_port for url in self.urls if url.output_port), None)
 
-    @property
-    def unicast(self) -> tuple[ConnectionUrl, ...]:
-        """Its URLs that are no groups."""
-        return tuple(url for url in self.urls if not url.transport.is_group)
-
-    @property
-    def groups(self) -> tuple[ConnectionUrl, ...]:
-        """Its URLs that are groups."""
-        return tuple(url for url in self.urls if url.transport.is_group)
-
 
 def families(urls: Sequence[ConnectionUrl]) -> tuple[UrlTransport, ...]:
     """Return the transports that a participant of these URLs has, in the order of the URLs.
@@ -103,37 +119,180 @@ def leaves_discovery_open(urls: Iterable[ConnectionUrl]) -> bool:
         or not url.multicast
         or url.metatraffic_port
         or url.interfaces
-        or (url.address and not url.transport.is_group)
+        or (url.address and not _is_group(url))
         for url in udp
     )
 
 
 def transport_of(url: ConnectionUrl) -> Medium:
     """Return the kind of transport that a URL is served by; a group's is that of its address."""
-    return udp_to(url.address) if url.transport.is_group else url.transport
+    return udp_to(url.address) if _is_group(url) else url.transport
+
+
+def may_be(address: str, kind: Medium) -> bool:
+    """Whether a peer can be reached by a family; a name may be, by any."""
+    version = _ip_version(address)
+    return version is None or version == kind.ip_version
+
+
+def add_urls(
+    name: str,
+    profiles: ET.Element,
+    rtps: ET.Element,
+    urls: Sequence[ConnectionUrl],
+    *,
+    domain_id: int,
+    super_client: bool = False,
+    non_blocking_send: bool = False,
+    localhost_peers: tuple[str, ...] | None = None,
+) -> None:
+    """Write transports, locators and discovery of a participant into its profile.
+
+    Args:
+        name: prefix of the transports' names.
+        profiles: gets <transport_descriptors>.
+        rtps: the participant's; what it said of locators and discovery is replaced.
+        urls: at least one.
+        domain_id: 0–232, for TCP's logical ports.
+        super_client: receive everything from the discovery server, not only of what matches.
+        non_blocking_send: on every UDP transport, whatever its URLs say.
+        localhost_peers: look for others on this host and on these only; for URLs that leave
+            discovery open.
+
+    Raises:
+        MiddlewareError: URLs that one participant cannot have together.
+    """
+    found = families(urls)
+    builtin = _child(rtps, "builtin")
+    for parent, tags in ((rtps, _DATA), (builtin, _DISCOVERY)):
+        for each in [each for each in parent if each.tag in tags]:
+            parent.remove(each)
+    lists = {tag: ET.Element(tag) for tag in (*_DATA, *_DISCOVERY)}
+    descriptors = ET.SubElement(profiles, "transport_descriptors")
+    chosen = ET.SubElement(rtps, "userTransports")
+    for family in found:
+        descriptors.append(
+            _descriptor(
+                name,
+                family,
+                non_blocking=non_blocking_send or any(url.non_blocking_send for url in family.urls),
+                open_peers=localhost_peers is not None,
+            )
+        )
+        _text(chosen, "transport_id", f"{name}_{family.kind}")
+        if family.udp:
+            _list_udp(lists, family, localhost_peers)
+        elif family.kind.is_tcp:
+            _list_tcp(lists, family, participant_ports(domain_id, 0).discovery_unicast)
+    _text(rtps, "useBuiltinTransports", "false")
+    _add_data(rtps, found, lists)
+    multicast = localhost_peers is None and all(url.multicast for url in urls)
+    if any(url.server for url in urls):
+        _add_servers(builtin, urls, super_client=super_client)
+        lists.pop(_SEARCHED)
+        _add_discovery(builtin, found, lists, multicast=False)
+    else:
+        _add_discovery(builtin, found, lists, multicast=multicast)
+        if not multicast and localhost_peers is None:
+            _text(builtin, "avoid_builtin_multicast", "true")
+
+
+def _list_udp(
+    lists: Mapping[str, ET.Element], family: UrlTransport, localhost_peers: tuple[str, ...] | None
+) -> None:
+    """List where a UDP transport's data and discovery arrive, and where others are looked for."""
+    kind = family.kind
+    own = [url for url in family.urls if not _is_group(url)]
+    # Readers of a group also need an address of their own: one that is alone is sent to there, and
+    # what a reliable writer repeats.
+    for address, port in [(url.address, url.port) for url in own] or [("", None)]:
+        _locator(lists[_UNICAST], kind, address, port)
+    for url in family.urls:
+        if _is_group(url):
+            _locator(lists[_GROUPS], kind, url.address, url.port)
+    for address in dict.fromkeys(url.address for url in own) or ("",):
+        _locator(lists[_DISCOVERY_UNICAST], kind, address, family.metatraffic_port)
+    _locator(lists[_DISCOVERY_GROUPS], kind, DISCOVERY_GROUP[kind], None)
+    for peer in family.peers:
+        _locator(lists[_SEARCHED], kind, peer.address, peer.port)
+    if localhost_peers is not None:
+        for address in (*localhost_peers, kind.loopback):
+            if may_be(address, kind):
+                _locator(lists[_SEARCHED], kind, address, None)
+
+
+def _list_tcp(lists: Mapping[str, ET.Element], family: UrlTransport, logical: int) -> None:
+    """List the same of a TCP transport.
+
+    Its data arrive at discovery's port inside a connection: Fast DDS may lose the request for
+    another one, and who was discovered over TCP is then reached by data, too.
+    """
+    for url in family.urls:
+        for tag in (_UNICAST, _DISCOVERY_UNICAST):
+            _tcp_locator(lists[tag], family.kind, url.address, url.port, logical)
+    for peer in family.peers:
+        _tcp_locator(lists[_SEARCHED], family.kind, peer.address, peer.port, None)
+
+
+def _add_data(
+    rtps: ET.Element, found: Sequence[UrlTransport], lists: Mapping[str, ET.Element]
+) -> None:
+    """Say where data arrives, if any of it is fixed: then Fast DDS adds nothing by itself."""
+    ports = any(
+        url.port for family in found if family.udp for url in family.urls if not _is_group(url)
+    )
+    has_tcp = any(family.kind.is_tcp for family in found)
+    is_network = all(family.kind.is_network for family in found)
+    if ports or (has_tcp and is_network) or len(lists[_GROUPS]):
+        rtps.extend(each for tag in _DATA if len(each := lists[tag]))
+
+
+def _add_discovery(
+    builtin: ET.Element,
+    found: Sequence[UrlTransport],
+    lists: Mapping[str, ET.Element],
+    *,
+    multicast: bool,
+) -> None:
+    """Say where discovery arrives, if Fast DDS would not do as asked by itself, and goes to."""
+    udp = [family for family in found if family.udp]
+    is_fixed = any(family.metatraffic_port for family in udp)
+    if is_fixed or all(family.kind.is_tcp for family in found) or (udp and not multicast):
+        builtin.append(lists[_DISCOVERY_UNICAST])
+        if udp and multicast:  # an empty list would be refused
+            builtin.append(lists[_DISCOVERY_GROUPS])
+    searched = lists.get(_SEARCHED)
+    if searched is not None and len(searched):
+        if multicast:
+            # Named peers replace the groups by which Fast DDS otherwise announces.
+            searched.extend(lists[_DISCOVERY_GROUPS])
+        builtin.append(searched)
+    if len(udp) < len(found):
+        config = _child(builtin, "discovery_config")
+        if config.find("leaseAnnouncement") is None:  # the user's own profile may say it
+            _text(ET.SubElement(config, "leaseAnnouncement"), "nanosec", str(_ANNOUNCED_NS))
+    if all(family.udp and _all_ports_fixed(family) for family in found):
+        # Else Fast DDS would take other ports for busy ones, and no peer would look there.
+        _text(builtin, "mutation_tries", "0")
 
 
 def _interfaces(urls: Sequence[ConnectionUrl]) -> tuple[str, ...]:
     """Return what a transport of these URLs is bound to; empty for everything."""
-    found: dict[str, None] = {}
     free = [url for url in urls if not _bound_to(url)]
     bound = [url for url in urls if _bound_to(url)]
-    if free and bound and not all(url.transport.is_group for url in free):
+    if free and bound and not all(_is_group(url) for url in free):
         raise MiddlewareError(
             f"cannot use {str(free[0])!r} on all interfaces and {str(bound[0])!r} on some: one "
             "participant has one transport for both",
             hint="give both an address or interface=",
         )
-    for url in bound:
-        found.update(dict.fromkeys(_bound_to(url)))
-    return tuple(found)
+    return tuple(dict.fromkeys(each for url in bound for each in _bound_to(url)))
 
 
 def _bound_to(url: ConnectionUrl) -> tuple[str, ...]:
     if url.interfaces:
         return url.interfaces
-    group = url.transport.is_group
-    if group or not url.address or ipaddress.ip_address(url.address).is_unspecified:
+    if _is_group(url) or not url.address or ipaddress.ip_address(url.address).is_unspecified:
         return ()
     return (url.address,)
 
@@ -173,128 +332,6 @@ def _check(found: Sequence[UrlTransport], urls: Sequence[ConnectionUrl]) -> None
         )
 
 
-DISCOVERY_GROUP = {Medium.UDPV4: "239.255.0.1", Medium.UDPV6: "ff1e::ffff:efff:1"}
-"""Where Fast DDS 2.14 announces participants by multicast."""
-
-ANNOUNCED_S = 0.5
-"""A participant announces itself each so many seconds where it cannot be probed.
-
-Over TCP Fast DDS 2.14 sends nothing while a connection or a port in it is being agreed on, and
-dials again only when there is something to send: what gets lost so comes with the next
-announcement, or with the one after it, which by default is 3 s later.
-"""
-
-_SERVER_ID_BYTE = 2
-"""`fast-discovery-server -i ID` writes ID into the third byte of its GUID prefix."""
-
-_REPLACED = (
-    "metatrafficUnicastLocatorList",
-    "metatrafficMulticastLocatorList",
-    "initialPeersList",
-    "avoid_builtin_multicast",
-    "mutation_tries",
-)
-
-
-def add_discovery(
-    builtin: ET.Element,
-    found: Sequence[UrlTransport],
-    urls: Sequence[ConnectionUrl],
-    *,
-    domain_id: int,
-    super_client: bool,
-    localhost_peers: tuple[str, ...] | None,
-) -> None:
-    """Write discovery into <builtin>, whatever that said of it.
-
-    Args:
-        builtin: of the participant's <rtps>.
-        found: the transports of the URLs.
-        urls: at least one.
-        domain_id: 0–232, for TCP's logical ports.
-        super_client: receive everything from the discovery server, not only of what matches.
-        localhost_peers: look for others on this host and on these only; for URLs that leave
-            discovery open.
-    """
-    for tag in _REPLACED:
-        for element in builtin.findall(tag):
-            builtin.remove(element)
-    if any(url.server for url in urls):
-        _add_servers(builtin, urls, super_client=super_client)
-        _add_metatraffic(builtin, found, domain_id, multicast=False)
-    elif localhost_peers is not None:
-        peers = [Peer(address=each) for each in localhost_peers]
-        _add_metatraffic(builtin, found, domain_id, multicast=False)
-        _add_peers(builtin, found, extra=peers, loopback=True)
-    else:
-        multicast = all(url.multicast for url in urls)
-        _add_metatraffic(builtin, found, domain_id, multicast=multicast)
-        _add_peers(builtin, found, announce=multicast)
-        if not multicast:
-            _text(builtin, "avoid_builtin_multicast", "true")
-    if not all(family.udp for family in found):
-        _announce_each(builtin, ANNOUNCED_S)
-    if _all_ports_fixed(found):
-        # Else Fast DDS would take other ports for busy ones, and no peer would look there.
-        _text(builtin, "mutation_tries", "0")
-
-
-def _add_metatraffic(
-    builtin: ET.Element, found: Sequence[UrlTransport], domain_id: int, *, multicast: bool
-) -> None:
-    """Say where discovery arrives, if Fast DDS would not do as asked by itself."""
-    fixed = any(family.metatraffic_port for family in found)
-    tcp_alone = all(family.kind.is_tcp for family in found)
-    udp = any(family.udp for family in found)
-    if not (fixed or tcp_alone or (udp and not multicast)):
-        return
-    unicast = ET.SubElement(builtin, "metatrafficUnicastLocatorList")
-    for family in found:
-        if family.udp:
-            addresses = dict.fromkeys(url.address for url in family.unicast) or {"": None}
-            for address in addresses:
-                _locator(unicast, family.kind, address, family.metatraffic_port)
-        elif family.kind.is_tcp:
-            logical = participant_ports(domain_id, 0).discovery_unicast
-            for url in family.urls:
-                _tcp_locator(unicast, family.kind, url.address, url.port, logical)
-    if multicast and udp:  # an empty list would be refused
-        groups = ET.SubElement(builtin, "metatrafficMulticastLocatorList")
-        for family in found:
-            if family.udp:
-                _locator(groups, family.kind, DISCOVERY_GROUP[family.kind], None)
-
-
-def _add_peers(
-    builtin: ET.Element,
-    found: Sequence[UrlTransport],
-    *,
-    extra: Sequence[Peer] = (),
-    loopback: bool = False,
-    announce: bool = False,
-) -> None:
-    searched = ET.Element("initialPeersList")
-    for family in found:
-        for peer in family.peers:
-            if family.kind.is_tcp:
-                _tcp_locator(searched, family.kind, peer.address, peer.port, None)
-            else:
-                _locator(searched, family.kind, peer.address, peer.port)
-        if family.udp:
-            for peer in extra:
-                if may_be(peer.address, family.kind):
-                    _locator(searched, family.kind, peer.address, None)
-            if loopback:
-                _locator(searched, family.kind, family.kind.loopback, None)
-    if len(searched):
-        if announce:
-            # Named peers replace the groups by which Fast DDS otherwise announces.
-            for family in found:
-                if family.udp:
-                    _locator(searched, family.kind, DISCOVERY_GROUP[family.kind], None)
-        builtin.append(searched)
-
-
 def _add_servers(builtin: ET.Element, urls: Sequence[ConnectionUrl], *, super_client: bool) -> None:
     config = _child(builtin, "discovery_config")
     for tag in ("discoveryProtocol", "discoveryServersList"):
@@ -314,96 +351,10 @@ def _add_servers(builtin: ET.Element, urls: Sequence[ConnectionUrl], *, super_cl
                 _locator(listened, transport_of(url), server.address, server.port)
 
 
-def _announce_each(builtin: ET.Element, period_s: float) -> None:
-    config = _child(builtin, "discovery_config")
-    if config.find("leaseAnnouncement") is None:  # the user's own profile may say it
-        period = ET.SubElement(config, "leaseAnnouncement")
-        _text(period, "nanosec", str(round(period_s * 1e9)))
-
-
 def _counted(prefix: str, index: int) -> str:
     octets = prefix.split(".")
     octets[_SERVER_ID_BYTE] = f"{(int(octets[_SERVER_ID_BYTE], 16) + index) & 0xFF:02x}"
     return ".".join(octets)
-
-
-def _all_ports_fixed(found: Sequence[UrlTransport]) -> bool:
-    # Shared memory has ports of its own, which must stay free to move.
-    return all(
-        family.udp
-        and family.metatraffic_port
-        and family.unicast
-        and all(url.port for url in family.unicast)
-        for family in found
-    )
-
-
-def may_be(address: str, kind: Medium) -> bool:
-    """Whether a peer can be reached by a family; a name may be, by any."""
-    try:
-        version = ipaddress.ip_address(address).version
-    except ValueError:
-        return True
-    return kind.ip_version == version
-
-
-TYPES = {Medium.UDPV4: "UDPv4", Medium.UDPV6: "UDPv6", Medium.TCPV4: "TCPv4", Medium.SHM: "SHM"}
-
-
-def add_urls(
-    name: str,
-    profiles: ET.Element,
-    rtps: ET.Element,
-    urls: Sequence[ConnectionUrl],
-    *,
-    domain_id: int,
-    super_client: bool = False,
-    non_blocking_send: bool = False,
-    localhost_peers: tuple[str, ...] | None = None,
-) -> None:
-    """Write transports, locators and discovery of a participant into its profile.
-
-    Args:
-        name: prefix of the transports' names.
-        profiles: gets <transport_descriptors>.
-        rtps: the participant's; what it said of locators and discovery is replaced.
-        urls: at least one.
-        domain_id: 0–232, for TCP's logical ports.
-        super_client: receive everything from the discovery server, not only of what matches.
-        non_blocking_send: on every UDP transport, whatever its URLs say.
-        localhost_peers: look for others on this host and on these only; for URLs that leave
-            discovery open.
-
-    Raises:
-        MiddlewareError: URLs that one participant cannot have together.
-    """
-    transports = families(urls)
-    descriptors = ET.SubElement(profiles, "transport_descriptors")
-    chosen = ET.SubElement(rtps, "userTransports")
-    for family in transports:
-        descriptors.append(
-            _descriptor(
-                name,
-                family,
-                non_blocking=non_blocking_send or any(url.non_blocking_send for url in family.urls),
-                open_peers=localhost_peers is not None,
-            )
-        )
-        _text(chosen, "transport_id", f"{name}_{family.kind}")
-    _text(rtps, "useBuiltinTransports", "false")
-    builtin = _child(rtps, "builtin")
-    for tag in ("defaultUnicastLocatorList", "defaultMulticastLocatorList"):
-        for element in rtps.findall(tag):
-            rtps.remove(element)
-    _add_user_traffic(rtps, transports, domain_id)
-    add_discovery(
-        builtin,
-        transports,
-        urls,
-        domain_id=domain_id,
-        super_client=super_client,
-        localhost_peers=localhost_peers,
-    )
 
 
 def _descriptor(
@@ -427,59 +378,34 @@ def _descriptor(
     if family.interfaces:
         allowed = ET.SubElement(descriptor, "interfaceWhiteList")
         for each in family.interfaces:
-            _text(allowed, "interface" if _is_name(each) else "address", each)
+            _text(allowed, "address" if _ip_version(each) else "interface", each)
     if family.kind.is_tcp:
-        _keep_dialling_whole(descriptor)
+        # Fast DDS 2.14 dials first and says then which port it wants inside the connection; an
+        # answer to the former that comes in between leaves the connection unused for good. A
+        # SCHED_BATCH thread does not overtake (sched(7)), and needs no privilege.
+        for tag, policy in (
+            ("accept_thread", os.SCHED_BATCH),
+            ("default_reception_threads", os.SCHED_OTHER),
+        ):
+            _text(ET.SubElement(descriptor, tag), "scheduling_policy", str(policy))
         ports = [url.port for url in family.urls if url.port]
         if ports:
             _text(ET.SubElement(descriptor, "listening_ports"), "port", str(ports[0]))
     return descriptor
 
 
-def _keep_dialling_whole(descriptor: ET.Element) -> None:
-    """Keep the thread that finishes a connection from overtaking the one that began it.
-
-    Fast DDS 2.14 dials first and says then which port it wants inside the connection; if the answer
-    to the former comes in between, the connection stays unused for good. A SCHED_BATCH
-    thread does not overtake then (sched(7)), and needs no privilege.
-    """
-    for tag, policy in (
-        ("accept_thread", os.SCHED_BATCH),
-        ("default_reception_threads", os.SCHED_OTHER),
-    ):
-        _text(ET.SubElement(descriptor, tag), "scheduling_policy", str(policy))
+def _is_group(url: ConnectionUrl) -> bool:
+    return url.transport.is_group
 
 
-def _add_user_traffic(rtps: ET.Element, found: Sequence[UrlTransport], domain_id: int) -> None:
-    """Say where data arrives, if any of it is fixed: then Fast DDS adds nothing by itself."""
-    groups = [(family, url) for family in found for url in family.groups]
-    ports = any(url.port for family in found if family.udp for url in family.unicast)
-    with_tcp = any(family.kind.is_tcp for family in found)
-    if not groups and not ports and (not with_tcp or not all(f.kind.is_network for f in found)):
-        return
-    unicast = ET.SubElement(rtps, "defaultUnicastLocatorList")
-    for family in found:
-        for url in family.unicast:
-            if family.udp:
-                _locator(unicast, family.kind, url.address, url.port)
-            elif family.kind.is_tcp:
-                # As discovery: one request for a port inside a connection, which Fast DDS may lose.
-                # Who was discovered over TCP is then reached by data, too.
-                logical = participant_ports(domain_id, 0).discovery_unicast
-                _tcp_locator(unicast, family.kind, url.address, url.port, logical)
-        if family.udp and not family.unicast:
-            # Readers of a group also need an address of their own: one that is alone is sent to
-            # there, and what a reliable writer repeats.
-            _locator(unicast, family.kind, "", None)
-    if groups:
-        multicast = ET.SubElement(rtps, "defaultMulticastLocatorList")
-        for family, url in groups:
-            _locator(multicast, family.kind, url.address, url.port)
+def _all_ports_fixed(family: UrlTransport) -> bool:
+    ports = [url.port for url in family.urls if not _is_group(url)]
+    return bool(family.metatraffic_port and ports and all(ports))
 
 
-def _is_name(text: str) -> bool:
+def _ip_version(address: str) -> int | None:
+    """Return 4 or 6; None for a name."""
     try:
-        ipaddress.ip_address(text)
+        return ipaddress.ip_address(address).version
     except ValueError:
-        return True
-    return False
+        return None
