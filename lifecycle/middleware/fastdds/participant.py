@@ -34,11 +34,9 @@ from lifecycle.middleware.fastdds.nfe import (
     has_shared_memory,
     senders_of,
 )
-from lifecycle.middleware.fastdds.participant_profile import (
-    ParticipantSettings,
-    find_endpoint,
-)
+from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.middleware.fastdds.sockets import open_sockets
+from lifecycle.middleware.fastdds.static_edp import find_endpoint
 from lifecycle.middleware.rcl import hidden_node
 from lifecycle.middleware.rcl.abi import is_known
 from lifecycle.middleware.rcl.hidden_node import forget_hidden, quiet_node

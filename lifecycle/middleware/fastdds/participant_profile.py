@@ -1,27 +1,24 @@
-"""The Fast DDS XML profile of one participant, and static endpoint discovery (STATIC EDP).
+"""The Fast DDS XML profile of one participant.
 
 Owns: the XML of a participant that must differ from the process's default, made from what the
 participant needs, from the default participant profile that is in force anyway (the user's own, or
-our quick discovery) and from the discovery that rmw_fastrtps would have set up; and, for endpoints
-that participants know without announcing them, the table of all participants' endpoints and the
-endpoint profiles that tie an endpoint to its line of the table. Must not import rclpy; nothing is
-applied here.
+our quick discovery) and from the discovery that rmw_fastrtps would have set up. Must not import
+rclpy; nothing is applied here.
 
 Nothing of a user's profile is changed or lost; where it already chooses transports, choosing others
-is refused. With static endpoints, participants still announce themselves, and in that which lines
-of the table exist: who they are and where is announced, what they publish is not.
+is refused.
 """
 
 from __future__ import annotations
 
 import copy
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from xml.etree import ElementTree as ET
 
 from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.fastdds import url_profile
+from lifecycle.middleware.fastdds import static_edp, url_profile
 from lifecycle.middleware.fastdds.profiles import (
     DEFAULT_FILE,
     PROFILE_NAME,
@@ -34,117 +31,12 @@ from lifecycle.middleware.fastdds.profiles import text as _text
 from lifecycle.network.connection_url import ConnectionUrl
 from lifecycle.network.connection_url import parse as parse_url
 from lifecycle.network.medium import RMW_DEFAULT, TRANSPORTS_VARIABLE, UDP_UNICAST, Medium
-from lifecycle.network.ports import LOCALHOST_PEERS_RANGE
 from lifecycle.plan.model import (
-    GRAPH_TOPIC,
-    GRAPH_TYPE,
-    MAX_USER_ID,
     ParticipantConnections,
     PlannedNode,
     StaticEndpoint,
     StaticParticipant,
 )
-
-
-def endpoint_table(participants: Sequence[StaticParticipant]) -> str:
-    """Return the table as XML, <staticdiscovery>.
-
-    Raises:
-        MiddlewareError: an id is out of range or occurs twice.
-    """
-    seen: dict[int, str] = {}
-    root = ET.Element("staticdiscovery")
-    for participant in participants:
-        element = ET.SubElement(root, "participant")
-        _text(element, "name", participant.name)
-        for endpoint in participant.endpoints:
-            _check(endpoint, participant, seen)
-            line = ET.SubElement(element, "writer" if endpoint.writer else "reader")
-            _text(line, "userId", str(endpoint.user_id))
-            _text(line, "topicName", endpoint.topic)
-            _text(line, "topicDataType", endpoint.type)
-            _text(line, "topicKind", "NO_KEY")
-            reliability = "RELIABLE" if endpoint.reliable else "BEST_EFFORT"
-            _text(line, "reliabilityQos", f"{reliability}_RELIABILITY_QOS")
-            durability = "TRANSIENT_LOCAL" if endpoint.transient_local else "VOLATILE"
-            _text(line, "durabilityQos", f"{durability}_DURABILITY_QOS")
-    return ET.tostring(root, encoding="unicode")
-
-
-def endpoint_profiles(endpoints: Sequence[StaticEndpoint]) -> str:
-    """Return profiles that give endpoints the ids of their lines in the table."""
-    root = ET.Element("dds", xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles")
-    profiles = ET.SubElement(root, "profiles")
-    for endpoint in endpoints:
-        tag = "data_writer" if endpoint.writer else "data_reader"
-        element = ET.SubElement(profiles, tag, profile_name=endpoint.profile)
-        _text(element, "userDefinedID", str(endpoint.user_id))
-    return ET.tostring(root, encoding="unicode", xml_declaration=True)
-
-
-def own_endpoints(
-    name: str, participants: Sequence[StaticParticipant]
-) -> tuple[StaticEndpoint, ...]:
-    """Return the lines of one participant.
-
-    Raises:
-        MiddlewareError: it is not in the table, or has no line for what every participant has.
-    """
-    own = next((each for each in participants if each.name == name), None)
-    if own is None:
-        known = ", ".join(repr(each.name) for each in participants)
-        raise MiddlewareError(
-            f"cannot find participant {name!r} in the table of static discovery: it has {known}"
-        )
-    for writer in (True, False):
-        if not any(each.topic == GRAPH_TOPIC and each.writer is writer for each in own.endpoints):
-            what = "writer" if writer else "reader"
-            raise MiddlewareError(
-                f"cannot discover endpoints of {name!r} statically: the table has no {what} of "
-                f"{GRAPH_TOPIC!r} for it, which every participant of rmw_fastrtps has",
-                hint=f"add one of type {GRAPH_TYPE}, reliable and transient local",
-            )
-    return own.endpoints
-
-
-def find_endpoint(
-    endpoints: Sequence[StaticEndpoint], *, writer: bool, profile: str, type_name: str
-) -> StaticEndpoint:
-    """Return the line of an endpoint that is about to be made.
-
-    Args:
-        endpoints: the participant's.
-        writer: a writer, else a reader.
-        profile: the name by which rmw looks for its profile, the fully qualified topic name.
-        type_name: DDS name of its type.
-
-    Raises:
-        MiddlewareError: the table has none like it: no participant would ever find this endpoint.
-    """
-    for each in endpoints:
-        if (each.writer, each.profile, each.type) == (writer, profile, type_name):
-            return each
-    what = "writers" if writer else "readers"
-    listed = [f"{e.profile} ({e.type})" for e in endpoints if e.writer is writer]
-    raise MiddlewareError(
-        f"cannot make a {what[:-1]} of {profile!r} ({type_name}): the table of static discovery "
-        f"has only these {what} for this participant: {', '.join(listed) or 'none'}",
-        hint="declare the endpoint, and check or plan again",
-    )
-
-
-def _check(endpoint: StaticEndpoint, participant: StaticParticipant, seen: dict[int, str]) -> None:
-    what = f"{endpoint.profile!r} of {participant.name!r}"
-    if not 1 <= endpoint.user_id <= MAX_USER_ID:
-        raise MiddlewareError(
-            f"cannot use id {endpoint.user_id} for {what}: allowed are 1–{MAX_USER_ID}"
-        )
-    if endpoint.user_id in seen:
-        raise MiddlewareError(
-            f"cannot use id {endpoint.user_id} for {what}: {seen[endpoint.user_id]} has it"
-        )
-    seen[endpoint.user_id] = what
-
 
 _SKIP_DEFAULT_FILE_VARIABLE = "SKIP_DEFAULT_XML"
 _TRANSPORT_CHOICES = ("userTransports", "useBuiltinTransports", "builtinTransports")
@@ -250,8 +142,6 @@ class ParticipantSettings:
                 "cannot discover endpoints statically without connection URLs",
                 hint="say where the participants are, udpv4://ADDRESS:PORT?metatraffic_port=…",
             )
-        if self.static_participants:
-            own_endpoints(self.static_name, self.static_participants)
         unknown = [each for each in self.transports if each not in UDP_UNICAST]
         if unknown or len(set(self.transports)) != len(self.transports):
             raise MiddlewareError(
@@ -274,9 +164,8 @@ class ParticipantSettings:
     @property
     def static_endpoints(self) -> tuple[StaticEndpoint, ...]:
         """Its own lines in the table of static discovery; empty without one."""
-        if not self.static_participants:
-            return ()
-        return own_endpoints(self.static_name, self.static_participants)
+        own = (each for each in self.static_participants if each.name == self.static_name)
+        return next((each.endpoints for each in own), ())
 
     @property
     def governs_discovery(self) -> bool:
@@ -381,7 +270,7 @@ def profile(
         if settings.static_participants:
             config = _child(_child(rtps, "builtin"), "discovery_config")
             _text(config, "EDP", "STATIC")
-            table = endpoint_table(settings.static_participants)
+            table = static_edp.endpoint_table(settings.static_participants)
             _text(config, "static_edp_xml_config", f"data://{table}")
     elif settings.chooses_transports:
         # Fast DDS's own default where none is asked for: shared memory and UDP over IPv4.
@@ -389,10 +278,16 @@ def profile(
         descriptors = ET.SubElement(profiles, "transport_descriptors")
         chosen = ET.SubElement(rtps, "userTransports")
         for kind in kinds:
-            descriptor = _descriptor(f"{name}_{kind}", kind, settings)
-            if localhost_peers is not None and kind.is_udp:
-                _text(descriptor, "maxInitialPeersRange", str(LOCALHOST_PEERS_RANGE))
-            descriptors.append(descriptor)
+            # Not maxMessageSize: it is the receive buffer's size as well, and would cut what others
+            # send.
+            descriptors.append(
+                url_profile.descriptor(
+                    name,
+                    url_profile.UrlTransport(kind=kind, urls=()),
+                    non_blocking=settings.non_blocking_send,
+                    open_peers=localhost_peers is not None,
+                )
+            )
             _text(chosen, "transport_id", f"{name}_{kind}")
         _text(rtps, "useBuiltinTransports", "false")
         if localhost_peers is not None:
@@ -461,16 +356,6 @@ def _refuse_second_choice(
             "already chooses its transports",
             hint=f"unset it, or say {TRANSPORTS_VARIABLE}={variable}?non_blocking=true",
         )
-
-
-def _descriptor(name: str, kind: Medium, settings: ParticipantSettings) -> ET.Element:
-    descriptor = ET.Element("transport_descriptor")
-    _text(descriptor, "transport_id", name)
-    _text(descriptor, "type", url_profile.TYPES[kind])
-    if settings.non_blocking_send and kind.is_udp:
-        _text(descriptor, "non_blocking_send", "true")
-    # Not maxMessageSize: it is the receive buffer's size as well, and would cut what others send.
-    return descriptor
 
 
 def _discover_as_localhost(

@@ -37,7 +37,6 @@ from lifecycle.middleware.fastdds.participant_profile import (
     DISCOVERY_SERVER_VARIABLE,
     ParticipantSettings,
     default_profile,
-    endpoint_profiles,
     profile,
     without_shared_memory,
 )
@@ -48,6 +47,7 @@ from lifecycle.middleware.fastdds.sockets import (
     check_sockets,
     open_sockets,
 )
+from lifecycle.middleware.fastdds.static_edp import endpoint_profiles
 from lifecycle.middleware.process.shared_memory import own_segments
 from lifecycle.middleware.rcl import abi
 from lifecycle.plan.model import StaticEndpoint

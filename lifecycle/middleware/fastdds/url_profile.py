@@ -172,7 +172,7 @@ def add_urls(
     chosen = ET.SubElement(rtps, "userTransports")
     for family in found:
         descriptors.append(
-            _descriptor(
+            descriptor(
                 name,
                 family,
                 non_blocking=non_blocking_send or any(url.non_blocking_send for url in family.urls),
@@ -195,6 +195,52 @@ def add_urls(
         _add_discovery(builtin, found, lists, multicast=multicast)
         if not multicast and localhost_peers is None:
             _text(builtin, "avoid_builtin_multicast", "true")
+
+
+def descriptor(
+    name: str, family: UrlTransport, *, non_blocking: bool, open_peers: bool
+) -> ET.Element:
+    """Return the description of a transport.
+
+    Args:
+        name: prefix of its name.
+        family: what it is; without URLs, as Fast DDS has it by default.
+        non_blocking: what finds a socket's buffer full is dropped, if it is UDP.
+        open_peers: participants are looked for at each well-known port of a peer.
+    """
+    made = ET.Element("transport_descriptor")
+    _text(made, "transport_id", f"{name}_{family.kind}")
+    _text(made, "type", TYPES[family.kind])
+    if family.udp:
+        ttl = next((url.ttl for url in family.urls if url.ttl is not None), None)
+        if ttl is not None:
+            _text(made, "TTL", str(ttl))
+        if family.output_port is not None:
+            _text(made, "output_port", str(family.output_port))
+        if non_blocking:
+            _text(made, "non_blocking_send", "true")
+    if family.kind.is_network:
+        wide = open_peers or any(peer.port is None for peer in family.peers)
+        range_ = LOCALHOST_PEERS_RANGE if wide and family.udp else 1
+        if family.urls or open_peers:
+            _text(made, "maxInitialPeersRange", str(range_))
+    if family.interfaces:
+        allowed = ET.SubElement(made, "interfaceWhiteList")
+        for each in family.interfaces:
+            _text(allowed, "address" if _ip_version(each) else "interface", each)
+    if family.kind.is_tcp:
+        # Fast DDS 2.14 dials first and says then which port it wants inside the connection; an
+        # answer to the former that comes in between leaves the connection unused for good. A
+        # SCHED_BATCH thread does not overtake (sched(7)), and needs no privilege.
+        for tag, policy in (
+            ("accept_thread", os.SCHED_BATCH),
+            ("default_reception_threads", os.SCHED_OTHER),
+        ):
+            _text(ET.SubElement(made, tag), "scheduling_policy", str(policy))
+        ports = [url.port for url in family.urls if url.port]
+        if ports:
+            _text(ET.SubElement(made, "listening_ports"), "port", str(ports[0]))
+    return made
 
 
 def _list_udp(
@@ -355,43 +401,6 @@ def _counted(prefix: str, index: int) -> str:
     octets = prefix.split(".")
     octets[_SERVER_ID_BYTE] = f"{(int(octets[_SERVER_ID_BYTE], 16) + index) & 0xFF:02x}"
     return ".".join(octets)
-
-
-def _descriptor(
-    name: str, family: UrlTransport, *, non_blocking: bool, open_peers: bool
-) -> ET.Element:
-    descriptor = ET.Element("transport_descriptor")
-    _text(descriptor, "transport_id", f"{name}_{family.kind}")
-    _text(descriptor, "type", TYPES[family.kind])
-    if family.udp:
-        ttl = next((url.ttl for url in family.urls if url.ttl is not None), None)
-        if ttl is not None:
-            _text(descriptor, "TTL", str(ttl))
-        if family.output_port is not None:
-            _text(descriptor, "output_port", str(family.output_port))
-        if non_blocking:
-            _text(descriptor, "non_blocking_send", "true")
-    if family.kind.is_network:
-        wide = open_peers or any(peer.port is None for peer in family.peers)
-        range_ = LOCALHOST_PEERS_RANGE if wide and family.udp else 1
-        _text(descriptor, "maxInitialPeersRange", str(range_))
-    if family.interfaces:
-        allowed = ET.SubElement(descriptor, "interfaceWhiteList")
-        for each in family.interfaces:
-            _text(allowed, "address" if _ip_version(each) else "interface", each)
-    if family.kind.is_tcp:
-        # Fast DDS 2.14 dials first and says then which port it wants inside the connection; an
-        # answer to the former that comes in between leaves the connection unused for good. A
-        # SCHED_BATCH thread does not overtake (sched(7)), and needs no privilege.
-        for tag, policy in (
-            ("accept_thread", os.SCHED_BATCH),
-            ("default_reception_threads", os.SCHED_OTHER),
-        ):
-            _text(ET.SubElement(descriptor, tag), "scheduling_policy", str(policy))
-        ports = [url.port for url in family.urls if url.port]
-        if ports:
-            _text(ET.SubElement(descriptor, "listening_ports"), "port", str(ports[0]))
-    return descriptor
 
 
 def _is_group(url: ConnectionUrl) -> bool:

@@ -8,13 +8,12 @@ from xml.etree import ElementTree as ET
 import pytest
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.fastdds.participant_profile import (
+from lifecycle.middleware.fastdds.static_edp import (
     endpoint_profiles,
     endpoint_table,
     find_endpoint,
-    own_endpoints,
 )
-from lifecycle.plan.model import GRAPH_TOPIC, GRAPH_TYPE, StaticEndpoint, StaticParticipant
+from lifecycle.plan.model import StaticEndpoint, StaticParticipant
 
 _STRING = "std_msgs::msg::dds_::String_"
 
@@ -27,17 +26,6 @@ def line(topic: str, user_id: int, *, writer: bool = True, **changes: bool) -> S
         profile=topic,
         user_id=user_id,
         **changes,
-    )
-
-
-def graph(user_id: int, *, writer: bool) -> StaticEndpoint:
-    return StaticEndpoint(
-        writer=writer,
-        topic=GRAPH_TOPIC,
-        type=GRAPH_TYPE,
-        profile=GRAPH_TOPIC,
-        user_id=user_id,
-        transient_local=True,
     )
 
 
@@ -92,19 +80,6 @@ def test_the_table_says_of_each_endpoint_what_matching_needs() -> None:
     ]
 
 
-@pytest.mark.parametrize("user_id", [0, 32768])
-def test_an_id_that_fast_dds_cannot_read_is_refused(user_id: int) -> None:
-    with pytest.raises(MiddlewareError) as refused:
-        endpoint_table([participant("/a", line("/x", user_id))])
-    assert str(refused.value) == (f"cannot use id {user_id} for '/x' of '/a': allowed are 1–32767")
-
-
-def test_an_id_that_another_participant_has_is_refused() -> None:
-    with pytest.raises(MiddlewareError) as refused:
-        endpoint_table([participant("/a", line("/x", 7)), participant("/b", line("/y", 7))])
-    assert str(refused.value) == "cannot use id 7 for '/y' of '/b': '/x' of '/a' has it"
-
-
 def test_profiles_are_named_as_rmw_looks_for_them_and_give_the_id() -> None:
     text = endpoint_profiles([line("/x", 3), line("/y", 4, writer=False)])
     root = ET.fromstring(text.replace(" xmlns=", " x="))
@@ -112,31 +87,6 @@ def test_profiles_are_named_as_rmw_looks_for_them_and_give_the_id() -> None:
         (each.tag, each.get("profile_name"), each.findtext("userDefinedID"))
         for each in root.findall("./profiles/*")
     ] == [("data_writer", "/x", "3"), ("data_reader", "/y", "4")]
-
-
-def test_a_participant_gets_its_own_lines() -> None:
-    own = (line("/x", 1), graph(2, writer=True), graph(3, writer=False))
-    other = participant("/b", line("/x", 4, writer=False))
-    assert own_endpoints("/a", [other, participant("/a", *own)]) == own
-
-
-def test_a_participant_that_is_not_in_the_table_is_refused() -> None:
-    with pytest.raises(MiddlewareError) as refused:
-        own_endpoints("/c", [participant("/a"), participant("/b")])
-    assert str(refused.value) == (
-        "cannot find participant '/c' in the table of static discovery: it has '/a', '/b'"
-    )
-
-
-@pytest.mark.parametrize(("kept", "missing"), [(True, "reader"), (False, "writer")])
-def test_a_participant_needs_both_ends_of_the_topic_of_rmw(kept: bool, missing: str) -> None:
-    with pytest.raises(MiddlewareError) as refused:
-        own_endpoints("/a", [participant("/a", graph(1, writer=kept))])
-    assert str(refused.value) == (
-        f"cannot discover endpoints of '/a' statically: the table has no {missing} of "
-        f"'{GRAPH_TOPIC}' for it, which every participant of rmw_fastrtps has; add one of type "
-        f"{GRAPH_TYPE}, reliable and transient local"
-    )
 
 
 def test_an_endpoint_is_found_by_direction_name_and_type_together() -> None:
