@@ -11,9 +11,9 @@ import asyncio
 import contextlib
 import dataclasses
 import signal
-from collections.abc import Awaitable, Callable, Coroutine, Iterable, Iterator, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import MiddlewareError
@@ -67,8 +67,6 @@ from lifecycle.verify.rules import rule
 from lifecycle.verify.verdict import Verdict
 from tests.builders import plan_of, planned_node
 from tests.unit.supervisor.fakes import FakeSpawner, interface_of
-
-T = TypeVar("T")
 
 SHUTDOWN_S = 30.0
 """However a node or a process resists, a system of the size of these is down within so long."""
@@ -523,23 +521,6 @@ def _line(event: Event, now_s: float) -> str:
     return f"[{event.kind}]"
 
 
-async def _beside(
-    running: Coroutine[Any, Any, T], scenarios: Iterable[Coroutine[Any, Any, None]]
-) -> T:
-    """Return what a run comes to; a scenario that fails ends it, and is raised."""
-    run = asyncio.ensure_future(running)
-    acting = [asyncio.ensure_future(each) for each in scenarios]
-    await asyncio.wait({run, *acting}, return_when=asyncio.FIRST_EXCEPTION)
-    if not run.done():
-        run.cancel()
-        await asyncio.wait({run})
-    for each in acting:
-        if each.done():
-            each.result()
-    await asyncio.gather(*acting)
-    return run.result()
-
-
 class SessionWorld:
     """One session with all that it acts on; make it, prepare it, `run` it once.
 
@@ -605,8 +586,8 @@ class SessionWorld:
         assert self.result is not None
         return [each.message for each in self.result.verdict.findings]
 
-    async def run(self, *scenarios: Coroutine[Any, Any, None]) -> None:
-        """Run the session to its end, and beside it what happens to it."""
+    async def run(self) -> None:
+        """Run the session to its end."""
         kept = self.journal.writing(self._tmp_path / "logs")
         with self.ending, self._run_directory() as directory, kept:
             session = Session(
@@ -621,9 +602,33 @@ class SessionWorld:
                 ending=self.ending,
             )
             self.status = session.status
-            self.result = await _beside(session.run(), scenarios)
+            self.result = await session.run()
             await session.leave()
         self._check()
+
+    @contextlib.asynccontextmanager
+    async def running(self, since: str = "", times: int = 1) -> AsyncIterator[None]:
+        """Run the session to its end; the body acts on it from the line on that begins so."""
+        run = asyncio.ensure_future(self.run())
+        body = asyncio.current_task()
+        assert body is not None
+
+        def interrupt(run: asyncio.Future[None]) -> None:
+            if run.exception() is not None:
+                body.cancel()
+
+        run.add_done_callback(interrupt)
+        try:
+            await self.story.until(since, times if since else 0)
+            yield
+        except BaseException:
+            if run.done():
+                run.result()  # what went wrong first
+            run.cancel()
+            await asyncio.wait({run})
+            raise
+        run.remove_done_callback(interrupt)
+        await run
 
     @contextlib.contextmanager
     def _run_directory(self) -> Iterator[RunDirectory]:

@@ -125,12 +125,9 @@ async def test_a_process_of_which_some_nodes_run_is_not_started_beside_them(tmp_
 async def test_a_node_in_a_transition_is_adopted_as_what_it_becomes(tmp_path: Path) -> None:
     world = world_of(tmp_path, plan_of(planned_node("lidar")), stop_after_s=0.0)
     world.graph.others["/lidar"] = "activating"
-
-    async def arrive() -> None:
+    async with world.running():
         await asyncio.sleep(1.0)
         world.graph.others["/lidar"] = "active"
-
-    await world.run(arrive())
     assert notices(world) == ["[notice] '/lidar' is adopted, found active"]
     assert world.outline[-1] == "[stopped] 0"
 
@@ -176,17 +173,13 @@ async def test_a_pause_deactivates_what_was_found_active_and_a_resume_leaves_it_
     tmp_path: Path,
 ) -> None:
     world = world_of(tmp_path, plan_of(planned_node("lidar")))
-
-    async def orders() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         for ask in (ControlRequest.PAUSE, ControlRequest.RESUME, ControlRequest.RESTART):
             assert await world.order(ask) == "0"
         assert await world.order(ControlRequest.RESTART, "lidar") == (
             "2 cannot restart '/lidar': it is attached, no process of this supervisor"
         )
         await world.order(ControlRequest.DOWN)
-
-    await world.run(orders())
     assert requests(world, "/lidar") == ["deactivate", "activate"]
     assert world.graph.others == {"/lidar": "active"}
     assert world.outline[-1] == "[stopped] 0"

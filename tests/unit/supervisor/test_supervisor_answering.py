@@ -135,31 +135,25 @@ class _Moved(ForeignNode):
         return True
 
 
-def test_a_node_that_somebody_moves_meanwhile_is_asked_again() -> None:
-    async def main() -> None:
-        node = _Moved("active", "active")
-        driver = ServiceDriver(node, planned_node("b"))  # type: ignore[arg-type]
-        assert (await driver.perform(Operation.DEACTIVATE)).state == "inactive"
-        assert node.requests == ["deactivate", "deactivate"]
-        node = _Moved("inactive", "inactive")
-        driver = ServiceDriver(node, planned_node("b"))  # type: ignore[arg-type]
-        permit = Gate(strict=False).judge(verdict_of(Outcome.OK))
-        assert (await driver.perform(Operation.ACTIVATE, permit)).state == "active"
-        assert node.requests == ["activate", "activate"]
-
-    asyncio.run(main())
+async def test_a_node_that_somebody_moves_meanwhile_is_asked_again() -> None:
+    node = _Moved("active", "active")
+    driver = ServiceDriver(node, planned_node("b"))  # type: ignore[arg-type]
+    assert (await driver.perform(Operation.DEACTIVATE)).state == "inactive"
+    assert node.requests == ["deactivate", "deactivate"]
+    node = _Moved("inactive", "inactive")
+    driver = ServiceDriver(node, planned_node("b"))  # type: ignore[arg-type]
+    permit = Gate(strict=False).judge(verdict_of(Outcome.OK))
+    assert (await driver.perform(Operation.ACTIVATE, permit)).state == "active"
+    assert node.requests == ["activate", "activate"]
 
 
-def test_whoever_moves_it_each_time_is_named_and_no_request_is_sent_that_cannot_be() -> None:
-    async def main() -> None:
-        node = _Moved("active", *["active"] * 9)
-        driver = ServiceDriver(node, planned_node("b"))  # type: ignore[arg-type]
-        with pytest.raises(ActiveError, match="activated again by its own code or another client"):
-            await driver.perform(Operation.DEACTIVATE)
-        node = _Moved("active", "unconfigured")
-        driver = ServiceDriver(node, planned_node("b"))  # type: ignore[arg-type]
-        with pytest.raises(BringUpError, match="others moved it, and it is unconfigured"):
-            await driver.perform(Operation.DEACTIVATE)
-        assert node.requests == ["deactivate"]
-
-    asyncio.run(main())
+async def test_whoever_moves_it_each_time_is_named_and_no_request_is_sent_that_cannot_be() -> None:
+    node = _Moved("active", *["active"] * 9)
+    driver = ServiceDriver(node, planned_node("b"))  # type: ignore[arg-type]
+    with pytest.raises(ActiveError, match="activated again by its own code or another client"):
+        await driver.perform(Operation.DEACTIVATE)
+    node = _Moved("active", "unconfigured")
+    driver = ServiceDriver(node, planned_node("b"))  # type: ignore[arg-type]
+    with pytest.raises(BringUpError, match="others moved it, and it is unconfigured"):
+        await driver.perform(Operation.DEACTIVATE)
+    assert node.requests == ["deactivate"]

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import dataclasses
 import random
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,6 @@ from lifecycle.plan.model import ExpectedParameter, ModeParameters, Plan, Planne
 from lifecycle.supervisor.control.protocol import Answer, ControlRequest
 from lifecycle.verify.outcome import Outcome
 from tests.builders import HERE, plan_of, planned_node
-from tests.unit.supervisor.fakes import run
 from tests.unit.supervisor.session_world import (
     CHAIN,
     DIALLING,
@@ -37,25 +37,14 @@ def _rate(node: PlannedNode, value: float) -> PlannedNode:
     return dataclasses.replace(node, parameters=(("rate", value),), expected_parameters=(rate,))
 
 
-Acts = Callable[[SessionWorld], Awaitable[None]]
-
-
-def _session(tmp_path: Path, plan: Plan, acts: Acts, *, code: str = "0") -> SessionWorld:
-    """Run a session in which something is done once it is active, and which is then ended."""
-
-    async def main() -> SessionWorld:
-        world = SessionWorld(plan, tmp_path)
-
-        async def then() -> None:
-            await world.story.until("[system] active")
-            await acts(world)
-            if code == "0":
-                assert await world.order(ControlRequest.DOWN) == code
-
-        await world.run(then())
-        return world
-
-    return run(main())
+@contextlib.asynccontextmanager
+async def active(tmp_path: Path, plan: Plan, *, code: str = "0") -> AsyncIterator[SessionWorld]:
+    """A session that is active; it is ended after the body, unless it ends by itself."""
+    world = SessionWorld(plan, tmp_path)
+    async with world.running("[system] active"):
+        yield world
+        if code == "0":
+            assert await world.order(ControlRequest.DOWN) == code
 
 
 def _since_begun(world: SessionWorld) -> list[str]:
@@ -68,8 +57,10 @@ def _told(answer: Answer) -> str:
     return f"{answer.exit_code} {answer.error}".rstrip()
 
 
-def test_an_added_node_goes_through_the_gate_while_the_others_stay_active(tmp_path: Path) -> None:
-    async def acts(world: SessionWorld) -> None:
+async def test_an_added_node_goes_through_the_gate_while_the_others_stay_active(
+    tmp_path: Path,
+) -> None:
+    async with active(tmp_path, CHAIN) as world:
         said = await world.apply(MORE, dry_run=True)
         assert said.exit_code == 4
         assert said.change is not None
@@ -90,8 +81,6 @@ def test_an_added_node_goes_through_the_gate_while_the_others_stay_active(tmp_pa
         assert (await world.apply(MORE, dry_run=True)).exit_code == 0
         # It is watched as all others are.
         assert await world.order(ControlRequest.RESTART, "arm") == "0"
-
-    world = _session(tmp_path, CHAIN, acts)
     assert _since_begun(world)[:11] == [
         "[apply] begun revision 1, added /arm",
         "arm start",
@@ -108,16 +97,14 @@ def test_an_added_node_goes_through_the_gate_while_the_others_stay_active(tmp_pa
     assert world.story.count("/camera activate") == 1
 
 
-def test_a_removed_node_is_taken_down_and_not_missed(tmp_path: Path) -> None:
-    async def acts(world: SessionWorld) -> None:
+async def test_a_removed_node_is_taken_down_and_not_missed(tmp_path: Path) -> None:
+    async with active(tmp_path, CHAIN) as world:
         assert _told(await world.apply(plan_of(CAMERA))) == "0"
         assert [each.node for each in world.status().nodes] == ["/camera"]
         await asyncio.sleep(30.0)
         assert world.status().not_ok == ""
         # Its key is free again.
         assert _told(await world.apply(CHAIN)) == "0"
-
-    world = _session(tmp_path, CHAIN, acts)
     assert _since_begun(world)[:9] == [
         "[apply] begun revision 1, removed /viewer",
         "/viewer deactivate",
@@ -131,11 +118,9 @@ def test_a_removed_node_is_taken_down_and_not_missed(tmp_path: Path) -> None:
     assert world.story.count("/camera activate") == 1
 
 
-def test_what_differs_in_a_process_is_restarted_alone(tmp_path: Path) -> None:
-    async def acts(world: SessionWorld) -> None:
+async def test_what_differs_in_a_process_is_restarted_alone(tmp_path: Path) -> None:
+    async with active(tmp_path, CHAIN) as world:
         assert _told(await world.apply(plan_of(CAMERA, LOUD))) == "0"
-
-    world = _session(tmp_path, CHAIN, acts)
     outline = _since_begun(world)
     assert outline[0] == "[apply] begun revision 1, restarted /viewer"
     assert outline[-1] == "[apply] applied revision 2, restarted /viewer"
@@ -144,17 +129,14 @@ def test_what_differs_in_a_process_is_restarted_alone(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("refuses", [False, True])
-def test_a_parameter_is_set_while_its_node_runs_and_else_by_a_restart(
+async def test_a_parameter_is_set_while_its_node_runs_and_else_by_a_restart(
     tmp_path: Path, refuses: bool
 ) -> None:
     plans = [plan_of(CAMERA, _rate(VIEWER, rate)) for rate in (1.0, 2.0)]
-
-    async def acts(world: SessionWorld) -> None:
+    async with active(tmp_path, plans[0]) as world:
         if refuses:
             world.graph.refuses_live["/viewer"] = "cannot set 'rate' of '/viewer': it is read-only"
         assert _told(await world.apply(plans[1])) == "0"
-
-    world = _session(tmp_path, plans[0], acts)
     outline = _since_begun(world)
     assert outline[:2] == [
         "[apply] begun revision 1, parameters of /viewer",
@@ -165,12 +147,11 @@ def test_a_parameter_is_set_while_its_node_runs_and_else_by_a_restart(
     assert world.system.plan == plans[1]
 
 
-def test_rules_alone_are_only_judged_by_and_given_up_where_they_are_violated(
+async def test_rules_alone_are_only_judged_by_and_given_up_where_they_are_violated(
     tmp_path: Path,
 ) -> None:
     open_ = dataclasses.replace(CHAIN, policy=Policy(undeclared_nodes=EndpointPolicy.OPEN))
-
-    async def acts(world: SessionWorld) -> None:
+    async with active(tmp_path, CHAIN) as world:
         world.intrude()
         await world.story.until("[verdict] active violated")
         assert _told(await world.apply(open_)) == "0"
@@ -184,8 +165,6 @@ def test_rules_alone_are_only_judged_by_and_given_up_where_they_are_violated(
         world.retreat()
         assert _told(await world.apply(CHAIN)) == "0"
         assert world.status().revision == 4
-
-    world = _session(tmp_path, CHAIN, acts)
     outline = _since_begun(world)
     assert not any(line.endswith(("start", "activate", "deactivate")) for line in outline)
 
@@ -201,10 +180,9 @@ WAYS = {
 
 
 @pytest.mark.parametrize("how", WAYS)
-def test_a_node_that_fails_rolls_everything_back(tmp_path: Path, how: str) -> None:
+async def test_a_node_that_fails_rolls_everything_back(tmp_path: Path, how: str) -> None:
     line, way, why = WAYS[how]
-
-    async def acts(world: SessionWorld) -> None:
+    async with active(tmp_path, CHAIN) as world:
         world.hosts.ways[line] = way
         answer = await world.apply(plan_of(CAMERA, LOUD, ARM))
         assert _told(answer).startswith(f"6 cannot apply robot.lifecycle.yaml: {why}")
@@ -214,8 +192,6 @@ def test_a_node_that_fails_rolls_everything_back(tmp_path: Path, how: str) -> No
         assert [each.node for each in status.nodes] == ["/camera", "/viewer"]
         assert world.system.plan == CHAIN
         assert await world.order(ControlRequest.RESTART) == "0"
-
-    world = _session(tmp_path, CHAIN, acts)
     outline = world.since("[apply] begun")
     stages = [line for line in outline if line.startswith("[apply]")]
     assert stages[0] == "[apply] begun revision 1, added /arm, restarted /viewer"
@@ -226,8 +202,8 @@ def test_a_node_that_fails_rolls_everything_back(tmp_path: Path, how: str) -> No
     assert "/viewer activate" in outline[:until]
 
 
-def test_a_gate_that_stays_closed_activates_nothing_and_rolls_back(tmp_path: Path) -> None:
-    async def acts(world: SessionWorld) -> None:
+async def test_a_gate_that_stays_closed_activates_nothing_and_rolls_back(tmp_path: Path) -> None:
+    async with active(tmp_path, CHAIN) as world:
         world.hosts.takes_s["/arm configure"] = 1.0
         applying = asyncio.ensure_future(world.apply(MORE))
         await world.story.until("/arm configure")
@@ -240,21 +216,16 @@ def test_a_gate_that_stays_closed_activates_nothing_and_rolls_back(tmp_path: Pat
         world.retreat()
         await asyncio.sleep(1.0)
         assert world.status().not_ok == ""
-
-    world = _session(tmp_path, CHAIN, acts)
     assert "/arm activate" not in world.story
     assert not any(line.endswith("deactivate") for line in _since_begun(world))
 
 
-def test_parameters_that_were_set_are_set_back(tmp_path: Path) -> None:
+async def test_parameters_that_were_set_are_set_back(tmp_path: Path) -> None:
     plans = [plan_of(CAMERA, _rate(VIEWER, rate)) for rate in (1.0, 2.0)]
     more = plan_of(*plans[1].nodes, ARM)
-
-    async def acts(world: SessionWorld) -> None:
+    async with active(tmp_path, plans[0]) as world:
         world.hosts.ways["/arm configure"] = "no gripper"
         assert _told(await world.apply(more)).endswith(BACK)
-
-    world = _session(tmp_path, plans[0], acts)
     assert [line for line in world.story if " set " in line] == [
         "/viewer set {'rate': 2.0}",
         "/viewer set {'rate': 1.0}",
@@ -262,46 +233,43 @@ def test_parameters_that_were_set_are_set_back(tmp_path: Path) -> None:
     assert "/viewer deactivate" not in _since_begun(world)
 
 
-def test_parameters_that_a_death_kept_us_from_hearing_of_are_set_back_too(tmp_path: Path) -> None:
+async def test_parameters_that_a_death_kept_us_from_hearing_of_are_set_back_too(
+    tmp_path: Path,
+) -> None:
     camera = dataclasses.replace(CAMERA, supervision=AGAIN)
     plans = [plan_of(camera, _rate(VIEWER, rate)) for rate in (1.0, 2.0)]
-
-    async def acts(world: SessionWorld) -> None:
+    async with active(tmp_path, plans[0]) as world:
         world.hosts.takes_s["/viewer set"] = 1.0  # it takes them at once, and answers late
         applying = asyncio.ensure_future(world.apply(plans[1]))
         await world.story.until("/viewer set {'rate': 2.0}")
         world.kill("camera")
         assert "cannot keep '/camera' running" in (await applying).error
         await world.story.until("[restarted] camera (1)")
-
-    world = _session(tmp_path, plans[0], acts)
     assert [line for line in world.story if " set " in line] == [
         "/viewer set {'rate': 2.0}",
         "/viewer set {'rate': 1.0}",
     ]
 
 
-def test_one_that_takes_too_long_is_rolled_back(tmp_path: Path) -> None:
-    async def acts(world: SessionWorld) -> None:
+async def test_one_that_takes_too_long_is_rolled_back(tmp_path: Path) -> None:
+    async with active(tmp_path, CHAIN) as world:
         world.hosts.takes_s["/arm configure"] = 4.0
         answer = await world.apply(MORE, timeout_s=2.0)
         assert "cannot bring up 'robot' within 2 s: /arm is still configuring" in answer.error
         assert answer.exit_code == 6
         assert answer.error.endswith(BACK)
 
-    _session(tmp_path, CHAIN, acts)
-
 
 @pytest.mark.parametrize("stage", ["viewer deactivate", "arm configure", "arm activate"])
 @pytest.mark.parametrize("policy", [Restart.NO, Restart.ON_FAILURE])
-def test_the_death_of_another_rolls_back_and_then_counts_as_ever(
+async def test_the_death_of_another_rolls_back_and_then_counts_as_ever(
     tmp_path: Path, stage: str, policy: Restart
 ) -> None:
     camera = dataclasses.replace(CAMERA, supervision=dataclasses.replace(AGAIN, restart=policy))
     plan, other = plan_of(camera, VIEWER), plan_of(camera, LOUD, ARM)
     ends = policy is Restart.NO
 
-    async def acts(world: SessionWorld) -> None:
+    async with active(tmp_path, plan, code="6" if ends else "0") as world:
         world.hosts.takes_s[f"/{stage}"] = 1.0
         applying = asyncio.ensure_future(world.apply(other))
         await world.story.until(f"/{stage}")
@@ -311,24 +279,21 @@ def test_the_death_of_another_rolls_back_and_then_counts_as_ever(
         assert "cannot keep '/camera' running" in answer.error
         if ends:
             assert answer.error.endswith("the system is taken down")
-            return
-        assert "is in force again, revision 1, and what failed meanwhile" in answer.error
-        await world.story.until("[restarted] camera")
-        status = world.status()
-        assert (status.phase, status.not_ok, status.revision) == ("active", "", 1)
-        assert [each.state for each in status.nodes] == ["active", "active"]
-
-    world = _session(tmp_path, plan, acts, code="6" if ends else "0")
+        else:
+            assert "is in force again, revision 1, and what failed meanwhile" in answer.error
+            await world.story.until("[restarted] camera")
+            status = world.status()
+            assert (status.phase, status.not_ok, status.revision) == ("active", "", 1)
+            assert [each.state for each in status.nodes] == ["active", "active"]
     assert world.story[-1] == f"[stopped] {6 if ends else 0}"
 
 
-def test_a_node_at_the_gate_again_as_another_dies_is_activated_with_that_one(
+async def test_a_node_at_the_gate_again_as_another_dies_is_activated_with_that_one(
     tmp_path: Path,
 ) -> None:
     camera = dataclasses.replace(CAMERA, supervision=AGAIN)
     plan, other = plan_of(camera, VIEWER), plan_of(camera, LOUD, ARM)
-
-    async def acts(world: SessionWorld) -> None:
+    async with active(tmp_path, plan) as world:
         world.hosts.takes_s["/arm configure"] = 4.0
         applying = asyncio.ensure_future(world.apply(other, timeout_s=2.0))
         await world.story.until("/arm configure")
@@ -344,13 +309,11 @@ def test_a_node_at_the_gate_again_as_another_dies_is_activated_with_that_one(
         assert [each.state for each in status.nodes] == ["active", "active"]
         assert (status.phase, status.not_ok, status.revision) == ("active", "", 1)
 
-    _session(tmp_path, plan, acts)
 
-
-def test_a_node_of_the_manifest_before_that_does_not_come_back_ends_the_run(
+async def test_a_node_of_the_manifest_before_that_does_not_come_back_ends_the_run(
     tmp_path: Path,
 ) -> None:
-    async def acts(world: SessionWorld) -> None:
+    async with active(tmp_path, CHAIN, code="6") as world:
         world.hosts.ways["/viewer configure"] = "no display"
         answer = await world.apply(plan_of(CAMERA, LOUD))
         assert _told(answer) == (
@@ -358,29 +321,26 @@ def test_a_node_of_the_manifest_before_that_does_not_come_back_ends_the_run(
             "cannot go back to robot.lifecycle.yaml: cannot configure '/viewer': no display; "
             "the system is taken down"
         )
-
-    world = _session(tmp_path, CHAIN, acts, code="6")
     assert world.story[-1] == "[stopped] 6"
 
 
-def test_a_failing_node_is_started_at_once_by_a_manifest_that_mends_it(tmp_path: Path) -> None:
+async def test_a_failing_node_is_started_at_once_by_a_manifest_that_mends_it(
+    tmp_path: Path,
+) -> None:
     slow = dataclasses.replace(AGAIN, restart_sec=1000.0, restart_max_delay_sec=1000.0)
     plan = plan_of(CAMERA, dataclasses.replace(VIEWER, supervision=slow))
     mended = plan_of(CAMERA, dataclasses.replace(LOUD, supervision=slow))
-
-    async def acts(world: SessionWorld) -> None:
+    async with active(tmp_path, plan) as world:
         world.kill("viewer")
         await world.story.until("[backoff] viewer")
         assert _told(await world.apply(mended)) == "0"
         assert world.status().phase == "active"
-
-    world = _session(tmp_path, plan, acts)
     assert "[restarted] viewer (0)" not in world.story
     assert world.outline[-1] == "[stopped] 0"
 
 
-def test_other_orders_are_refused_meanwhile(tmp_path: Path) -> None:
-    async def acts(world: SessionWorld) -> None:
+async def test_other_orders_are_refused_meanwhile(tmp_path: Path) -> None:
+    async with active(tmp_path, CHAIN) as world:
         world.hosts.takes_s["/arm configure"] = 5.0
         applying = asyncio.ensure_future(world.apply(plan_of(CAMERA, LOUD, ARM)))
         await world.story.until("/arm configure")
@@ -400,8 +360,6 @@ def test_other_orders_are_refused_meanwhile(tmp_path: Path) -> None:
         assert (await world.apply(CHAIN, timeout_s=-1.0)).exit_code == 2
         assert (await world.order(ControlRequest.APPLY)).startswith("2 cannot apply a manifest")
 
-    _session(tmp_path, CHAIN, acts)
-
 
 STAGES = {
     "/viewer deactivate": "applying",
@@ -414,8 +372,8 @@ STAGES = {
 
 
 @pytest.mark.parametrize("stage", STAGES)
-def test_an_end_in_the_middle_takes_down_what_is_there(tmp_path: Path, stage: str) -> None:
-    async def acts(world: SessionWorld) -> None:
+async def test_an_end_in_the_middle_takes_down_what_is_there(tmp_path: Path, stage: str) -> None:
+    async with active(tmp_path, CHAIN, code="6") as world:
         world.hosts.takes_s[stage] = 5.0
         times = 1 + sum(line.startswith(stage) for line in world.story)
         if stage.startswith("["):
@@ -428,13 +386,13 @@ def test_an_end_in_the_middle_takes_down_what_is_there(tmp_path: Path, stage: st
         assert world.status().phase == STAGES[stage]
         assert await world.order(ControlRequest.DOWN) == "6"
         assert _told(await applying) == "6 cannot go on: 'robot' is being taken down"
-
-    world = _session(tmp_path, CHAIN, acts, code="6")
     assert world.report.endswith(f"the system was {STAGES[stage]}, not active")
 
 
-def test_what_waits_at_its_gate_is_let_through_by_a_manifest_or_waits_on(tmp_path: Path) -> None:
-    async def acts(world: SessionWorld) -> None:
+async def test_what_waits_at_its_gate_is_let_through_by_a_manifest_or_waits_on(
+    tmp_path: Path,
+) -> None:
+    async with active(tmp_path, CHAIN) as world:
         world.intrude()
         assert (await world.order(ControlRequest.RESTART, "viewer"))[0] == "4"
         world.retreat()
@@ -448,14 +406,12 @@ def test_what_waits_at_its_gate_is_let_through_by_a_manifest_or_waits_on(tmp_pat
         world.hosts.ways.clear()
         assert _told(await world.apply(MORE)) == "0"
         assert world.status().phase == "active"
-
-    world = _session(tmp_path, CHAIN, acts)
     assert world.story.count("/camera activate") == 1
     assert world.story.count("/viewer activate") == 2
 
 
-def test_a_network_that_cannot_be_programmed_rolls_back(tmp_path: Path) -> None:
-    async def acts(world: SessionWorld) -> None:
+async def test_a_network_that_cannot_be_programmed_rolls_back(tmp_path: Path) -> None:
+    async with active(tmp_path, CHAIN) as world:
         world.networks.fails = "cannot reach the server"
         world.story.in_the_moment["[apply] rolling_back"] = lambda: setattr(
             world.networks, "fails", ""
@@ -463,13 +419,11 @@ def test_a_network_that_cannot_be_programmed_rolls_back(tmp_path: Path) -> None:
         answer = await world.apply(MORE)
         assert _told(answer).startswith("6 cannot apply robot.lifecycle.yaml: cannot reach")
         assert answer.error.endswith(BACK)
-
-    world = _session(tmp_path, CHAIN, acts)
     assert "/arm activate" not in world.story
 
 
-def test_a_paused_system_takes_a_manifest_and_stays_paused(tmp_path: Path) -> None:
-    async def acts(world: SessionWorld) -> None:
+async def test_a_paused_system_takes_a_manifest_and_stays_paused(tmp_path: Path) -> None:
+    async with active(tmp_path, CHAIN) as world:
         assert await world.order(ControlRequest.PAUSE) == "0"
         assert _told(await world.apply(MORE)) == "0"
         status = world.status()
@@ -482,27 +436,22 @@ def test_a_paused_system_takes_a_manifest_and_stays_paused(tmp_path: Path) -> No
         )
         assert world.status().phase == "paused"
         assert await world.order(ControlRequest.RESUME) == "0"
-
-    world = _session(tmp_path, CHAIN, acts)
     assert world.story.count("/arm activate") == 1
 
 
-def test_modes_may_change_and_the_nodes_follow(tmp_path: Path) -> None:
+async def test_modes_may_change_and_the_nodes_follow(tmp_path: Path) -> None:
     quiet = dataclasses.replace(CHAIN, modes=(Mode(name="quiet", inactive=("viewer",), at=HERE),))
     loud = dataclasses.replace(CHAIN, modes=(Mode(name="loud", at=HERE),))
-
-    async def acts(world: SessionWorld) -> None:
+    async with active(tmp_path, CHAIN) as world:
         assert _told(await world.apply(quiet)) == "0"
         assert [each.state for each in world.status().nodes] == ["active", "inactive"]
         assert _told(await world.apply(loud)) == "0"
         assert world.status().mode == "loud"
         assert [each.state for each in world.status().nodes] == ["active", "active"]
-
-    world = _session(tmp_path, CHAIN, acts)
     assert "viewer start" not in _since_begun(world)
 
 
-def test_parameters_of_the_mode_that_the_system_is_in_are_set(tmp_path: Path) -> None:
+async def test_parameters_of_the_mode_that_the_system_is_in_are_set(tmp_path: Path) -> None:
     def plan(rate: float) -> Plan:
         rates = {"day": 1.0, "night": rate}
         camera = _rate(CAMERA, 1.0)
@@ -520,20 +469,18 @@ def test_parameters_of_the_mode_that_the_system_is_in_are_set(tmp_path: Path) ->
         policy = Policy(undeclared_nodes=EndpointPolicy.OPEN) if rate > 2.0 else Policy()
         return dataclasses.replace(plan_of(camera, VIEWER), modes=modes, policy=policy)
 
-    async def acts(world: SessionWorld) -> None:
+    async with active(tmp_path, plan(2.0)) as world:
         assert await world.order(ControlRequest.MODE, mode="night") == "0"
         assert _told(await world.apply(plan(3.0))) == "0"
         assert world.status().mode == "night"
         assert world.system.plan.node("camera").parameters == (("rate", 3.0),)
         assert await world.order(ControlRequest.MODE, mode="day") == "0"
         assert _told(await world.apply(plan(4.0))) == "0"
-
-    world = _session(tmp_path, plan(2.0), acts)
     assert [line for line in world.story if " set " in line] == ["/camera set {'rate': 3.0}"]
     assert "camera start" not in _since_begun(world)
 
 
-def test_what_a_running_supervisor_cannot_change_is_refused_before_anything_is_touched(
+async def test_what_a_running_supervisor_cannot_change_is_refused_before_anything_is_touched(
     tmp_path: Path,
 ) -> None:
     others = {
@@ -543,8 +490,7 @@ def test_what_a_running_supervisor_cannot_change_is_refused_before_anything_is_t
             CHAIN, rmw="rmw_zenoh_cpp"
         ),
     }
-
-    async def acts(world: SessionWorld) -> None:
+    async with active(tmp_path, CHAIN) as world:
         for line, plan in others.items():
             for dry_run in (True, False):
                 answer = await world.apply(plan, dry_run=dry_run)
@@ -553,12 +499,10 @@ def test_what_a_running_supervisor_cannot_change_is_refused_before_anything_is_t
                     f"supervisor cannot change this:\n{line}; end it and start it anew: "
                     "lifecycle down, then lifecycle up"
                 )
-
-    world = _session(tmp_path, CHAIN, acts)
     assert not any(line.startswith("[apply]") for line in world.story)
 
 
-def test_a_plan_that_does_not_hold_together_is_refused(tmp_path: Path) -> None:
+async def test_a_plan_that_does_not_hold_together_is_refused(tmp_path: Path) -> None:
     nobody = dataclasses.replace(MORE.processes[0], nodes=("nobody",))
     broken = [
         dataclasses.replace(MORE, nodes=()),
@@ -568,47 +512,35 @@ def test_a_plan_that_does_not_hold_together_is_refused(tmp_path: Path) -> None:
         dataclasses.replace(MORE, levels=(("nobody",),)),
         dataclasses.replace(MORE, modes=(Mode(name="m", inactive=("nobody",), at=HERE),)),
     ]
-
-    async def acts(world: SessionWorld) -> None:
+    async with active(tmp_path, CHAIN) as world:
         for plan in broken:
             answer = await world.apply(plan)
             assert _told(answer).endswith("its nodes and processes do not fit together")
-
-    world = _session(tmp_path, CHAIN, acts)
     assert not any(line.startswith("[apply]") for line in world.story)
 
 
-def test_what_was_adopted_is_judged_by_another_manifest_and_never_taken_down(
+async def test_what_was_adopted_is_judged_by_another_manifest_and_never_taken_down(
     tmp_path: Path,
 ) -> None:
-    async def main() -> SessionWorld:
-        world = SessionWorld(CHAIN, tmp_path, adopt=True)
-        world.graph.others["/viewer"] = "active"
-
-        async def acts() -> None:
-            await world.story.until("[system] active")
-            for plan in (plan_of(CAMERA, LOUD), plan_of(CAMERA)):
-                assert _told(await world.apply(plan)) == (
-                    "2 cannot apply robot.lifecycle.yaml to 'robot' while it runs: '/viewer' would "
-                    "be taken down, and was adopted; who started it ends it; then lifecycle down, "
-                    "and lifecycle up"
-                )
-            assert _told(await world.apply(MORE)) == "0"
-            assert [each.state for each in world.status().nodes] == ["active"] * 3
-            assert await world.order(ControlRequest.DOWN) == "0"
-
-        await world.run(acts())
-        return world
-
-    world = run(main())
+    world = SessionWorld(CHAIN, tmp_path, adopt=True)
+    world.graph.others["/viewer"] = "active"
+    async with world.running("[system] active"):
+        for plan in (plan_of(CAMERA, LOUD), plan_of(CAMERA)):
+            assert _told(await world.apply(plan)) == (
+                "2 cannot apply robot.lifecycle.yaml to 'robot' while it runs: '/viewer' would "
+                "be taken down, and was adopted; who started it ends it; then lifecycle down, "
+                "and lifecycle up"
+            )
+        assert _told(await world.apply(MORE)) == "0"
+        assert [each.state for each in world.status().nodes] == ["active"] * 3
+        assert await world.order(ControlRequest.DOWN) == "0"
     assert "viewer start" not in world.story
     assert not any(line.startswith("/viewer") for line in world.story)
 
 
-def test_over_tcp_only_what_restarts_nothing_is_applied(tmp_path: Path) -> None:
+async def test_over_tcp_only_what_restarts_nothing_is_applied(tmp_path: Path) -> None:
     rules = dataclasses.replace(DIALLING, policy=Policy(undeclared_nodes=EndpointPolicy.OPEN))
-
-    async def acts(world: SessionWorld) -> None:
+    async with active(tmp_path, DIALLING) as world:
         assert await world.order(ControlRequest.RESTART, "viewer") == "0"
         urls = world.system.plan.node("viewer").connections
         refused = await world.apply(plan_of(*DIALLING.nodes, ARM))
@@ -617,8 +549,6 @@ def test_over_tcp_only_what_restarts_nothing_is_applied(tmp_path: Path) -> None:
         # It runs where its restart has put it.
         assert world.system.plan.node("viewer").connections == urls
         assert urls != rules.node("viewer").connections
-
-    _session(tmp_path, DIALLING, acts)
 
 
 POOL = (
@@ -642,7 +572,7 @@ FAULTS = (
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_whatever_fails_one_of_two_manifests_is_in_force_as_a_whole(
+async def test_whatever_fails_one_of_two_manifests_is_in_force_as_a_whole(
     tmp_path: Path, seed: int
 ) -> None:
     chance = random.Random(seed)
@@ -666,7 +596,7 @@ def test_whatever_fails_one_of_two_manifests_is_in_force_as_a_whole(
             if process is not None and not process.exited.done():
                 world.kill(name)
 
-    async def acts(world: SessionWorld) -> None:
+    async with active(tmp_path, pool[0]) as world:
         for line in FAULTS:
             world.hosts.takes_s[line] = chance.choice([0.0, 0.0, 0.2])
         for _ in range(4):
@@ -697,5 +627,3 @@ def test_whatever_fails_one_of_two_manifests_is_in_force_as_a_whole(
             assert status.revision == world.system.revision
             wanted = {each.name for each in world.system.nodes.values() if each.is_to_be_active}
             assert {each.node for each in status.nodes if each.state == "active"} == wanted
-
-    _session(tmp_path, pool[0], acts)

@@ -110,9 +110,7 @@ async def test_a_violated_node_is_deactivated_and_stays_so_until_it_is_resumed(
 ) -> None:
     plan = _plan(camera=((TWICE, DEACTIVATE),))
     world = SessionWorld(plan, tmp_path, stop_after_s=20.0)
-
-    async def violate() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         world.double("/camera")
         await world.story.until("[node] /camera connected", 2)
         await asyncio.sleep(3.0)
@@ -125,8 +123,6 @@ async def test_a_violated_node_is_deactivated_and_stays_so_until_it_is_resumed(
         assert world.status().nodes[0].doing == why
         assert await world.order(ControlRequest.RESUME) == "0"
         assert world.status().nodes[0].doing == ""
-
-    await world.run(violate())
     outline = world.since("[verdict] active violated")
     assert outline[:3] == [
         f"[verdict] active violated {TWICE} /camera",
@@ -146,27 +142,19 @@ async def test_a_violated_node_is_deactivated_and_stays_so_until_it_is_resumed(
 
 async def test_what_passes_has_no_consequence(tmp_path: Path) -> None:
     world = SessionWorld(_plan((("default", STOP),)), tmp_path, stop_after_s=5.0)
-
-    async def violate() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         for _ in range(3):
             world.double("/camera")
             await asyncio.sleep(0.3)
             world.double()
             await asyncio.sleep(0.3)
-
-    await world.run(violate())
     assert world.story[-1] == "[stopped] 0"
 
 
 async def test_a_violation_stops_the_run_in_order_with_exit_code_4(tmp_path: Path) -> None:
     world = SessionWorld(_plan(((TWICE, STOP), ("default", PAUSE))), tmp_path)
-
-    async def violate() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         world.double("/viewer")
-
-    await world.run(violate())
     assert world.since("[consequence]") == [
         f"[consequence] stop  for {TWICE}",
         f"[stopping] at 0.5 s: on_violation: stop ({TWICE} of /viewer)",
@@ -178,9 +166,7 @@ async def test_a_violation_stops_the_run_in_order_with_exit_code_4(tmp_path: Pat
 async def test_what_concerns_no_node_of_the_system_pauses_all_of_it(tmp_path: Path) -> None:
     plan = _plan((("graph", DEACTIVATE),))
     world = SessionWorld(plan, tmp_path, stop_after_s=10.0)
-
-    async def violate() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         world.intrude()
         await world.story.until("[system] paused")
         await asyncio.sleep(2.0)
@@ -188,8 +174,6 @@ async def test_what_concerns_no_node_of_the_system_pauses_all_of_it(tmp_path: Pa
         assert "graph.undeclared-node of /intruder" in world.status().nodes[1].doing
         world.retreat()
         assert await world.order(ControlRequest.RESUME) == "0"
-
-    await world.run(violate())
     assert world.since("[consequence]")[:4] == [
         "[consequence] pause  for graph.undeclared-node",
         "/viewer deactivate",
@@ -204,9 +188,7 @@ async def test_a_node_in_restart_has_no_consequence_and_one_withheld_comes_back_
 ) -> None:
     plan = _plan((("default", STOP), (TWICE, DEACTIVATE)), restart=RestartWhen.ON_FAILURE)
     world = SessionWorld(plan, tmp_path, stop_after_s=20.0)
-
-    async def violate() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         world.kill("camera")
         await world.story.until("[restarted] camera (1)")
         await asyncio.sleep(1.0)
@@ -219,8 +201,6 @@ async def test_a_node_in_restart_has_no_consequence_and_one_withheld_comes_back_
         await asyncio.sleep(1.0)
         assert world.status().phase == "held"
         assert await world.order(ControlRequest.RESUME) == "0"
-
-    await world.run(violate())
     assert world.outline.count("/camera activate") == 3
     assert world.outline.count("/viewer activate") == 1
     assert world.story[-1] == "[stopped] 4"
@@ -234,9 +214,7 @@ async def test_who_comes_again_passes_its_gate_while_another_is_held_behind_it(
         planned_node("viewer", supervision=Supervision(restart=RestartWhen.ON_FAILURE)),
     )
     world = SessionWorld(plan, tmp_path, stop_after_s=60.0)
-
-    async def violate() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         world.double("/camera")
         await world.story.until("[node] /camera connected (inactive)", 2)
         world.double()
@@ -249,8 +227,6 @@ async def test_who_comes_again_passes_its_gate_while_another_is_held_behind_it(
         assert (camera.state, viewer.state) == ("inactive", "active")
         assert await world.order(ControlRequest.RESUME) == "0"
         assert world.status().phase == "active"
-
-    await world.run(violate())
     assert not [each for each in world.outline if each.startswith("[failure] run.transition")]
 
 
@@ -271,9 +247,7 @@ async def test_a_violation_enters_a_mode_once_and_one_that_its_gate_refuses_is_l
         ),
     )
     world = SessionWorld(in_mode(plan, "normal"), tmp_path, stop_after_s=20.0)
-
-    async def violate() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         world.double("/camera")
         await world.story.until("[mode] safe")
         await asyncio.sleep(3.0)
@@ -284,8 +258,6 @@ async def test_a_violation_enters_a_mode_once_and_one_that_its_gate_refuses_is_l
         await world.story.until("[notice] cannot enter mode 'other': back to 'normal'")
         await asyncio.sleep(3.0)
         assert (world.status().mode, world.status().phase) == ("normal", "held")
-
-    await world.run(violate())
     taken = [each for each in world.outline if each.startswith("[consequence]")]
     assert taken == [
         f"[consequence] mode  for {TWICE}",
@@ -333,17 +305,13 @@ async def test_a_node_waits_until_another_is_healthy_and_one_that_no_longer_is_h
             )
         )
 
-    async def change() -> None:
-        # What it does not say in 5 s is taken on trust, but nobody activates by it.
-        await world.story.until("/camera activate")
+    async with world.running("/camera activate"):
         await asyncio.sleep(3.0)
         assert "/viewer activate" not in world.story
         report(HealthReport(ok=True))
         await world.story.until("[system] active")
         await asyncio.sleep(1.0)
         report(HealthReport(ok=False, message="too hot"))
-
-    await world.run(change())
     at = world.outline.index("[system] active at 8.0 s")
     assert world.outline[at + 1 : at + 4] == [
         "[verdict] active violated node.unhealthy /camera",

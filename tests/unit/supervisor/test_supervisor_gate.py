@@ -46,21 +46,18 @@ class ForeignNode:
         return True
 
 
-def test_a_foreign_managed_node_gets_no_activate_request_without_a_permit_that_holds() -> None:
-    async def main() -> None:
-        node, gate = ForeignNode(), Gate(strict=False)
-        driver = ServiceDriver(node, planned_node("b"))  # type: ignore[arg-type]
-        permit = gate.judge(verdict_of(Outcome.OK))
-        gate.close()
-        with pytest.raises(BringUpError, match="cannot activate '/b' without a permit"):
-            await driver.perform(Operation.ACTIVATE)
-        with pytest.raises(BringUpError, match="the gate was closed again before this request"):
-            await driver.perform(Operation.ACTIVATE, permit)
-        assert node.requests == []
-        await driver.perform(Operation.ACTIVATE, gate.judge(verdict_of(Outcome.OK)))
-        assert node.requests == ["activate"]
-
-    asyncio.run(main())
+async def test_a_foreign_node_gets_no_activate_request_without_a_permit_that_holds() -> None:
+    node, gate = ForeignNode(), Gate(strict=False)
+    driver = ServiceDriver(node, planned_node("b"))  # type: ignore[arg-type]
+    permit = gate.judge(verdict_of(Outcome.OK))
+    gate.close()
+    with pytest.raises(BringUpError, match="cannot activate '/b' without a permit"):
+        await driver.perform(Operation.ACTIVATE)
+    with pytest.raises(BringUpError, match="the gate was closed again before this request"):
+        await driver.perform(Operation.ACTIVATE, permit)
+    assert node.requests == []
+    await driver.perform(Operation.ACTIVATE, gate.judge(verdict_of(Outcome.OK)))
+    assert node.requests == ["activate"]
 
 
 def test_an_ok_verdict_opens_the_gate() -> None:
@@ -200,41 +197,30 @@ def run_quietly(main: Callable[[], Coroutine[object, object, None]]) -> None:
     asyncio.run(watched())
 
 
-def test_a_verdict_of_the_moment_is_not_judged_again() -> None:
-    async def main() -> None:
-        system = Changing(verdict_of(Outcome.OK))
-        permit = system.gate().judge(system.latest)
-        await permit.use("/camera")
-        assert system.asked == []
-
-    asyncio.run(main())
+async def test_a_verdict_of_the_moment_is_not_judged_again() -> None:
+    system = Changing(verdict_of(Outcome.OK))
+    permit = system.gate().judge(system.latest)
+    await permit.use("/camera")
+    assert system.asked == []
 
 
-def test_a_verdict_that_is_no_longer_the_latest_is_judged_again() -> None:
-    async def main() -> None:
-        system = Changing(verdict_of(Outcome.OK), newer := verdict_of(Outcome.OK))
-        permit = system.gate().judge(verdict_of(Outcome.OK))
-        await permit.use("/camera")
-        assert system.asked == [frozenset()]
-        assert permit.verdict is newer
-
-    asyncio.run(main())
+async def test_a_verdict_that_is_no_longer_the_latest_is_judged_again() -> None:
+    system = Changing(verdict_of(Outcome.OK), newer := verdict_of(Outcome.OK))
+    permit = system.gate().judge(verdict_of(Outcome.OK))
+    await permit.use("/camera")
+    assert system.asked == [frozenset()]
+    assert permit.verdict is newer
 
 
-def test_whoever_asks_after_a_change_waits_for_one_judgement_that_knows_who_was_let_through() -> (
-    None
-):
-    async def main() -> None:
-        newer = verdict_of(Outcome.OK)
-        system = Changing(verdict_of(Outcome.OK), newer)
-        permit = system.gate().judge(system.latest)
-        await permit.use("/camera")
-        system.changed = True
-        await asyncio.gather(*(permit.use(f"/viewer_{index}") for index in range(20)))
-        assert system.asked == [frozenset({"/camera"})]
-        assert permit.verdict is newer
-
-    asyncio.run(main())
+async def test_who_asks_after_a_change_waits_for_one_judgement_that_knows_who_was_let_by() -> None:
+    newer = verdict_of(Outcome.OK)
+    system = Changing(verdict_of(Outcome.OK), newer)
+    permit = system.gate().judge(system.latest)
+    await permit.use("/camera")
+    system.changed = True
+    await asyncio.gather(*(permit.use(f"/viewer_{index}") for index in range(20)))
+    assert system.asked == [frozenset({"/camera"})]
+    assert permit.verdict is newer
 
 
 def test_a_change_that_is_not_allowed_closes_the_gate_for_all_that_were_not_sent() -> None:
@@ -266,17 +252,14 @@ def test_a_change_that_is_not_allowed_closes_the_gate_for_all_that_were_not_sent
 
 
 @pytest.mark.parametrize("deadline", [None, 31.0])
-def test_a_change_is_judged_until_the_deadline_of_what_the_gate_was_opened_for(
+async def test_a_change_is_judged_until_the_deadline_of_what_the_gate_was_opened_for(
     deadline: float | None,
 ) -> None:
-    async def main() -> None:
-        system = Changing(verdict_of(Outcome.OK), verdict_of(Outcome.OK))
-        permit = system.gate().judge(system.latest, deadline=deadline)
-        system.changed = True
-        await permit.use("/camera")
-        assert system.deadline == deadline
-
-    asyncio.run(main())
+    system = Changing(verdict_of(Outcome.OK), verdict_of(Outcome.OK))
+    permit = system.gate().judge(system.latest, deadline=deadline)
+    system.changed = True
+    await permit.use("/camera")
+    assert system.deadline == deadline
 
 
 def test_who_waits_too_long_for_a_verdict_is_given_the_one_that_keeps_the_gate_closed() -> None:

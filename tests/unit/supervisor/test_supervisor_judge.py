@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import dataclasses
-from collections.abc import Callable, Coroutine
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +42,7 @@ from lifecycle.verify.observation import (
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import Finding, Stage, Verdict
 from tests.builders import plan_of, planned_node
-from tests.unit.supervisor.fakes import FakeGraph, World, interface_of, run, verdict_of
+from tests.unit.supervisor.fakes import FakeGraph, World, interface_of, verdict_of
 from tests.unit.supervisor.test_supervisor_negotiation import plan_of as negotiated_plan
 
 OK = verdict_of(Outcome.OK)
@@ -115,24 +116,29 @@ class _Bench:
         self.graph.observation = Observation(nodes=(*nodes, added))
         self.graph.changed.set()
 
+    def match(self) -> None:
+        self.verdicts = (OK,)
+
+    def later(self, delay_s: float, what: Callable[[], object]) -> None:
+        asyncio.get_running_loop().call_later(delay_s, what)
+
+    async def hold(self, seconds: float) -> None:
+        """Watch the active system for so long."""
+        watching = asyncio.ensure_future(Watch(self.judge, self.changes, Stage.ACTIVE).run())
+        await asyncio.sleep(seconds)
+        watching.cancel()
+
     def told(self) -> list[Verdict]:
         return [event.verdict for event in self.world.heard(VerdictChanged)]
 
 
-def _run(
-    tmp_path: Path,
-    test: Callable[[_Bench], Coroutine[Any, Any, None]],
-    *of: Verdict,
-    **options: Any,
-) -> None:
-    async def main() -> None:
-        bench = _Bench(tmp_path, *of, **options)
-        try:
-            await test(bench)
-        finally:
-            await bench.changes.close()
-
-    run(main())
+@contextlib.asynccontextmanager
+async def judging(tmp_path: Path, *of: Verdict, **options: Any) -> AsyncIterator[_Bench]:
+    bench = _Bench(tmp_path, *of, **options)
+    try:
+        yield bench
+    finally:
+        await bench.changes.close()
 
 
 def _both(one: Verdict, other: Verdict) -> Verdict:
@@ -156,49 +162,43 @@ def _both(one: Verdict, other: Verdict) -> Verdict:
         pytest.param(_both(UNPROVEN, UNMEASURED), {}, 3.5, None, id="a report beside it"),
     ],
 )
-def test_how_long_a_verdict_is_waited_out(
+async def test_how_long_a_verdict_is_waited_out(
     tmp_path: Path, verdict: Verdict, options: dict[str, Any], waits_s: float, looks: int | None
 ) -> None:
-    async def test(bench: _Bench) -> None:
+    async with judging(tmp_path, verdict, **options) as bench:
         assert await bench.judge.until_clear(Stage.CONNECTED, 30.0) == verdict
         assert bench.now == pytest.approx(waits_s, abs=0.1 if waits_s > 1 else 0.05)
         assert looks in (None, len(bench.looks))
 
-    _run(tmp_path, test, verdict, **options)
 
-
-def test_what_is_missing_is_waited_for_and_each_change_of_the_verdict_is_told(
+async def test_what_is_missing_is_waited_for_and_each_change_of_the_verdict_is_told(
     tmp_path: Path,
 ) -> None:
-    async def test(bench: _Bench) -> None:
-        asyncio.get_running_loop().call_later(7.0, bench.grow)
+    async with judging(tmp_path, MISSING, OK) as bench:
+        bench.later(7.0, bench.grow)
         assert await bench.judge.until_clear(Stage.CONNECTED, 30.0) == OK
         assert bench.now == pytest.approx(7.0, abs=0.1)
         assert bench.told() == [MISSING, OK]
 
-    _run(tmp_path, test, MISSING, OK)
 
-
-def test_a_node_that_must_be_healthy_is_given_time_to_say_how_it_is_once(tmp_path: Path) -> None:
+async def test_a_node_that_must_be_healthy_is_given_time_to_say_how_it_is_once(
+    tmp_path: Path,
+) -> None:
     unsaid = verdict_of(Outcome.UNVERIFIABLE, "node.unhealthy")
-
-    async def says(bench: _Bench) -> None:
-        asyncio.get_running_loop().call_later(1.0, bench.grow)
+    async with judging(tmp_path, unsaid, OK) as bench:
+        bench.later(1.0, bench.grow)
         assert await bench.judge.until_clear(Stage.CONNECTED, 20.0) is OK
         assert bench.now == pytest.approx(1.0, abs=0.1)
-
-    async def says_nothing(bench: _Bench) -> None:
-        assert await bench.judge.until_clear(Stage.CONNECTED, 20.0) is unsaid
-        assert bench.now == pytest.approx(HEALTH_S)
-        assert await bench.judge.until_clear(Stage.CONNECTED, 20.0) is unsaid
-        assert bench.now == pytest.approx(HEALTH_S)
-
-    _run(tmp_path, says, unsaid, OK)
-    _run(tmp_path, says_nothing, unsaid)
+    async with judging(tmp_path, unsaid) as bench:
+        began = bench.now
+        for _ in range(2):
+            assert await bench.judge.until_clear(Stage.CONNECTED, 20.0) is unsaid
+            assert bench.now - began == pytest.approx(HEALTH_S)
 
 
-def test_it_stands_although_the_graph_goes_on_changing(tmp_path: Path) -> None:
-    async def test(bench: _Bench) -> None:
+async def test_it_stands_although_the_graph_goes_on_changing(tmp_path: Path) -> None:
+    async with judging(tmp_path, UNDECLARED) as bench:
+
         async def noise() -> None:
             while True:
                 await asyncio.sleep(0.1)
@@ -209,29 +209,21 @@ def test_it_stands_although_the_graph_goes_on_changing(tmp_path: Path) -> None:
         noisy.cancel()
         assert bench.now < 0.8
 
-    _run(tmp_path, test, UNDECLARED)
 
-
-def test_an_unmatched_pair_is_asked_again_because_its_match_changes_no_graph(
+async def test_an_unmatched_pair_is_asked_again_because_its_match_changes_no_graph(
     tmp_path: Path,
 ) -> None:
-    async def test(bench: _Bench) -> None:
-        def match() -> None:
-            bench.verdicts = (OK,)
-
-        asyncio.get_running_loop().call_later(0.1, match)
+    async with judging(tmp_path, UNMATCHED) as bench:
+        bench.later(0.1, bench.match)
         assert await bench.judge.until_clear(Stage.CONNECTED, 30.0) == OK
         assert bench.now < 0.3
         assert len(bench.looks) <= 5
 
-    _run(tmp_path, test, UNMATCHED)
 
-
-def test_a_node_that_tells_of_its_matches_is_not_asked_for_them(tmp_path: Path) -> None:
+async def test_a_node_that_tells_of_its_matches_is_not_asked_for_them(tmp_path: Path) -> None:
     finding = dataclasses.replace(UNMATCHED.findings[0], ends=("/camera", "/viewer"))
     unmatched = dataclasses.replace(UNMATCHED, findings=(finding,))
-
-    async def test(bench: _Bench) -> None:
+    async with judging(tmp_path, unmatched) as bench:
         bench.world.system.nodes["camera"].reports_changes = True
 
         def match() -> None:
@@ -239,22 +231,20 @@ def test_a_node_that_tells_of_its_matches_is_not_asked_for_them(tmp_path: Path) 
             event = Event(kind="configuration", node="/camera", configuration=None)
             bench.world.system.on_host_event(event)
 
-        asyncio.get_running_loop().call_later(5.0, match)
+        bench.later(5.0, match)
         assert await bench.judge.until_clear(Stage.CONNECTED, 30.0) == OK
         assert bench.now < 5.1
         assert len(bench.looks) == 2  # the first, and the one after it told
 
-    _run(tmp_path, test, unmatched)
 
-
-def test_a_reply_does_not_undo_what_was_told_after_it(tmp_path: Path) -> None:
+async def test_a_reply_does_not_undo_what_was_told_after_it(tmp_path: Path) -> None:
     def of(*, matched: bool) -> NodeConfiguration:
         told = interface_of("/camera", "service_clients/ask")
         (end,) = told.endpoints
         end = dataclasses.replace(end, server_matched=matched)
         return dataclasses.replace(told, endpoints=(end,))
 
-    async def test(bench: _Bench) -> None:
+    async with judging(tmp_path, OK) as bench:
         system = bench.world.system
         node = system.nodes["camera"]
         before, after = of(matched=False), of(matched=True)
@@ -267,11 +257,9 @@ def test_a_reply_does_not_undo_what_was_told_after_it(tmp_path: Path) -> None:
         assert node.configuration is not None
         assert node.configuration.endpoints == after.endpoints
 
-    _run(tmp_path, test, OK)
 
-
-def test_a_reply_in_the_place_of_a_report_has_the_system_judged_again(tmp_path: Path) -> None:
-    async def test(bench: _Bench) -> None:
+async def test_a_reply_in_the_place_of_a_report_has_the_system_judged_again(tmp_path: Path) -> None:
+    async with judging(tmp_path, OK) as bench:
         system = bench.world.system
         node = system.nodes["camera"]
         node.reports_changes = False
@@ -284,11 +272,9 @@ def test_a_reply_in_the_place_of_a_report_has_the_system_judged_again(tmp_path: 
         system.on_host_event(dataclasses.replace(reply, reports=True))
         assert (node.reports_changes, system.touched.is_set()) == (True, True)
 
-    _run(tmp_path, test, OK)
-
 
 @pytest.mark.parametrize(("client", "server"), [("/viewer", "/camera"), ("/camera", "/viewer")])
-def test_of_a_server_that_is_matched_only_its_client_tells(
+async def test_of_a_server_that_is_matched_only_its_client_tells(
     tmp_path: Path, client: str, server: str
 ) -> None:
     finding = dataclasses.replace(
@@ -297,34 +283,26 @@ def test_of_a_server_that_is_matched_only_its_client_tells(
         subject=f"/calibrate: {client} → {server}",
         node=client,
     )
-
-    async def test(bench: _Bench) -> None:
+    async with judging(tmp_path, dataclasses.replace(UNMATCHED, findings=(finding,))) as bench:
         bench.world.system.nodes["camera"].reports_changes = True
-
-        def match() -> None:
-            bench.verdicts = (OK,)
 
         def tell() -> None:
             event = Event(kind="configuration", node="/camera", configuration=None)
             bench.world.system.on_host_event(event)
 
-        asyncio.get_running_loop().call_later(0.1, match)
-        asyncio.get_running_loop().call_later(5.0, tell)
+        bench.later(0.1, bench.match)
+        bench.later(5.0, tell)
         assert await bench.judge.until_clear(Stage.CONNECTED, 30.0) == OK
         told = client == "/camera"
         assert (bench.now > 4.9, len(bench.looks) == 2) == (told, told)
 
-    _run(tmp_path, test, dataclasses.replace(UNMATCHED, findings=(finding,)))
 
-
-def test_a_burst_of_changes_is_one_look(tmp_path: Path) -> None:
-    async def test(bench: _Bench) -> None:
+async def test_a_burst_of_changes_is_one_look(tmp_path: Path) -> None:
+    async with judging(tmp_path, MISSING) as bench:
         for index in range(10):
-            asyncio.get_running_loop().call_later(1.0 + index / 1000, bench.grow)
+            bench.later(1.0 + index / 1000, bench.grow)
         await bench.judge.until_clear(Stage.CONNECTED, 2.0)
         assert len(bench.looks) == 3
-
-    _run(tmp_path, test, MISSING)
 
 
 def test_a_dead_node_is_gone_although_discovery_shows_it_for_the_whole_lease() -> None:
@@ -351,8 +329,8 @@ def test_a_dead_node_is_gone_although_discovery_shows_it_for_the_whole_lease() -
     assert without(seen, frozenset()) is seen
 
 
-def test_nodes_that_are_silent_are_not_asked_for_and_judged_silent(tmp_path: Path) -> None:
-    async def test(bench: _Bench) -> None:
+async def test_nodes_that_are_silent_are_not_asked_for_and_judged_silent(tmp_path: Path) -> None:
+    async with judging(tmp_path, OK) as bench:
         system = bench.world.system
         await bench.judge.once(Stage.CONNECTED)
         assert bench.graph.asked is system.plan
@@ -362,8 +340,6 @@ def test_nodes_that_are_silent_are_not_asked_for_and_judged_silent(tmp_path: Pat
         assert bench.judged[-1]["plan"] is system.expected
         assert (verdict.verdict, verdict.blocking) == (Outcome.VIOLATED, True)
         assert verdict.findings == system.liveliness.findings()
-
-    _run(tmp_path, test, OK)
 
 
 def test_of_a_plan_only_silent_nodes_are_left_out() -> None:
@@ -406,13 +382,14 @@ class _Agreement:
         return self.unknown
 
 
-def test_what_is_seen_is_judged_against_what_is_expected_with_what_others_find(
+async def test_what_is_seen_is_judged_against_what_is_expected_with_what_others_find(
     tmp_path: Path,
 ) -> None:
     looker, guard, agreement = _Looker(), _Looker(), _Agreement()
     guard.wrong = verdict_of(Outcome.VIOLATED, "state.activated-at-closed-gate").findings
-
-    async def test(bench: _Bench) -> None:
+    async with judging(
+        tmp_path, UNATTRIBUTED, looker=looker, agreement=agreement, guard=guard
+    ) as bench:
         system, judge = bench.world.system, bench.judge
         assert (judge.latest, judge.seen, judge.ahead) == (None, Observation(), frozenset())
         system.expected = plan_of(planned_node("camera"), planned_node("negotiated"))
@@ -444,8 +421,6 @@ def test_what_is_seen_is_judged_against_what_is_expected_with_what_others_find(
         (changed,) = bench.world.heard(VerdictChanged)
         assert (changed.stage, changed.verdict) == (Stage.CONNECTED, verdict)
 
-    _run(tmp_path, test, UNATTRIBUTED, looker=looker, agreement=agreement, guard=guard)
-
 
 def test_what_the_supervisor_finds_comes_first_and_makes_a_verdict_worse_never_better() -> None:
     for outcome, blocking in ((Outcome.VIOLATED, True), (Outcome.UNVERIFIABLE, False)):
@@ -470,10 +445,10 @@ def test_the_policy_holds_for_what_the_supervisor_finds_too() -> None:
     assert (trusted.verdict, trusted.blocking, trusted.findings) == (Outcome.OK, False, (finding,))
 
 
-def test_of_a_process_that_ended_the_nodes_are_left_out_and_of_the_server_it_is_told(
+async def test_of_a_process_that_ended_the_nodes_are_left_out_and_of_the_server_it_is_told(
     tmp_path: Path,
 ) -> None:
-    async def test(bench: _Bench) -> None:
+    async with judging(tmp_path, OK) as bench:
         system = bench.world.system
         bench.graph.observation = Observation(
             nodes=tuple(ObservedNode(full_name=each) for each in ("/camera", "/viewer"))
@@ -493,16 +468,14 @@ def test_of_a_process_that_ended_the_nodes_are_left_out_and_of_the_server_it_is_
             ("run.process-died", "discovery_server")
         ]
 
-    _run(tmp_path, test, OK)
-
 
 def _end(process: ManagedProcess, state: ProcessState = ProcessState.EXITED) -> None:
     process.state = state
     process.ended.set_result(ProcessExit(signal=11))
 
 
-def test_the_configurations_of_nodes_are_read_before_each_look(tmp_path: Path) -> None:
-    async def test(bench: _Bench) -> None:
+async def test_the_configurations_of_nodes_are_read_before_each_look(tmp_path: Path) -> None:
+    async with judging(tmp_path, OK) as bench:
         node = bench.world.system.nodes["camera"]
         node.driver = object()  # type: ignore[assignment]
         node.reports_changes = True
@@ -511,11 +484,9 @@ def test_the_configurations_of_nodes_are_read_before_each_look(tmp_path: Path) -
         await bench.judge.once(Stage.CONNECTED)
         assert bench.graph.put == [interface_of("/camera")]
 
-    _run(tmp_path, test, OK)
 
-
-def test_what_is_held_is_judged_at_its_stage_against_what_is_expected(tmp_path: Path) -> None:
-    async def test(bench: _Bench) -> None:
+async def test_what_is_held_is_judged_at_its_stage_against_what_is_expected(tmp_path: Path) -> None:
+    async with judging(tmp_path, OK) as bench:
         chatter = ("/chatter", "/camera")
         bench.verdicts = (OK, _missing_endpoint(*chatter))
         system = bench.world.system
@@ -528,8 +499,6 @@ def test_what_is_held_is_judged_at_its_stage_against_what_is_expected(tmp_path: 
         assert await bench.judge.settled(Stage.ACTIVE) == (bench.verdicts[1], None)
         assert [each["stage"] for each in bench.judged] == [Stage.ACTIVE] * 3
         assert {each.stage for each in bench.world.heard(VerdictChanged)} == {Stage.ACTIVE}
-
-    _run(tmp_path, test, OK)
 
 
 def _with_publisher(plan: Plan, topic: str) -> Plan:
@@ -547,8 +516,8 @@ def _missing_endpoint(topic: str, node: str) -> Verdict:
     return dataclasses.replace(MISSING, findings=(finding,))
 
 
-def test_changes_are_counted_and_waited_for_within_a_time(tmp_path: Path) -> None:
-    async def test(bench: _Bench) -> None:
+async def test_changes_are_counted_and_waited_for_within_a_time(tmp_path: Path) -> None:
+    async with judging(tmp_path, OK) as bench:
         loop = asyncio.get_running_loop()
         assert bench.changes.count == 0
         assert not await bench.changes.beyond(0, 2.0)
@@ -561,13 +530,11 @@ def test_changes_are_counted_and_waited_for_within_a_time(tmp_path: Path) -> Non
         assert await bench.changes.beyond(1, 2.0)
         assert (bench.changes.count, bench.now) == (2, pytest.approx(4.0))
 
-    _run(tmp_path, test, OK)
 
-
-def test_a_verdict_is_current_until_something_is_noticed_after_its_look_began(
+async def test_a_verdict_is_current_until_something_is_noticed_after_its_look_began(
     tmp_path: Path,
 ) -> None:
-    async def test(bench: _Bench) -> None:
+    async with judging(tmp_path, OK) as bench:
         judge = bench.judge
         assert not judge.is_current(OK)
         verdict = await judge.once(Stage.CONNECTED)
@@ -591,14 +558,12 @@ def test_a_verdict_is_current_until_something_is_noticed_after_its_look_began(
         await judge.once(Stage.CONNECTED)
         assert not judge.is_current(verdict)
 
-    _run(tmp_path, test, OK)
-
 
 @pytest.mark.parametrize(("left_s", "judged_s"), [(None, 5.0), (12.0, 12.0), (0.5, 2.0)])
-def test_behind_an_open_gate_it_is_judged_in_time_who_was_let_through_being_ahead(
+async def test_behind_an_open_gate_it_is_judged_in_time_who_was_let_through_being_ahead(
     tmp_path: Path, left_s: float | None, judged_s: float
 ) -> None:
-    async def test(bench: _Bench) -> None:
+    async with judging(tmp_path, MISSING) as bench:
         bench.judge.ahead = frozenset({"/radar"})
         deadline = None if left_s is None else bench.now + left_s
         found = await bench.judge.again(frozenset({"/camera"}), deadline)
@@ -608,11 +573,10 @@ def test_behind_an_open_gate_it_is_judged_in_time_who_was_let_through_being_ahea
         assert {each["stage"] for each in bench.judged} == {Stage.CONNECTED}
         assert {each["ahead"] for each in bench.judged} == {frozenset({"/radar", "/camera"})}
 
-    _run(tmp_path, test, MISSING)
 
+async def test_an_observer_that_fails_fails_whoever_waits_for_a_change(tmp_path: Path) -> None:
+    async with judging(tmp_path, OK) as bench:
 
-def test_an_observer_that_fails_fails_whoever_waits_for_a_change(tmp_path: Path) -> None:
-    async def test(bench: _Bench) -> None:
         async def fail() -> None:
             raise RuntimeError("the observer failed")
 
@@ -623,85 +587,68 @@ def test_an_observer_that_fails_fails_whoever_waits_for_a_change(tmp_path: Path)
             await changes.beyond(0, 1.0) or await changes.beyond(0, 1.0)
         await changes.close()
 
-    _run(tmp_path, test, OK)
 
-
-def test_after_the_end_of_listening_nothing_is_a_change(tmp_path: Path) -> None:
-    async def test(bench: _Bench) -> None:
+async def test_after_the_end_of_listening_nothing_is_a_change(tmp_path: Path) -> None:
+    async with judging(tmp_path, OK) as bench:
         await bench.changes.close()
         bench.graph.changed.set()
         bench.world.system.touched.set()
         await asyncio.sleep(1.0)
         assert bench.changes.count == 0
 
-    _run(tmp_path, test, OK)
 
-
-def test_findings_that_could_heal_are_given_up_once_unchanged_for_so_long_as_is_asked(
+async def test_findings_that_could_heal_are_given_up_once_unchanged_for_so_long_as_is_asked(
     tmp_path: Path,
 ) -> None:
-    async def test(bench: _Bench) -> None:
+    async with judging(tmp_path, MISSING) as bench:
         # A change of the graph that changes no finding, and one that does.
         bench.verdicts = (MISSING, MISSING, UNMATCHED)
         for delay_s in (2.0, 4.0):
-            asyncio.get_running_loop().call_later(delay_s, bench.grow)
+            bench.later(delay_s, bench.grow)
         assert await bench.judge.until_clear(Stage.CONNECTED, 30.0, unchanged_s=5.0) == UNMATCHED
         assert bench.now == pytest.approx(9.0, abs=0.1)
         bench.verdicts = (MISSING,)
         assert await bench.judge.until_clear(Stage.CONNECTED, 3.0, unchanged_s=5.0) == MISSING
         assert bench.now == pytest.approx(12.0, abs=0.1)
 
-    _run(tmp_path, test, MISSING)
 
-
-def test_what_time_does_not_heal_is_not_waited_for_longer_because_more_time_was_asked(
+async def test_what_time_does_not_heal_is_not_waited_for_longer_because_more_time_was_asked(
     tmp_path: Path,
 ) -> None:
-    async def test(bench: _Bench) -> None:
+    async with judging(tmp_path, UNDECLARED) as bench:
         await bench.judge.until_clear(Stage.CONNECTED, 30.0, unchanged_s=5.0)
         assert bench.now == pytest.approx(0.5, abs=0.05)
 
-    _run(tmp_path, test, UNDECLARED)
 
-
-def test_what_healed_and_broke_again_has_its_time_anew(tmp_path: Path) -> None:
-    async def test(bench: _Bench) -> None:
+async def test_what_healed_and_broke_again_has_its_time_anew(tmp_path: Path) -> None:
+    async with judging(tmp_path, UNKNOWN) as bench:
         bench.verdicts = (UNKNOWN, MISSING, UNKNOWN)
         for delay_s in (2.0, 3.0):
-            asyncio.get_running_loop().call_later(delay_s, bench.grow)
+            bench.later(delay_s, bench.grow)
         assert await bench.judge.until_clear(Stage.CONNECTED, 30.0) == UNKNOWN
         assert bench.now == pytest.approx(6.5, abs=0.1)
 
-    _run(tmp_path, test, UNKNOWN)
 
-
-def test_nodes_are_asked_for_a_match_at_growing_intervals_up_to_half_a_second(
+async def test_nodes_are_asked_for_a_match_at_growing_intervals_up_to_half_a_second(
     tmp_path: Path,
 ) -> None:
-    async def test(bench: _Bench) -> None:
+    async with judging(tmp_path, UNMATCHED) as bench:
         await bench.judge.until_clear(Stage.CONNECTED, 3.0)
         assert bench.looks == pytest.approx(
             [0.0, 0.02, 0.06, 0.14, 0.3, 0.62, 1.12, 1.62, 2.12, 2.62, 3.0]
         )
         assert {each["stage"] for each in bench.judged} == {Stage.CONNECTED}
 
-    _run(tmp_path, test, UNMATCHED)
 
-
-def test_while_held_a_match_with_a_node_of_another_machine_is_asked_for_until_it_is_there(
+async def test_while_held_a_match_with_a_node_of_another_machine_is_asked_for_until_it_is_there(
     tmp_path: Path,
 ) -> None:
     finding = dataclasses.replace(UNMATCHED.findings[0], ends=("/camera", "/viewer"))
     unmatched = dataclasses.replace(UNMATCHED, findings=(finding,))
-
-    async def test(bench: _Bench) -> None:
+    async with judging(tmp_path, unmatched) as bench:
         bench.world.system.remote = {"viewer": RemoteNode(planned_node("viewer"))}
         bench.world.system.nodes["camera"].reports_changes = True
-
-        def match() -> None:
-            bench.verdicts = (OK,)
-
-        asyncio.get_running_loop().call_later(5.0, match)
+        bench.later(5.0, bench.match)
         watching = asyncio.ensure_future(Watch(bench.judge, bench.changes, Stage.ACTIVE).run())
         await asyncio.sleep(5.6)
         assert bench.judge.latest == OK
@@ -710,47 +657,42 @@ def test_while_held_a_match_with_a_node_of_another_machine_is_asked_for_until_it
         assert len(bench.looks) == looks
         watching.cancel()
 
-    _run(tmp_path, test, unmatched)
 
-
-def test_a_match_that_is_only_unverifiable_is_not_asked_for(tmp_path: Path) -> None:
-    async def test(bench: _Bench) -> None:
+async def test_a_match_that_is_only_unverifiable_is_not_asked_for(tmp_path: Path) -> None:
+    async with judging(
+        tmp_path, verdict_of(Outcome.UNVERIFIABLE, "graph.unmatched-link", blocking=True)
+    ) as bench:
         await bench.judge.until_clear(Stage.CONNECTED, 3.0)
         assert bench.looks == pytest.approx([0.0, 3.0])
-
-    _run(tmp_path, test, verdict_of(Outcome.UNVERIFIABLE, "graph.unmatched-link", blocking=True))
 
 
 @pytest.mark.parametrize("rule", ["state.wrong-state", "config.missing-report"])
 @pytest.mark.parametrize(("node", "asked"), [("/viewer", True), ("/camera", False)])
-def test_a_node_of_another_supervisor_that_has_a_step_to_go_is_asked_again(
+async def test_a_node_of_another_supervisor_that_has_a_step_to_go_is_asked_again(
     tmp_path: Path, rule: str, node: str, asked: bool
 ) -> None:
     (finding,) = verdict_of(Outcome.VIOLATED, rule).findings
     late = dataclasses.replace(MISSING, findings=(dataclasses.replace(finding, node=node),))
-
-    async def test(bench: _Bench) -> None:
+    async with judging(tmp_path, late) as bench:
         bench.world.system.remote = {"viewer": RemoteNode(planned_node("viewer"))}
         await bench.judge.until_clear(Stage.CONNECTED, 1.0)
         assert (len(bench.looks) > 2) is asked
 
-    _run(tmp_path, test, late)
 
-
-def test_a_node_of_another_supervisor_that_is_missing_announces_itself(tmp_path: Path) -> None:
+async def test_a_node_of_another_supervisor_that_is_missing_announces_itself(
+    tmp_path: Path,
+) -> None:
     (finding,) = MISSING.findings
     missing = dataclasses.replace(MISSING, findings=(dataclasses.replace(finding, node="/viewer"),))
-
-    async def test(bench: _Bench) -> None:
+    async with judging(tmp_path, missing) as bench:
         bench.world.system.remote = {"viewer": RemoteNode(planned_node("viewer"))}
         await bench.judge.until_clear(Stage.CONNECTED, 1.0)
         assert len(bench.looks) == 2
 
-    _run(tmp_path, test, missing)
 
+async def test_a_burst_that_does_not_end_is_looked_at_every_50_ms(tmp_path: Path) -> None:
+    async with judging(tmp_path, MISSING) as bench:
 
-def test_a_burst_that_does_not_end_is_looked_at_every_50_ms(tmp_path: Path) -> None:
-    async def test(bench: _Bench) -> None:
         async def burst() -> None:
             while True:
                 await asyncio.sleep(0.003)
@@ -761,8 +703,6 @@ def test_a_burst_that_does_not_end_is_looked_at_every_50_ms(tmp_path: Path) -> N
         bursting.cancel()
         gaps = [later - one for one, later in zip(bench.looks, bench.looks[1:], strict=False)]
         assert all(0.05 <= each <= 0.062 for each in gaps[:-1])
-
-    _run(tmp_path, test, MISSING)
 
 
 def _system(tmp_path: Path) -> System:
@@ -803,30 +743,24 @@ async def test_a_process_that_is_started_again_did_not_die(tmp_path: Path) -> No
     assert await asyncio.wait_for(death, 1.0) is system.processes["viewer"]
 
 
-def test_while_held_a_passing_violation_is_told_but_does_not_count(tmp_path: Path) -> None:
-    async def test(bench: _Bench) -> None:
-        watch = Watch(bench.judge, bench.changes, Stage.ACTIVE)
-        watching = asyncio.ensure_future(watch.run())
+async def test_while_held_a_passing_violation_is_told_but_does_not_count(tmp_path: Path) -> None:
+    async with judging(tmp_path, OK, UNDECLARED, OK) as bench:
         for delay_s in (1.0, 1.0 + 0.9 * LASTS_S):
-            asyncio.get_running_loop().call_later(delay_s, bench.grow)
-        await asyncio.sleep(5.0)
-        watching.cancel()
+            bench.later(delay_s, bench.grow)
+        await bench.hold(5.0)
         assert bench.told() == [OK, UNDECLARED, OK]
         assert not bench.judge.violations.counted
         assert bench.judge.violations.passed().endswith(
             "not counted: /camera (graph.undeclared-publisher)"
         )
 
-    _run(tmp_path, test, OK, UNDECLARED, OK)
 
-
-def test_while_held_a_violation_that_stands_counts_and_nothing_is_polled(tmp_path: Path) -> None:
-    async def test(bench: _Bench) -> None:
-        watch = Watch(bench.judge, bench.changes, Stage.ACTIVE)
-        watching = asyncio.ensure_future(watch.run())
-        asyncio.get_running_loop().call_later(1.0, bench.grow)
-        await asyncio.sleep(60.0)
-        watching.cancel()
+async def test_while_held_a_violation_that_stands_counts_and_nothing_is_polled(
+    tmp_path: Path,
+) -> None:
+    async with judging(tmp_path, OK, UNDECLARED) as bench:
+        bench.later(1.0, bench.grow)
+        await bench.hold(60.0)
         assert bench.judge.violations.counted == "wrong: /camera (graph.undeclared-publisher)"
         assert not bench.judge.violations.passed()
         # At the start, at the change, once it has lasted; and then nothing is polled.
@@ -834,78 +768,55 @@ def test_while_held_a_violation_that_stands_counts_and_nothing_is_polled(tmp_pat
         assert {each["stage"] for each in bench.judged} == {Stage.ACTIVE}
         assert {each.stage for each in bench.world.heard(VerdictChanged)} == {Stage.ACTIVE}
 
-    _run(tmp_path, test, OK, UNDECLARED)
 
-
-def test_while_held_a_violation_counts_however_busy_the_graph_is(tmp_path: Path) -> None:
-    async def test(bench: _Bench) -> None:
-        watching = asyncio.ensure_future(Watch(bench.judge, bench.changes, Stage.ACTIVE).run())
+async def test_while_held_a_violation_counts_however_busy_the_graph_is(tmp_path: Path) -> None:
+    async with judging(tmp_path, OK, *[UNDECLARED] * 15, OK) as bench:
         for tenth in range(10, 40):
-            asyncio.get_running_loop().call_later(tenth / 10, bench.grow)
-        await asyncio.sleep(5.0)
-        watching.cancel()
+            bench.later(tenth / 10, bench.grow)
+        await bench.hold(5.0)
         assert bench.judge.violations.counted == "wrong: /camera (graph.undeclared-publisher)"
 
-    _run(tmp_path, test, OK, *[UNDECLARED] * 15, OK)
 
-
-def test_while_held_violations_that_relieve_each_other_do_not_count(tmp_path: Path) -> None:
-    async def test(bench: _Bench) -> None:
-        watching = asyncio.ensure_future(Watch(bench.judge, bench.changes, Stage.ACTIVE).run())
+async def test_while_held_violations_that_relieve_each_other_do_not_count(tmp_path: Path) -> None:
+    async with judging(tmp_path, OK, UNDECLARED, UNMATCHED, MISSING, OK) as bench:
         for times in range(4):
-            asyncio.get_running_loop().call_later(1.0 + 0.8 * times, bench.grow)
-        await asyncio.sleep(6.0)
-        watching.cancel()
+            bench.later(1.0 + 0.8 * times, bench.grow)
+        await bench.hold(6.0)
         assert not bench.judge.violations.counted
         assert "(graph.undeclared-publisher), " in bench.judge.violations.passed()
 
-    _run(tmp_path, test, OK, UNDECLARED, UNMATCHED, MISSING, OK)
 
-
-def test_while_held_a_violated_verdict_without_findings_counts_too(tmp_path: Path) -> None:
-    async def test(bench: _Bench) -> None:
-        watch = Watch(bench.judge, bench.changes, Stage.ACTIVE)
-        watching = asyncio.ensure_future(watch.run())
-        await asyncio.sleep(2.0)
-        watching.cancel()
+async def test_while_held_a_violated_verdict_without_findings_counts_too(tmp_path: Path) -> None:
+    async with judging(tmp_path, verdict_of(Outcome.VIOLATED)) as bench:
+        await bench.hold(2.0)
         assert bench.judge.violations.counted == "violated"
 
-    _run(tmp_path, test, verdict_of(Outcome.VIOLATED))
 
-
-def test_while_held_a_newcomer_that_is_not_known_by_name_yet_is_not_told(tmp_path: Path) -> None:
-    async def test(bench: _Bench) -> None:
-        watching = asyncio.ensure_future(Watch(bench.judge, bench.changes, Stage.ACTIVE).run())
-        for delay_s in (1.0, 1.0 + 0.9 * PASSING_S):
-            asyncio.get_running_loop().call_later(delay_s, bench.grow)
-        await asyncio.sleep(60.0)
-        watching.cancel()
-        assert bench.told() == [OK]
-
-    _run(tmp_path, test, OK, UNATTRIBUTED, OK)
-
-
-def test_while_held_a_newcomer_that_stays_unknown_is_told_after_a_bounded_time(
+async def test_while_held_a_newcomer_that_is_not_known_by_name_yet_is_not_told(
     tmp_path: Path,
 ) -> None:
-    async def test(bench: _Bench) -> None:
-        watching = asyncio.ensure_future(Watch(bench.judge, bench.changes, Stage.ACTIVE).run())
-        asyncio.get_running_loop().call_later(1.0, bench.grow)
-        await asyncio.sleep(60.0)
-        watching.cancel()
+    async with judging(tmp_path, OK, UNATTRIBUTED, OK) as bench:
+        for delay_s in (1.0, 1.0 + 0.9 * PASSING_S):
+            bench.later(delay_s, bench.grow)
+        await bench.hold(60.0)
+        assert bench.told() == [OK]
+
+
+async def test_while_held_a_newcomer_that_stays_unknown_is_told_after_a_bounded_time(
+    tmp_path: Path,
+) -> None:
+    async with judging(tmp_path, OK, UNATTRIBUTED) as bench:
+        bench.later(1.0, bench.grow)
+        await bench.hold(60.0)
         assert bench.told() == [OK, UNATTRIBUTED]
         # At the start, at the change, once its time is over; and then nothing is polled.
         assert bench.looks == pytest.approx([0.0, 1.0, 1.0 + PASSING_S], abs=0.1)
 
-    _run(tmp_path, test, OK, UNATTRIBUTED)
 
-
-def test_before_the_gate_a_newcomer_that_is_not_known_by_name_is_told_at_once(
+async def test_before_the_gate_a_newcomer_that_is_not_known_by_name_is_told_at_once(
     tmp_path: Path,
 ) -> None:
-    async def test(bench: _Bench) -> None:
+    async with judging(tmp_path, OK, UNATTRIBUTED) as bench:
         await bench.judge.once(Stage.CONNECTED)
         bench.grow()
         assert await bench.judge.once(Stage.CONNECTED) == UNATTRIBUTED
-
-    _run(tmp_path, test, OK, UNATTRIBUTED)

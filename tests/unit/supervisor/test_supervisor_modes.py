@@ -50,9 +50,7 @@ def test_a_mode_keeps_its_nodes_inactive_and_the_next_has_them_active_again() ->
 
 async def test_a_mode_takes_nodes_out_at_once_and_back_in_through_the_gate(tmp_path: Path) -> None:
     world = SessionWorld(_plan(), tmp_path, stop_after_s=10.0)
-
-    async def switch() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         assert await world.order(MODE, mode="degraded") == "0"
         await asyncio.sleep(2.0)
         status = world.status()
@@ -64,8 +62,6 @@ async def test_a_mode_takes_nodes_out_at_once_and_back_in_through_the_gate(tmp_p
             "did you mean 'blind'?"
         )
         assert await world.order(MODE, mode="normal") == "0"
-
-    await world.run(switch())
     outline = world.since("[mode]")
     assert outline[: outline.index("[stopping] at 10.0 s: done")] == [
         "[mode] degraded without /camera",
@@ -94,9 +90,7 @@ async def test_a_mode_with_less_is_entered_whatever_is_violated_and_one_with_mor
     tmp_path: Path,
 ) -> None:
     world = SessionWorld(_plan(), tmp_path, stop_after_s=20.0)
-
-    async def switch() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         world.intrude()
         await world.story.until("[verdict] active violated")
         assert await world.order(MODE, mode="degraded") == "0"
@@ -111,8 +105,6 @@ async def test_a_mode_with_less_is_entered_whatever_is_violated_and_one_with_mor
         world.retreat()
         assert await world.order(ControlRequest.RESUME) == "0"
         assert world.status().phase == "active"
-
-    await world.run(switch())
     assert any(INTRUDED in each for each in world.outline)
     assert "[notice] cannot enter mode 'normal': back to 'degraded'" in world.outline
     assert world.outline.count("/camera activate") == 1
@@ -123,9 +115,7 @@ async def test_a_paused_system_stays_paused_and_what_is_restarted_comes_back_as_
     tmp_path: Path,
 ) -> None:
     world = SessionWorld(_plan(Restart.ON_FAILURE), tmp_path, stop_after_s=20.0)
-
-    async def switch() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         assert await world.order(ControlRequest.PAUSE) == "0"
         assert await world.order(MODE, mode="degraded") == "0"
         assert world.status().phase == "paused"
@@ -135,8 +125,6 @@ async def test_a_paused_system_stays_paused_and_what_is_restarted_comes_back_as_
         assert world.status().phase == "active"
         assert await world.order(ControlRequest.RESTART) == "0"
         assert world.status().mode == "degraded"
-
-    await world.run(switch())
     assert world.outline.count("/camera activate") == 1
     assert world.outline.count("/base activate") == 3
     assert world.story[-1] == "[stopped] 0"
@@ -171,9 +159,7 @@ async def test_parameters_are_set_before_what_comes_in_is_activated_and_set_back
 ) -> None:
     plan = dataclasses.replace(_with_speeds(), policy=Policy(ros_interface=RosInterfaceAccess.FULL))
     world = SessionWorld(plan, tmp_path, stop_after_s=10.0)
-
-    async def switch() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         await asyncio.sleep(0.3)
         ros = world.graph.ros
         assert ros is not None
@@ -186,8 +172,6 @@ async def test_parameters_are_set_before_what_comes_in_is_activated_and_set_back
         )
         status = world.status()
         assert (status.mode, status.phase) == ("normal", "active")
-
-    await world.run(switch())
     outline = [each for each in world.since("[system] active")[1:] if "[system]" not in each]
     # Fake nodes report no parameters.
     through = ["networks programmed (unverifiable)", "[gate] unverifiable: /camera"]
@@ -216,11 +200,7 @@ async def test_a_consequence_that_a_node_refuses_is_reported_and_the_system_goes
         dataclasses.replace(_with_speeds(), on_violation=(what,)), tmp_path, stop_after_s=10.0
     )
     world.graph.refuses = "speed=0.2"
-
-    async def intrude() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         world.intrude()
         await world.story.until("[notice] cannot enter mode 'slow': cannot set")
-
-    await world.run(intrude())
     assert world.status().mode == "normal"

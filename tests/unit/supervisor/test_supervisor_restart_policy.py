@@ -172,13 +172,9 @@ async def test_a_node_that_crashed_comes_again_through_its_gate_and_the_others_a
     tmp_path: Path,
 ) -> None:
     world = SessionWorld(_chain(), tmp_path, stop_after_s=10.0)
-
-    async def die() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         await asyncio.sleep(3.0)
         world.kill("camera")
-
-    await world.run(die())
     assert world.since("[system] active")[1:] == [
         "[failure] run.process-died /camera, and the run goes on",
         "[backoff] camera in 1.0 s",
@@ -199,13 +195,9 @@ async def test_a_process_that_fails_again_and_again_is_given_up_loudly_with_its_
 ) -> None:
     how = dataclasses.replace(ON_FAILURE, restart_sec=0.5, start_limit_burst=3)
     world = SessionWorld(_chain(how), tmp_path)
-
-    async def die() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         world.hosts.ways["/camera configure"] = "no device"
         world.kill("camera")
-
-    await world.run(die())
     again = ["camera start", "/camera configure"]
     failed = "[failure] run.transition-failed /camera, and the run goes on"
     assert world.since("[verdict] active violated")[1:] == [
@@ -240,12 +232,8 @@ async def test_a_node_that_dies_during_bring_up_comes_again_while_the_others_wai
     plan = plan_of(planned_node("camera", supervision=ON_FAILURE), viewer)
     world = SessionWorld(plan, tmp_path, stop_after_s=5.0)
     world.hosts.ways[step if step.startswith("/") else "camera start"] = "die"
-
-    async def heal() -> None:
-        await world.story.until("[backoff] camera")
+    async with world.running("[backoff] camera"):
         world.hosts.ways.clear()
-
-    await world.run(heal())
     assert "[restarted] camera (1)" in world.outline
     assert world.outline.count("viewer start") == 1
     assert world.outline.count("/viewer configure") == 1
@@ -257,15 +245,11 @@ async def test_a_start_counts_towards_the_limit_also_where_another_s_failure_too
 ) -> None:
     twice = dataclasses.replace(ON_FAILURE, start_limit_burst=2, start_limit_interval_sec=3600)
     world = SessionWorld(_chain(DEPENDENTS, twice), tmp_path, stop_after_s=60.0)
-
-    async def die() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         for times in (1, 2):  # more starts than the limit, and no failure of its own
             world.kill("camera")
             await world.story.until("[restarted] camera", times)
         world.kill("viewer")
-
-    await world.run(die())
     assert "[gave_up] viewer (1 failures)" in world.outline
     assert world.outline[-1] == "[stopped] 7"
 
@@ -279,9 +263,7 @@ async def test_a_start_that_was_cut_off_by_another_s_failure_counts_and_is_no_fa
         planned_node("viewer", supervision=thrice),
     )
     world = SessionWorld(plan, tmp_path, stop_after_s=60.0)
-
-    async def die() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         world.hosts.takes_s["/viewer configure"] = 3.0
         world.kill("viewer")
         await world.story.until("/viewer configure", 2)
@@ -289,8 +271,6 @@ async def test_a_start_that_was_cut_off_by_another_s_failure_counts_and_is_no_fa
         await world.story.until("[restarted] viewer")
         assert sum(each == "viewer start" for each in world.outline) == 3
         world.kill("viewer")
-
-    await world.run(die())
     assert "[gave_up] viewer (2 failures)" in world.outline
     assert world.outline[-1] == "[stopped] 7"
 
@@ -300,12 +280,8 @@ async def test_a_node_that_fails_to_activate_is_restarted_and_what_is_active_sta
 ) -> None:
     world = SessionWorld(_chain(), tmp_path, stop_after_s=5.0)
     world.hosts.ways["/viewer activate"] = "die"
-
-    async def heal() -> None:
-        await world.story.until("[backoff]")
+    async with world.running("[backoff]"):
         world.hosts.ways.clear()
-
-    await world.run(heal())
     assert world.since("/viewer activate") == [
         "/viewer activate",
         "[failure] run.process-died /viewer, and the run goes on",
@@ -328,12 +304,8 @@ async def test_a_node_that_fails_to_activate_is_restarted_and_what_is_active_sta
 async def test_dependents_go_down_in_order_and_come_again_with_it(tmp_path: Path) -> None:
     how = dataclasses.replace(ON_FAILURE, on_failure=OnFailure.DEPENDENTS)
     world = SessionWorld(_chain(how, Supervision()), tmp_path, stop_after_s=5.0)
-
-    async def die() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         world.kill("camera")
-
-    await world.run(die())
     assert world.since("[failure]") == [
         "[failure] run.process-died /camera, and the run goes on",
         "/viewer deactivate",
@@ -359,15 +331,11 @@ async def test_what_fails_while_another_is_restarted_keeps_both_at_the_gate(
 ) -> None:
     world = SessionWorld(_chain(), tmp_path, stop_after_s=10.0)
     world.hosts.takes_s["/camera configure"] = 2.0
-
-    async def die() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         world.kill("camera")
         await world.story.until("/camera configure", 2)
         await asyncio.sleep(1.0)
         world.kill("viewer")
-
-    await world.run(die())
     assert world.since("[failure] run.process-died /viewer") == [
         "[failure] run.process-died /viewer, and the run goes on",
         f"[verdict] connected violated {VIEWER_GONE}, {UNREPORTED}",
@@ -397,15 +365,11 @@ async def test_a_restarted_node_waits_at_a_gate_that_stays_closed_and_passes_onc
     tmp_path: Path,
 ) -> None:
     world = SessionWorld(_chain(), tmp_path, stop_after_s=10.0)
-
-    async def die() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         world.intrude()
         world.kill("camera")
         await asyncio.sleep(5.0)
         world.retreat()
-
-    await world.run(die())
     assert world.since("[notice]")[:7] == [
         f"[notice] {REFUSED}",
         "[verdict] connected ok",
@@ -428,8 +392,7 @@ async def test_a_restarted_node_waits_for_one_that_is_away_and_orders_wait_5_s_f
         world.graph.unseen = {"/viewer"}
         world.graph.note()
 
-    async def die() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         world.story.in_the_moment["networks programmed"] = hide
         world.kill("camera")
         await world.story.until("networks programmed", 2)
@@ -441,8 +404,6 @@ async def test_a_restarted_node_waits_for_one_that_is_away_and_orders_wait_5_s_f
         world.graph.note()
         assert await world.order(ControlRequest.RESUME) == "0"
         assert await world.order(ControlRequest.DOWN) == "0"
-
-    await world.run(die())
     away = "graph.missing-node: cannot find node /viewer in domain 30"
     assert world.since("networks programmed", 2)[1:8] == [
         "[verdict] connected violated graph.missing-node /viewer",
@@ -457,9 +418,7 @@ async def test_a_restarted_node_waits_for_one_that_is_away_and_orders_wait_5_s_f
 
 async def test_orders_in_backoff_are_carried_out_at_once(tmp_path: Path) -> None:
     world = SessionWorld(_chain(), tmp_path)
-
-    async def order() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         world.kill("camera")
         await world.story.until("[backoff]")
         assert await world.order(ControlRequest.PAUSE) == "0"
@@ -473,8 +432,6 @@ async def test_orders_in_backoff_are_carried_out_at_once(tmp_path: Path) -> None
         world.kill("viewer")
         await world.story.until("[backoff] viewer", 2)
         assert await world.order(ControlRequest.DOWN) == "4"
-
-    await world.run(order())
     assert world.since("[system] paused")[:5] == [
         "[system] paused at 0.0 s",
         "camera start",
@@ -497,15 +454,11 @@ async def test_who_is_restarted_by_hand_in_its_backoff_takes_its_dependents_with
 
     how = dataclasses.replace(ON_FAILURE, on_failure=OnFailure.DEPENDENTS)
     world = SessionWorld(_chain(how, Supervision()), tmp_path, stop_after_s=5.0)
-
-    async def order() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         world.kill("camera")
         await world.story.until("[backoff] camera")
         assert await world.order(ControlRequest.RESTART, "camera") == "0"
         assert world.story[-1] == "[system] active at 0.0 s"
-
-    await world.run(order())
     assert world.story.count("viewer start") == 2
 
 
@@ -513,17 +466,13 @@ async def test_an_order_during_a_restart_waits_for_its_step_and_not_for_its_gate
     tmp_path: Path,
 ) -> None:
     world = SessionWorld(_chain(), tmp_path, stop_after_s=10.0)
-
-    async def order() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         world.intrude()
         world.hosts.takes_s["/camera configure"] = 2.0
         world.kill("camera")
         await world.story.until("/camera configure", 2)
         assert await world.order(ControlRequest.PAUSE) == "0"
         assert world.story[-2:] == ["[system] paused at 3.0 s", "[restarted] camera (1)"]
-
-    await world.run(order())
     assert "[gate] ok: /camera" not in world.outline
 
 
@@ -533,27 +482,19 @@ async def test_a_clean_exit_is_started_again_after_only_by_always(
 ) -> None:
     how = dataclasses.replace(ON_FAILURE, restart=restart)
     world = SessionWorld(_chain(how), tmp_path, stop_after_s=5.0)
-
-    async def leave() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         world.hosts.processes["camera"].end(ProcessExit(status=0))
-
-    await world.run(leave())
     assert world.story[-1] == f"[stopped] {0 if restart is Restart.ALWAYS else 6}"
 
 
 async def test_a_hang_is_ended_by_the_watchdog_and_one_that_passes_is_not(tmp_path: Path) -> None:
     world = SessionWorld(_chain(), tmp_path, stop_after_s=20.0)
-
-    async def hang() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         process = world.system.processes["camera"]
         for hangs_s in (2.0, 10.0):
             process.on_stop(True)
             await asyncio.sleep(hangs_s)
             process.on_stop(False)
-
-    await world.run(hang())
     found = [
         each for each in world.story if each in ("camera SIGKILL", "[backoff] camera in 1.0 s")
     ]
@@ -562,9 +503,7 @@ async def test_a_hang_is_ended_by_the_watchdog_and_one_that_passes_is_not(tmp_pa
 
 async def test_status_says_what_failed_and_when_it_is_started_again(tmp_path: Path) -> None:
     world = SessionWorld(_chain(), tmp_path, stop_after_s=5.0)
-
-    async def look() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         world.hosts.ways["/camera configure"] = "die"
         world.kill("camera")
         await world.story.until("[backoff]", 2)
@@ -578,8 +517,6 @@ async def test_status_says_what_failed_and_when_it_is_started_again(tmp_path: Pa
         assert away.last_failure.stderr == ""
         assert (viewer.restarts, viewer.uptime_s, viewer.last_failure) == (0, 1.25, None)
         world.hosts.ways.clear()
-
-    await world.run(look())
 
 
 @pytest.mark.parametrize(("restart", "taken"), [(Restart.ON_FAILURE, True), (Restart.NO, False)])
@@ -632,9 +569,7 @@ async def test_a_death_is_reported_at_once_also_while_another_process_is_taken_d
         planned_node("other", supervision=ON_FAILURE),
     )
     world = SessionWorld(plan, tmp_path, stop_after_s=20.0)
-
-    async def die() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         world.hosts.takes_s["/viewer deactivate"] = 2.0
         world.kill("camera")
         await world.story.until("/viewer deactivate")
@@ -644,8 +579,6 @@ async def test_a_death_is_reported_at_once_also_while_another_process_is_taken_d
         await world.story.until("[failure] run.process-died /other")
         assert asyncio.get_running_loop().time() - began < 0.1
         await world.story.until("[restarted] other")
-
-    await world.run(die())
     failures = [each for each in world.outline if each.startswith("[failure]")]
     assert len(failures) == 2
     assert world.story[-1] == "[stopped] 0"
@@ -658,9 +591,7 @@ async def test_an_order_does_not_keep_others_from_coming_again_that_its_gate_wai
     tmp_path: Path, asked: ControlRequest, node: str
 ) -> None:
     world = SessionWorld(_chain(), tmp_path, stop_after_s=30.0)
-
-    async def order() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         if asked is ControlRequest.RESUME:
             assert await world.order(ControlRequest.PAUSE) == "0"
         world.kill("camera")
@@ -672,8 +603,6 @@ async def test_an_order_does_not_keep_others_from_coming_again_that_its_gate_wai
         assert {each.state for each in world.status().nodes} == {"active"}
         await world.story.until("[restarted] camera (1)")
 
-    await world.run(order())
-
 
 async def test_what_becomes_wrong_while_another_node_is_restarted_is_found_within_a_second(
     tmp_path: Path,
@@ -683,9 +612,7 @@ async def test_what_becomes_wrong_while_another_node_is_restarted_is_found_withi
         planned_node("viewer", supervision=ON_FAILURE),
     )
     world = SessionWorld(plan, tmp_path, stop_after_s=30.0)
-
-    async def intrude() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         world.hosts.takes_s["/camera configure"] = 5.0
         world.kill("camera")
         await world.story.until("/camera configure", 2)
@@ -696,8 +623,6 @@ async def test_what_becomes_wrong_while_another_node_is_restarted_is_found_withi
         assert asyncio.get_running_loop().time() - began < 1.0
         world.retreat()
         await world.story.until("[restarted] camera (1)")
-
-    await world.run(intrude())
     assert "state.wrong-state" not in " ".join(world.outline)
 
 
@@ -705,9 +630,7 @@ async def test_a_resume_that_a_death_cuts_short_leaves_the_system_paused_and_ope
     tmp_path: Path,
 ) -> None:
     world = SessionWorld(_chain(), tmp_path, stop_after_s=30.0)
-
-    async def order() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         assert await world.order(ControlRequest.PAUSE) == "0"
         world.intrude()
         resuming = asyncio.ensure_future(world.order(ControlRequest.RESUME))
@@ -723,8 +646,6 @@ async def test_a_resume_that_a_death_cuts_short_leaves_the_system_paused_and_ope
         assert await world.order(ControlRequest.RESUME) == "0"
         assert world.status().phase == "active"
 
-    await world.run(order())
-
 
 @pytest.mark.parametrize("node", ["", "camera"])
 async def test_a_restart_by_hand_that_a_death_cuts_short_is_finished_once_all_are_back(
@@ -735,9 +656,7 @@ async def test_a_restart_by_hand_that_a_death_cuts_short_is_finished_once_all_ar
         planned_node("viewer", supervision=ON_FAILURE),
     )
     world = SessionWorld(plan, tmp_path, stop_after_s=30.0)
-
-    async def order() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         world.hosts.takes_s["/camera configure"] = 2.0
         restarting = asyncio.ensure_future(world.order(ControlRequest.RESTART, node))
         await world.story.until("/camera configure", 2)
@@ -748,16 +667,12 @@ async def test_a_restart_by_hand_that_a_death_cuts_short_is_finished_once_all_ar
         assert world.status().phase == "active"
         assert {each.state for each in world.status().nodes} == {"active"}
 
-    await world.run(order())
-
 
 async def test_a_resume_that_a_death_cuts_short_behind_its_gate_is_finished_once_all_are_back(
     tmp_path: Path,
 ) -> None:
     world = SessionWorld(_chain(), tmp_path, stop_after_s=30.0)
-
-    async def order() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         assert await world.order(ControlRequest.PAUSE) == "0"
         world.hosts.takes_s["/camera activate"] = 2.0
         resuming = asyncio.ensure_future(world.order(ControlRequest.RESUME))
@@ -768,5 +683,3 @@ async def test_a_resume_that_a_death_cuts_short_behind_its_gate_is_finished_once
         await world.story.until("[restarted] viewer (1)")
         assert world.status().phase == "active"
         assert {each.state for each in world.status().nodes} == {"active"}
-
-    await world.run(order())

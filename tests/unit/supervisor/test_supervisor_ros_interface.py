@@ -55,9 +55,7 @@ async def test_who_only_tries_a_system_pays_nothing_for_it(tmp_path: Path) -> No
 async def test_a_bring_up_that_is_held_up_says_why_before_it_is_active(tmp_path: Path) -> None:
     world = SessionWorld(CHAIN, tmp_path, stop_after_s=1.0)
     world.graph.unseen.add("/camera")
-
-    async def wait() -> None:
-        await world.story.until("[joined] /viewer")
+    async with world.running("[joined] /viewer"):
         await asyncio.sleep(HELD_UP_S - 0.2)
         assert world.graph.ros is None
         await asyncio.sleep(0.4)
@@ -80,8 +78,6 @@ async def test_a_bring_up_that_is_held_up_says_why_before_it_is_active(tmp_path:
         await world.story.until("[system] active")
         await asyncio.sleep(0.1)
         assert json.loads(ros.statuses[-1])["phase"] == "active"
-
-    await world.run(wait())
 
 
 async def test_what_cannot_be_offered_is_said_once_and_the_system_runs_without(
@@ -119,9 +115,7 @@ async def test_diagnostics_come_from_active_on_each_second_and_at_once_when_some
     tmp_path: Path,
 ) -> None:
     world = SessionWorld(offering(RosInterfaceAccess.READ_ONLY), tmp_path, stop_after_s=9.9)
-
-    async def intrude() -> None:
-        await world.story.until("[gate]")
+    async with world.running("[gate]"):
         assert world.graph.ros is None  # bring-up pays nothing for it
         await world.story.until("[system] active")
         await asyncio.sleep(3.5)
@@ -146,8 +140,6 @@ async def test_diagnostics_come_from_active_on_each_second_and_at_once_when_some
         await asyncio.sleep(3.0)
         assert ros.diagnostics[-1][-1][:3] == (OK, "robot: graph.undeclared-node", "ok")
         assert (await ros.call("get_status"))[0] is True
-
-    await world.run(intrude())
     assert world.graph.ros is not None
     assert world.graph.ros.destroyed
     assert json.loads(world.graph.ros.statuses[-1])["phase"] == "stopping"
@@ -155,9 +147,7 @@ async def test_diagnostics_come_from_active_on_each_second_and_at_once_when_some
 
 async def test_services_give_the_orders_of_the_control_socket(tmp_path: Path) -> None:
     world = SessionWorld(offering(FULL), tmp_path)
-
-    async def order() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         await asyncio.sleep(0.3)
         ros = world.graph.ros
         assert ros is not None
@@ -176,19 +166,13 @@ async def test_services_give_the_orders_of_the_control_socket(tmp_path: Path) ->
         assert await ros.call("resume") == (True, "active")
         assert await ros.call("restart") == (True, "active")
         assert await ros.call("down") == (True, "the system is being taken down")
-
-    await world.run(order())
     assert "the down service" in world.report
 
 
 async def test_a_node_that_is_silent_is_stale(tmp_path: Path) -> None:
     world = SessionWorld(offering(FULL), tmp_path, stop_after_s=5.0)
-
-    async def hush() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         world.system.liveliness.fell_silent(["/camera"], Cause.STOPPED, "pid 7")
         await asyncio.sleep(1.1)
         assert world.graph.ros is not None
         assert world.graph.ros.diagnostics[-1][0][0] == STALE
-
-    await world.run(hush())

@@ -212,13 +212,9 @@ async def test_a_process_that_dies_while_its_node_waits_for_another_is_noticed_a
     )
     world = SessionWorld(plan, tmp_path)
     world.hosts.takes_s["/camera configure"] = 20.0
-
-    async def die() -> None:
-        await world.story.until("[process] viewer running")
+    async with world.running("[process] viewer running"):
         await asyncio.sleep(1.0)
         world.kill("viewer")
-
-    await world.run(die())
     assert world.since("[failure]")[:2] == [
         "[failure] run.process-died /viewer",
         "[stopping] at 2.2 s: rolling back",
@@ -260,14 +256,10 @@ async def test_a_bring_up_that_takes_too_long_names_what_is_missing(tmp_path: Pa
 async def test_nothing_is_activated_before_the_verdict_is_ok(tmp_path: Path) -> None:
     world = SessionWorld(CHAIN, tmp_path, stop_after_s=0.0)
     world.graph.unseen = {"/viewer"}
-
-    async def appear() -> None:
-        await world.story.until("[system] connected")
+    async with world.running("[system] connected"):
         await asyncio.sleep(7.0)
         world.graph.unseen.clear()
         world.graph.note()
-
-    await world.run(appear())
     assert world.since("[system] connected")[1:5] == [
         "[verdict] connected violated graph.missing-node /viewer",
         "[verdict] connected ok",
@@ -349,13 +341,9 @@ async def test_what_changes_while_networks_are_programmed_keeps_the_gate_closed(
 ) -> None:
     world = SessionWorld(CHAIN, tmp_path)
     world.networks.takes_s = 3.0
-
-    async def intrude() -> None:
-        await world.story.until("networks programmed")
+    async with world.running("networks programmed"):
         await asyncio.sleep(1.0)
         world.intrude()
-
-    await world.run(intrude())
     assert world.since("networks programmed") == [
         "networks programmed (ok)",
         f"[verdict] connected violated {INTRUDED}",
@@ -405,13 +393,9 @@ async def test_what_changes_between_two_requests_has_the_rest_not_asked_and_all_
 
     world = SessionWorld(CHAIN, tmp_path)
     world.hosts.takes_s["/camera activate"] = 3.0
-
-    async def intrude() -> None:
-        await world.story.until("/camera activate")
+    async with world.running("/camera activate"):
         await asyncio.sleep(1.0)
         world.intrude()
-
-    await world.run(intrude())
     assert world.since("[gate]") == [
         OPENED,
         "/camera activate",
@@ -433,15 +417,11 @@ async def test_what_changes_between_two_requests_and_heals_is_judged_again_and_t
 ) -> None:
     world = SessionWorld(CHAIN, tmp_path, stop_after_s=0.0)
     world.hosts.takes_s["/camera activate"] = 3.0
-
-    async def come_and_go() -> None:
-        await world.story.until("/camera activate")
+    async with world.running("/camera activate"):
         await asyncio.sleep(2.9)
         world.intrude()
         await world.story.until("[verdict] connected violated")
         world.retreat()
-
-    await world.run(come_and_go())
     assert world.since("[gate]")[:6] == [
         OPENED,
         "/camera activate",
@@ -478,14 +458,11 @@ async def test_the_time_for_which_a_change_is_judged_is_not_that_of_the_node_tha
         world.graph.unseen = {"/camera"}
         world.graph.note()
 
-    async def show() -> None:
-        await world.story.until("[verdict] connected violated")
+    world.story.in_the_moment["/camera activate"] = hide
+    async with world.running("[verdict] connected violated"):
         await asyncio.sleep(4.0)
         world.graph.unseen.clear()
         world.graph.note()
-
-    world.story.in_the_moment["/camera activate"] = hide
-    await world.run(show())
     assert world.since("[gate]")[:6] == [
         OPENED,
         "/camera activate",
@@ -518,14 +495,11 @@ async def test_what_is_away_behind_an_open_gate_may_come_back_for_as_long_as_bef
 
     world = SessionWorld(CHAIN, tmp_path, stop_after_s=0.0)
 
-    async def show() -> None:
-        await world.story.until(HIDDEN)
+    world.story.in_the_moment[moment] = hiding(world)
+    async with world.running(HIDDEN):
         await asyncio.sleep(25.0)
         world.graph.unseen.clear()
         world.graph.note()
-
-    world.story.in_the_moment[moment] = hiding(world)
-    await world.run(show())
     before = [OPENED, "/camera activate"]
     if moment == "networks programmed":
         heals = ["networks programmed (ok)", HIDDEN, "[verdict] connected ok", *before]
@@ -560,13 +534,9 @@ async def test_what_changes_before_a_request_to_a_foreign_node_leaves_keeps_it_b
 
     world = SessionWorld(ATTACHED, tmp_path)
     world.graph.services.matched_after_s["/base activate"] = 2.0
-
-    async def intrude() -> None:
-        await world.story.until("[request] /base activate")
+    async with world.running("[request] /base activate"):
         await asyncio.sleep(1.0)
         world.intrude()
-
-    await world.run(intrude())
     assert world.since("[gate]") == [
         "[gate] ok: /camera, /base",
         "/camera activate",
@@ -600,12 +570,8 @@ async def test_what_became_active_is_judged_again_and_must_be_what_was_verified(
 ) -> None:
     world = SessionWorld(CHAIN, tmp_path)
     world.hosts.takes_s["/viewer activate"] = 3.0
-
-    async def intrude() -> None:
-        await world.story.until("/viewer activate")
+    async with world.running("/viewer activate"):
         world.intrude()
-
-    await world.run(intrude())
     assert world.since("/viewer activate") == [
         "/viewer activate",
         f"[verdict] active violated {INTRUDED}",
@@ -638,12 +604,8 @@ async def test_a_node_that_is_not_discovered_over_tcp_is_started_again_on_a_fres
 ) -> None:
     world = SessionWorld(DIALLING, tmp_path, stop_after_s=0.0)
     world.graph.unseen.add("/viewer")
-
-    async def appear() -> None:
-        await world.story.until("viewer start", needed + 1)
+    async with world.running("viewer start", needed + 1):
         world.graph.unseen.clear()
-
-    await world.run(appear())
     again = [line for attempt in range(needed) for line in started_again(attempt + 1)]
     assert world.since("[system] connected")[1:-ENDING] == [
         "[verdict] connected violated graph.missing-node /viewer",
@@ -679,14 +641,10 @@ async def test_a_node_that_is_never_discovered_is_started_three_times_and_then_w
 async def test_a_node_that_would_get_no_other_port_is_waited_for(tmp_path: Path) -> None:
     world = SessionWorld(DIALLING, tmp_path, stop_after_s=0.0)
     world.graph.unseen.add("/camera")
-
-    async def appear() -> None:
-        await world.story.until("[system] connected")
+    async with world.running("[system] connected"):
         await asyncio.sleep(12.0)
         world.graph.unseen.clear()
         world.graph.note()
-
-    await world.run(appear())
     assert world.since("[system] connected")[1:4] == [
         "[verdict] connected violated graph.missing-node /camera",
         "[verdict] connected ok",
@@ -744,13 +702,9 @@ async def test_a_node_that_cannot_be_activated_has_everything_rolled_back(
 async def test_a_process_that_dies_while_the_system_is_judged_ends_the_run(tmp_path: Path) -> None:
     world = SessionWorld(CHAIN, tmp_path)
     world.graph.unseen = {"/viewer"}
-
-    async def die() -> None:
-        await world.story.until("[verdict]")
+    async with world.running("[verdict]"):
         await asyncio.sleep(2.0)
         world.kill("camera")
-
-    await world.run(die())
     assert world.since("[failure]") == [
         "[failure] run.process-died /camera",
         "[stopping] at 2.0 s: rolling back",
@@ -837,13 +791,9 @@ async def test_a_signal_ends_the_run_at_every_stage_and_says_what_was_waited_for
 ) -> None:
     world = SessionWorld(CHAIN, tmp_path)
     begun = prepare(world)
-
-    async def send() -> None:
-        await world.story.until(begun)
+    async with world.running(begun):
         await asyncio.sleep(1.0)
         signal.raise_signal(number)
-
-    await world.run(send())
     exit_code = active if prepare is _active else cut_short
     assert world.since("[stopping]") == [
         f"[stopping] at 1.0 s: {why}",
@@ -867,12 +817,8 @@ async def test_a_signal_that_came_before_the_session_ends_it_at_once(tmp_path: P
 
 async def test_a_run_that_is_bound_to_stay_is_cut_short_by_a_signal(tmp_path: Path) -> None:
     world = SessionWorld(CHAIN, tmp_path, stop_after_s=10.0)
-
-    async def send() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         signal.raise_signal(signal.SIGTERM)
-
-    await world.run(send())
     assert world.report == (
         "ended after it was active, exit code 143: "
         "terminated; it did not hold for the 10 s of --stop-after"
@@ -900,9 +846,7 @@ async def test_a_run_is_a_success_only_if_its_system_is_as_it_was_ordered(
     tmp_path: Path, phase: str, report: str
 ) -> None:
     world = SessionWorld(CHAIN, tmp_path)
-
-    async def order() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         ordered = None
         if phase == "paused":
             assert await world.order(ControlRequest.PAUSE) == "0"
@@ -918,21 +862,15 @@ async def test_a_run_is_a_success_only_if_its_system_is_as_it_was_ordered(
         signal.raise_signal(signal.SIGTERM)
         if ordered is not None:
             assert await ordered == "6 cannot go on: 'robot' is being taken down"
-
-    await world.run(order())
     assert world.report == f"ended after it was active, {report}"
 
 
 async def test_a_second_interrupt_ends_what_is_left_at_once(tmp_path: Path) -> None:
     world = SessionWorld(CHAIN, tmp_path, stop_after_s=0.0)
     world.hosts.takes_s["/viewer deactivate"] = 4.0
-
-    async def send() -> None:
-        await world.story.until("/viewer deactivate")
+    async with world.running("/viewer deactivate"):
         await asyncio.sleep(1.0)
         signal.raise_signal(signal.SIGINT)
-
-    await world.run(send())
     assert world.since("[stopping]") == [
         "[stopping] at 0.0 s: done",
         "/viewer deactivate",

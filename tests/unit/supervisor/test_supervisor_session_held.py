@@ -43,16 +43,12 @@ async def test_a_violation_while_holding_is_told_and_makes_the_end_no_success_ev
     tmp_path: Path, heals: bool
 ) -> None:
     world = SessionWorld(CHAIN, tmp_path, stop_after_s=10.0)
-
-    async def intrude() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         await asyncio.sleep(3.0)
         world.intrude()
         await asyncio.sleep(2.0)
         if heals:
             world.retreat()
-
-    await world.run(intrude())
     assert world.since("[system] active")[1:] == [
         f"[verdict] active violated {INTRUDED}",
         *(["[verdict] active ok"] if heals else []),
@@ -69,15 +65,11 @@ async def test_a_violation_while_holding_is_told_and_makes_the_end_no_success_ev
 
 async def test_a_passing_moment_is_no_violation_of_what_is_held(tmp_path: Path) -> None:
     world = SessionWorld(CHAIN, tmp_path, stop_after_s=10.0)
-
-    async def pass_by() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         await asyncio.sleep(3.0)
         world.intrude()
         await asyncio.sleep(0.2)
         world.retreat()
-
-    await world.run(pass_by())
     assert world.since("[system] active")[1:] == [
         f"[verdict] active violated {INTRUDED}",
         "[verdict] active ok",
@@ -92,13 +84,9 @@ async def test_a_process_that_dies_while_holding_ends_the_run_unless_it_is_to_ke
     tmp_path: Path, keep_going: bool
 ) -> None:
     world = SessionWorld(CHAIN, tmp_path, stop_after_s=10.0, keep_going=keep_going)
-
-    async def die() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         await asyncio.sleep(3.0)
         world.kill("camera")
-
-    await world.run(die())
     gone = "graph.missing-node /camera"
     if keep_going:
         held = [
@@ -122,9 +110,7 @@ async def test_a_process_that_dies_while_holding_ends_the_run_unless_it_is_to_ke
 
 async def test_a_paused_system_is_inactive_until_it_is_judged_anew(tmp_path: Path) -> None:
     world = SessionWorld(CHAIN, tmp_path)
-
-    async def order() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         assert await world.order(ControlRequest.RESUME) == (
             "2 cannot resume 'robot': it is active; only a paused system can be resumed"
         )
@@ -132,8 +118,6 @@ async def test_a_paused_system_is_inactive_until_it_is_judged_anew(tmp_path: Pat
         await asyncio.sleep(3.0)
         assert await world.order(ControlRequest.RESUME) == "0"
         assert await world.order(ControlRequest.DOWN) == "0"
-
-    await world.run(order())
     assert world.since("[system] active")[1:] == [
         "/viewer deactivate",
         "/camera deactivate",
@@ -152,9 +136,7 @@ async def test_a_system_that_is_wrong_stays_paused_and_can_be_resumed_once_it_is
     tmp_path: Path,
 ) -> None:
     world = SessionWorld(CHAIN, tmp_path)
-
-    async def order() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         assert await world.order(ControlRequest.PAUSE) == "0"
         world.intrude()
         assert await world.order(ControlRequest.RESUME) == f"4 {REFUSED}"
@@ -164,8 +146,6 @@ async def test_a_system_that_is_wrong_stays_paused_and_can_be_resumed_once_it_is
         world.retreat()
         assert await world.order(ControlRequest.RESUME) == "0"
         assert await world.order(ControlRequest.DOWN) == "0"
-
-    await world.run(order())
     assert world.since("[system] paused")[1:-ENDING] == [
         f"[verdict] connected violated {INTRUDED}",
         f"[notice] {REFUSED}",
@@ -180,9 +160,7 @@ async def test_a_system_that_is_wrong_stays_paused_and_can_be_resumed_once_it_is
 
 async def test_what_changes_while_a_system_is_resumed_has_it_paused_again(tmp_path: Path) -> None:
     world = SessionWorld(CHAIN, tmp_path)
-
-    async def order() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         assert await world.order(ControlRequest.PAUSE) == "0"
         world.hosts.takes_s["/camera activate"] = 3.0
         resumed = asyncio.ensure_future(world.order(ControlRequest.RESUME))
@@ -193,8 +171,6 @@ async def test_what_changes_while_a_system_is_resumed_has_it_paused_again(tmp_pa
         world.retreat()
         assert await world.order(ControlRequest.RESUME) == "0"
         assert await world.order(ControlRequest.DOWN) == "0"
-
-    await world.run(order())
     assert world.since("[gate]", 2)[:7] == [
         OPENED,
         "/camera activate",
@@ -216,13 +192,9 @@ async def test_one_node_is_restarted_through_the_gate_and_the_others_stay_active
     tmp_path: Path,
 ) -> None:
     world = SessionWorld(CHAIN, tmp_path)
-
-    async def order() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         assert await world.order(ControlRequest.RESTART, "viewer") == "0"
         assert await world.order(ControlRequest.DOWN) == "0"
-
-    await world.run(order())
     assert world.since("[system] active")[1:] == [
         "/viewer deactivate",
         *VIEWER_DOWN,
@@ -246,13 +218,9 @@ async def test_a_restart_waits_until_nobody_takes_the_new_node_for_a_second_one_
 ) -> None:
     world = SessionWorld(CHAIN, tmp_path)
     world.hosts.lingers_s = 2.0
-
-    async def order() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         assert await world.order(ControlRequest.RESTART, "viewer") == "0"
         world.kill("viewer")
-
-    await world.run(order())
     assert world.since("viewer start", 2) == [
         "viewer start",
         "/viewer configure",
@@ -275,9 +243,7 @@ async def test_a_restart_waits_until_nobody_takes_the_new_node_for_a_second_one_
 async def test_an_order_to_a_system_that_is_not_up_is_refused_and_not_kept(tmp_path: Path) -> None:
     world = SessionWorld(CHAIN, tmp_path)
     world.hosts.takes_s["/camera configure"] = 5.0
-
-    async def order() -> None:
-        await world.story.until("/camera configure")
+    async with world.running("/camera configure"):
         for ask, hint in (
             (ControlRequest.PAUSE, "only an active system can be paused"),
             (ControlRequest.RESTART, "only a system that is active or paused can be restarted"),
@@ -287,24 +253,18 @@ async def test_an_order_to_a_system_that_is_not_up_is_refused_and_not_kept(tmp_p
             )
         assert await world.order(ControlRequest.DOWN) == "6"
 
-    await world.run(order())
-
 
 async def test_a_restarted_node_stays_inactive_while_the_system_is_wrong_and_can_be_resumed(
     tmp_path: Path,
 ) -> None:
     world = SessionWorld(CHAIN, tmp_path)
-
-    async def order() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         world.intrude()
         assert await world.order(ControlRequest.RESTART, "viewer") == f"4 {REFUSED}"
         world.retreat()
         await asyncio.sleep(1.0)
         assert await world.order(ControlRequest.RESUME) == "0"
         assert await world.order(ControlRequest.DOWN) == "0"
-
-    await world.run(order())
     assert world.since("[verdict] active violated")[1:-ENDING] == [
         "/viewer deactivate",
         *VIEWER_DOWN,
@@ -331,12 +291,8 @@ async def test_a_restart_for_which_no_port_is_left_ends_the_run(tmp_path: Path) 
     full_up = "cannot give out 2 more ports: they would begin at 67535, and the highest is 65535"
 
     world = SessionWorld(full, tmp_path)
-
-    async def order() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         assert await world.order(ControlRequest.RESTART, "viewer") == f"6 {full_up}"
-
-    await world.run(order())
     assert "[failure] run.start-failed robot" in world.outline
     assert world.report.startswith("ended after it was active, exit code 6: failed: robot")
 
@@ -345,9 +301,7 @@ async def test_an_order_that_comes_during_another_is_carried_out_after_it(tmp_pa
     world = SessionWorld(CHAIN, tmp_path)
     world.hosts.takes_s |= {"/viewer deactivate": 3.0, "/viewer configure": 3.0}
     answers = []
-
-    async def order() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         for first, second, line, times in (
             (ControlRequest.RESTART, ControlRequest.PAUSE, "/viewer deactivate", 1),
             (ControlRequest.RESTART, ControlRequest.RESUME, "/viewer configure", 3),
@@ -360,8 +314,6 @@ async def test_an_order_that_comes_during_another_is_carried_out_after_it(tmp_pa
             assert not other.done()
             answers.append((await one, await other))
         assert await world.order(ControlRequest.DOWN) == "0"
-
-    await world.run(order())
     assert answers == [
         ("0", "0"),
         ("0", "0"),
@@ -373,16 +325,12 @@ async def test_an_order_that_comes_during_another_is_carried_out_after_it(tmp_pa
 async def test_a_restart_that_cannot_begin_leaves_everything_as_it_is(tmp_path: Path) -> None:
     world = SessionWorld(CHAIN, tmp_path)
     why = "the fork server does not answer within 10 s"
-
-    async def order() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         world.hosts.cannot_start = why
         assert await world.order(ControlRequest.RESTART) == (
             f"6 cannot restart 'robot': {why}; everything stays as it is"
         )
         assert await world.order(ControlRequest.DOWN) == "0"
-
-    await world.run(order())
     assert world.since("[system] active")[1:] == [
         "[stopping] at 0.0 s: lifecycle down",
         *DOWN,
@@ -392,15 +340,11 @@ async def test_a_restart_that_cannot_begin_leaves_everything_as_it_is(tmp_path: 
 
 async def test_a_restart_in_which_a_step_fails_ends_the_run(tmp_path: Path) -> None:
     world = SessionWorld(CHAIN, tmp_path)
-
-    async def order() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         world.hosts.ways["/viewer configure"] = "no display"
         assert await world.order(ControlRequest.RESTART, "/viewer") == (
             "6 cannot configure '/viewer': no display"
         )
-
-    await world.run(order())
     assert world.since("viewer start", 2) == [
         "viewer start",
         "/viewer configure",
@@ -415,14 +359,10 @@ async def test_a_restart_in_which_a_step_fails_ends_the_run(tmp_path: Path) -> N
 
 async def test_a_paused_system_is_restarted_as_far_as_it_was(tmp_path: Path) -> None:
     world = SessionWorld(CHAIN, tmp_path)
-
-    async def order() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         assert await world.order(ControlRequest.PAUSE) == "0"
         assert await world.order(ControlRequest.RESTART) == "0"
         assert await world.order(ControlRequest.DOWN) == "0"
-
-    await world.run(order())
     assert world.since("[system] paused")[1:] == [
         *BACK,
         *CONNECTED,
@@ -437,13 +377,9 @@ async def test_an_order_that_is_open_when_the_system_is_taken_down_is_answered(
     tmp_path: Path,
 ) -> None:
     world = SessionWorld(CHAIN, tmp_path)
-
-    async def order() -> None:
-        await world.story.until("[system] active")
+    async with world.running("[system] active"):
         world.hosts.takes_s["/viewer deactivate"] = 2.0
         paused = asyncio.ensure_future(world.order(ControlRequest.PAUSE))
         await world.story.until("/viewer deactivate")
         signal.raise_signal(signal.SIGTERM)
         assert await paused == "6 cannot go on: 'robot' is being taken down"
-
-    await world.run(order())
