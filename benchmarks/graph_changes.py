@@ -1,9 +1,8 @@
 """What one change costs in systems of 10 to 10,000 endpoints: `python benchmarks/graph_changes.py`.
 
-One reader (`GraphEvents` and `GraphState`) holds a simulated system whose nodes have ten endpoints
-each. Prints the median time from a message's sending until subscribers have been told, for each
-kind of change, and the time of a query; each also as a ratio to the smallest system. Nothing but
-the reader is measured: messages travel in memory, and nodes answer at once.
+One `GraphState` holds a simulated system whose nodes have ten endpoints each. Prints the median
+time from a status or a configuration until subscribers have been told, and the time of a query;
+each also as a ratio to the smallest system.
 
 Then the CPU time for which a supervisor looks and judges when one endpoint of a system of 5 to 200
 nodes, a chain, goes or comes back: what is given of nodes is put into the graph's state, what a
@@ -28,18 +27,10 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parents[1]))  # as a script, only its own directory is there
 
 from benchmarks import scale
-from lifecycle.graph.events import GraphEvents
-from lifecycle.graph.messages import (
-    ConfigurationChanged,
-    GraphMessage,
-    Heartbeat,
-    Joined,
-    MappingEstablished,
-    StateChanged,
-    encode,
-)
+from lifecycle.graph.loop import GraphLoop
 from lifecycle.graph.observer import Observer
 from lifecycle.graph.state import GraphState
+from lifecycle.graph.status import NodeStatus, decode, encode
 from lifecycle.manifest.loading import load
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.plan.build import build_plan
@@ -55,7 +46,6 @@ from lifecycle.verify.observation import (
 )
 from lifecycle.verify.tool_filter import NO_NAMES, DeclaredNames
 from lifecycle.verify.verdict import Stage
-from tests.unit.graph.simulated import ManualScheduler, Network
 from tests.unit.supervisor.fakes import World
 from tests.unit.verify.perfect import perfect
 
@@ -67,30 +57,16 @@ LOOKS = 20
 
 
 class System:
-    """A reader and the nodes that it reads."""
+    """A state and the nodes that it holds."""
 
     def __init__(self, endpoints: int) -> None:
-        self.scheduler = ManualScheduler()
-        network = Network(self.scheduler)
-        self.wire = network.transport()
-        self.configurations: dict[str, NodeConfiguration] = {}
-        self.sequences: dict[str, int] = {}
         self.told = 0
-        events = GraphEvents(network.transport(), self.scheduler)
-        self.state = GraphState(events, lambda name, done: done(self.configurations[name]))
+        self.state = GraphState(lambda work: work())
         self.state.on_change(self._count)
-        for number in range(max(1, endpoints // PER_NODE)):
-            name = f"/robot/node_{number}"
-            self.configurations[name] = configuration(name, number)
-            self.sequences[name] = 0
-            self.wire.send(self.message(Joined, name, state="inactive", checksum="0"))
+        self.names = [f"/robot/node_{number}" for number in range(max(1, endpoints // PER_NODE))]
+        for number, name in enumerate(self.names):
+            self.state.put_configuration(configuration(name, number))
         assert sum(len(each.endpoints) for each in self.state.nodes()) == endpoints
-
-    def message(self, type_: type[GraphMessage], name: str, **fields: object) -> bytes:
-        """Return the next message of a node."""
-        self.sequences[name] += type_ is not Heartbeat
-        header = {"node": name, "incarnation": "1", "sequence": self.sequences[name]}
-        return encode(type_(**header, **fields))  # type: ignore[arg-type]
 
     def _count(self, _: object) -> None:
         self.told += 1
@@ -121,58 +97,43 @@ def configuration(name: str, number: int) -> NodeConfiguration:
     )
 
 
-def change_state(system: System, name: str, turn: int) -> bytes:
-    state = ("active", "inactive")[turn // len(system.sequences) % 2]
-    return system.message(StateChanged, name, state=state, connected=True)
+def change_state(system: System, name: str, turn: int) -> None:
+    state = ("active", "inactive")[turn // len(system.names) % 2]
+    status = NodeStatus(node=name, instance="1", state=state, connected=True)
+    system.state.put_status(decode(encode(status)))
 
 
-def change_mapping(system: System, name: str, turn: int) -> bytes:
-    return system.message(MappingEstablished, name, endpoint="publishers/e0", matched=turn + 1)
-
-
-def change_configuration(system: System, name: str, turn: int) -> bytes:
-    """One endpoint more, or one less: the node is read again."""
-    before = system.configurations[name]
+def change_configuration(system: System, name: str, turn: int) -> None:
+    """One endpoint more, or one less."""
+    before = system.state.node(name)
+    assert before is not None
+    assert before.configuration is not None
     one_more = len(before.endpoints) == PER_NODE
     extra = dataclasses.replace(before.endpoints[0], name="extra", resolved="/extra")
-    system.configurations[name] = dataclasses.replace(
-        before,
-        endpoints=(*before.endpoints, extra) if one_more else before.endpoints[:PER_NODE],
-        checksum=str(turn + 1),
-    )
-    return system.message(ConfigurationChanged, name, checksum=str(turn + 1))
-
-
-def heartbeat(system: System, name: str, _: int) -> bytes:
-    held = system.state.node(name)
-    assert held is not None
-    assert held.configuration is not None
-    return system.message(
-        Heartbeat,
-        name,
-        state=held.state,
-        connected=held.connected,
-        checksum=held.configuration.checksum,
+    system.state.learn(
+        dataclasses.replace(
+            before.configuration,
+            endpoints=(*before.endpoints, extra) if one_more else before.endpoints[:PER_NODE],
+            checksum=str(turn + 1),
+        )
     )
 
 
-def measure(system: System, make: Callable[[System, str, int], bytes], *, tells: bool) -> float:
+def measure(system: System, make: Callable[[System, str, int], None]) -> float:
     """Return the median microseconds of one change; nodes take turns."""
-    names = list(system.sequences)
     before, took_us = system.told, []
     for turn in range(CHANGES):
-        message = make(system, names[turn % len(names)], turn)
         began = time.perf_counter()
-        system.wire.send(message)
+        make(system, system.names[turn % len(system.names)], turn)
         took_us.append((time.perf_counter() - began) * 1e6)
-    assert system.told - before == (CHANGES if tells else 0), "a change was not told"
+    assert system.told - before == CHANGES, "a change was not told"
     return statistics.median(took_us)
 
 
 def measure_query(system: System) -> float:
     took_us = []
     for number in range(CHANGES):
-        topic = f"/topic_{number % len(system.sequences)}_0"
+        topic = f"/topic_{number % len(system.names)}_0"
         began = time.perf_counter()
         found = system.state.publishers_of(topic)
         took_us.append((time.perf_counter() - began) * 1e6)
@@ -181,10 +142,8 @@ def measure_query(system: System) -> float:
 
 
 MEASURED: dict[str, Callable[[System], float]] = {
-    "state changed": functools.partial(measure, make=change_state, tells=True),
-    "mapping established": functools.partial(measure, make=change_mapping, tells=True),
-    "endpoint added or removed": functools.partial(measure, make=change_configuration, tells=True),
-    "heartbeat, nothing new": functools.partial(measure, make=heartbeat, tells=False),
+    "state changed": functools.partial(measure, make=change_state),
+    "endpoint added or removed": functools.partial(measure, make=change_configuration),
     "who publishes a topic?": measure_query,
 }
 
@@ -225,9 +184,8 @@ class Supervised:
         seen = perfect(plan, Stage.ACTIVE)
         self.shown: Any = Shown(seen)
         self._configurations = seen.configurations
-        scheduler = ManualScheduler()
-        events = GraphEvents(Network(scheduler).transport(), scheduler)
-        self._graph = Observer(self.shown, None, events)  # type: ignore[arg-type]
+        loop = GraphLoop(own_thread=False)
+        self._graph = Observer(self.shown, None, loop)  # type: ignore[arg-type]
         self.changes = 0
         world = World(plan, folder)
         counter = ChangeCounter(world.system, self)

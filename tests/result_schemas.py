@@ -20,6 +20,7 @@ import msgspec
 from lifecycle.cli.verbs.apply import ApplyReport
 from lifecycle.cli.verbs.check import CheckReport
 from lifecycle.export.picture.model import Picture
+from lifecycle.graph.status import NodeStatus
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.run.journal import JournalLine
 from lifecycle.verify.observation import NodeConfiguration
@@ -28,7 +29,6 @@ from lifecycle.verify.verdict import Verdict
 FOLDER = Path(__file__).parents[1] / "schemas"
 BY_HAND = {
     "manifest": "it is what users write; the types are made from it",
-    "graph_message": "version and kind stand beside the fields of each message",
 }
 
 _Schema = dict[str, Any]
@@ -88,6 +88,17 @@ RESULTS = {
     "node_configuration": Result(
         type_=NodeConfiguration, title="Configuration of one node (~/get_configuration)"
     ),
+    "node_status": Result(
+        type_=NodeStatus,
+        title="What a node says of itself to the graph (/lifecycle/graph)",
+        always={
+            "NodeStatus": (
+                *("version", "state", "connected", "checksum", "connections", "mappings"),
+                *("left", "reason"),
+            ),
+            "MappingStatus": ("connection", "matched"),
+        },
+    ),
     "plan": Result(
         type_=Plan,
         title="Plan of one system (lifecycle plan --format json)",
@@ -126,12 +137,14 @@ def generate(name: str) -> str:
 
 
 def _types(hint: Any) -> Iterator[type]:
-    """Yield the dataclasses and enums that a type is made of, itself among them."""
+    """Yield the structs, dataclasses and enums that a type is made of, itself among them."""
     for each in get_args(hint):
         yield from _types(each)
     if isinstance(hint, type) and issubclass(hint, enum.Enum):
         yield hint
-    elif isinstance(hint, type) and dataclasses.is_dataclass(hint):
+    elif isinstance(hint, type) and (
+        dataclasses.is_dataclass(hint) or issubclass(hint, msgspec.Struct)
+    ):
         yield hint
         for each in get_type_hints(hint).values():
             yield from _types(each)

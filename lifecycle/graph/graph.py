@@ -1,7 +1,7 @@
 """The ROS graph on real DDS: the three layers of the graph interface put together.
 
 Owns: `Graph`, for programs that follow a ROS graph and for the supervisor that judges one. Both
-have the same state: fed by graph messages, by the configurations that nodes serve or that are put
+have the same state: fed by node statuses, by the configurations that nodes serve or that are put
 there, and by discovery. It sleeps until one of them has something new.
 """
 
@@ -15,11 +15,11 @@ from collections.abc import Callable
 
 from rclpy.node import Node
 
-from lifecycle.graph.events import SILENT_AFTER_S, GraphEvents
+from lifecycle.graph.events import GraphEvents
+from lifecycle.graph.loop import GraphLoop
 from lifecycle.graph.observer import BURST_S, QUIET_S, Observer
-from lifecycle.graph.scheduler import LoopScheduler, ThreadScheduler
+from lifecycle.graph.reporter import receive
 from lifecycle.graph.state import GraphState
-from lifecycle.graph.transport import DdsTransport, GraphTransport
 from lifecycle.middleware.rcl.graph import GraphObserver
 from lifecycle.middleware.services.clients import NodeClients
 from lifecycle.plan.model import ParticipantConnections, Plan
@@ -29,7 +29,7 @@ from lifecycle.verify.verdict import Stage, Verdict
 
 
 @typing.final
-class Graph:
+class Graph(Observer):
     """A ROS graph as it is now, and what happens in it.
 
     Use `open` in a program that has no node, `on` in one that has. Callbacks come in a thread of
@@ -37,82 +37,65 @@ class Graph:
     and judges the graph rather than following it, use `in_loop`. `close` it, or use it in a `with`.
 
     Attributes:
-        transport: layer 1, for who wants to send.
         events: layer 2.
-        state: layer 3.
-        discovery: what discovery shows.
-        clients: of nodes' services; to be used in the graph's loop.
     """
 
     def __init__(
         self,
         discovery: GraphObserver,
-        scheduler: LoopScheduler | ThreadScheduler,
         *,
+        in_loop: bool = False,
         messages: bool = True,
-        silent_after_s: float = SILENT_AFTER_S,
         quiet_s: float = QUIET_S,
         burst_s: float = BURST_S,
         unplanned: bool = False,
     ) -> None:
         """Put the layers together; with a thread of its own the graph also follows every node."""
-        self.scheduler = scheduler
-        self.transport: GraphTransport = DdsTransport(discovery.node)
-        self.discovery = discovery
-        self.clients = NodeClients(discovery)
-        self.events = GraphEvents(
-            self.transport if messages else None, scheduler, silent_after_s=silent_after_s
-        )
-        self._observer = Observer(
+        super().__init__(
             discovery,
-            self.clients,
-            self.events,
+            NodeClients(discovery),
+            GraphLoop(own_thread=not in_loop),
             quiet_s=quiet_s,
             burst_s=burst_s,
             unplanned=unplanned,
-            follows=isinstance(scheduler, ThreadScheduler),
         )
-        self.state = self._observer.state
+        self.events = GraphEvents(self.state)
+        self._stop_receiving: Callable[[], None] | None = None
+        if messages:
+            self._stop_receiving = receive(discovery.node, self.state.put_status)
         self._closed = False
 
     @classmethod
     def open(
-        cls,
-        domain_id: int | None = None,
-        *,
-        connections: ParticipantConnections | None = None,
-        silent_after_s: float = SILENT_AFTER_S,
+        cls, domain_id: int | None = None, *, connections: ParticipantConnections | None = None
     ) -> Graph:
         """Follow the graph of a domain with a participant of its own.
 
         Args:
             domain_id: 0–232; None: ROS_DOMAIN_ID, else 0.
             connections: how the participant is connected; None leaves it to the RMW.
-            silent_after_s: see `GraphEvents`.
 
         Raises:
             MiddlewareError: no participant could be made.
         """
         if domain_id is None:
             domain_id = int(os.environ.get("ROS_DOMAIN_ID") or 0)
-        discovery = GraphObserver(domain_id, connections)
-        return cls(discovery, ThreadScheduler(), silent_after_s=silent_after_s)
+        return cls(GraphObserver(domain_id, connections))
 
     @classmethod
-    def on(cls, node: Node, *, silent_after_s: float = SILENT_AFTER_S) -> Graph:
+    def on(cls, node: Node) -> Graph:
         """Follow the graph with a node that is there and that an executor spins.
 
-        Nothing is spun here: messages and answers come while the node's executor runs. Close the
+        Nothing is spun here: statuses and answers come while the node's executor runs. Close the
         graph before the node is destroyed.
 
         Args:
             node: any rclpy node, a LifecycleNode for instance.
-            silent_after_s: see `GraphEvents`.
 
         Raises:
             MiddlewareError: rcl's graph guard condition could not be waited on.
         """
-        return cls(GraphObserver.on(node), ThreadScheduler(), silent_after_s=silent_after_s)
+        return cls(GraphObserver.on(node))
 
     @classmethod
     def in_loop(
@@ -133,7 +116,7 @@ class Graph:
         Args:
             domain_id: 0–232.
             connections: how the participant is connected; None leaves it to the RMW.
-            messages: receive what nodes report about themselves; a change is worth another look.
+            messages: receive what nodes say of themselves; a change is worth another look.
             unplanned: also ask nodes that are not planned, as far as they have our node interface.
             quiet_s: a burst of changes is over when nothing changed for so long, ≥ 0.
             burst_s: a burst is cut off after so long, ≥ quiet_s.
@@ -143,7 +126,7 @@ class Graph:
         """
         return cls(
             GraphObserver(domain_id, connections),
-            LoopScheduler(),
+            in_loop=True,
             messages=messages,
             quiet_s=quiet_s,
             burst_s=burst_s,
@@ -160,9 +143,9 @@ class Graph:
         until discovery is complete, up to 3.5 s. Not to be called in a callback, nor with
         `in_loop`: there, `observe`.
         """
-        if isinstance(self.scheduler, LoopScheduler):
+        if not self._loop.has_thread:
             raise TypeError("cannot wait for an observation in its own loop; await observe(plan)")
-        return asyncio.run_coroutine_threadsafe(self.observe(plan), self.scheduler.loop).result()
+        return asyncio.run_coroutine_threadsafe(self.observe(plan), self._loop.bind()).result()
 
     def verdict(self, plan: Plan, *, stage: Stage = Stage.ACTIVE) -> Verdict:
         """Return whether what runs now is what `plan` says, by the rules of `lifecycle verify`.
@@ -172,39 +155,6 @@ class Graph:
             stage: ACTIVE, or CONNECTED before anything is activated.
         """
         return verify(plan, self.observation(plan), stage=stage)
-
-    async def observe(self, plan: Plan) -> Observation:
-        """Return what `observation` returns; in the graph's loop.
-
-        Raises:
-            MiddlewareError: the graph can no longer be watched.
-        """
-        return await self._observer.observe(plan)
-
-    def expect_newcomers(self, *, everybody: bool = False) -> bool:
-        """Have the next `observe` wait for who came lately; return whether there may be anybody.
-
-        Args:
-            everybody: this process did not run for a while, and anybody may have come.
-        """
-        return self._observer.expect_newcomers(everybody=everybody)
-
-    def reread_parameters(self) -> bool:
-        """Have the next `observe` read all parameters again; return whether it reads any."""
-        return self._observer.reread_parameters()
-
-    def drop_configuration(self, node: str) -> None:
-        """Forget what a node said of itself whose process ended, on /diagnostics too."""
-        self._observer.drop_configuration(node)
-
-    @property
-    def changes(self) -> int:
-        """Changes so far, each counted at once: before its burst has passed (`wait_change`)."""
-        return self._observer.changes
-
-    async def wait_change(self) -> None:
-        """Wait until a burst of changes has passed, if any came since the last observation."""
-        await self._observer.wait_change()
 
     # -- following
 
@@ -221,7 +171,7 @@ class Graph:
 
         remove = self.state.on_change(look)
         try:
-            self.scheduler.post(look)
+            self._loop.post(look)
             return found.wait(timeout_s)
         finally:
             remove()
@@ -231,11 +181,11 @@ class Graph:
         if self._closed:
             return
         self._closed = True
-        self.events.close()
-        if isinstance(self.scheduler, ThreadScheduler):
-            self.scheduler.close()
-        self._observer.close()
-        self.transport.close()
+        self.state.close()
+        self._loop.close()
+        super().close()
+        if self._stop_receiving is not None:
+            self._stop_receiving()
         self.clients.destroy()
         self.discovery.destroy()
 

@@ -1,34 +1,28 @@
-"""Updates the graph's state from discovery, nodes' services and parameters.
+"""Brings the state of a graph up to date from discovery, nodes' services and statuses.
 
 Owns: what is asked of which node, and when, and whose answers count; which of discovery's nodes are
-members of the graph, and what counts as the configuration of one that serves none; what
-/diagnostics says of nodes; when a change is worth another look.
-It looks when it is asked to, and when something happened.
+members of the graph, and what counts as the configuration of one that serves none; when a change is
+worth another look. It looks when it is asked to, and when something happened.
 """
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import functools
 import logging
-import threading
-import time
-import typing
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Awaitable, Collection, Coroutine, Iterable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError
-from lifecycle.graph.events import GraphEvents
-from lifecycle.graph.messages import GraphMessage, Heartbeat
+from lifecycle.graph.diagnostics import DiagnosticReadings
+from lifecycle.graph.loop import GraphLoop, set_within
+from lifecycle.graph.model import GraphChange
 from lifecycle.graph.parameters import ParameterReadings
-from lifecycle.graph.scheduler import Remove, set_within
 from lifecycle.graph.state import Answer, GraphState, Look
+from lifecycle.graph.status import NodeStatus
 from lifecycle.plan.model import Plan
 from lifecycle.verify.observation import (
     EndpointReport,
-    HealthReport,
     Identity,
     NodeConfiguration,
     Observation,
@@ -39,7 +33,6 @@ from lifecycle.verify.tool_filter import (
     DeclaredNames,
     is_noise_node,
     known_node,
-    matches,
     tolerating_pattern,
 )
 
@@ -49,8 +42,13 @@ if TYPE_CHECKING:  # it imports rclpy
 
 _logger = logging.getLogger(__name__)
 
+_T = TypeVar("_T")
+
 QUIET_S = 0.02
 BURST_S = 0.1
+
+FORGET_AFTER_S = 600.0
+"""A node that was silent for so long has left."""
 
 _ASK_S = 1.0
 """A node that answers at all answers within milliseconds."""
@@ -58,142 +56,39 @@ _ASK_S = 1.0
 _READ_S = 3.0
 """No caller waits for a reading, and a node that has just begun may still be on its way."""
 
+_FAREWELL_S = 1.0
+"""A node that reports itself says that it leaves, and discovery may show it first."""
+
+_AGAIN_S = 2.0
+"""What could not be read is read again after so long."""
+
 _TOGETHER_S = 0.05
 """Changes of discovery come in bursts; who follows them looks once for all within so long."""
 
-
-Diagnostic = tuple[str, int, str]
-"""Name, level and message of a diagnostic_msgs/DiagnosticStatus."""
-
-
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class _Shown:
-    """A node that sends no messages, as discovery shows it.
-
-    Attributes:
-        serves: it has the node configuration interface.
-        beside: what its hidden participants have: it knows what they mean.
-    """
-
-    managed: bool
-    serves: bool
-    endpoints: tuple[ObservedEndpoint, ...]
-    beside: tuple[tuple[str, tuple[ObservedEndpoint, ...]], ...]
+_Seen = tuple[NodeStatus | None, ObservedNode | None, bool, tuple[ObservedEndpoint, ...]]
+"""What a node says of itself; or, of one that says nothing, what discovery shows: whether it serves
+its configuration, its endpoints and those of its hidden participants: it knows what they mean."""
 
 
-_OF_WARN, _OF_ERROR, _OF_STALE = 1, 2, 3
-"""Levels of that."""
-
-STALE_S = 5.0
-"""An entry that was not published for so long says nothing any more, as diagnostic_aggregator has
-it by default."""
-
-_LONGEST_MESSAGE = 200
-_MOST_ENTRIES = 1000
-
-
-class DiagnosticReadings:
-    """What /diagnostics says of some nodes.
-
-    Args:
-        clients: where it is subscribed to, once there is such a node.
-        wake: called, in any thread, when it says something else.
-        clock: seconds.
-    """
-
-    def __init__(
-        self,
-        clients: NodeClients,
-        wake: Callable[[], None],
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._clients = clients
-        self._wake = wake
-        self._clock = clock
-        self._lock = threading.Lock()
-        self._patterns: dict[str, tuple[str, ...]] = {}
-        self._entries: dict[str, tuple[int, str, float]] = {}
-        self._said: dict[str, HealthReport] = {}
-
-    def listen(self, patterns: Mapping[str, tuple[str, ...]]) -> None:
-        """Follow the entries of nodes from now on.
-
-        Args:
-            patterns: of the names of their entries, by full node name.
-        """
-        with self._lock:
-            # Looks at a part of the system go on beside those at all of it.
-            self._patterns.update(patterns)
-        if patterns:
-            self._clients.on_diagnostics(self._arrived)
-
-    def forget(self, node: str) -> None:
-        """Forget what was said of a node: what comes in its place has said nothing yet."""
-        with self._lock:
-            patterns = self._patterns.get(node, ())
-            for name in [one for one in self._entries if any(matches(one, p) for p in patterns)]:
-                del self._entries[name]
-
-    def reports(self) -> dict[str, HealthReport]:
-        """Return what is known now, by full node name."""
-        with self._lock:
-            self._said = self._reports()
-            return self._said
-
-    def _arrived(self, entries: Sequence[Diagnostic]) -> None:
-        with self._lock:
-            wanted = {each for patterns in self._patterns.values() for each in patterns}
-            for name, level, message in entries:
-                known = name in self._entries or len(self._entries) < _MOST_ENTRIES
-                if known and any(matches(name, each) for each in wanted):
-                    self._entries[name] = level, message[:_LONGEST_MESSAGE], self._clock()
-            changed = self._reports() != self._said
-        if changed:
-            self._wake()
-
-    def _reports(self) -> dict[str, HealthReport]:
-        found = {node: self._report(patterns) for node, patterns in self._patterns.items()}
-        return {node: each for node, each in found.items() if each is not None}
-
-    def _report(self, patterns: tuple[str, ...]) -> HealthReport | None:
-        wrong, unknown, ok = [], [], False
-        for name, (level, message, at_s) in sorted(self._entries.items()):
-            if not any(matches(name, each) for each in patterns):
-                continue
-            said = f": {message}" if message else ""
-            if self._clock() - at_s > STALE_S:
-                unknown.append(f"{name!r} was not published for {STALE_S:g} s")
-            elif level == _OF_STALE:
-                unknown.append(f"{name!r} is stale{said}")
-            elif level == _OF_ERROR:
-                wrong.append(f"{name!r}{said or ' has level ERROR'}")
-            elif level > _OF_WARN:
-                unknown.append(f"{name!r} has level {level}, which has no meaning{said}")
-            else:
-                ok = True
-        if wrong or unknown:
-            said = "; ".join(wrong or unknown)[:_LONGEST_MESSAGE]
-            return HealthReport(ok=False if wrong else None, message=said)
-        return HealthReport(ok=True) if ok else None
-
-
-@typing.final
 class Observer:
     """Brings the state of one graph up to date.
+
+    Where its loop has a thread of its own it reads every node whenever it changes, as programs want
+    it that ask the state; else nodes are asked by `observe` only, as who judges wants it.
 
     Args:
         discovery: what is there.
         clients: services of nodes.
-        events: layer 2; `state` is kept on it, and its scheduler is where everything runs.
+        loop: where everything runs.
         quiet_s: a burst of changes is over when nothing changed for so long, ≥ 0.
         burst_s: a burst is cut off after so long, ≥ quiet_s.
         unplanned: `observe` also asks nodes that are not planned, as far as they have our node
             interface.
-        follows: read every node whenever it changes, as programs want it that ask the state;
-            else nodes are asked by `observe` only, as who judges wants it.
 
     Attributes:
         state: layer 3.
+        discovery: what discovery shows.
+        clients: of nodes' services; to be used in the loop.
         changes: changes so far, each counted at once: before its burst has passed (`wait_change`).
     """
 
@@ -201,47 +96,39 @@ class Observer:
         self,
         discovery: GraphObserver,
         clients: NodeClients,
-        events: GraphEvents,
+        loop: GraphLoop,
         *,
         quiet_s: float = QUIET_S,
         burst_s: float = BURST_S,
         unplanned: bool = False,
-        follows: bool = False,
     ) -> None:
         self.changes = 0
-        self._discovery = discovery
-        self._clients = clients
-        self._events = events
+        self.state = GraphState(loop.post)
+        self.discovery = discovery
+        self.clients = clients
+        self._loop = loop
         self._quiet_s = quiet_s
         self._burst_s = burst_s
         self._unplanned = unplanned
-        self._follows = follows
-        self._seen: frozenset[str] = frozenset()
+        self._follows = loop.has_thread
+        self._present: frozenset[str] = frozenset()
         self._asked: set[str] = set()
-        self._checksums: dict[str, str] = {}
-        self._shown: dict[str, _Shown] = {}
-        self._readings: set[asyncio.Task[None]] = set()
-        self._parameters = ParameterReadings(clients, self._wake)
+        self._answered: dict[str, NodeConfiguration] = {}
+        self._read_as: dict[str, _Seen] = {}
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._parameters = ParameterReadings(clients, loop, self._wake)
         self._diagnostics = DiagnosticReadings(clients, self._wake)
         self._changed = asyncio.Event()
         self._changed.set()  # nothing was looked at yet
         self._to_note = False
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self._due: Remove | None = None
-        self._closed = False
-        # The scheduler may be another thread's, and asks for the first node at once.
-        self.state = GraphState(events, self._read)
-        events.on_message(self._message_received)
-        self._remove = discovery.on_change(self._discovery_changed)
-        if follows:
-            events.scheduler.post(self._follow)
+        self._is_used = False
+        self._to_follow = asyncio.Event()
+        self.state.on_change(self._state_changed)
+        self._remove = discovery.on_change(self._wake)
+        if self._follows:
+            loop.post(lambda: self._start(self._follow()))
 
     # -- one observation
-
-    def drop_configuration(self, node: str) -> None:
-        """Forget what a node said of itself whose process ended."""
-        self.state.drop_configuration(node)
-        self._diagnostics.forget(node)
 
     async def observe(self, plan: Plan) -> Observation:
         """Return what is there now, as the state has it then.
@@ -261,14 +148,14 @@ class Observer:
         names = DeclaredNames.of(plan)
         while True:
             self._changed.clear()
-            nodes, endpoints = self._discovery.snapshot(declared=planned, names=names)
-            settling_s = self._discovery.settling_s()
+            nodes, endpoints = self.discovery.snapshot(declared=planned, names=names)
+            settling_s = self.discovery.settling_s()
             if settling_s <= 0:
                 break
             # To look costs more than the moment in which the rest of a burst comes.
             if await set_within(self._changed, settling_s):
                 await asyncio.sleep(min(self._quiet_s, settling_s))
-        self._show(nodes, endpoints)
+        self._show(nodes)
         given = self.state.given
         judged = {
             node.full_name: None
@@ -276,7 +163,7 @@ class Observer:
             else frozenset(each.name for each in node.expected_parameters)
             for node in plan.nodes
             if (node.expected_parameters or node.has_all_parameters)
-            and node.full_name in self._seen - given.keys()
+            and node.full_name in self._present - given.keys()
         }
         self._parameters.listen(judged)
         self._diagnostics.listen(
@@ -287,12 +174,15 @@ class Observer:
             }
         )
         answers = self._believed(plan, await self._ask_all(plan, nodes, planned, given))
-        asked = {name: configuration for name, (_, configuration) in answers.items()}
-        self._checksums = {name: each.checksum for name, each in asked.items() if each is not None}
+        self._answered = {
+            name: configuration
+            for name, (_, configuration) in answers.items()
+            if configuration is not None
+        }
         reporting = {
             name
-            for name, each in {**self.state.given, **asked}.items()
-            if each is not None and each.parameters is not None
+            for name, each in {**self.state.given, **self._answered}.items()
+            if each.parameters is not None
         }
         if await self._parameters.follow(sorted(judged.keys() - reporting), reporting=reporting):
             return await self.observe(plan)  # each node is waited for once
@@ -305,21 +195,22 @@ class Observer:
                 health=self._diagnostics.reports(),
             )
         )
-        if not self._follows:
-            # Else readings bring it, which put messages that come meanwhile on top of the answer.
-            for configuration in asked.values():
-                if configuration is not None:
-                    self.state.learn(configuration)
+        for each in self._answered.values():
+            self.state.learn(each)
         return self.state.observation()
+
+    def drop_configuration(self, node: str) -> None:
+        """Forget what a node said of itself whose process ended."""
+        self.state.drop_configuration(node)
+        self._diagnostics.forget(node)
 
     def expect_newcomers(self, *, everybody: bool = False) -> bool:
         """Have the next `observe` wait for who came lately; return whether there may be anybody.
 
         Args:
-            everybody: wait also for what those have to say that are known: this process did not
-                run for a while.
+            everybody: this process did not run for a while, and anybody may have come.
         """
-        return self._discovery.expect_newcomers(everybody=everybody)
+        return self.discovery.expect_newcomers(everybody=everybody)
 
     def reread_parameters(self) -> bool:
         """Have the next `observe` read all parameters again; return whether it reads any."""
@@ -328,7 +219,7 @@ class Observer:
     async def wait_change(self) -> None:
         """Wait until a burst of changes has passed, if any came since this or `observe` was called.
 
-        Discovery, a transition or a parameter of a node that is asked, or a message of one that
+        Discovery, a transition or a parameter of a node that is asked, or a status of one that
         changed makes a change; a configuration that is put into the state makes none.
         """
         loop = self._bind()
@@ -344,12 +235,17 @@ class Observer:
 
     def close(self) -> None:
         """Look no more; again is harmless."""
-        self._closed = True
         self._remove()
         self.state.close()
-        if self._due is not None:
-            self._due()
         self._parameters.close()
+        for each in self._tasks:
+            each.cancel()
+
+    def _bind(self) -> asyncio.AbstractEventLoop:
+        self._is_used = True
+        return self._loop.bind()
+
+    # -- asking
 
     async def _ask_all(
         self,
@@ -358,28 +254,19 @@ class Observer:
         planned: Collection[str],
         given: Collection[str],
     ) -> dict[str, Answer]:
-        answers = dict(
-            await asyncio.gather(
-                *(
-                    self._ask(node)
-                    for node in nodes
-                    if node.full_name in planned and node.full_name not in given
-                )
-            )
-        )
-        if self._unplanned:
-            answers.update(
-                await asyncio.gather(
-                    *(
-                        self._ask_unplanned(node)
-                        for node in nodes
-                        if node.managed
-                        and node.full_name not in planned
-                        and not tolerating_pattern(node.full_name, plan.policy.tolerated_nodes)
-                    )
-                )
-            )
-        return answers
+        asking = []
+        for node in nodes:
+            name = node.full_name
+            if name in planned:
+                if name not in given:
+                    asking.append(self._ask(node))
+            elif (
+                self._unplanned
+                and node.managed
+                and not tolerating_pattern(name, plan.policy.tolerated_nodes)
+            ):
+                asking.append(self._ask_unplanned(name))
+        return dict(await asyncio.gather(*asking))
 
     def _believed(self, plan: Plan, answers: Mapping[str, Answer]) -> dict[str, Answer]:
         """Leave out what nodes say of themselves that are in no host of ours.
@@ -387,7 +274,7 @@ class Observer:
         On this machine a host shows that it is one. Of another machine's nodes those count that the
         plan has in a host: its supervisor started them there.
         """
-        here = self._discovery.hosted(
+        here = self.discovery.hosted(
             name for name, (_, configuration) in answers.items() if configuration is not None
         )
         elsewhere = {each.full_name: bool(each.run.python) for each in plan.nodes}
@@ -407,8 +294,7 @@ class Observer:
         )
         return name, (state, configuration)
 
-    async def _ask_unplanned(self, node: ObservedNode) -> tuple[str, Answer]:
-        name = node.full_name
+    async def _ask_unplanned(self, name: str) -> tuple[str, Answer]:
         configuration = await self._ask_configuration(name)
         if configuration is None:
             return name, (None, None)
@@ -416,183 +302,177 @@ class Observer:
         self._follow_transitions(name)
         return name, (configuration.state, configuration)
 
-    async def _ask_state(self, name: str) -> str | None:
-        try:
-            return await self._clients.get_state(name, timeout_s=_ASK_S)
-        except MiddlewareError as error:
-            _logger.info("state of %s unknown: %s", name, error)
-            return None
+    async def _ask_state(self, name: str, timeout_s: float = _ASK_S) -> str | None:
+        return await _answer("state", name, self.clients.get_state(name, timeout_s=timeout_s))
 
     async def _ask_configuration(
         self, name: str, *, timeout_s: float = _ASK_S, expected: bool = False
     ) -> NodeConfiguration | None:
-        try:
-            return await self._clients.get_configuration(
-                name, timeout_s=timeout_s, expected=expected
-            )
-        except MiddlewareError as error:
-            _logger.info("configuration of %s unknown: %s", name, error)
-            return None
+        asking = self.clients.get_configuration(name, timeout_s=timeout_s, expected=expected)
+        return await _answer("configuration", name, asking)
 
     def _follow_transitions(self, name: str) -> None:
-        self._clients.on_transition(name, functools.partial(self._moved, name))
+        self.clients.on_transition(name, functools.partial(self._moved, name))
 
     # -- what happened, from any thread
 
-    def _discovery_changed(self) -> None:
-        self._wake()
-        if self._follows:
-            self._events.scheduler.post(self._follow_soon)
-
     def _moved(self, name: str) -> None:
-        if self._loop is not None:
-            with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
-                self._loop.call_soon_threadsafe(self._parameters.reread, name)
+        self._loop.post(functools.partial(self._parameters.reread, name))
+        self._read_as.pop(name, None)
         self._wake()
-        if self._follows:
-            self.state.reread(name)
 
     def _wake(self) -> None:
-        # Before the first use there is no loop, and no waiter. What is to be noted is noted later
-        # than this, so that it is noted once.
-        if self._loop is not None and not self._to_note:
+        # Before the first use there is no waiter. What is to be noted is noted later than this, so
+        # that it is noted once.
+        if self._is_used and not self._to_note:
             self._to_note = True
-            with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
-                self._loop.call_soon_threadsafe(self._note)
+            self._loop.post(self._note)
 
-    # -- what happens in the scheduler
+    # -- what happens in the loop
 
     def _note(self) -> None:
         self._to_note = False
         self.changes += 1
         self._changed.set()
+        self._to_follow.set()
 
-    def _message_received(self, message: GraphMessage) -> None:
-        """Take it as a change, unless it reports only what is known of its node.
+    def _state_changed(self, change: GraphChange) -> None:
+        """Look again at a node that says something else of itself.
 
-        A node whose configuration is put into the state reports its changes that way; a heartbeat
-        is one if its checksum is new.
+        One whose configuration is put into the state reports its changes that way, and what was
+        answered already is no change.
         """
-        name = message.node
-        checksum = message.checksum if isinstance(message, Heartbeat) else ""
-        known = checksum and self._checksums.get(name) == checksum
-        if self._loop is not None and not known and name not in self.state.given:
-            self._note()
-
-    def _follow_soon(self) -> None:
-        if self._due is None and not self._closed:
-            scheduler = self._events.scheduler
-            self._due = scheduler.call_at(scheduler.now_s() + _TOGETHER_S, self._follow)
-            self.state.retry()
-
-    def _follow(self) -> None:
-        """Compare who is there with who was."""
-        self._due = None
-        if not self._closed:
-            self._show(*self._discovery.snapshot())
-
-    def _show(self, nodes: Collection[ObservedNode], endpoints: Iterable[ObservedEndpoint]) -> None:
-        """Have nodes join that discovery shows, and forget those that it shows no more."""
-        present = frozenset(node.full_name for node in nodes)
-        for name in sorted(self._seen - present):
-            self._forget(name)
-        for name in sorted(present - self._seen):
-            if _counts(name) and not self._events.reports(name):
-                self._events.report_seen(name)
-        self._seen = present
-        given = self.state.given
-        silent: list[ObservedNode] = []
-        for node in nodes:
-            name = node.full_name
-            if name in given or not _counts(name) or self._events.reports(name):
-                self._shown.pop(name, None)
-            else:
-                silent.append(node)
-        if not silent:
+        name, after = change.node, change.after
+        if after is not None and after.silent:
+            self._loop.bind().call_later(FORGET_AFTER_S, self.state.forget, after)
+        if not change.status_changed or name in self.state.given:
             return
-        by_node: dict[str, list[ObservedEndpoint]] = {}
-        for endpoint in endpoints:
-            by_node.setdefault(endpoint.node, []).append(endpoint)
-        hidden = sorted(name for name in present if name.rpartition("/")[2].startswith("_"))
-        for node in silent:
-            name = node.full_name
-            space, _, base = name.rpartition("/")
-            own = f"{space}/_{base}_"
-            shown = _Shown(
-                managed=bool(node.managed),
-                serves=self._follows and self._discovery.offers(name, f"{name}/get_configuration"),
-                endpoints=tuple(by_node.get(name, ())),
-                beside=tuple(
-                    (each, tuple(by_node.get(each, ()))) for each in hidden if each.startswith(own)
-                ),
-            )
-            if self._shown.get(name) != shown:
-                self._shown[name] = shown
-                self.state.reread(name)
+        status = None if after is None else after.status
+        answer = self._answered.get(name)
+        if (
+            self._follows
+            or status is None
+            or answer is None
+            or (status.state, status.connected, status.checksum)
+            != (answer.state, answer.connected, answer.checksum)
+        ):
+            self._wake()
+
+    def _show(self, nodes: Iterable[ObservedNode]) -> None:
+        """Have nodes join that discovery shows, and forget those that it shows no more."""
+        before, self._present = self._present, frozenset(node.full_name for node in nodes)
+        for name in sorted(before - self._present):
+            self._forget(name)
+        for name in sorted(self._present - before):
+            if _counts(name):
+                self.state.show(name)
 
     def _forget(self, name: str) -> None:
         """Drop what is held for a node that was in the graph and is not any more."""
-        self._shown.pop(name, None)
+        self._read_as.pop(name, None)
         self._parameters.forget(name)
-        self.state.drop_configuration(name, "discovery does not show it any more")
+        view = self.state.node(name)
+        if view is None or view.status is None or name in self.state.given:
+            self._hide(name)
+        else:
+            self._loop.bind().call_later(_FAREWELL_S, self._hide, name)
         if name in self._asked:
             self._asked.discard(name)
-            self._clients.forget(name)
+            self.clients.forget(name)
 
-    # -- configurations for the state
+    def _hide(self, name: str) -> None:
+        if name not in self._present:
+            self.state.hide(name, "discovery does not show it any more")
 
-    def _read(self, name: str, done: Callable[[NodeConfiguration | None], None]) -> None:
-        """Give the configuration of a node: its own if it serves one, else what is seen of it."""
-        if not self._follows:
-            done(self.state.given.get(name) or self._seen_configuration(name, ""))
-        elif not self._closed:
-            reading = asyncio.ensure_future(self._answer(name, done))
-            self._readings.add(reading)
-            reading.add_done_callback(self._readings.discard)
+    # -- nodes that are followed
 
-    async def _answer(self, name: str, done: Callable[[NodeConfiguration | None], None]) -> None:
-        # Who sends messages serves one, even if the next look has yet to show it.
-        reports = self._events.reports(name)
-        shown = self._shown.get(name)
+    def _start(self, work: Coroutine[Any, Any, None]) -> None:
+        task = self._bind().create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _follow(self) -> None:
+        """Read each node that is not what it was when it was read last."""
+        while True:
+            self._to_follow.clear()
+            nodes, endpoints = self.discovery.snapshot()
+            self._show(nodes)
+            for name, seen in self._look_at(nodes, endpoints):
+                if self._read_as.get(name) != seen:
+                    self._read_as[name] = seen
+                    self._start(self._read(name, seen))
+            await self._to_follow.wait()
+            await asyncio.sleep(_TOGETHER_S)
+
+    def _look_at(
+        self, nodes: Iterable[ObservedNode], endpoints: Iterable[ObservedEndpoint]
+    ) -> Iterator[tuple[str, _Seen]]:
+        """Yield what is seen of each node whose configuration is not given."""
+        shown = {node.full_name: node for node in nodes}
+        by_node: dict[str, list[ObservedEndpoint]] = {}
+        for endpoint in endpoints:
+            by_node.setdefault(endpoint.node, []).append(endpoint)
+        for view in self.state.nodes():
+            name = view.name
+            if name in self.state.given:
+                continue
+            if view.status is not None:
+                yield name, (view.status, None, True, ())
+            elif name in shown:
+                space, _, base = name.rpartition("/")
+                beside = sorted(each for each in shown if each.startswith(f"{space}/_{base}_"))
+                owned = (each for owner in (name, *beside) for each in by_node.get(owner, ()))
+                serves = self.discovery.offers(name, f"{name}/get_configuration")
+                yield name, (None, shown[name], serves, tuple(owned))
+
+    async def _read(self, name: str, seen: _Seen) -> None:
+        """Hold what a node serves of itself, or else what is seen of it."""
+        _, node, serves, endpoints = seen
         self._asked.add(name)
-        if shown is not None and shown.managed:
+        if node is not None and node.managed:
             self._follow_transitions(name)
-        configuration = None
-        if reports or shown is None or shown.serves:
-            configuration = await self._ask_configuration(
-                name, timeout_s=_READ_S, expected=reports or shown is not None
-            )
-        elif shown.managed:
-            configuration = self._seen_configuration(name, await self._ask_state(name) or "")
+        configuration: NodeConfiguration | None
+        if serves:
+            configuration = await self._ask_configuration(name, timeout_s=_READ_S, expected=True)
         else:
-            configuration = self._seen_configuration(name, "")
-        done(configuration or self.state.given.get(name))
+            asks = node is not None and node.managed
+            state = await self._ask_state(name, _READ_S) if asks else ""
+            configuration = _seen_configuration(name, state or "", endpoints)
+        if self._read_as.get(name) != seen:
+            return  # it has changed meanwhile, and is read again
+        if configuration is not None:
+            self.state.learn(configuration)
+        else:
+            del self._read_as[name]
+            self._bind().call_later(_AGAIN_S, self._wake)
 
-    def _seen_configuration(self, name: str, state: str) -> NodeConfiguration | None:
-        shown = self._shown.get(name)
-        if shown is None:
-            return None
-        return NodeConfiguration(
-            identity=Identity(machine_id="", process_id=0, node_id=""),
-            name=name,
-            state=state,
-            connected=True,
-            rmw="",
-            transports=(),
-            serializations=(),
-            paradigms=(),
-            endpoints=tuple(
-                EndpointReport(
-                    kind=each.kind, name="", resolved=each.name, type=each.type, mapped=True
-                )
-                for each in shown.endpoints
-            ),
-        )
 
-    def _bind(self) -> asyncio.AbstractEventLoop:
-        if self._loop is None:
-            self._loop = asyncio.get_running_loop()
-        return self._loop
+def _seen_configuration(
+    name: str, state: str, endpoints: Iterable[ObservedEndpoint]
+) -> NodeConfiguration:
+    return NodeConfiguration(
+        identity=Identity(machine_id="", process_id=0, node_id=""),
+        name=name,
+        state=state,
+        connected=True,
+        rmw="",
+        transports=(),
+        serializations=(),
+        paradigms=(),
+        endpoints=tuple(
+            EndpointReport(kind=each.kind, name="", resolved=each.name, type=each.type, mapped=True)
+            for each in endpoints
+            if each.node == name
+        ),
+    )
+
+
+async def _answer(what: str, node: str, asking: Awaitable[_T]) -> _T | None:
+    try:
+        return await asking
+    except MiddlewareError as error:
+        _logger.info("%s of %s unknown: %s", what, node, error)
+        return None
 
 
 def _counts(name: str) -> bool:

@@ -8,16 +8,17 @@ undeclared, rclcpp need not publish any, and an event may pass before our subscr
 from __future__ import annotations
 
 import asyncio
+import functools
 import logging
-import threading
 from collections.abc import Callable, Collection, Mapping
 from typing import TYPE_CHECKING
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.graph.scheduler import set_within
+from lifecycle.graph.loop import set_within
 from lifecycle.verify.observation import SERVES_NONE, NodeParameters, ParameterReport
 
 if TYPE_CHECKING:  # it imports rclpy
+    from lifecycle.graph.loop import GraphLoop
     from lifecycle.middleware.services.clients import NodeClients
 
 _logger = logging.getLogger(__name__)
@@ -39,26 +40,25 @@ _BETWEEN_S = 0.02
 
 _NO_ANSWER = f"did not answer its parameter services within {ANSWER_S:g} s"
 
-
 Names = frozenset[str] | None
 """Of those parameters of a node that are read; None for all that it has."""
 
 
 class ParameterReadings:
-    """The parameters of some nodes, kept as they are. To be used in one asyncio loop.
+    """The parameters of some nodes, kept as they are. To be used in a graph's loop.
 
     Args:
         clients: where they are read.
-        wake: called, in any thread, when they are others than before.
+        loop: of the graph.
+        wake: called when they are others than before.
     """
 
-    def __init__(self, clients: NodeClients, wake: Callable[[], None]) -> None:
+    def __init__(self, clients: NodeClients, loop: GraphLoop, wake: Callable[[], None]) -> None:
         self._clients = clients
+        self._loop = loop
         self._wake = wake
         self._nodes: dict[str, _Node] = {}
-        self._lock = threading.Lock()
         self._named: dict[str, Names] = {}
-        self._loop: asyncio.AbstractEventLoop | None = None
 
     def listen(self, named: Mapping[str, Names]) -> None:
         """Take each change of a named parameter as a reason to look again.
@@ -66,12 +66,10 @@ class ParameterReadings:
         Args:
             named: by full node name; without any, nothing is subscribed to.
         """
-        with self._lock:
-            # Looks at a part of the system go on beside those at all of it.
-            self._named.update(named)
+        # Looks at a part of the system go on beside those at all of it.
+        self._named.update(named)
         if named:
-            self._loop = asyncio.get_running_loop()
-            self._clients.on_parameters(self._changed)
+            self._clients.on_parameters(self._arrived)
 
     async def follow(self, nodes: Collection[str], *, reporting: Collection[str]) -> bool:
         """Read the named parameters of nodes from now on.
@@ -123,25 +121,18 @@ class ParameterReadings:
         Returns:
             Whether any is read.
         """
-        nodes = [*self._nodes.values()] if node is None else [self._nodes.get(node)]
+        nodes = [each for name, each in self._nodes.items() if node in (None, name)]
         for each in nodes:
-            if each is not None:
-                each.reread()
-        return any(each is not None for each in nodes)
+            each.reread()
+        return bool(nodes)
 
-    def _changed(self, node: str, names: frozenset[str]) -> None:
-        # Any thread.
-        with self._lock:
-            named = self._named.get(node, frozenset())
-            concerned = named is None or not names.isdisjoint(named)
-        if not concerned or self._loop is None:
-            return
-        try:
-            self._loop.call_soon_threadsafe(self._read_again, node)
-        except RuntimeError:
-            return  # the loop was closed meanwhile
+    def _arrived(self, node: str, names: frozenset[str]) -> None:
+        # In a thread of DDS.
+        named = self._named.get(node, frozenset())
+        if named is None or not names.isdisjoint(named):
+            self._loop.post(functools.partial(self._changed, node))
 
-    def _read_again(self, node: str) -> None:
+    def _changed(self, node: str) -> None:
         known = self._nodes.get(node)
         if known is not None:
             known.due.set()
@@ -184,9 +175,7 @@ class _Node:
             self.first.set_result(None)
 
     async def _follow(self) -> None:
-        pause_s = AGAIN_S
-        unanswered = 0
-        notified = True
+        pause_s, unanswered, notified = AGAIN_S, 0, True
         while True:
             self.due.clear()
             wanted = self._wanted
@@ -202,28 +191,15 @@ class _Node:
             if not self.first.done() and self._wanted == wanted:
                 self.first.set_result(None)
             notified = await set_within(self.due, pause_s)
-            if notified:
-                pause_s = AGAIN_S
-                await asyncio.sleep(_BETWEEN_S)
-            else:
-                pause_s = min(2 * pause_s, AGAIN_AT_MOST_S)
+            pause_s = AGAIN_S if notified else min(2 * pause_s, AGAIN_AT_MOST_S)
+            await asyncio.sleep(_BETWEEN_S)
 
     async def _read(self) -> NodeParameters:
-        try:
-            return await self._read_now()
-        except Exception:
-            # What a foreign node answers must not end the reading of its parameters.
-            _logger.exception("parameters of %s unknown", self._name)
-            return NodeParameters(node=self._name, error=_NO_ANSWER)
-
-    async def _read_now(self) -> NodeParameters:
-        serves = self._clients.serves_parameters(self._name)
-        if serves is None:
+        if self._clients.serves_parameters(self._name) is None:
             found = await self._ask(UNSHOWN_S)
             if found is not None:
                 return NodeParameters(node=self._name, parameters=found)
-            serves = self._clients.serves_parameters(self._name)
-        if not serves:
+        if not self._clients.serves_parameters(self._name):
             return NodeParameters(node=self._name, error=SERVES_NONE)
         found = await self._ask(ANSWER_S)
         error = _NO_ANSWER if found is None else ""
@@ -234,12 +210,13 @@ class _Node:
             self._clients.report_parameters(self._name, self.names, timeout_s=limit_s)
         )
         try:
-            # Not wait_for, see set_within.
-            await asyncio.wait({asking}, timeout=limit_s)
-            if asking.done():
-                return asking.result()
+            await asyncio.wait({asking}, timeout=limit_s)  # not wait_for, see set_within
+            return asking.result() if asking.done() else None
         except MiddlewareError as error:
             _logger.info("parameters of %s unknown: %s", self._name, error)
+        except Exception:
+            # What a foreign node answers must not end the reading of its parameters.
+            _logger.exception("parameters of %s unknown", self._name)
         finally:
             asking.cancel()
         return None

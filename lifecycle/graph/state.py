@@ -1,11 +1,10 @@
-"""State of the ROS graph and its queries: layer 3 of the graph interface.
+"""State of a ROS graph and its queries: layer 3 of the graph interface.
 
-Owns: what is known of every node, kept true by events, and re-read from a node only when the
-checksum that it announces is not the one that is held, or when messages of it were lost. One change
-costs work in proportion to the node that changed, a query in proportion to its answer.
+Owns: what is known of every node: what it said last of itself, whether discovery shows it, and its
+configuration as it was read or given last.
 
-Threads: the state changes in the scheduler of its events, and subscribers are called there. Every
-public method may be called from any thread, and what it returns does not change afterwards.
+Threads: every method may be called from any thread, and what it returns does not change afterwards.
+Callbacks are called where the graph posts them, one after another, after the change is in force.
 """
 
 from __future__ import annotations
@@ -15,34 +14,20 @@ import logging
 import threading
 import typing
 from collections.abc import Callable, Mapping
+from typing import Any
+
+import msgspec
 
 from lifecycle import dataclasses
-from lifecycle.graph.events import GraphEvents
-from lifecycle.graph.messages import (
-    ConfigurationChanged,
-    GraphMessage,
-    Heartbeat,
-    Joined,
-    StateChanged,
-)
 from lifecycle.graph.model import (
     End,
-    EndpointChange,
-    EventKind,
     GraphChange,
-    GraphEvent,
     Link,
-    Member,
-    NodeLiveliness,
     NodeView,
-    Owned,
-    altered,
-    change,
-    kept,
     link,
     match_ends,
 )
-from lifecycle.graph.scheduler import Remove
+from lifecycle.graph.status import NodeStatus
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.verify.observation import (
     HealthReport,
@@ -56,143 +41,14 @@ from lifecycle.verify.outcome import ConnectionReport
 
 _logger = logging.getLogger(__name__)
 
-_LIVELINESS = {
-    EventKind.SILENT: NodeLiveliness.SILENT,
-    EventKind.ALIVE: NodeLiveliness.ALIVE,
-}
-
-
-class Record:
-    """One instance of one node."""
-
-    def __init__(self, member: Member) -> None:
-        self.view = NodeView(
-            name=member.node,
-            incarnation=member.incarnation,
-            liveliness=member.liveliness,
-            reason=member.reason,
-            state=member.state,
-            connected=member.connected,
-        )
-        self.reading: object | None = None
-        """Token of the reading that is under way."""
-        self._taken: tuple[NodeConfiguration, NodeView] | None = None
-        self._announced = member.checksum
-        self._doubtful = member.checksum is None
-        self._again = False
-        self._meanwhile: list[GraphMessage] = []
-
-    @property
-    def must_read(self) -> bool:
-        """Whether what is held is not what the node announced, or may not be."""
-        if self.reading is not None:
-            return False
-        if self._doubtful:
-            return True
-        held = self.view.configuration
-        return bool(self._announced) and (held is None or held.checksum != self._announced)
-
-    def doubt(self) -> None:
-        """Have the configuration read again whatever its checksum."""
-        if self.reading is None:
-            self._doubtful = True
-        else:
-            self._again = True
-
-    def holds(self, configuration: NodeConfiguration) -> bool:
-        """Whether this was taken last, and nothing changed since."""
-        return (
-            self._taken is not None
-            and self._taken[0] == configuration
-            and self._taken[1] is self.view
-            and self.reading is None
-            and not self._doubtful
-        )
-
-    def begin(self) -> object:
-        """Begin to read; return the token of this reading."""
-        self._doubtful = self._again = False
-        self._meanwhile = []
-        self.reading = object()
-        return self.reading
-
-    def failed(self) -> None:
-        """End a reading without an answer; the next heartbeat gives occasion to try again."""
-        self.reading = None
-        self._doubtful = True
-        self._meanwhile = []
-
-    def take(self, configuration: NodeConfiguration) -> None:
-        """Hold a configuration that was read or given, and what messages said since it was asked.
-
-        The node may have changed between its answer and a message that came before the answer: the
-        checksum that was announced meanwhile, if it is another one, has it read once more.
-        """
-        meanwhile, self._meanwhile = self._meanwhile, []
-        again, self._again = self._again, False
-        self.reading = None
-        self.view = dataclasses.replace(
-            self.view,
-            configuration=kept(configuration),
-            state=configuration.state,
-            connected=configuration.connected,
-        )
-        self._taken = configuration, self.view
-        announced = False
-        for message in meanwhile:
-            announced |= isinstance(message, ConfigurationChanged | Heartbeat | Joined)
-            self._alter(message)
-        if not announced:
-            self._announced = configuration.checksum
-        self._doubtful = again
-
-    def apply(self, event: GraphEvent) -> None:
-        """Let an event of this node take effect."""
-        if event.kind in _LIVELINESS:
-            self.view = dataclasses.replace(
-                self.view, liveliness=_LIVELINESS[event.kind], reason=event.reason
-            )
-        elif event.kind is EventKind.GAP:
-            self.doubt()
-        elif event.message is not None:
-            if event.incarnation != self.view.incarnation:
-                # Discovery had shown it already; now it reports itself.
-                self.view = dataclasses.replace(self.view, incarnation=event.incarnation)
-                self.doubt()
-            message = event.message
-            if isinstance(message, ConfigurationChanged | Heartbeat | Joined):
-                self._announced = message.checksum
-            if self.reading is not None:
-                self._meanwhile.append(message)
-            self._alter(message)
-
-    def _alter(self, message: GraphMessage) -> None:
-        view, configuration = self.view, self.view.configuration
-        if isinstance(message, StateChanged | Heartbeat | Joined):
-            if (view.state, view.connected) == (message.state, message.connected):
-                return
-            if configuration is not None:
-                configuration = dataclasses.replace(
-                    configuration, state=message.state, connected=message.connected
-                )
-            self.view = dataclasses.replace(
-                view,
-                configuration=configuration,
-                state=message.state,
-                connected=message.connected,
-            )
-        elif configuration is not None:
-            changed = altered(configuration, message)
-            if changed != configuration:
-                self.view = dataclasses.replace(view, configuration=changed)
-
+Remove = Callable[[], None]
+"""Takes a callback away again; a second call does nothing."""
 
 Answer = tuple[str | None, NodeConfiguration | None]
 """State and configuration of a node that was asked for them; None where it did not say."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Look:
+class Look(msgspec.Struct, frozen=True, kw_only=True):
     """What was there at one moment, as `lifecycle.graph.observer` saw it.
 
     Attributes:
@@ -205,18 +61,9 @@ class Look:
 
     nodes: tuple[ObservedNode, ...] = ()
     endpoints: tuple[ObservedEndpoint, ...] = ()
-    answers: Mapping[str, Answer] = dataclasses.field(default_factory=dict)
+    answers: Mapping[str, Answer] = {}
     parameters: tuple[NodeParameters, ...] = ()
-    health: Mapping[str, HealthReport] = dataclasses.field(default_factory=dict)
-
-
-Fetch = Callable[[str, Callable[[NodeConfiguration | None], None]], None]
-"""Reads the configuration of a node (fully qualified) and calls back once, from any thread, at once
-or later; with None if it could not be read."""
-
-_ENDPOINT_KINDS = frozenset(
-    {EventKind.ENDPOINT_ADDED, EventKind.ENDPOINT_REMOVED, EventKind.ENDPOINT_CHANGED}
-)
+    health: Mapping[str, HealthReport] = {}
 
 
 @typing.final
@@ -224,36 +71,28 @@ class GraphState:
     """The state of one graph.
 
     Args:
-        events: layer 2; the state learns of the members that they know already. It may be shared.
-        fetch: how configurations are read.
+        post: has what it is given called, in order, where callbacks are to be called.
     """
 
-    def __init__(self, events: GraphEvents, fetch: Fetch) -> None:
-        self.events = events
+    def __init__(self, post: Callable[[Callable[[], None]], None]) -> None:
+        self._post = post
         self._lock = threading.RLock()
-        self._records: dict[str, Record] = {}
+        self._views: dict[str, NodeView] = {}
         self._given: Mapping[str, NodeConfiguration] = {}
         self._look = Look()
-        self._fetch = fetch
-        self._callbacks: tuple[Callable[[GraphChange], None], ...] = ()
-        self._unread: set[str] = set()
-        self._stop: tuple[Remove, ...] = ()
-        self._closed = False
-        events.scheduler.post(self._begin)
+        self._callbacks: dict[object, Callable[[GraphChange], None]] = {}
 
     # -- queries
 
     def nodes(self) -> tuple[NodeView, ...]:
         """Return every node of the graph, silent ones included, by name."""
         with self._lock:
-            views = [each.view for each in self._records.values()]
-        return tuple(sorted(views, key=lambda each: each.name))
+            return tuple(view for _, view in sorted(self._views.items()))
 
     def node(self, name: str) -> NodeView | None:
         """Return what is known of a node (fully qualified); None if it is not in the graph."""
         with self._lock:
-            record = self._records.get(name)
-            return None if record is None else record.view
+            return self._views.get(name)
 
     def connections_of(self, node: str) -> tuple[ConnectionReport, ...]:
         """Return the connections of a node; none if it is not known."""
@@ -270,18 +109,17 @@ class GraphState:
 
     def endpoints(self, kind: EndpointKind, name: str) -> tuple[End, ...]:
         """Return the endpoints of a kind and name (fully qualified), by node name."""
-        with self.events.lock:
-            owned = self.events.endpoints.named(kind, name)
-        return self._ends(owned)
+        return tuple(
+            End(node=view, endpoint=each)
+            for view in self.nodes()
+            for each in view.endpoints
+            if each.kind is kind and each.resolved == name
+        )
 
     def topics(self) -> tuple[str, ...]:
         """Return every topic that is published or subscribed to, sorted."""
-        with self.events.lock:
-            names = {
-                *self.events.endpoints.names(EndpointKind.PUBLISHER),
-                *self.events.endpoints.names(EndpointKind.SUBSCRIPTION),
-            }
-        return tuple(sorted(names))
+        endpoints = (each for view in self.nodes() for each in view.endpoints)
+        return tuple(sorted({each.resolved for each in endpoints if each.kind.is_topic}))
 
     def connected(self, topic: str, publisher: str, subscription: str) -> tuple[Link, ...]:
         """Return how two nodes are connected by a topic.
@@ -294,83 +132,151 @@ class GraphState:
         Returns:
             One link for each pair of their endpoints, usually one; none if either has no endpoint.
         """
-        return self._links(
-            topic,
-            lambda end: end.node.name == publisher,
-            lambda end: end.node.name == subscription,
+        return tuple(
+            each
+            for each in self.flows(topic)
+            if (each.publisher.node.name, each.subscription.node.name) == (publisher, subscription)
         )
 
     def flows(self, topic: str | None = None) -> tuple[Link, ...]:
         """Return every publisher → subscription pair, connected or not, of one topic or of all."""
-        topics = self.topics() if topic is None else (topic,)
-        return tuple(each for name in topics for each in self._links(name, _any, _any))
+        found: list[Link] = []
+        for name in self.topics() if topic is None else (topic,):
+            publishers, subscriptions = self.publishers_of(name), self.subscriptions_of(name)
+            publishing, subscribing = match_ends(publishers), match_ends(subscriptions)
+            found += [
+                link(name, one, other, publishers=publishing, subscriptions=subscribing)
+                for one in publishers
+                for other in subscriptions
+            ]
+        return tuple(found)
 
     # -- changes
 
-    def on_change(self, callback: Callable[[GraphChange], None]) -> Remove:
-        """Have `callback` called in the scheduler with each change, after it is in force."""
+    def on_change(self, callback: Callable[[GraphChange], None], *, known: bool = False) -> Remove:
+        """Have `callback` called with each change from now on; an exception of it is logged.
+
+        Args:
+            callback: gets one change after another.
+            known: also call it, first, with each node that is there, as if it joined.
+        """
+        key = object()
         with self._lock:
-            self._callbacks += (callback,)
+            self._callbacks[key] = callback
+            for view in self.nodes() if known else ():
+                joined = GraphChange(before=None, after=view)
+                self._post(functools.partial(self._call, key, joined))
 
         def remove() -> None:
             with self._lock:
-                self._callbacks = tuple(each for each in self._callbacks if each is not callback)
+                self._callbacks.pop(key, None)
 
         return remove
+
+    def put_status(self, status: NodeStatus) -> None:
+        """Take what a node says of itself, whatever carried it here.
+
+        A later instance takes the place of an earlier one; an earlier one is passed over, unless
+        the other has left or is silent: then the wall clock was set back between the two.
+        """
+        with self._lock:
+            view = self._views.get(status.node)
+            held = None if view is None else view.status
+            if status.left:
+                if held is not None and held.instance == status.instance:
+                    self._leave(status.node, status.reason)
+                return
+            if view is not None and held is not None and held.instance != status.instance:
+                if status.instance < held.instance and not view.silent:
+                    return
+                self._leave(status.node, "restarted")
+            self._set(status.node, status=status, silent="")
 
     def put_configuration(self, configuration: NodeConfiguration) -> None:
         """Give what was learnt of a node in another way, over a control channel say.
 
-        A node that sends no messages becomes a member by it. For `observation` it is what the node
+        A node that sends no statuses becomes a member by it. For `observation` it is what the node
         reports until a newer one is put, the node leaves the graph or it is dropped.
         """
         name = configuration.name
         with self._lock:
             if self._given.get(name) != configuration:
                 self._given = {**self._given, name: configuration}
-            elif (record := self._records.get(name)) is not None and record.holds(configuration):
-                return  # it is known already, and nothing came after it
-        self.events.report_seen(name)
-        self.events.scheduler.post(functools.partial(self._put, configuration))
+            self._set(name, configuration=configuration)
 
     def drop_configuration(self, node: str, reason: str = "its process ended") -> None:
-        """Forget what was given of a node (fully qualified) that is not there any more."""
+        """Forget a node (fully qualified) whose configuration was given: it is not there now."""
         with self._lock:
-            self._given = {name: each for name, each in self._given.items() if name != node}
-        self.events.report_gone(node, reason)
+            if node in self._given:
+                self._given = {name: each for name, each in self._given.items() if name != node}
+                self._leave(node, reason)
 
     @property
     def given(self) -> Mapping[str, NodeConfiguration]:
         """The configurations that were put, by full node name."""
         return self._given
 
-    def reread(self, node: str) -> None:
-        """Have a node's configuration read again, whatever its checksum."""
+    def learn(self, configuration: NodeConfiguration) -> None:
+        """Hold what a member answered when it was asked for its configuration."""
+        with self._lock:
+            if configuration.name in self._views:
+                self._set(configuration.name, configuration=configuration)
 
-        def doubt() -> None:
-            record = self._records.get(node)
-            if record is not None:
-                record.doubt()
-                self._read_if_needed(record)
+    def show(self, node: str) -> None:
+        """Take it that a node is there: discovery shows it."""
+        with self._lock:
+            self._set(node, silent="")
 
-        self.events.scheduler.post(doubt)
+    def hide(self, node: str, reason: str) -> None:
+        """Take it that discovery does not show a node any more.
 
-    def retry(self) -> None:
-        """Read now what could not be read before: services appear later than messages arrive."""
+        One that sends statuses is silent from now on: Fast DDS forgets the names of nodes that
+        live. Another has left.
+        """
+        with self._lock:
+            self._given = {name: each for name, each in self._given.items() if name != node}
+            view = self._views.get(node)
+            if view is None or view.status is None:
+                self._leave(node, reason)
+            else:
+                self._set(node, silent=reason)
 
-        def again() -> None:
-            for node in tuple(self._unread):
-                record = self._records.get(node)
-                if record is not None:
-                    self._read_if_needed(record)
-
-        self.events.scheduler.post(again)
+    def forget(self, view: NodeView) -> None:
+        """Take out a silent node of which nothing came since it was `view`."""
+        with self._lock:
+            if self._views.get(view.name) == view:
+                self._leave(view.name, "silent for long")
 
     def close(self) -> None:
-        """Follow events no longer; what is known stays as it is. Again is harmless."""
-        self._closed = True
-        for stop in self._stop:
-            stop()
+        """Call nobody back any more; what is known stays as it is. Again is harmless."""
+        with self._lock:
+            self._callbacks.clear()
+
+    def _set(self, node: str, **fields: Any) -> None:
+        before = self._views.get(node)
+        view = msgspec.structs.replace(before or NodeView(name=node), **fields)
+        if view != before:
+            self._views[node] = view
+            self._notify(before, view)
+
+    def _leave(self, node: str, reason: str) -> None:
+        before = self._views.pop(node, None)
+        if before is not None:
+            self._notify(before, None, reason)
+
+    def _notify(self, before: NodeView | None, after: NodeView | None, reason: str = "") -> None:
+        what = GraphChange(before=before, after=after, reason=reason)
+        for key in tuple(self._callbacks):
+            self._post(functools.partial(self._call, key, what))
+
+    def _call(self, key: object, what: GraphChange) -> None:
+        callback = self._callbacks.get(key)
+        if callback is None:
+            return
+        try:
+            callback(what)
+        except Exception:
+            _logger.exception("cannot handle a change of %s", what.node)
 
     # -- what is judged
 
@@ -378,19 +284,17 @@ class GraphState:
         """Give what discovery and the nodes that were asked say now."""
         self._look = look
 
-    def learn(self, configuration: NodeConfiguration) -> None:
-        """Show what a member answered, where no reading of this state would bring it."""
-        self.events.scheduler.post(functools.partial(self._put, configuration))
-
     def observation(self) -> Observation:
         """Return what `lifecycle.verify` judges: the last look, and what is given of nodes now."""
         look, given = self._look, self._given
         asked = {name: configuration for name, (_, configuration) in look.answers.items()}
+        states = {name: state for name, (state, _) in look.answers.items()}
+        states |= {name: each.state for name, each in given.items()}
         return Observation(
             nodes=tuple(
                 dataclasses.replace(
                     each,
-                    state=_state(each.full_name, look.answers, given),
+                    state=states.get(each.full_name),
                     health=look.health.get(each.full_name),
                 )
                 for each in look.nodes
@@ -399,153 +303,3 @@ class GraphState:
             configurations=tuple(each for each in {**given, **asked}.values() if each is not None),
             parameters=look.parameters,
         )
-
-    # -- what happens in the scheduler
-
-    def _begin(self) -> None:
-        if self._closed:
-            return
-        kinds = [each for each in EventKind if each not in _ENDPOINT_KINDS]
-        self._stop = (self.events.on(kinds, self._happened),)
-        for member in self.events.members():
-            self._join(member)
-
-    def _happened(self, event: GraphEvent) -> None:
-        if event.kind is EventKind.JOINED:
-            self._join(_member(event))
-            return
-        if event.kind is EventKind.LEFT:
-            self._leave(event.node)
-            return
-        record = self._records.get(event.node)
-        if record is None:
-            return
-        before = record.view
-        with self._lock:
-            record.apply(event)
-        self._publish(before, record)
-        self._read_if_needed(record)
-
-    def _join(self, member: Member) -> None:
-        record = Record(member)
-        with self._lock:
-            self._records[member.node] = record
-        self._publish(None, record)
-        self._read_if_needed(record)
-
-    def _leave(self, node: str) -> None:
-        with self._lock:
-            record = self._records.pop(node, None)
-            self._unread.discard(node)
-        if record is not None:
-            gone = EndpointChange(removed=record.view.endpoints)
-            self._call(change(record.view, None, gone))
-
-    def _put(self, configuration: NodeConfiguration) -> None:
-        record = self._records.get(configuration.name)
-        if record is not None:
-            self._take(record, configuration)
-
-    def _read_if_needed(self, record: Record) -> None:
-        if not record.must_read or self._closed:
-            return
-        token = record.begin()
-        node = record.view.name
-
-        def done(configuration: NodeConfiguration | None) -> None:
-            self.events.scheduler.post(
-                functools.partial(self._answered, node, token, configuration)
-            )
-
-        self._fetch(node, done)
-
-    def _answered(self, node: str, token: object, configuration: NodeConfiguration | None) -> None:
-        record = self._records.get(node)
-        if record is None or record.reading is not token:
-            return  # of an instance that is gone
-        if configuration is None:
-            record.failed()
-            self._unread.add(node)
-        else:
-            self._take(record, configuration)
-
-    def _take(self, record: Record, configuration: NodeConfiguration) -> None:
-        self._unread.discard(record.view.name)
-        before = record.view
-        with self._lock:
-            record.take(configuration)
-        self._publish(before, record)
-        self._read_if_needed(record)
-
-    def _publish(self, before: NodeView | None, record: Record) -> None:
-        after = record.view
-        if after is before:
-            return
-        endpoints = EndpointChange()
-        if before is None or after.endpoints is not before.endpoints:
-            endpoints = self.events.configuration_read(after.name, after.endpoints)
-        if after != before:
-            self._call(change(before, after, endpoints))
-
-    def _call(self, what: GraphChange) -> None:
-        for callback in self._callbacks:
-            _logged(callback, what)
-
-    def _links(
-        self, topic: str, publishes: Callable[[End], bool], subscribes: Callable[[End], bool]
-    ) -> tuple[Link, ...]:
-        publishers, subscriptions = self.publishers_of(topic), self.subscriptions_of(topic)
-        publishing, subscribing = match_ends(publishers), match_ends(subscriptions)
-        return tuple(
-            link(
-                topic,
-                publisher,
-                subscription,
-                publishers=publishing,
-                subscriptions=subscribing,
-            )
-            for publisher in publishers
-            if publishes(publisher)
-            for subscription in subscriptions
-            if subscribes(subscription)
-        )
-
-    def _ends(self, owned: tuple[Owned, ...]) -> tuple[End, ...]:
-        found: list[End] = []
-        for each in owned:
-            view = self.node(each.node)
-            if view is not None:
-                found.append(End(node=view, endpoint=each.endpoint))
-        return tuple(sorted(found, key=lambda each: each.node.name))
-
-
-def _any(_: End) -> bool:
-    return True
-
-
-def _state(
-    name: str, answers: Mapping[str, Answer], given: Mapping[str, NodeConfiguration]
-) -> str | None:
-    if name in given:
-        return given[name].state
-    return answers[name][0] if name in answers else None
-
-
-def _logged(callback: Callable[[GraphChange], None], what: GraphChange) -> None:
-    try:
-        callback(what)
-    except Exception:
-        _logger.exception("cannot handle a change of %s", what.node)
-
-
-def _member(event: GraphEvent) -> Member:
-    message = event.message
-    if isinstance(message, Joined | Heartbeat):
-        return Member(
-            node=event.node,
-            incarnation=event.incarnation,
-            state=message.state,
-            connected=message.connected,
-            checksum=message.checksum,
-        )
-    return Member(node=event.node, incarnation=event.incarnation)

@@ -36,12 +36,13 @@ ANSWERS: dict[str, str] = {
 MESSAGES: list[str] = [
     *(text[:60_000] for text in ANSWERS.values()),
     *(
-        json.dumps({"version": 1, "kind": kind, "node": "/talker", "incarnation": "9" * 20,
-                    "sequence": 2**62, "state": "active", "connected": True, "checksum": "\x1b[2J",
-                    "about": "/listener", "reason": "\x1b[2J\n", "connection": "net",
-                    "endpoint": "x", "urls": [], "silent": ["/listener"]})
-        for kind in ("joined", "left", "state_changed", "heartbeat", "configuration_changed",
-                     "connection_lost", "mapping_lost", "silent", "stuck", "alive")
+        json.dumps({"version": 1, "node": "/talker", "instance": "9" * 20, "state": "active",
+                    "connected": True, "checksum": "\x1b[2J", "reason": "\x1b[2J\n",
+                    "connections": [{"name": "net", "error": "\x1b[2J"}],
+                    "mappings": [{"endpoint": "x", "connection": "net", "matched": 2**62}],
+                    **more})
+        for more in ({}, {"left": True}, {"version": 2}, {"instance": ""}, {"node": "talker"},
+                     {"node": "/\x1b[2J"}, {"instance": "0"}, {"state": "\x1b[2J"})
     ),
     json.dumps({"run": "x", "host": "y", "system": "faults", "machines": ["local"],
                 "nodes": ["/talker"], "checksum": "ab", "plan": "eJzLAAAA"}),

@@ -18,8 +18,8 @@ from pathlib import Path
 from lifecycle import codec
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import LifecycleError
-from lifecycle.graph.messages import GraphMessageError, Joined, encode
-from lifecycle.graph.messages import decode as decode_message
+from lifecycle.graph.status import NodeStatus, NodeStatusError, encode
+from lifecycle.graph.status import decode as decode_status
 from lifecycle.manifest.diagnostics import ManifestError, Position
 from lifecycle.manifest.installed_types import bounded_size, installed_hash
 from lifecycle.manifest.loading import load
@@ -151,9 +151,9 @@ links: []
 
 READERS: dict[str, Reader] = {
     "graph message": Reader(
-        good=encode(Joined(node="/a", incarnation="1", sequence=3, state="active", checksum="ab")),
-        read=lambda data, _: decode_message(data),
-        errors=(GraphMessageError,),
+        good=encode(NodeStatus(node="/a", instance="1", state="active", checksum="ab")),
+        read=lambda data, _: decode_status(data),
+        errors=(NodeStatusError,),
     ),
     "configuration report": Reader(
         good=_CONFIGURATION,

@@ -90,13 +90,13 @@ def main() -> None:
 
 
 def _say(nodes: list[Node], topic: str, index: int) -> None:
-    from lifecycle.graph.transport import GRAPH_QOS
+    from lifecycle.graph.reporter import STATUS_QOS
     from lifecycle.middleware.discovery.liveliness import _qos
     from tests.hostile.answers import MESSAGES
 
     node = Node("_ros2cli_teller", enable_rosout=False)
     nodes.append(node)
-    qos = GRAPH_QOS if topic.endswith("graph") else _qos(64)
+    qos = STATUS_QOS if topic.endswith("graph") else _qos(64)
     publisher = node.create_publisher(String, topic, qos)
     for _ in range(200):
         if publisher.get_subscription_count():

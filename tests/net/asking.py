@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import sys
 
-from lifecycle.graph.scheduler import set_within
+from lifecycle.graph.loop import set_within
 from lifecycle.middleware.rcl.graph import GraphObserver
 from lifecycle.middleware.services.clients import NodeClients
 from lifecycle.plan.model import ParticipantConnections

@@ -17,7 +17,6 @@ FILES = {each.name.removesuffix(".v1.schema.json"): each for each in FOLDER.glob
 def test_each_schema_is_generated_or_written_by_hand_for_a_reason() -> None:
     by_hand = {
         "manifest": "it is what users write; the types are made from it",
-        "graph_message": "version and kind stand beside the fields of each message",
     }
     assert by_hand == result_schemas.BY_HAND
     assert {*FILES} == {*result_schemas.RESULTS, *by_hand}

@@ -1,8 +1,8 @@
 """The managed half of a LifecycleNode (`node.lifecycle`): controller, gate, data layer, services.
 
 Owns: putting controller, gate, data layer, parameters, timers and services of one node together;
-its reporter to the ROS graph, whose publisher and timer must work in every state, so that they do
-not pass the gate; and the endpoints that code makes with rclpy's own factories, which are on no
+its reporter to the ROS graph, whose publisher must work in every state, so that it does not pass
+the gate; and the endpoints that code makes with rclpy's own factories, which are on no
 interface, so that the node configuration can report them. It is reached as `node.lifecycle`, so
 that authors have every other attribute name to themselves.
 """
@@ -28,8 +28,6 @@ from lifecycle.node.author.handlers import alternatives
 from lifecycle.node.author.spec import Mode
 from lifecycle.node.configuration import ConfigurationChanges
 from lifecycle.node.connections.connection_status import (
-    ConnectionEvent,
-    ConnectionEventKind,
     ConnectionEvents,
 )
 from lifecycle.node.connections.data_layer import NodeDataLayer, serve_interface
@@ -50,47 +48,7 @@ from lifecycle.plan.model import PlannedNode
 from lifecycle.verify.observation import NodeConfiguration
 
 if TYPE_CHECKING:
-    from rclpy.callback_groups import CallbackGroup
-
-
-class GraphMember:
-    """Reports one node to the graph, from its construction until it is destroyed.
-
-    Args:
-        node: to report; its executor sends the heartbeats.
-        group: reentrant.
-
-    Attributes:
-        reporter: of its states and configurations.
-    """
-
-    def __init__(self, node: Node, group: CallbackGroup) -> None:
-        # Late: most nodes report to their supervisor only.
-        from lifecycle.graph.reporter import GraphReporter
-        from lifecycle.graph.transport import DdsTransport, steady_timer
-
-        self._transport = DdsTransport(node, callback_group=group)
-        self.reporter = GraphReporter(
-            self._transport, str(node.get_fully_qualified_name()), every=steady_timer(node)
-        )
-
-    def connection_event(self, event: ConnectionEvent) -> None:
-        """Report what became of a connection or mapping."""
-        kind, name = event.kind, event.connection
-        if kind is ConnectionEventKind.CONNECTION_ESTABLISHED:
-            self.reporter.connection_established(name, event.urls)
-        elif kind is ConnectionEventKind.CONNECTION_LOST:
-            error = "" if event.unmade else "an endpoint on it has lost its last peer"
-            self.reporter.connection_lost(name, event.urls, error)
-        elif kind is ConnectionEventKind.MAPPING_ESTABLISHED:
-            self.reporter.mapping_established(event.endpoint, name, matched=event.peers)
-        else:
-            self.reporter.mapping_lost(event.endpoint, name, matched=event.peers)
-
-    def close(self) -> None:
-        """Say farewell."""
-        self.reporter.left()
-        self._transport.close()
+    from lifecycle.graph.reporter import GraphReporter
 
 
 class Undeclared:
@@ -189,7 +147,7 @@ class Managed:
         self.call_soon = self._turns.call_soon
         self._listeners: list[Callable[[Managed], None]] = []
         self._method_timers: list[Timer] = []
-        self._member: GraphMember | None = None
+        self._reporter: GraphReporter | None = None
         self.connection_events = ConnectionEvents(self.call_soon)
         self.configuration_changes = ConfigurationChanges(
             self.call_soon, self.get_configuration, failed=node.get_logger().error
@@ -209,7 +167,7 @@ class Managed:
             self._turns,
             state=lambda: self.state,
             changed=self.configuration_changes.touch,
-            notify=self._report_connection,
+            notify=self.connection_events.notify,
         )
         self.declared = DeclaredInCode(node, spec, self.data_layer, lambda: self.state)
         self._controller = Controller(self, spec.timeouts, self._changed)
@@ -322,9 +280,9 @@ class Managed:
         """Leave the graph and take the data layer away: the node is being destroyed."""
         self._turns.close()
         self.data_layer.remove()
-        if self._member is not None:
-            self._member.close()
-            self._member = None
+        if self._reporter is not None:
+            self._reporter.left()
+            self._reporter = None
 
     async def shut_down(self, reason: str) -> Result:
         """Bring the node to finalized from any state; a running async callback is cancelled."""
@@ -405,23 +363,23 @@ class Managed:
     # Inside.
 
     def _join(self) -> None:
-        self._member = GraphMember(self._node, self._turns.group)
+        # Late: most nodes report to their supervisor only.
+        from lifecycle.graph.reporter import GraphReporter
+
+        self._reporter = GraphReporter(self._node)
+        self._reporter.report(state=self.state.seen.label, connected=self.state.connected)
+        self.configuration_changes.listen(self._report_configuration)
         now = self.configuration_changes.collect()
-        self._member.reporter.joined(
-            self.state.seen.label,
-            connected=self.state.connected,
-            checksum=now.checksum if now is not None else "",
-        )
-        self.configuration_changes.listen(self._report_checksum)
+        if now is not None:
+            self._report_configuration(now)
 
-    def _report_checksum(self, now: NodeConfiguration) -> None:
-        if self._member is not None:
-            self._member.reporter.configuration_changed(now.checksum)
-
-    def _report_connection(self, event: ConnectionEvent) -> None:
-        if self._member is not None and self.spec.events:
-            self._member.connection_event(event)
-        self.connection_events.notify(event)
+    def _report_configuration(self, now: NodeConfiguration) -> None:
+        if self._reporter is None:
+            return
+        if self.spec.events:
+            self._reporter.report_configuration(now)
+        else:
+            self._reporter.report(checksum=now.checksum)
 
     async def _change(self, request: TransitionRequest) -> Result:
         if request is TransitionRequest.ACTIVATE and not self._let_through:
@@ -450,10 +408,8 @@ class Managed:
             self._let_through = False
         if change.event is not None and self._services is not None:
             self._services.publish(change.event)
-        if self._member is not None:
-            self._member.reporter.state_changed(
-                change.goal.seen.label, connected=change.goal.connected
-            )
+        if self._reporter is not None:
+            self._reporter.report(state=change.goal.seen.label, connected=change.goal.connected)
         self._health.follow(change.goal)
         for listener in self._listeners:
             listener(self)

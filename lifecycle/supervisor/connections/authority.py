@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 from lifecycle import dataclasses
 from lifecycle.errors import BringUpError
-from lifecycle.graph.scheduler import set_within
+from lifecycle.graph.loop import set_within
 from lifecycle.manifest.model import Authority, Condition, DataLayerSource
 from lifecycle.node.host.control import Operation
 from lifecycle.plan.model import Plan

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lifecycle.errors import LifecycleError
-from lifecycle.graph.scheduler import set_within
+from lifecycle.graph.loop import set_within
 from lifecycle.plan.model import Plan
 from lifecycle.run_directory import LEDGER_NAME, RunDirectory
 from lifecycle.supervisor.run.events import Emitter, Event, Notice, VerdictChanged

@@ -15,7 +15,7 @@ from collections.abc import Callable, Collection, Iterator
 from typing import TYPE_CHECKING
 
 from lifecycle import dataclasses
-from lifecycle.graph.scheduler import set_within
+from lifecycle.graph.loop import set_within
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.connections import discovery_server

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.graph.scheduler import set_within
+from lifecycle.graph.loop import set_within
 from lifecycle.manifest.model import RunKind
 from lifecycle.supervisor.control.protocol import Reach
 from lifecycle.supervisor.nodes.system import NodeRun, System

@@ -14,7 +14,7 @@ from collections.abc import Awaitable, Callable, Collection, Iterable
 from typing import TYPE_CHECKING
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.graph.scheduler import set_within
+from lifecycle.graph.loop import set_within
 from lifecycle.manifest.names import supervisor_alive_topic
 from lifecycle.plan.model import ParticipantConnections, PlannedNode
 from lifecycle.supervisor.control.ros_interface import Answer

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import BringUpError
-from lifecycle.graph.scheduler import set_within
+from lifecycle.graph.loop import set_within
 from lifecycle.run_directory import PROCESS_VARIABLE
 from lifecycle.supervisor.processes.fork_server_main import (
     DISOWN,

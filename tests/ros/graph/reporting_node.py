@@ -19,7 +19,6 @@ from std_srvs.srv import Trigger
 
 from lifecycle import codec
 from lifecycle.graph.reporter import GraphReporter
-from lifecycle.graph.transport import DdsTransport, steady_timer
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.middleware.process.teardown import leave_and_exit
 from lifecycle.verify.observation import EndpointReport, Identity, NodeConfiguration
@@ -28,7 +27,7 @@ from lifecycle.verify.observation import EndpointReport, Identity, NodeConfigura
 class ReportingNode:
     """An ordinary rclpy node with a reporter and the configuration service."""
 
-    def __init__(self, node: Node, topic: str, *, period_s: float = 0.2) -> None:
+    def __init__(self, node: Node, topic: str) -> None:
         self.node = node
         self.name = node.get_fully_qualified_name()
         self.configuration = NodeConfiguration(
@@ -55,11 +54,8 @@ class ReportingNode:
         self.asked = 0
         node.create_publisher(String, topic, 1)
         node.create_service(Trigger, "~/get_configuration", self._serve)
-        self.transport = DdsTransport(node)
-        self.reporter = GraphReporter(
-            self.transport, self.name, every=steady_timer(node), period_s=period_s
-        )
-        self.reporter.joined("inactive", connected=True, checksum="1")
+        self.reporter = GraphReporter(node)
+        self.reporter.report(state="inactive", connected=True, checksum="1")
 
     def _serve(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self.asked += 1

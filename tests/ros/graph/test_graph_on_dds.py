@@ -22,8 +22,9 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from lifecycle import codec
+from lifecycle.graph.events import EventKind, GraphEvent
 from lifecycle.graph.graph import Graph
-from lifecycle.graph.model import EventKind, GraphEvent, NodeLiveliness
+from lifecycle.graph.model import NodeLiveliness
 from lifecycle.graph.state import GraphState
 from lifecycle.manifest.loading import load
 from lifecycle.manifest.model import EndpointKind
@@ -38,8 +39,6 @@ LIMIT_S = 30.0
 
 WaitUntil = Callable[..., None]
 
-SILENT_AFTER_S = 3.0
-"""Many heartbeats of 0.2 s: a node that a busy machine keeps waiting is not silent."""
 PROCESS = Path(__file__).with_name("reporting_node.py")
 
 
@@ -86,7 +85,7 @@ def process(name: str, topic: str) -> Iterator[subprocess.Popen[str]]:
 
 @pytest.fixture
 def graph(domain_id: int) -> Iterator[Graph]:
-    with Graph.open(domain_id, silent_after_s=SILENT_AFTER_S) as graph:
+    with Graph.open(domain_id) as graph:
         yield graph
 
 
@@ -112,16 +111,16 @@ def test_a_node_joins_tells_its_changes_and_leaves(
     with spinning(node):
         teller = ReportingNode(node, "/told")
         until(graph, publishers("/told", "/teller"))
-        # Its messages come: what was read of it says the same, and could have come before them.
-        until(graph, lambda state: (seen := state.node("/teller")) and seen.incarnation)
+        # Its status comes: what was read of it says the same, and could have come before it.
+        until(graph, lambda state: (seen := state.node("/teller")) and seen.instance)
         until(graph, lambda state: (seen := state.node("/teller")) and seen.state == "inactive")
-        teller.reporter.state_changed("active", connected=True)
+        teller.reporter.report(state="active")
         until(graph, lambda state: (seen := state.node("/teller")) and seen.state == "active")
         asked = teller.asked
         teller.configuration = dataclasses.replace(
             teller.configuration, endpoints=(), state="active", checksum="2"
         )
-        teller.reporter.configuration_changed("2")
+        teller.reporter.report(checksum="2")
         until(graph, publishers("/told"))
         assert teller.asked > asked
         teller.reporter.left("done")
@@ -136,8 +135,7 @@ def test_a_late_joiner_learns_what_was_before_and_both_see_the_same(
     nodes = [make_node(f"early_{number}") for number in range(5)]
     with spinning(*nodes):
         for number, node in enumerate(nodes):
-            # No heartbeat comes within the test: that they say who they are again must do.
-            ReportingNode(node, f"/early/t{number}", period_s=3600.0)
+            ReportingNode(node, f"/early/t{number}")
         until(graph, publishers("/early/t4", "/early_4"))
         with Graph.open(domain_id) as late:
             for number in range(5):
@@ -153,7 +151,7 @@ def test_a_killed_node_falls_silent_and_its_next_instance_takes_its_place(
     fresh_domain: int, wait_until: WaitUntil
 ) -> None:
     told: list[EventKind] = []
-    with Graph.open(fresh_domain, silent_after_s=SILENT_AFTER_S) as graph:
+    with Graph.open(fresh_domain) as graph:
         graph.events.on(
             [EventKind.JOINED, EventKind.LEFT, EventKind.SILENT],
             lambda event: told.append(event.kind),
@@ -161,8 +159,8 @@ def test_a_killed_node_falls_silent_and_its_next_instance_takes_its_place(
         )
         with process("mortal", "/mortal/t") as first:
             until(graph, publishers("/mortal/t", "/mortal"))
-            # Discovery may show it before its first graph message, without which none is missed.
-            until(graph, lambda state: (seen := state.node("/mortal")) and seen.incarnation)
+            # Discovery may show it before its first status, without which none is missed.
+            until(graph, lambda state: (seen := state.node("/mortal")) and seen.instance)
             born = graph.state.node("/mortal")
             assert born is not None
             os.kill(first.pid, signal.SIGKILL)
@@ -179,7 +177,7 @@ def test_a_killed_node_falls_silent_and_its_next_instance_takes_its_place(
                 lambda state: (
                     (seen := state.node("/mortal"))
                     and seen.liveliness is NodeLiveliness.ALIVE
-                    and seen.incarnation > born.incarnation
+                    and seen.instance > born.instance
                     and seen.configuration
                 ),
             )

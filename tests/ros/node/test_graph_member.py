@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -12,12 +12,10 @@ from planning import built_with, planned, publisher
 from std_msgs.msg import String
 
 from lifecycle import LifecycleNode, codec
-from lifecycle.graph.messages import GraphMessage, Heartbeat, decode
-from lifecycle.graph.transport import GRAPH_QOS
+from lifecycle.graph.reporter import receive
+from lifecycle.graph.status import MappingStatus, NodeStatus
 from lifecycle.verify.observation import NodeConfiguration
 from lifecycle.verify.tool_filter import GRAPH_TOPIC
-
-Told = Callable[[], list[GraphMessage]]
 
 
 class It(LifecycleNode):
@@ -25,17 +23,12 @@ class It(LifecycleNode):
 
 
 @pytest.fixture
-def messages(driver: Driver) -> list[GraphMessage]:
-    """What /it tells, heartbeats left out."""
-    told: list[GraphMessage] = []
-
-    def arrived(message: String) -> None:
-        decoded = decode(message.data)
-        if decoded.node == "/it" and not isinstance(decoded, Heartbeat):
-            told.append(decoded)
-
-    driver.node.create_subscription(String, GRAPH_TOPIC, arrived, GRAPH_QOS)
-    return told
+def statuses(driver: Driver) -> Iterator[list[NodeStatus]]:
+    """What /it says of itself, one status after another."""
+    said: list[NodeStatus] = []
+    remove = receive(driver.node, lambda each: said.append(each) if each.node == "/it" else None)
+    yield said
+    remove()
 
 
 def build(driver: Driver, context: rclpy.Context, *endpoints: Any, **plan: Any) -> It:
@@ -45,45 +38,39 @@ def build(driver: Driver, context: rclpy.Context, *endpoints: Any, **plan: Any) 
     return node
 
 
-def test_a_node_tells_its_states_connections_mappings_and_checksums(
-    driver: Driver, context: rclpy.Context, messages: list[GraphMessage]
+def test_a_node_reports_its_states_connections_mappings_and_checksums(
+    driver: Driver, context: rclpy.Context, statuses: list[NodeStatus]
 ) -> None:
     node = build(driver, context, publisher("out"), events=True)
-    driver.spin_until(lambda: driver.node.count_publishers(GRAPH_TOPIC) == 1)
-    driver.settle()
+    driver.spin_until(lambda: statuses and statuses[-1].state == "unconfigured")
     for label in ("configure", "connect", "activate"):
         assert driver.set("/it", label)
+    driver.spin_until(lambda: statuses[-1].state == "active" and statuses[-1].mappings)
+    assert ("inactive", True) in [(each.state, each.connected) for each in statuses]
+    assert statuses[-1].mappings == (MappingStatus(endpoint="publishers/out", matched=0),)
     driver.spin_until(node.map_to("out", node.connect_to("udpv4://127.0.0.1", name="net")).done)
     driver.node.create_subscription(String, "/out", lambda m: None, 10)
-    driver.spin_until(lambda: sum(m.kind.value == "connection_established" for m in messages) == 2)
+    on_net = MappingStatus(endpoint="publishers/out", connection="net", matched=1)
+    driver.spin_until(lambda: statuses[-1].mappings == (on_net,))
+    (net,) = (each for each in statuses[-1].connections if each.name == "net")
+    assert (net.urls, net.established) == (("udpv4://127.0.0.1",), True)
     configuration = codec.from_json(driver.configuration("/it"), NodeConfiguration)
-    driver.spin_until(
-        lambda: configuration.checksum in {getattr(each, "checksum", "") for each in messages}
-    )
+    driver.spin_until(lambda: configuration.checksum == statuses[-1].checksum)
     node.disconnect("net")
-    driver.spin_until(lambda: messages[-1].kind.value == "configuration_changed")
+    driver.spin_until(lambda: "net" not in {each.name for each in statuses[-1].connections})
+    driver.spin_until(lambda: statuses[-1].checksum != configuration.checksum)
     driver.remove(node)
-    driver.spin_until(lambda: messages[-1].kind.value == "left")
+    driver.spin_until(lambda: statuses[-1].left)
+    assert len({each.instance for each in statuses}) == 1
 
-    def told(kind: str, *fields: str) -> list[tuple[Any, ...]]:
-        found = [each for each in messages if each.kind.value == kind]
-        return [tuple(getattr(each, field) for field in fields) for each in found]
 
-    states = told("state_changed", "state", "connected")
-    assert states[-1] == ("active", True)
-    assert ("inactive", True) in states
-    net = ("net", ("udpv4://127.0.0.1",))
-    assert told("connection_established", "connection", "urls") == [net, net]
-    assert told("connection_lost", "connection", "urls", "error") == [(*net, "")]
-    out = "publishers/out"
-    assert told("mapping_established", "endpoint", "connection", "matched") == [
-        (out, "", 0),
-        (out, "net", 0),
-        (out, "net", 1),
-    ]
-    assert told("mapping_lost", "endpoint", "connection") == [(out, ""), (out, "net")]
-    assert configuration.checksum in {each for (each,) in told("configuration_changed", "checksum")}
-    assert [each.sequence for each in messages] == sorted(each.sequence for each in messages)
+def test_who_comes_later_is_told_what_a_node_is(driver: Driver, context: rclpy.Context) -> None:
+    build(driver, context, publisher("out"), events=True)
+    assert driver.set("/it", "configure")
+    later: list[NodeStatus] = []
+    remove = receive(driver.node, later.append)
+    driver.spin_until(lambda: [(each.node, each.state) for each in later] == [("/it", "inactive")])
+    remove()
 
 
 def test_a_node_whose_plan_says_no_events_stays_off_the_graph_topic(
@@ -95,16 +82,15 @@ def test_a_node_whose_plan_says_no_events_stays_off_the_graph_topic(
     assert GRAPH_TOPIC not in {name for name, _ in names}
 
 
-def test_a_node_that_only_comes_and_goes_tells_no_connections(
-    driver: Driver, context: rclpy.Context, messages: list[GraphMessage]
+def test_a_node_that_only_comes_and_goes_reports_no_connections(
+    driver: Driver, context: rclpy.Context, statuses: list[NodeStatus]
 ) -> None:
     node = build(driver, context, publisher("out"), membership=True)
-    driver.spin_until(lambda: driver.node.count_publishers(GRAPH_TOPIC) == 1)
-    driver.settle()
+    driver.spin_until(lambda: bool(statuses))
     for label in ("configure", "connect"):
         assert driver.set("/it", label)
     driver.remove(node)
-    driver.spin_until(lambda: bool(messages) and messages[-1].kind.value == "left")
-    kinds = {each.kind.value for each in messages}
-    assert "state_changed" in kinds
-    assert kinds & {"connection_established", "mapping_established", "mapping_lost"} == set()
+    driver.spin_until(lambda: statuses[-1].left)
+    assert "inactive" in {each.state for each in statuses}
+    assert "" not in {each.checksum for each in statuses[1:]}
+    assert {(*each.connections, *each.mappings) for each in statuses} == {()}

@@ -11,8 +11,9 @@ from typing import Any, TypeVar
 import pytest
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.graph.events import GraphEvents
-from lifecycle.graph.observer import Diagnostic, DiagnosticReadings, Observer
+from lifecycle.graph.diagnostics import Diagnostic, DiagnosticReadings
+from lifecycle.graph.loop import GraphLoop
+from lifecycle.graph.observer import Observer
 from lifecycle.manifest.model import (
     EndpointKind,
     Run,
@@ -30,7 +31,6 @@ from lifecycle.verify.observation import (
 )
 from lifecycle.verify.tool_filter import NO_NAMES, DeclaredNames
 from tests.builders import configuration, plan_of, planned_node
-from tests.unit.graph.simulated import ManualScheduler
 from tests.unit.supervisor.fakes import run as run_jumping
 
 T = TypeVar("T")
@@ -87,8 +87,10 @@ class FakeGraph:
 class FakeClients:
     def __init__(self) -> None:
         self.states: dict[str, str] = {}
-        self.configurations: dict[str, NodeConfiguration] = {}
+        self.configurations: dict[str, NodeConfiguration | None] = {}
         self.asked: list[str] = []
+        self.answer_s = 0.0
+        self.read_configurations: list[str] = []
         self.followed: dict[str, Callable[[], None]] = {}
         self.forgotten: list[str] = []
         self.destroyed = False
@@ -105,7 +107,10 @@ class FakeClients:
     async def get_configuration(
         self, node: str, *, timeout_s: float, expected: bool
     ) -> NodeConfiguration | None:
-        return self.configurations.get(node)
+        self.read_configurations.append(node)
+        answer = self.configurations.get(node)
+        await asyncio.sleep(self.answer_s)
+        return answer
 
     def on_transition(self, node: str, callback: Callable[[], None]) -> None:
         self.followed[node] = callback
@@ -149,8 +154,8 @@ def clients() -> FakeClients:
 
 
 def observing(graph: FakeGraph, clients: FakeClients, **options: Any) -> Observer:
-    """An observer whose state changes at once."""
-    return Observer(graph, clients, GraphEvents(None, ManualScheduler()), **options)
+    """An observer as a supervisor has it."""
+    return Observer(graph, clients, GraphLoop(own_thread=False), **options)
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""A graph that is followed: discovery must not undo what messages say, nor the other way round.
+"""A graph that is followed: when nodes are read, and what discovery makes of them.
 
 And one state for all: what a program is shown of a node is what the verification judges.
 """
@@ -8,19 +8,18 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 from collections.abc import Awaitable, Callable
+from typing import Any
 
 import pytest
 
-from lifecycle.graph.events import GraphEvents
-from lifecycle.graph.observer import Observer
-from lifecycle.graph.reporter import GraphReporter
-from lifecycle.graph.scheduler import LoopScheduler
+from lifecycle.graph.loop import GraphLoop
+from lifecycle.graph.observer import FORGET_AFTER_S, Observer
+from lifecycle.graph.status import NodeStatus
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.verify.judge import verify
-from lifecycle.verify.observation import EndpointReport, ObservedNode
+from lifecycle.verify.observation import EndpointReport, NodeConfiguration, ObservedNode
 from lifecycle.verify.verdict import Stage
-from tests.unit.graph.simulated import Network, every
-from tests.unit.graph.test_observer import FakeClients, FakeGraph, configuration, plan
+from tests.unit.graph.test_observer import VIDEO, FakeClients, FakeGraph, configuration, plan
 from tests.unit.supervisor.fakes import run
 
 OUT = EndpointReport(
@@ -29,20 +28,33 @@ OUT = EndpointReport(
 ITS_OWN = dataclasses.replace(configuration("/it"), endpoints=(OUT,), checksum="1")
 
 
+class LoopOfItsOwn(GraphLoop):
+    """The test's loop, taken for one that has a thread of its own."""
+
+    has_thread = True
+
+
 class World:
     def __init__(self, *, follows: bool = True) -> None:
         self.graph, self.clients = FakeGraph(), FakeClients()
-        self.scheduler = LoopScheduler()
-        self.network = Network(self.scheduler)
-        events = GraphEvents(self.network.transport(), self.scheduler)
-        self.observer = Observer(self.graph, self.clients, events, follows=follows)
+        loop = (LoopOfItsOwn if follows else GraphLoop)(own_thread=False)
+        loop.bind()
+        self.observer = Observer(self.graph, self.clients, loop)
         self.state = self.observer.state
 
-    async def settle(self) -> None:
+    async def show(self, *names: str) -> None:
+        """Have discovery show nodes, and wait until what follows is done."""
+        self.graph.nodes = tuple(ObservedNode(full_name=each) for each in names)
+        self.graph.change()
         await asyncio.sleep(0.5)
 
-    def topics(self) -> tuple[str, ...]:
-        return self.state.topics()
+    async def say(self, **fields: Any) -> None:
+        self.state.put_status(NodeStatus(node="/it", **{"instance": "1", **fields}))
+        await asyncio.sleep(0.5)
+
+    def known(self) -> NodeConfiguration | None:
+        view = self.state.node("/it")
+        return None if view is None else view.configuration
 
 
 def in_world(main: Callable[[World], Awaitable[None]], *, follows: bool = True) -> None:
@@ -50,28 +62,113 @@ def in_world(main: Callable[[World], Awaitable[None]], *, follows: bool = True) 
         world = World(follows=follows)
         await main(world)
         world.observer.close()
+        await asyncio.sleep(0)  # its tasks end in the loop
 
     run(made())
 
 
-def test_a_node_that_reports_is_asked_although_its_services_are_not_shown_yet() -> None:
+def test_a_node_that_reports_is_read_although_its_services_are_not_shown_yet() -> None:
     async def main(world: World) -> None:
-        world.graph.nodes = (ObservedNode(full_name="/it"),)
-        await world.settle()
-        seen = world.state.node("/it")
-        assert seen is not None
-        assert (seen.incarnation, seen.endpoints) == ("", ())
-
+        await world.show("/it")
+        assert world.state.node("/it") is not None
         world.clients.configurations["/it"] = ITS_OWN
-        reporter = GraphReporter(
-            world.network.transport(), "/it", every=every(world.scheduler), period_s=3600.0
-        )
-        reporter.joined("inactive", connected=True, checksum="1")
-        await world.settle()
-        joined = world.state.node("/it")
-        assert joined is not None
-        assert (joined.incarnation, joined.configuration) == (reporter.incarnation, ITS_OWN)
-        reporter.left()
+        await world.say(state="inactive", checksum="1")
+        assert world.known() == ITS_OWN
+
+    in_world(main)
+
+
+def test_a_node_is_read_again_when_it_says_something_new_and_else_never() -> None:
+    async def main(world: World) -> None:
+        world.clients.configurations["/it"] = ITS_OWN
+        await world.say(checksum="1")
+        assert world.clients.read_configurations == ["/it"]
+        await world.say(checksum="1")
+        await world.show("/it")
+        await asyncio.sleep(100)
+        assert world.clients.read_configurations == ["/it"]
+        changed = dataclasses.replace(ITS_OWN, endpoints=(), checksum="2")
+        world.clients.configurations["/it"] = changed
+        await world.say(checksum="2")
+        assert world.clients.read_configurations == ["/it"] * 2
+        assert world.known() == changed
+
+    in_world(main)
+
+
+def test_a_node_that_changes_while_it_is_read_is_read_once_more_however_often() -> None:
+    async def main(world: World) -> None:
+        world.clients.configurations["/it"] = ITS_OWN
+        world.clients.answer_s = 0.1
+        for number in range(20):
+            world.state.put_status(NodeStatus(node="/it", instance="1", checksum=str(number)))
+            await asyncio.sleep(0)
+        await asyncio.sleep(0.5)
+        assert world.clients.read_configurations == ["/it", "/it"]
+        assert world.known() == ITS_OWN
+
+    in_world(main)
+
+
+def test_an_answer_of_the_instance_before_is_not_taken() -> None:
+    async def main(world: World) -> None:
+        world.clients.configurations["/it"] = ITS_OWN
+        world.clients.answer_s = 1.0
+        await world.say(instance="1")
+        world.clients.configurations["/it"] = None
+        await world.say(instance="2")
+        await asyncio.sleep(0.5)
+        assert world.known() is None
+
+    in_world(main)
+
+
+def test_a_node_that_does_not_answer_is_read_again_later() -> None:
+    async def main(world: World) -> None:
+        await world.say(checksum="1")
+        assert world.known() is None
+        world.clients.configurations["/it"] = ITS_OWN
+        await asyncio.sleep(2.0)
+        assert world.known() == ITS_OWN
+
+    in_world(main)
+
+
+def test_a_plain_node_has_what_discovery_shows_of_it() -> None:
+    async def main(world: World) -> None:
+        world.graph.endpoints = (dataclasses.replace(VIDEO, node="/it"),)
+        await world.show("/it", "/_it_net", "/_ros2cli_1", "/other")
+        assert [each.name for each in world.state.nodes()] == ["/it", "/other"]
+        (end,) = world.state.publishers_of("/video")
+        assert (end.node.name, end.endpoint.mapped, end.endpoint.gid) == ("/it", True, "")
+        world.graph.endpoints = ()
+        await world.show("/it")
+        assert (world.state.publishers_of("/video"), world.state.node("/other")) == ((), None)
+
+    in_world(main)
+
+
+def test_a_node_that_left_is_not_back_because_discovery_still_shows_it() -> None:
+    async def main(world: World) -> None:
+        await world.show("/it")
+        await world.say()
+        await world.say(left=True)
+        await world.show("/it", "/new")
+        assert [each.name for each in world.state.nodes()] == ["/new"]
+
+    in_world(main)
+
+
+def test_a_node_that_is_silent_for_long_has_left() -> None:
+    async def main(world: World) -> None:
+        await world.show("/it")
+        await world.say()
+        await world.show()
+        assert [each.liveliness.value for each in world.state.nodes()] == ["alive"]
+        await asyncio.sleep(1.0)  # no farewell came
+        assert [each.liveliness.value for each in world.state.nodes()] == ["silent"]
+        await asyncio.sleep(FORGET_AFTER_S)
+        assert world.state.nodes() == ()
 
     in_world(main)
 
@@ -90,7 +187,7 @@ def test_what_is_judged_is_a_snapshot_of_the_state_that_programs_ask(*, follows:
         world.state.put_configuration(put)
         seen = await world.observer.observe(plan("put", "it", "absent"))
         assert seen == world.state.observation()
-        await world.settle()
+        await asyncio.sleep(0.5)
         views = {each.name: each.configuration for each in world.state.nodes()}
         assert views == {each.name: each for each in seen.configurations}
         verdict = verify(plan("put", "it", "absent"), seen, stage=Stage.ACTIVE)
@@ -105,38 +202,9 @@ def test_what_is_judged_is_a_snapshot_of_the_state_that_programs_ask(*, follows:
 def test_what_was_put_of_a_node_whose_process_ended_is_judged_no_more() -> None:
     async def main(world: World) -> None:
         world.state.put_configuration(configuration("/put"))
-        await asyncio.sleep(0)
         assert [each.name for each in world.state.nodes()] == ["/put"]
         world.state.drop_configuration("/put")
         assert (await world.observer.observe(plan("put"))).configurations == ()
-        await asyncio.sleep(0)
         assert world.state.nodes() == ()
 
     in_world(main)
-
-
-class _Ahead(LoopScheduler):
-    """As in a thread of its own that is faster than who posts."""
-
-    def post(self, call: Callable[[], None]) -> None:
-        call()
-
-
-def test_a_node_that_is_there_at_once_may_be_read_before_the_observer_is_made_to_its_end() -> None:
-    async def main() -> None:
-        scheduler = _Ahead()
-        network = Network(scheduler)
-        events = GraphEvents(network.transport(), scheduler)
-        events.report_seen("/it")
-        clients = FakeClients()
-        clients.configurations["/it"] = ITS_OWN
-        graph = FakeGraph()
-        graph.nodes = (ObservedNode(full_name="/it"),)
-        observer = Observer(graph, clients, events, follows=True)
-        await asyncio.sleep(0.5)
-        view = observer.state.node("/it")
-        assert view is not None
-        assert view.configuration is not None
-        observer.close()
-
-    run(main())

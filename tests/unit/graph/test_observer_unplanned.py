@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+from typing import Any
 
-from lifecycle.graph.events import GraphEvents
-from lifecycle.graph.messages import GraphMessage, Heartbeat, StateChanged, encode
 from lifecycle.graph.observer import Observer
-from lifecycle.graph.scheduler import set_within
+from lifecycle.graph.status import NodeStatus
 from lifecycle.verify.observation import ObservedNode
-from tests.unit.graph.simulated import ManualScheduler, Network
 from tests.unit.graph.test_observer import FakeClients, FakeGraph, configuration, observing, plan
 from tests.unit.supervisor.fakes import run
 
@@ -54,35 +52,26 @@ def test_without_guests_only_planned_nodes_are_read() -> None:
     run(main())
 
 
-def test_a_message_is_worth_a_look_and_a_heartbeat_only_with_a_new_checksum() -> None:
-    async def woken(observer: Observer) -> bool:
-        waiting = asyncio.Event()
-        change = asyncio.ensure_future(observer.wait_change())
-        change.add_done_callback(lambda _: waiting.set())
-        try:
-            return await set_within(waiting, 1.0)
-        finally:
-            change.cancel()
-
+def test_a_status_is_worth_a_look_unless_it_says_what_is_known() -> None:
     async def main() -> None:
-        graph, clients, _ = world(unplanned=True)
-        network = Network(scheduler := ManualScheduler())
-        events = GraphEvents(network.transport(), scheduler)
-        observer = Observer(graph, clients, events, unplanned=True)
-        sender = network.transport()
+        _, _, observer = world(unplanned=True)
+        woken = observer.changes
 
-        def send(type_: type[GraphMessage], node: str, **fields: str) -> None:
-            sender.send(encode(type_(node=node, incarnation="1", sequence=1, **fields)))
+        async def wakes(node: str, **fields: Any) -> bool:
+            nonlocal woken
+            observer.state.put_status(NodeStatus(node=node, instance="1", **fields))
+            await asyncio.sleep(0)
+            await asyncio.sleep(0)
+            before, woken = woken, observer.changes
+            return woken > before
 
         await observer.observe(plan())
-        send(Heartbeat, "/guest", checksum="1")
-        assert not await woken(observer)
-        send(Heartbeat, "/guest", checksum="2")
-        assert await woken(observer)
-        send(StateChanged, "/guest", state="active")
-        assert await woken(observer)
+        answered = {"state": "inactive", "connected": True, "checksum": "1"}
+        assert not await wakes("/guest", **answered)
+        assert await wakes("/guest", **answered | {"checksum": "2"})
+        assert await wakes("/guest", **answered | {"state": "active"})
+        assert await wakes("/guest", **answered, left=True)
         observer.state.put_configuration(configuration("/hosted"))
-        send(StateChanged, "/hosted", state="active")
-        assert not await woken(observer)
+        assert not await wakes("/hosted", state="active")
 
     run(main())

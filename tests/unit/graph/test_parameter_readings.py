@@ -8,6 +8,7 @@ from collections.abc import Awaitable, Callable, Collection
 import pytest
 
 from lifecycle.errors import MiddlewareError
+from lifecycle.graph.loop import GraphLoop
 from lifecycle.graph.parameters import (
     AGAIN_AT_MOST_S,
     AGAIN_S,
@@ -66,7 +67,9 @@ class Reader:
     def __init__(self) -> None:
         self.services = Services()
         self.woken = 0
-        self.readings = ParameterReadings(self.services, self._wake)
+        loop = GraphLoop(own_thread=False)
+        loop.bind()
+        self.readings = ParameterReadings(self.services, loop, self._wake)
         self.readings.listen(NAMED)
 
     def _wake(self) -> None:

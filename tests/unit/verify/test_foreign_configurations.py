@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lifecycle import codec
-from lifecycle.graph.messages import GraphMessageError
-from lifecycle.graph.messages import decode as decode_message
+from lifecycle.graph.status import NodeStatusError
+from lifecycle.graph.status import decode as decode_status
 from lifecycle.plan.comparison import PlanNoticeError
 from lifecycle.plan.comparison import decode as decode_notice
 from lifecycle.verify.judge import verify
@@ -196,8 +196,8 @@ def test_deep_text_is_refused_in_a_thread_with_little_stack_too() -> None:
 def test_no_text_makes_a_decoder_raise_anything_but_its_own_error(text: str | bytes) -> None:
     with pytest.raises(ConfigurationError):
         decode_configuration(text, NAME)
-    with pytest.raises(GraphMessageError):
-        decode_message(text)
+    with pytest.raises(NodeStatusError):
+        decode_status(text)
     if isinstance(text, str):
         with pytest.raises(PlanNoticeError):
             decode_notice(text)

@@ -1,0 +1,99 @@
+"""The asyncio loop in which a graph runs, and a wait that loses no cancellation.
+
+Owns: where callbacks of a graph are called, one after another. Pure.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import threading
+import typing
+from collections.abc import Callable
+
+
+@typing.final
+class GraphLoop:
+    """Runs what it is given in one asyncio loop, in order.
+
+    Args:
+        own_thread: the loop has a thread of its own; else it is the one in which `bind` is first
+            called, and what is posted before waits for that.
+    """
+
+    def __init__(self, *, own_thread: bool) -> None:
+        self._lock = threading.Lock()
+        self._early: list[Callable[[], object]] = []
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._thread: threading.Thread | None = None
+        self._closed = False
+        if own_thread:
+            self._loop = asyncio.new_event_loop()
+            self._thread = threading.Thread(target=self._run, name="graph", daemon=True)
+            self._thread.start()
+
+    @property
+    def has_thread(self) -> bool:
+        """Whether the loop has a thread of its own."""
+        return self._thread is not None
+
+    def bind(self) -> asyncio.AbstractEventLoop:
+        """Return the loop.
+
+        Raises:
+            RuntimeError: there is none yet, and none runs here.
+        """
+        if self._loop is None:
+            loop = asyncio.get_running_loop()
+            with self._lock:
+                self._loop, early = loop, self._early
+            for work in early:
+                loop.call_soon(work)
+        return self._loop
+
+    def post(self, work: Callable[[], object]) -> None:
+        """Run `work` in the loop soon; from any thread. Dropped once the loop is closed."""
+        with self._lock:
+            if self._loop is None:
+                self._early.append(work)
+                return
+        with contextlib.suppress(RuntimeError):
+            self._loop.call_soon_threadsafe(work)
+
+    def close(self) -> None:
+        """End the thread, if there is one, and cancel what runs in it; again is harmless."""
+        if self._thread is None or self._loop is None:
+            return
+        with self._lock:
+            closed, self._closed = self._closed, True
+        if not closed:
+            self._loop.call_soon_threadsafe(self._loop.stop)
+        if self._thread is not threading.current_thread():
+            self._thread.join()
+
+    def _run(self) -> None:
+        assert self._loop is not None
+        try:
+            self._loop.run_forever()
+            tasks = asyncio.all_tasks(self._loop)
+            for each in tasks:
+                each.cancel()
+            if tasks:
+                self._loop.run_until_complete(asyncio.wait(tasks))
+        finally:
+            self._loop.close()
+
+
+async def set_within(event: asyncio.Event, timeout_s: float | None) -> bool:
+    """Wait until `event` is set; False if it was not within `timeout_s` (None: no limit).
+
+    asyncio.wait_for of Python 3.10 and 3.11 returns normally when it is cancelled in the moment in
+    which what it waits for comes true (python/cpython#86296): a task that waits in a loop then
+    outlives its cancellation, and who waits for its end waits for ever.
+    """
+    waiting = asyncio.ensure_future(event.wait())
+    try:
+        done, _ = await asyncio.wait({waiting}, timeout=timeout_s)
+    finally:
+        waiting.cancel()
+    return bool(done)
