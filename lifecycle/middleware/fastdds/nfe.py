@@ -15,29 +15,28 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import weakref
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Callable, Iterator
 from typing import Any
 
-from rcl_interfaces.msg import ParameterEvent
 from rclpy.callback_groups import CallbackGroup
 from rclpy.context import Context
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile, qos_profile_parameter_events
+from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 from rclpy.type_support import check_is_valid_msg_type
 from rclpy.validate_topic_name import validate_topic_name
 
-from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.fastdds.settings import noted_shared_memory
+from lifecycle.middleware.fastdds.sockets import udp_sockets
+from lifecycle.middleware.process.shared_memory import own_segments
 from lifecycle.middleware.rcl import abi
-from lifecycle.middleware.rcl.hidden_node import is_moved
 from lifecycle.middleware.rcl.qos import to_rclpy
+from lifecycle.network.medium import DEFAULT_RMW
 from lifecycle.network.nfe import (
     InternetProtocol,
     NetworkFlowEndpoint,
@@ -80,7 +79,7 @@ def get_network_flow_endpoints(
     only among a subscription's: ask `has_shared_memory` for a publisher. An empty tuple means that
     the endpoint cannot be reached over any network.
 
-    Of a publisher only before its participant has peers, see `senders_of`.
+    Ask a publisher only before its participant has peers, see `senders_of`.
 
     Raises:
         NetworkFlowEndpointsUnsupported: this RMW has no such function.
@@ -121,28 +120,11 @@ def senders_of(node: Node) -> tuple[NetworkFlowEndpoint, ...]:
 def has_shared_memory(node: Node) -> bool:
     """Return whether the participant of `node` has a shared memory transport.
 
-    Every subscription of a participant listens on all its transports, so one shows it for the
-    publishers as well. Where the node has none, one is made for a moment, on /parameter_events.
-
-    Raises:
-        MiddlewareError: as `get_network_flow_endpoints`.
+    It is noted when this package makes a participant. Of one that was made otherwise it is what the
+    process has: segments of Fast DDS in /dev/shm.
     """
-    existing = next((each for each in node.subscriptions if not is_moved(each)), None)
-    if existing is not None:
-        return _listens_on_shared_memory(existing)
-    if (noted := noted_shared_memory(node.context)) is not None:
-        return noted
-    probe = node.create_subscription(
-        ParameterEvent,
-        "/parameter_events",
-        _ignore,
-        qos_profile_parameter_events,
-        event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
-    )
-    try:
-        return _listens_on_shared_memory(probe)
-    finally:
-        node.destroy_subscription(probe)
+    noted = noted_shared_memory(node.context)
+    return bool(own_segments()) if noted is None else noted
 
 
 def read_handle(handle: Any, kind: str) -> tuple[NetworkFlowEndpoint, ...]:
@@ -154,23 +136,17 @@ def read_handle(handle: Any, kind: str) -> tuple[NetworkFlowEndpoint, ...]:
             handle.pointer, ctypes.byref(rcl.default_allocator), ctypes.byref(array)
         )
     if result != abi.RCL_RET_OK:
-        raise _failure(result, kind, rcl.take_error())
+        reason = rcl.take_error()
+        message = f"cannot read the network flow endpoints of a {kind}: {reason}"
+        if result == abi.RCL_RET_UNSUPPORTED:
+            hint = f"set RMW_IMPLEMENTATION={DEFAULT_RMW}"
+            raise NetworkFlowEndpointsUnsupported(message, reason=reason, hint=hint)
+        raise MiddlewareError(message)
     try:
         return tuple(_convert(array.items[index]) for index in range(array.size))
     finally:
         if array.allocator:  # an empty list was never initialised, and fini would complain of it
             rcl.nfe_array_fini(ctypes.byref(array))
-
-
-def _listens_on_shared_memory(subscription: Subscription) -> bool:
-    return SHARED_MEMORY in (
-        dataclasses.replace(each, transport_port=0)
-        for each in get_network_flow_endpoints(subscription)
-    )
-
-
-def _ignore(_: ParameterEvent) -> None:
-    """Take nothing: the probe is never spun."""
 
 
 def _convert(nfe: abi.Nfe) -> NetworkFlowEndpoint:
@@ -184,17 +160,8 @@ def _convert(nfe: abi.Nfe) -> NetworkFlowEndpoint:
     )
 
 
-def _failure(result: int, kind: str, reason: str) -> MiddlewareError:
-    message = f"cannot read the network flow endpoints of a {kind}: {reason}"
-    if result == abi.RCL_RET_UNSUPPORTED:
-        return NetworkFlowEndpointsUnsupported(
-            message, reason=reason, hint="set RMW_IMPLEMENTATION=rmw_fastrtps_cpp"
-        )
-    return MiddlewareError(message)
-
-
 _PUBLISHER_HINT = "give the publisher its own participant, or ask for optionally_required"
-_SUBSCRIPTION_HINT = "ask for optionally_required, or set RMW_IMPLEMENTATION=rmw_fastrtps_cpp"
+_SUBSCRIPTION_HINT = f"ask for optionally_required, or set RMW_IMPLEMENTATION={DEFAULT_RMW}"
 _UNIQUE_PORTS = range(7000, 7400)
 """Fast DDS looks for a unique port in [portBase − 400, portBase), in every domain."""
 
@@ -258,7 +225,7 @@ def create_subscription(
     if content_filter is not None:
         abi.load()  # before anything is made
     if _is_plain(node, "subscription", topic, unique):
-        plain = node.create_subscription(
+        subscription = node.create_subscription(
             type_,
             topic,
             callback,
@@ -267,29 +234,21 @@ def create_subscription(
             event_callbacks=event_callbacks,
             raw=raw,
         )
-        return _filtered(node, plain, content_filter)
-    group = callback_group or node.default_callback_group
-    handle = _create_handle(
-        node, "subscription", type_=type_, topic=topic, profile=profile, unique=unique
-    )
-    try:
-        subscription = Subscription(
-            handle,
-            type_,
-            topic,
-            callback,
-            group,
-            profile,
-            raw,
-            event_callbacks=event_callbacks or SubscriptionEventCallbacks(),
-        )
-    except BaseException:
-        handle.destroy_when_not_in_use()
-        raise
-    group.add_entity(subscription)
-    node._subscriptions.append(subscription)  # noqa: SLF001 - what Node.create_subscription does
-    _register(node, subscription)
-    return _filtered(node, subscription, content_filter)
+    else:
+        group = callback_group or node.default_callback_group
+        events = event_callbacks or SubscriptionEventCallbacks()
+        with _unique_handle(
+            node, "subscription", type_, topic, profile=profile, unique=unique
+        ) as handle:
+            subscription = Subscription(
+                *(handle, type_, topic, callback, group, profile, raw), event_callbacks=events
+            )
+        group.add_entity(subscription)
+        node._subscriptions.append(subscription)  # noqa: SLF001 - as Node.create_subscription does
+        _register(node, subscription)
+    if content_filter is not None:
+        _filter(node, subscription, *content_filter)
+    return subscription
 
 
 class _ContentFilter(ctypes.Structure):
@@ -303,32 +262,25 @@ class _ContentFilter(ctypes.Structure):
     )
 
 
-def _filtered(
-    node: Node, subscription: Subscription, content_filter: tuple[str, tuple[str, ...]] | None
-) -> Subscription:
+def _filter(
+    node: Node, subscription: Subscription, expression: str, parameters: tuple[str, ...]
+) -> None:
     """Have the middleware take those messages alone that a filter lets through."""
-    if content_filter is None:
-        return subscription
     rcl = abi.load()
-    expression, parameters = content_filter
     values = (ctypes.c_char_p * len(parameters))(*(each.encode() for each in parameters))
     options = _ContentFilter()
+    at = ctypes.byref(options)
     pointer, code = ctypes.c_void_p, ctypes.c_int
-    init = abi.bind(
-        "rcl",
-        "rcl_subscription_content_filter_options_init",
-        code,
-        (pointer, ctypes.c_char_p, ctypes.c_size_t, pointer, pointer),
-    )
+    prefix = "rcl_subscription_content_filter_options"
+    arguments = (pointer, ctypes.c_char_p, ctypes.c_size_t, pointer, pointer)
+    init = abi.bind("rcl", f"{prefix}_init", code, arguments)
     apply = abi.bind("rcl", "rcl_subscription_set_content_filter", code, (pointer, pointer))
-    end = abi.bind("rcl", "rcl_subscription_content_filter_options_fini", code, (pointer, pointer))
+    end = abi.bind("rcl", f"{prefix}_fini", code, (pointer, pointer))
     with subscription.handle:
         made = subscription.handle.pointer
-        failed = init(
-            made, expression.encode(), len(parameters), values, ctypes.byref(options)
-        ) or apply(made, ctypes.byref(options))
+        failed = init(made, expression.encode(), len(parameters), values, at) or apply(made, at)
         reason = rcl.take_error() if failed else ""
-        end(made, ctypes.byref(options))
+        end(made, at)
     if failed:
         topic = subscription.topic_name
         node.destroy_subscription(subscription)
@@ -336,7 +288,6 @@ def _filtered(
             f"cannot filter subscription {topic!r} by {expression!r}: {reason}",
             hint="write it as the WHERE part of SQL, with %0, %1, … for its parameters",
         )
-    return subscription
 
 
 def create_publisher(
@@ -370,21 +321,12 @@ def create_publisher(
             event_callbacks=event_callbacks,
             publisher_class=publisher_class,
         )
-    handle = _create_handle(
-        node, "publisher", type_=type_, topic=topic, profile=profile, unique=unique
-    )
-    try:
+    events = event_callbacks or PublisherEventCallbacks()
+    group = callback_group or node.default_callback_group
+    with _unique_handle(node, "publisher", type_, topic, profile=profile, unique=unique) as handle:
         publisher = publisher_class(
-            handle,
-            type_,
-            topic,
-            profile,
-            event_callbacks=event_callbacks or PublisherEventCallbacks(),
-            callback_group=callback_group or node.default_callback_group,
+            *(handle, type_, topic, profile), event_callbacks=events, callback_group=group
         )
-    except BaseException:
-        handle.destroy_when_not_in_use()
-        raise
     node._publishers.append(publisher)  # noqa: SLF001 - what Node.create_publisher does
     _register(node, publisher)
     return publisher
@@ -416,23 +358,25 @@ class _RefusedError(Exception):
     """The RMW said no; the text is its reason."""
 
 
-def _create_handle(
+@contextlib.contextmanager
+def _unique_handle(
     node: Node,
     kind: str,
-    *,
     type_: type[Any],
     topic: str,
+    *,
     profile: QoSProfile,
     unique: UniqueRequirement,
-) -> Any:
-    """Make rclpy's C++ handle and re-initialise the rcl struct inside it with the option."""
+) -> Iterator[Any]:
+    """Yield rclpy's C++ handle, with the rcl struct inside it re-initialised with the option.
+
+    It is destroyed if the block raises.
+    """
     rcl = abi.load()
     check_is_valid_msg_type(type_)  # also loads the type support
     validate_topic_name(topic)  # names the character at fault, which resolving does not
     resolved = node.resolve_topic_name(topic)  # for messages; unreadable while re-initialising
-    make = rclpy_implementation.Publisher
-    if kind == "subscription":
-        make = rclpy_implementation.Subscription
+    make = getattr(rclpy_implementation, kind.capitalize())
     with node.handle:
         handle = make(node.handle, type_, topic, profile.get_c_qos_profile())
     try:
@@ -448,20 +392,19 @@ def _create_handle(
             )
         if unique is UniqueRequirement.STRICTLY_REQUIRED:
             _prove(handle, kind)
-    except _RefusedError as refused:
-        handle.destroy_when_not_in_use()
-        raise UniqueFlowNotFeasible(
-            f"cannot create {kind} {resolved!r} with network flow endpoints {unique.value}: "
-            f"{refused}",
-            topic=resolved,
-            reason=str(refused),
-            hint=_PUBLISHER_HINT if kind == "publisher" else _subscription_hint(),
-        ) from refused
-    except BaseException:
+        yield handle
+    except BaseException as error:
         # A handle whose init failed is zero inside; rcl's fini accepts that.
         handle.destroy_when_not_in_use()
-        raise
-    return handle
+        if not isinstance(error, _RefusedError):
+            raise
+        raise UniqueFlowNotFeasible(
+            f"cannot create {kind} {resolved!r} with network flow endpoints {unique.value}: "
+            f"{error}",
+            topic=resolved,
+            reason=str(error),
+            hint=_PUBLISHER_HINT if kind == "publisher" else _subscription_hint(),
+        ) from error
 
 
 def _reinitialise(
@@ -501,11 +444,7 @@ def _prove(handle: Any, kind: str) -> None:
 
 def _subscription_hint() -> str:
     """Say so when the host's unique ports are used up: rcl's own reason does not."""
-    taken = set()
-    for table in ("/proc/net/udp", "/proc/net/udp6"):
-        with contextlib.suppress(FileNotFoundError):
-            for line in Path(table).read_text(encoding="ascii").splitlines()[1:]:
-                taken.add(int(line.split()[1].rpartition(":")[2], 16))
+    taken = {each.port for each in udp_sockets()}
     if not taken.issuperset(_UNIQUE_PORTS):
         return _SUBSCRIPTION_HINT
     return (

@@ -156,21 +156,18 @@ class FlowParticipant:
         # Without ROS arguments: endpoint names come here resolved.
         self._context, self.node = quiet_node(name, namespace, domain_id, settings=settings)
         self._fixed = fixed_sockets(settings) - before
+        said = [url.transport.is_network for url in settings.urls]
+        self.has_shared_memory = not all(said) if said else has_shared_memory(self.node)
         try:
             # Every publisher of a participant lists the same sender sockets; rclpy's parameter
             # event publisher lists them before there is any publisher of the user's.
             probe = next(iter(self.node.publishers))
-            self.has_shared_memory: bool | None = None
             if dscp is not None or is_known():
                 self._nfes = senders_of(self.node)
             if dscp is not None:
                 sockets.set_dscp(self._nfes, dscp)
             # It would share the sockets that are to be unique.
             self.node.destroy_publisher(probe)
-            if is_known():
-                # URLs say it, without a probe that static discovery would not allow.
-                said = [url.transport.is_network for url in settings.urls]
-                self.has_shared_memory = not all(said) if said else has_shared_memory(self.node)
         except BaseException:
             self.destroy()
             raise

@@ -44,7 +44,7 @@ class Connection:
         urls: what it was made from, as text; empty if the RMW chose.
         node_name: base name of the hidden node that owns the participant; empty for the node's own.
         participant: None for the node's own, and once disconnected.
-        has_shared_memory: it has that transport; None where the RMW cannot report it.
+        has_shared_memory: it has that transport.
         warning: what of it could not be made as asked, while the rest was; empty otherwise.
         error: why it could not be made; empty if it was.
     """
@@ -53,7 +53,7 @@ class Connection:
     urls: tuple[str, ...] = ()
     node_name: str = ""
     participant: FlowParticipant | None = None
-    has_shared_memory: bool | None = None
+    has_shared_memory: bool = False
     warning: str = ""
     error: str = ""
 
@@ -67,7 +67,7 @@ class Connections:
 
     def __init__(self, node: Node) -> None:
         self._node = node
-        self.own = Connection(name="")
+        self.own = Connection(name="", has_shared_memory=has_shared_memory(node))
         self._made: dict[str, Connection] = {}  # by name of the hidden node
         self._failed: dict[str, Connection] = {}  # by name
         with contextlib.suppress(MiddlewareError):
@@ -197,14 +197,6 @@ class Connections:
         for connection in reversed(tuple(self._made.values())):
             self.close(connection)
         self._failed.clear()
-
-    def look_at_shared_memory(self) -> None:
-        """Find out whether the node's own participant has it; cheaper once it has endpoints."""
-        try:
-            self.own.has_shared_memory = has_shared_memory(self._node)
-        except MiddlewareError:
-            # "unknown to the RMW" is a value here, and the verifier's to judge.
-            self.own.has_shared_memory = None
 
     def _unplanned(self, name: str) -> PlannedParticipant:
         base = f"_{self._node.get_name()}_{name}"

@@ -189,8 +189,6 @@ class NodeDataLayer:
         else:
             self._map_all(spec)
             self._changed()
-        # Last, because a subscription of the node saves making one to find out.
-        self.connections.look_at_shared_memory()
         self._is_made = True
 
     def remove(self) -> None:

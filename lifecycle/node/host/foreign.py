@@ -388,8 +388,6 @@ class ForeignNode:
 
     def get_configuration(self) -> NodeConfiguration:
         """Return its identity and its endpoints as they are."""
-        if self._connections.own.has_shared_memory is None:
-            self._connections.look_at_shared_memory()
         reported, own = self.reported, self._connections.own
         endpoints, connections = configuration.foreign_reports(
             self._node,

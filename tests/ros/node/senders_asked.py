@@ -1,7 +1,4 @@
-"""Node classes whose process says when it asks for sender sockets.
-
-It also says when it makes a subscription to learn whether it has shared memory.
-"""
+"""Node classes whose process says when it asks for sender sockets."""
 
 from __future__ import annotations
 
@@ -16,15 +13,14 @@ from lifecycle.middleware.fastdds import nfe
 __all__ = ["Good", "Plain", "Theirs"]
 
 
-def _saying(what: str, function: Any) -> Any:
+def _saying(function: Any) -> Any:
     @functools.wraps(function)
     def call(*arguments: Any) -> Any:
-        if what != "asked" or "publisher" in arguments:
-            print(what, file=sys.stderr, flush=True)
+        if "publisher" in arguments:
+            print("asked", file=sys.stderr, flush=True)
         return function(*arguments)
 
     return call
 
 
-nfe._listens_on_shared_memory = _saying("probed", nfe._listens_on_shared_memory)
-nfe.read_handle = _saying("asked", nfe.read_handle)
+nfe.read_handle = _saying(nfe.read_handle)

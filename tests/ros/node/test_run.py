@@ -77,9 +77,7 @@ def read_until(process: subprocess.Popen[str], last: str) -> list[str]:
     return lines
 
 
-def test_a_node_alone_makes_no_subscription_to_learn_whether_it_has_shared_memory(
-    start: Start,
-) -> None:
+def test_a_node_alone_asks_for_its_sender_sockets_once(start: Start) -> None:
     code = (
         f"import sys; sys.path.insert(0, {str(HERE)!r}); import lifecycle, senders_asked; "
         "from alone import Counter; lifecycle.run(Counter)"
