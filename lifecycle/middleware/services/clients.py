@@ -12,7 +12,7 @@ import importlib
 from collections.abc import Awaitable, Callable, Collection, Coroutine, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from lifecycle_msgs.msg import TransitionEvent
+from lifecycle_msgs.msg import Transition, TransitionEvent
 from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
 from rcl_interfaces.msg import ParameterEvent
 from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically
@@ -29,7 +29,6 @@ from lifecycle.middleware.services.parameters import (
     TYPES,
     parameter_value,
     read_parameters,
-    report_parameters,
     type_word,
 )
 from lifecycle.middleware.services.service_calls import ServiceCalls, ServiceUnansweredError
@@ -89,7 +88,7 @@ class NodeClients:
         Raises:
             ServiceUnansweredError: no such service, or no answer.
         """
-        response = await self._ask(f"{node}/get_state", GetState, timeout_s)
+        response = await self._request(f"{node}/get_state", GetState, timeout_s)
         label: str = response.current_state.label
         return label
 
@@ -101,9 +100,8 @@ class NodeClients:
         Raises:
             ServiceUnansweredError: no such service, or no answer.
         """
-        response = await self._ask(
-            f"{node}/get_available_transitions", GetAvailableTransitions, timeout_s
-        )
+        service = f"{node}/get_available_transitions"
+        response = await self._request(service, GetAvailableTransitions, timeout_s)
         return tuple(each.transition.label for each in response.available_transitions)
 
     async def change_state(
@@ -137,20 +135,22 @@ class NodeClients:
         if self._calls.open(service, ChangeState):
             # The node drops its reply if it does not know this client's reader yet. It learns of
             # our readers in order: a reply to one made later proves that it knows this one.
-            self._calls.renew(f"{node}/get_state", GetState)
-            await self.get_state(node, timeout_s=timeout_s)
-        request = ChangeState.Request()
-        request.transition.label = transition
+            await self._request(f"{node}/get_state", GetState, timeout_s, fresh=True)
         left_s = max(deadline - loop.time(), _LEAST_S)
 
         async def ask() -> bool:
-            reply = await self._calls.call(
-                service, ChangeState, request, timeout_s=left_s, repeat=False, before=before
+            wanted = Transition(label=transition)
+            reply = await self._request(
+                service, ChangeState, left_s, repeat=False, before=before, transition=wanted
             )
             return bool(reply.success)
 
         async def reached() -> bool | None:
-            return await self._reached(node, transition) or None
+            try:
+                state = await self.get_state(node, timeout_s=_REREAD_S)
+            except ServiceUnansweredError:
+                return None
+            return True if state == _GOALS.get(transition) else None
 
         try:
             return await _reply(ask(), reached)
@@ -177,16 +177,14 @@ class NodeClients:
         service = f"{node}/get_configuration"
         if not expected and not self._observer.offers(node, service):
             return None
-        response = await self._ask(service, Trigger, timeout_s)
-        if not response.success:
-            raise _refused(f"read the configuration of {node!r}", response.message)
+        response = await self._request(service, Trigger, timeout_s)
+        what = f"read the configuration of {node!r}"
+        _check(what, response.success, response.message)
         try:
             return decode_configuration(response.message, node)
         except ConfigurationError as error:
-            raise MiddlewareError(
-                f"cannot read the configuration of {node!r}: {error}",
-                hint="the node may run another version of lifecycle",
-            ) from error
+            hint = "the node may run another version of lifecycle"
+            raise MiddlewareError(f"cannot {what}: {error}", hint=hint) from error
 
     async def get_parameters(
         self, node: str, *, timeout_s: float = TIMEOUT_S
@@ -196,7 +194,19 @@ class NodeClients:
         Raises:
             ServiceUnansweredError: the node serves no parameters, or did not answer.
         """
-        return await read_parameters(self._calls, node, timeout_s=timeout_s)
+        from lifecycle.export.captured import CapturedParameter
+
+        found = await read_parameters(self._calls, node, None, timeout_s=timeout_s)
+        return tuple(
+            CapturedParameter(
+                name=descriptor.name,
+                type=type_,
+                value=value,
+                description=descriptor.description,
+                read_only=descriptor.read_only,
+            )
+            for descriptor, type_, value in found
+        )
 
     async def load_component(
         self, node: PlannedNode, container: str, *, timeout_s: float = TIMEOUT_S
@@ -218,60 +228,64 @@ class NodeClients:
             ServiceUnansweredError: no such container, or no answer.
             MiddlewareError: composition_interfaces is not installed, or the container refuses.
         """
+        what = f"load {node.run.component!r} into {container!r}"
         try:
             services = importlib.import_module("composition_interfaces.srv")
         except ImportError as error:
             raise MiddlewareError(
-                f"cannot load {node.run.component!r} into {container!r}: composition_interfaces is "
-                "not installed",
+                f"cannot {what}: composition_interfaces is not installed",
                 hint="install it, or start the node as a command",
             ) from error
         package, _, plugin = node.run.component.partition("/")
-        request = services.LoadNode.Request(
-            package_name=package,
-            plugin_name=plugin,
-            node_name=node.name,
-            node_namespace=node.namespace,
-            remap_rules=[f"{source}:={target}" for source, target in node.remap],
-            parameters=[each.to_parameter_msg() for each in _given_values(node).values()],
-            extra_arguments=[
-                Parameter(name, value=value).to_parameter_msg()
-                for name, value in node.run.extra_arguments
-            ],
-        )
+        extra = (Parameter(name, value=value) for name, value in node.run.extra_arguments)
+        at = f"{container}/_container"
 
-        async def ask(what: str, type_: type[Any], asked: object, refused: str) -> Any:
-            service = f"{container}/_container/{what}"
-            response = await self._calls.call(
-                service, type_, asked, timeout_s=timeout_s, repeat=False
-            )
-            if not response.success:
-                raise _refused(refused, response.error_message)
-            return response
+        async def loaded() -> dict[int, str] | None:
+            """Return what the container has, full names by number; None if it does not answer."""
+            try:
+                there = await self._request(f"{at}/list_nodes", services.ListNodes, _REREAD_S)
+            except ServiceUnansweredError:
+                return None
+            return dict(zip(there.unique_ids, there.full_node_names, strict=True))
 
         async def load() -> int:
-            refused = f"load {node.run.component!r} into {container!r}"
-            return int((await ask("load_node", services.LoadNode, request, refused)).unique_id)
+            response = await self._request(
+                f"{at}/load_node",
+                services.LoadNode,
+                timeout_s,
+                repeat=False,
+                package_name=package,
+                plugin_name=plugin,
+                node_name=node.name,
+                node_namespace=node.namespace,
+                remap_rules=[f"{source}:={target}" for source, target in node.remap],
+                parameters=[each.to_parameter_msg() for each in _given_values(node).values()],
+                extra_arguments=[each.to_parameter_msg() for each in extra],
+            )
+            _check(what, response.success, response.error_message)
+            return int(response.unique_id)
 
-        async def loaded() -> int | None:
-            there = await self._loaded(container, services) or {}
+        async def is_loaded() -> int | None:
+            there = await loaded() or {}
             named = (number for number, name in there.items() if name == node.full_name)
             return max(named, default=None)
 
-        number = await _reply(load(), loaded)
+        number = await _reply(load(), is_loaded)
 
         async def ask_to_unload() -> bool:
-            asked = services.UnloadNode.Request(unique_id=number)
-            refused = f"unload {node.full_name!r} from {container!r}"
-            await ask("unload_node", services.UnloadNode, asked, refused)
+            response = await self._request(
+                f"{at}/unload_node", services.UnloadNode, timeout_s, repeat=False, unique_id=number
+            )
+            what = f"unload {node.full_name!r} from {container!r}"
+            _check(what, response.success, response.error_message)
             return True
 
-        async def unloaded() -> bool | None:
-            there = await self._loaded(container, services)
+        async def is_unloaded() -> bool | None:
+            there = await loaded()
             return None if there is None or number in there else True
 
         async def unload() -> None:
-            await _reply(ask_to_unload(), unloaded)
+            await _reply(ask_to_unload(), is_unloaded)
 
         return unload
 
@@ -293,12 +307,10 @@ class NodeClients:
         if not wanted:
             return
         parameters = [each.to_parameter_msg() for each in wanted.values()]
-        response = await self._ask(
-            f"{node}/set_parameters", SetParameters, timeout_s, parameters=parameters
-        )
+        service = f"{node}/set_parameters"
+        response = await self._request(service, SetParameters, timeout_s, parameters=parameters)
         for name, result in zip(wanted, response.results, strict=False):
-            if not result.successful:
-                raise _refused(f"set parameter {name!r} of {node!r}", result.reason)
+            _check(f"set parameter {name!r} of {node!r}", result.successful, result.reason)
 
     async def set_parameters(
         self,
@@ -324,15 +336,13 @@ class NodeClients:
             Parameter(name, TYPES[types[name]], value).to_parameter_msg()
             for name, value in values.items()
         ]
-        answer = await self._ask(
-            f"{node}/set_parameters_atomically",
-            SetParametersAtomically,
-            timeout_s,
-            parameters=parameters,
+        service = f"{node}/set_parameters_atomically"
+        response = await self._request(
+            service, SetParametersAtomically, timeout_s, parameters=parameters
         )
-        if not answer.result.successful:
-            names = ", ".join(map(repr, values))
-            raise _refused(f"set {names} of {node!r} while it runs", answer.result.reason)
+        names = ", ".join(map(repr, values))
+        what = f"set {names} of {node!r} while it runs"
+        _check(what, response.result.successful, response.result.reason)
 
     async def answers(
         self, node: str, *, managed: bool, timeout_s: float, repeat: bool = False
@@ -345,15 +355,12 @@ class NodeClients:
             timeout_s: seconds, > 0.
             repeat: see ServiceCalls; else a reply that is lost is none.
         """
-        service, type_ = (
-            (f"{node}/get_state", GetState)
-            if managed
-            else (f"{node}/get_parameters", GetParameters)
-        )
+        type_ = GetState if managed else GetParameters
+        service = f"{node}/get_{'state' if managed else 'parameters'}"
         if not self._observer.offers(node, service):
             return None
         try:
-            await self._ask(service, type_, timeout_s, repeat=repeat)
+            await self._request(service, type_, timeout_s, repeat=repeat)
         except ServiceUnansweredError as error:
             return False if error.found else None
         return True
@@ -366,7 +373,16 @@ class NodeClients:
         Raises:
             ServiceUnansweredError: the node serves no parameters, or did not answer.
         """
-        return await report_parameters(self._calls, node, names, timeout_s=timeout_s)
+        found = await read_parameters(self._calls, node, names, timeout_s=timeout_s)
+        return tuple(
+            ParameterReport.of(
+                descriptor.name,
+                type_ or type_word(descriptor.type),
+                value,
+                read_only=descriptor.read_only,
+            )
+            for descriptor, type_, value in found
+        )
 
     def serves_parameters(self, node: str) -> bool | None:
         """Return whether `node` has parameter services; None while discovery may not show them yet.
@@ -452,17 +468,15 @@ class NodeClients:
         """Call one of the services that take a name and a value, and say why if it is refused."""
         type_ = TYPES["string" if isinstance(value, str) else "string_array"]
         given = Parameter(name, type_, value).to_parameter_msg()
+        service = f"{node}/{operation}"
         # Each of them makes the same state again when it arrives twice.
-        response = await self._ask(
-            f"{node}/{operation}", SetParameters, timeout_s, parameters=[given]
-        )
+        response = await self._request(service, SetParameters, timeout_s, parameters=[given])
+        what = f"{operation} {name!r} of {node!r}"
         if len(response.results) != 1:
             raise MiddlewareError(
-                f"cannot {operation} {name!r} of {node!r}: it answered with "
-                f"{len(response.results)} results instead of one"
+                f"cannot {what}: it answered with {len(response.results)} results instead of one"
             )
-        if not response.results[0].successful:
-            raise _refused(f"{operation} {name!r} of {node!r}", response.results[0].reason)
+        _check(what, response.results[0].successful, response.results[0].reason)
 
     def on_transition(self, node: str, callback: Callable[[], None]) -> None:
         """Have `callback` called in the executor thread after each transition of `node`.
@@ -499,37 +513,27 @@ class NodeClients:
         if topic in self._subscriptions:
             self._observer.node.destroy_subscription(self._subscriptions.pop(topic))
 
-    async def _ask(
+    async def _request(
         self,
         service: str,
         type_: type[Any],
         timeout_s: float,
         *,
         repeat: bool = True,
+        fresh: bool = False,
+        before: Callable[[], Awaitable[None]] | None = None,
         **fields: Any,
     ) -> Any:
-        """Send a request of these fields and return the response; raises as `ServiceCalls.call`."""
-        request = type_.Request(**fields)
-        return await self._calls.call(service, type_, request, timeout_s=timeout_s, repeat=repeat)
-
-    async def _loaded(self, container: str, services: Any) -> dict[int, str] | None:
-        """Return what a container has loaded, full names by number; None if it does not answer."""
-        try:
-            there = await self._ask(
-                f"{container}/_container/list_nodes", services.ListNodes, _REREAD_S
-            )
-        except ServiceUnansweredError:
-            return None
-        return dict(zip(there.unique_ids, there.full_node_names, strict=True))
-
-    async def _reached(self, node: str, transition: str) -> bool:
-        goal = _GOALS.get(transition)
-        if goal is None:
-            return False
-        try:
-            return await self.get_state(node, timeout_s=_REREAD_S) == goal
-        except ServiceUnansweredError:
-            return False
+        """Send a request of these fields and return the response; see `ServiceCalls.call`."""
+        return await self._calls.call(
+            service,
+            type_,
+            type_.Request(**fields),
+            timeout_s=timeout_s,
+            repeat=repeat,
+            fresh=fresh,
+            before=before,
+        )
 
 
 async def _reply(
@@ -553,8 +557,9 @@ async def _reply(
         pending.cancel()
 
 
-def _refused(what: str, reason: str) -> MiddlewareError:
-    return MiddlewareError(f"cannot {what}: it says {reason!r}")
+def _check(what: str, accepted: bool, reason: str) -> None:
+    if not accepted:
+        raise MiddlewareError(f"cannot {what}: it says {reason!r}")
 
 
 def _given_values(node: PlannedNode, has: Mapping[str, str] | None = None) -> dict[str, Any]:

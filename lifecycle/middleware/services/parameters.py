@@ -10,15 +10,14 @@ import array
 from collections.abc import Collection
 from typing import TYPE_CHECKING, Any
 
+from rcl_interfaces.msg import ParameterDescriptor
 from rcl_interfaces.msg import ParameterValue as ParameterValueMessage
 from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters
 from rclpy.parameter import Parameter, parameter_value_to_python
 
 from lifecycle.manifest.model import ParameterValue
-from lifecycle.verify.observation import ParameterReport
 
 if TYPE_CHECKING:
-    from lifecycle.export.captured import CapturedParameter
     from lifecycle.middleware.services.service_calls import ServiceCalls
 
 TYPES = {
@@ -38,76 +37,51 @@ _WORDS = {each.value: word for word, each in TYPES.items()}
 
 
 async def read_parameters(
-    calls: ServiceCalls, node: str, *, timeout_s: float
-) -> tuple[CapturedParameter, ...]:
-    """Read every parameter that a node declares: its type, value and description.
+    calls: ServiceCalls, node: str, names: Collection[str] | None, *, timeout_s: float
+) -> list[tuple[ParameterDescriptor, str, ParameterValue | None]]:
+    """Read parameters of a node: descriptor, our name of the type, and value; sorted by name.
+
+    One that is declared and not set has an empty type and no value.
 
     Args:
         calls: makes the requests.
         node: fully qualified name.
+        names: those that it has of these; None for all.
         timeout_s: seconds, > 0, for each request.
 
     Raises:
         ServiceUnansweredError: no such service, or no answer.
     """
-    from lifecycle.export.captured import CapturedParameter
-
-    return tuple(
-        CapturedParameter(
-            name=name,
-            type=type_word(value.type),
-            value=_value(value),
-            description=descriptor.description if descriptor else "",
-            read_only=bool(descriptor and descriptor.read_only),
-        )
-        for name, descriptor, value in await _read(calls, node, None, timeout_s)
-    )
-
-
-async def report_parameters(
-    calls: ServiceCalls, node: str, names: Collection[str] | None, *, timeout_s: float
-) -> tuple[ParameterReport, ...]:
-    """Read those parameters of a node that are named and that it has; as `read_parameters`."""
-    return tuple(
-        ParameterReport.of(
-            name,
-            type_word(value.type) or type_word(descriptor.type if descriptor else 0),
-            _value(value),
-            read_only=bool(descriptor and descriptor.read_only),
-        )
-        for name, descriptor, value in await _read(calls, node, names, timeout_s)
-    )
-
-
-async def _read(
-    calls: ServiceCalls, node: str, names: Collection[str] | None, timeout_s: float
-) -> list[tuple[str, Any, Any]]:
-    """Return name, descriptor (None if unknown) and value of parameters, sorted by name."""
     import asyncio  # late: a host, which needs `parameter_value` only, has no use for it
 
-    async def ask(service: str, type_: type[Any], request: object) -> Any:
+    async def ask(service: str, type_: type[Any], **fields: object) -> Any:
+        request = type_.Request(**fields)
         name = f"{node}/{service}"
         return await calls.call(name, type_, request, timeout_s=timeout_s, repeat=True)
 
     async def get(asked: list[str]) -> list[Any]:
-        request = GetParameters.Request(names=asked)
-        return list((await ask("get_parameters", GetParameters, request)).values)
+        return list((await ask("get_parameters", GetParameters, names=asked)).values)
 
-    listed = await ask("list_parameters", ListParameters, ListParameters.Request())
-    has = set(listed.result.names)
+    has = set((await ask("list_parameters", ListParameters)).result.names)
     wanted = sorted(has if names is None else has.intersection(names))
     if not wanted:
         return []
     described, values = await asyncio.gather(
-        ask("describe_parameters", DescribeParameters, DescribeParameters.Request(names=wanted)),
-        get(wanted),
+        ask("describe_parameters", DescribeParameters, names=wanted), get(wanted)
     )
     if len(values) != len(wanted):
         # One that is declared and not set makes rclpy and rclcpp answer with none at all.
         alone = await asyncio.gather(*(get([name]) for name in wanted))
         values = [each[0] if each else ParameterValueMessage() for each in alone]
     found = {each.name: each for each in described.descriptors}
-    return [(name, found.get(name), value) for name, value in zip(wanted, values, strict=True)]
+    return [
+        (
+            found.get(name, ParameterDescriptor(name=name)),
+            type_word(value.type),
+            parameter_value(parameter_value_to_python(value)) if value.type in _WORDS else None,
+        )
+        for name, value in zip(wanted, values, strict=True)
+    ]
 
 
 def type_word(type_: int) -> str:
@@ -121,7 +95,3 @@ def parameter_value(value: Any) -> ParameterValue | None:
         return tuple(each[0] if isinstance(each, bytes) else each for each in value)
     plain: ParameterValue | None = value
     return plain
-
-
-def _value(message: Any) -> ParameterValue | None:
-    return parameter_value(parameter_value_to_python(message)) if message.type in _WORDS else None

@@ -11,7 +11,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import threading
-from collections import Counter
 from collections.abc import Awaitable, Callable
 from typing import Any
 
@@ -68,9 +67,7 @@ class ServiceCalls:
 
     def __init__(self, observer: GraphObserver) -> None:
         self._observer = observer
-        self._clients: dict[tuple[str, type[Any]], Client] = {}
-        self._pending: Counter[Client] = Counter()  # calls of each
-        self._replaced: set[Client] = set()
+        self._clients: dict[tuple[str, type[Any], bool], Client] = {}
         self.group = ReentrantCallbackGroup()
         self._destroyed = False
         self._spinner: _Spinner | None = None
@@ -85,6 +82,7 @@ class ServiceCalls:
         *,
         timeout_s: float,
         repeat: bool,
+        fresh: bool = False,
         before: Callable[[], Awaitable[None]] | None = None,
     ) -> Any:
         """Wait for `service`, send `request`, and return the response.
@@ -95,6 +93,7 @@ class ServiceCalls:
             request: of that class.
             timeout_s: seconds, > 0, for all of it.
             repeat: the request does no harm when it arrives twice.
+            fresh: by a client that is made now and dropped afterwards.
             before: awaited when the first request is about to leave; what it raises keeps it back.
 
         Raises:
@@ -104,7 +103,7 @@ class ServiceCalls:
         try:
             loop = asyncio.get_running_loop()
             deadline = loop.time() + timeout_s
-            client = await self._usable(service, type_, deadline)
+            client = await self._usable(service, type_, deadline, fresh=fresh)
             if client is None:
                 raise ServiceUnansweredError(service, found=False, timeout_s=timeout_s)
             if before is not None:
@@ -117,7 +116,6 @@ class ServiceCalls:
 
             attempt_s = _FIRST_ATTEMPT_S if repeat else timeout_s
             sent = []
-            self._pending[client] += 1
             try:
                 while (left_s := deadline - loop.time()) > 0:
                     sent.append(client.call_async(request))
@@ -130,47 +128,25 @@ class ServiceCalls:
                 for pending in sent:
                     client.remove_pending_request(pending)
                 answer.cancel()
-                self._over(client)
             raise ServiceUnansweredError(service, found=True, timeout_s=timeout_s)
         except InvalidHandle as error:
             # Its node left, and its client was destroyed meanwhile.
             raise ServiceUnansweredError(service, found=False, timeout_s=timeout_s) from error
+        finally:
+            if fresh:
+                self._drop((service, type_, True))
 
     def open(self, service: str, type_: type[Any]) -> bool:
         """Make the client of a service now; False if there is one already."""
-        if (service, type_) in self._clients:
+        if (service, type_, False) in self._clients:
             return False
         self._client(service, type_)
         return True
 
-    def renew(self, service: str, type_: type[Any]) -> None:
-        """Make the client of a service anew; calls that are under way keep theirs."""
-        replaced = self._clients.pop((service, type_), None)
-        if replaced is None:
-            return
-        self._client(service, type_)
-        if self._pending[replaced]:
-            self._replaced.add(replaced)
-        else:
-            self._observer.node.destroy_client(replaced)
-
-    def _over(self, client: Client) -> None:
-        """Note that a call is over; a client that was replaced goes with its last one."""
-        self._pending[client] -= 1
-        if self._pending[client]:
-            return
-        del self._pending[client]
-        if client in self._replaced:
-            self._replaced.discard(client)
-            self._observer.node.destroy_client(client)
-
     def forget(self, prefix: str) -> None:
         """Drop the clients of services whose name starts with `prefix`, of a node that left."""
-        for client in [each for each in self._replaced if each.srv_name.startswith(prefix)]:
-            self._replaced.discard(client)
-            self._observer.node.destroy_client(client)
         for key in [key for key in self._clients if key[0].startswith(prefix)]:
-            self._observer.node.destroy_client(self._clients.pop(key))
+            self._drop(key)
 
     def destroy(self) -> None:
         """Stop the thread and drop the clients; again is harmless."""
@@ -179,21 +155,28 @@ class ServiceCalls:
             self._spinner.stop()
         self.forget("")
 
-    def _client(self, service: str, type_: type[Any]) -> Client:
-        client = self._clients.get((service, type_))
+    def _client(self, service: str, type_: type[Any], *, fresh: bool = False) -> Client:
+        client = self._clients.get((service, type_, fresh))
         if client is None:
             client = self._observer.node.create_client(type_, service, callback_group=self.group)
-            self._clients[service, type_] = client
+            self._clients[service, type_, fresh] = client
         return client
 
-    async def _usable(self, service: str, type_: type[Any], deadline: float) -> Client | None:
+    def _drop(self, key: tuple[str, type[Any], bool]) -> None:
+        client = self._clients.pop(key, None)
+        if client is not None:
+            self._observer.node.destroy_client(client)
+
+    async def _usable(
+        self, service: str, type_: type[Any], deadline: float, *, fresh: bool
+    ) -> Client | None:
         """Wait until a service is there; None at the deadline.
 
         Its client may be dropped meanwhile, with a node of that name that the graph shows to have
         left only now: its successor is waited for by another one.
         """
         while True:
-            client = self._client(service, type_)
+            client = self._client(service, type_, fresh=fresh)
             try:
                 return client if await self._found(client, service, deadline) else None
             except InvalidHandle:

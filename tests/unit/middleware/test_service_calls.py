@@ -1,4 +1,4 @@
-"""Clients that are made anew, or whose node left, while a call of theirs is under way."""
+"""Clients that are made for one call, or whose node left, while a call is under way."""
 
 from __future__ import annotations
 
@@ -49,51 +49,37 @@ class _Node:
         self.destroyed.append(client)
 
 
-def test_a_call_under_way_keeps_its_client_until_it_is_answered() -> None:
+def test_a_fresh_client_is_made_for_one_call_and_dropped_with_it_or_with_its_node() -> None:
     async def main() -> None:
         node = _Node()
         observer: Any = types.SimpleNamespace(node=node, owns_node=False)
         calls = ServiceCalls(observer)
 
-        async def ask() -> Any:
+        def ask(*, fresh: bool) -> asyncio.Future[Any]:
             request = GetState.Request()
-            return await calls.call(SERVICE, GetState, request, timeout_s=5.0, repeat=False)
+            return asyncio.ensure_future(
+                calls.call(SERVICE, GetState, request, timeout_s=5.0, repeat=False, fresh=fresh)
+            )
 
-        first = asyncio.ensure_future(ask())
+        kept = ask(fresh=False)
         await asyncio.sleep(0.01)
-        calls.renew(SERVICE, GetState)
-        second = asyncio.ensure_future(ask())
+        proving = ask(fresh=True)
         await asyncio.sleep(0.01)
         old, new = node.made
         assert node.destroyed == []
         new.asked[0].set_result("new")
-        assert await second == "new"
+        assert await proving == "new"
+        assert node.destroyed == [new]
         old.asked[0].set_result("old")
-        assert await first == "old"
-        assert node.destroyed == [old]
-        calls.renew(SERVICE, GetState)  # nobody waits for it: it goes at once
-        assert node.destroyed == [old, new]
-        calls.destroy()
-        assert node.destroyed == node.made
-
-    asyncio.run(main())
-
-
-def test_a_client_that_was_replaced_goes_with_its_node() -> None:
-    async def main() -> None:
-        node = _Node()
-        observer: Any = types.SimpleNamespace(node=node, owns_node=False)
-        calls = ServiceCalls(observer)
-        request = GetState.Request()
-        asking = asyncio.ensure_future(
-            calls.call(SERVICE, GetState, request, timeout_s=5.0, repeat=False)
-        )
+        assert await kept == "old"
+        asking = ask(fresh=True)
         await asyncio.sleep(0.01)
-        calls.renew(SERVICE, GetState)
         calls.forget("/base/")
-        assert node.destroyed == node.made
         asking.cancel()
         await asyncio.wait({asking})
-        assert node.destroyed == node.made
+        assert sorted(node.destroyed, key=id) == sorted(node.made, key=id)
+        assert calls.open(SERVICE, GetState)
+        calls.destroy()
+        assert sorted(node.destroyed, key=id) == sorted(node.made, key=id)
 
     asyncio.run(main())
