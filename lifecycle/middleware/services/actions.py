@@ -1,13 +1,14 @@
 """Action client and server on rclpy's that never wait for ever: goals can be ended from outside.
 
-Owns: the private names of `rclpy.action.client` and `rclpy.action.server` that this takes. Callers
-that wait for a client's answer learn that it is gone, and that they must not block; a server's
-answers are sent at once. What works on a goal, and when one has to end, is `lifecycle.node`'s.
+Owns: the private names of `rclpy.action.server` that this takes. Callers that wait for a client's
+answer learn that it is gone, and that they must not block; a server's answers are sent at once.
+What works on a goal, and when one has to end, is `lifecycle.node`'s.
 Import it late: rclpy.action imports numpy, 100 ms.
 """
 
 from __future__ import annotations
 
+import functools
 import threading
 import typing
 from collections.abc import Awaitable, Callable
@@ -59,8 +60,11 @@ class GoalClient(ActionClient):  # type: ignore[misc]  # rclpy is not typed
         self._refuse_to_block = refuse_to_block
         self._participant = node  # `_node` becomes whose executor it is, on a connection another
         self._group = group
-        self._lock = threading.Lock()  # of the next three
-        self._held: list[_Held] = []
+        self._goal_type = action_type.Goal
+        self._what = f"action {name!r}"
+        self._awaited: dict[Future, str] = {}  # what each says
+        self._lock = threading.Lock()  # of the next four
+        self._held: list[Callable[[], None]] = []
         self._watch: ServerWatch | None = None
         self._matched: GuardCondition | None = None
         self._destroyed = False
@@ -69,22 +73,44 @@ class GoalClient(ActionClient):  # type: ignore[misc]  # rclpy is not typed
 
     def send_goal(self, goal: Any, **options: Any) -> Any:
         """As rclpy's, outside of callbacks: it waits for the result."""
-        self._refuse_to_block(f"a result of action {self._action_name!r}", "send_goal_async(goal)")
-        return super().send_goal(goal, **options)
+        self._refuse_to_block(f"a result of {self._what}", "send_goal_async(goal)")
+        return _wait(_wait(self.send_goal_async(goal, **options)).get_result_async())
 
     def send_goal_async(self, goal: Any, *arguments: Any, **options: Any) -> Future:
         """As rclpy's; a goal is held until a server is matched, before which DDS would lose it."""
-        if self.server_is_ready() or not isinstance(goal, self._action_type.Goal):
-            return super().send_goal_async(goal, *arguments, **options)
-        held = _Held(
-            send=lambda: super(GoalClient, self).send_goal_async(goal, *arguments, **options)
-        )
+        if not isinstance(goal, self._goal_type):
+            raise TypeError(f"{goal!r} is no goal of {self._what}")
+        promised = self._await(Future(), "whether a goal is accepted")
+
+        def send() -> None:
+            sent = ActionClient.send_goal_async(self, goal, *arguments, **options)
+            sent.add_done_callback(lambda _: self._accepted(sent, promised))
+
+        if self.server_is_ready():
+            send()
+            return promised
         with self._lock:
-            self._held.append(held)
+            self._held.append(send)
             if self._watch is None:
                 self._matched = self._node.create_guard_condition(self._send_held, self._group)
                 self._watch = ServerWatch(self._participant, self, self._matched.trigger)
-        return held.promised
+        return promised
+
+    def destroy(self) -> None:
+        """As rclpy's; pending answers raise ActionClientGoneError. Again is harmless."""
+        with self._lock:
+            if self._destroyed:
+                return
+            self._destroyed = True
+            self._let_go()
+        for future, what in tuple(self._awaited.items()):
+            if not future.done():
+                future.set_exception(
+                    ActionClientGoneError(
+                        f"cannot learn {what} of {self._what}: the action client was disconnected"
+                    )
+                )
+        super().destroy()
 
     def _send_held(self) -> None:
         """Send what was held, if a server is matched now; in the executor."""
@@ -92,10 +118,10 @@ class GoalClient(ActionClient):  # type: ignore[misc]  # rclpy is not typed
             if self._destroyed or not self.server_is_ready():
                 return
             held = self._let_go()
-        for each in held:
-            each.send_on()
+        for send in held:
+            send()
 
-    def _let_go(self) -> list[_Held]:
+    def _let_go(self) -> list[Callable[[], None]]:
         """Hold nothing any more, with the lock taken; return what was held."""
         held, self._held = self._held, []
         if self._watch is not None:
@@ -106,66 +132,42 @@ class GoalClient(ActionClient):  # type: ignore[misc]  # rclpy is not typed
             self._matched = None
         return held
 
-    def destroy(self) -> None:
-        """As rclpy's; pending answers raise ActionClientGoneError. Again is harmless."""
-        if self._destroyed:
+    def _await(self, future: Future, what: str) -> Future:
+        """Have an answer end with this client at the latest."""
+        self._awaited[future] = what
+        future.add_done_callback(lambda done: self._awaited.pop(done, None))
+        return future
+
+    def _accepted(self, sent: Future, promised: Future) -> None:
+        """Pass on whether a goal is accepted, and have its handle ask as this client does."""
+        if promised.done():
             return
-        with self._lock:
-            self._destroyed = True
-            held = [each.promised for each in self._let_go()]
-        for pending, what in (
-            (held, "whether a goal is accepted"),
-            (self._pending_goal_requests.values(), "whether a goal is accepted"),
-            (self._pending_cancel_requests.values(), "whether a goal is cancelled"),
-            (self._pending_result_requests.values(), "the result of a goal"),
+        if (error := sent.exception()) is not None:
+            promised.set_exception(error)
+            return
+        goal = sent.result()
+        for what, answer, method in (
+            (f"a result of {self._what}", "the result of a goal", "get_result"),
+            (f"{self._what} to cancel a goal", "whether a goal is cancelled", "cancel_goal"),
         ):
-            for future in tuple(pending):
-                future.set_exception(
-                    ActionClientGoneError(
-                        f"cannot learn {what} of action {self._action_name!r}: the action client "
-                        "was disconnected"
-                    )
-                )
-        super().destroy()
+            ask = functools.partial(self._ask, getattr(goal, f"{method}_async"), answer)
+            setattr(goal, f"{method}_async", ask)
+            setattr(goal, method, functools.partial(self._ask_and_wait, ask, what, method))
+        promised.set_result(goal)
 
-    def _cancel_goal(self, goal_handle: Any) -> Any:
-        self._refuse_to_block(
-            f"action {self._action_name!r} to cancel a goal", "goal_handle.cancel_goal_async()"
-        )
-        return super()._cancel_goal(goal_handle)
+    def _ask(self, ask: Callable[[], Future], answer: str) -> Future:
+        return self._await(ask(), answer)
 
-    def _get_result(self, goal_handle: Any) -> Any:
-        self._refuse_to_block(
-            f"a result of action {self._action_name!r}", "goal_handle.get_result_async()"
-        )
-        return super()._get_result(goal_handle)
+    def _ask_and_wait(self, ask: Callable[[], Future], what: str, method: str) -> Any:
+        self._refuse_to_block(what, f"goal_handle.{method}_async()")
+        return _wait(ask())
 
 
-@typing.final
-class _Held:
-    """A goal that waits for a server.
-
-    Args:
-        send: sends it; its future is the answer.
-
-    Attributes:
-        promised: the answer.
-    """
-
-    def __init__(self, *, send: Callable[[], Future]) -> None:
-        self._send = send
-        self.promised: Future = Future()
-
-    def send_on(self) -> None:
-        """Send it."""
-        self._send().add_done_callback(self._report)
-
-    def _report(self, sent: Future) -> None:
-        error = sent.exception()
-        if error is not None:
-            self.promised.set_exception(error)
-        else:
-            self.promised.set_result(sent.result())
+def _wait(future: Future) -> Any:
+    done = threading.Event()
+    future.add_done_callback(lambda _: done.set())
+    done.wait()
+    return future.result()
 
 
 @typing.final
@@ -196,6 +198,8 @@ class GoalServer(ActionServer):  # type: ignore[misc]  # rclpy is not typed
         group: CallbackGroup,
     ) -> None:
         self._accept = accept
+        self._accepted: tuple[ServerGoalHandle, ...] = ()
+        self._log = node.get_logger().get_child("action_server")
         self._destroyed = False
         self.action_name = ""
         super().__init__(
@@ -205,13 +209,14 @@ class GoalServer(ActionServer):  # type: ignore[misc]  # rclpy is not typed
             execute,
             callback_group=group,
             goal_callback=self._respond,
+            handle_accepted_callback=self._begin,
             cancel_callback=lambda _: CancelResponse.ACCEPT,
         )
 
     @property
     def goals(self) -> tuple[ServerGoalHandle, ...]:
         """The goals that were accepted and have not ended."""
-        return tuple(each for each in self._goal_handles.values() if each.is_active)
+        return tuple(each for each in self._accepted if each.is_active)
 
     def finish(self, goal: ServerGoalHandle, result: Any | None) -> None:
         """Answer all that wait for a goal, now; the first answer counts.
@@ -242,7 +247,7 @@ class GoalServer(ActionServer):  # type: ignore[misc]  # rclpy is not typed
         try:
             await super().execute(taken_data)
         except InvalidHandle:
-            self._logger.warning(
+            self._log.warning(
                 f"cannot answer a request to action server {self.action_name!r}: it was "
                 "disconnected meanwhile"
             )
@@ -256,6 +261,10 @@ class GoalServer(ActionServer):  # type: ignore[misc]  # rclpy is not typed
     async def _respond(self, goal: Any) -> GoalResponse:
         return GoalResponse.ACCEPT if await self._accept(goal) else GoalResponse.REJECT
 
+    def _begin(self, goal: ServerGoalHandle) -> None:
+        self._accepted = (*self.goals, goal)
+        goal.execute()
+
     async def _execute_goal(self, execute_callback: Any, goal_handle: ServerGoalHandle) -> None:
         result = await execute_callback(goal_handle)
         self.finish(goal_handle, result)
@@ -264,7 +273,7 @@ class GoalServer(ActionServer):  # type: ignore[misc]  # rclpy is not typed
         try:
             super()._send_result_response(request_header, future)
         except InvalidHandle:
-            self._logger.warning(
+            self._log.warning(
                 f"cannot send a result of action server {self.action_name!r}: it was disconnected "
                 "before its goal had ended"
             )

@@ -15,7 +15,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks
-from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
@@ -129,7 +129,7 @@ class RosInterface:
             def answer(success: bool, message: str) -> None:
                 response.success, response.message = success, message
                 answered.set_result(None)
-                with contextlib.suppress(rclpy_implementation.InvalidHandle):
+                with contextlib.suppress(InvalidHandle):
                     if self._node.executor is not None:
                         self._node.executor.wake()
 

@@ -16,15 +16,13 @@ from typing import Any
 
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.client import Client
+from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ExternalShutdownException, ShutdownException, SingleThreadedExecutor
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.task import Future
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.rcl.graph import GraphObserver
-
-InvalidHandle = rclpy_implementation.InvalidHandle
 
 _FIRST_ATTEMPT_S = 0.1
 """So long a server of rmw_fastrtps waits for the client's reader before it drops its reply."""
