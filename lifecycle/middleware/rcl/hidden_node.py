@@ -165,7 +165,6 @@ Action: typing.TypeAlias = Waitable
 MovedEndpoint: typing.TypeAlias = Subscription | Service | Client | Action
 
 _LISTS = {Subscription: "_subscriptions", Service: "_services", Client: "_clients"}
-_moved: weakref.WeakSet[Any] = weakref.WeakSet()
 
 
 def move(entity: MovedEndpoint, maker: Node, host: Node) -> None:
@@ -184,13 +183,7 @@ def move(entity: MovedEndpoint, maker: Node, host: Node) -> None:
     for handler in entity.event_handlers if isinstance(entity, Subscription) else ():
         maker.remove_waitable(handler)
         host.add_waitable(handler)
-    _moved.add(entity)
     host._wake_executor()  # noqa: SLF001 - as Node.create_… does
-
-
-def is_moved(entity: object) -> bool:
-    """Whether an endpoint is on a node whose participant is not its own."""
-    return entity in _moved
 
 
 def dismiss(entity: MovedEndpoint, host: Node) -> None:

@@ -29,6 +29,7 @@ from lifecycle.middleware.services.parameters import (
     TYPES,
     parameter_value,
     read_parameters,
+    to_rclpy,
     type_word,
 )
 from lifecycle.middleware.services.service_calls import ServiceCalls, ServiceUnansweredError
@@ -582,10 +583,7 @@ def _given_values(node: PlannedNode, has: Mapping[str, str] | None = None) -> di
             continue
         if each.type == "array" and not word.endswith("_array"):
             continue
-        value = each.raw
-        if isinstance(value, tuple):
-            value = [bytes((one,)) for one in value] if word == "byte_array" else list(value)
-        given[each.name] = Parameter(each.name, known, value)
+        given[each.name] = Parameter(each.name, known, to_rclpy(each.raw, word))
     return given
 
 

@@ -95,3 +95,19 @@ def parameter_value(value: Any) -> ParameterValue | None:
         return tuple(each[0] if isinstance(each, bytes) else each for each in value)
     plain: ParameterValue | None = value
     return plain
+
+
+def to_rclpy(value: ParameterValue, type_: str) -> Any:
+    """Return `value` as rclpy wants it for a parameter of `type_`.
+
+    YAML writes 5 where a double is meant, and bytes as a list of integers.
+    """
+    if isinstance(value, tuple):
+        if type_ == "double_array":
+            return [float(each) for each in value]
+        if type_ == "byte_array":
+            return [bytes((int(each),)) for each in value]
+        return list(value)
+    if type_ == "double" and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    return value

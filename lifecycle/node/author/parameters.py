@@ -22,7 +22,12 @@ from rclpy.parameter import Parameter
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.checks.parameters import type_of
 from lifecycle.manifest.model import ParameterDeclaration, ParameterValue
-from lifecycle.middleware.services.parameters import parameter_value, type_word
+from lifecycle.middleware.services.parameters import (
+    TYPES,
+    parameter_value,
+    to_rclpy,
+    type_word,
+)
 from lifecycle.plan.model import raw_value
 from lifecycle.plan.parameters import DEFAULT
 from lifecycle.verify.observation import ParameterReport
@@ -34,18 +39,7 @@ if TYPE_CHECKING:
 
     from lifecycle.plan.model import PlannedNode
 
-_TYPES = {
-    "bool": Parameter.Type.BOOL,
-    "int": Parameter.Type.INTEGER,
-    "double": Parameter.Type.DOUBLE,
-    "string": Parameter.Type.STRING,
-    "bool_array": Parameter.Type.BOOL_ARRAY,
-    "int_array": Parameter.Type.INTEGER_ARRAY,
-    "double_array": Parameter.Type.DOUBLE_ARRAY,
-    "string_array": Parameter.Type.STRING_ARRAY,
-    "byte_array": Parameter.Type.BYTE_ARRAY,
-}
-_ARRAYS = frozenset(each for name, each in _TYPES.items() if name.endswith("_array"))
+_ARRAYS = frozenset(each for name, each in TYPES.items() if name.endswith("_array"))
 
 
 def overrides(spec: PlannedNode) -> list[Parameter]:
@@ -104,7 +98,7 @@ def _array_type(declared: tuple[Any, ...], wanted: str | None) -> Parameter.Type
     if by_code is not None and not isinstance(by_code, Parameter.Type):
         by_code = Parameter.Type.from_parameter_value(by_code)
     # Where types differ, rclpy refuses the value, as any of another type.
-    found = _TYPES[wanted] if wanted else by_code
+    found = TYPES[wanted] if wanted else by_code
     return found if found in _ARRAYS else None
 
 
@@ -150,15 +144,15 @@ def declare(node: Node, spec: PlannedNode) -> None:
         descriptor = ParameterDescriptor(
             description=declared.description, read_only=declared.read_only
         )
-        value: Any = _TYPES[declared.type]
+        value: Any = TYPES[declared.type]
         if declared.default is not None:
             value = to_rclpy(raw_value(declared.default, declared.type), declared.type)
         try:
             if value == [] and declared.name not in given:
-                type_ = _TYPES[declared.type]
+                type_ = TYPES[declared.type]
                 _declare_empty(node, node.declare_parameters, declared.name, type_, descriptor)
             else:
-                value = _TYPES[declared.type] if value == [] else value
+                value = TYPES[declared.type] if value == [] else value
                 node.declare_parameter(declared.name, value, descriptor)
         except (InvalidParameterTypeException, InvalidParameterValueException) as error:
             problems.append(_problem(declared, error))
@@ -179,22 +173,6 @@ def reports(node: Node) -> tuple[ParameterReport, ...]:
         )
         for (name, parameter), descriptor in zip(found, descriptors, strict=True)
     )
-
-
-def to_rclpy(value: ParameterValue, type_: str) -> Any:
-    """Return `value` as rclpy wants it for a parameter of `type_`.
-
-    YAML writes 5 where a double is meant, and bytes as a list of integers.
-    """
-    if isinstance(value, tuple):
-        if type_ == "double_array":
-            return [float(each) for each in value]
-        if type_ == "byte_array":
-            return [bytes((int(each),)) for each in value]
-        return list(value)
-    if type_ == "double" and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
-    return value
 
 
 def without_text(spec: PlannedNode) -> Iterator[tuple[str, ParameterValue]]:
