@@ -90,18 +90,6 @@ def test_the_option_that_need_not_be_met_makes_working_endpoints(
     assert got == [String(data="hello")]
 
 
-def test_not_required_goes_through_rclpy_untouched(
-    make_node: MakeNode, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuse() -> None:
-        raise AssertionError("rcl was loaded")
-
-    monkeypatch.setattr("lifecycle.middleware.rcl.abi.load", refuse)
-    node = make_node("node")
-    assert create_publisher(node, String, "/a", QOS) in node.publishers
-    assert create_subscription(node, String, "/a", ignore, QOS) in node.subscriptions
-
-
 def test_messages_and_events_reach_a_unique_subscription(
     make_node: MakeNode, spin_until: SpinUntil
 ) -> None:
@@ -222,26 +210,6 @@ def test_a_publisher_on_its_own_participant_shares_no_port_with_the_node(
         unique.publish(String(data="frame"))
         spin_until(lambda: got, node)
     assert got == [String(data="frame")]
-
-
-def test_sender_sockets_are_asked_for_once_in_the_life_of_a_participant(
-    make_node: MakeNode, domain_id: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    node = make_node("camera")
-    other = make_node("other")
-    node.create_publisher(String, "/a", 10)
-    first = senders_of(node)
-    with FlowParticipant("_camera_flow_0", "/", domain_id, dscp=46) as participant:
-        participant.create_publisher(String, "/flow", QOS)
-
-        def ask(*arguments: object) -> None:
-            raise AssertionError(arguments)
-
-        monkeypatch.setattr(nfe, "read_handle", ask)
-        assert senders_of(other) == first
-        assert senders_of(participant.node) != first
-        participant.ensure_dscp()
-        assert participant.read_dscp() == 46
 
 
 def test_the_dscp_of_a_participant_is_read_back_from_every_sender_socket(
