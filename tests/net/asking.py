@@ -41,7 +41,7 @@ async def _main(domain: int, url: str, verb: str, *words: str) -> None:
     try:
         await _settled(observer)
         if verb == "disconnect":
-            await clients.disconnect(*words, timeout_s=_LIMIT_S)
+            await clients.wire(words[0], "disconnect", *words[1:], timeout_s=_LIMIT_S)
         elif verb == "publishers":
             for each in observer.node.get_publishers_info_by_topic(*words):
                 print(f"{each.node_namespace.rstrip('/')}/{each.node_name}")

@@ -430,48 +430,38 @@ class NodeClients:
             1.0, lambda: callback(()), group, clock=Clock(clock_type=ClockType.STEADY_TIME)
         )
 
-    async def connect_to(
-        self, node: str, name: str, urls: Sequence[str], *, timeout_s: float = TIMEOUT_S
+    async def wire(
+        self,
+        node: str,
+        operation: str,
+        name: str,
+        value: str | Sequence[str] = "",
+        *,
+        timeout_s: float,
     ) -> None:
-        """Have a node make a connection, `~/connect_to`.
+        """Call a service of a node's interface that changes how its endpoints are connected.
 
         Args:
             node: fully qualified name.
-            name: of the connection.
-            urls: connection URLs, at least one.
-            timeout_s: seconds, > 0; all of these.
+            operation: "connect_to" makes a connection, "map_to" carries an endpoint by one,
+                "disconnect" removes one, "remap" gives an endpoint another name.
+            name: of the connection, or of the endpoint, `publishers/video`.
+            value: URLs of connect_to, at least one; connection of map_to, "" is the node's own;
+                new name of remap.
+            timeout_s: seconds, > 0.
 
         Raises:
-            ServiceUnansweredError: no such service, or no answer; all of these.
-            MiddlewareError: the node refused, with its reason; all of these.
+            ServiceUnansweredError: no such service, or no answer.
+            MiddlewareError: the node refused, with its reason.
         """
-        await self._set(node, "connect_to", name, list(urls), timeout_s)
-
-    async def map_to(
-        self, node: str, endpoint: str, connection: str, *, timeout_s: float = TIMEOUT_S
-    ) -> None:
-        """Have a node carry an endpoint, `publishers/video`, by a connection; "" is its own."""
-        await self._set(node, "map_to", endpoint, connection, timeout_s)
-
-    async def disconnect(self, node: str, connection: str, *, timeout_s: float = TIMEOUT_S) -> None:
-        """Make a node remove a connection."""
-        await self._set(node, "disconnect", connection, "", timeout_s)
-
-    async def remap(
-        self, node: str, endpoint: str, name: str, *, timeout_s: float = TIMEOUT_S
-    ) -> None:
-        """Have a node give an endpoint another topic or service name."""
-        await self._set(node, "remap", endpoint, name, timeout_s)
-
-    async def _set(
-        self, node: str, operation: str, name: str, value: str | list[str], timeout_s: float
-    ) -> None:
-        """Call one of the services that take a name and a value, and say why if it is refused."""
-        type_ = TYPES["string" if isinstance(value, str) else "string_array"]
-        given = Parameter(name, type_, value).to_parameter_msg()
-        service = f"{node}/{operation}"
+        is_text = isinstance(value, str)
+        given = Parameter(
+            name, TYPES["string" if is_text else "string_array"], value if is_text else list(value)
+        )
         # Each of them makes the same state again when it arrives twice.
-        response = await self._request(service, SetParameters, timeout_s, parameters=[given])
+        response = await self._request(
+            f"{node}/{operation}", SetParameters, timeout_s, parameters=[given.to_parameter_msg()]
+        )
         what = f"{operation} {name!r} of {node!r}"
         if len(response.results) != 1:
             raise MiddlewareError(

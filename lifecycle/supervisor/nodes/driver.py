@@ -169,16 +169,13 @@ class NodeInterfaceClient:
         Raises:
             BringUpError: the node refused or failed, or did not answer.
         """
-        services, limit_s = self._services, self._timeout_s
+        asked: tuple[str, str, str | tuple[str, ...]] = ("disconnect", step.connection, "")
+        if step.operation is Operation.CONNECT_TO:
+            asked = ("connect_to", step.connection, step.connections.urls)
+        elif step.operation is Operation.MAP_TO:
+            asked = ("map_to", step.endpoint, step.connection)
         try:
-            if step.operation is Operation.CONNECT_TO:
-                urls = step.connections.urls
-                await services.connect_to(self._node, step.connection, urls, timeout_s=limit_s)
-            elif step.operation is Operation.MAP_TO:
-                end = step.endpoint
-                await services.map_to(self._node, end, step.connection, timeout_s=limit_s)
-            else:
-                await services.disconnect(self._node, step.connection, timeout_s=limit_s)
+            await self._services.wire(self._node, *asked, timeout_s=self._timeout_s)
         except MiddlewareError as error:
             raise BringUpError(f"cannot {step}: {error.message}", hint=error.hint) from error
         return await self.interface()

@@ -92,18 +92,18 @@ def test_a_connection_is_made_carries_an_endpoint_and_is_unmade(
     clients: NodeClients, it: It
 ) -> None:
     run(
-        clients.connect_to("/it", "net", [UDP], timeout_s=BOUND_S),
-        clients.connect_to("/it", "both", [UDP, "shm://"], timeout_s=BOUND_S),
-        clients.map_to("/it", "publishers/out", "net", timeout_s=BOUND_S),
+        clients.wire("/it", "connect_to", "net", [UDP], timeout_s=BOUND_S),
+        clients.wire("/it", "connect_to", "both", [UDP, "shm://"], timeout_s=BOUND_S),
+        clients.wire("/it", "map_to", "publishers/out", "net", timeout_s=BOUND_S),
     )
     assert [(each.name, each.urls, each.mappings) for each in configuration(clients).connections][
         1:
     ] == [("net", (UDP,), ("publishers/out",)), ("both", (UDP, "shm://"), ())]
     assert endpoint(clients, "in").connection == ""
-    run(clients.disconnect("/it", "net", timeout_s=BOUND_S))
+    run(clients.wire("/it", "disconnect", "net", timeout_s=BOUND_S))
     assert [each.name for each in configuration(clients).connections] == ["", "both"]
     assert endpoint(clients, "out").mapped is False
-    run(clients.map_to("/it", "out", "", timeout_s=BOUND_S))
+    run(clients.wire("/it", "map_to", "out", "", timeout_s=BOUND_S))
     out = endpoint(clients, "out")
     assert (out.connection, out.mapped) == ("", True)
 
@@ -111,19 +111,19 @@ def test_a_connection_is_made_carries_an_endpoint_and_is_unmade(
 def test_a_renamed_subscription_hears_what_is_said_under_its_new_name(
     clients: NodeClients, it: It, make_node: Callable[..., Node], wait_until: WaitUntil
 ) -> None:
-    run(clients.remap("/it", "in", "/there", timeout_s=BOUND_S))
+    run(clients.wire("/it", "remap", "in", "/there", timeout_s=BOUND_S))
     assert endpoint(clients, "in").resolved == "/there"
     sender = make_node("sender").create_publisher(String, "/there", 10)
     wait_until(sender.get_subscription_count)
     sender.publish(String(data="hello"))
     wait_until(lambda: it.heard == ["hello"])
-    run(clients.remap("/it", "in", "", timeout_s=BOUND_S))
+    run(clients.wire("/it", "remap", "in", "", timeout_s=BOUND_S))
     assert endpoint(clients, "in").resolved == "/in"
 
 
 def test_what_the_node_refuses_is_raised_with_its_reason(clients: NodeClients, it: It) -> None:
     with pytest.raises(MiddlewareError) as refused:
-        run(clients.map_to("/it", "out", "nowhere", timeout_s=BOUND_S))
+        run(clients.wire("/it", "map_to", "out", "nowhere", timeout_s=BOUND_S))
     reason = "cannot find connection 'nowhere' of /it; connected: none but its own participant, ''"
     assert str(refused.value) == f"cannot map_to 'out' of '/it': it says {reason!r}"
     assert run(clients.get_state("/it", timeout_s=BOUND_S)) == "active"
@@ -134,5 +134,5 @@ def test_a_node_without_the_interface_is_told_from_one_that_refuses(
 ) -> None:
     make_node("plain")
     with pytest.raises(ServiceUnansweredError) as unanswered:
-        run(clients.map_to("/plain", "out", "net", timeout_s=0.5))
+        run(clients.wire("/plain", "map_to", "out", "net", timeout_s=0.5))
     assert "/plain/map_to" in str(unanswered.value)

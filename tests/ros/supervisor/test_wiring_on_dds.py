@@ -201,7 +201,7 @@ def test_a_lost_connection_is_told_and_made_again(
     with up(pair(tmp_path, fresh_domain, edit=edit), runtime=tmp_path) as run:
         run.until("system", reached="active")
         began = time.monotonic()
-        ask(lambda clients: clients.disconnect("/talker", "net", timeout_s=BOUND_S))
+        ask(lambda clients: clients.wire("/talker", "disconnect", "net", timeout_s=BOUND_S))
         run.until("lost", node="/talker", connection="net", endpoint="")
         since = len(run.events)
         run.until("wiring", node="/talker", operation="map_to", connection="net")

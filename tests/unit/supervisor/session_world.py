@@ -399,16 +399,8 @@ class FakeServices:
         del node, timeout_s
         return None
 
-    async def connect_to(
-        self, node: str, name: str, urls: Iterable[str], *, timeout_s: float
-    ) -> None:
-        raise AssertionError(f"no authority connects {node} to {name} {urls} {timeout_s}")
-
-    async def map_to(self, node: str, endpoint: str, connection: str, *, timeout_s: float) -> None:
-        raise AssertionError(f"no authority maps {node} {endpoint} {connection} {timeout_s}")
-
-    async def disconnect(self, node: str, name: str, *, timeout_s: float) -> None:
-        raise AssertionError(f"no authority disconnects {node} {name} {timeout_s}")
+    async def wire(self, node: str, *asked: object, timeout_s: float) -> None:
+        raise AssertionError(f"no authority wires {node}: {asked} {timeout_s}")
 
 
 class FakeNetworks(Networks):
