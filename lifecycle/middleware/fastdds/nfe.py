@@ -1,13 +1,14 @@
-"""Network flow endpoints of rclpy publishers and subscriptions; making endpoints with unique ones.
+"""Network flow endpoints (NFEs) of publishers and subscriptions; subscriptions with unique ones.
 
 Owns: the call into rmw that rclpy lacks, and the creation option that it cannot set, rcl's
-`require_unique_network_flow_endpoints`: the endpoint is made by rclpy, re-initialised in place with
-the option, and only then given event handlers and shown to the node, so that neither an executor
-nor an event ever sees the handle while it changes. See *Unique Network Flows*
+`require_unique_network_flow_endpoints`: the subscription is made by rclpy, re-initialised in place
+with the option, and only then given event handlers and shown to the node, so that neither an
+executor nor an event ever sees the handle while it changes. See *Unique Network Flows*
 (rmw_unique_network_flow_endpoints_requirement_t).
-An NFE list says which network resources an endpoint may
-use, not which transport carried a message; `dscp` and `flow_label` in it are always 0 with
-Fast DDS (see `lifecycle.middleware.fastdds.sockets` for the value the kernel really uses).
+
+An NFE list says which network resources an endpoint may use, not which transport carried a message;
+`dscp` and `flow_label` in it are always 0 with Fast DDS (see `lifecycle.middleware.fastdds.sockets`
+for the value the kernel really uses).
 """
 
 from __future__ import annotations
@@ -160,7 +161,6 @@ def _convert(nfe: abi.Nfe) -> NetworkFlowEndpoint:
     )
 
 
-_PUBLISHER_HINT = "give the publisher its own participant, or ask for optionally_required"
 _SUBSCRIPTION_HINT = f"ask for optionally_required, or set RMW_IMPLEMENTATION={DEFAULT_RMW}"
 _UNIQUE_PORTS = range(7000, 7400)
 """Fast DDS looks for a unique port in [portBase − 400, portBase), in every domain."""
@@ -224,7 +224,7 @@ def create_subscription(
     profile = to_rclpy(qos)
     if content_filter is not None:
         abi.load()  # before anything is made
-    if _is_plain(node, "subscription", topic, unique):
+    if _is_plain(node, topic, unique):
         subscription = node.create_subscription(
             type_,
             topic,
@@ -237,15 +237,15 @@ def create_subscription(
     else:
         group = callback_group or node.default_callback_group
         events = event_callbacks or SubscriptionEventCallbacks()
-        with _unique_handle(
-            node, "subscription", type_, topic, profile=profile, unique=unique
-        ) as handle:
+        with _unique_handle(node, type_, topic, profile=profile, unique=unique) as handle:
             subscription = Subscription(
                 *(handle, type_, topic, callback, group, profile, raw), event_callbacks=events
             )
         group.add_entity(subscription)
         node._subscriptions.append(subscription)  # noqa: SLF001 - as Node.create_subscription does
-        _register(node, subscription)
+        for handler in subscription.event_handlers:
+            node.add_waitable(handler)
+        node._wake_executor()  # noqa: SLF001
     if content_filter is not None:
         _filter(node, subscription, *content_filter)
     return subscription
@@ -303,37 +303,44 @@ def create_publisher(
 ) -> Publisher:
     """Create a publisher on `node`, on the node's own participant.
 
-    Fast DDS refuses STRICTLY_REQUIRED on publishers and silently ignores OPTIONALLY_REQUIRED: a
-    publisher becomes unique on a `FlowParticipant`. Arguments as `create_subscription`;
-    `publisher_class` as in rclpy.
+    No RMW gives a publisher flow endpoints of its own: all refuse STRICTLY_REQUIRED, or neither
+    check it nor list any, and ignore OPTIONALLY_REQUIRED. A publisher becomes unique on a
+    `FlowParticipant`. Arguments as `create_subscription`; `publisher_class` as in rclpy.
 
     Raises:
-        UniqueFlowNotFeasible: STRICTLY_REQUIRED on an RMW that cannot; no endpoint is left.
-        MiddlewareError: the endpoint could not be made at all.
+        UniqueFlowNotFeasible: STRICTLY_REQUIRED; nothing was made.
     """
-    profile = to_rclpy(qos)
-    if _is_plain(node, "publisher", topic, unique):
-        return node.create_publisher(
-            type_,
-            topic,
-            profile,
-            callback_group=callback_group,
-            event_callbacks=event_callbacks,
-            publisher_class=publisher_class,
+    if unique is UniqueRequirement.STRICTLY_REQUIRED:
+        raise _not_feasible(
+            node.resolve_topic_name(topic),
+            "publisher",
+            unique,
+            "Unique network flow endpoints not supported on publishers",
+            "give the publisher its own participant, or ask for optionally_required",
         )
-    events = event_callbacks or PublisherEventCallbacks()
-    group = callback_group or node.default_callback_group
-    with _unique_handle(node, "publisher", type_, topic, profile=profile, unique=unique) as handle:
-        publisher = publisher_class(
-            *(handle, type_, topic, profile), event_callbacks=events, callback_group=group
-        )
-    node._publishers.append(publisher)  # noqa: SLF001 - what Node.create_publisher does
-    _register(node, publisher)
-    return publisher
+    return node.create_publisher(
+        type_,
+        topic,
+        to_rclpy(qos),
+        callback_group=callback_group,
+        event_callbacks=event_callbacks,
+        publisher_class=publisher_class,
+    )
 
 
-def _is_plain(node: Node, kind: str, topic: str, unique: UniqueRequirement) -> bool:
-    """Return whether rclpy makes it: nothing else is wanted, or can be had.
+def _not_feasible(
+    topic: str, kind: str, unique: UniqueRequirement, reason: str, hint: str
+) -> UniqueFlowNotFeasible:
+    return UniqueFlowNotFeasible(
+        f"cannot create {kind} {topic!r} with network flow endpoints {unique.value}: {reason}",
+        topic=topic,
+        reason=reason,
+        hint=hint,
+    )
+
+
+def _is_plain(node: Node, topic: str, unique: UniqueRequirement) -> bool:
+    """Return whether rclpy makes a subscription: nothing else is wanted, or can be had.
 
     Raises:
         UniqueFlowNotFeasible: STRICTLY_REQUIRED, with an rcl that is not known.
@@ -344,13 +351,12 @@ def _is_plain(node: Node, kind: str, topic: str, unique: UniqueRequirement) -> b
         return False
     if unique is UniqueRequirement.OPTIONALLY_REQUIRED:
         return True
-    resolved = node.resolve_topic_name(topic)
-    reason = f"rcl {abi.rcl_version() or '(version unknown)'} is not known; known: {abi.KNOWN}"
-    raise UniqueFlowNotFeasible(
-        f"cannot create {kind} {resolved!r} with network flow endpoints {unique.value}: {reason}",
-        topic=resolved,
-        reason=reason,
-        hint=f"ask for optionally_required, or {abi.INSTALL}",
+    raise _not_feasible(
+        node.resolve_topic_name(topic),
+        "subscription",
+        unique,
+        f"rcl {abi.rcl_version() or '(version unknown)'} is not known; known: {abi.KNOWN}",
+        f"ask for optionally_required, or {abi.INSTALL}",
     )
 
 
@@ -360,79 +366,55 @@ class _RefusedError(Exception):
 
 @contextlib.contextmanager
 def _unique_handle(
-    node: Node,
-    kind: str,
-    type_: type[Any],
-    topic: str,
-    *,
-    profile: QoSProfile,
-    unique: UniqueRequirement,
+    node: Node, type_: type[Any], topic: str, *, profile: QoSProfile, unique: UniqueRequirement
 ) -> Iterator[Any]:
-    """Yield rclpy's C++ handle, with the rcl struct inside it re-initialised with the option.
+    """Yield rclpy's C++ handle, with the rcl subscription inside re-initialised with the option.
 
     It is destroyed if the block raises.
     """
-    rcl = abi.load()
     check_is_valid_msg_type(type_)  # also loads the type support
     validate_topic_name(topic)  # names the character at fault, which resolving does not
     resolved = node.resolve_topic_name(topic)  # for messages; unreadable while re-initialising
-    make = getattr(rclpy_implementation, kind.capitalize())
     with node.handle:
-        handle = make(node.handle, type_, topic, profile.get_c_qos_profile())
+        handle = rclpy_implementation.Subscription(
+            node.handle, type_, topic, profile.get_c_qos_profile()
+        )
     try:
         with handle, node.handle:
-            _reinitialise(
-                rcl,
-                kind,
-                entity=handle.pointer,
-                node=node.handle.pointer,
-                type_support=abi.type_support(type_),
-                topic=topic,
-                unique=unique,
-            )
+            _reinitialise(handle.pointer, node.handle.pointer, type_, topic, unique)
         if unique is UniqueRequirement.STRICTLY_REQUIRED:
-            _prove(handle, kind)
+            _prove(handle)
         yield handle
     except BaseException as error:
         # A handle whose init failed is zero inside; rcl's fini accepts that.
         handle.destroy_when_not_in_use()
         if not isinstance(error, _RefusedError):
             raise
-        raise UniqueFlowNotFeasible(
-            f"cannot create {kind} {resolved!r} with network flow endpoints {unique.value}: "
-            f"{error}",
-            topic=resolved,
-            reason=str(error),
-            hint=_PUBLISHER_HINT if kind == "publisher" else _subscription_hint(),
-        ) from error
+        hint = _subscription_hint()
+        raise _not_feasible(resolved, "subscription", unique, str(error), hint) from error
 
 
 def _reinitialise(
-    rcl: abi.Rcl,
-    kind: str,
-    *,
-    entity: int,
-    node: int,
-    type_support: int,
-    topic: str,
-    unique: UniqueRequirement,
+    entity: int, node: int, type_: type[Any], topic: str, unique: UniqueRequirement
 ) -> None:
-    functions = rcl.by_kind[kind]
+    rcl = abi.load()
+    functions = rcl.by_kind["subscription"]
     held = functions["options"](entity).contents
     options = type(held).from_buffer_copy(held)  # fini frees the original
     options.rmw.unique = unique.rmw_value
     if functions["fini"](entity, node) != abi.RCL_RET_OK:
-        raise MiddlewareError(f"cannot re-create {kind} {topic!r}: {rcl.take_error()}")
+        raise MiddlewareError(f"cannot re-create subscription {topic!r}: {rcl.take_error()}")
+    type_support = abi.type_support(type_)
     # The unresolved name, as rclpy gave it: rcl must apply remap rules exactly once.
     result = functions["init"](entity, node, type_support, topic.encode(), ctypes.byref(options))
     if result != abi.RCL_RET_OK:
         raise _RefusedError(rcl.take_error())
 
 
-def _prove(handle: Any, kind: str) -> None:
-    """Refuse an endpoint whose RMW accepted STRICTLY_REQUIRED but shows nothing for it."""
+def _prove(handle: Any) -> None:
+    """Refuse a subscription whose RMW accepted STRICTLY_REQUIRED but shows nothing for it."""
     try:
-        nfes = read_handle(handle, kind)
+        nfes = read_handle(handle, "subscription")
     except NetworkFlowEndpointsUnsupported as error:
         raise _RefusedError(error.reason) from error
     if not nfes:
@@ -452,10 +434,3 @@ def _subscription_hint() -> str:
         "taken; Fast DDS frees one only when the participant that used it ends: restart the "
         "processes whose nodes were disconnected and connected again"
     )
-
-
-def _register(node: Node, entity: Publisher | Subscription) -> None:
-    """Show the finished entity to executors, as Node.create_… does at its end."""
-    for handler in entity.event_handlers:
-        node.add_waitable(handler)
-    node._wake_executor()  # noqa: SLF001
