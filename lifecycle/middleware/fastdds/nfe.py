@@ -133,7 +133,7 @@ def read_handle(handle: Any, kind: str) -> tuple[NetworkFlowEndpoint, ...]:
     rcl = abi.load()
     array = abi.NfeArray()
     with handle:
-        result = rcl.by_kind[kind]["nfes"](
+        result = rcl.nfes[kind](
             handle.pointer, ctypes.byref(rcl.default_allocator), ctypes.byref(array)
         )
     if result != abi.RCL_RET_OK:
@@ -398,15 +398,15 @@ def _reinitialise(
     entity: int, node: int, type_: type[Any], topic: str, unique: UniqueRequirement
 ) -> None:
     rcl = abi.load()
-    functions = rcl.by_kind["subscription"]
-    held = functions["options"](entity).contents
+    held = rcl.options(entity).contents
     options = type(held).from_buffer_copy(held)  # fini frees the original
     options.rmw.unique = unique.rmw_value
-    if functions["fini"](entity, node) != abi.RCL_RET_OK:
+    if rcl.subscription_fini(entity, node) != abi.RCL_RET_OK:
         raise MiddlewareError(f"cannot re-create subscription {topic!r}: {rcl.take_error()}")
-    type_support = abi.type_support(type_)
     # The unresolved name, as rclpy gave it: rcl must apply remap rules exactly once.
-    result = functions["init"](entity, node, type_support, topic.encode(), ctypes.byref(options))
+    result = rcl.subscription_init(
+        entity, node, abi.type_support(type_), topic.encode(), ctypes.byref(options)
+    )
     if result != abi.RCL_RET_OK:
         raise _RefusedError(rcl.take_error())
 

@@ -97,10 +97,6 @@ class _RmwSubscriptionOptions(ctypes.Structure):
     )
 
 
-class _RmwPublisherOptions(ctypes.Structure):
-    _fields_ = (("payload", ctypes.c_void_p), ("unique", ctypes.c_int))
-
-
 class SubscriptionOptions(ctypes.Structure):
     """rcl_subscription_options_t."""
 
@@ -108,17 +104,6 @@ class SubscriptionOptions(ctypes.Structure):
         ("qos", Qos),
         ("allocator", Allocator),
         ("rmw", _RmwSubscriptionOptions),
-        ("disable_loaned_message", ctypes.c_bool),
-    )
-
-
-class PublisherOptions(ctypes.Structure):
-    """rcl_publisher_options_t."""
-
-    _fields_ = (
-        ("qos", Qos),
-        ("allocator", Allocator),
-        ("rmw", _RmwPublisherOptions),
         ("disable_loaned_message", ctypes.c_bool),
     )
 
@@ -147,13 +132,9 @@ class _ErrorString(ctypes.Structure):
     _fields_ = (("text", ctypes.c_char * 1024),)
 
 
-def _padded(options: type[ctypes.Structure]) -> type[ctypes.Structure]:
-    """Return `options` with room behind it, for a library whose struct turns out larger."""
-    return type(
-        f"Padded{options.__name__}",
-        (ctypes.Structure,),
-        {"_fields_": (("options", options), ("room", ctypes.c_ubyte * 1024))},
-    )
+class _PaddedOptions(ctypes.Structure):
+    # With room behind it, for a library whose struct turns out larger.
+    _fields_ = (("options", SubscriptionOptions), ("room", ctypes.c_ubyte * 1024))
 
 
 class Rcl:
@@ -185,30 +166,26 @@ class Rcl:
         self.nfe_array_fini = _bind(
             rmw, "rmw_network_flow_endpoint_array_fini", integer, (pointer,)
         )
-        self.by_kind: dict[str, dict[str, Any]] = {}
-        for kind, options in (
-            ("publisher", PublisherOptions),
-            ("subscription", SubscriptionOptions),
-        ):
-            self.by_kind[kind] = {
-                "default_options": _bind(rcl, f"rcl_{kind}_get_default_options", _padded(options)),
-                "options": _bind(
-                    rcl, f"rcl_{kind}_get_options", ctypes.POINTER(options), (pointer,)
-                ),
-                "init": _bind(
-                    rcl,
-                    f"rcl_{kind}_init",
-                    integer,
-                    (pointer, pointer, pointer, ctypes.c_char_p, pointer),
-                ),
-                "fini": _bind(rcl, f"rcl_{kind}_fini", integer, (pointer, pointer)),
-                "nfes": _bind(
-                    rcl,
-                    f"rcl_{kind}_get_network_flow_endpoints",
-                    integer,
-                    (pointer, pointer, pointer),
-                ),
-            }
+        self.default_options = _bind(rcl, "rcl_subscription_get_default_options", _PaddedOptions)
+        self.options = _bind(
+            rcl,
+            "rcl_subscription_get_options",
+            ctypes.POINTER(SubscriptionOptions),
+            (pointer,),
+        )
+        self.subscription_init = _bind(
+            rcl,
+            "rcl_subscription_init",
+            integer,
+            (pointer, pointer, pointer, ctypes.c_char_p, pointer),
+        )
+        self.subscription_fini = _bind(rcl, "rcl_subscription_fini", integer, (pointer, pointer))
+        self.nfes = {
+            kind: _bind(
+                rcl, f"rcl_{kind}_get_network_flow_endpoints", integer, (pointer, pointer, pointer)
+            )
+            for kind in ("publisher", "subscription")
+        }
         self.graph_guard = _bind(rcl, "rcl_node_get_graph_guard_condition", pointer, (pointer,))
         self.zero_wait_set = _bind(rcl, "rcl_get_zero_initialized_wait_set", WaitSet)
         self.wait_set_init = _bind(
@@ -235,19 +212,18 @@ class Rcl:
         that moved shows as a wrong default before anything is written through it.
         """
         expected = (1, 10, 1, 2, False, bytes(self.default_allocator), 0)
-        for kind, functions in self.by_kind.items():
-            options = functions["default_options"]().options
-            found = (
-                options.qos.history,
-                options.qos.depth,
-                options.qos.reliability,
-                options.qos.durability,
-                options.qos.avoid_ros_namespace_conventions,
-                bytes(options.allocator),
-                options.rmw.unique,
-            )
-            if found != expected or options.rmw.payload is not None:
-                raise _layout_error(f"rcl_{kind}_options_t", version)
+        options = self.default_options().options
+        found = (
+            options.qos.history,
+            options.qos.depth,
+            options.qos.reliability,
+            options.qos.durability,
+            options.qos.avoid_ros_namespace_conventions,
+            bytes(options.allocator),
+            options.rmw.unique,
+        )
+        if found != expected or options.rmw.payload is not None:
+            raise _layout_error("rcl_subscription_options_t", version)
         # One spare element behind it, should the library's struct be longer.
         probe = (Nfe * 2)()
         self.nfe_set_address(ctypes.byref(probe), b"192.0.2.1", 9)

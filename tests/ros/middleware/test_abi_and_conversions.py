@@ -126,17 +126,16 @@ def test_an_unknown_rcl_shows_the_same_graph(
     assert seen() == known
 
 
-@pytest.mark.parametrize("kind", ["publisher", "subscription"])
-def test_a_struct_that_is_laid_out_otherwise_is_refused(kind: str) -> None:
+def test_a_struct_that_is_laid_out_otherwise_is_refused() -> None:
     rcl = abi.Rcl()
-    shifted = rcl.by_kind[kind]["default_options"]()
+    shifted = rcl.default_options()
     shifted.options.qos.depth = 0
-    rcl.by_kind[kind]["default_options"] = lambda: shifted
+    rcl.default_options = lambda: shifted
     with pytest.raises(MiddlewareError) as refused:
         rcl._check_layout("9.9.9")
     assert str(refused.value) == (
-        f"cannot use the installed rcl 9.9.9: its rcl_{kind}_options_t is not laid out as rcl 9's; "
-        f"{INSTALL}"
+        "cannot use the installed rcl 9.9.9: its rcl_subscription_options_t is not laid out as rcl "
+        f"9's; {INSTALL}"
     )
 
 
@@ -144,8 +143,8 @@ def test_a_struct_that_is_laid_out_otherwise_is_refused(kind: str) -> None:
 def other_rmw(monkeypatch: pytest.MonkeyPatch) -> None:
     """An RMW without network flow endpoints that ignores the creation option, as Cyclone's."""
     rcl = abi.load()
-    for functions in rcl.by_kind.values():
-        monkeypatch.setitem(functions, "nfes", lambda *_: abi.RCL_RET_UNSUPPORTED)
+    for kind in rcl.nfes:
+        monkeypatch.setitem(rcl.nfes, kind, lambda *_: abi.RCL_RET_UNSUPPORTED)
     monkeypatch.setattr(rcl, "take_error", lambda: "not supported by rmw_other")
 
 
@@ -181,7 +180,7 @@ def test_an_rmw_that_only_pretends_to_be_strict_is_refused(make_node: MakeNode) 
 def test_an_endpoint_that_listens_nowhere_is_refused(
     make_node: MakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(abi.load().by_kind["subscription"], "nfes", lambda *_: abi.RCL_RET_OK)
+    monkeypatch.setitem(abi.load().nfes, "subscription", lambda *_: abi.RCL_RET_OK)
     strictly = UniqueRequirement.STRICTLY_REQUIRED
     with pytest.raises(UniqueFlowNotFeasible) as refused:
         create_subscription(make_node("n"), String, "/a", ignore, QosProfile(), unique=strictly)
