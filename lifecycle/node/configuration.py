@@ -34,8 +34,8 @@ from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.fastdds.nfe import SHARED_MEMORY, get_network_flow_endpoints, senders_of
 from lifecycle.middleware.process.control import machine_id
 from lifecycle.middleware.process.hosted import vouch_for
+from lifecycle.middleware.rcl.graph import EndpointInfo, endpoints_of, endpoints_of_node
 from lifecycle.middleware.rcl.graph_changes import is_server_matched
-from lifecycle.middleware.rcl.graph_queries import EndpointInfo, endpoints_of, endpoints_of_node
 from lifecycle.middleware.rcl.qos import from_rclpy
 from lifecycle.middleware.rcl.rclpy_nodes import interface_of
 from lifecycle.network.medium import CONNECTABLE, Medium
@@ -389,20 +389,11 @@ def _prefix_of(connection: Connection) -> str:
     node = connection.participant.node
     name = node.get_fully_qualified_name()
     found: set[str] = set()
-    for kind, (side, topic) in _SHOWN_BY.items():
+    for kind in (each for each in EndpointKind if not each.is_action):
         for each, _ in endpoints_of_node(node, kind, name) or ():
-            infos = endpoints_of(node, side, topic.format(each), no_mangle=not kind.is_topic)
-            found.update(info.gid[:PREFIX_DIGITS] for info in infos if info.node == name)
+            infos = endpoints_of(node, kind, each)
+            found.update(info.prefix for info in infos if info.node == name)
     return found.pop() if len(found) == 1 else ""
-
-
-_SHOWN_BY = {
-    EndpointKind.PUBLISHER: (EndpointKind.PUBLISHER, "{}"),
-    EndpointKind.SUBSCRIPTION: (EndpointKind.SUBSCRIPTION, "{}"),
-    EndpointKind.SERVICE_SERVER: (EndpointKind.SUBSCRIPTION, "rq{}Request"),
-    EndpointKind.SERVICE_CLIENT: (EndpointKind.PUBLISHER, "rq{}Request"),
-}
-"""The DDS endpoint of each kind, and its topic: with no_mangle for services."""
 
 
 def _nfes(

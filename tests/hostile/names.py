@@ -1,7 +1,9 @@
 """Names of topics and nodes that ROS would refuse, announced by a bare DDS participant.
 
 One active system sees them all; every verb that looks at it runs once, and each name must be in
-what the supervisor finds, escaped. The real verbs say what they always say.
+what the supervisor finds, escaped. The real verbs say what they always say. Names that are no UTF-8
+come last: rclpy names one of the topics that have such a name and no other topic then, and of a
+topic on which a node has such a name no endpoint, so that one topic is found for each.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from lifecycle.errors import ExitCode
@@ -84,6 +86,9 @@ VERBS = {
 }
 """Verbs that look → exit code, and what they show."""
 
+BLIND = "verify blindly"
+"""Where a name of a topic is no UTF-8, from before it looks."""
+
 
 def raw(name: bytes) -> str:
     return name.decode(errors="backslashreplace")
@@ -143,16 +148,31 @@ class Named:
         """How a finding names it."""
         return _of_topic(*self.name) if len(self.name) == 1 else _of_node(*self.name)
 
+    @property
+    def legible(self) -> bool:
+        """Whether it is UTF-8."""
+        with contextlib.suppress(UnicodeDecodeError):
+            return all(isinstance(part.decode(), str) for part in self.name)
+        return False
+
     def __call__(self, seen: Seen) -> None:
-        if self.shown not in seen.subjects:
+        if self.legible and self.shown not in seen.subjects:
             raise Unhandled(f"no finding names {self.shown!r}")
+        if not self.legible and not seen.illegible[len(self.name)]:
+            raise Unhandled(f"no finding says that there is {self.shown!r}")
 
 
 class Seen:
-    """What a supervisor found, and how verbs ended, beside all of the names."""
+    """What a supervisor found, and how verbs ended, beside all of the names.
+
+    Attributes:
+        illegible: whether it found topics with names that are no UTF-8 (1), and a topic of a node
+            with such a name (2).
+    """
 
     def __init__(self) -> None:
         self.subjects: set[str] = set()
+        self.illegible: dict[int, bool] = {}
         self.verbs: dict[str, Exception | None] = {}
 
 
@@ -165,29 +185,25 @@ def stage(place: Place, attacks: Sequence[Attack]) -> Iterator[Seen]:
     intruders = []
     try:
         run.until("system", reached="active")
-        names = [each.run.name for each in attacks if isinstance(each.run, Named)]
-        topics = [topic for (topic,) in (e for e in names if len(e) == 1)]
-        nodes = [each for each in names if len(each) == 2]
-        program = [os.fsencode(each) for each in (sys.executable, BARE_DDS)]
+        every = [each.run for each in attacks if isinstance(each.run, Named)]
+        legible = [each for each in every if each.legible]
+        topics = [each.name for each in legible if len(each.name) == 1]
+        nodes = [each.name for each in legible if len(each.name) == 2]
         for at in range(0, max(len(topics), len(nodes)), PER_PARTICIPANT):
-            words = []
-            for topic in topics[at : at + PER_PARTICIPANT]:
-                words += [b"--write", b"rt/" + topic + STRING]
-            if words:
-                intruders.append(subprocess.Popen([*program, *words], stdout=subprocess.DEVNULL))
-            words = [b"--write", b"rt/foo-baz%d" % at + STRING]
-            for space, name in nodes[at : at + PER_PARTICIPANT]:
-                words += [b"--node", space, name]
-            intruders.append(subprocess.Popen([*program, *words], stdout=subprocess.DEVNULL))
-        wanted = {each.run.shown for each in attacks if isinstance(each.run, Named)}
-        deadline = time.monotonic() + WAIT_S
-        while wanted - seen.subjects and time.monotonic() < deadline:
-            run.catch_up()
-            for each in run.of_kind("verdict"):
-                seen.subjects |= {found["subject"] for found in each["verdict"]["findings"]}
-            time.sleep(0.2)
+            intruders.append(_intruder(topics[at : at + PER_PARTICIPANT]))
+            intruders.append(_intruder(nodes[at : at + PER_PARTICIPANT], at))
+        wanted = {each.shown for each in legible}
+        _found(run, seen, lambda: not wanted - seen.subjects)
         for each in VERBS:
             seen.verbs[each] = _ended(each, str(manifest), place, folder)
+        for length, number in ((2, MANY), (1, 0)):
+            names = [each for each in every if not each.legible and len(each.name) == length]
+            if not names:
+                continue
+            intruders.append(_intruder([each.name for each in names], number))
+            shown = {each.shown for each in names} if length == 1 else {_topic_of(number)}
+            seen.illegible[length] = _found(run, seen, lambda any_=shown: any_ & seen.subjects)
+        seen.verbs[BLIND] = _ended(BLIND, str(manifest), place, folder)
         if run.process.poll() is not None:
             raise Unhandled(f"the supervisor ended: {run.events[-2:]}")
         for each in intruders:
@@ -206,6 +222,31 @@ def stage(place: Place, attacks: Sequence[Attack]) -> Iterator[Seen]:
         run.close()
 
 
+def _intruder(names: Sequence[tuple[bytes, ...]], number: int = 0) -> subprocess.Popen[bytes]:
+    """Start a participant that has topics of these names, or nodes that have one topic each."""
+    words = [os.fsencode(each) for each in (sys.executable, BARE_DDS)]
+    for at, (*space, name) in enumerate(names, number):
+        topic = os.fsencode(_topic_of(at)) if space else b"/" + name
+        words += [b"--write", b"rt" + topic + STRING]
+        words += [b"--node", *space, name] if space else []
+    return subprocess.Popen(words, stdout=subprocess.DEVNULL)
+
+
+def _topic_of(number: int) -> str:
+    return f"/foo_baz{number}"
+
+
+def _found(run: Up, seen: Seen, holds: Callable[[], object]) -> bool:
+    """Note what findings name until something holds of it; return whether it does."""
+    deadline = time.monotonic() + WAIT_S
+    while not holds() and time.monotonic() < deadline:
+        run.catch_up()
+        for each in run.of_kind("verdict"):
+            seen.subjects |= {found["subject"] for found in each["verdict"]["findings"]}
+        time.sleep(0.2)
+    return bool(holds())
+
+
 def _ended(name: str, manifest: str, place: Place, runtime: Path) -> Exception | None:
     try:
         _shows(name, manifest, place, runtime)
@@ -220,8 +261,8 @@ def _shows(name: str, manifest: str, place: Place, runtime: Path) -> None:
         "graph": (manifest,),
         "status": (manifest,),
     }.get(name, (manifest, "--timeout", "1"))
-    code, shown = VERBS[name]
-    done = verb(name, *words, runtime=runtime)
+    code, shown = VERBS.get(name, (ExitCode.VIOLATED, "\\x"))
+    done = verb(name.removesuffix(" blindly"), *words, runtime=runtime)
     check(Done(code=done.returncode, out=done.stdout, err=done.stderr), code)
     if shown not in done.stdout + done.stderr or "\nverdict: ok" in done.stdout:
         raise Unhandled(f"it does not show {shown!r}, or is fooled: {done.stdout[-300:]}")
@@ -238,7 +279,7 @@ def attacks(rng: random.Random) -> list[Attack]:
     nodes = dict.fromkeys((*NODES, *((rng.choice(spaces), _name(rng)) for _ in range(MANY // 2))))
     every = (*((each,) for each in topics), *nodes)
     found = [Attack(name=f"{names!r}", run=Named(names)) for names in every]
-    found += [Attack(name=each, run=functools.partial(_looks, each)) for each in VERBS]
+    found += [Attack(name=each, run=functools.partial(_looks, each)) for each in (*VERBS, BLIND)]
     return found
 
 

@@ -1,32 +1,45 @@
 """ROS graph observer: snapshots of nodes and endpoints as discovery shows them, without polling.
 
-Owns: the observer's participant, and the translation of graph queries into observation types.
-Entities that tools add are left out by `lifecycle.verify.tool_filter`. The type hashes (REP-2016)
-of services are found at their request and reply endpoints, by their DDS names; rmw_fastrtps and
-rmw_cyclonedds announce hashes since Iron.
+Owns: the graph queries of rclpy, put with the names that the RMW has, which rclpy neither expands
+nor validates; the observer's participant; and the translation into observation types. Entities that
+tools add are left out by `lifecycle.verify.tool_filter`.
+
+A node is there while an endpoint is its own: rmw_dds_common may keep the names of nodes that have
+left. The type hashes (REP-2016) of services are found at their request and reply endpoints, by
+their DDS names; rmw_fastrtps and rmw_cyclonedds announce hashes since Iron.
+
+Any participant may announce names that are no UTF-8, at which rclpy's queries raise. Such a name is
+shown escaped, and a topic of which nothing can be read as one of an unknown node: neither is ever
+verified.
 """
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import itertools
 import os
-import re
 import threading
 import time
 import typing
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from typing import Any
 
 import rclpy
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 from rclpy.subscription import Subscription
-from rosgraph_msgs.msg import Clock
+from rclpy.topic_endpoint_info import TopicEndpointInfo
+from rclpy.utilities import get_rmw_implementation_identifier
 
 from lifecycle import dataclasses
+from lifecycle.errors import MiddlewareError
 from lifecycle.export.programs import CapturedProgram
 from lifecycle.manifest.installed_types import join
 from lifecycle.manifest.model import EndpointKind
+from lifecycle.manifest.qos import Durability, History, Liveliness, QosProfile, Reliability
 from lifecycle.middleware.discovery.dead_peers import (
     PROCESS_DIGITS,
     give_up_dead_connections,
@@ -38,6 +51,7 @@ from lifecycle.middleware.discovery.dead_peers import (
 )
 from lifecycle.middleware.discovery.probe import (
     ANSWER_S,
+    Probe,
     answered_at,
     connects_first,
     dispose_of_announced,
@@ -53,21 +67,15 @@ from lifecycle.middleware.fastdds.settings import observer_settings
 from lifecycle.middleware.fastdds.sockets import OpenSocket
 from lifecycle.middleware.process.hosted import is_vouched_for
 from lifecycle.middleware.process.process_table import programs_of
-from lifecycle.middleware.rcl.graph_changes import GraphGuard, on_graph_change
-from lifecycle.middleware.rcl.graph_queries import (
-    RAW,
-    EndpointInfo,
-    endpoints_of,
-    endpoints_of_node,
-    topic_endpoints,
-)
+from lifecycle.middleware.rcl.graph_changes import GraphGuard
 from lifecycle.middleware.rcl.hidden_node import quiet_node
-from lifecycle.middleware.rcl.stale_node_filter import StaleNodeFilter
+from lifecycle.middleware.rcl.qos import from_rclpy
 from lifecycle.plan.model import ParticipantConnections
 from lifecycle.verify.observation import ObservedEndpoint, ObservedNode
 from lifecycle.verify.tool_filter import (
     CLOCK,
     NO_NAMES,
+    PREFIX_DIGITS,
     DeclaredNames,
     fold_actions,
     is_noise_endpoint,
@@ -76,64 +84,175 @@ from lifecycle.verify.tool_filter import (
     without_noise,
 )
 
+RAW = "dds:"
+"""What names of topics begin with here that are no names of ROS."""
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class _Service:
-    """Endpoints of one service: writers and readers of its requests, then of its replies."""
+_OVER_DDS = not get_rmw_implementation_identifier().startswith("rmw_zenoh")
+"""The RMW adds `rt`, `rq` or `rr` to names of ROS, as DDS has them (rmw_dds_common)."""
 
-    clients: tuple[list[EndpointInfo], list[EndpointInfo]]
-    servers: tuple[list[EndpointInfo], list[EndpointInfo]]
+_TOPIC, _REQUEST, _REPLY = ("rt{}", "rq{}Request", "rr{}Reply") if _OVER_DDS else ("{}",) * 3
+
+_NODES = "ros_discovery_info"
+"""Every participant of rmw_fastrtps and rmw_cyclonedds writes it, and no other."""
+
+_PARAMETER_EVENTS = "/parameter_events"
+"""rclcpp and rclpy give every node one publisher of it."""
+
+_OF_SERVICES = (EndpointKind.SERVICE_SERVER, EndpointKind.SERVICE_CLIENT)
+
+_REFUSED = (ValueError, rclpy_implementation.RCLError)
+"""What rclpy's queries raise where a name or a value cannot be had: UnicodeDecodeError is one."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class EndpointInfo:
+    """A publisher or subscription of the RMW as discovery shows it.
+
+    Attributes:
+        node: fully qualified name of its node; empty while that is not known.
+        type: `std_msgs/msg/String`, of a service's `std_srvs/srv/Trigger`.
+        gid: hex, 32 digits; empty of one that could not be read.
+        qos: history and depth are UNKNOWN and 0 over Fast DDS.
+        type_hash: `RIHS01_df66…`; empty if it announces none.
+    """
+
+    node: str
+    type: str
+    gid: str
+    qos: QosProfile
+    type_hash: str
+
+    @property
+    def prefix(self) -> str:
+        """What its participant's GUID begins with, 24 hex digits."""
+        return self.gid[:PREFIX_DIGITS]
 
     @classmethod
-    def of(cls, node: Node, name: str) -> _Service:
-        requests, replies = f"rq{name}Request", f"rr{name}Reply"
-
-        def publishers(topic: str) -> list[EndpointInfo]:
-            return endpoints_of(node, EndpointKind.PUBLISHER, topic, no_mangle=True)
-
-        def subscriptions(topic: str) -> list[EndpointInfo]:
-            return endpoints_of(node, EndpointKind.SUBSCRIPTION, topic, no_mangle=True)
-
+    def of(cls, info: TopicEndpointInfo) -> EndpointInfo:
+        """Return it as rclpy has it."""
+        space = info.node_namespace.rstrip("/")
+        announced = info.topic_type_hash
         return cls(
-            clients=(publishers(requests), subscriptions(replies)),
-            servers=(subscriptions(requests), publishers(replies)),
+            node=known_node(f"{space}/{info.node_name}"),
+            type=_ros_type(info.topic_type),
+            gid=bytes(info.endpoint_gid[:_GID_BYTES]).hex(),
+            qos=from_rclpy(info.qos_profile),
+            type_hash=str(announced) if announced.version > 0 else "",
         )
 
-    def hash_of(self, endpoint: ObservedEndpoint) -> str | None:
-        """Return the joined hashes of a node's end, empty while only half of it is seen; else None.
 
-        None means that the RMW has no such topics, or that nothing of them is seen.
-        """
-        sides = self.servers if endpoint.kind is EndpointKind.SERVICE_SERVER else self.clients
-        hashes, seen = [], False
-        for side in sides:
-            own = {info.type_hash for info in side if info.node == endpoint.node}
-            seen = seen or bool(own)
-            # A node with several servers or clients of one name is one end: all of them count.
-            hashes.append("" if "" in own else "|".join(sorted(own)))
-        return join(hashes) if seen else None
+_GID_BYTES = 16
 
-    def servers_of(
-        self, endpoint: ObservedEndpoint, ignores: Callable[[str], bool]
-    ) -> tuple[str, ...]:
-        """Return the GID of each server of a node's end, of what reads its requests.
-
-        A client has one, which may be empty: whoever asks may ask with several.
-        """
-        if endpoint.gid or endpoint.kind is not EndpointKind.SERVICE_SERVER:
-            return (endpoint.gid,)
-        found = {
-            info.gid
-            for info in self.servers[0]
-            if info.node == endpoint.node
-            and _service_type(info.type) == endpoint.type
-            and not ignores(info.gid)
-        }
-        return tuple(sorted(found)) or ("",)
+_UNREADABLE = EndpointInfo(
+    node="",
+    type="",
+    gid="",
+    qos=QosProfile(
+        history=History.UNKNOWN,
+        depth=0,
+        reliability=Reliability.UNKNOWN,
+        durability=Durability.UNKNOWN,
+        liveliness=Liveliness.UNKNOWN,
+    ),
+    type_hash="",
+)
+"""Stands for all endpoints of a topic of which one has a name that is no UTF-8."""
 
 
-_Listed = tuple[tuple[EndpointKind, tuple[tuple[str, str], ...]], ...]
-"""Name and type of what rcl lists of a node, by kind."""
+def _ros_type(dds_type: str) -> str:
+    """Return `std_msgs/msg/String` for `std_msgs::msg::dds_::String_`; others as they are."""
+    package, ours, name = dds_type.partition("dds_::")
+    if not ours or not name.endswith("_"):
+        return dds_type
+    return package.replace("::", "/") + name[:-1].removesuffix("_Request").removesuffix("_Response")
+
+
+def _publishers(node: Node, name: str) -> list[EndpointInfo]:
+    return _read(node.get_publishers_info_by_topic, name)
+
+
+def _subscriptions(node: Node, name: str) -> list[EndpointInfo]:
+    return _read(node.get_subscriptions_info_by_topic, name)
+
+
+def _read(query: Callable[..., list[Any]], name: str) -> list[EndpointInfo]:
+    try:
+        return [EndpointInfo.of(info) for info in query(name, no_mangle=True)]
+    except _REFUSED:
+        return [_UNREADABLE]
+
+
+def endpoints_of(node: Node, kind: EndpointKind, name: str) -> list[EndpointInfo]:
+    """Return what `node` sees of the publishers or subscriptions of a topic.
+
+    Args:
+        node: that queries.
+        kind: PUBLISHER or SUBSCRIPTION; of a service SERVICE_SERVER, for what reads its requests,
+            or SERVICE_CLIENT, for what writes them.
+        name: fully qualified.
+    """
+    pattern = _TOPIC if kind.is_topic else _REQUEST
+    writes = kind in (EndpointKind.PUBLISHER, EndpointKind.SERVICE_CLIENT)
+    return (_publishers if writes else _subscriptions)(node, pattern.format(name))
+
+
+_Listed = tuple[tuple[str, str], ...]
+"""Names and types."""
+
+
+def endpoints_of_node(node: Node, kind: EndpointKind, full_name: str) -> _Listed | None:
+    """Return name and type of a node's publishers, subscriptions, servers or clients.
+
+    Returns:
+        None where rcl shows no such node: it has left, or has a name that no rcl would give it.
+    """
+    query = {
+        EndpointKind.PUBLISHER: node.get_publisher_names_and_types_by_node,
+        EndpointKind.SUBSCRIPTION: node.get_subscriber_names_and_types_by_node,
+        EndpointKind.SERVICE_SERVER: node.get_service_names_and_types_by_node,
+        EndpointKind.SERVICE_CLIENT: node.get_client_names_and_types_by_node,
+    }[kind]
+    namespace, _, name = full_name.rpartition("/")
+    try:
+        return tuple(
+            (each, type_) for each, types in query(name, namespace or "/") for type_ in types
+        )
+    except _REFUSED:
+        return None
+
+
+def _node_names(node: Node) -> list[str]:
+    """Return the names that the RMW has, of nodes that have left too; none if it cannot say all."""
+    try:
+        found = node.get_node_names_and_namespaces()
+    except _REFUSED:
+        return []
+    return [f"{space.rstrip('/')}/{name}" for name, space in found]
+
+
+_Ends = tuple[list[EndpointInfo], list[EndpointInfo]]
+"""Of a service's servers or clients: what reads or writes requests, then replies."""
+
+
+def _ends(node: Node, kind: EndpointKind, service: str) -> _Ends:
+    if not _OVER_DDS:
+        return [], []
+    requests, replies = _REQUEST.format(service), _REPLY.format(service)
+    if kind is EndpointKind.SERVICE_SERVER:
+        return _subscriptions(node, requests), _publishers(node, replies)
+    return _publishers(node, requests), _subscriptions(node, replies)
+
+
+def _service_hash(ends: _Ends, node: str) -> str | None:
+    """Return the joined hashes of a node's ends, empty while only half of it is seen; else None.
+
+    None means that the RMW has no such topics, or that nothing of them is seen.
+    """
+    hashes = [{info.type_hash for info in side if info.node == node} for side in ends]
+    if not any(hashes):
+        return None
+    # A node with several servers or clients of one name is one end: all of them count.
+    return join(["" if "" in each else "|".join(sorted(each)) for each in hashes])
 
 
 PATIENCE_S = 3.5
@@ -160,10 +279,6 @@ _ANNOUNCED_S = 2.0
 """For so long a participant announces itself often enough that no newcomer waits for that."""
 
 _LOOK_S = 0.005
-_PREFIX_DIGITS = 24
-
-_REQUEST = re.compile(r"rq/.*Request")
-"""DDS names of the topics that carry the requests of services."""
 _CHANGE_STATE = "lifecycle_msgs/srv/ChangeState"
 _GET_STATE = "lifecycle_msgs/srv/GetState"
 
@@ -211,27 +326,26 @@ class GraphObserver:
         self._ours: frozenset[str] = frozenset()
         self._asked_for: set[str] = set()
         self._nameless_since_s: dict[str, float] = {}
-        self._clock: Subscription[Clock] | None = None
+        self._clock: Subscription[Any] | None = None
         self._time_came = self._clock_closed = False
         self._context: rclpy.Context | None = None
-        self._guard: GraphGuard | None = None
+        self._probes: tuple[Probe, ...] = ()
+        self._limit_s = PATIENCE_S
         if node is None:
             self._context, node = _observing_node(domain_id, settings)
-            self._guard = GraphGuard(node, self._changed)
-            self._unwatch = self._guard.stop
-            self._probes = probes_for(domain_id, settings.urls, os.environ)
+            if _OVER_DDS:
+                self._probes = probes_for(domain_id, settings.urls, os.environ)
             self._limit_s = _UNPROBED_S if settings.urls else PATIENCE_S
             if is_served(settings.urls, os.environ):
                 self._limit_s = _ANNOUNCED_BY_SERVER_S
             if connects_first(settings.urls, os.environ):
                 self._limit_s = _CONNECTED_S
-        else:
-            self._unwatch = on_graph_change(node, self._changed)
-            self._probes = ()
-            self._limit_s = PATIENCE_S
         self.node = node
+        self._guard = GraphGuard.of(node)
+        self._unwatch = self._guard.follow(node, self._changed)
         self._name = self.node.get_fully_qualified_name()
-        self._stale_node_filter = StaleNodeFilter(self.node)
+        self._dead: frozenset[str] = frozenset()
+        self._topics_before: frozenset[str] = frozenset()
         self._made_s = time.monotonic()
         self._ask_silent_s = 0.0
         self._own = ""
@@ -285,43 +399,57 @@ class GraphObserver:
                 them and is not `declared` is shown, whatever it looks like.
 
         Raises:
-            MiddlewareError: the graph is no longer watched; the message says why.
+            MiddlewareError: the graph is no longer watched, or cannot be read; the message says
+                why.
         """
-        if self._guard is not None and self._guard.failure is not None:
+        if self._guard.failure is not None:
             raise self._guard.failure
         if names.simulated and self.owns_node:
             self._watch_clock()
-        counts = self._stale_node_filter.count()
-        ourselves = self._name if self.owns_node and counts[self._name] == 1 else None
+        with self._lock:
+            return self._look(declared, names)
+
+    def _look(self, declared: Collection[str], names: DeclaredNames) -> Snapshot:
+        topics, illegible = self._topics(names)
         shown: dict[str, list[ObservedEndpoint]] = {}
-        for each in self._topic_endpoints(declared, names):
-            shown.setdefault(each.node, []).append(each)
+        if illegible:
+            shown[""] = [_observed(EndpointKind.PUBLISHER, illegible, _UNREADABLE)]
+        homes: dict[str, Counter[str]] = {}
+        for kind, topic, info in self._topic_endpoints(topics):
+            if info.node:
+                has_events = kind is EndpointKind.PUBLISHER and topic == _PARAMETER_EVENTS
+                homes.setdefault(info.node, Counter())[info.prefix] += has_events
+            if not _is_noise(kind, topic, info, declared, names):
+                shown.setdefault(info.node, []).append(self._timed(_observed(kind, topic, info)))
+        # Who was known and left is not on the way into the graph.
+        self._named = frozenset(itertools.chain.from_iterable(homes.values()))
+        self._known |= self._named
+        # A participant may have several nodes of one name.
+        counts = {name: sum(max(1, each) for each in on.values()) for name, on in homes.items()}
+        ourselves = self._name if self.owns_node and counts.get(self._name) == 1 else None
+        services, are_all = self._services_by_node(counts, ourselves)
         if ourselves is not None:
             # Others match what a supervisor offers under names that are looked for.
+            del counts[ourselves]
             own = shown.pop(ourselves, [])
-            if own := [each for each in own if names.looks_for(each.kind, each.name)]:
-                shown[ourselves] = own
-        unreported = {""}
-        nodes: list[ObservedNode] = []
-        for name in sorted(name for name in counts if known_node(name) and name != ourselves):
-            services = self._services_of(name)
-            managed = None if services is None else _managed(name, services)
-            nodes.append(ObservedNode(full_name=name, count=counts[name], managed=managed))
-            if services is None:
-                unreported.add(name)
-            elif services:
-                shown.setdefault(name, []).extend(services)
-        for each in self._services_of_others(names, unreported):
+            shown[ourselves] = [each for each in own if names.looks_for(each.kind, each.name)]
+        ends = functools.cache(functools.partial(_ends, self.node))
+        wanted = _declared_services(names) | (set() if are_all else _services_in(topics))
+        others = self._services_by_name(wanted, services, ends)
+        for each in itertools.chain(*services.values(), others):
             shown.setdefault(each.node, []).append(each)
-        # One that leaves, endpoint by endpoint, stays ours.
-        self._ours = self._ours.intersection(shown).union(
-            *(our_nodes(endpoints) for endpoints in shown.values())
+            if each.node:
+                counts.setdefault(each.node, 1)
+        nodes = (
+            ObservedNode(full_name=name, count=count, managed=_managed(name, shown.get(name, ())))
+            for name, count in sorted(counts.items())
         )
-        queried: dict[str, _Service] = {}
+        # One that leaves, endpoint by endpoint, stays ours.
+        self._ours = self._ours.intersection(shown).union(*map(our_nodes, shown.values()))
         endpoints: list[ObservedEndpoint] = []
         for name in sorted(shown):
             but = NO_NAMES if name in declared else names
-            endpoints += self._hashed(name, shown[name], but, queried)
+            endpoints += self._hashed(name, shown[name], but, ends)
         return tuple(nodes), tuple(endpoints)
 
     def settling_s(self) -> float:
@@ -414,8 +542,7 @@ class GraphObserver:
     @property
     def prefix(self) -> str:
         """GUID prefix of its own participant, 24 hex digits; empty where that is not known."""
-        homes = self._stale_node_filter.homes()
-        return next(iter(homes.get(self._name, ())), "")
+        return next(iter(self._homes().get(self._name, ())), "")
 
     def hosted(self, nodes: Iterable[str]) -> dict[str, bool]:
         """Return which nodes of this machine are in hosts of ours, see `process/hosted.py`.
@@ -423,7 +550,7 @@ class GraphObserver:
         Args:
             nodes: fully qualified names; those on other machines are not in the result.
         """
-        homes, found = self._stale_node_filter.homes(), {}
+        homes, found = self._homes(), {}
         own = next(iter(homes.get(self._name, ())), "")
         for name in nodes:
             here = [each for each in homes.get(name, ()) if own and is_of_host(each, own)]
@@ -439,16 +566,15 @@ class GraphObserver:
 
     def offers(self, node: str, service: str) -> bool:
         """Return whether discovery shows `service` (a fully qualified name) on `node`."""
-        return service in self.services_of(node)
+        return service in self.services_of(node) or any(
+            info.node == node
+            for info in endpoints_of(self.node, EndpointKind.SERVICE_SERVER, service)
+        )
 
     def services_of(self, node: str) -> frozenset[str]:
         """Return the fully qualified names of the services that discovery shows on `node`."""
-        return frozenset(
-            name
-            for kind, listed in self._services(node) or ()
-            if kind is EndpointKind.SERVICE_SERVER
-            for name, _ in listed
-        )
+        listed = endpoints_of_node(self.node, EndpointKind.SERVICE_SERVER, node)
+        return frozenset(name for name, _ in listed or ())
 
     def missing_port(self) -> int | None:
         """Return the UDP port that another process keeps from all participants of this host."""
@@ -490,22 +616,28 @@ class GraphObserver:
         """
         if self._destroyed:
             return frozenset()
-        homes, own = self._stale_node_filter.homes(), self.prefix
+        homes, own, there = self._homes(), self.prefix, self._participants()
         reported = frozenset(reported)
         claimed = {*reported, *(prefix for name in nodes for prefix in homes.get(name, ()))}
         if not claimed and is_alone(pid):
-            named = {prefix for name, home in homes.items() if name for prefix in home}
-            claimed = set(self._stale_node_filter.shown()) - named
+            claimed = set(there).difference(*homes.values())
         processes = {
             each[:PROCESS_DIGITS] for each in claimed if own and is_of_process(each, pid, own)
         }
         processes.discard(own[:PROCESS_DIGITS])
-        # It may have come and gone between two looks.
-        was_on = (each for each in reported if each[:PROCESS_DIGITS] in processes)
-        self._stale_node_filter.was_on(nodes, frozenset(was_on))
-        return frozenset(
-            each for each in self._stale_node_filter.shown() if each[:PROCESS_DIGITS] in processes
-        )
+        return frozenset(each for each in there if each[:PROCESS_DIGITS] in processes)
+
+    def _homes(self) -> dict[str, set[str]]:
+        """Return by full name the prefixes of the participants that nodes are on now."""
+        homes: dict[str, set[str]] = {}
+        for each in endpoints_of(self.node, EndpointKind.PUBLISHER, _PARAMETER_EVENTS):
+            if each.node and each.prefix not in self._dead:
+                homes.setdefault(each.node, set()).add(each.prefix)
+        return homes
+
+    def _participants(self) -> frozenset[str]:
+        """Return the prefixes of every participant of the RMW that discovery has, dead or not."""
+        return frozenset(each.prefix for each in _publishers(self.node, _NODES) if each.gid)
 
     def programs(self, environment: Mapping[str, str]) -> dict[str, dict[str, CapturedProgram]]:
         """Return how the processes of this host's nodes were started.
@@ -516,7 +648,7 @@ class GraphObserver:
         Returns:
             By full node name, for each of its participants by GUID prefix (24 hex digits).
         """
-        homes = self._stale_node_filter.homes()
+        homes = self._homes()
         own = next(iter(homes.get(self._name, ())), "")
         if not own:
             return {}
@@ -536,7 +668,7 @@ class GraphObserver:
             prefixes: GUID prefixes, 24 hex digits each.
             pids: of processes on this host that run; they are reached wherever they listen.
         """
-        self._stale_node_filter.ignore(prefixes := tuple(prefixes))
+        self._dead |= (prefixes := frozenset(prefixes))
         self._changed()
         remove_participants(prefixes, self.domain_id, self.urls, os.environ, (os.getpid(), *pids))
 
@@ -561,12 +693,10 @@ class GraphObserver:
     def __exit__(self, *_: object) -> None:
         self.destroy()
 
-    @property
-    def _is_silent(self) -> bool:
-        return self._clock is not None and not self._time_came
-
     def _watch_clock(self) -> None:
         """Receive /clock until time has come once."""
+        from rosgraph_msgs.msg import Clock
+
         if self._clock is None:
             self._clock = self.node.create_subscription(
                 Clock, CLOCK[0], self._take_time, qos_profile_sensor_data
@@ -575,7 +705,7 @@ class GraphObserver:
             self._clock_closed = True
             self.node.destroy_subscription(self._clock)
 
-    def _take_time(self, _: Clock) -> None:
+    def _take_time(self, _: object) -> None:
         if not self._time_came:
             self._time_came = True
             self._changed()
@@ -584,91 +714,136 @@ class GraphObserver:
         for callback in self._callbacks:
             callback()
 
+    def _topics(self, names: DeclaredNames) -> tuple[Collection[str], str]:
+        """Return the topics that the RMW has, and one name that is no UTF-8, escaped.
+
+        Where there is such a name rclpy says no other: then those count that were there before, or
+        are looked for.
+        """
+        try:
+            found = self.node.get_topic_names_and_types(no_demangle=True)
+        except UnicodeDecodeError as error:
+            wanted = (_PARAMETER_EVENTS, *names.of_kind(EndpointKind.PUBLISHER))
+            illegible = error.object.decode(errors="backslashreplace")
+            return self._topics_before | set(map(_TOPIC.format, wanted)), _of_ros(illegible)
+        except _REFUSED as error:
+            raise MiddlewareError(f"cannot read the topics of the graph: {error}") from error
+        self._topics_before = frozenset(topic for topic, _ in found)
+        return self._topics_before, ""
+
     def _topic_endpoints(
-        self, declared: Collection[str], names: DeclaredNames
+        self, topics: Iterable[str]
+    ) -> Iterator[tuple[EndpointKind, str, EndpointInfo]]:
+        """Yield kind, topic and endpoint of all publishers and subscriptions.
+
+        A topic of a node that avoids the naming conventions of ROS has its name of DDS behind
+        `dds:`: `dds:/chatter` is not `/chatter`.
+        """
+        for topic in topics:
+            if topic == _NODES or (_OVER_DDS and topic.startswith(("rq/", "rr/"))):
+                continue
+            name = _of_ros(topic)
+            shown = f"{RAW}{topic}" if _OVER_DDS and name == topic else name
+            for kind, query in (
+                (EndpointKind.PUBLISHER, _publishers),
+                (EndpointKind.SUBSCRIPTION, _subscriptions),
+            ):
+                for info in query(self.node, topic):
+                    if info.prefix not in self._dead:
+                        yield kind, shown, info
+
+    def _timed(self, endpoint: ObservedEndpoint) -> ObservedEndpoint:
+        """Say of who publishes /clock that no time came from it, while that is so."""
+        publishes = (endpoint.kind, endpoint.name) == (EndpointKind.PUBLISHER, CLOCK[0])
+        if publishes and self._clock is not None and not self._time_came:
+            return dataclasses.replace(endpoint, silent=True)
+        return endpoint
+
+    def _services_by_node(
+        self, counts: Mapping[str, int], ourselves: str | None
+    ) -> tuple[dict[str, list[ObservedEndpoint]], bool]:
+        """Return the services and clients that rcl lists of each node, and whether that is all.
+
+        It lists none of a node whose name it would not give, and of several of one name those of
+        the first, which may have left.
+
+        Args:
+            counts: how many nodes of each name have topics.
+            ourselves: of which none are shown.
+        """
+        listed: dict[str, list[ObservedEndpoint]] = {}
+        are_all = True
+        named = Counter(_node_names(self.node))
+        for name in counts.keys() | named.keys():
+            found = [(kind, endpoints_of_node(self.node, kind, name)) for kind in _OF_SERVICES]
+            if name == ourselves:
+                listed[name] = []
+            elif named[name] <= counts.get(name, 0) and None not in (each for _, each in found):
+                listed[name] = [
+                    ObservedEndpoint(kind=kind, node=name, name=service, type=type_)
+                    for kind, each in found
+                    for service, type_ in each or ()
+                ]
+            elif name in counts or any(each != () for _, each in found):
+                are_all = False
+        return listed, are_all
+
+    def _services_by_name(
+        self, names: Iterable[str], listed: Collection[str], ends: Callable[..., _Ends]
     ) -> Iterator[ObservedEndpoint]:
-        known: set[str] = set()
-        for kind, topic, info in topic_endpoints(self.node):
-            if self._stale_node_filter.ignores(info.gid):
-                continue
-            if info.node:
-                known.add(info.gid[:_PREFIX_DIGITS])
-            endpoint = _topic_endpoint(kind, topic, info, declared, names)
-            if endpoint is None:
-                continue
-            if kind is EndpointKind.PUBLISHER and topic == CLOCK[0] and self._is_silent:
-                endpoint = dataclasses.replace(endpoint, silent=True)
-            yield endpoint
-        # Who was known and left is not on the way into the graph.
-        self._known |= known
-        self._named = frozenset(known)
+        """Yield the endpoints of services on nodes of which rcl lists none.
+
+        A node that is about to be known has them too; a plain DDS program never is one.
+
+        Args:
+            names: of the services.
+            listed: nodes whose services are known.
+            ends: see `_ends`.
+        """
+        for name, kind in itertools.product(sorted(names), _OF_SERVICES):
+            shown: set[str] = set()
+            for info in itertools.chain(*ends(kind, name)):
+                owner = info.node or info.prefix
+                if info.node in listed or owner in shown or info.prefix in self._dead:
+                    continue
+                shown.add(owner)
+                gid = "" if info.node else info.gid
+                yield ObservedEndpoint(
+                    kind=kind, node=info.node, name=name, type=info.type, gid=gid
+                )
 
     def _hashed(
         self,
         name: str,
         shown: Iterable[ObservedEndpoint],
         but: DeclaredNames,
-        queried: dict[str, _Service],
+        ends: Callable[..., _Ends],
     ) -> Iterable[ObservedEndpoint]:
-        """Return what is judged of one node's endpoints; `queried` are services asked for so far.
+        """Return what is judged of one node's endpoints.
 
         The graph lists services by name and type only; their requests and replies are DDS topics
-        like all others, `rq/NAMERequest` and `rr/NAMEReply`, whose endpoints announce the hashes.
+        like all others, whose endpoints announce the hashes. A client has no GID: whoever asks may
+        ask with several.
         """
         hashed: list[ObservedEndpoint] = []
-        ignores = self._stale_node_filter.ignores
         for each in without_noise(shown, but=but, ours=self._ours):
-            if each.kind not in (EndpointKind.SERVICE_SERVER, EndpointKind.SERVICE_CLIENT):
+            if each.kind not in _OF_SERVICES:
                 hashed.append(each)
                 continue
-            if each.name not in queried:
-                queried[each.name] = _Service.of(self.node, each.name)
-            service = queried[each.name]
-            type_hash = service.hash_of(each)
+            both = ends(each.kind, each.name)
+            gids = {each.gid}
+            if not each.gid and each.kind is EndpointKind.SERVICE_SERVER:
+                gids = {
+                    info.gid
+                    for info in both[0]
+                    if (info.node, info.type) == (name, each.type) and info.prefix not in self._dead
+                } or {""}
+            type_hash = _service_hash(both, name)
             hashed += (
-                dataclasses.replace(each, type_hash=type_hash, gid=gid)
-                for gid in service.servers_of(each, ignores)
+                dataclasses.replace(each, type_hash=type_hash, gid=gid) for gid in sorted(gids)
             )
         folded = fold_actions(hashed)
         return sorted(folded if name else self._located(folded), key=_order)
-
-    def _services_of_others(
-        self, names: DeclaredNames, unreported: Collection[str]
-    ) -> Iterator[ObservedEndpoint]:
-        """Yield the endpoints of declared services on nodes that rcl does not show.
-
-        A node that is about to be known has them too; a plain DDS program never is one, and no rcl
-        shows a node whose name it would not give.
-        """
-        services = [
-            *names.of_kind(EndpointKind.SERVICE_SERVER),
-            *(
-                f"{action}/_action/{part}"
-                for action in names.of_kind(EndpointKind.ACTION_SERVER)
-                for part in ("send_goal", "cancel_goal", "get_result")
-            ),
-        ]
-        for service in services:
-            found = _Service.of(self.node, service)
-            for kind, sides in (
-                (EndpointKind.SERVICE_SERVER, found.servers),
-                (EndpointKind.SERVICE_CLIENT, found.clients),
-            ):
-                shown: set[str] = set()
-                for info in itertools.chain(*sides):
-                    node, prefix = known_node(info.node), info.gid[:_PREFIX_DIGITS]
-                    if node not in unreported or prefix in shown:
-                        continue
-                    if self._stale_node_filter.ignores(info.gid):
-                        continue
-                    shown.add(prefix)
-                    yield ObservedEndpoint(
-                        kind=kind,
-                        node=node,
-                        name=service,
-                        type=_service_type(info.type),
-                        gid=info.gid,
-                    )
 
     def _located(self, endpoints: Iterable[ObservedEndpoint]) -> Iterator[ObservedEndpoint]:
         """Add their participants' addresses to endpoints of no known node.
@@ -680,7 +855,7 @@ class GraphObserver:
         for probe in self._probes:
             known.update(probe.addresses())
         for endpoint in endpoints:
-            prefix = endpoint.gid[:_PREFIX_DIGITS]
+            prefix = endpoint.gid[:PREFIX_DIGITS]
             if not prefix:
                 yield endpoint
                 continue
@@ -691,50 +866,6 @@ class GraphObserver:
                 for probe in self._probes:
                     probe.ask_again(to_count=True)
             yield dataclasses.replace(endpoint, address=known.get(prefix, ""))
-
-    def _services(self, full_name: str) -> _Listed | None:
-        """Return the services and clients of a node; None if rcl does not show them."""
-        if full_name in self._stale_node_filter.ghosts:
-            return self._services_by_topic(full_name)
-        found = []
-        for kind in (EndpointKind.SERVICE_SERVER, EndpointKind.SERVICE_CLIENT):
-            listed = endpoints_of_node(self.node, kind, full_name)
-            if listed is None:
-                return None
-            found.append((kind, listed))
-        return tuple(found)
-
-    def _services_by_topic(self, full_name: str) -> _Listed:
-        """Return what `_services` does of a node whose name a stale one has, too.
-
-        rcl takes the first of a name: its services would be those of a node that is gone.
-        """
-        servers, clients = EndpointKind.SUBSCRIPTION, EndpointKind.PUBLISHER
-        sides = ((EndpointKind.SERVICE_SERVER, servers), (EndpointKind.SERVICE_CLIENT, clients))
-        topics = [name for name, _ in self.node.get_topic_names_and_types(no_demangle=True)]
-        requests = sorted(each for each in topics if _REQUEST.fullmatch(each))
-        found: dict[EndpointKind, list[tuple[str, str]]] = {kind: [] for kind, _ in sides}
-        for topic in requests:
-            for kind, side in sides:
-                types = {
-                    _service_type(each.type)
-                    for each in endpoints_of(self.node, side, topic, no_mangle=True)
-                    if each.node == full_name and not self._stale_node_filter.ignores(each.gid)
-                }
-                service = topic.removeprefix("rq").removesuffix("Request")
-                found[kind] += [(service, each) for each in sorted(types)]
-        return tuple((kind, tuple(found[kind])) for kind, _ in sides)
-
-    def _services_of(self, full_name: str) -> tuple[ObservedEndpoint, ...] | None:
-        """Return the service endpoints of a node; None if rcl does not show them."""
-        listed = self._services(full_name)
-        if listed is None:
-            return None
-        return tuple(
-            ObservedEndpoint(kind=kind, node=full_name, name=service, type=type_)
-            for kind, services in listed
-            for service, type_ in services
-        )
 
 
 def _observing_node(domain_id: int, settings: ParticipantSettings) -> tuple[rclpy.Context, Node]:
@@ -765,52 +896,68 @@ def _as_super_client() -> Iterator[None]:
         del os.environ[_SUPER_CLIENT_VARIABLE]
 
 
-def _topic_endpoint(
+def _of_ros(topic: str) -> str:
+    """Return the name that ROS has for a topic of the RMW; one that is none of ROS as it is."""
+    return topic.removeprefix("rt") if _OVER_DDS and topic.startswith("rt/") else topic
+
+
+def _is_noise(
     kind: EndpointKind,
     topic: str,
     info: EndpointInfo,
     declared: Collection[str],
     names: DeclaredNames,
-) -> ObservedEndpoint | None:
-    """Return a publisher or subscription; None if it is the housekeeping of a client library.
+) -> bool:
+    """Return whether a publisher or subscription is the housekeeping of a client library.
 
     One on a topic of DDS that no ROS name has is shown if it is a node's; of plain DDS programs
     only what has the names of ROS concerns a system of ROS.
     """
-    node = known_node(info.node)
     if topic.startswith(RAW):
-        if not node:
-            return None
-        package, _, base = info.type.replace("::dds_::", "::").replace("::", "/").rpartition("/")
-        type_ = f"{package}/{base.removesuffix('_')}" if package else base
-    else:
-        type_ = info.type
-        wanted = node not in declared and names.looks_for(kind, topic)
-        if not wanted and is_noise_endpoint(kind, node, topic, type_, ours=False):
-            return None
+        return not info.node
+    wanted = info.node not in declared and names.looks_for(kind, topic)
+    return not wanted and is_noise_endpoint(kind, info.node, topic, info.type, ours=False)
+
+
+def _observed(kind: EndpointKind, topic: str, info: EndpointInfo) -> ObservedEndpoint:
     return ObservedEndpoint(
         kind=kind,
-        node=node,
+        node=info.node,
         name=topic,
-        type=type_,
+        type=info.type,
         qos=info.qos,
         gid=info.gid,
         type_hash=info.type_hash,
     )
 
 
-def _managed(node: str, services: Iterable[ObservedEndpoint]) -> bool:
+def _declared_services(names: DeclaredNames) -> set[str]:
+    """Return the names of all services that are looked for, those of actions included."""
+    return {
+        *names.of_kind(EndpointKind.SERVICE_SERVER),
+        *(
+            f"{action}/_action/{part}"
+            for action in names.of_kind(EndpointKind.ACTION_SERVER)
+            for part in ("send_goal", "cancel_goal", "get_result")
+        ),
+    }
+
+
+def _services_in(topics: Iterable[str]) -> set[str]:
+    """Return the names of the services whose requests are among topics of the RMW."""
+    return {
+        topic.removeprefix("rq").removesuffix("Request")
+        for topic in topics
+        if topic.startswith("rq/") and topic.endswith("Request")
+    }
+
+
+def _managed(node: str, endpoints: Iterable[ObservedEndpoint]) -> bool:
     """Return whether a node offers the services by which a managed node is driven."""
     offered = {
-        (each.name, each.type) for each in services if each.kind is EndpointKind.SERVICE_SERVER
+        (each.name, each.type) for each in endpoints if each.kind is EndpointKind.SERVICE_SERVER
     }
     return {(f"{node}/change_state", _CHANGE_STATE), (f"{node}/get_state", _GET_STATE)} <= offered
-
-
-def _service_type(dds_type: str) -> str:
-    """Return `std_srvs/srv/Trigger` for `std_srvs::srv::dds_::Trigger_Request_`."""
-    package, _, name = dds_type.replace("::dds_::", "::").replace("::", "/").rpartition("/")
-    return f"{package}/{name.removesuffix('_Request_').removesuffix('_Response_')}"
 
 
 def _order(endpoint: ObservedEndpoint) -> tuple[str, ...]:

@@ -1,9 +1,8 @@
 """Graph changes without polling: rcl's guard condition, and whether a client's server is matched.
 
-Owns: a thread that sleeps on rcl's graph guard condition, which rclpy does not expose, and on one
-guard condition of its own by which it is stopped: a change wakes it within a millisecond; and the
-one guard of each participant, which exists only while it is followed. Where the installed rcl is
-not one whose layouts are known, the thread compares what rclpy shows four times a second instead.
+Owns: the thread of each participant that sleeps on rcl's graph guard condition, which rclpy does
+not expose, while anybody follows the graph: a change wakes it within a millisecond. Where the
+installed rcl is not one whose layouts are known, it compares what rclpy shows twice a second.
 
 What may be taken for a match of a client: rmw_fastrtps counts its server only while its request
 writer has matched as many readers as its response reader has matched writers, at least one, and the
@@ -18,7 +17,6 @@ import contextlib
 import ctypes
 import logging
 import threading
-import time
 import typing
 import weakref
 from collections.abc import Callable, Iterator
@@ -27,13 +25,13 @@ from typing import TYPE_CHECKING, TypeAlias
 from rclpy.client import Client
 from rclpy.context import Context
 from rclpy.exceptions import InvalidHandle
+from rclpy.guard_condition import GuardCondition
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.utilities import get_rmw_implementation_identifier
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.rcl import abi
-from lifecycle.middleware.rcl.graph_queries import fingerprint
 
 if TYPE_CHECKING:
     from rclpy.action import ActionClient
@@ -43,203 +41,61 @@ if TYPE_CHECKING:
 
 _logger = logging.getLogger(__name__)
 _FOR_EVER = -1
-_AGAIN_NS = tuple(round(each * 1e9) for each in (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0))
-"""Pauses after a change, while a callback says that what it waits for may follow: discovery shows
-an endpoint a moment before it is matched, and no event reports the match."""
-_STOP = 1
-_GUARDS = 2
-_COMPARE_S = 0.25
+_STOP, _GUARDS = 1, 2
+_SOON_S, _AGAIN_S = 0.002, 0.2
+"""Pauses, ever longer, while a callback says that what it waits for may follow a change: discovery
+shows an endpoint a moment before it is matched, and no event reports the match."""
+_COMPARE_S = 0.5
 
 
+@typing.final
 class GraphGuard:
-    """Calls `on_change` in its own thread whenever discovery changes the graph that `node` sees.
+    """Calls back whenever discovery changes the graph that a participant sees; get it by `of`.
 
-    Changes that happen while `on_change` runs are folded into one further call: level-triggered.
-    A participant has one such condition, and waking by it resets it: two guards on it take
-    the changes from each other. Where several may follow one, use `on_graph_change`.
+    Changes that happen during callbacks are folded into one further call: level-triggered. It
+    costs a thread that sleeps, while there are callbacks.
 
-    Args:
-        node: its context must outlive the guard; call `stop` before destroying either.
-        on_change: quick; an exception it raises is logged and ends nothing. While it returns True
-            it is called a few times more after a change, ever later, for 4.4 s in all.
+    Attributes:
+        failure: why the thread gave up; None while it works.
     """
-
-    def __init__(self, node: Node, on_change: Callable[[], bool | None]) -> None:
-        self._on_change = on_change
-        self._source = _GuardCondition(node) if abi.is_known() else _Comparison(node)
-        self._stopping = False
-        self.failure: MiddlewareError | None = None
-        """Why the thread gave up; None while it works."""
-        self._thread = threading.Thread(target=self._run, name="graph-guard", daemon=True)
-        self._thread.start()
-
-    def stop(self) -> None:
-        """End the thread and free the wait set; again is harmless, from `on_change` an error."""
-        if self._stopping:
-            return
-        self._stopping = True
-        self._source.stop()
-        self._thread.join()
-        self._source.free()
-
-    def _run(self) -> None:
-        pauses: Iterator[int] = iter(())
-        with self._source.held():
-            try:
-                while (changed := self._source.wait(next(pauses, _FOR_EVER))) is not None:
-                    if changed:
-                        pauses = iter(_AGAIN_NS)
-                    if not self._notify():
-                        pauses = iter(())
-            except MiddlewareError as error:
-                _logger.exception("the graph is no longer watched")
-                self.failure = error
-                self._notify()
-
-    def _notify(self) -> bool:
-        try:
-            return bool(self._on_change())
-        except Exception:
-            _logger.exception("cannot handle a graph change")
-            return False
-
-
-class _GuardCondition:
-    """Waits on rcl's graph guard condition, and on one of its own by which it is stopped."""
-
-    def __init__(self, node: Node) -> None:
-        self._rcl = abi.load()
-        self._node = node
-        with node.context.handle:
-            self._stop_guard = rclpy_implementation.GuardCondition(node.context.handle)
-        self._graph = 0
-        self._stopping = False
-        self._wait_set = self._rcl.zero_wait_set()
-        self._check(
-            self._rcl.wait_set_init(
-                ctypes.byref(self._wait_set),
-                *(0, _GUARDS, 0, 0, 0, 0),
-                node.context.handle.pointer,
-                self._rcl.default_allocator,
-            )
-        )
-
-    @contextlib.contextmanager
-    def held(self) -> Iterator[None]:
-        """Keep rclpy from freeing what the C code of `wait` points at."""
-        with self._node.context.handle, self._node.handle, self._stop_guard:
-            self._graph = self._rcl.graph_guard(self._node.handle.pointer)
-            yield
-
-    def wait(self, pause_ns: int) -> bool | None:
-        """Block until the graph changed (True), a pause is over (False) or `stop` came (None)."""
-        wait_set = ctypes.byref(self._wait_set)
-        while True:
-            self._check(self._rcl.wait_set_clear(wait_set))
-            self._check(self._rcl.wait_set_add_guard(wait_set, self._graph, None))
-            self._check(self._rcl.wait_set_add_guard(wait_set, self._stop_guard.pointer, None))
-            result = self._rcl.wait(wait_set, pause_ns)
-            if self._stopping or self._wait_set.guard_conditions[_STOP]:
-                return None
-            if result == abi.RCL_RET_OK:
-                return True
-            if result != abi.RCL_RET_TIMEOUT:
-                self._check(result)
-            elif pause_ns != _FOR_EVER:
-                return False
-
-    def stop(self) -> None:
-        """Have `wait` return None, now and later."""
-        self._stopping = True
-        with self._stop_guard:
-            self._stop_guard.trigger_guard_condition()
-
-    def free(self) -> None:
-        """Free the wait set; nothing waits any more."""
-        self._rcl.wait_set_fini(ctypes.byref(self._wait_set))
-        self._stop_guard.destroy_when_not_in_use()
-
-    def _check(self, result: int) -> None:
-        if result != abi.RCL_RET_OK:
-            raise MiddlewareError(f"cannot wait for graph changes: {self._rcl.take_error()}")
-
-
-class _Comparison:
-    """Reads the graph four times a second: all that is left with an rcl that is not known."""
-
-    def __init__(self, node: Node) -> None:
-        self._node = node
-        self._stopped = threading.Event()
-        self._last: object = None
-
-    @contextlib.contextmanager
-    def held(self) -> Iterator[None]:
-        """Hold nothing: rclpy does that in each of its functions."""
-        yield
-
-    def wait(self, pause_ns: int) -> bool | None:
-        """As that of `_GuardCondition`."""
-        until_s = None if pause_ns == _FOR_EVER else time.monotonic() + pause_ns / 1e9
-        while True:
-            left_s = _COMPARE_S if until_s is None else until_s - time.monotonic()
-            if self._stopped.wait(max(0.0, min(_COMPARE_S, left_s))):
-                return None
-            try:
-                found = fingerprint(self._node)
-            except InvalidHandle:
-                return None  # it is being destroyed
-            changed, self._last = found != self._last, found
-            if changed:
-                return True
-            if until_s is not None and time.monotonic() >= until_s:
-                return False
-
-    def stop(self) -> None:
-        """Have `wait` return None, now and later."""
-        self._stopped.set()
-
-    def free(self) -> None:
-        """Nothing is kept."""
-
-
-def on_graph_change(node: Node, callback: Callable[[], bool | None]) -> Callable[[], None]:
-    """Have `callback` called after each change of the graph that `node` sees.
-
-    It costs a thread that sleeps, one for all that follow the same participant.
-
-    Args:
-        node: take the callback away before it is destroyed.
-        callback: called in that thread, as `GraphGuard` calls its `on_change`.
-
-    Returns:
-        A function that takes the callback away again; not to be called by a callback. One that
-        is being called meanwhile may return later.
-
-    Raises:
-        MiddlewareError: rcl's graph guard condition could not be waited on.
-    """
-    with _lock:
-        followers = _followers.get(node.context)
-        if followers is None:
-            followers = _followers[node.context] = _Followers()
-            node.context.on_shutdown(followers.close)
-    return followers.add(node, callback)
-
-
-class _Followers:
-    """All that follow the graph of one participant."""
 
     def __init__(self) -> None:
+        self.failure: MiddlewareError | None = None
         self._lock = threading.Lock()
         self._callbacks: dict[object, tuple[Node, Callable[[], bool | None]]] = {}
-        self._guard: GraphGuard | None = None
-        self._node: Node | None = None  # the guard's
+        self._node: Node | None = None  # through which the thread waits
+        self._source: _Condition | _Comparison
+        self._thread: threading.Thread
 
-    def add(self, node: Node, callback: Callable[[], bool | None]) -> Callable[[], None]:
+    @classmethod
+    def of(cls, node: Node) -> GraphGuard:
+        """Return that of a node's participant: two would take the changes from each other."""
+        with _lock:
+            guard = _guards.get(node.context)
+            if guard is None:
+                guard = _guards[node.context] = cls()
+                node.context.on_shutdown(guard.close)
+        return guard
+
+    def follow(self, node: Node, callback: Callable[[], bool | None]) -> Callable[[], None]:
+        """Have `callback` called in the thread after each change.
+
+        Args:
+            node: of the participant; take the callback away before it is destroyed.
+            callback: quick; an exception it raises is logged and ends nothing. While it returns
+                True it is called again without a change, at last each 0.2 s.
+
+        Returns:
+            A function that takes the callback away again; not to be called by a callback. One that
+            is being called meanwhile may return later.
+
+        Raises:
+            MiddlewareError: rcl's graph guard condition could not be waited on.
+        """
         key = object()
         with self._lock:
-            if self._guard is None:
-                self._guard, self._node = GraphGuard(node, self._changed), node
+            if self._node is None:
+                self._start(node)
             self._callbacks = {**self._callbacks, key: (node, callback)}
         return lambda: self._remove(key)
 
@@ -253,32 +109,166 @@ class _Followers:
         with self._lock:
             self._callbacks = {other: it for other, it in self._callbacks.items() if other != key}
             nodes = [node for node, _ in self._callbacks.values()]
-            if self._guard is None or self._node in nodes:
+            if self._node is None or self._node in nodes:
                 return
             self._stop()
             if nodes:
-                self._guard, self._node = GraphGuard(nodes[0], self._changed), nodes[0]
-                self._changed()  # changes in between were not reported
+                self._start(nodes[0])
+                self._notify()  # changes in between were not reported
+
+    def _start(self, node: Node) -> None:
+        source = _Condition(node) if abi.is_known() else _Comparison(node)
+        self._node, self._source, self.failure = node, source, None
+        self._thread = threading.Thread(
+            target=self._run, args=[source], name="graph-guard", daemon=True
+        )
+        self._thread.start()
 
     def _stop(self) -> None:
-        if self._guard is not None:
-            self._guard.stop()
-            self._guard = self._node = None
+        if self._node is not None:
+            self._source.stop()
+            self._thread.join()
+            self._node = None
 
-    def _changed(self) -> bool:
-        wanted = [callback() for _, callback in self._callbacks.values()]
+    def _run(self, source: _Condition | _Comparison) -> None:
+        pause_s: float | None = None
+        try:
+            with source.held():
+                while (changed := source.wait(pause_s)) is not None:
+                    if not self._notify():
+                        pause_s = None
+                    elif changed or pause_s is None:
+                        pause_s = _SOON_S
+                    else:
+                        pause_s = min(2 * pause_s, _AGAIN_S)
+        except MiddlewareError as error:
+            _logger.exception("the graph is no longer watched")
+            self.failure = error
+            self._notify()
+
+    def _notify(self) -> bool:
+        """Call all back; return whether any is to be called again."""
+        wanted = [_call(callback) for _, callback in self._callbacks.values()]
         return any(wanted)
 
 
+def _call(callback: Callable[[], bool | None]) -> bool:
+    try:
+        return bool(callback())
+    except Exception:
+        _logger.exception("cannot handle a graph change")
+        return False
+
+
 _lock = threading.Lock()
-_followers: weakref.WeakKeyDictionary[Context, _Followers] = weakref.WeakKeyDictionary()
+_guards: weakref.WeakKeyDictionary[Context, GraphGuard] = weakref.WeakKeyDictionary()
 
 
 @atexit.register
 def _let_go() -> None:
     """Leave no thread in rcl when the interpreter ends: it would keep the participant alive."""
-    for followers in tuple(_followers.values()):
-        followers.close()
+    for guard in tuple(_guards.values()):
+        guard.close()
+
+
+class _Condition:
+    """Waits on rcl's graph guard condition, and on one of its own by which it is stopped."""
+
+    def __init__(self, node: Node) -> None:
+        self._rcl = abi.load()
+        self._node = node
+        self._stopped = GuardCondition(None, None, context=node.context)
+        self._stopping = False
+        self._wait_set = self._rcl.zero_wait_set()
+        self._check(
+            self._rcl.wait_set_init(
+                ctypes.byref(self._wait_set),
+                *(0, _GUARDS, 0, 0, 0, 0),
+                node.context.handle.pointer,
+                self._rcl.default_allocator,
+            )
+        )
+
+    @contextlib.contextmanager
+    def held(self) -> Iterator[None]:
+        """Keep rclpy from freeing what the C code of `wait` points at; free the rest after it."""
+        try:
+            with self._node.context.handle, self._node.handle, self._stopped.handle:
+                yield
+        finally:
+            self._rcl.wait_set_fini(ctypes.byref(self._wait_set))
+            self._stopped.destroy()
+
+    def wait(self, pause_s: float | None) -> bool | None:
+        """Block until the graph changed (True), a pause is over (False) or `stop` came (None)."""
+        wait_set = ctypes.byref(self._wait_set)
+        graph = self._rcl.graph_guard(self._node.handle.pointer)
+        pause_ns = _FOR_EVER if pause_s is None else round(pause_s * 1e9)
+        while True:
+            self._check(self._rcl.wait_set_clear(wait_set))
+            for each in (graph, self._stopped.handle.pointer):
+                self._check(self._rcl.wait_set_add_guard(wait_set, each, None))
+            result = self._rcl.wait(wait_set, pause_ns)
+            if self._stopping or self._wait_set.guard_conditions[_STOP]:
+                return None
+            if result == abi.RCL_RET_OK:
+                return True
+            if result != abi.RCL_RET_TIMEOUT:
+                self._check(result)
+            elif pause_s is not None:
+                return False
+
+    def stop(self) -> None:
+        """Have `wait` return None, now and later."""
+        self._stopping = True
+        self._stopped.trigger()
+
+    def _check(self, result: int) -> None:
+        if result != abi.RCL_RET_OK:
+            raise MiddlewareError(f"cannot wait for graph changes: {self._rcl.take_error()}")
+
+
+class _Comparison:
+    """Reads the graph twice a second: all that is left with an rcl that is not known."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._stopped = threading.Event()
+        self._last: object = None
+
+    @contextlib.contextmanager
+    def held(self) -> Iterator[None]:
+        """Hold nothing: rclpy does that in each of its functions."""
+        yield
+
+    def wait(self, pause_s: float | None) -> bool | None:
+        """As that of `_Condition`."""
+        while not self._stopped.wait(_COMPARE_S if pause_s is None else pause_s):
+            found = self._read()
+            changed, self._last = found != self._last, found
+            if changed or pause_s is not None:
+                return changed
+        return None
+
+    def _read(self) -> object:
+        """Return what differs when the graph has changed; None where that cannot be read."""
+        node = self._node
+        try:
+            listed = sorted(node.get_topic_names_and_types(no_demangle=True))
+            queries = node.get_publishers_info_by_topic, node.get_subscriptions_info_by_topic
+            gids = {
+                tuple(info.endpoint_gid)
+                for name, _ in listed
+                for query in queries
+                for info in query(name, no_mangle=True)
+            }
+            return listed, gids, sorted(node.get_node_names_and_namespaces())
+        except (ValueError, InvalidHandle, rclpy_implementation.RCLError):
+            return None
+
+    def stop(self) -> None:
+        """Have `wait` return None, now and later."""
+        self._stopped.set()
 
 
 _COUNTING_BOTH_WAYS = ("rmw_fastrtps_cpp", "rmw_fastrtps_dynamic_cpp")
@@ -294,8 +284,8 @@ def is_server_matched(client: AnyClient) -> bool | None:
 class ServerWatch:
     """Calls back when the server of a client was matched, or is no longer.
 
-    No event reports that, but each match follows a change of the graph within a moment: it is
-    looked at then, for some seconds if need be, and not in between.
+    No event reports that, but each match follows a change of the graph: it is looked at then, and
+    again each 0.2 s while the graph has a server that is not matched.
 
     Args:
         node: of the client.
@@ -310,7 +300,7 @@ class ServerWatch:
         self._changed = changed
         self._lock = threading.Lock()
         self._matched = False
-        self._stop: Callable[[], None] | None = on_graph_change(node, self._look)
+        self._stop: Callable[[], None] | None = GraphGuard.of(node).follow(node, self._look)
         self._look()
 
     def stop(self) -> None:

@@ -3,8 +3,8 @@
 Spoken by hand: it announces itself and its endpoints as DDSI-RTPS 2.3 says (§8.5, §9.6.2.2) on the
 loopback, under the vendor id of Cyclone DDS, to every participant of ROS_DOMAIN_ID, and answers
 whoever asks who is there. TOPIC and TYPE are DDS's own: `rt/chatter:std_msgs::msg::dds_::String_`.
-With `--node` it says on `ros_discovery_info` that it has such nodes, as rmw_dds_common would; the
-first of them has all endpoints; with `--ghost PREFIX SPACE NAME` it says so in the name of another
+With `--node` it says on `ros_discovery_info` that it has such nodes, as rmw_dds_common would, which
+have the endpoints in turn; with `--ghost PREFIX SPACE NAME` it says so in the name of another
 participant, as one that has left may be heard last. Names are taken byte by byte as they are given,
 legal or not.
 It sends no data besides: what is judged is that it could. Prints `ready` at its first announcement,
@@ -122,7 +122,8 @@ def nodes(prefix: bytes, claimed: list[list[str]], entities: list[bytes]) -> byt
             data = aligned(data) + text(os.fsencode(name))
         data = aligned(data)
         for kind in (READER, WRITER):
-            own = [each for each in entities if each[-1] == kind and not index]
+            theirs = entities[index :: len(claimed)]
+            own = [each for each in theirs if each[-1] == kind]
             data += struct.pack("<I", len(own)) + b"".join(prefix + each for each in own)
     return b"\x00\x01\x00\x00" + data
 

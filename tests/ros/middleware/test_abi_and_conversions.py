@@ -21,7 +21,7 @@ from lifecycle.middleware.fastdds.nfe import (
     create_subscription,
     get_network_flow_endpoints,
 )
-from lifecycle.middleware.rcl import abi, graph_queries
+from lifecycle.middleware.rcl import abi
 from lifecycle.middleware.rcl.qos import (
     UnknownInterfaceError,
     from_rclpy,
@@ -100,30 +100,6 @@ def test_with_an_unknown_rcl_only_what_strictly_requires_a_unique_flow_is_refuse
         "is not known; known: rcl 9 (ROS 2 Jazzy); ask for optionally_required, or " + INSTALL
     )
     assert node.count_subscribers("/b") == 0
-
-
-def test_an_unknown_rcl_shows_the_same_graph(
-    make_node: MakeNode, request: pytest.FixtureRequest
-) -> None:
-    node = make_node("node")
-    node.create_publisher(String, "/a", 10)
-    node.create_service(Trigger, "/reset", lambda _, response: response)
-
-    def seen() -> tuple[object, ...]:
-        return (
-            graph_queries.node_names(node),
-            sorted(map(repr, graph_queries.topic_endpoints(node))),
-            [
-                sorted(graph_queries.endpoints_of_node(node, kind, "/node") or ())
-                for kind in graph_queries.EndpointKind
-                if "action" not in kind.value
-            ],
-            graph_queries.endpoints_of_node(node, graph_queries.EndpointKind.PUBLISHER, "/gone"),
-        )
-
-    known = seen()
-    request.getfixturevalue("unknown")
-    assert seen() == known
 
 
 def test_a_struct_that_is_laid_out_otherwise_is_refused() -> None:

@@ -12,7 +12,7 @@ from rclpy.node import Node
 from std_msgs.msg import String
 
 from lifecycle.middleware.rcl import graph_changes
-from lifecycle.middleware.rcl.graph_changes import on_graph_change
+from lifecycle.middleware.rcl.graph_changes import GraphGuard
 
 BOUND_S = 30.0
 
@@ -47,7 +47,7 @@ class Counted:
 
 @contextlib.contextmanager
 def followed(node: Node, callback: Counted) -> Iterator[Callable[[], None]]:
-    stop = on_graph_change(node, callback)
+    stop = GraphGuard.of(node).follow(node, callback)
     yield stop
     stop()
 
@@ -87,7 +87,7 @@ def test_who_stays_goes_on_hearing_when_the_first_one_leaves(nodes: tuple[Node, 
 def test_who_waits_for_what_follows_a_change_is_called_again_without_one(
     nodes: tuple[Node, Node], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(graph_changes, "_AGAIN_NS", (1_000_000,) * 50)
+    monkeypatch.setattr(graph_changes, "_AGAIN_S", 0.002)
     waiting = Counted(again=True)
     with followed(nodes[0], waiting):
         nodes[0].create_publisher(String, "/topic", 1)
