@@ -24,7 +24,7 @@ import time
 import typing
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import rclpy
 from rclpy.impl.implementation_singleton import rclpy_implementation
@@ -36,7 +36,6 @@ from rclpy.utilities import get_rmw_implementation_identifier
 
 from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError
-from lifecycle.export.programs import CapturedProgram
 from lifecycle.manifest.installed_types import join
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import Durability, History, Liveliness, QosProfile, Reliability
@@ -66,7 +65,6 @@ from lifecycle.middleware.fastdds.participant_profile import (
 from lifecycle.middleware.fastdds.settings import observer_settings
 from lifecycle.middleware.fastdds.sockets import OpenSocket
 from lifecycle.middleware.process.hosted import is_vouched_for
-from lifecycle.middleware.process.process_table import programs_of
 from lifecycle.middleware.rcl.graph_changes import GraphGuard
 from lifecycle.middleware.rcl.hidden_node import quiet_node
 from lifecycle.middleware.rcl.qos import from_rclpy
@@ -83,6 +81,9 @@ from lifecycle.verify.tool_filter import (
     our_nodes,
     without_noise,
 )
+
+if TYPE_CHECKING:  # nodes ask what is in the graph as well, and capture nothing
+    from lifecycle.export.programs import CapturedProgram
 
 RAW = "dds:"
 """What names of topics begin with here that are no names of ROS."""
@@ -164,7 +165,9 @@ def _ros_type(dds_type: str) -> str:
     package, ours, name = dds_type.partition("dds_::")
     if not ours or not name.endswith("_"):
         return dds_type
-    return package.replace("::", "/") + name[:-1].removesuffix("_Request").removesuffix("_Response")
+    if not package.endswith("msg::"):  # one of a service
+        name = name.removesuffix("_Request_").removesuffix("_Response_")
+    return package.replace("::", "/") + name.removesuffix("_")
 
 
 def _publishers(node: Node, name: str) -> list[EndpointInfo]:
@@ -648,6 +651,8 @@ class GraphObserver:
         Returns:
             By full node name, for each of its participants by GUID prefix (24 hex digits).
         """
+        from lifecycle.middleware.process.process_table import programs_of
+
         homes = self._homes()
         own = next(iter(homes.get(self._name, ())), "")
         if not own:
