@@ -1,0 +1,187 @@
+"""What a snapshot makes of what rclpy's graph queries return, or raise."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from types import SimpleNamespace
+
+import pytest
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.qos import QoSProfile
+from rclpy.topic_endpoint_info import TopicEndpointInfo
+
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.middleware.rcl import graph
+from lifecycle.middleware.rcl.graph import GraphObserver
+from lifecycle.verify.observation import ObservedNode
+from lifecycle.verify.tool_filter import DeclaredNames
+
+STRING = "std_msgs::msg::dds_::String_"
+EVENTS = ("rt/parameter_events", "rcl_interfaces::msg::dds_::ParameterEvent_")
+TRIGGER = "std_srvs::srv::dds_::Trigger_{}_"
+ONE, TWO = "11" * 12, "22" * 12
+
+
+@dataclasses.dataclass
+class End:
+    """A writer or reader of the RMW; `node` in bytes, as it was announced."""
+
+    writes: bool
+    topic: bytes
+    type: str
+    node: bytes
+    prefix: str
+
+
+@dataclasses.dataclass
+class Graph:
+    """What rclpy shows: the queries that a snapshot makes, of these ends and names."""
+
+    ends: list[End]
+    names: list[str] = dataclasses.field(default_factory=list)
+    services: dict[str, list[tuple[str, list[str]]]] = dataclasses.field(default_factory=dict)
+    context: SimpleNamespace = dataclasses.field(
+        default_factory=lambda: SimpleNamespace(get_domain_id=lambda: 7)
+    )
+
+    def get_fully_qualified_name(self) -> str:
+        """Return that of the node that looks."""
+        return "/looks"
+
+    def get_topic_names_and_types(self, *, no_demangle: bool) -> list[tuple[str, list[str]]]:
+        """Return DDS's names; raise at one that is no UTF-8."""
+        assert no_demangle
+        return [(end.topic.decode(), [end.type]) for end in self.ends]
+
+    def _infos(self, writes: bool, topic: str) -> list[TopicEndpointInfo]:
+        return [
+            TopicEndpointInfo(
+                node_name=end.node.decode(),
+                node_namespace="/",
+                topic_type=end.type,
+                endpoint_gid=[*bytes.fromhex(end.prefix), 0, 0, number, 3],
+                qos_profile=QoSProfile(depth=1),
+            )
+            for number, end in enumerate(self.ends)
+            if (end.writes, end.topic) == (writes, topic.encode())
+        ]
+
+    def get_publishers_info_by_topic(self, topic: str, no_mangle: bool) -> list[TopicEndpointInfo]:
+        """Return writers by DDS's name; raise at a node's name that is no UTF-8."""
+        assert no_mangle
+        return self._infos(True, topic)
+
+    def get_subscriptions_info_by_topic(
+        self, topic: str, no_mangle: bool
+    ) -> list[TopicEndpointInfo]:
+        """Return readers, likewise."""
+        assert no_mangle
+        return self._infos(False, topic)
+
+    def get_node_names_and_namespaces(self) -> list[tuple[str, str]]:
+        """Return the names that the RMW has, of nodes that have left too."""
+        return [(name, "/") for name in self.names]
+
+    def get_service_names_and_types_by_node(self, name: str, _: str) -> list[tuple[str, list[str]]]:
+        """Return what the first node of a name has."""
+        if name not in self.names:
+            raise rclpy_implementation.NodeNameNonExistentError
+        return self.services.get(name, [])
+
+    def get_client_names_and_types_by_node(self, name: str, _: str) -> list[tuple[str, list[str]]]:
+        """Return none."""
+        return [] if name in self.names else self.get_service_names_and_types_by_node(name, "/")
+
+    get_publisher_names_and_types_by_node = get_client_names_and_types_by_node
+    get_subscriber_names_and_types_by_node = get_client_names_and_types_by_node
+
+
+Look = Callable[[Graph], GraphObserver]
+
+
+@pytest.fixture
+def look(monkeypatch: pytest.MonkeyPatch) -> Look:
+    """Return an observer of what is given, which nothing wakes."""
+    guard = SimpleNamespace(failure=None, follow=lambda *_: lambda: None)
+    monkeypatch.setattr(graph, "GraphGuard", SimpleNamespace(of=lambda _: guard))
+    return GraphObserver.on  # type: ignore[return-value]
+
+
+def node(name: str, prefix: str = ONE) -> End:
+    return End(True, EVENTS[0].encode(), EVENTS[1], name.encode(), prefix)
+
+
+def server(name: str, service: str, prefix: str = ONE) -> list[End]:
+    return [
+        End(
+            False, f"rq{service}Request".encode(), TRIGGER.format("Request"), name.encode(), prefix
+        ),
+        End(True, f"rr{service}Reply".encode(), TRIGGER.format("Response"), name.encode(), prefix),
+    ]
+
+
+def talker(name: bytes, topic: bytes = b"rt/chatter", prefix: str = ONE) -> End:
+    return End(True, topic, STRING, name, prefix)
+
+
+def seen(observer: GraphObserver) -> list[tuple[str, str, str]]:
+    names = DeclaredNames(names=frozenset({(EndpointKind.PUBLISHER, "/chatter")}))
+    return [(each.node, each.name, each.type) for each in observer.snapshot(names=names)[1]]
+
+
+def test_a_node_is_there_while_an_endpoint_is_its_own(look: Look) -> None:
+    shown = Graph([node("one"), node("twin"), node("twin")], names=["one", "twin", "twin", "gone"])
+    assert look(shown).snapshot()[0] == (
+        ObservedNode(full_name="/one", managed=False),
+        ObservedNode(full_name="/twin", count=2, managed=False),
+    )
+
+
+def test_a_node_of_an_ended_process_is_nobody_while_discovery_shows_it(
+    look: Look, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(graph, "remove_participants", lambda *_: None)
+    observer = look(Graph([node("one"), node("one", TWO), talker(b"other", prefix=TWO)]))
+    assert [(each.full_name, each.count) for each in observer.snapshot()[0]] == [
+        ("/one", 2),
+        ("/other", 1),
+    ]
+    observer.remove_participants([TWO], ())
+    assert [(each.full_name, each.count) for each in observer.snapshot()[0]] == [("/one", 1)]
+    assert seen(observer) == []
+
+
+def test_a_node_that_has_nothing_but_a_service_is_one(look: Look) -> None:
+    shown = Graph(
+        server("lamp", "/on"),
+        names=["lamp"],
+        services={"lamp": [("/on", ["std_srvs/srv/Trigger"])]},
+    )
+    nodes, (endpoint,) = look(shown).snapshot()
+    assert [each.full_name for each in nodes] == ["/lamp"]
+    assert (endpoint.node, endpoint.name, endpoint.gid[:24]) == ("/lamp", "/on", ONE)
+
+
+def test_behind_one_that_has_left_a_node_of_its_name_has_its_services(look: Look) -> None:
+    """Of several of one name rcl lists the services of the first: here it has none left."""
+    shown = Graph([node("lamp"), *server("lamp", "/on")], names=["lamp", "lamp"])
+    assert seen(look(shown)) == [("/lamp", "/on", "std_srvs/srv/Trigger")]
+
+
+def test_a_topic_that_is_no_utf_8_is_found_and_hides_only_what_was_not_known(look: Look) -> None:
+    shown = Graph([node("one"), talker(b"one", b"rt/known"), talker(b"one")], names=["one"])
+    bad = talker(b"one", b"rt/f\xffo")
+    observer = look(shown)
+    known = [("/one", "/chatter", "std_msgs/msg/String"), ("/one", "/known", "std_msgs/msg/String")]
+    assert seen(observer) == known
+    shown.ends += [bad, talker(b"one", b"rt/late")]
+    assert seen(observer) == [("", "/f\\xffo", ""), *known]
+    # What is declared is looked for by its name.
+    assert seen(look(shown)) == [("", "/f\\xffo", ""), known[0]]
+
+
+def test_a_topic_on_which_a_node_is_no_utf_8_is_one_of_an_unknown_node(look: Look) -> None:
+    shown = Graph([node("one"), talker(b"one", b"rt/sound"), talker(b"one"), talker(b"\xff")])
+    shown.names = ["one"]
+    assert seen(look(shown)) == [("", "/chatter", ""), ("/one", "/sound", "std_msgs/msg/String")]
