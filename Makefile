@@ -13,11 +13,12 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --co
 # Tests start hundreds of programs: where nothing may be compiled ahead, each compiles the whole package again.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test test-thorough outside check check-static soak soak-tests bench bench-all hostile mutate docs schemas clean help
+.PHONY: demo test test-thorough test-kilted outside check check-static soak soak-tests bench bench-all hostile mutate docs schemas clean help
 
 help:
 	@echo "make demo    bring up a small robot from its manifest, verified, then shut it down"
 	@echo "make test    set up and run the tests, real DDS included; no privilege needed; five minutes"
+	@echo "make test-kilted  try the verbs on ROS 2 Kilted, in a venv of its own; two minutes"
 	@echo "make outside try the promise from outside: every attack, the nine systems, ros2 clients, faults; eight minutes."
 	@echo "             LIFECYCLE=path/to/lifecycle make outside asks another installation"
 	@echo "make check   everything CI runs: lint, types, import contracts, all tests"
@@ -47,6 +48,18 @@ test: $(STAMP)
 test-thorough: $(STAMP)
 	$(PYTEST) -n $(WORKERS) --dist worksteal -m "thorough and not alone" tests/ros tests/net tests/outside
 	$(PYTEST) -m alone tests/ros tests/net
+
+# The same tests on the other distribution: what is asked, and what asks, run on it.
+KILTED    := $(VENV)-kilted
+ON_KILTED := $(addprefix tests/ros/,test_distribution.py examples/test_teleop.py \
+  middleware/test_abi_and_conversions.py middleware/test_network_flow_endpoints_on_dds.py)
+$(KILTED)/.installed: pyproject.toml
+	$(PYTHON) -m venv $(KILTED)
+	$(INSTALL:$(BIN)/%=$(KILTED)/bin/%) '.[kilted,examples,test]' ros-kilted-test-msgs
+	touch $@
+
+test-kilted: $(KILTED)/.installed
+	$(KILTED)/bin/python -m pytest -n $(WORKERS) --dist worksteal $(ON_KILTED)
 
 # The nine systems need root and network namespaces, and skip without. `$(BIN)/python -m tests.outside` prints the table of attacks.
 outside: $(STAMP)

@@ -65,9 +65,11 @@ _RUNS = {"pause", "resume", "restart", "mode", "apply", "down", "status", "logs"
 _LINUX = _PARTICIPANTS | _RUNS
 """Verbs that run nodes, or are about what runs or ran."""
 
-_NEEDS_ROS = (
-    "pip install 'ros-lifecycle-manifests[ros]', or source /opt/ros/jazzy/setup.bash for its Python"
-)
+
+def _ros_hint() -> str:
+    from lifecycle.middleware.versions import INSTALL
+
+    return f"{INSTALL} for its Python"
 
 
 def _check_ros(verb: str) -> None:
@@ -82,7 +84,7 @@ def _check_ros(verb: str) -> None:
     if find_spec("rclpy") is None:
         raise UsageError(
             f"cannot run 'lifecycle {verb}': it needs ROS 2, and this Python has no rclpy",
-            hint=_NEEDS_ROS,
+            hint=_ros_hint(),
         )
     from lifecycle.middleware.process.shared_memory import check_room_to_load
     from lifecycle.middleware.rcl.rmw_choice import check_rmw
@@ -233,7 +235,7 @@ def _report(error: Exception) -> int:
     if isinstance(error, ImportError) and "rclpy" in f"{error.name} {error}":
         # Of another Python, most often: ROS 2 has its C extensions for one version only.
         version = sys.version.split()[0]
-        message = f"cannot import rclpy with Python {version}: {error}; {_NEEDS_ROS}"
+        message = f"cannot import rclpy with Python {version}: {error}; {_ros_hint()}"
         click.echo(lines(" ".join(message.split())), err=True)
         return ExitCode.USAGE
     import traceback

@@ -28,6 +28,7 @@ from rclpy.node import Node
 
 from lifecycle.middleware.fastdds.profiles import discovery_environment
 from lifecycle.middleware.process.shared_memory import leftovers
+from lifecycle.middleware.versions import DISTRIBUTIONS
 from lifecycle.pytest_plugin import claimed_domain
 from tests.second_try import SECOND_TRY
 from tests.shared_memory import owned_by
@@ -43,7 +44,8 @@ def domain_id(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
         patch.setenv("ROS_DOMAIN_ID", str(domain))
         patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         patch.setenv("ROS_LOG_DIR", str(tmp_path_factory.mktemp("ros_log")))
-        patch.delenv("FASTRTPS_DEFAULT_PROFILES_FILE", raising=False)
+        for each in DISTRIBUTIONS:
+            patch.delenv(each.profiles_variable, raising=False)
         profiles = discovery_environment(tmp_path_factory.mktemp("profiles"))
         for name, value in profiles.items():
             patch.setenv(name, value)

@@ -17,6 +17,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from lifecycle.errors import MiddlewareError
+from lifecycle.middleware.versions import DISTRIBUTIONS, INSTALL, installed
 from lifecycle.network.medium import TRANSPORTS_VARIABLE
 from lifecycle.plan.model import PlannedServer
 
@@ -46,12 +47,12 @@ def discovery_server_command(
             "'44.53.XX.5f.45.50.52.4f.53.49.4d.41', XX the server's id in hex"
         )
     options = ("-t", server.address, "-q") if server.tcp else ("-l", server.address, "-p")
-    argv = (_program(), "-i", str(int(found.group(1), 16)), *options, str(server.port))
+    command = (_program(), *installed().server_arguments)
+    argv = (*command, "-i", str(int(found.group(1), 16)), *options, str(server.port))
     current = dict(os.environ if environment is None else environment)
     # A profile or a server of the environment's would be applied to the server itself.
     for variable in (
-        "FASTRTPS_DEFAULT_PROFILES_FILE",
-        "FASTDDS_DEFAULT_PROFILES_FILE",
+        *(each.profiles_variable for each in DISTRIBUTIONS),
         TRANSPORTS_VARIABLE,
         "ROS_DISCOVERY_SERVER",
     ):
@@ -93,7 +94,7 @@ def _program() -> str:
             return found
     raise MiddlewareError(
         f"cannot find {PROGRAM!r}",
-        hint="it comes with Fast DDS: pip install 'ros-lifecycle-manifests[ros]', or set PATH",
+        hint=f"it comes with Fast DDS; set PATH, or {INSTALL}",
     )
 
 
@@ -101,6 +102,9 @@ def _library_paths() -> list[str]:
     """Return where the wheels keep Fast DDS and what it needs; what is not there is left out."""
     places = (
         Path(sysconfig.get_path("data")) / "lib",
-        Path(sysconfig.get_path("purelib")) / "ros_fastrtps.libs",
+        *(
+            Path(sysconfig.get_path("purelib")) / f"ros_{library}.libs"
+            for library in ("fastrtps", "fastdds")
+        ),
     )
     return [str(place) for place in places if place.is_dir()]

@@ -37,6 +37,7 @@ from lifecycle.middleware.fastdds.sockets import udp_sockets
 from lifecycle.middleware.process.shared_memory import own_segments
 from lifecycle.middleware.rcl import abi
 from lifecycle.middleware.rcl.qos import to_rclpy
+from lifecycle.middleware.versions import INSTALL, KNOWN_RCL, rcl_version
 from lifecycle.network.medium import DEFAULT_RMW
 from lifecycle.network.nfe import (
     InternetProtocol,
@@ -151,6 +152,10 @@ def read_handle(handle: Any, kind: str) -> tuple[NetworkFlowEndpoint, ...]:
 
 
 def _convert(nfe: abi.Nfe) -> NetworkFlowEndpoint:
+    if not nfe.internet_address:
+        # Shared memory, of which Kilted's RMW says that it is UDPv4: it looks at single bits of the
+        # kind, and LOCATOR_KIND_SHM of Fast DDS 3 is 19, which has that of LOCATOR_KIND_UDPv4.
+        return dataclasses.replace(SHARED_MEMORY, transport_port=nfe.transport_port)
     return NetworkFlowEndpoint(
         transport_protocol=_TRANSPORTS[nfe.transport_protocol],
         internet_protocol=_INTERNETS[nfe.internet_protocol],
@@ -355,8 +360,8 @@ def _is_plain(node: Node, topic: str, unique: UniqueRequirement) -> bool:
         node.resolve_topic_name(topic),
         "subscription",
         unique,
-        f"rcl {abi.rcl_version() or '(version unknown)'} is not known; known: {abi.KNOWN}",
-        f"ask for optionally_required, or {abi.INSTALL}",
+        f"rcl {rcl_version() or '(version unknown)'} is not known; known: {KNOWN_RCL}",
+        f"ask for optionally_required, or {INSTALL}",
     )
 
 

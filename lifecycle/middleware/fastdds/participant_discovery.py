@@ -29,7 +29,7 @@ from lifecycle.middleware.fastdds.local_readers import (
     virtual_functions,
 )
 from lifecycle.middleware.fastdds.settings import fast_dds_function
-from lifecycle.middleware.rcl import abi
+from lifecycle.middleware.versions import INSTALL
 
 _IGNORE_NONE_FLAGS, _IGNORE_ALL_FLAGS = 0, 7
 _SIMPLE = 1
@@ -94,7 +94,7 @@ class Unannounced:
             raise MiddlewareError(
                 "cannot have a participant discover others: the loaded Fast DDS is not laid out as "
                 "2.14.5, though that of the process that started this one is",
-                hint=f"start both in one environment; {abi.INSTALL}",
+                hint=f"start both in one environment; {INSTALL}",
             )
         return cls(pdp) if pdp.ignored == _IGNORE_ALL_FLAGS else None
 

@@ -20,14 +20,13 @@ from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds import static_edp, url_profile
 from lifecycle.middleware.fastdds.profiles import (
-    DEFAULT_FILE,
     PROFILE_NAME,
-    PROFILES_FILE_VARIABLE,
     announcements,
 )
 from lifecycle.middleware.fastdds.profiles import child as _child
 from lifecycle.middleware.fastdds.profiles import locator as _locator
 from lifecycle.middleware.fastdds.profiles import text as _text
+from lifecycle.middleware.versions import installed
 from lifecycle.network.connection_url import ConnectionUrl
 from lifecycle.network.connection_url import parse as parse_url
 from lifecycle.network.medium import RMW_DEFAULT, TRANSPORTS_VARIABLE, UDP_UNICAST, Medium
@@ -199,10 +198,11 @@ class DefaultProfile:
 
 
 def default_profile(environment: Mapping[str, str] | None = None) -> DefaultProfile | None:
-    """Return the default participant profile that Fast DDS 2.14 loads; None if there is none.
+    """Return the default participant profile that Fast DDS loads; None if there is none.
 
-    It reads the file that FASTRTPS_DEFAULT_PROFILES_FILE names and then, unless SKIP_DEFAULT_XML=1,
-    DEFAULT_FASTRTPS_PROFILES.xml of the working directory; the last default profile counts.
+    It reads the file that FASTRTPS_DEFAULT_PROFILES_FILE (Fast DDS 3: FASTDDS_…) names and then,
+    unless SKIP_DEFAULT_XML=1, DEFAULT_FASTRTPS_PROFILES.xml (DEFAULT_FASTDDS_…) of the working
+    directory; the last default profile counts.
 
     Args:
         environment: None for this process's.
@@ -211,12 +211,15 @@ def default_profile(environment: Mapping[str, str] | None = None) -> DefaultProf
         MiddlewareError: a file cannot be read, or is no XML.
     """
     current = os.environ if environment is None else environment
+    version = installed()
     files = []
-    if current.get(PROFILES_FILE_VARIABLE):
-        files.append(current[PROFILES_FILE_VARIABLE])
+    if named := current.get(version.profiles_variable):
+        files.append(named)
     # Not by pathlib: what each host calls is copied into its own memory (docs/performance.md).
-    if current.get(_SKIP_DEFAULT_FILE_VARIABLE, "")[:1] != "1" and os.path.exists(DEFAULT_FILE):
-        files.append(DEFAULT_FILE)
+    if current.get(_SKIP_DEFAULT_FILE_VARIABLE, "")[:1] != "1" and os.path.exists(
+        version.default_profiles
+    ):
+        files.append(version.default_profiles)
     found = None
     for file in files:
         for element in _default_participants(file):

@@ -1,7 +1,7 @@
 """Fast DDS participant profiles applied through the environment, and the XML elements of profiles.
 
-Owns: the quick discovery profile, and text elements and locators as Fast DDS 2.14's XML parser
-reads them. Must not import rclpy.
+Owns: the quick discovery profile, and text elements and locators as Fast DDS's XML parser reads
+them. Must not import rclpy.
 
 Fast DDS announces a new participant five times at 100 ms and then once each 3 s; where those five
 are lost or arrive too early, discovery stalls. Announcements for 2 s remove the stall. The
@@ -21,13 +21,9 @@ from pathlib import Path
 from xml.etree import ElementTree as ET
 
 from lifecycle.errors import MiddlewareError
+from lifecycle.middleware.versions import DISTRIBUTIONS, installed
 from lifecycle.network.medium import Medium, udp_to
 
-PROFILES_FILE_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
-DEFAULT_FILE = "DEFAULT_FASTRTPS_PROFILES.xml"
-"""What Fast DDS loads from the working directory, unless SKIP_DEFAULT_XML=1."""
-
-_USER_VARIABLES = (PROFILES_FILE_VARIABLE, "FASTDDS_DEFAULT_PROFILES_FILE")
 PROFILE_NAME = "lifecycle_quick_discovery"
 _FILE_NAME = "quick_discovery.xml"
 
@@ -92,7 +88,9 @@ def discovery_environment(
         MiddlewareError: the file cannot be written.
     """
     current = os.environ if environment is None else environment
-    if any(current.get(variable) for variable in _USER_VARIABLES) or Path(DEFAULT_FILE).exists():
+    version = installed()
+    variables = (each.profiles_variable for each in DISTRIBUTIONS)
+    if any(map(current.get, variables)) or Path(version.default_profiles).exists():
         return {}
     path = directory.absolute() / _FILE_NAME
     # Renamed into place: a process that starts meanwhile reads the whole file or an older one.
@@ -105,7 +103,7 @@ def discovery_environment(
         raise MiddlewareError(
             f"cannot write the discovery profile {str(path)!r}: {error.strerror}"
         ) from error
-    return {PROFILES_FILE_VARIABLE: str(path)}
+    return {version.profiles_variable: str(path)}
 
 
 def announcements(count: int, period_ms: int) -> ET.Element:

@@ -6,7 +6,7 @@ adding discovery of its own to it.
 
 Profiles are read from the environment once per process, and rmw_fastrtps gives every participant
 the factory's default QoS. So that default is changed for one participant at a time, by the few C++
-functions of libfastrtps 2.14 that no environment variable replaces, called by mangled name through
+functions of Fast DDS that no environment variable replaces, called by mangled name through
 ctypes; the DomainParticipantQos objects stay opaque, made and destroyed by their own constructor
 and destructor.
 
@@ -50,10 +50,9 @@ from lifecycle.middleware.fastdds.sockets import (
 from lifecycle.middleware.fastdds.static_edp import endpoint_profiles
 from lifecycle.middleware.process.shared_memory import own_segments
 from lifecycle.middleware.rcl import abi
+from lifecycle.middleware.versions import INSTALL, KNOWN_FAST_DDS, KNOWN_RCL, installed, rcl_version
 from lifecycle.plan.model import StaticEndpoint
 
-_LIBRARY = "libfastrtps.so.2.14"
-_KNOWN = "Fast DDS 2.14 (ROS 2 Jazzy)"
 _DDS = "8eprosima7fastdds3dds"
 _FACTORY = f"{_DDS}24DomainParticipantFactory"
 _QOS = f"{_DDS}20DomainParticipantQos"
@@ -75,7 +74,7 @@ class _String(ctypes.Structure):
 
 @functools.lru_cache(maxsize=1)
 def _shared_library() -> ctypes.CDLL:
-    return ctypes.CDLL(_LIBRARY)
+    return ctypes.CDLL(installed().library)
 
 
 class _FastDds:
@@ -86,7 +85,7 @@ class _FastDds:
             _shared_library()
         except OSError as error:
             raise MiddlewareError(
-                f"cannot use Fast DDS, only {_KNOWN} is known: {error}", hint=abi.INSTALL
+                f"cannot use Fast DDS, only {KNOWN_FAST_DDS} is known: {error}", hint=INSTALL
             ) from error
         pointer = ctypes.c_void_p
         code = ctypes.c_uint32  # ReturnCode_t is a trivially copyable class of one uint32_t
@@ -95,8 +94,8 @@ class _FastDds:
             function = fast_dds_function(symbol, result, *arguments)
             if function is None:
                 raise MiddlewareError(
-                    f"cannot find {symbol!r} in {_LIBRARY}: only {_KNOWN} is known",
-                    hint=abi.INSTALL,
+                    f"cannot find {symbol!r} in Fast DDS: only {KNOWN_FAST_DDS} is known",
+                    hint=INSTALL,
                 )
             return function
 
@@ -180,7 +179,7 @@ def _node_functions() -> tuple[Any, Any] | None:
 
 @functools.cache
 def fast_dds_function(symbol: str, result: Any, *arguments: Any) -> Any:
-    """Return a function of libfastrtps 2.14 by its mangled name; None where there is none.
+    """Return a function of Fast DDS by its mangled name; None where there is none.
 
     It loads the library: only for who has a participant of it, see `participant_of`.
     """
@@ -210,9 +209,9 @@ def unknown_versions() -> str:
     """
     unknown = []
     if not abi.is_known():
-        version = abi.rcl_version() or "of unknown version"
+        version = rcl_version() or "of unknown version"
         unknown.append(
-            f"rcl {version} is not known (known: {abi.KNOWN}): nodes, endpoints and states are "
+            f"rcl {version} is not known (known: {KNOWN_RCL}): nodes, endpoints and states are "
             "verified; network flow endpoints cannot be read or made unique, so that what requires "
             "them is unverifiable or refused"
         )
@@ -221,7 +220,7 @@ def unknown_versions() -> str:
             _library()
         except MiddlewareError:
             unknown.append(
-                f"the loaded Fast DDS is not known (known: {_KNOWN}): participants get no "
+                f"the loaded Fast DDS is not known (known: {KNOWN_FAST_DDS}): participants get no "
                 "connections, transports or DSCP of their own"
             )
     return "; ".join(unknown)

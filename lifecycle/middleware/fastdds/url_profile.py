@@ -22,6 +22,7 @@ from lifecycle.middleware.fastdds.profiles import child as _child
 from lifecycle.middleware.fastdds.profiles import locator as _locator
 from lifecycle.middleware.fastdds.profiles import tcp_locator as _tcp_locator
 from lifecycle.middleware.fastdds.profiles import text as _text
+from lifecycle.middleware.versions import installed
 from lifecycle.network.connection_url import ConnectionUrl, Peer
 from lifecycle.network.medium import Medium, udp_to
 from lifecycle.network.ports import LOCALHOST_PEERS_RANGE, participant_ports
@@ -387,9 +388,11 @@ def _add_servers(builtin: ET.Element, urls: Sequence[ConnectionUrl], *, super_cl
     servers = ET.SubElement(config, "discoveryServersList")
     for url in urls:
         for index, server in enumerate(url.server):
-            prefix = _counted(url.server_prefix, index)
-            remote = ET.SubElement(servers, "RemoteServer", prefix=prefix)
-            listened = ET.SubElement(remote, "metatrafficUnicastLocatorList")
+            listened = servers
+            if installed().names_servers:
+                prefix = _counted(url.server_prefix, index)
+                remote = ET.SubElement(servers, "RemoteServer", prefix=prefix)
+                listened = ET.SubElement(remote, "metatrafficUnicastLocatorList")
             if url.transport.is_tcp:
                 # A server's logical port is its physical one.
                 _tcp_locator(listened, url.transport, server.address, server.port, server.port)

@@ -3,7 +3,8 @@
 Owns: which of them are in use, and removing what a killed process left: one segment of some 540 kB
 per participant and the files of its ports, which Fast DDS never reclaims. Must not import rclpy.
 
-A file belongs to a group, `fastrtps_<segment>` or `fastrtps_port<number>`, each with a lock file
+A file belongs to a group, `fastrtps_<segment>` or `fastrtps_port<number>` (Fast DDS 3:
+`fastdds_…`), each with a lock file
 (`_el` exclusive, `_sl` shared) that the owner keeps open and locked, and a port with a named
 semaphore under which it is opened (sem_overview(7)).
 
@@ -41,7 +42,7 @@ from lifecycle.errors import MiddlewareError
 
 _DIRECTORY = Path("/dev/shm")  # noqa: S108 - where shm_open(3) keeps them
 _FILE = re.compile(
-    r"(?P<semaphore>sem\.)?(?P<group>fastrtps_(?:port\d+|[0-9a-f]{16}))(?P<rest>_el|_sl|_mutex)?"
+    r"(?P<semaphore>sem\.)?(?P<group>fast(?:rtps|dds)_(?:port\d+|[0-9a-f]{16}))(?P<rest>_el|_sl|_mutex)?"
 )
 _LOCK_FIELDS = 8
 """Of a held lock in /proc/locks: number, FLOCK, ADVISORY, WRITE, pid, file, start, end."""
@@ -52,7 +53,8 @@ _AGAIN_S = 0.02
 _NEW_S = 0.1
 """Files of Fast DDS are locked by their owner within milliseconds."""
 
-_PORT = "fastrtps_port"
+_PORTS = ("fastrtps_port", "fastdds_port")  # of Fast DDS 2 and 3
+_OURS = re.compile("fast(?:rtps|dds)_")
 _LOCKS = ("_el", "_sl")
 _Inode = tuple[int, int]
 """(device, inode number)."""
@@ -70,7 +72,7 @@ def holds_shared_memory() -> bool:
     found = Path("/proc/self/maps").read_text(encoding="utf-8", errors="replace").splitlines()
     found += [to for _, to in open_files()]
     own = f"{_DIRECTORY}/"
-    return any(own in line and "fastrtps_" in line and "(deleted)" not in line for line in found)
+    return any(own in line and _OURS.search(line) and "(deleted)" not in line for line in found)
 
 
 def open_files() -> list[tuple[int, str]]:
@@ -87,9 +89,11 @@ def own_segments() -> frozenset[str]:
 
     A participant of it that has the transport has one from when it is made until it ends.
     """
-    own, ports = f"{_DIRECTORY}/fastrtps_", f"{_DIRECTORY}/{_PORT}"
+    own, names = f"{_DIRECTORY}/", ((to, Path(to).name) for _, to in open_files())
     return frozenset(
-        to for _, to in open_files() if to.startswith(own) and not to.startswith(ports)
+        to
+        for to, name in names
+        if to.startswith(own) and _OURS.match(name) and not name.startswith(_PORTS)
     )
 
 
@@ -116,7 +120,7 @@ class _SharedFile:
 
     @property
     def is_port(self) -> bool:
-        return self.group.startswith(_PORT)
+        return self.group.startswith(_PORTS)
 
 
 def _locked() -> Iterator[_Inode]:
@@ -212,7 +216,7 @@ def disown_ports() -> tuple[str, ...]:
         Their names, sorted.
     """
     groups: dict[str, list[_SharedFile]] = {}
-    for file in _files(lambda group: group.startswith(_PORT)):
+    for file in _files(lambda group: group.startswith(_PORTS)):
         if file.uid == os.getuid():
             groups.setdefault(file.group, []).append(file)
     used: set[_Inode] = set()
@@ -236,7 +240,7 @@ def _disowned(group: str, files: Collection[_SharedFile]) -> bool:
         file = os.open(_DIRECTORY / group, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW)
         stack.callback(os.close, file)
         memory = stack.enter_context(mmap.mmap(file, 0))
-        flags = _port_flags(memory, int(group.removeprefix(_PORT)))
+        flags = _port_flags(memory, int(group.partition("port")[2]))
         if flags is None or memory[flags] & _READ_AND_OK != _READ_AND_OK:
             return False
         # The semaphore first: opening the port after this waits until we are done.

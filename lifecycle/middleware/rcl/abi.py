@@ -1,8 +1,8 @@
 """The C ABI of rcl, rmw and rcutils that rclpy does not expose, through ctypes.
 
 Owns: the struct layouts, the function signatures, and the check that the loaded libraries are the
-ones these layouts were written for. Layouts are those of rcl 9 and rmw 7 (ROS 2 Jazzy), on any
-64-bit Linux; headers rcl/{publisher,subscription,wait,guard_condition}.h,
+ones these layouts were written for. Layouts are those of rcl 9 (ROS 2 Jazzy) and 10 (Kilted), both
+with rmw 7, on any 64-bit Linux; headers rcl/{publisher,subscription,wait,guard_condition}.h,
 rmw/{types,network_flow_endpoint}.h, rcutils/{allocator,error_handling}.h. With other libraries
 nothing is called: `is_known` says so, and what can be had from rclpy is taken from there.
 """
@@ -12,22 +12,15 @@ from __future__ import annotations
 import ctypes
 import functools
 import re
-import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from lifecycle.errors import MiddlewareError
+from lifecycle.middleware.versions import INSTALL, KNOWN_RCL, of_rcl, rcl_version
 
 RCL_RET_OK = 0
 RCL_RET_UNSUPPORTED = 3
 RCL_RET_TIMEOUT = 2
-SUPPORTED_RCL_MAJOR = 9
-"""rcl 9 is ROS 2 Jazzy; another major may lay its structs out differently."""
-
-KNOWN = f"rcl {SUPPORTED_RCL_MAJOR} (ROS 2 Jazzy)"
-INSTALL = "pip install 'ros-lifecycle-manifests[ros]', or source /opt/ros/jazzy/setup.bash"
-
 _ERROR_LOCATION = re.compile(r", at [^,]+?:\d+(?=,|$)")
 
 
@@ -145,9 +138,9 @@ class Rcl:
 
     def __init__(self) -> None:
         version = rcl_version()
-        if version and version.partition(".")[0] != str(SUPPORTED_RCL_MAJOR):
+        if of_rcl(version) is None:
             raise MiddlewareError(
-                f"cannot reach network flows through rcl {version!r}: only {KNOWN} is known",
+                f"cannot reach network flows through rcl {version!r}: only {KNOWN_RCL} is known",
                 hint=INSTALL,
             )
         pointer, size, integer = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int
@@ -235,7 +228,7 @@ def load() -> Rcl:
     """Load and check the libraries once.
 
     Raises:
-        MiddlewareError: a library or symbol is missing, or is not laid out as rcl 9.
+        MiddlewareError: a library or symbol is missing, or is laid out otherwise.
     """
     loaded = _loaded()
     if isinstance(loaded, MiddlewareError):
@@ -254,24 +247,6 @@ def _loaded() -> Rcl | MiddlewareError:
         return Rcl()
     except MiddlewareError as error:
         return error
-
-
-def rcl_version() -> str:
-    """Return the version of rcl: of its wheel, else of its ament package; empty if unknown."""
-    # By the name that an installed wheel's directory has; importing importlib.metadata and reading
-    # what it reads takes 12 ms and more, in the supervisor and in each node that is started alone.
-    for entry in sys.path:
-        found = [*Path(entry or ".").glob("ros_rcl-*.dist-info")]
-        if len(found) == 1:
-            return found[0].name.removeprefix("ros_rcl-").removesuffix(".dist-info")
-        if found:
-            break
-    import importlib.metadata
-
-    try:
-        return importlib.metadata.version("ros-rcl")
-    except importlib.metadata.PackageNotFoundError:
-        return _ament_version()
 
 
 def type_support(message_type: object) -> int:
@@ -302,17 +277,6 @@ def bind(library: str, symbol: str, result: Any, arguments: Sequence[Any] = ()) 
     return _bind(_open(f"lib{library}.so"), symbol, result, arguments)
 
 
-def _ament_version() -> str:
-    try:
-        from ament_index_python.packages import get_package_share_path
-
-        text = (get_package_share_path("rcl") / "package.xml").read_text(encoding="utf-8")
-    except (ImportError, LookupError, OSError):
-        return ""
-    found = re.search(r"<version>\s*([^<\s]+)\s*</version>", text)
-    return found.group(1) if found else ""
-
-
 def _open(library: str) -> ctypes.CDLL:
     # Importing rclpy loads the very same libraries; dlopen then finds them by name wherever they
     # are installed, and never a second copy.
@@ -341,6 +305,6 @@ def _bind(library: ctypes.CDLL, symbol: str, result: Any, arguments: Sequence[An
 def _layout_error(struct: str, version: str) -> MiddlewareError:
     return MiddlewareError(
         f"cannot use the installed rcl {version or '(version unknown)'}: its {struct} is not laid "
-        f"out as rcl {SUPPORTED_RCL_MAJOR}'s",
+        f"out as that of {KNOWN_RCL}",
         hint=INSTALL,
     )

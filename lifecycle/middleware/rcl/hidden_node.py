@@ -22,6 +22,7 @@ from rclpy.client import Client
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile
 from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rclpy.waitable import Waitable
@@ -39,6 +40,7 @@ from lifecycle.middleware.fastdds.settings import (
     participant_settings,
 )
 from lifecycle.middleware.fastdds.sockets import widen_discovery_buffers
+from lifecycle.middleware.versions import installed
 
 _hidden: weakref.WeakSet[Node] = weakref.WeakSet()
 
@@ -94,10 +96,11 @@ def bare_node(context: rclpy.Context) -> Any:
 
     The first node of a context makes its participant.
     """
+    more = (QoSProfile(depth=1).get_c_qos_profile(),) if installed().node_takes_rosout else ()
     with context.handle:
         return _rclpy.Node(
             f"_lifecycle_names_{os.getpid()}_{next(_numbers)}",
-            *("", context.handle, None, False, False),
+            *("", context.handle, None, False, False, *more),
         )
 
 

@@ -31,6 +31,7 @@ from lifecycle.middleware.process.control import (
 )
 from lifecycle.middleware.process.shared_memory import check_room, disown_ports, sweep
 from lifecycle.middleware.rcl.qos import load_type_support
+from lifecycle.middleware.versions import DISTRIBUTIONS
 from lifecycle.plan.connections.hosts import reached_hosts
 from lifecycle.plan.model import Plan, PlannedProcess
 from lifecycle.plan.restart import moved_observer
@@ -396,7 +397,7 @@ _GRAPH_VARIABLES = (
     "ROS_DOMAIN_ID",
     "ROS_AUTOMATIC_DISCOVERY_RANGE",
     "ROS_STATIC_PEERS",
-    "FASTRTPS_DEFAULT_PROFILES_FILE",
+    *(each.profiles_variable for each in DISTRIBUTIONS),
 )
 
 

@@ -15,6 +15,7 @@ from std_srvs.srv import Trigger
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.qos import Durability, History, Liveliness, QosProfile, Reliability
+from lifecycle.middleware.fastdds import nfe
 from lifecycle.middleware.fastdds.nfe import (
     NetworkFlowEndpointsUnsupported,
     UniqueFlowNotFeasible,
@@ -28,10 +29,10 @@ from lifecycle.middleware.rcl.qos import (
     import_interface,
     to_rclpy,
 )
+from lifecycle.middleware.versions import INSTALL, KNOWN_RCL
 from lifecycle.network.nfe import UniqueRequirement
 
 MakeNode = Callable[..., Node]
-INSTALL = abi.INSTALL
 
 
 def ignore(_: String) -> None:
@@ -45,13 +46,12 @@ def test_the_installed_libraries_are_laid_out_as_known() -> None:
 def test_another_major_of_rcl_is_refused_before_anything_is_called(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(abi, "rcl_version", lambda: "10.1.0")
+    monkeypatch.setattr(abi, "rcl_version", lambda: "11.0.0")
     monkeypatch.setattr(abi, "_open", lambda _: pytest.fail("a library was loaded"))
     with pytest.raises(MiddlewareError) as refused:
         abi.Rcl()
     assert str(refused.value) == (
-        "cannot reach network flows through rcl '10.1.0': only rcl 9 (ROS 2 Jazzy) is known; "
-        f"{INSTALL}"
+        f"cannot reach network flows through rcl '11.0.0': only {KNOWN_RCL} is known; {INSTALL}"
     )
 
 
@@ -78,7 +78,8 @@ def test_a_missing_symbol_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def unknown(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """An rcl whose layouts nobody wrote down."""
-    monkeypatch.setattr(abi, "rcl_version", lambda: "10.1.0")
+    monkeypatch.setattr(abi, "rcl_version", lambda: "11.0.0")
+    monkeypatch.setattr(nfe, "rcl_version", lambda: "11.0.0")
     abi._loaded.cache_clear()
     yield
     abi._loaded.cache_clear()
@@ -96,8 +97,8 @@ def test_with_an_unknown_rcl_only_what_strictly_requires_a_unique_flow_is_refuse
     with pytest.raises(UniqueFlowNotFeasible) as refused:
         create_subscription(node, String, "/b", ignore, QosProfile(), unique=strictly)
     assert str(refused.value) == (
-        "cannot create subscription '/b' with network flow endpoints strictly_required: rcl 10.1.0 "
-        "is not known; known: rcl 9 (ROS 2 Jazzy); ask for optionally_required, or " + INSTALL
+        "cannot create subscription '/b' with network flow endpoints strictly_required: rcl 11.0.0 "
+        f"is not known; known: {KNOWN_RCL}; ask for optionally_required, or {INSTALL}"
     )
     assert node.count_subscribers("/b") == 0
 
@@ -110,8 +111,8 @@ def test_a_struct_that_is_laid_out_otherwise_is_refused() -> None:
     with pytest.raises(MiddlewareError) as refused:
         rcl._check_layout("9.9.9")
     assert str(refused.value) == (
-        "cannot use the installed rcl 9.9.9: its rcl_subscription_options_t is not laid out as rcl "
-        f"9's; {INSTALL}"
+        "cannot use the installed rcl 9.9.9: its rcl_subscription_options_t is not laid out as that of "
+        f"{KNOWN_RCL}; {INSTALL}"
     )
 
 

@@ -28,6 +28,7 @@ from lifecycle.middleware.fastdds.nfe import (
 )
 from lifecycle.middleware.fastdds.participant import FlowParticipant
 from lifecycle.middleware.fastdds.sockets import get_dscp
+from lifecycle.middleware.versions import installed
 from lifecycle.network.nfe import TransportProtocol, UniqueRequirement
 
 MakeNode = Callable[..., Node]
@@ -301,7 +302,7 @@ def test_shared_memory_alone_cannot_be_marked(domain_id: int) -> None:
 def test_ipv6_sockets_are_marked_by_their_traffic_class(domain_id: int, tmp_path: Path) -> None:
     profile = tmp_path / "v6.xml"
     profile.write_text(_IPV6_PROFILE)
-    assert mark(domain_id, FASTRTPS_DEFAULT_PROFILES_FILE=str(profile)) == [
+    assert mark(domain_id, **{installed().profiles_variable: str(profile)}) == [
         "['ipv4', 'ipv6']",
         "46",
     ]

@@ -11,6 +11,7 @@ import pytest
 
 from lifecycle.cli import main
 from lifecycle.errors import ExitCode
+from lifecycle.middleware.versions import INSTALL
 
 ROOT = Path(__file__).parents[3]
 MANIFEST = "manifests/first_node.lifecycle.yaml"
@@ -91,8 +92,8 @@ def test_a_verb_that_needs_ros_says_how_to_get_it(verb: str) -> None:
     done = _bare("linux", verb, MANIFEST)
     assert (done.returncode, done.stdout) == (ExitCode.USAGE, "")
     assert done.stderr == (
-        f"cannot run 'lifecycle {verb}': it needs ROS 2, and this Python has no rclpy; pip install "
-        "'ros-lifecycle-manifests[ros]', or source /opt/ros/jazzy/setup.bash for its Python\n"
+        f"cannot run 'lifecycle {verb}': it needs ROS 2, and this Python has no rclpy; "
+        f"{INSTALL} for its Python\n"
     )
 
 
@@ -119,8 +120,7 @@ def test_a_ros_of_another_python_is_said_in_one_line(
     assert main(["up", MANIFEST]) is ExitCode.USAGE
     assert capfd.readouterr().err == (
         f"cannot import rclpy with Python {sys.version.split()[0]}: {' '.join(missing.split())}; "
-        "pip install 'ros-lifecycle-manifests[ros]', or source /opt/ros/jazzy/setup.bash for its "
-        "Python\n"
+        f"{INSTALL} for its Python\n"
     )
 
 
