@@ -71,7 +71,7 @@ check-static: $(STAMP)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-check: check-static test test-thorough docs
+check: check-static test test-kilted test-thorough docs
 
 # ROUNDS=20 SEED=7 chooses; `$(BIN)/python -m tests.soak --list --seed 7` prints what a seed stands for.
 ROUNDS ?= 100

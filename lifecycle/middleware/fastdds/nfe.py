@@ -37,7 +37,7 @@ from lifecycle.middleware.fastdds.sockets import udp_sockets
 from lifecycle.middleware.process.shared_memory import own_segments
 from lifecycle.middleware.rcl import abi
 from lifecycle.middleware.rcl.qos import to_rclpy
-from lifecycle.middleware.versions import INSTALL, KNOWN_RCL, rcl_version
+from lifecycle.middleware.versions import INSTALL
 from lifecycle.network.medium import DEFAULT_RMW
 from lifecycle.network.nfe import (
     InternetProtocol,
@@ -360,7 +360,7 @@ def _is_plain(node: Node, topic: str, unique: UniqueRequirement) -> bool:
         node.resolve_topic_name(topic),
         "subscription",
         unique,
-        f"rcl {rcl_version() or '(version unknown)'} is not known; known: {KNOWN_RCL}",
+        abi.refusal(),
         f"ask for optionally_required, or {INSTALL}",
     )
 

@@ -50,7 +50,7 @@ from lifecycle.middleware.fastdds.sockets import (
 from lifecycle.middleware.fastdds.static_edp import endpoint_profiles
 from lifecycle.middleware.process.shared_memory import own_segments
 from lifecycle.middleware.rcl import abi
-from lifecycle.middleware.versions import INSTALL, KNOWN_FAST_DDS, KNOWN_RCL, installed, rcl_version
+from lifecycle.middleware.versions import INSTALL, KNOWN_FAST_DDS, installed
 from lifecycle.plan.model import StaticEndpoint
 
 _DDS = "8eprosima7fastdds3dds"
@@ -208,10 +208,9 @@ def unknown_versions() -> str:
     It needs rclpy, and loads nothing that rclpy has not loaded.
     """
     unknown = []
-    if not abi.is_known():
-        version = rcl_version() or "of unknown version"
+    if refusal := abi.refusal():
         unknown.append(
-            f"rcl {version} is not known (known: {KNOWN_RCL}): nodes, endpoints and states are "
+            f"{refusal}: nodes, endpoints and states are "
             "verified; network flow endpoints cannot be read or made unique, so that what requires "
             "them is unverifiable or refused"
         )

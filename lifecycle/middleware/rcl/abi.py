@@ -140,7 +140,7 @@ class Rcl:
         version = rcl_version()
         if of_rcl(version) is None:
             raise MiddlewareError(
-                f"cannot reach network flows through rcl {version!r}: only {KNOWN_RCL} is known",
+                f"rcl {version} is not known (known: {KNOWN_RCL})",
                 hint=INSTALL,
             )
         pointer, size, integer = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int
@@ -238,7 +238,13 @@ def load() -> Rcl:
 
 def is_known() -> bool:
     """Return whether the installed libraries are those that the layouts here are of."""
-    return isinstance(_loaded(), Rcl)
+    return not refusal()
+
+
+def refusal() -> str:
+    """Return why the installed libraries are not used: version, layout; empty if they are."""
+    loaded = _loaded()
+    return loaded.message if isinstance(loaded, MiddlewareError) else ""
 
 
 @functools.lru_cache(maxsize=1)
@@ -304,7 +310,7 @@ def _bind(library: ctypes.CDLL, symbol: str, result: Any, arguments: Sequence[An
 
 def _layout_error(struct: str, version: str) -> MiddlewareError:
     return MiddlewareError(
-        f"cannot use the installed rcl {version or '(version unknown)'}: its {struct} is not laid "
-        f"out as that of {KNOWN_RCL}",
+        f"rcl {version or 'of unknown version'} was built otherwise: its {struct} is not laid out "
+        f"as that of {KNOWN_RCL}",
         hint=INSTALL,
     )

@@ -22,6 +22,7 @@ import yaml
 from rclpy.node import Node
 
 from lifecycle.errors import ExitCode
+from lifecycle.middleware.versions import KNOWN_FAST_DDS, KNOWN_RCL
 from lifecycle.network.ports import participant_ports
 from lifecycle.supervisor.gate.verification_loop import SETTLED_S
 from tests.ros.middleware.free_ports import free_ports
@@ -73,7 +74,7 @@ library = ctypes.CDLL
 
 class Library(library):
     def __init__(self, name, *arguments, **options):
-        if name and "libfastrtps.so" in name:
+        if name and name.startswith(("libfastrtps.so", "libfastdds.so")):
             raise OSError(f"{name}: cannot open shared object file: No such file or directory")
         super().__init__(name, *arguments, **options)
 
@@ -124,7 +125,7 @@ def test_with_libraries_that_are_not_known_all_but_unique_flows_is_verified(
     tmp_path: Path, fresh_domain: int
 ) -> None:
     (tmp_path / "sitecustomize.py").write_text(OTHER_VERSIONS)
-    (tmp_path / "ros_rcl-10.1.0.dist-info").mkdir()
+    (tmp_path / "ros_rcl-11.0.0.dist-info").mkdir()
     other = ("env", f"PYTHONPATH={tmp_path}")
     optionally = {"chatter": {"unique": "optionally_required"}}
     edit = {
@@ -134,8 +135,8 @@ def test_with_libraries_that_are_not_known_all_but_unique_flows_is_verified(
     manifest = pair(tmp_path, fresh_domain, edit=edit)
     with up(manifest, "--stop-after", "0.5", runtime=tmp_path, through=other) as run:
         notice = run.met("notice")["message"]
-        assert "rcl 10.1.0 is not known (known: rcl 9 (ROS 2 Jazzy))" in notice
-        assert "Fast DDS is not known (known: Fast DDS 2.14 (ROS 2 Jazzy))" in notice
+        assert f"rcl 11.0.0 is not known (known: {KNOWN_RCL})" in notice
+        assert f"Fast DDS is not known (known: {KNOWN_FAST_DDS})" in notice
         run.until("system", reached="active")
         assert run.finish() == ExitCode.OK
         assert run.verdict["verdict"] == "ok"

@@ -63,8 +63,10 @@ def names(directory: Path) -> tuple[str, ...]:
 
 def test_only_fast_dds_files_are_left_over(directory: Path) -> None:
     others = ("fastrtps_", "fastrtps_port", "fastrtps_xyz", "fastrtps_portal_el", "lttng", "sem.x")
-    make(directory, *others, *GROUP, SEGMENT)
-    assert set(leftovers()) == {*GROUP, SEGMENT}
+    newer = tuple(each.replace("fastrtps", "fastdds") for each in (*GROUP, SEGMENT))
+    make(directory, *others, *GROUP, SEGMENT, *newer)
+    assert set(leftovers()) == {*GROUP, SEGMENT, *newer}
+    assert sweep(newer) == tuple(sorted(newer))
     assert sweep(others) == ()
     assert names(directory) == tuple(sorted((*others, *GROUP, SEGMENT)))
 
