@@ -214,15 +214,21 @@ def unknown_versions() -> str:
             "verified; network flow endpoints cannot be read or made unique, so that what requires "
             "them is unverifiable or refused"
         )
+    if refusal := fast_dds_refusal():
+        unknown.append(
+            f"{refusal}: participants get no connections, transports or DSCP of their own"
+        )
+    return "; ".join(unknown)
+
+
+def fast_dds_refusal() -> str:
+    """Return why the loaded Fast DDS is not used beyond what rmw does; empty if it is, or none."""
     if get_rmw_implementation_identifier() == _RMW:
         try:
             _library()
         except MiddlewareError:
-            unknown.append(
-                f"the loaded Fast DDS is not known (known: {KNOWN_FAST_DDS}): participants get no "
-                "connections, transports or DSCP of their own"
-            )
-    return "; ".join(unknown)
+            return f"the loaded Fast DDS is not known (known: {KNOWN_FAST_DDS})"
+    return ""
 
 
 def load_profile(name: str, xml: str) -> None:

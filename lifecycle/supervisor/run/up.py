@@ -406,8 +406,9 @@ def _enter_graph(plan: Plan, options: UpOptions, directory: RunDirectory) -> Non
 
     Raises:
         UsageError: there can be no ROS log directory.
-        MiddlewareError: a package is missing, or it cannot have the threads of a participant. Fast
-            DDS would end the process then, or wait for ever.
+        MiddlewareError: a package is missing, or a version of one is not known that the plan needs,
+            or it cannot have the threads of a participant. Fast DDS would end the process then, or
+            wait for ever.
     """
     check_log_root(os.environ)
     check_installed(plan.policy)
@@ -422,6 +423,10 @@ def _enter_graph(plan: Plan, options: UpOptions, directory: RunDirectory) -> Non
     check_memory()
     check_threads(THREADS)
     check_room()
+    from lifecycle.middleware.fastdds.unsupported import refuse_unsupported
+
+    hosted = (each for each in plan.processes if each.run.kind is RunKind.PYTHON)
+    refuse_unsupported(plan.node(k) for each in hosted if each.machine in own for k in each.nodes)
     os.environ["ROS_DOMAIN_ID"] = str(plan.domain_id)
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = plan.discovery_range.name
     hosts = reached_hosts(plan, own)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import socket
@@ -143,6 +144,25 @@ def test_with_libraries_that_are_not_known_all_but_unique_flows_is_verified(
         assert run.verdict["flows"][0]["unique"] is None
         run.assert_gate_held()
         run.assert_nothing_left()
+
+
+def test_what_needs_libraries_that_are_known_is_refused_before_anything_is_started(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    (tmp_path / "sitecustomize.py").write_text(OTHER_VERSIONS)
+    (tmp_path / "ros_rcl-11.0.0.dist-info").mkdir()
+    other = ("env", f"PYTHONPATH={tmp_path}")
+    for flows, refused in (
+        ({"unique": "strictly_required"}, "a flow of its own ('unique: strictly_required'): rcl"),
+        ({"transport": "network"}, "a participant of 'talker' with 'transport'"),
+    ):
+        edit = {"nodes/talker/flows": {"publishers": {"chatter": flows}}}
+        manifest = pair(tmp_path, fresh_domain, edit=edit)
+        with up(manifest, "--stop-after", "0.5", runtime=tmp_path, through=other) as run:
+            assert run.finish() == ExitCode.BRING_UP_FAILED
+            assert run.of_kind("process") == []
+            assert refused in run.said()
+            assert re.match(rf"{re.escape(str(manifest))}:\d+:\d+: cannot ", run.said())
 
 
 def test_nodes_that_keep_each_other_from_the_processor_are_not_too_late(
