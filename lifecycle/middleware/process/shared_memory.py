@@ -216,7 +216,7 @@ def disown_ports() -> tuple[str, ...]:
         Their names, sorted.
     """
     groups: dict[str, list[_SharedFile]] = {}
-    for file in _files(lambda group: group.startswith(_PORTS)):
+    for file in _files(lambda group: group.startswith(_PORTS[0])):  # as in Fast DDS 2
         if file.uid == os.getuid():
             groups.setdefault(file.group, []).append(file)
     used: set[_Inode] = set()
