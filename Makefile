@@ -51,8 +51,8 @@ test-thorough: $(STAMP)
 
 # The same tests on the other distribution: what is asked, and what asks, run on it.
 KILTED    := $(VENV)-kilted
-ON_KILTED := $(addprefix tests/ros/,test_distribution.py examples/test_teleop.py \
-  middleware/test_abi_and_conversions.py middleware/test_network_flow_endpoints_on_dds.py)
+ON_KILTED := $(addprefix tests/ros/,test_distribution.py middleware/test_abi_and_conversions.py \
+  middleware/test_network_flow_endpoints_on_dds.py)
 $(KILTED)/.installed: pyproject.toml
 	$(PYTHON) -m venv $(KILTED)
 	$(INSTALL:$(BIN)/%=$(KILTED)/bin/%) '.[kilted,examples,test]' ros-kilted-test-msgs
