@@ -30,6 +30,7 @@ from rclpy.subscription import Subscription
 from rclpy.type_support import check_is_valid_msg_type
 from rclpy.validate_topic_name import validate_topic_name
 
+from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.fastdds.settings import noted_shared_memory
