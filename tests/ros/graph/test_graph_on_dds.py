@@ -231,6 +231,7 @@ def test_a_node_of_ours_that_tells_no_events_is_read_again_when_its_connections_
         until(graph, publishers("/before", "/quiet"))
         topic = "/after"
         hidden = make_node("_quiet_net")
+        hidden.create_publisher(String, topic, 10)
         until(graph, publishers("/after", "/quiet"))
         topic = "/remapped"
         hidden.create_publisher(String, "/remapped", 1)
