@@ -260,15 +260,6 @@ def test_what_was_put_stands_before_discovery_shows_the_node_and_goes_with_it(
     assert run(observer.observe(plan("a"))).configurations == ()
 
 
-def test_a_newer_configuration_replaces_an_older_and_can_be_dropped(observer: Observer) -> None:
-    observer.state.put_configuration(configuration("/a"))
-    observer.state.put_configuration(configuration("/a", state="active"))
-    assert run(observer.observe(plan("a"))).configurations == (configuration("/a", state="active"),)
-    observer.state.drop_configuration("/a")
-    observer.state.drop_configuration("/a")
-    assert run(observer.observe(plan("a"))).configurations == ()
-
-
 def test_a_node_that_does_not_answer_has_no_state_and_the_log_says_why(
     observer: Observer, graph: FakeGraph, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -348,13 +339,6 @@ def test_a_transition_of_a_node_that_is_asked_wakes(
         await asyncio.wait_for(observer.wait_change(), 5)
 
     run(transition())
-
-
-def test_a_change_after_the_loop_was_closed_is_nobodys_concern(
-    observer: Observer, graph: FakeGraph
-) -> None:
-    run(observer.observe(plan()))
-    graph.change()
 
 
 def test_who_has_left_is_called_back_no_more(graph: FakeGraph, clients: FakeClients) -> None:
