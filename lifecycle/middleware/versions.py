@@ -19,11 +19,10 @@ class Distribution(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         name: as people write it.
-        extra: of our package, which installs its wheels.
         rcl_major: version of rcl.
         fast_dds: version of Fast DDS.
         library: file name of Fast DDS's library.
-        profiles_variable: names the file of Fast DDS's profiles.
+        profiles_variables: name the file of Fast DDS's profiles; the first that is set counts.
         default_profiles: what Fast DDS loads from the working directory, unless SKIP_DEFAULT_XML=1.
         server_arguments: of `fast-discovery-server`, before its options.
         names_servers: a client's profile has the GUID prefix of each discovery server.
@@ -31,24 +30,27 @@ class Distribution(msgspec.Struct, frozen=True, kw_only=True):
     """
 
     name: str
-    extra: str
     rcl_major: str
     fast_dds: str
     library: str
-    profiles_variable: str
+    profiles_variables: tuple[str, ...]
     default_profiles: str
     server_arguments: tuple[str, ...]
     names_servers: bool
     node_takes_rosout: bool
 
+    @property
+    def profiles_variable(self) -> str:
+        """The variable that is set for what is started."""
+        return self.profiles_variables[0]
+
 
 JAZZY = Distribution(
     name="Jazzy",
-    extra="ros",
     rcl_major="9",
     fast_dds="2.14",
     library="libfastrtps.so.2.14",
-    profiles_variable="FASTRTPS_DEFAULT_PROFILES_FILE",
+    profiles_variables=("FASTRTPS_DEFAULT_PROFILES_FILE",),
     default_profiles="DEFAULT_FASTRTPS_PROFILES.xml",
     server_arguments=(),
     names_servers=True,
@@ -56,11 +58,10 @@ JAZZY = Distribution(
 )
 KILTED = Distribution(
     name="Kilted",
-    extra="kilted",
     rcl_major="10",
     fast_dds="3.2",
     library="libfastdds.so.3.2",
-    profiles_variable="FASTDDS_DEFAULT_PROFILES_FILE",
+    profiles_variables=("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE"),
     default_profiles="DEFAULT_FASTDDS_PROFILES.xml",
     server_arguments=("42",),  # the command "server" of tools/fastdds/discovery/parser.py
     names_servers=False,

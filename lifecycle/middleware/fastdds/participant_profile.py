@@ -213,8 +213,8 @@ def default_profile(environment: Mapping[str, str] | None = None) -> DefaultProf
     current = os.environ if environment is None else environment
     version = installed()
     files = []
-    if named := current.get(version.profiles_variable):
-        files.append(named)
+    named = (current.get(each) for each in version.profiles_variables)
+    files += [each for each in named if each][:1]
     # Not by pathlib: what each host calls is copied into its own memory (docs/performance.md).
     if current.get(_SKIP_DEFAULT_FILE_VARIABLE, "")[:1] != "1" and os.path.exists(
         version.default_profiles
