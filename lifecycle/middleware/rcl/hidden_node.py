@@ -42,6 +42,13 @@ from lifecycle.middleware.fastdds.settings import (
 from lifecycle.middleware.fastdds.sockets import widen_discovery_buffers
 from lifecycle.middleware.versions import installed
 
+_QUIET: dict[str, Any] = {
+    "enable_rosout": False,
+    "start_parameter_services": False,
+    "parameter_overrides": [Parameter("start_type_description_service", value=False)],
+}
+"""Arguments of a node that has nothing but parameter events."""
+
 _hidden: weakref.WeakSet[Node] = weakref.WeakSet()
 
 
@@ -70,9 +77,7 @@ def quiet_node(
                 name,
                 namespace=namespace,
                 context=context,
-                enable_rosout=False,
-                start_parameter_services=False,
-                parameter_overrides=[Parameter("start_type_description_service", value=False)],
+                **_QUIET,
             )
     except Exception as error:
         if node is not None:
@@ -96,12 +101,13 @@ def bare_node(context: rclpy.Context) -> Any:
 
     The first node of a context makes its participant.
     """
+    name = f"_lifecycle_names_{os.getpid()}_{next(_numbers)}"
     more = (QoSProfile(depth=1).get_c_qos_profile(),) if installed().node_takes_rosout else ()
-    with context.handle:
-        return _rclpy.Node(
-            f"_lifecycle_names_{os.getpid()}_{next(_numbers)}",
-            *("", context.handle, None, False, False, *more),
-        )
+    try:
+        with context.handle:
+            return _rclpy.Node(name, "", context.handle, None, False, False, *more)
+    except TypeError:  # of another rclpy: with what a public node has
+        return Node(name, context=context, use_global_arguments=False, **_QUIET).handle
 
 
 _numbers = itertools.count()

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 
 import pytest
+from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data, qos_profile_services_default
 from std_msgs.msg import String
@@ -15,13 +16,14 @@ from std_srvs.srv import Trigger
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.qos import Durability, History, Liveliness, QosProfile, Reliability
+from lifecycle.middleware import versions
 from lifecycle.middleware.fastdds.nfe import (
     NetworkFlowEndpointsUnsupported,
     UniqueFlowNotFeasible,
     create_subscription,
     get_network_flow_endpoints,
 )
-from lifecycle.middleware.rcl import abi
+from lifecycle.middleware.rcl import abi, hidden_node
 from lifecycle.middleware.rcl.qos import (
     UnknownInterfaceError,
     from_rclpy,
@@ -50,6 +52,17 @@ def test_another_major_of_rcl_is_refused_before_anything_is_called(
     with pytest.raises(MiddlewareError) as refused:
         abi.Rcl()
     assert str(refused.value) == (f"rcl 11.0.0 is not known (known: {KNOWN_RCL}); {INSTALL}")
+
+
+def test_a_node_is_made_by_an_rclpy_with_another_constructor(
+    context: Context, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (other,) = {True, False} - {versions.installed().node_takes_rosout}
+    wrong = SimpleNamespace(node_takes_rosout=other)
+    monkeypatch.setattr(hidden_node, "installed", lambda: wrong)
+    node = hidden_node.bare_node(context)
+    assert node.pointer
+    node.destroy_when_not_in_use()
 
 
 def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
