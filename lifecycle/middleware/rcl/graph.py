@@ -27,15 +27,7 @@ from lifecycle import dataclasses
 from lifecycle.export.programs import CapturedProgram
 from lifecycle.manifest.installed_types import join
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.middleware.discovery.dead_peers import (
-    PROCESS_DIGITS,
-    give_up_dead_connections,
-    is_alone,
-    is_of_host,
-    is_of_process,
-    is_used,
-    remove_participants,
-)
+from lifecycle.middleware.discovery.prefixes import PROCESS_DIGITS, is_of_host, is_of_process
 from lifecycle.middleware.discovery.probe import (
     ANSWER_S,
     answered_at,
@@ -45,6 +37,7 @@ from lifecycle.middleware.discovery.probe import (
     missing_port,
     probes_for,
 )
+from lifecycle.middleware.discovery.tcp import give_up_dead_connections, is_used
 from lifecycle.middleware.fastdds.participant_profile import (
     DISCOVERY_SERVER_VARIABLE,
     ParticipantSettings,
@@ -475,37 +468,32 @@ class GraphObserver:
                 time.sleep(_LOOK_S)  # the kernel gives no event
         return True
 
-    def participants_of(
-        self, pid: int, *, nodes: Iterable[str], reported: Iterable[str]
-    ) -> frozenset[str]:
-        """Return the GUID prefixes (24 hex digits) of a process's participants in the graph.
+    def ended(self, pid: int, *, nodes: Iterable[str], reported: Iterable[str]) -> None:
+        """Count the participants of a process no more, although discovery shows them still.
 
         Args:
-            pid: of a process on this host.
-            nodes: fully qualified names of nodes that it runs.
+            pid: of a process on this host that has ended.
+            nodes: fully qualified names of nodes that it ran.
             reported: GUID prefixes that these nodes said are theirs. Of both only those count
-                that bear this host and this pid. Where there are none, because the process ended
-                before its nodes' names were known, participants without any name count, unless
-                another process bears the same.
+                that bear this host and this pid.
         """
-        if self._destroyed:
-            return frozenset()
         homes, own = self._stale_node_filter.homes(), self.prefix
-        reported = frozenset(reported)
         claimed = {*reported, *(prefix for name in nodes for prefix in homes.get(name, ()))}
-        if not claimed and is_alone(pid):
-            named = {prefix for name, home in homes.items() if name for prefix in home}
-            claimed = set(self._stale_node_filter.shown()) - named
-        processes = {
-            each[:PROCESS_DIGITS] for each in claimed if own and is_of_process(each, pid, own)
-        }
-        processes.discard(own[:PROCESS_DIGITS])
-        # It may have come and gone between two looks.
-        was_on = (each for each in reported if each[:PROCESS_DIGITS] in processes)
-        self._stale_node_filter.was_on(nodes, frozenset(was_on))
-        return frozenset(
-            each for each in self._stale_node_filter.shown() if each[:PROCESS_DIGITS] in processes
-        )
+        theirs = [each for each in claimed if own and is_of_process(each, pid, own)]
+        self._stale_node_filter.was_on(nodes, frozenset(theirs))
+        for each in theirs:
+            self.ended_participant(each)
+
+    def ended_participant(self, prefix: str) -> None:
+        """Count participants of an ended process no more.
+
+        Args:
+            prefix: of the GUID of one of them, 24 hex digits.
+        """
+        own = self.prefix
+        if prefix[:PROCESS_DIGITS] != own[:PROCESS_DIGITS]:
+            self._stale_node_filter.ignore(prefix[:PROCESS_DIGITS])
+            self._changed()
 
     def programs(self, environment: Mapping[str, str]) -> dict[str, dict[str, CapturedProgram]]:
         """Return how the processes of this host's nodes were started.
@@ -525,20 +513,6 @@ class GraphObserver:
             name: {each: known[each] for each in home if each in known}
             for name, home in homes.items()
         }
-
-    def remove_participants(self, prefixes: Iterable[str], pids: Iterable[int]) -> None:
-        """Have all participants forget participants whose process is known to be dead.
-
-        Others learn of it over UDP only, see `discovery/dead_peers.py`; here they do
-        not count any more, whatever discovery shows until their lease has run out.
-
-        Args:
-            prefixes: GUID prefixes, 24 hex digits each.
-            pids: of processes on this host that run; they are reached wherever they listen.
-        """
-        self._stale_node_filter.ignore(prefixes := tuple(prefixes))
-        self._changed()
-        remove_participants(prefixes, self.domain_id, self.urls, os.environ, (os.getpid(), *pids))
 
     def destroy(self) -> None:
         """Stop watching and leave the graph; again is harmless."""

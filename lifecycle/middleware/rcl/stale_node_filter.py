@@ -14,6 +14,7 @@ from collections.abc import Iterable, Mapping
 from rclpy.node import Node
 
 from lifecycle.manifest.model import EndpointKind
+from lifecycle.middleware.discovery.prefixes import PROCESS_DIGITS
 from lifecycle.middleware.rcl.graph_queries import endpoints_of, endpoints_of_node, node_names
 
 _NODES_TOPIC = "ros_discovery_info"
@@ -45,13 +46,13 @@ class StaleNodeFilter:
         self._dead: frozenset[str] = frozenset()
         self.ghosts: frozenset[str] = frozenset()
 
-    def ignore(self, prefixes: Iterable[str]) -> None:
-        """Count no participants whose process is dead, for as long as discovery shows them.
+    def ignore(self, process: str) -> None:
+        """Count no participants of a process that has ended, for as long as discovery shows them.
 
         Args:
-            prefixes: of their GUIDs, 24 hex digits each; Fast DDS never gives one again.
+            process: the first 16 hex digits of their GUIDs; Fast DDS never gives them again.
         """
-        self._dead |= frozenset(prefixes)
+        self._dead |= {process}
 
     def was_on(self, names: Iterable[str], prefixes: frozenset[str]) -> None:
         """Take note of the participants that nodes were on, which may have been seen too briefly.
@@ -69,13 +70,13 @@ class StaleNodeFilter:
         Args:
             gid: in hex, or its first 24 digits.
         """
-        return gid[:_PREFIX_DIGITS] in self._dead
+        return gid[:PROCESS_DIGITS] in self._dead
 
     def count(self) -> Counter[str]:
         """Return by full name how many nodes there are; a name that is not known yet included."""
         every = shown = Counter(node_names(self._node))
         homes = self.homes()
-        if dead := self.shown() & self._dead if self._dead else frozenset():
+        if dead := self.shown() - self.participants() if self._dead else frozenset():
             shown = without_dead(shown, homes, self._homes, dead)
         if any(
             count > homes.get(name, Counter()).total() and self._homes.get(name)
@@ -119,7 +120,7 @@ class StaleNodeFilter:
 
     def participants(self) -> frozenset[str]:
         """Return the prefixes of every participant of rmw_fastrtps that is not ignored."""
-        return self.shown() - self._dead
+        return frozenset(each for each in self.shown() if not self.ignores(each))
 
     def shown(self) -> frozenset[str]:
         """Return the prefixes of every participant of rmw_fastrtps that discovery has."""

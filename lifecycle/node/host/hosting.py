@@ -28,7 +28,7 @@ from rclpy.signals import SignalHandlerOptions
 from lifecycle import codec
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import Executor
-from lifecycle.middleware.discovery.rediscovery import send_again_soon
+from lifecycle.middleware.discovery.tcp import send_again_soon
 from lifecycle.middleware.fastdds.participant_discovery import Unannounced
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.middleware.fastdds.settings import discovery_by_profile, host_settings

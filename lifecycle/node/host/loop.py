@@ -40,7 +40,7 @@ from rclpy.node import Node
 from rclpy.timer import Timer
 
 from lifecycle.manifest.model import Executor
-from lifecycle.middleware.discovery.rediscovery import republish_names
+from lifecycle.middleware.discovery.names import republish_names
 from lifecycle.middleware.process.busy_timer import BusySign, label
 from lifecycle.middleware.process.stacks import show_stacks_here
 from lifecycle.middleware.process.teardown import leave_and_exit

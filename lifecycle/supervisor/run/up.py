@@ -439,15 +439,11 @@ _PREFIX = re.compile(r"[0-9a-f]{24}")
 def _succeed(
     directory: RunDirectory, observer_participant: ObserverParticipant
 ) -> ObserverParticipant:
-    """Have all others forget the participant of a supervisor that was killed; note and return ours.
-
-    They would take the two for supervisors that both say they are the same, until its lease is
-    over.
-    """
+    """Note our participant; that of a supervisor that was killed counts no more. Return ours."""
     directory.participant = observer_participant.discovery.prefix
     killed = directory.previous
     if killed is not None and killed.boot_id == boot_id() and _PREFIX.fullmatch(killed.participant):
-        observer_participant.discovery.remove_participants([killed.participant], ())
+        observer_participant.discovery.ended_participant(killed.participant)
     return observer_participant
 
 

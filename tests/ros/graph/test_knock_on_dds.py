@@ -13,8 +13,7 @@ from types import SimpleNamespace
 import pytest
 
 from lifecycle.graph.graph import Graph
-from lifecycle.middleware.discovery.rediscovery import introduce
-from lifecycle.middleware.rcl.graph import ANSWER_S, PATIENCE_S, GraphObserver
+from lifecycle.middleware.rcl.graph import PATIENCE_S
 from tests.stalls import Stalls, assert_in_time, noted_stalls
 
 pytestmark = [pytest.mark.ros, pytest.mark.alone]
@@ -82,13 +81,3 @@ def test_an_empty_domain_is_known_to_be_empty_in_a_moment(fresh_domain: int) -> 
             return taken - PATIENCE_S / 2
 
         assert_in_time(late_s)
-
-
-def test_who_introduces_others_does_not_wait_for_those_by_whom_it_does(fresh_domain: int) -> None:
-    with GraphObserver(fresh_domain) as observer:
-        time.sleep(2 * ANSWER_S)
-        observer.snapshot()
-        assert observer.settling_s() == 0.0
-        # As after a restart: all sockets of this process are called, also the one that counts.
-        introduce([os.getpid()], fresh_domain, observer.urls, os.environ, [])
-        assert observer.settling_s() == 0.0

@@ -217,8 +217,7 @@ def test_a_ghost_of_a_node_that_was_never_seen_is_nobody_once_its_process_has_en
     with a_ghost(domain_id, gone, "brief"):
         wait_until(lambda: "/brief" in node_names(observer.node))
         wait_until(lambda: {"/bare", "/brief"} <= nodes(observer).keys())
-        found = observer.participants_of(process.pid, nodes=["/brief"], reported=[gone])
-        assert found == frozenset()
+        observer.ended(process.pid, nodes=["/brief"], reported=[gone])
         wait_until(lambda: "/bare" in nodes(observer) and "/brief" not in nodes(observer))
         assert "/brief" in node_names(observer.node)
 

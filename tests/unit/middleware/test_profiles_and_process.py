@@ -20,15 +20,15 @@ from lifecycle.network.ports import participant_ports
 VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 
 
-def test_the_profile_only_sets_announcements() -> None:
+def test_the_profile_only_sets_announcements_and_the_lease() -> None:
     root = ET.fromstring(discovery_profile())
     space = "{http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles}"
     (participant,) = root.iter(f"{space}participant")
     assert participant.get("is_default_profile") == "true"
-    leaves = {
-        each.tag.removeprefix(space): each.text for each in participant.iter() if not len(each)
-    }
-    assert leaves == {"count": "10", "nanosec": "200000000"}
+    leaves = [
+        (each.tag.removeprefix(space), each.text) for each in participant.iter() if not len(each)
+    ]
+    assert leaves == [("count", "10"), ("nanosec", "200000000"), ("sec", "8"), ("sec", "1")]
 
 
 def test_endpoints_are_sent_by_multicast_where_it_is_asked_for() -> None:
