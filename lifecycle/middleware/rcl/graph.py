@@ -27,23 +27,15 @@ from lifecycle import dataclasses
 from lifecycle.export.programs import CapturedProgram
 from lifecycle.manifest.installed_types import join
 from lifecycle.manifest.model import EndpointKind
+from lifecycle.middleware.discovery.environment import is_served, missing_port, reach
 from lifecycle.middleware.discovery.prefixes import PROCESS_DIGITS, is_of_host, is_of_process
-from lifecycle.middleware.discovery.probe import (
-    ANSWER_S,
-    answered_at,
-    connects_first,
-    dispose_of_announced,
-    is_served,
-    missing_port,
-    probes_for,
-)
+from lifecycle.middleware.discovery.prober import Settling
 from lifecycle.middleware.discovery.tcp import give_up_dead_connections, is_used
 from lifecycle.middleware.fastdds.participant_profile import (
     DISCOVERY_SERVER_VARIABLE,
     ParticipantSettings,
 )
 from lifecycle.middleware.fastdds.settings import observer_settings
-from lifecycle.middleware.fastdds.sockets import OpenSocket
 from lifecycle.middleware.process.hosted import is_vouched_for
 from lifecycle.middleware.process.process_table import programs_of
 from lifecycle.middleware.rcl.graph_changes import GraphGuard, on_graph_change
@@ -129,29 +121,11 @@ _Listed = tuple[tuple[EndpointKind, tuple[tuple[str, str], ...]], ...]
 """Name and type of what rcl lists of a node, by kind."""
 
 
-PATIENCE_S = 3.5
-"""What Fast DDS lost on the way it sends again every 3 s."""
-
-_UNPROBED_S = 1.5
-"""Within so long all are seen where none can be asked, over shared memory or TCP."""
-
-_UNCOUNTED_S = 0.6
-"""Within so long a probed participant is discovered, if we may not receive its answer."""
-
-_CONNECTED_S = 5.0
-"""Within so long all are seen that make TCP connections once they are discovered."""
-
-_ANNOUNCED_BY_SERVER_S = 2.5
-"""Within so long a discovery server has announced all."""
-
 _AGREED_S = 5.0
 """A server that listens agrees within so long, on a busy machine too."""
 
 _NAMED_S = 0.2
 """Of a new participant endpoints are known first, and within so long of which nodes they are."""
-_ANNOUNCED_S = 2.0
-"""For so long a participant announces itself often enough that no newcomer waits for that."""
-
 _LOOK_S = 0.005
 _PREFIX_DIGITS = 24
 
@@ -200,7 +174,6 @@ class GraphObserver:
         self._lock = threading.Lock()
         self._callbacks: tuple[Callable[[], None], ...] = ()
         self._destroyed = False
-        self._known: frozenset[str] = frozenset()
         self._ours: frozenset[str] = frozenset()
         self._asked_for: set[str] = set()
         self._nameless_since_s: dict[str, float] = {}
@@ -212,25 +185,13 @@ class GraphObserver:
             self._context, node = _observing_node(domain_id, settings)
             self._guard = GraphGuard(node, self._changed)
             self._unwatch = self._guard.stop
-            self._probes = probes_for(domain_id, settings.urls, os.environ)
-            self._limit_s = _UNPROBED_S if settings.urls else PATIENCE_S
-            if is_served(settings.urls, os.environ):
-                self._limit_s = _ANNOUNCED_BY_SERVER_S
-            if connects_first(settings.urls, os.environ):
-                self._limit_s = _CONNECTED_S
+            self._settling = Settling(reach(domain_id, settings.urls, os.environ))
         else:
             self._unwatch = on_graph_change(node, self._changed)
-            self._probes = ()
-            self._limit_s = PATIENCE_S
+            self._settling = Settling(())
         self.node = node
         self._name = self.node.get_fully_qualified_name()
         self._stale_node_filter = StaleNodeFilter(self.node)
-        self._made_s = time.monotonic()
-        self._ask_silent_s = 0.0
-        self._own = ""
-        self._waits_for_newcomers = False
-        self._familiar: frozenset[OpenSocket] = frozenset()
-        self._familiar_prefixes: frozenset[str] = frozenset()
         self._named: frozenset[str] = frozenset()
 
     @classmethod
@@ -320,89 +281,18 @@ class GraphObserver:
     def settling_s(self) -> float:
         """Return for how many seconds a snapshot may still miss nodes; 0 once it cannot.
 
-        A participant that answered our probe and whose node is not known is on its way into the
-        graph, and so is one of this host that has a port for discovery and did not answer.
-        Fast DDS needs 3 s at most for what it lost; a participant without a node by
-        then has none. Judged by the last `snapshot`. Where probing is impossible, it is a time.
+        Judged by the last `snapshot`, see `Settling`.
         """
-        left_s = self._settling_s()
-        if left_s <= 0 and self._waits_for_newcomers:
-            self._waits_for_newcomers = False
-            # Who did not come into the graph in all of the time is not waited for again.
-            self._known |= self._answered()
-            self._familiar_prefixes = self._known
-        return left_s
+        return self._settling.left_s(self._named)
 
     def expect_newcomers(self, *, everybody: bool = False) -> bool:
         """Have `settling_s` wait for who came since; return whether there may be anybody.
-
-        A participant that is made more than 2 s after this one gets our answer to its first
-        announcement before it listens. It knows us, and says what it has, after our next one only,
-        up to 3 s later, unless we announce ourselves.
-
-        On this host participants have sockets, and who has more of them than the graph shows
-        participants is not seen yet. On others they have to be asked.
 
         Args:
             everybody: wait also for what those have to say that are known: this process did not
                 run for a while.
         """
-        counting = [each for each in self._probes if each.counts]
-        if not counting or len(counting) != len(self._probes):
-            if everybody:
-                self._made_s = time.monotonic()
-            return everybody
-        if self._settling_s() > 0 and not everybody:
-            return True
-        now_s = time.monotonic()
-        if now_s - self._made_s > _ANNOUNCED_S and any(each.leaves_host for each in counting):
-            everybody = True
-        sockets = {each: each.listeners_here() for each in counting}
-        listeners = frozenset().union(*sockets.values())
-        came = listeners - self._familiar
-        own = self._own = self._own or self.prefix
-        known = {
-            each
-            for each in self._named - self._familiar_prefixes
-            if own and is_of_host(each, own) and each[:PROCESS_DIGITS] != own[:PROCESS_DIGITS]
-        }
-        self._familiar = listeners
-        if not everybody and len({each.port for each in came}) <= len(known):
-            self._familiar_prefixes = self._known
-            return False
-        self._made_s, self._waits_for_newcomers = now_s, True
-        self._asked_for -= self._answered()
-        for probe, found in sockets.items():
-            probe.ask_newcomers(found & came)
-        self.announce_ourselves()
-        return True
-
-    def _answered(self) -> frozenset[str]:
-        return frozenset().union(*(each.answered() for each in self._probes))
-
-    def _settling_s(self) -> float:
-        age_s = time.monotonic() - self._made_s
-        if not self._probes:
-            return max(0.0, self._limit_s - age_s)
-        if not all(probe.counts for probe in self._probes):
-            return max(0.0, _UNCOUNTED_S - age_s)
-        if age_s < ANSWER_S:
-            return ANSWER_S - age_s
-        patience_s = max(0.0, PATIENCE_S - age_s)
-        if patience_s and any(each.silent() for each in self._probes):
-            if age_s >= self._ask_silent_s:
-                self._ask_silent_s = 2 * age_s
-                for probe in self._probes:
-                    probe.ask_silent()
-            return min(patience_s, ANSWER_S)
-        unknown = self._answered() - self._known
-        if not unknown:
-            return 0.0
-        if not unknown <= self._asked_for:
-            self._asked_for |= unknown
-            for probe in self._probes:
-                probe.ask_again(to_count=False)
-        return patience_s
+        return self._settling.expect_newcomers(self._named, self.prefix, everybody=everybody)
 
     @property
     def prefix(self) -> str:
@@ -423,12 +313,6 @@ class GraphObserver:
             if here:
                 found[name] = all(map(is_vouched_for, here))
         return found
-
-    def announce_ourselves(self) -> None:
-        """Have our participant announce itself to all others of this host, as far as that goes."""
-        everybody = answered_at(self.domain_id, self.urls, os.environ)
-        for probe in self._probes if everybody else ():
-            probe.announce_ourselves(everybody)
 
     def offers(self, node: str, service: str) -> bool:
         """Return whether discovery shows `service` (a fully qualified name) on `node`."""
@@ -519,9 +403,7 @@ class GraphObserver:
         if self._destroyed:
             return
         self._destroyed = True
-        for probe in self._probes:
-            probe.close()
-        dispose_of_announced()
+        self._settling.close()
         self._unwatch()
         if self._context is not None:
             give_up_dead_connections()
@@ -573,8 +455,6 @@ class GraphObserver:
             if kind is EndpointKind.PUBLISHER and topic == CLOCK[0] and self._is_silent:
                 endpoint = dataclasses.replace(endpoint, silent=True)
             yield endpoint
-        # Who was known and left is not on the way into the graph.
-        self._known |= known
         self._named = frozenset(known)
 
     def _hashed(
@@ -650,9 +530,7 @@ class GraphObserver:
         One whose address is not known is asked for it: it answers within a moment, and the next
         look has it.
         """
-        known: dict[str, str] = {}
-        for probe in self._probes:
-            known.update(probe.addresses())
+        known = self._settling.addresses()
         for endpoint in endpoints:
             prefix = endpoint.gid[:_PREFIX_DIGITS]
             if not prefix:
@@ -662,8 +540,7 @@ class GraphObserver:
             is_coming = time.monotonic() - since_s < _NAMED_S
             if prefix not in known and prefix not in self._asked_for and not is_coming:
                 self._asked_for.add(prefix)
-                for probe in self._probes:
-                    probe.ask_again(to_count=True)
+                self._settling.ask()
             yield dataclasses.replace(endpoint, address=known.get(prefix, ""))
 
     def _services(self, full_name: str) -> _Listed | None:

@@ -20,7 +20,7 @@ from pathlib import Path
 from lifecycle import dataclasses
 from lifecycle.errors import ExitCode, MiddlewareError
 from lifecycle.manifest.model import Authority, DataLayerSource, EndpointPolicy, RunKind
-from lifecycle.middleware.discovery.probe import discovery_peers, peers_environment
+from lifecycle.middleware.discovery.environment import discovery_peers, peers_environment
 from lifecycle.middleware.fastdds.profiles import discovery_environment
 from lifecycle.middleware.process.control import (
     adopt_orphans,
