@@ -9,7 +9,7 @@ rclpy.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Coroutine, Iterable, Sequence
+from collections.abc import Coroutine, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from lifecycle.supervisor.control.protocol import ProcessState
@@ -118,15 +118,11 @@ class EndedProcesses:
     Args:
         system: whose processes; `on_event` must be given its events.
         participant: ours.
-        disown_ports: has all others send no more to ports in shared memory whose process is dead.
     """
 
-    def __init__(
-        self, system: System, participant: ObserverParticipant, *, disown_ports: Callable[[], None]
-    ) -> None:
+    def __init__(self, system: System, participant: ObserverParticipant) -> None:
         self._system = system
         self._participant = participant
-        self._disown_ports = disown_ports
 
     def on_event(self, event: Event) -> None:
         """Take an event of the system; of interest are ends of processes."""
@@ -146,7 +142,6 @@ class EndedProcesses:
             pid: of the process.
             nodes: that it ran.
         """
-        self._disown_ports()
         self._participant.discovery.ended(
             pid,
             nodes=[node.name for node in nodes],

@@ -204,9 +204,7 @@ class Session:
         )
         self._gate = Gate(strict=options.strict, judging=self._judge)
         sightings = Sightings(system, observer_participant.graph, self._changes)
-        self._ended = EndedProcesses(
-            system, observer_participant, disown_ports=fork_server.disown_ports
-        )
+        self._ended = EndedProcesses(system, observer_participant)
         emit.listen(self._ended.on_event)
         emit.listen(self._judge.on_event)
         self._records = records

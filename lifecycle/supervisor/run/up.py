@@ -29,7 +29,7 @@ from lifecycle.middleware.process.control import (
     check_threads,
     exit_after,
 )
-from lifecycle.middleware.process.shared_memory import check_room, disown_ports, sweep
+from lifecycle.middleware.process.shared_memory import check_room, sweep
 from lifecycle.middleware.rcl.qos import load_type_support
 from lifecycle.plan.connections.hosts import reached_hosts
 from lifecycle.plan.model import Plan, PlannedProcess
@@ -450,7 +450,6 @@ def _succeed(
 def _clean_up_after(record: RunRecord, emit: Emitter) -> None:
     """Sweep what a supervisor left that had no chance to do it itself."""
     ended = end_run(record)
-    disown_ports()
     swept = sweep()
     if ended or swept:
         emit(

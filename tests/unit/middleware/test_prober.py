@@ -299,14 +299,14 @@ def test_a_process_that_closed_its_port_is_waited_for_no_more(peer: socket.socke
 def test_who_answers_and_never_has_a_node_is_waited_for_once(
     peer: socket.socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(probing, "SETTLE_S", 0.4)
+    monkeypatch.setattr(probing, "SETTLE_S", 2.0)
     url, _ = url_for(peer)
     with contextlib.closing(Settling(reach(25, (parse(url),), {}))) as settling:
         _, asked_from = peer.recvfrom(65536)
         peer.sendto(_ANSWER, asked_from)
         time.sleep(ANSWER_S)
         assert not settled(settling)
-        time.sleep(0.3)
+        time.sleep(2.0)
         assert settled(settling)
         assert settling.expect_newcomers(frozenset(), "", everybody=True)
         peer.sendto(_ANSWER, asked_from)

@@ -101,9 +101,6 @@ class FakeForkServer(FakeSpawner):
     def family(self) -> frozenset[int]:
         return frozenset()
 
-    def disown_ports(self) -> None:
-        """There is no shared memory."""
-
     async def ready(self) -> None:
         if self.cannot_start:
             raise StepFailedError(self.cannot_start, rule=rule("run.start-failed"), subject="robot")

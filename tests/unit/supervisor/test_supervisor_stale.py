@@ -17,7 +17,6 @@ ENDED = ProcessChanged(process="camera", state=ProcessState.EXITED, pid=7)
 
 def test_only_a_process_of_the_system_that_has_ended_counts_no_more() -> None:
     ended: list[tuple[int, list[str], list[str]]] = []
-    disowned: list[None] = []
 
     def take(pid: int, *, nodes: Iterable[str], reported: Iterable[str]) -> None:
         ended.append((pid, list(nodes), list(reported)))
@@ -29,13 +28,13 @@ def test_only_a_process_of_the_system_that_has_ended_counts_no_more() -> None:
     process = SimpleNamespace(pid=7, planned=SimpleNamespace(nodes=("camera",)))
     system: Any = SimpleNamespace(nodes={"camera": camera}, processes={"camera": process})
     participant: Any = SimpleNamespace(discovery=SimpleNamespace(ended=take))
-    processes = EndedProcesses(system, participant, disown_ports=lambda: disowned.append(None))
+    processes = EndedProcesses(system, participant)
     for event in (
         dataclasses.replace(ENDED, state=ProcessState.RUNNING),
         dataclasses.replace(ENDED, pid=6),
         dataclasses.replace(ENDED, process="discovery_server"),
     ):
         processes.on_event(event)
-    assert (ended, disowned) == ([], [])
+    assert ended == []
     processes.on_event(ENDED)
-    assert (ended, disowned) == ([(7, ["/camera"], [PREFIX])], [None])
+    assert ended == [(7, ["/camera"], [PREFIX])]
