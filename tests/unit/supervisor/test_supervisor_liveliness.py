@@ -12,8 +12,8 @@ import pytest
 
 from lifecycle.cli.up_output import describe
 from lifecycle.manifest.model import DiscoveryRange, Machine, Run, RunKind, Timeouts
-from lifecycle.middleware.process.busy_timer import BusySign, Overdue
-from lifecycle.node.host.control import SIGN_DESCRIPTORS, HostSpec, Operation
+from lifecycle.middleware.process.busy_sign import BusySign, Overdue
+from lifecycle.node.host.control import HostSpec, Operation
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.gate.verification_loop import without_nodes
 from lifecycle.supervisor.health.liveliness import Cause, NodeArrivals, SilenceMonitor
@@ -435,7 +435,7 @@ def test_a_process_that_was_killed_while_it_was_busy_does_not_hang() -> None:
         told: asyncio.Queue[Overdue | None] = asyncio.Queue()
         channel = ControlChannel(spec, lambda _: None, told.put_nowait)
         theirs = await channel.open()
-        _, descriptors, _, _ = socket.recv_fds(theirs, 1, SIGN_DESCRIPTORS)
+        _, descriptors, _, _ = socket.recv_fds(theirs, 1, 1)
         sign = BusySign(*descriptors)
         sign.begin()
         theirs.close()
