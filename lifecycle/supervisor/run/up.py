@@ -22,13 +22,8 @@ from lifecycle.errors import ExitCode, MiddlewareError
 from lifecycle.manifest.model import Authority, DataLayerSource, EndpointPolicy, RunKind
 from lifecycle.middleware.discovery.environment import discovery_peers, peers_environment
 from lifecycle.middleware.fastdds.profiles import discovery_environment
-from lifecycle.middleware.process.control import (
-    adopt_orphans,
-    check_descriptors,
-    check_memory,
-    check_threads,
-    exit_after,
-)
+from lifecycle.middleware.process.control import check_descriptors, check_memory, check_threads
+from lifecycle.middleware.process.prctl import adopt_orphans, exit_after
 from lifecycle.middleware.process.shared_memory import check_room, sweep
 from lifecycle.middleware.rcl.qos import load_type_support
 from lifecycle.plan.connections.hosts import reached_hosts
