@@ -38,6 +38,13 @@ from lifecycle.network.ports import (
     unicast_pairs,
 )
 
+SETTLE_S = 3.5
+"""Within so long everybody is known: Fast DDS announces itself, and sends again what was lost, each
+3 s. It is waited for in full where nobody can be asked."""
+
+_CONNECTED_S = 1.5
+"""So much later those are known that make TCP connections first."""
+
 RANGE_VARIABLE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 PEERS_VARIABLE = "ROS_STATIC_PEERS"
 _RMW_VARIABLE = "RMW_IMPLEMENTATION"
@@ -111,6 +118,11 @@ def reach(
         return tuple(_listed(domain_id, family) for family in found)
     kinds = tuple(family.kind for family in found) or (RMW_DISCOVERY,)
     return tuple(_around(domain_id, kind, environment) for kind in kinds)
+
+
+def settle_s(urls: Sequence[ConnectionUrl], environment: Mapping[str, str]) -> float:
+    """Return within how many seconds a participant of these URLs knows all that were there."""
+    return SETTLE_S + (_CONNECTED_S if not urls and _connects_first(environment) else 0.0)
 
 
 def _around(domain_id: int, kind: Medium, environment: Mapping[str, str]) -> Reach:

@@ -25,14 +25,10 @@ import time
 import weakref
 from collections.abc import Iterable, Sequence
 
-from lifecycle.middleware.discovery.environment import Reach, Target
+from lifecycle.middleware.discovery.environment import SETTLE_S, Reach, Target
 from lifecycle.middleware.discovery.prefixes import PROCESS_DIGITS, is_of_host
 from lifecycle.middleware.fastdds.profiles import LEASE_S
 from lifecycle.middleware.fastdds.sockets import OpenSocket, udp_sockets
-
-SETTLE_S = 3.5
-"""Within so long everybody is known: Fast DDS announces itself, and sends again what was lost, each
-3 s. It is waited for in full where nobody can be asked."""
 
 ANSWER_S = 0.15
 """A participant that is asked, on this host or the next one, answers within so long."""
@@ -266,9 +262,11 @@ class Settling:
 
     Args:
         reached: whom our participant, which listens already, can ask.
+        settle_s: seconds in which everybody is known.
     """
 
-    def __init__(self, reached: Sequence[Reach]) -> None:
+    def __init__(self, reached: Sequence[Reach], settle_s: float = SETTLE_S) -> None:
+        self._settle_s = settle_s
         self._began_s = time.monotonic()
         self._again_s = ANSWER_S
         self._prober = Prober(reached) if reached else None
@@ -288,7 +286,7 @@ class Settling:
         """
         self._known |= named  # who was known and left is not on the way into the graph
         age_s = time.monotonic() - self._began_s
-        left_s = max(0.0, SETTLE_S - age_s)
+        left_s = max(0.0, self._settle_s - age_s)
         if self._prober is None or not left_s:
             return left_s
         if age_s < ANSWER_S:

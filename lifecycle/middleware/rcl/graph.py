@@ -27,7 +27,7 @@ from lifecycle import dataclasses
 from lifecycle.export.programs import CapturedProgram
 from lifecycle.manifest.installed_types import join
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.middleware.discovery.environment import is_served, missing_port, reach
+from lifecycle.middleware.discovery.environment import is_served, missing_port, reach, settle_s
 from lifecycle.middleware.discovery.prefixes import PROCESS_DIGITS, is_of_host, is_of_process
 from lifecycle.middleware.discovery.prober import Settling
 from lifecycle.middleware.discovery.tcp import give_up_dead_connections, is_used
@@ -185,7 +185,9 @@ class GraphObserver:
             self._context, node = _observing_node(domain_id, settings)
             self._guard = GraphGuard(node, self._changed)
             self._unwatch = self._guard.stop
-            self._settling = Settling(reach(domain_id, settings.urls, os.environ))
+            self._settling = Settling(
+                reach(domain_id, settings.urls, os.environ), settle_s(settings.urls, os.environ)
+            )
         else:
             self._unwatch = on_graph_change(node, self._changed)
             self._settling = Settling(())

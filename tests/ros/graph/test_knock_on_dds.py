@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import pytest
 
 from lifecycle.graph.graph import Graph
-from lifecycle.middleware.discovery.prober import SETTLE_S
+from lifecycle.middleware.discovery.environment import SETTLE_S
 from tests.stalls import Stalls, assert_in_time, noted_stalls
 
 pytestmark = [pytest.mark.ros, pytest.mark.alone]

@@ -17,6 +17,7 @@ from lifecycle.middleware.discovery.environment import (
     is_served,
     missing_port,
     reach,
+    settle_s,
 )
 from lifecycle.middleware.discovery.prober import ANSWER_S, Prober, Settling, leave_all
 from lifecycle.network.connection_url import parse
@@ -243,6 +244,7 @@ def test_where_participants_connect_first_an_answer_is_not_enough(
     assert bool(asked) is not (connects or "builtinTransports" in element)
     large = {"FASTDDS_BUILTIN_TRANSPORTS": "LARGE_DATA"}
     assert reach(25, (), large) == ()
+    assert settle_s((), large) > settle_s((), {}) == settle_s((parse("shm://"),), large)
     assert reach(25, (), {**large, **near})
 
 
@@ -297,11 +299,10 @@ def test_a_process_that_closed_its_port_is_waited_for_no_more(peer: socket.socke
 
 
 def test_who_answers_and_never_has_a_node_is_waited_for_once(
-    peer: socket.socket, monkeypatch: pytest.MonkeyPatch
+    peer: socket.socket,
 ) -> None:
-    monkeypatch.setattr(probing, "SETTLE_S", 2.0)
     url, _ = url_for(peer)
-    with contextlib.closing(Settling(reach(25, (parse(url),), {}))) as settling:
+    with contextlib.closing(Settling(reach(25, (parse(url),), {}), 2.0)) as settling:
         _, asked_from = peer.recvfrom(65536)
         peer.sendto(_ANSWER, asked_from)
         time.sleep(ANSWER_S)
@@ -325,9 +326,8 @@ def test_a_socket_of_another_process_that_came_is_asked_for_once(peer: socket.so
             assert not settled(settling)
 
 
-def test_where_nobody_can_be_asked_it_is_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(probing, "SETTLE_S", 0.2)
-    settling = Settling(())
+def test_where_nobody_can_be_asked_it_is_a_time() -> None:
+    settling = Settling((), 0.2)
     assert 0.0 < settling.left_s(frozenset()) <= 0.2
     time.sleep(0.2)
     assert settled(settling)
