@@ -278,6 +278,16 @@ class Settling:
             self._silent = self._prober.listeners()
             self._prober.ask()
 
+    def within(self, settle_s: float) -> None:
+        """Take so many seconds for those in which everybody is known, where nobody can be asked."""
+        if self._prober is None:
+            self._settle_s = settle_s
+
+    @property
+    def unasked_s(self) -> float:
+        """Seconds that are waited for because nobody can be asked; 0 where all can be."""
+        return self._settle_s if self._prober is None else 0.0
+
     def left_s(self, named: frozenset[str]) -> float:
         """Return for how many seconds a look may still miss somebody; 0 once it cannot.
 

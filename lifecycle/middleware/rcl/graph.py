@@ -153,6 +153,7 @@ class GraphObserver:
 
     Attributes:
         urls: of its connections; none where the RMW chooses.
+        settling: for how long it may still miss somebody.
         owns_node: the node is its own, and is spun and destroyed by nothing else.
 
     Raises:
@@ -185,12 +186,12 @@ class GraphObserver:
             self._context, node = _observing_node(domain_id, settings)
             self._guard = GraphGuard(node, self._changed)
             self._unwatch = self._guard.stop
-            self._settling = Settling(
+            self.settling = Settling(
                 reach(domain_id, settings.urls, os.environ), settle_s(settings.urls, os.environ)
             )
         else:
             self._unwatch = on_graph_change(node, self._changed)
-            self._settling = Settling(())
+            self.settling = Settling(())
         self.node = node
         self._name = self.node.get_fully_qualified_name()
         self._stale_node_filter = StaleNodeFilter(self.node)
@@ -285,7 +286,7 @@ class GraphObserver:
 
         Judged by the last `snapshot`, see `Settling`.
         """
-        return self._settling.left_s(self._named)
+        return self.settling.left_s(self._named)
 
     def expect_newcomers(self, *, everybody: bool = False) -> bool:
         """Have `settling_s` wait for who came since; return whether there may be anybody.
@@ -294,7 +295,7 @@ class GraphObserver:
             everybody: wait also for what those have to say that are known: this process did not
                 run for a while.
         """
-        return self._settling.expect_newcomers(self._named, self.prefix, everybody=everybody)
+        return self.settling.expect_newcomers(self._named, self.prefix, everybody=everybody)
 
     @property
     def prefix(self) -> str:
@@ -405,7 +406,7 @@ class GraphObserver:
         if self._destroyed:
             return
         self._destroyed = True
-        self._settling.close()
+        self.settling.close()
         self._unwatch()
         if self._context is not None:
             give_up_dead_connections()
@@ -532,7 +533,7 @@ class GraphObserver:
         One whose address is not known is asked for it: it answers within a moment, and the next
         look has it.
         """
-        known = self._settling.addresses()
+        known = self.settling.addresses()
         for endpoint in endpoints:
             prefix = endpoint.gid[:_PREFIX_DIGITS]
             if not prefix:
@@ -542,7 +543,7 @@ class GraphObserver:
             is_coming = time.monotonic() - since_s < _NAMED_S
             if prefix not in known and prefix not in self._asked_for and not is_coming:
                 self._asked_for.add(prefix)
-                self._settling.ask()
+                self.settling.ask()
             yield dataclasses.replace(endpoint, address=known.get(prefix, ""))
 
     def _services(self, full_name: str) -> _Listed | None:

@@ -61,6 +61,7 @@ class ObserverParticipant:
         *,
         unplanned: bool = False,
         events: bool = False,
+        settle_s: float | None = None,
     ) -> ObserverParticipant:
         """Make the participant; before any process, so that each is discovered at once.
 
@@ -69,6 +70,7 @@ class ObserverParticipant:
             connections: how it is connected; by default as the RMW likes.
             unplanned: also read the configurations of nodes that are not planned.
             events: receive graph messages, and look again at nodes that changed.
+            settle_s: see Discovery; None takes what Fast DDS needs.
 
         Raises:
             MiddlewareError: it cannot be made.
@@ -85,6 +87,8 @@ class ObserverParticipant:
             burst_s=_BURST_S,
         )
         widen_discovery_buffers(domain_id)
+        if settle_s is not None:
+            graph.discovery.settling.within(settle_s)
         return cls(graph)
 
     @property

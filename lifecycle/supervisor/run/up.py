@@ -342,6 +342,7 @@ async def _observer_participant(
                 connections,
                 unplanned=wires and dynamic and plan.policy.undeclared_nodes is EndpointPolicy.OPEN,
                 events=wires and (dynamic or layer.events),
+                settle_s=plan.settle_s,
             )
         if number + 1 == OBSERVER_TRIES or observer_participant.discovery.reaches_servers():
             break
@@ -366,6 +367,13 @@ async def _observer_participant(
             "which all participants find each other, is taken by something else",
             hint=f"`ss -lunp 'sport = :{port}'` says by what; end it, or choose another domain: "
             "`lifecycle ports` says which are safe",
+        )
+    if unasked_s := discovery.settling.unasked_s:
+        emit(
+            Notice(
+                message=f"who is there is seen within {unasked_s:g} s, before which the gate stays "
+                "closed: by this discovery nobody can be asked (discovery.settle_s)"
+            )
         )
     if limits := observer_participant.unknown_versions:
         emit(Notice(message=limits))

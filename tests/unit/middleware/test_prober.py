@@ -334,3 +334,7 @@ def test_where_nobody_can_be_asked_it_is_a_time() -> None:
     assert not settling.expect_newcomers(frozenset(), "")
     assert settling.expect_newcomers(frozenset(), "", everybody=True)
     assert not settled(settling)
+    assert settling.unasked_s == 0.2
+    settling.within(0.001)
+    time.sleep(0.001)
+    assert settled(settling)
