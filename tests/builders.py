@@ -8,7 +8,6 @@ and `reported`, what a node says of itself. Needs neither YAML nor ROS.
 from __future__ import annotations
 
 import dataclasses
-import struct
 from collections.abc import Iterable, Mapping
 
 from lifecycle.manifest.diagnostics import Position
@@ -266,14 +265,6 @@ def configuration(
         endpoints=endpoints,
     )
     return dataclasses.replace(made, **changes)
-
-
-def port_node(
-    port: int = 7411, *, number: int | None = None, wait_ms: int = 333, flags: int = 7
-) -> bytes:
-    """Return a port in shared memory, as far as it is looked at, as Fast DDS 2.14.5 writes it."""
-    node = struct.pack("=7I", port if number is None else number, 1, 1000, wait_ms, 512, 1, flags)
-    return struct.pack("=I", port) + bytes(272) + node + bytes(1024)
 
 
 def nfe(

@@ -183,10 +183,10 @@ def program() -> int:
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, signal.SIG_IGN)
     if "rclpy" in sys.modules:
-        from lifecycle.middleware.discovery.probe import dispose_of_announced
+        from lifecycle.middleware.discovery.prober import leave_all
         from lifecycle.middleware.process.shared_memory import holds_shared_memory
 
-        dispose_of_announced()
+        leave_all()
         if code not in _ORDERLY and not (verb == ["up"] and code == ExitCode.INTERRUPTED):
             gc.collect()  # what an error may have kept of a participant leaves the graph with it
         if holds_shared_memory():

@@ -684,6 +684,8 @@ class Discovery:
             TCPV4 for SERVER.
         first_port: first of the ports given out where the mode fixes them, per machine, 1024–65535.
         server_machine: runs the discovery server; empty for the first machine.
+        settle_s: in which a supervisor sees everybody, where it can ask none, > 0; None takes what
+            Fast DDS needs.
     """
 
     domain_id: DomainId | None = None
@@ -692,6 +694,7 @@ class Discovery:
     transport: FlowTransport = FlowTransport.ANY
     first_port: Annotated[int, says(minimum=1024, maximum=65535)] = 7910
     server_machine: str = ""
+    settle_s: float | None = None
     at: Position | None = None
 
 

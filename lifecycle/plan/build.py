@@ -251,6 +251,7 @@ def build_plan(
         max_datagram_bytes=manifest.network.max_datagram_bytes,
         server=wired.server,
         observers=wired.observers,
+        settle_s=manifest.discovery.settle_s,
     )
     return _told(in_mode(plan, plan.modes[0].name) if plan.modes else plan)
 

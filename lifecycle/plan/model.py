@@ -375,6 +375,7 @@ class Plan(SystemDeclaration):
         discovery_mode: how participants find each other.
         max_datagram_bytes: UDP payload that the path carries unfragmented; None assumes Ethernet.
         server: the discovery server; None without.
+        settle_s: as the manifest has it.
         observers: (machine, how its supervisor's own participant is connected); machine is empty
             for this host. Machines without an entry leave it to the RMW.
     """
@@ -392,6 +393,7 @@ class Plan(SystemDeclaration):
     max_datagram_bytes: Positive | None = None
     server: PlannedServer | None = None
     observers: tuple[tuple[str, ParticipantConnections], ...] = ()
+    settle_s: float | None = None
 
     def node(self, key: str) -> PlannedNode:
         """Return the node with this manifest key.

@@ -12,7 +12,7 @@ import sys
 from std_msgs.msg import String
 
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.middleware.discovery.rediscovery import republish_names
+from lifecycle.middleware.discovery.names import republish_names
 from lifecycle.middleware.rcl.graph import GraphObserver, endpoints_of
 from lifecycle.plan.model import ParticipantConnections
 

@@ -1,1 +1,1 @@
-"""DDS discovery: range, discovery server, probes, liveliness, rediscovery, dead participants."""
+"""DDS discovery: range, discovery server, the prober, liveliness, TCP, names."""

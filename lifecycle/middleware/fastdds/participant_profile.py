@@ -21,6 +21,7 @@ from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds import static_edp, url_profile
 from lifecycle.middleware.fastdds.profiles import (
     PROFILE_NAME,
+    announced_again,
     announcements,
 )
 from lifecycle.middleware.fastdds.profiles import child as _child
@@ -259,7 +260,11 @@ def profile(
     rtps = _child(participant, "rtps")
     root = ET.Element("dds", xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles")
     profiles = ET.SubElement(root, "profiles")
+    is_users = base is not None and base.name != PROFILE_NAME
     if settings.urls:
+        for config in () if is_users else rtps.iter("discovery_config"):
+            for period in config.findall("leaseAnnouncement"):
+                config.remove(period)  # ours, which some URLs have shorter
         url_profile.add_urls(
             name,
             profiles,
@@ -297,7 +302,7 @@ def profile(
             _discover_as_localhost(_child(rtps, "builtin"), kinds, localhost_peers)
     if settings.max_datagram_bytes is not None:
         _set_property(rtps, "fastdds.max_message_size", str(settings.max_datagram_bytes))
-    _set_discovery(rtps, settings, is_users=base is not None and base.name != PROFILE_NAME)
+    _set_discovery(rtps, settings, is_users=is_users)
     profiles.append(participant)
     return ET.tostring(root, encoding="unicode", xml_declaration=True)
 
@@ -306,6 +311,9 @@ def _set_discovery(rtps: ET.Element, settings: ParticipantSettings, *, is_users:
     for each in rtps.iter("discoveryProtocol") if settings.super_client else ():
         if (each.text or "").strip() == "CLIENT":
             each.text = "SUPER_CLIENT"
+    config = rtps.find("builtin/discovery_config/leaseDuration/..")
+    if not is_users and config is not None and config.find("leaseAnnouncement") is None:
+        config.append(announced_again())
     if not (settings.announces_often or settings.unannounced):
         return
     config = _child(_child(rtps, "builtin"), "discovery_config")

@@ -4,9 +4,10 @@ Owns: the quick discovery profile, and text elements and locators as Fast DDS's 
 them. Must not import rclpy.
 
 Fast DDS announces a new participant five times at 100 ms and then once each 3 s; where those five
-are lost or arrive too early, discovery stalls. Announcements for 2 s remove the stall. The
-environment is used, not Fast DDS's C++ API: the children of a supervisor, whatever they are written
-in, inherit it.
+are lost or arrive too early, discovery stalls. Announcements for 2 s remove the stall, and later
+ones each second the same for who is started again. One that is dropped without a word (its process
+was killed, its link is cut) is there for its lease: 20 s by default. The environment is used, not
+Fast DDS's C++ API: the children of a supervisor, whatever they are written in, inherit it.
 
 Endpoints are sent to each participant by itself unless a profile asks for multicast
 (`avoid_builtin_multicast`): of fifty processes on one host, each endpoint and each heartbeat fifty
@@ -30,6 +31,12 @@ _FILE_NAME = "quick_discovery.xml"
 
 _ANNOUNCEMENTS = 10
 _PERIOD_NS = 200_000_000
+
+LEASE_S = 8
+"""As long as a machine may be too busy for a participant to announce itself, or to take it in."""
+
+_AGAIN_S = 1
+"""Who was there before and who was started again know each other within so long."""
 
 
 def discovery_profile(
@@ -59,7 +66,10 @@ def discovery_profile(
       <rtps><builtin><discovery_config><initialAnnouncements>
         <count>{_ANNOUNCEMENTS}</count>
         <period><nanosec>{_PERIOD_NS}</nanosec></period>
-      </initialAnnouncements></discovery_config>{together}{searched}</builtin></rtps>
+      </initialAnnouncements>
+      <leaseDuration><sec>{LEASE_S}</sec></leaseDuration>
+      <leaseAnnouncement><sec>{_AGAIN_S}</sec></leaseAnnouncement>
+      </discovery_config>{together}{searched}</builtin></rtps>
     </participant>
   </profiles>
 </dds>
@@ -111,6 +121,13 @@ def announcements(count: int, period_ms: int) -> ET.Element:
     element = ET.Element("initialAnnouncements")
     text(element, "count", str(count))
     text(child(element, "period"), "nanosec", str(period_ms * 1_000_000))
+    return element
+
+
+def announced_again() -> ET.Element:
+    """Return how often a participant announces itself later."""
+    element = ET.Element("leaseAnnouncement")
+    text(element, "sec", str(_AGAIN_S))
     return element
 
 

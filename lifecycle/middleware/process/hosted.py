@@ -12,7 +12,7 @@ from __future__ import annotations
 import contextlib
 import socket
 
-from lifecycle.middleware.discovery.dead_peers import PROCESS_DIGITS
+from lifecycle.middleware.discovery.prefixes import PROCESS_DIGITS
 
 _held: dict[str, socket.socket] = {}
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from lifecycle import dataclasses
 from lifecycle.export.programs import CapturedProgram
-from lifecycle.middleware.discovery.dead_peers import is_of_process
+from lifecycle.middleware.discovery.prefixes import is_of_process
 from lifecycle.plan.secrets import shown
 
 _LONGEST_VALUE = 8192

@@ -15,8 +15,8 @@ import sys
 from collections.abc import Callable, Iterable
 from typing import Any, NoReturn
 
-from lifecycle.middleware.discovery.dead_peers import give_up_dead_connections
-from lifecycle.middleware.process.control import exit_after
+from lifecycle.middleware.discovery.tcp import give_up_dead_connections
+from lifecycle.middleware.process.prctl import exit_after
 
 _logger = logging.getLogger(__name__)
 

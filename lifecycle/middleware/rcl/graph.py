@@ -39,31 +39,15 @@ from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.installed_types import join
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import Durability, History, Liveliness, QosProfile, Reliability
-from lifecycle.middleware.discovery.dead_peers import (
-    PROCESS_DIGITS,
-    give_up_dead_connections,
-    is_alone,
-    is_of_host,
-    is_of_process,
-    is_used,
-    remove_participants,
-)
-from lifecycle.middleware.discovery.probe import (
-    ANSWER_S,
-    Probe,
-    answered_at,
-    connects_first,
-    dispose_of_announced,
-    is_served,
-    missing_port,
-    probes_for,
-)
+from lifecycle.middleware.discovery.environment import is_served, missing_port, reach, settle_s
+from lifecycle.middleware.discovery.prefixes import PROCESS_DIGITS, is_of_host, is_of_process
+from lifecycle.middleware.discovery.prober import Settling
+from lifecycle.middleware.discovery.tcp import give_up_dead_connections, is_used
 from lifecycle.middleware.fastdds.participant_profile import (
     DISCOVERY_SERVER_VARIABLE,
     ParticipantSettings,
 )
 from lifecycle.middleware.fastdds.settings import observer_settings
-from lifecycle.middleware.fastdds.sockets import OpenSocket
 from lifecycle.middleware.process.hosted import is_vouched_for
 from lifecycle.middleware.rcl.graph_changes import GraphGuard
 from lifecycle.middleware.rcl.hidden_node import quiet_node
@@ -258,29 +242,11 @@ def _service_hash(ends: _Ends, node: str) -> str | None:
     return join(["" if "" in each else "|".join(sorted(each)) for each in hashes])
 
 
-PATIENCE_S = 3.5
-"""What Fast DDS lost on the way it sends again every 3 s."""
-
-_UNPROBED_S = 1.5
-"""Within so long all are seen where none can be asked, over shared memory or TCP."""
-
-_UNCOUNTED_S = 0.6
-"""Within so long a probed participant is discovered, if we may not receive its answer."""
-
-_CONNECTED_S = 5.0
-"""Within so long all are seen that make TCP connections once they are discovered."""
-
-_ANNOUNCED_BY_SERVER_S = 2.5
-"""Within so long a discovery server has announced all."""
-
 _AGREED_S = 5.0
 """A server that listens agrees within so long, on a busy machine too."""
 
 _NAMED_S = 0.2
 """Of a new participant endpoints are known first, and within so long of which nodes they are."""
-_ANNOUNCED_S = 2.0
-"""For so long a participant announces itself often enough that no newcomer waits for that."""
-
 _LOOK_S = 0.005
 _CHANGE_STATE = "lifecycle_msgs/srv/ChangeState"
 _GET_STATE = "lifecycle_msgs/srv/GetState"
@@ -304,6 +270,7 @@ class GraphObserver:
 
     Attributes:
         urls: of its connections; none where the RMW chooses.
+        settling: for how long it may still miss somebody.
         owns_node: the node is its own, and is spun and destroyed by nothing else.
 
     Raises:
@@ -325,36 +292,24 @@ class GraphObserver:
         self._lock = threading.Lock()
         self._callbacks: tuple[Callable[[], None], ...] = ()
         self._destroyed = False
-        self._known: frozenset[str] = frozenset()
         self._ours: frozenset[str] = frozenset()
         self._asked_for: set[str] = set()
         self._nameless_since_s: dict[str, float] = {}
         self._clock: Subscription[Any] | None = None
         self._time_came = self._clock_closed = False
         self._context: rclpy.Context | None = None
-        self._probes: tuple[Probe, ...] = ()
-        self._limit_s = PATIENCE_S
         if node is None:
             self._context, node = _observing_node(domain_id, settings)
-            if _OVER_DDS:
-                self._probes = probes_for(domain_id, settings.urls, os.environ)
-            self._limit_s = _UNPROBED_S if settings.urls else PATIENCE_S
-            if is_served(settings.urls, os.environ):
-                self._limit_s = _ANNOUNCED_BY_SERVER_S
-            if connects_first(settings.urls, os.environ):
-                self._limit_s = _CONNECTED_S
+            reached = reach(domain_id, settings.urls, os.environ) if _OVER_DDS else ()
+            self.settling = Settling(reached, settle_s(settings.urls, os.environ))
+        else:
+            self.settling = Settling(())
         self.node = node
         self._guard = GraphGuard.of(node)
         self._unwatch = self._guard.follow(node, self._changed)
         self._name = self.node.get_fully_qualified_name()
         self._dead: frozenset[str] = frozenset()
         self._topics_before: frozenset[str] = frozenset()
-        self._made_s = time.monotonic()
-        self._ask_silent_s = 0.0
-        self._own = ""
-        self._waits_for_newcomers = False
-        self._familiar: frozenset[OpenSocket] = frozenset()
-        self._familiar_prefixes: frozenset[str] = frozenset()
         self._named: frozenset[str] = frozenset()
 
     @classmethod
@@ -424,9 +379,7 @@ class GraphObserver:
                 homes.setdefault(info.node, Counter())[info.prefix] += has_events
             if not _is_noise(kind, topic, info, declared, names):
                 shown.setdefault(info.node, []).append(self._timed(_observed(kind, topic, info)))
-        # Who was known and left is not on the way into the graph.
         self._named = frozenset(itertools.chain.from_iterable(homes.values()))
-        self._known |= self._named
         # A participant may have several nodes of one name.
         counts = {name: sum(max(1, each) for each in on.values()) for name, on in homes.items()}
         ourselves = self._name if self.owns_node and counts.get(self._name) == 1 else None
@@ -458,89 +411,18 @@ class GraphObserver:
     def settling_s(self) -> float:
         """Return for how many seconds a snapshot may still miss nodes; 0 once it cannot.
 
-        A participant that answered our probe and whose node is not known is on its way into the
-        graph, and so is one of this host that has a port for discovery and did not answer.
-        Fast DDS needs 3 s at most for what it lost; a participant without a node by
-        then has none. Judged by the last `snapshot`. Where probing is impossible, it is a time.
+        Judged by the last `snapshot`, see `Settling`.
         """
-        left_s = self._settling_s()
-        if left_s <= 0 and self._waits_for_newcomers:
-            self._waits_for_newcomers = False
-            # Who did not come into the graph in all of the time is not waited for again.
-            self._known |= self._answered()
-            self._familiar_prefixes = self._known
-        return left_s
+        return self.settling.left_s(self._named)
 
     def expect_newcomers(self, *, everybody: bool = False) -> bool:
         """Have `settling_s` wait for who came since; return whether there may be anybody.
-
-        A participant that is made more than 2 s after this one gets our answer to its first
-        announcement before it listens. It knows us, and says what it has, after our next one only,
-        up to 3 s later, unless we announce ourselves.
-
-        On this host participants have sockets, and who has more of them than the graph shows
-        participants is not seen yet. On others they have to be asked.
 
         Args:
             everybody: wait also for what those have to say that are known: this process did not
                 run for a while.
         """
-        counting = [each for each in self._probes if each.counts]
-        if not counting or len(counting) != len(self._probes):
-            if everybody:
-                self._made_s = time.monotonic()
-            return everybody
-        if self._settling_s() > 0 and not everybody:
-            return True
-        now_s = time.monotonic()
-        if now_s - self._made_s > _ANNOUNCED_S and any(each.leaves_host for each in counting):
-            everybody = True
-        sockets = {each: each.listeners_here() for each in counting}
-        listeners = frozenset().union(*sockets.values())
-        came = listeners - self._familiar
-        own = self._own = self._own or self.prefix
-        known = {
-            each
-            for each in self._named - self._familiar_prefixes
-            if own and is_of_host(each, own) and each[:PROCESS_DIGITS] != own[:PROCESS_DIGITS]
-        }
-        self._familiar = listeners
-        if not everybody and len({each.port for each in came}) <= len(known):
-            self._familiar_prefixes = self._known
-            return False
-        self._made_s, self._waits_for_newcomers = now_s, True
-        self._asked_for -= self._answered()
-        for probe, found in sockets.items():
-            probe.ask_newcomers(found & came)
-        self.announce_ourselves()
-        return True
-
-    def _answered(self) -> frozenset[str]:
-        return frozenset().union(*(each.answered() for each in self._probes))
-
-    def _settling_s(self) -> float:
-        age_s = time.monotonic() - self._made_s
-        if not self._probes:
-            return max(0.0, self._limit_s - age_s)
-        if not all(probe.counts for probe in self._probes):
-            return max(0.0, _UNCOUNTED_S - age_s)
-        if age_s < ANSWER_S:
-            return ANSWER_S - age_s
-        patience_s = max(0.0, PATIENCE_S - age_s)
-        if patience_s and any(each.silent() for each in self._probes):
-            if age_s >= self._ask_silent_s:
-                self._ask_silent_s = 2 * age_s
-                for probe in self._probes:
-                    probe.ask_silent()
-            return min(patience_s, ANSWER_S)
-        unknown = self._answered() - self._known
-        if not unknown:
-            return 0.0
-        if not unknown <= self._asked_for:
-            self._asked_for |= unknown
-            for probe in self._probes:
-                probe.ask_again(to_count=False)
-        return patience_s
+        return self.settling.expect_newcomers(self._named, self.prefix, everybody=everybody)
 
     @property
     def prefix(self) -> str:
@@ -560,12 +442,6 @@ class GraphObserver:
             if here:
                 found[name] = all(map(is_vouched_for, here))
         return found
-
-    def announce_ourselves(self) -> None:
-        """Have our participant announce itself to all others of this host, as far as that goes."""
-        everybody = answered_at(self.domain_id, self.urls, os.environ)
-        for probe in self._probes if everybody else ():
-            probe.announce_ourselves(everybody)
 
     def offers(self, node: str, service: str) -> bool:
         """Return whether discovery shows `service` (a fully qualified name) on `node`."""
@@ -604,43 +480,44 @@ class GraphObserver:
                 time.sleep(_LOOK_S)  # the kernel gives no event
         return True
 
-    def participants_of(
-        self, pid: int, *, nodes: Iterable[str], reported: Iterable[str]
-    ) -> frozenset[str]:
-        """Return the GUID prefixes (24 hex digits) of a process's participants in the graph.
+    def ended(self, pid: int, *, nodes: Iterable[str], reported: Iterable[str]) -> None:
+        """Count the participants of a process no more, although discovery shows them still.
 
         Args:
-            pid: of a process on this host.
-            nodes: fully qualified names of nodes that it runs.
+            pid: of a process on this host that has ended.
+            nodes: fully qualified names of nodes that it ran.
             reported: GUID prefixes that these nodes said are theirs. Of both only those count
-                that bear this host and this pid. Where there are none, because the process ended
-                before its nodes' names were known, participants without any name count, unless
-                another process bears the same.
+                that bear this host and this pid.
         """
         if self._destroyed:
-            return frozenset()
-        homes, own, there = self._homes(), self.prefix, self._participants()
-        reported = frozenset(reported)
+            return
+        homes, own = self._homes(), self.prefix
         claimed = {*reported, *(prefix for name in nodes for prefix in homes.get(name, ()))}
-        if not claimed and is_alone(pid):
-            claimed = set(there).difference(*homes.values())
-        processes = {
-            each[:PROCESS_DIGITS] for each in claimed if own and is_of_process(each, pid, own)
-        }
-        processes.discard(own[:PROCESS_DIGITS])
-        return frozenset(each for each in there if each[:PROCESS_DIGITS] in processes)
+        for each in claimed:
+            if own and is_of_process(each, pid, own):
+                self.ended_participant(each)
+
+    def ended_participant(self, prefix: str) -> None:
+        """Count participants of an ended process no more.
+
+        Args:
+            prefix: of the GUID of one of them, 24 hex digits.
+        """
+        process = prefix[:PROCESS_DIGITS]
+        if process != self.prefix[:PROCESS_DIGITS]:
+            self._dead |= {process}
+            self._changed()
+
+    def _is_dead(self, info: EndpointInfo) -> bool:
+        return info.prefix[:PROCESS_DIGITS] in self._dead
 
     def _homes(self) -> dict[str, set[str]]:
         """Return by full name the prefixes of the participants that nodes are on now."""
         homes: dict[str, set[str]] = {}
         for each in endpoints_of(self.node, EndpointKind.PUBLISHER, _PARAMETER_EVENTS):
-            if each.node and each.prefix not in self._dead:
+            if each.node and not self._is_dead(each):
                 homes.setdefault(each.node, set()).add(each.prefix)
         return homes
-
-    def _participants(self) -> frozenset[str]:
-        """Return the prefixes of every participant of the RMW that discovery has, dead or not."""
-        return frozenset(each.prefix for each in _publishers(self.node, _NODES) if each.gid)
 
     def programs(self, environment: Mapping[str, str]) -> dict[str, dict[str, CapturedProgram]]:
         """Return how the processes of this host's nodes were started.
@@ -663,28 +540,12 @@ class GraphObserver:
             for name, home in homes.items()
         }
 
-    def remove_participants(self, prefixes: Iterable[str], pids: Iterable[int]) -> None:
-        """Have all participants forget participants whose process is known to be dead.
-
-        Others learn of it over UDP only, see `discovery/dead_peers.py`; here they do
-        not count any more, whatever discovery shows until their lease has run out.
-
-        Args:
-            prefixes: GUID prefixes, 24 hex digits each.
-            pids: of processes on this host that run; they are reached wherever they listen.
-        """
-        self._dead |= (prefixes := frozenset(prefixes))
-        self._changed()
-        remove_participants(prefixes, self.domain_id, self.urls, os.environ, (os.getpid(), *pids))
-
     def destroy(self) -> None:
         """Stop watching and leave the graph; again is harmless."""
         if self._destroyed:
             return
         self._destroyed = True
-        for probe in self._probes:
-            probe.close()
-        dispose_of_announced()
+        self.settling.close()
         self._unwatch()
         if self._context is not None:
             give_up_dead_connections()
@@ -754,7 +615,7 @@ class GraphObserver:
                 (EndpointKind.SUBSCRIPTION, _subscriptions),
             ):
                 for info in query(self.node, topic):
-                    if info.prefix not in self._dead:
+                    if not self._is_dead(info):
                         yield kind, shown, info
 
     def _timed(self, endpoint: ObservedEndpoint) -> ObservedEndpoint:
@@ -809,7 +670,7 @@ class GraphObserver:
             shown: set[str] = set()
             for info in itertools.chain(*ends(kind, name)):
                 owner = info.node or info.prefix
-                if info.node in listed or owner in shown or info.prefix in self._dead:
+                if info.node in listed or owner in shown or self._is_dead(info):
                     continue
                 shown.add(owner)
                 gid = "" if info.node else info.gid
@@ -841,7 +702,7 @@ class GraphObserver:
                 gids = {
                     info.gid
                     for info in both[0]
-                    if (info.node, info.type) == (name, each.type) and info.prefix not in self._dead
+                    if (info.node, info.type) == (name, each.type) and not self._is_dead(info)
                 } or {""}
             type_hash = _service_hash(both, name)
             hashed += (
@@ -856,9 +717,7 @@ class GraphObserver:
         One whose address is not known is asked for it: it answers within a moment, and the next
         look has it.
         """
-        known: dict[str, str] = {}
-        for probe in self._probes:
-            known.update(probe.addresses())
+        known = self.settling.addresses()
         for endpoint in endpoints:
             prefix = endpoint.gid[:PREFIX_DIGITS]
             if not prefix:
@@ -868,8 +727,7 @@ class GraphObserver:
             is_coming = time.monotonic() - since_s < _NAMED_S
             if prefix not in known and prefix not in self._asked_for and not is_coming:
                 self._asked_for.add(prefix)
-                for probe in self._probes:
-                    probe.ask_again(to_count=True)
+                self.settling.ask()
             yield dataclasses.replace(endpoint, address=known.get(prefix, ""))
 
 

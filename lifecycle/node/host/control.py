@@ -31,10 +31,6 @@ from lifecycle.manifest.model import DiscoveryRange
 from lifecycle.plan.model import ParticipantConnections, PlannedNode
 from lifecycle.verify.observation import NodeConfiguration
 
-SIGN_DESCRIPTORS = 2
-"""Beside the first byte of the HostSpec are the two descriptors of the busy sign, by which the
-host's executor is watched (SCM_RIGHTS, unix(7)); a host that gets none is not watched."""
-
 
 class Operation(enum.Enum):
     """What a supervisor may ask of one node; each is answered by exactly one Reply."""
@@ -154,14 +150,15 @@ class HostChannel:
     in order until it reads on, and of what is reported unasked only the newest.
 
     Attributes:
-        descriptors: of the busy sign, beside the first byte; none if it is not watched.
+        descriptors: of the busy sign, by which the host's executor is watched, beside the first
+            byte (SCM_RIGHTS, unix(7)); none if it is not watched.
     """
 
     def __init__(self, control: socket.socket) -> None:
         control.setblocking(True)
         self._control = control
         try:
-            first, found, _, _ = socket.recv_fds(control, 1, SIGN_DESCRIPTORS)
+            first, found, _, _ = socket.recv_fds(control, 1, 1)
         except ConnectionError:  # as at end of file
             first, found = b"", []
         self._received = bytearray(first)

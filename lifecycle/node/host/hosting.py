@@ -28,11 +28,11 @@ from rclpy.signals import SignalHandlerOptions
 from lifecycle import codec
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import Executor
-from lifecycle.middleware.discovery.rediscovery import send_again_soon
+from lifecycle.middleware.discovery.tcp import send_again_soon
 from lifecycle.middleware.fastdds.participant_discovery import Unannounced
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.middleware.fastdds.settings import discovery_by_profile, host_settings
-from lifecycle.middleware.process.busy_timer import BusySign
+from lifecycle.middleware.process.busy_sign import BusySign
 from lifecycle.middleware.process.teardown import leave_and_exit
 from lifecycle.middleware.rcl.hidden_node import made_participant
 from lifecycle.middleware.rcl.rclpy_nodes import follow_nodes

@@ -8,7 +8,7 @@ nothing could be reported or done after that.
 
 An executor that waits is idle, whatever it waits for; a callback of a transition has a deadline of
 its own; everything else may take as long as the nodes' `silent_s`. What notices is at the other end
-of the busy sign (middleware/process/busy_timer.py): it need not be this process, whose interpreter
+of the busy sign (middleware/process/busy_sign.py): it need not be this process, whose interpreter
 may be locked by the very callback that hangs.
 """
 
@@ -40,8 +40,8 @@ from rclpy.node import Node
 from rclpy.timer import Timer
 
 from lifecycle.manifest.model import Executor
-from lifecycle.middleware.discovery.rediscovery import republish_names
-from lifecycle.middleware.process.busy_timer import BusySign, label
+from lifecycle.middleware.discovery.names import republish_names
+from lifecycle.middleware.process.busy_sign import BusySign, label
 from lifecycle.middleware.process.stacks import show_stacks_here
 from lifecycle.middleware.process.teardown import leave_and_exit
 from lifecycle.middleware.rcl.executor import NodeExecutor, described

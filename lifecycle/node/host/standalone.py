@@ -14,10 +14,10 @@ from __future__ import annotations
 import contextlib
 import functools
 import os
-import select
 import signal
 import sys
 import threading
+import time
 import traceback
 import typing
 from collections.abc import Callable, Iterator
@@ -31,7 +31,7 @@ from lifecycle.manifest.model import Executor, Run, RunKind, Timeouts
 from lifecycle.middleware.discovery.liveliness import AlivePublisher, node_topic
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.middleware.fastdds.settings import discovery_by_profile
-from lifecycle.middleware.process.busy_timer import BusySign, Overdue
+from lifecycle.middleware.process.busy_sign import BusySign, Overdue
 from lifecycle.middleware.process.stacks import brief
 from lifecycle.middleware.rcl.hidden_node import made_participant
 from lifecycle.middleware.rcl.rclpy_nodes import follow_nodes
@@ -85,8 +85,8 @@ class OwnLiveliness:
         threading.Thread(target=self._watch, name="watchdog", daemon=True).start()
 
     def _watch(self) -> None:
-        while select.select([self._sign], [], []):
-            why = self._sign.overdue()
+        while True:
+            why, again_s = self._sign.look()
             if why is Overdue.HANGS:
                 what = f" {self._sign.what}" if self._sign.what else ""
                 where = brief(self._sign.where(os.getpid()))
@@ -94,11 +94,12 @@ class OwnLiveliness:
                     f"a callback{what} in its process (pid {os.getpid()}) has been running for "
                     f"more than {self._sign.limit_s:g} s{where and f', in {where}'}"
                 )
-            elif why is Overdue.UNSERVED and not self._silent:
+            elif why is Overdue.UNSERVED:
                 self._announce(
                     f"its process (pid {os.getpid()}) gets no processor for its callback: the "
                     "machine is overloaded"
                 )
+            time.sleep(again_s)
 
     def _announce(self, why: str) -> None:
         with self._lock:

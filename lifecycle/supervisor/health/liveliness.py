@@ -2,7 +2,7 @@
 
 Owns: `SilenceMonitor`, which turns what is noticed of processes and machines into events, findings
 and the status of nodes. Nothing here waits or asks: the kernel says that a process was stopped or
-that an executor hangs (middleware/process/busy_timer.py), DDS that a machine is lost. A process
+that an executor hangs (middleware/process/busy_sign.py), DDS that a machine is lost. A process
 that ended is not silent but dead, see process_monitor.py. Must not import rclpy.
 """
 
@@ -13,7 +13,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import TYPE_CHECKING
 
 from lifecycle import dataclasses
-from lifecycle.middleware.process.busy_timer import Overdue
+from lifecycle.middleware.process.busy_sign import Overdue
 from lifecycle.supervisor.run.events import (
     Emitter,
     NodeAlive,

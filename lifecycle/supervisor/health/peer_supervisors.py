@@ -1,8 +1,7 @@
 """Liveliness of the supervisors of other machines, and of attached nodes: found, lost, left.
 
 Owns: announcing ourselves to other supervisors, noticing them and the attached nodes that announce
-themselves, what they report of silent nodes, and asking all to announce themselves while one is
-missing. Event driven but for that, which ends with the silence. Must not import rclpy.
+themselves, and what they report of silent nodes. Event driven. Must not import rclpy.
 """
 
 from __future__ import annotations
@@ -25,9 +24,6 @@ from lifecycle.supervisor.run.failure import ended
 if TYPE_CHECKING:
     from lifecycle.middleware.discovery.liveliness import AlivePublisher, AliveSubscription
     from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
-
-CALL_EACH_S = 0.25
-"""While a peer is missing."""
 
 SAID_AGAIN_S = (0.1, 0.3)
 """Fast DDS repeats what was lost after up to 3 s: too late for a silence."""
@@ -78,7 +74,6 @@ class PeerSupervisors:
         self._attached: tuple[str, ...] = ()
         self._announcements: list[AlivePublisher] = []
         self._said: Mapping[str, str] = {}
-        self._calling: asyncio.Task[None] | None = None
         self._tasks: set[asyncio.Task[None]] = set()
 
     def open(self) -> None:
@@ -130,8 +125,7 @@ class PeerSupervisors:
     async def close(self) -> None:
         """Leave, and stop watching."""
         self._closed = True
-        tasks = [*self._tasks, *([self._calling] if self._calling else [])]
-        await ended(*tasks)
+        await ended(*self._tasks)
         self._destroy()
 
     def _destroy(self) -> None:
@@ -176,8 +170,6 @@ class PeerSupervisors:
         self._system.liveliness.fell_silent(peer.nodes, Cause.LOST, detail)
         self._exchange.send_again_soon()
         self._start(self._have_hosts(Operation.SEND_AGAIN_SOON))
-        if self._calling is None:
-            self._calling = asyncio.ensure_future(self._call())
 
     def _found(self, peer: _PeerSupervisor) -> None:
         lost_s = 0.0
@@ -228,15 +220,6 @@ class PeerSupervisors:
                 each.notify(silent)
             if pause_s is not None:
                 await asyncio.sleep(pause_s)
-
-    async def _call(self) -> None:
-        """Call out until no peer is missing."""
-        machines = {each.name: each.address for each in self._system.plan.machines}
-        while missing := [each for each in self._known if each.lost_at_s is not None]:
-            names = (each.machine for each in missing)
-            self._exchange.call_out([a for name in names if (a := machines.get(name, ""))])
-            await asyncio.sleep(CALL_EACH_S)
-        self._calling = None
 
     async def _have_hosts(self, operation: Operation) -> None:
         """Have our hosts do something with all of their process; one that hangs holds up none."""

@@ -61,6 +61,7 @@ class ObserverParticipant:
         *,
         unplanned: bool = False,
         events: bool = False,
+        settle_s: float | None = None,
     ) -> ObserverParticipant:
         """Make the participant; before any process, so that each is discovered at once.
 
@@ -69,6 +70,7 @@ class ObserverParticipant:
             connections: how it is connected; by default as the RMW likes.
             unplanned: also read the configurations of nodes that are not planned.
             events: receive graph messages, and look again at nodes that changed.
+            settle_s: see Discovery; None takes what Fast DDS needs.
 
         Raises:
             MiddlewareError: it cannot be made.
@@ -85,6 +87,8 @@ class ObserverParticipant:
             burst_s=_BURST_S,
         )
         widen_discovery_buffers(domain_id)
+        if settle_s is not None:
+            graph.discovery.settling.within(settle_s)
         return cls(graph)
 
     @property
@@ -189,16 +193,6 @@ class ObserverParticipant:
         except Exception as error:  # rclpy has no root of its own errors
             raise MiddlewareError(" ".join(str(error).split())) from error
 
-    def call_out(self, addresses: Iterable[str]) -> None:
-        """Make all participants announce themselves, as far as the system's discovery allows."""
-        from lifecycle.middleware.discovery.rediscovery import call_out
-
-        call_out(self.discovery.domain_id, self.discovery.urls, addresses, os.environ)
-
-    def announce_ourselves(self) -> None:
-        """Have our participant announce itself to those that it knows, as far as that goes."""
-        self.discovery.announce_ourselves()
-
     def can_be_unannounced(self) -> bool:
         """Return whether participants like ours can be, see HostSpec."""
         from lifecycle.middleware.fastdds.participant_discovery import can_be_unannounced
@@ -206,25 +200,15 @@ class ObserverParticipant:
         with self._node.handle:
             return can_be_unannounced(self._node.handle.pointer)
 
-    def introduce(
-        self, newcomers: Iterable[int], pids: Iterable[int], *, rediscover: bool = False
-    ) -> None:
-        """Have new participants discovered by, and discover, those that were there before."""
-        from lifecycle.middleware.discovery.rediscovery import introduce
-
-        discovery = self.discovery
-        ours = discovery.prefix if rediscover else ""
-        introduce(newcomers, discovery.domain_id, discovery.urls, os.environ, pids, rediscover=ours)
-
     def send_again_soon(self) -> None:
         """Have what waits for a link to come back be sent soon when it does."""
-        from lifecycle.middleware.discovery.rediscovery import send_again_soon
+        from lifecycle.middleware.discovery.tcp import send_again_soon
 
         send_again_soon()
 
     def republish_names(self) -> None:
         """Announce our node to the graph again."""
-        from lifecycle.middleware.discovery.rediscovery import republish_names
+        from lifecycle.middleware.discovery.names import republish_names
 
         republish_names([self._node])
 
@@ -237,7 +221,7 @@ class ObserverParticipant:
 
     def prepare_to_leave(self) -> None:
         """Let go of connections that do not answer: all that is sent would wait for their ends."""
-        from lifecycle.middleware.discovery.dead_peers import give_up_dead_connections
+        from lifecycle.middleware.discovery.tcp import give_up_dead_connections
 
         give_up_dead_connections()
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import BringUpError
-from lifecycle.middleware.process.busy_timer import BusySign, Overdue
+from lifecycle.middleware.process.busy_sign import BusySign, Overdue
 from lifecycle.node.host.control import Command, Event, HostSpec, Operation
 from lifecycle.plan.model import ParticipantConnections
 from lifecycle.supervisor.gate.gate import Permit
@@ -68,6 +68,7 @@ class ControlChannel:
         self._on_state = on_state
         self._on_hang = on_hang
         self._sign: BusySign | None = None
+        self._looking: asyncio.TimerHandle | None = None
         self.failures: list[HostFailedError] = []
         self._next = 0
         self._replies: dict[int, asyncio.Future[Event]] = {}
@@ -106,8 +107,8 @@ class ControlChannel:
         ours.setblocking(False)
         line = to_json(self._spec) + b"\n"
         self._sign = BusySign.make(self.silent_s)
-        socket.send_fds(ours, [line[:1]], self._sign.descriptors)
-        asyncio.get_running_loop().add_reader(self._sign, self._look)
+        socket.send_fds(ours, [line[:1]], [self._sign.descriptor])
+        self._look()
         reader, self._writer = await asyncio.open_connection(sock=ours, limit=_LONGEST_LINE)
         self._writer.write(line[1:])
         self._task = asyncio.get_running_loop().create_task(self._read(reader))
@@ -229,13 +230,16 @@ class ControlChannel:
             self._on_state(event)
 
     def _look(self) -> None:
-        """The busy sign's timer fired."""
-        if self._sign is not None and (why := self._sign.overdue()):
-            self._on_hang(why)
+        if self._sign is not None:
+            why, again_s = self._sign.look()
+            self._looking = asyncio.get_running_loop().call_later(again_s, self._look)
+            if why is not None:
+                self._on_hang(why)
 
     def _watch_no_more(self) -> None:
+        if self._looking is not None:
+            self._looking.cancel()
         if self._sign is not None:
-            asyncio.get_running_loop().remove_reader(self._sign)
             self._sign.close()
             self._sign = None
 

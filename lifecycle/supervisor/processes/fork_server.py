@@ -21,7 +21,6 @@ from lifecycle.errors import BringUpError
 from lifecycle.graph.loop import set_within
 from lifecycle.run_directory import PROCESS_VARIABLE
 from lifecycle.supervisor.processes.fork_server_main import (
-    DISOWN,
     LARGEST_MESSAGE,
     MSG_CMSG_CLOEXEC,
     SERVES,
@@ -274,12 +273,6 @@ class ForkServer:
 
     def _living(self) -> set[int]:
         return {each.pid for each in self._children.values() if not each.exited.done()}
-
-    def disown_ports(self) -> None:
-        """Have all participants of this host send no more to ports whose process was killed."""
-        if self._alive:  # one that has died is noticed elsewhere
-            with contextlib.suppress(OSError):
-                self._process.socket.send(DISOWN.encode())
 
     def _reports(self) -> None:
         """Take one report; at end of file it is about to end."""

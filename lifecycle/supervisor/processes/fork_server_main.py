@@ -3,8 +3,7 @@
 Owns: what runs in `python -m lifecycle.supervisor.processes.fork_server_main SOCKET_FD [--preload]
 [--programs]`. It stays single-threaded and never calls rclpy.init, so that forking is safe and
 every child is a participant of its own; with `--preload` a forked host skips ~130 ms of imports.
-For the same reason it has all let go of shared memory whose owner was killed
-(lifecycle.middleware.process.shared_memory). Each child leads a session of its own. It adopts what
+Each child leads a session of its own. It adopts what
 its children leave behind (PR_SET_CHILD_SUBREAPER), so as long as it lives, what descends from it is
 what the run started. If the supervisor vanishes it ends what is left of its children, bounded.
 """
@@ -27,13 +26,12 @@ from typing import NoReturn
 from lifecycle import dataclasses
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.process.control import (
+from lifecycle.middleware.process.control import limit_resources
+from lifecycle.middleware.process.prctl import (
     adopt_orphans,
     drop_network_administration,
-    limit_resources,
     refuse_new_privileges,
 )
-from lifecycle.middleware.process.shared_memory import disown_ports
 from lifecycle.supervisor.processes.fork_server_process import PRELOAD
 
 LARGEST_MESSAGE = 1 << 18
@@ -89,9 +87,6 @@ class ChildReport:
     stopped: bool | None = None
 
 
-DISOWN = "disown"
-"""A message: have all let go of ports in shared memory whose process was killed; not answered."""
-
 SERVES = "serves"
 """A message: say that you serve."""
 
@@ -145,9 +140,7 @@ class _ForkServer:
             self._fork(from_json(data, ForkRequest), descriptors)
             return True
         word, *lines = data.decode().split("\n")
-        if word == DISOWN:
-            disown_ports()
-        elif word == SERVES:
+        if word == SERVES:
             self._tell(ChildReport(id=0))
         elif word == PRELOAD:
             _preload(lines)

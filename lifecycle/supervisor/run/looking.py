@@ -24,7 +24,7 @@ from lifecycle.export.picture.build import Supervised, build_picture
 from lifecycle.export.picture.model import Picture
 from lifecycle.graph.state import Look
 from lifecycle.manifest.model import DiscoveryRange, EndpointPolicy
-from lifecycle.middleware.discovery.probe import peers_environment
+from lifecycle.middleware.discovery.environment import peers_environment
 from lifecycle.middleware.process.control import check_memory
 from lifecycle.middleware.process.process_table import note_ended
 from lifecycle.plan.connections.hosts import reached_hosts
@@ -184,6 +184,7 @@ def _looking(plan: Plan) -> ObserverParticipant:
         plan.domain_id,
         onlooker_connections(plan, _reported_to_supervisors(plan)),
         unplanned=is_open and is_negotiated(plan),
+        settle_s=plan.settle_s,
     )
 
 

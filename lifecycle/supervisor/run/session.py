@@ -40,9 +40,9 @@ from lifecycle.supervisor.health.agreement import Agreement
 from lifecycle.supervisor.health.answering import Answering
 from lifecycle.supervisor.health.peer_supervisors import PeerSupervisors
 from lifecycle.supervisor.health.process_monitor import (
+    EndedProcesses,
     ProcessMonitor,
     Sightings,
-    StaleNodes,
 )
 from lifecycle.supervisor.nodes.adoption import adopt, ran_before
 from lifecycle.supervisor.nodes.bring_up import BringUp
@@ -204,10 +204,8 @@ class Session:
         )
         self._gate = Gate(strict=options.strict, judging=self._judge)
         sightings = Sightings(system, observer_participant.graph, self._changes)
-        self._stale = StaleNodes(
-            system, observer_participant, disown_ports=fork_server.disown_ports
-        )
-        emit.listen(self._stale.on_event)
+        self._ended = EndedProcesses(system, observer_participant)
+        emit.listen(self._ended.on_event)
         emit.listen(self._judge.on_event)
         self._records = records
         self._process_monitor = ProcessMonitor(system)
@@ -336,7 +334,6 @@ class Session:
                 if self._hurry.is_set() and result.exit_code == ExitCode.OK:
                     result = _hurried(result)
         finally:
-            self._stale.close()
             self._judge.close()
             await self._changes.close()
             self._ros_interface.close()
@@ -516,7 +513,7 @@ class Session:
             self._observer_participant.graph.drop_configuration(node.name)
         for pid in left:
             if start_ticks(pid) is None:
-                self._stale.forget(pid, tuple(nodes))
+                self._ended.forget(pid, tuple(nodes))
 
     def _alone(self, node: NodeRun) -> None:
         processes = self._observer_participant.processes().get(node.name, {})

@@ -20,16 +20,11 @@ from pathlib import Path
 from lifecycle import dataclasses
 from lifecycle.errors import ExitCode, MiddlewareError
 from lifecycle.manifest.model import Authority, DataLayerSource, EndpointPolicy, RunKind
-from lifecycle.middleware.discovery.probe import discovery_peers, peers_environment
+from lifecycle.middleware.discovery.environment import discovery_peers, peers_environment
 from lifecycle.middleware.fastdds.profiles import discovery_environment
-from lifecycle.middleware.process.control import (
-    adopt_orphans,
-    check_descriptors,
-    check_memory,
-    check_threads,
-    exit_after,
-)
-from lifecycle.middleware.process.shared_memory import check_room, disown_ports, sweep
+from lifecycle.middleware.process.control import check_descriptors, check_memory, check_threads
+from lifecycle.middleware.process.prctl import adopt_orphans, exit_after
+from lifecycle.middleware.process.shared_memory import check_room, sweep
 from lifecycle.middleware.rcl.qos import load_type_support
 from lifecycle.middleware.versions import DISTRIBUTIONS
 from lifecycle.plan.connections.hosts import reached_hosts
@@ -331,7 +326,7 @@ async def _observer_participant(
 ) -> ObserverParticipant:
     """Make the supervisor's participant; on another port if a discovery server is not reached.
 
-    Fast DDS may never use the first connection to it (middleware/discovery/dead_peers.py).
+    Fast DDS may never use the first connection to it (middleware/discovery/tcp.py).
     """
     with ending.raised():
         await _until_interface_is_up(plan, options, emit)
@@ -348,6 +343,7 @@ async def _observer_participant(
                 connections,
                 unplanned=wires and dynamic and plan.policy.undeclared_nodes is EndpointPolicy.OPEN,
                 events=wires and (dynamic or layer.events),
+                settle_s=plan.settle_s,
             )
         if number + 1 == OBSERVER_TRIES or observer_participant.discovery.reaches_servers():
             break
@@ -372,6 +368,13 @@ async def _observer_participant(
             "which all participants find each other, is taken by something else",
             hint=f"`ss -lunp 'sport = :{port}'` says by what; end it, or choose another domain: "
             "`lifecycle ports` says which are safe",
+        )
+    if unasked_s := discovery.settling.unasked_s:
+        emit(
+            Notice(
+                message=f"who is there is seen within {unasked_s:g} s, before which the gate stays "
+                "closed: by this discovery nobody can be asked (discovery.settle_s)"
+            )
         )
     if limits := observer_participant.unknown_versions:
         emit(Notice(message=limits))
@@ -445,22 +448,17 @@ _PREFIX = re.compile(r"[0-9a-f]{24}")
 def _succeed(
     directory: RunDirectory, observer_participant: ObserverParticipant
 ) -> ObserverParticipant:
-    """Have all others forget the participant of a supervisor that was killed; note and return ours.
-
-    They would take the two for supervisors that both say they are the same, until its lease is
-    over.
-    """
+    """Note our participant; that of a supervisor that was killed counts no more. Return ours."""
     directory.participant = observer_participant.discovery.prefix
     killed = directory.previous
     if killed is not None and killed.boot_id == boot_id() and _PREFIX.fullmatch(killed.participant):
-        observer_participant.discovery.remove_participants([killed.participant], ())
+        observer_participant.discovery.ended_participant(killed.participant)
     return observer_participant
 
 
 def _clean_up_after(record: RunRecord, emit: Emitter) -> None:
     """Sweep what a supervisor left that had no chance to do it itself."""
     ended = end_run(record)
-    disown_ports()
     swept = sweep()
     if ended or swept:
         emit(

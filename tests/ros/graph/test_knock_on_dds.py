@@ -13,8 +13,7 @@ from types import SimpleNamespace
 import pytest
 
 from lifecycle.graph.graph import Graph
-from lifecycle.middleware.discovery.rediscovery import introduce
-from lifecycle.middleware.rcl.graph import ANSWER_S, PATIENCE_S, GraphObserver
+from lifecycle.middleware.discovery.environment import SETTLE_S
 from tests.stalls import Stalls, assert_in_time, noted_stalls
 
 pytestmark = [pytest.mark.ros, pytest.mark.alone]
@@ -70,7 +69,7 @@ def test_the_first_observation_holds_whoever_was_there_before(stranger: int) -> 
         looks = [asyncio.run(first_look(stranger, stalls)) for _ in range(TIMES)]
     assert all(seen for seen, _ in looks)
     # Unanswered, about half of the looks would take until the next announcement, 3 s later.
-    assert sorted(taken for _, taken in looks)[TIMES // 2] < PATIENCE_S / 2
+    assert sorted(taken for _, taken in looks)[TIMES // 2] < SETTLE_S / 2
 
 
 def test_an_empty_domain_is_known_to_be_empty_in_a_moment(fresh_domain: int) -> None:
@@ -79,16 +78,6 @@ def test_an_empty_domain_is_known_to_be_empty_in_a_moment(fresh_domain: int) -> 
         def late_s() -> float:
             seen, taken = asyncio.run(first_look(fresh_domain, stalls))
             assert not seen
-            return taken - PATIENCE_S / 2
+            return taken - SETTLE_S / 2
 
         assert_in_time(late_s)
-
-
-def test_who_introduces_others_does_not_wait_for_those_by_whom_it_does(fresh_domain: int) -> None:
-    with GraphObserver(fresh_domain) as observer:
-        time.sleep(2 * ANSWER_S)
-        observer.snapshot()
-        assert observer.settling_s() == 0.0
-        # As after a restart: all sockets of this process are called, also the one that counts.
-        introduce([os.getpid()], fresh_domain, observer.urls, os.environ, [])
-        assert observer.settling_s() == 0.0

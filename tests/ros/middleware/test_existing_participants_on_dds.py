@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.middleware.discovery.probe import chosen_otherwise
+from lifecycle.middleware.discovery.environment import chosen_otherwise
 from tests.ros.middleware.free_ports import free_ports
 
 _LIMIT_S = 60.0

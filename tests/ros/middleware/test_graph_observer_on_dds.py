@@ -24,7 +24,7 @@ from test_msgs.action import Fibonacci
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import Durability, History, QosProfile, Reliability
-from lifecycle.middleware.discovery.probe import ANSWER_S
+from lifecycle.middleware.discovery.prober import ANSWER_S
 from lifecycle.middleware.fastdds.participant import FlowParticipant
 from lifecycle.middleware.rcl.graph import GraphObserver, endpoints_of
 from lifecycle.middleware.rcl.hidden_node import quiet_node

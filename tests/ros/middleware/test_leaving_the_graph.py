@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import re
 import subprocess
 import sys
@@ -12,9 +11,7 @@ from pathlib import Path
 
 import pytest
 from fast_dds_words import without_fast_dds
-from std_msgs.msg import String
 
-from lifecycle.middleware.discovery.rediscovery import introduce
 from lifecycle.middleware.process.shared_memory import leftovers, sweep
 from lifecycle.middleware.rcl.graph import GraphObserver
 from tests.shared_memory import owned_by
@@ -93,38 +90,6 @@ def test_leaving_tells_the_graph_and_leaves_no_shared_memory(
     left = {name for name in domains_own(ours) if Path("/dev/shm", name).exists()}
     assert set(sweep(left, within_s=1.0)) <= left
     assert not any(Path("/dev/shm", name).exists() for name in left), users_of(left)
-
-
-_COUNTS = """
-import time, rclpy
-from std_msgs.msg import String
-
-rclpy.init()
-publisher = rclpy.create_node("counts").create_publisher(String, "/counted", 10)
-shown = 0
-while True:
-    if (count := publisher.get_subscription_count()) != shown:
-        shown = count
-        print(count, flush=True)
-    time.sleep(0.002)
-"""
-
-
-def test_one_that_is_to_rediscover_the_observer_drops_it_and_matches_it_again(
-    observer: GraphObserver, wait_until: WaitUntil
-) -> None:
-    observer.node.create_subscription(String, "/counted", lambda _: None, 10)
-    with subprocess.Popen([sys.executable, "-c", _COUNTS], stdout=subprocess.PIPE) as process:
-        try:
-            assert process.stdout is not None
-            assert process.stdout.readline() == b"1\n"
-            wait_until(lambda: observer.prefix)
-            pid, domain_id = process.pid, observer.domain_id
-            introduce([pid], domain_id, (), os.environ, [], rediscover=observer.prefix)
-            assert process.stdout.readline() == b"0\n"
-            assert process.stdout.readline() == b"1\n"
-        finally:
-            process.kill()
 
 
 def users_of(names: Iterable[str]) -> list[str]:

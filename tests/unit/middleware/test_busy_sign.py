@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import os
-import select
 import signal
 import time
 from collections.abc import Iterator
 
 import pytest
 
-from lifecycle.middleware.process import busy_timer
-from lifecycle.middleware.process.busy_timer import BusySign, Overdue
+from lifecycle.middleware.process import busy_sign
+from lifecycle.middleware.process.busy_sign import BusySign, Overdue
 
 LIMIT_S = 0.05
 BOUND_S = 10.0
@@ -21,22 +20,21 @@ BOUND_S = 10.0
 def sides() -> Iterator[tuple[BusySign, BusySign]]:
     """The holder's side and the watcher's."""
     holder = BusySign.make(LIMIT_S)
-    watcher = BusySign(*(os.dup(each) for each in holder.descriptors))
+    watcher = BusySign(os.dup(holder.descriptor))
     yield holder, watcher
     holder.close()
     watcher.close()
 
 
-def fires(watcher: BusySign, within_s: float = BOUND_S) -> bool:
-    return bool(select.select([watcher], [], [], within_s)[0])
-
-
 def until_overdue(watcher: BusySign) -> float:
-    """Return when the watcher noticed; it only looks when the timer fires."""
+    """Return when the watcher noticed; it only looks when it said that it would."""
     end = time.monotonic() + BOUND_S
     while time.monotonic() < end:
-        if fires(watcher) and watcher.overdue():
+        why, again_s = watcher.look()
+        if why is not None:
             return time.monotonic()
+        assert 0 < again_s <= LIMIT_S
+        time.sleep(again_s)
     raise AssertionError("never overdue")
 
 
@@ -51,13 +49,17 @@ def test_whoever_stays_busy_is_overdue_after_the_limit_and_not_before(
     holder, watcher = sides
     began = time.monotonic()
     holder.begin()
-    assert not watcher.overdue()
+    assert watcher.look()[0] is None
     assert until_overdue(watcher) - began >= LIMIT_S
+    assert watcher.look()[0] is None  # it is said once
 
 
-def test_whoever_was_idle_never_wakes_the_watcher(sides: tuple[BusySign, BusySign]) -> None:
-    _, watcher = sides
-    assert not fires(watcher, 3 * LIMIT_S)
+def test_whoever_is_idle_is_looked_at_once_in_a_limit(sides: tuple[BusySign, BusySign]) -> None:
+    holder, watcher = sides
+    assert watcher.look() == (None, LIMIT_S)
+    holder.begin()
+    holder.end()
+    assert watcher.look() == (None, LIMIT_S)
 
 
 def test_many_short_callbacks_are_not_a_long_one(sides: tuple[BusySign, BusySign]) -> None:
@@ -66,20 +68,20 @@ def test_many_short_callbacks_are_not_a_long_one(sides: tuple[BusySign, BusySign
     while time.monotonic() < end:
         holder.begin()
         assert holder.end() is None
-        if fires(watcher, 0.001):
-            assert not watcher.overdue()
+        assert watcher.look()[0] is None
 
 
-def test_a_hang_is_noticed_that_begins_while_the_timer_of_an_earlier_callback_runs(
+def test_a_hang_that_begins_just_after_a_look_is_noticed_at_its_limit(
     sides: tuple[BusySign, BusySign],
 ) -> None:
     holder, watcher = sides
-    holder.begin()
-    holder.end()
-    time.sleep(LIMIT_S / 2)
+    _, again_s = watcher.look()
     began = time.monotonic()
-    holder.begin()  # does not arm the timer again: the watcher does, when it fires
-    assert until_overdue(watcher) - began >= LIMIT_S
+    holder.begin()
+    time.sleep(began + again_s - time.monotonic())
+    why, again_s = watcher.look()
+    assert again_s < LIMIT_S
+    assert why is not None or until_overdue(watcher) - began >= LIMIT_S
 
 
 def test_the_holder_learns_how_long_it_took_only_beyond_the_limit(
@@ -91,7 +93,7 @@ def test_the_holder_learns_how_long_it_took_only_beyond_the_limit(
     busy_s = holder.end()
     assert busy_s is not None
     assert busy_s >= LIMIT_S
-    assert not watcher.overdue()
+    assert watcher.look()[0] is None
     assert holder.end() is None
 
 
@@ -118,10 +120,11 @@ class Turns:
         self.began = time.monotonic_ns()
         self.ready, self.ran, self.waited, self.at_s = ready, ran, waited, at_s
 
-    def __call__(self, thread: int, now: int) -> busy_timer._Turns:
+    def __call__(self, thread: int, now: int) -> busy_sign._Turns:
         passed = now - self.began
         counted = passed if passed >= self.at_s * 1e9 else 0
-        return busy_timer._Turns(
+        return busy_sign._Turns(
+            thread=thread,
             at_ns=now,
             ran_ns=1 + round(counted * self.ran),
             waited_ns=round(counted * self.waited),
@@ -134,20 +137,22 @@ def busy(
 ) -> list[tuple[float, Overdue]]:
     """Be busy for so many limits; return after how many of them the watcher said what."""
     holder, watcher = sides
-    monkeypatch.setattr(busy_timer, "_turns_of", turns)
-    monkeypatch.setattr(holder, "_note_turns", lambda: None)
+    monkeypatch.setattr(busy_sign, "_turns_of", turns)
     began = turns.began = time.monotonic_ns()
     said = []
 
     def passed() -> float:
         return (time.monotonic_ns() - began) / 1e9 / LIMIT_S
 
+    watcher.look()
     holder.begin()
     while passed() < limits:
-        if fires(watcher, 0.01) and (why := watcher.overdue()):
+        why, again_s = watcher.look()
+        if why is not None:
             said.append((passed(), why))
-            if why is Overdue.HANGS:
-                break
+        if why is Overdue.HANGS:
+            break
+        time.sleep(again_s)
     holder.end()
     return said
 

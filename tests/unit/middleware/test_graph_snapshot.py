@@ -138,16 +138,13 @@ def test_a_node_is_there_while_an_endpoint_is_its_own(look: Look) -> None:
     )
 
 
-def test_a_node_of_an_ended_process_is_nobody_while_discovery_shows_it(
-    look: Look, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(graph, "remove_participants", lambda *_: None)
+def test_a_node_of_an_ended_process_is_nobody_while_discovery_shows_it(look: Look) -> None:
     observer = look(Graph([node("one"), node("one", TWO), talker(b"other", prefix=TWO)]))
     assert [(each.full_name, each.count) for each in observer.snapshot()[0]] == [
         ("/one", 2),
         ("/other", 1),
     ]
-    observer.remove_participants([TWO], ())
+    observer.ended_participant(TWO)
     assert [(each.full_name, each.count) for each in observer.snapshot()[0]] == [("/one", 1)]
     assert seen(observer) == []
 

@@ -14,21 +14,21 @@ import pytest
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds.profiles import discovery_environment, discovery_profile
 from lifecycle.middleware.fastdds.sockets import widen_discovery_buffers
-from lifecycle.middleware.process.control import exit_after
+from lifecycle.middleware.process.prctl import exit_after
 from lifecycle.network.ports import participant_ports
 
 VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 
 
-def test_the_profile_only_sets_announcements() -> None:
+def test_the_profile_only_sets_announcements_and_the_lease() -> None:
     root = ET.fromstring(discovery_profile())
     space = "{http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles}"
     (participant,) = root.iter(f"{space}participant")
     assert participant.get("is_default_profile") == "true"
-    leaves = {
-        each.tag.removeprefix(space): each.text for each in participant.iter() if not len(each)
-    }
-    assert leaves == {"count": "10", "nanosec": "200000000"}
+    leaves = [
+        (each.tag.removeprefix(space), each.text) for each in participant.iter() if not len(each)
+    ]
+    assert leaves == [("count", "10"), ("nanosec", "200000000"), ("sec", "8"), ("sec", "1")]
 
 
 def test_endpoints_are_sent_by_multicast_where_it_is_asked_for() -> None:
@@ -79,7 +79,7 @@ def test_a_deadman_out_of_range_is_refused(seconds: float, code: int) -> None:
 def test_the_deadman_ends_a_process_that_holds_the_gil() -> None:
     hang = (
         "import ctypes\n"
-        "from lifecycle.middleware.process.control import exit_after\n"
+        "from lifecycle.middleware.process.prctl import exit_after\n"
         "exit_after(0.1, 42)\n"
         "ctypes.PyDLL(None).sleep(60)\n"
     )
@@ -91,7 +91,7 @@ def test_the_deadman_ends_a_process_that_holds_the_gil() -> None:
 def test_an_orphan_is_adopted_by_the_subreaper() -> None:
     reaper = (
         "import os, subprocess, sys, time\n"
-        "from lifecycle.middleware.process.control import adopt_orphans\n"
+        "from lifecycle.middleware.process.prctl import adopt_orphans\n"
         "adopt_orphans()\n"
         "grandchild = 'import os, sys; print(os.getpid(), flush=True); sys.stdin.read()'\n"
         "child = ('import subprocess, sys; '\n"

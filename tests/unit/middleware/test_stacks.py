@@ -9,7 +9,7 @@ from pathlib import Path
 
 import lifecycle
 from lifecycle.middleware.process import stacks
-from lifecycle.middleware.process.busy_timer import BusySign, label
+from lifecycle.middleware.process.busy_sign import BusySign, label
 
 OURS = str(Path(lifecycle.__file__).parent)
 STDLIB = sysconfig.get_path("stdlib")

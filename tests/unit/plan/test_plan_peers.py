@@ -7,7 +7,7 @@ import dataclasses
 import pytest
 
 from lifecycle.manifest.model import DiscoveryMode, DiscoveryRange, Machine
-from lifecycle.middleware.discovery.probe import discovery_peers, peers_environment
+from lifecycle.middleware.discovery.environment import discovery_peers, peers_environment
 from lifecycle.middleware.fastdds.profiles import discovery_profile
 from lifecycle.plan.connections.hosts import reached_hosts
 from lifecycle.plan.model import Plan

@@ -101,9 +101,6 @@ class FakeForkServer(FakeSpawner):
     def family(self) -> frozenset[int]:
         return frozenset()
 
-    def disown_ports(self) -> None:
-        """There is no shared memory."""
-
     async def ready(self) -> None:
         if self.cannot_start:
             raise StepFailedError(self.cannot_start, rule=rule("run.start-failed"), subject="robot")
@@ -287,22 +284,8 @@ class FakeParticipant:
     def node_interface(self, node: str) -> NodeInterfaceClient:
         return NodeInterfaceClient(self.services, node)
 
-    def participants_of(
-        self, pid: int, *, nodes: Iterable[str], reported: Iterable[str]
-    ) -> frozenset[str]:
-        del pid, nodes, reported
-        return frozenset()
-
-    def remove_participants(self, prefixes: Iterable[str], pids: Iterable[int]) -> None:
-        raise AssertionError(f"nothing is left in this graph: {prefixes} {pids}")
-
-    def introduce(
-        self, newcomers: Iterable[int], pids: Iterable[int], *, rediscover: bool = False
-    ) -> None:
-        """Everybody is discovered at once."""
-
-    def announce_ourselves(self) -> None:
-        """Likewise."""
+    def ended(self, pid: int, *, nodes: Iterable[str], reported: Iterable[str]) -> None:
+        """Nothing is left in this graph."""
 
     def can_be_unannounced(self) -> bool:
         return False
@@ -335,9 +318,6 @@ class FakeParticipant:
         self.ros = FakeRosInterface(prefix, tuple(services), on_call)
         self.ros.diagnoses = diagnoses
         return self.ros
-
-    def call_out(self, addresses: Iterable[str]) -> None:
-        """Nobody is far away."""
 
     def send_again_soon(self) -> None:
         """No link is ever lost."""

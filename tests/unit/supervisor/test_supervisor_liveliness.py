@@ -5,19 +5,19 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import socket
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
 
 from lifecycle.cli.up_output import describe
 from lifecycle.manifest.model import DiscoveryRange, Machine, Run, RunKind, Timeouts
-from lifecycle.middleware.process.busy_timer import BusySign, Overdue
-from lifecycle.node.host.control import SIGN_DESCRIPTORS, HostSpec, Operation
+from lifecycle.middleware.process.busy_sign import BusySign, Overdue
+from lifecycle.node.host.control import HostSpec, Operation
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.gate.verification_loop import without_nodes
 from lifecycle.supervisor.health.liveliness import Cause, NodeArrivals, SilenceMonitor
-from lifecycle.supervisor.health.peer_supervisors import CALL_EACH_S, Listener, PeerSupervisors
+from lifecycle.supervisor.health.peer_supervisors import Listener, PeerSupervisors
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.control_channel import ChannelClosedError, ControlChannel
 from lifecycle.supervisor.run.events import (
@@ -185,7 +185,6 @@ class FakeAir:
     def __init__(self) -> None:
         self.ears: dict[str, FakeEar] = {}
         self.voices: dict[str, FakeVoice] = {}
-        self.calls: list[list[str]] = []
         self.done: list[str] = []
         self.destroyed = 0
 
@@ -197,9 +196,6 @@ class FakeAir:
 
     def watch_node(self, node: str, to: Listener) -> FakeEar:
         return self.ears.setdefault(node, FakeEar(to, self))
-
-    def call_out(self, addresses: Iterable[str]) -> None:
-        self.calls.append(list(addresses))
 
     def send_again_soon(self) -> None:
         self.done.append("send_again_soon")
@@ -302,20 +298,6 @@ async def test_that_dds_forgets_a_lost_machine_changes_nothing(tmp_path: Path) -
     await desk.peer_supervisors.close()
 
 
-async def test_calls_go_out_while_somebody_is_missing_and_only_then(tmp_path: Path) -> None:
-    desk = Desk(tmp_path)
-    desk.desk.alive(True)
-    await settle()
-    assert desk.air.calls == []
-    desk.desk.alive(False)
-    await asyncio.sleep(3.5 * CALL_EACH_S)
-    assert desk.air.calls == [["10.0.0.2"]] * 4
-    desk.desk.alive(True)
-    await asyncio.sleep(10 * CALL_EACH_S)
-    assert len(desk.air.calls) == 4
-    await desk.peer_supervisors.close()
-
-
 async def test_what_another_supervisor_says_of_its_nodes_is_taken_over(tmp_path: Path) -> None:
     desk = Desk(tmp_path)
     desk.desk.silent({"/viewer": "a callback hangs", "/camera": "not theirs to say"})
@@ -388,8 +370,6 @@ async def test_a_reloaded_plan_has_its_own_attached_nodes_followed_and_no_others
     old["/lidar"].listener.alive(False)
     await settle()
     assert set(system.liveliness.silent) == {"/lidar"}
-    await asyncio.sleep(1)
-    assert air.calls
 
     plan = attached("radar", "sonar")
     system.take(plan, tuple(system.nodes.values()))
@@ -397,13 +377,10 @@ async def test_a_reloaded_plan_has_its_own_attached_nodes_followed_and_no_others
     peer_supervisors.renew()
     assert air.destroyed == 2
     assert set(air.ears) == {"/radar", "/sonar"}
-    # Who is not planned any more is neither missed nor called, whatever was on the way.
+    # Who is not planned any more is not missed, whatever was on the way.
     old["/radar"].listener.alive(False)
     await settle()
     assert dict(system.liveliness.silent) == {}
-    air.calls.clear()
-    await asyncio.sleep(1)
-    assert air.calls == []
     air.ears["/sonar"].listener.alive(True)
     air.ears["/sonar"].listener.alive(False)
     await settle()
@@ -458,7 +435,7 @@ def test_a_process_that_was_killed_while_it_was_busy_does_not_hang() -> None:
         told: asyncio.Queue[Overdue | None] = asyncio.Queue()
         channel = ControlChannel(spec, lambda _: None, told.put_nowait)
         theirs = await channel.open()
-        _, descriptors, _, _ = socket.recv_fds(theirs, 1, SIGN_DESCRIPTORS)
+        _, descriptors, _, _ = socket.recv_fds(theirs, 1, 1)
         sign = BusySign(*descriptors)
         sign.begin()
         theirs.close()

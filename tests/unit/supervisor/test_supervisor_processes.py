@@ -45,7 +45,7 @@ from lifecycle.supervisor.processes.process import (
 )
 from lifecycle.supervisor.run.events import Emitter, LogLine
 from lifecycle.verify.outcome import Outcome
-from tests.builders import port_node, teleop
+from tests.builders import teleop
 
 PYTHON = sys.executable
 BOUND_S = 20.0
@@ -218,30 +218,6 @@ def test_a_python_that_does_not_exist_cannot_be_a_fork_server(
     expected = "cannot start the fork server: No such file or directory"
     with pytest.raises(BringUpError, match=expected):
         ForkServerProcess(preload=False)
-
-
-def test_ports_whose_owner_was_killed_are_the_fork_servers_matter(tmp_path: Path) -> None:
-    # A process that has participants would wait for itself, see shared_memory.py.
-    port = f"fastrtps_port{60000 + os.getpid() % 5000}"
-    files = [Path("/dev/shm", name) for name in (port, f"{port}_el", f"sem.{port}_mutex")]
-
-    async def test() -> None:
-        async with _bench(tmp_path) as bench:
-            server = bench.fork_server
-            # Open, or any supervisor that ends meanwhile sweeps it.
-            with next(each for each in files if each.name == port).open("rb") as held:
-                server.disown_ports()
-                await server.ready()
-                assert held.read() == port_node(number, flags=6)
-
-    number = int(port.removeprefix("fastrtps_port"))
-    try:
-        for each in files:
-            each.write_bytes(port_node(number) if each.name == port else b"")
-        _run(test())
-    finally:
-        for each in files:
-            each.unlink(missing_ok=True)
 
 
 async def test_when_the_supervisor_vanishes_the_fork_server_ends_what_it_forked(

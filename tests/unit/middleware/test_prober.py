@@ -1,28 +1,25 @@
-"""Whom an observer asks, from what its connection URLs say, and who answers."""
+"""Whom a participant can ask, from what its connection URLs and settings say, and who answers."""
 
 from __future__ import annotations
 
 import contextlib
 import socket
 import struct
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from lifecycle.middleware.discovery import probe as probing
-from lifecycle.middleware.discovery.messages import announcement, disposal, new_prefix
-from lifecycle.middleware.discovery.probe import (
-    Probe,
-    ProbeTarget,
-    answered_at,
+from lifecycle.middleware.discovery import prober as probing
+from lifecycle.middleware.discovery.environment import (
     chosen_otherwise,
-    connects_first,
-    dispose_of_announced,
     is_served,
     missing_port,
-    probes_for,
+    reach,
+    settle_s,
 )
+from lifecycle.middleware.discovery.prober import ANSWER_S, Prober, Settling, leave_all
 from lifecycle.network.connection_url import parse
 from lifecycle.network.ports import participant_ports
 from lifecycle.pytest_plugin import claimed_domain
@@ -65,96 +62,52 @@ def locators(message: bytes, address: str) -> set[int]:
     return ports
 
 
-def test_a_listed_peer_is_asked_to_answer_the_observer_and_is_counted(peer: socket.socket) -> None:
+def prober_of(url: str) -> Prober:
+    return Prober(reach(25, (parse(url),), {}))
+
+
+def test_a_listed_peer_is_asked_to_answer_both_and_is_counted(peer: socket.socket) -> None:
     url, address = url_for(peer)
-    (probe,) = probes_for(25, (parse(url),), {})
-    try:
+    with contextlib.closing(prober_of(url)) as prober:
+        prober.ask()
         message, (_, asked_from, *_) = peer.recvfrom(65536)
         assert locators(message, address) == {7910, asked_from}
-        assert probe.answered() == frozenset()
+        assert prober.answers() == {}
         peer.sendto(_ANSWER, (address, asked_from))
-        assert probe.answered() == {_PREFIX.hex()}
-    finally:
-        probe.close()
-
-
-def test_what_introduces_others_to_each_other_is_no_participant_that_answers(
-    peer: socket.socket,
-) -> None:
-    url, address = url_for(peer)
-    (probe,) = probes_for(25, (parse(url),), {})
-    try:
-        called, (_, asked_from, *_) = peer.recvfrom(65536)
-        another = (announcement(new_prefix(), at, 0.5) for at in ([(address, 7910)], ()))
-        left = disposal(called[8:20].hex())
-        for message in (called, *another, left, _ANSWER):
-            peer.sendto(message, (address, asked_from))
-        assert probe.answered() == {_PREFIX.hex()}
-    finally:
-        probe.close()
+        assert prober.answers() == {_PREFIX.hex(): address}
 
 
 @pytest.mark.parametrize("at_the_end", [False, True])
-def test_who_was_announced_and_does_not_exist_is_soon_said_to_have_left(
+def test_it_is_one_participant_of_its_own_that_soon_leaves_by_a_message(
     peer: socket.socket, monkeypatch: pytest.MonkeyPatch, *, at_the_end: bool
 ) -> None:
     """Not by its lease: each look at one is an occasion for Fast DDS's deadlock."""
-    monkeypatch.setattr(probing, "_DISPOSED_S", 60.0 if at_the_end else 0.05)
+    monkeypatch.setattr(probing, "_JOINED_S", 60.0 if at_the_end else 0.05)
     url, _ = url_for(peer)
-    for each in probes_for(25, (parse(url),), {}):
-        each.close()
+    prober = prober_of(url)
+    prober.ask()
     if at_the_end:
-        dispose_of_announced()
-    came, left = peer.recv(65536), peer.recv(65536)
-    assert lease_s(came) == 10.0
-    expected = disposal(came[8:20].hex())
-    assert (left[:24], left[32:]) == (expected[:24], expected[32:])  # but for the time between
-    dispose_of_announced()
+        leave_all()
+    messages = [peer.recv(65536), peer.recv(65536)]
+    prober.ask()
+    messages.append(peer.recv(65536))
+    prober.close()
+    messages.append(peer.recv(65536))
+    assert {each[:8] for each in messages} == {b"RTPS\x02\x03LC"}
+    (prefix,) = {each[8:20] for each in messages}
+    assert prefix.startswith(b"LC")
+    # PID_STATUS_INFO says that it left; PID_PARTICIPANT_LEASE_DURATION for how long it is there.
+    left = struct.pack("<HH", 0x0071, 4) + b"\x00\x00\x00\x03"
+    assert [left in each for each in messages] == [False, True, False, True]
+    lease = struct.pack("<HHiI", 0x0002, 8, 8, 0)
+    assert [lease in each for each in messages] == [True, False, True, False]
+    # After INFO_TS, and the head of DATA: flags, what follows, the two ends of discovery.
+    sequences = [struct.unpack_from("<iI", each, 20 + 12 + 16) for each in messages]
+    assert sequences == [(0, 1), (0, 2), (0, 3), (0, 4)]
+    leave_all()
     peer.setblocking(False)
     with pytest.raises(BlockingIOError):
         peer.recv(65536)
-
-
-def lease_s(message: bytes) -> float:
-    at = message.index(struct.pack("<HH", 0x0002, 8)) + 4
-    seconds, rest = struct.unpack_from("<iI", message, at)
-    return float(seconds + rest / 2**32)
-
-
-@pytest.mark.parametrize(
-    ("range_", "everybody"),
-    [
-        ("", (("239.255.0.1", 13650),)),
-        ("LOCALHOST", tuple(("127.0.0.1", 13660 + 2 * each) for each in range(32))),
-        ("OFF", ()),
-    ],
-)
-def test_our_own_participant_is_to_answer_where_all_of_this_host_hear_it(
-    range_: str, everybody: tuple[tuple[str, int], ...]
-) -> None:
-    found = answered_at(25, (), {"ROS_AUTOMATIC_DISCOVERY_RANGE": range_})
-    assert found == everybody
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ours:
-        ours.settimeout(_WAIT_S)
-        ours.bind(("127.0.0.1", 0))
-        probe = Probe((), ("127.0.0.1",), (ours.getsockname()[1],))
-        try:
-            probe.announce_ourselves(found)
-        finally:
-            probe.close()
-        message = ours.recv(65536)
-    for address, port in everybody:
-        assert port in locators(message, address)
-
-
-@pytest.mark.parametrize(
-    ("url", "environment"),
-    [("udpv4://127.0.0.1:7911?metatraffic_port=7910", {}), ("", {"ROS_DISCOVERY_SERVER": "x"})],
-)
-def test_where_participants_are_told_whom_to_look_for_ours_announces_itself_by_itself(
-    url: str, environment: dict[str, str]
-) -> None:
-    assert answered_at(25, (parse(url),) if url else (), environment) == ()
 
 
 _SUBNET = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}
@@ -194,16 +147,11 @@ def _sharing(port: int) -> socket.socket:
 
 
 def test_who_is_not_listed_is_not_asked(peer: socket.socket) -> None:
-    url, _ = url_for(peer)
+    url, address = url_for(peer)
     without = url.partition("&peer=")[0] + "&multicast=off"
-    for probe in probes_for(25, (parse(without),), {}):
-        probe.close()
-    for probe in probes_for(25, (parse(url),), {}):
-        probe.close()
-    peer.recv(65536)
-    peer.setblocking(False)
-    with pytest.raises(BlockingIOError):
-        peer.recv(65536)
+    (nobody,), (one,) = reach(25, (parse(without),), {}), reach(25, (parse(url),), {})
+    assert nobody.targets == ()
+    assert one.targets == ((address, peer.getsockname()[1], ""),)
 
 
 @pytest.mark.parametrize(
@@ -212,10 +160,13 @@ def test_who_is_not_listed_is_not_asked(peer: socket.socket) -> None:
         "shm://",
         "tcpv4://127.0.0.1:5100?peer=127.0.0.1:5101",
         "udpv4://127.0.0.1:7911?server=127.0.0.1:11811",
+        "udpv4://127.0.0.1:7911?metatraffic_port=7910&output_port=7912",
     ],
 )
-def test_over_shared_memory_and_tcp_and_behind_a_server_nobody_can_be_asked(url: str) -> None:
-    assert probes_for(25, (parse(url),), {}) == ()
+def test_over_shared_memory_and_tcp_behind_a_server_and_from_one_port_nobody_can_be_asked(
+    url: str,
+) -> None:
+    assert reach(25, (parse(url),), {}) == ()
 
 
 @pytest.mark.parametrize(
@@ -224,13 +175,14 @@ def test_over_shared_memory_and_tcp_and_behind_a_server_nobody_can_be_asked(url:
         {"ROS_DISCOVERY_SERVER": "127.0.0.1:11811"},
         {"FASTDDS_BUILTIN_TRANSPORTS": "SHM"},
         {"FASTDDS_BUILTIN_TRANSPORTS": "TCPv4"},
+        {"RMW_IMPLEMENTATION": "rmw_zenoh_cpp"},
     ],
 )
 def test_where_the_user_chose_how_others_are_found_nobody_is_asked(
     environment: dict[str, str],
 ) -> None:
     assert chosen_otherwise(environment)
-    assert probes_for(25, (), environment) == ()
+    assert reach(25, (), environment) == ()
 
 
 @pytest.mark.parametrize(
@@ -287,11 +239,13 @@ def test_where_participants_connect_first_an_answer_is_not_enough(
         f"""<dds><profiles><participant profile_name="mine" is_default_profile="true">
         <rtps>{element}</rtps></participant></profiles></dds>"""
     )
-    assert connects_first((), {"FASTRTPS_DEFAULT_PROFILES_FILE": str(file)}) is connects
+    near = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    asked = reach(25, (), {**near, "FASTRTPS_DEFAULT_PROFILES_FILE": str(file)})
+    assert bool(asked) is not (connects or "builtinTransports" in element)
     large = {"FASTDDS_BUILTIN_TRANSPORTS": "LARGE_DATA"}
-    assert connects_first((), large)
-    assert not connects_first((parse("shm://"),), large)
-    assert not connects_first((), {**large, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"})
+    assert reach(25, (), large) == ()
+    assert settle_s((), large) > settle_s((), {}) == settle_s((parse("shm://"),), large)
+    assert reach(25, (), {**large, **near})
 
 
 @pytest.mark.parametrize("transports", ["", "DEFAULT", "UDPv4?max_msg_size=1400B"])
@@ -299,56 +253,88 @@ def test_transports_with_multicast_leave_everybody_to_be_asked(transports: str) 
     assert not chosen_otherwise({"FASTDDS_BUILTIN_TRANSPORTS": transports})
 
 
-@contextlib.contextmanager
-def listening_elsewhere(peer: socket.socket) -> Iterator[tuple[str, int]]:
-    """Give a socket to another process; return its URL and port."""
-    (url, _), port = url_for(peer), peer.getsockname()[1]
-    with of_another_process(peer):
-        yield url, port
-
-
 def announced(port: int, order: str = "<") -> bytes:
     """Return an answer that names a port for discovery."""
     return _ANSWER + struct.pack(f"{order}HHiI", _METATRAFFIC_UNICAST, 24, 1, port) + bytes(16)
 
 
+def settled(settling: Settling, named: frozenset[str] = frozenset()) -> bool:
+    return settling.left_s(named) == 0.0
+
+
 @pytest.mark.parametrize("byte_order", ["<", ">"])
-def test_another_process_that_listens_is_silent_until_an_answer_names_its_port(
+def test_another_process_that_listens_is_waited_for_until_it_answers_and_its_node_is_known(
     peer: socket.socket, byte_order: str
 ) -> None:
     """It may have had no processor since it was asked: no time says that it is no participant."""
-    with listening_elsewhere(peer) as (url, port):
-        (probe,) = probes_for(25, (parse(url),), {})
-        family, address = (socket.AF_INET6, "::1") if "[" in url else (socket.AF_INET, "127.0.0.1")
-        with socket.socket(family, socket.SOCK_DGRAM) as answering:
-            answering.connect((address, probe._socket.getsockname()[1]))
-            assert probe.silent() == {port}
-            answering.send(announced(port + 2))
-            assert probe.silent() == {port}
-            answering.send(announced(port, byte_order))
-            assert probe.silent() == frozenset()
-        probe.close()
+    (url, address), port = url_for(peer), peer.getsockname()[1]
+    with (
+        of_another_process(peer),
+        contextlib.closing(Settling(reach(25, (parse(url),), {}))) as settling,
+        socket.socket(peer.family, socket.SOCK_DGRAM) as answering,
+    ):
+        assert settling._prober is not None
+        answering.connect((address, settling._prober._sockets[0].getsockname()[1]))
+        time.sleep(ANSWER_S)
+        assert not settled(settling)
+        answering.send(announced(port + 2))
+        known = frozenset({_PREFIX.hex()})
+        assert not settled(settling, known)
+        answering.send(announced(port, byte_order))
+        assert settled(settling, known)
+        assert settled(settling)  # who was known and left is not on the way into the graph
 
 
-def test_a_process_that_closed_its_port_is_silent_no_more(peer: socket.socket) -> None:
-    with listening_elsewhere(peer) as (url, port):
-        (probe,) = probes_for(25, (parse(url),), {})
-        assert probe.silent() == {port}
-    assert probe.silent() == frozenset()
-    probe.close()
+def test_a_process_that_closed_its_port_is_waited_for_no_more(peer: socket.socket) -> None:
+    url, _ = url_for(peer)
+    with contextlib.ExitStack() as stack:
+        closes = stack.enter_context(contextlib.ExitStack())
+        closes.enter_context(of_another_process(peer))
+        settling = Settling(reach(25, (parse(url),), {}))
+        stack.callback(settling.close)
+        time.sleep(ANSWER_S)
+        assert not settled(settling)
+        closes.close()
+        assert settled(settling)
 
 
-def test_only_processes_that_did_not_answer_are_asked_again(
-    peer: socket.socket, monkeypatch: pytest.MonkeyPatch
+def test_who_answers_and_never_has_a_node_is_waited_for_once(
+    peer: socket.socket,
 ) -> None:
-    with listening_elsewhere(peer) as (url, port):
-        peers = f"peer={url.partition('peer=')[2].partition('&')[0]}"
-        another = url.replace(peers, f"{peers}&{peers.rpartition(':')[0]}:7913")
-        (probe,) = probes_for(25, (parse(another),), {})
-        asked: list[ProbeTarget] = []
-        monkeypatch.setattr(probing, "send", lambda *sent: asked.extend(sent[2]))
-        probe.ask_silent()
-        assert [each.port for each in asked] == [port]
-    probe.ask_silent()
-    assert len(asked) == 1
-    probe.close()
+    url, _ = url_for(peer)
+    with contextlib.closing(Settling(reach(25, (parse(url),), {}), 2.0)) as settling:
+        _, asked_from = peer.recvfrom(65536)
+        peer.sendto(_ANSWER, asked_from)
+        time.sleep(ANSWER_S)
+        assert not settled(settling)
+        time.sleep(2.0)
+        assert settled(settling)
+        assert settling.expect_newcomers(frozenset(), "", everybody=True)
+        peer.sendto(_ANSWER, asked_from)
+        time.sleep(ANSWER_S)
+        assert settled(settling)
+
+
+def test_a_socket_of_another_process_that_came_is_asked_for_once(peer: socket.socket) -> None:
+    url, _ = url_for(peer)
+    with contextlib.closing(Settling(reach(25, (parse(url),), {}))) as settling:
+        time.sleep(ANSWER_S)
+        assert settled(settling)
+        assert not settling.expect_newcomers(frozenset(), "")
+        with of_another_process(peer):
+            assert settling.expect_newcomers(frozenset(), "")
+            assert not settled(settling)
+
+
+def test_where_nobody_can_be_asked_it_is_a_time() -> None:
+    settling = Settling((), 0.2)
+    assert 0.0 < settling.left_s(frozenset()) <= 0.2
+    time.sleep(0.2)
+    assert settled(settling)
+    assert not settling.expect_newcomers(frozenset(), "")
+    assert settling.expect_newcomers(frozenset(), "", everybody=True)
+    assert not settled(settling)
+    assert settling.unasked_s == 0.2
+    settling.within(0.001)
+    time.sleep(0.001)
+    assert settled(settling)

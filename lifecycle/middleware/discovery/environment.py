@@ -1,0 +1,333 @@
+"""Where participants are looked for: by discovery settings in the environment and by URLs.
+
+Owns: which UDP ports a participant of this process asks in order to find others, and where it
+cannot ask: over shared memory and TCP, behind a discovery server, and where the user's own settings
+of Fast DDS choose transports or peers. Must not import rclpy.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ipaddress
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from lifecycle.errors import MiddlewareError
+from lifecycle.middleware.fastdds.participant_profile import (
+    DISCOVERY_SERVER_VARIABLE,
+    DefaultProfile,
+    default_profile,
+)
+from lifecycle.middleware.fastdds.profiles import PROFILE_NAME
+from lifecycle.middleware.fastdds.sockets import open_sockets, own_udp_ports, udp_sockets
+from lifecycle.middleware.fastdds.url_profile import (
+    DISCOVERY_GROUP,
+    UrlTransport,
+    families,
+    leaves_discovery_open,
+)
+from lifecycle.middleware.process.control import interface_addresses
+from lifecycle.network.connection_url import ConnectionUrl
+from lifecycle.network.medium import RMW_DISCOVERY, TRANSPORTS_VARIABLE, Medium
+from lifecycle.network.ports import (
+    DG,
+    LOCALHOST_PEERS_RANGE,
+    PARTICIPANTS_PER_DOMAIN,
+    participant_ports,
+    unicast_pairs,
+)
+
+SETTLE_S = 3.5
+"""Within so long everybody is known: Fast DDS announces itself, and sends again what was lost, each
+3 s. It is waited for in full where nobody can be asked."""
+
+_CONNECTED_S = 1.5
+"""So much later those are known that make TCP connections first."""
+
+RANGE_VARIABLE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+PEERS_VARIABLE = "ROS_STATIC_PEERS"
+_RMW_VARIABLE = "RMW_IMPLEMENTATION"
+_WITHOUT_SERVER = ("", "SIMPLE", "NONE")
+_WITH_UDP = ("", "DEFAULT", "UDPV4", "LARGE_DATA")
+_CONNECTING = ("TCPv4", "TCPv6", "LARGE_DATA")
+_CHOICES = frozenset(
+    {
+        "userTransports",
+        "builtinTransports",
+        "discoveryProtocol",
+        "initialPeersList",
+        "metatrafficMulticastLocatorList",
+        "metatrafficUnicastLocatorList",
+        "avoid_builtin_multicast",
+        "portBase",
+        "domainIDGain",
+        "participantIDGain",
+        "offsetd0",
+        "offsetd1",
+    }
+)
+"""Elements of a participant profile that say where others are looked for, or by what."""
+
+
+class Target(NamedTuple):
+    """The UDP port of a participant, or of a multicast group and the interface it is reached by."""
+
+    address: str
+    port: int
+    interface: str = ""
+
+
+class Reach(NamedTuple):
+    """Whom a participant of this process can ask over one address family.
+
+    Attributes:
+        kind: UDPV4 or UDPV6.
+        targets: where participants receive discovery.
+        addresses: of this host, at which answers arrive.
+        receivers: UDP ports of this process where its participants receive discovery.
+    """
+
+    kind: Medium
+    targets: tuple[Target, ...]
+    addresses: tuple[str, ...]
+    receivers: tuple[int, ...]
+
+
+def reach(
+    domain_id: int, urls: Sequence[ConnectionUrl], environment: Mapping[str, str]
+) -> tuple[Reach, ...]:
+    """Return whom a participant with these URLs can ask; it has its sockets already.
+
+    Args:
+        domain_id: 0–232.
+        urls: its own; none for what the RMW does by itself.
+        environment: where ROS_AUTOMATIC_DISCOVERY_RANGE is looked up, for URLs that leave discovery
+            open. OFF asks nobody, SUBNET (the default) this host, by multicast, and those of
+            ROS_STATIC_PEERS, everything else this host only.
+
+    Returns:
+        One per address family; none where others cannot be asked, or may only be from one port.
+    """
+    found = families(urls)
+    if any(url.server or url.output_port for url in urls) or not all(each.udp for each in found):
+        return ()
+    if not urls and (chosen_otherwise(environment) or _connects_first(environment)):
+        return ()
+    if urls and not leaves_discovery_open(urls):
+        return tuple(_listed(domain_id, family) for family in found)
+    kinds = tuple(family.kind for family in found) or (RMW_DISCOVERY,)
+    return tuple(_around(domain_id, kind, environment) for kind in kinds)
+
+
+def settle_s(urls: Sequence[ConnectionUrl], environment: Mapping[str, str]) -> float:
+    """Return within how many seconds a participant of these URLs knows all that were there."""
+    return SETTLE_S + (_CONNECTED_S if not urls and _connects_first(environment) else 0.0)
+
+
+def _around(domain_id: int, kind: Medium, environment: Mapping[str, str]) -> Reach:
+    range_ = _range(environment)
+    if range_ == "OFF":
+        return Reach(kind, (), (), ())
+    addresses = [kind.loopback]
+    targets = [*_well_known(domain_id, kind.loopback, PARTICIPANTS_PER_DOMAIN)]
+    if range_ == "SUBNET":
+        by_interface = _addresses_of(kind)
+        addresses += [each for found in by_interface.values() for each in found]
+        targets += _groups(domain_id, kind, by_interface)
+        for peer in _static_peers(environment):
+            if (":" in peer) == (kind.ip_version == 6):
+                targets += _well_known(domain_id, peer, LOCALHOST_PEERS_RANGE)
+    return Reach(kind, tuple(targets), tuple(addresses), _receivers(domain_id, kind))
+
+
+def _listed(domain_id: int, family: UrlTransport) -> Reach:
+    """Return whom a participant can ask whose URLs list its peers."""
+    here = _addresses_of(family.kind, loopback=True)
+    if bound := set(family.interfaces):
+        here = {
+            name: addresses if name in bound else tuple(each for each in addresses if each in bound)
+            for name, addresses in here.items()
+        }
+    targets: list[Target] = []
+    for peer in family.peers:
+        if peer.port is None:
+            targets += _well_known(domain_id, peer.address, LOCALHOST_PEERS_RANGE)
+        else:
+            targets.append(Target(peer.address, peer.port))
+    if all(url.multicast for url in family.urls):
+        targets += _groups(domain_id, family.kind, (name for name, found in here.items() if found))
+    fixed = family.metatraffic_port
+    receivers = (fixed,) if fixed else _receivers(domain_id, family.kind)
+    addresses = tuple(each for found in here.values() for each in found)
+    return Reach(family.kind, tuple(targets), addresses, receivers)
+
+
+def _receivers(domain_id: int, kind: Medium) -> tuple[int, ...]:
+    """Return the ports of this process on which participants receive discovery.
+
+    Read from the kernel, never inferred: a taken port moves a participant to another one.
+    """
+    first = participant_ports(domain_id, 0).discovery_unicast
+    last = participant_ports(domain_id, 0).discovery_multicast + DG
+    ports = {each.port for each in open_sockets() if each.kind == kind}
+    return tuple(sorted(p for p in ports if first <= p < last and (p - first) % 2 == 0))
+
+
+def _well_known(domain_id: int, address: str, participants: int) -> Iterator[Target]:
+    """Yield the discovery ports of a host's first participants (DDSI-RTPS 9.6.2.3)."""
+    return (Target(address, port) for port, _ in unicast_pairs(domain_id, participants))
+
+
+def _groups(domain_id: int, kind: Medium, interfaces: Iterable[str]) -> Iterator[Target]:
+    """Yield the group of discovery by each interface."""
+    port = participant_ports(domain_id, 0).discovery_multicast
+    return (Target(DISCOVERY_GROUP[kind], port, interface) for interface in interfaces)
+
+
+def _addresses_of(kind: Medium, *, loopback: bool = False) -> dict[str, tuple[str, ...]]:
+    """Return this host's addresses of a family by interface; interfaces without one are left out.
+
+    Link-local ones of IPv6 mean nothing to others without an interface of theirs.
+    """
+    found: dict[str, tuple[str, ...]] = {}
+    for name, text in sorted(interface_addresses(kind.socket_family), key=lambda each: each[0]):
+        each = ipaddress.ip_address(text)
+        if (loopback or not each.is_loopback) and not (each.version == 6 and each.is_link_local):
+            found[name] = (*found.get(name, ()), str(each))
+    return found
+
+
+def is_served(urls: Sequence[ConnectionUrl], environment: Mapping[str, str]) -> bool:
+    """Return whether a participant of these URLs finds others by a discovery server."""
+    if any(url.server for url in urls) or environment.get(DISCOVERY_SERVER_VARIABLE):
+        return True
+    with contextlib.suppress(MiddlewareError):  # as for `chosen_otherwise`
+        profile = default_profile(environment)
+        protocols = () if profile is None or urls else profile.element.iter("discoveryProtocol")
+        return any((each.text or "").strip() not in _WITHOUT_SERVER for each in protocols)
+    return False
+
+
+def missing_port(
+    domain_id: int, urls: Sequence[ConnectionUrl], environment: Mapping[str, str]
+) -> int | None:
+    """Return the UDP port of the multicast by which participants find each other, if it is missing.
+
+    Fast DDS shares that port with other participants. If another kind of socket has it, no
+    participant of this host receives announcements, and none of them finds another; Fast DDS 2.14
+    says nothing.
+
+    Args:
+        domain_id: of a participant of this process.
+        urls: its own.
+        environment: as for `reach`.
+
+    Returns:
+        None if this process has it, or participants look for each other elsewhere, too.
+    """
+    if urls or chosen_otherwise(environment) or _range(environment) != "SUBNET":
+        return None
+    port = participant_ports(domain_id, 0).discovery_multicast
+    if _static_peers(environment) or port in own_udp_ports():
+        return None
+    return port if any(each.port == port for each in udp_sockets()) else None
+
+
+def chosen_otherwise(environment: Mapping[str, str]) -> bool:
+    """Whether the user's own settings of Fast DDS say how participants without URLs are found.
+
+    A discovery server, transports, or where to look for others: then nothing may be asked over
+    UDP, which those settings may have ruled out. An RMW without DDS has nothing that answers.
+    """
+    if environment.get(DISCOVERY_SERVER_VARIABLE) or not _has_udpv4(environment):
+        return True
+    if "zenoh" in environment.get(_RMW_VARIABLE, ""):
+        return True
+    profile = _users_profile(environment)
+    return profile is not None and any(each.tag in _CHOICES for each in profile.element.iter())
+
+
+def _connects_first(environment: Mapping[str, str]) -> bool:
+    """Return whether participants, once discovered, make TCP connections before they say more.
+
+    So it is with LARGE_DATA, where the range does not choose other transports, and with a file of
+    profiles that has TCP. An answer by UDP says nothing then of what a participant has.
+    """
+    builtin = environment.get(TRANSPORTS_VARIABLE, "").upper()
+    if builtin.startswith("LARGE_DATA") and _range(environment) != "LOCALHOST":
+        return True
+    with contextlib.suppress(OSError):
+        if (profile := _users_profile(environment)) is not None:
+            text = Path(profile.file).read_text(encoding="utf-8", errors="replace")
+            return any(each in text for each in _CONNECTING)
+    return False
+
+
+def _users_profile(environment: Mapping[str, str]) -> DefaultProfile | None:
+    """Return the default profile of the user's; ours adds to Fast DDS's defaults."""
+    with contextlib.suppress(MiddlewareError):  # Fast DDS cannot read it either, and takes those
+        found = default_profile(environment)
+        return None if found is None or found.name == PROFILE_NAME else found
+    return None
+
+
+def _range(environment: Mapping[str, str]) -> str:
+    return environment.get(RANGE_VARIABLE, "").upper() or "SUBNET"
+
+
+def _has_udpv4(environment: Mapping[str, str]) -> bool:
+    builtin = environment.get(TRANSPORTS_VARIABLE, "").partition("?")[0].upper()
+    return builtin in _WITH_UDP
+
+
+def _static_peers(environment: Mapping[str, str]) -> tuple[str, ...]:
+    """Return the addresses among ROS_STATIC_PEERS; a name would have to be looked up."""
+    found = []
+    for text in environment.get(PEERS_VARIABLE, "").split(";"):
+        with contextlib.suppress(ValueError):
+            found.append(str(ipaddress.ip_address(text.strip())))
+    return tuple(found)
+
+
+def peers_environment(hosts: Iterable[str], environment: Mapping[str, str]) -> Mapping[str, str]:
+    """Return ROS_STATIC_PEERS with these hosts beside those of the user's; rmw reads it.
+
+    It looks at the first four participants of each, and only with the range SUBNET. Participants
+    without UDP over IPv4 would look for no others then, so where the user's settings take it
+    away, nothing is added.
+
+    Args:
+        hosts: IPv4 addresses.
+        environment: what it is now.
+    """
+    if environment.get(DISCOVERY_SERVER_VARIABLE) or not _has_udpv4(environment):
+        return {}
+    given = [each.strip() for each in environment.get(PEERS_VARIABLE, "").split(";")]
+    every = dict.fromkeys([*filter(None, given), *hosts])
+    return {PEERS_VARIABLE: ";".join(every)} if every else {}
+
+
+def discovery_peers(
+    domain_id: int, hosts: Mapping[str, int], environment: Mapping[str, str]
+) -> tuple[tuple[str, int], ...]:
+    """Return where participants of these hosts are looked for, beside multicast.
+
+    Args:
+        domain_id: 0–232.
+        hosts: by IP address, how many participants may be there.
+        environment: where settings of Fast DDS are looked up.
+
+    Returns:
+        Address and UDP port, the groups of multicast among them; nothing without hosts, or where
+        the user's own settings say how others are found.
+    """
+    if not hosts or chosen_otherwise(environment):
+        return ()
+    found = [
+        (target.address, target.port)
+        for host, count in hosts.items()
+        for target in _well_known(domain_id, host, min(count, LOCALHOST_PEERS_RANGE))
+    ]
+    group = participant_ports(domain_id, 0).discovery_multicast
+    return ((DISCOVERY_GROUP[RMW_DISCOVERY], group), *found)

@@ -1,0 +1,117 @@
+"""TCP connections of Fast DDS in this process: those that are dead, those that are not used.
+
+Owns: what is read of them from the kernel (TCP_INFO of tcp(7)), and how long it waits at most
+before it sends again. Must not import rclpy.
+
+Fast DDS 2.14 never returns from the destruction of a participant whose connection is cut, until its
+socket is shut down; and it never uses a connection whose first answer arrived before the connecting
+thread had noted what to request next: only another participant, on another port, helps then.
+
+The kernel doubles the time between retransmissions each time, up to 120 s, so that after an outage
+nothing passes for about as long again (RFC 6298 §5.5).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import struct
+
+from lifecycle.middleware.fastdds.sockets import sockets_here
+
+_UNANSWERED = 2
+"""Retransmissions in a row after which a connection is dead for a leaving process: the kernel
+sends again after 0.2 s and 0.6 s at the earliest, and participants send something each 0.5 s."""
+
+_SYN_SENT = 2  # tcp_states.h
+_ESTABLISHED = 1
+_STATE, _RETRANSMITS, _PROBES = 0, 2, 3  # offsets in struct tcp_info
+_LAST_RECEIVED_MS, _BYTES_ACKED, _BYTES_RECEIVED = 52, 120, 128
+
+_FIRST_REQUEST = 100
+"""Bytes; the request by which Fast DDS begins has 68, and the next one 38 more."""
+
+_IDLE_MS = 500
+"""A connection in use says what it wants next within a millisecond of the first answer, and on a
+machine with both processors busy within 0.1 s."""
+
+
+def give_up_dead_connections() -> int:
+    """Shut down every TCP connection of this process that is not answered; return how many.
+
+    For a process that is about to end: an accepted connection that is shut down is not made again.
+    """
+    count = 0
+    for each in sockets_here():
+        with contextlib.suppress(OSError):  # closed since
+            if each.type == socket.SOCK_STREAM and _is_dead(each):
+                each.shutdown(socket.SHUT_RDWR)
+                count += 1
+    return count
+
+
+def is_used(address: str, port: int) -> bool | None:
+    """Return whether the connection that this process dialled is used by Fast DDS.
+
+    Args:
+        address: IPv4, of the other end.
+        port: likewise.
+
+    Returns:
+        None while that is open: there is no connection yet, or it has only just begun.
+    """
+    for each in sockets_here():
+        if (each.family, each.type) != (socket.AF_INET, socket.SOCK_STREAM):
+            continue
+        with contextlib.suppress(OSError):  # not connected yet
+            if each.getpeername() == (address, port):
+                return _is_used(each.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 256))
+    return None
+
+
+def _is_used(info: bytes) -> bool | None:
+    if len(info) < _BYTES_RECEIVED + 8:
+        return True  # before Linux 4.2 it cannot be known
+    (idle_ms,) = struct.unpack_from("=I", info, _LAST_RECEIVED_MS)
+    acked, received = struct.unpack_from("=QQ", info, _BYTES_ACKED)
+    if acked >= _FIRST_REQUEST:
+        return True
+    return False if received and idle_ms >= _IDLE_MS else None
+
+
+def _is_dead(each: socket.socket) -> bool:
+    if each.family not in (socket.AF_INET, socket.AF_INET6):
+        return False
+    info = each.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 8)
+    if info[_STATE] == _SYN_SENT:
+        return True
+    return info[_STATE] == _ESTABLISHED and max(info[_RETRANSMITS], info[_PROBES]) >= _UNANSWERED
+
+
+AT_MOST_S = 1.0
+"""The least that Linux allows, and what healing may take."""
+
+_GIVES_UP_S = 924
+"""As long as Linux tries by default (tcp_retries2 of tcp(7)): it counts how often it sent again,
+and would give up after 15 s. Fast DDS 2.14 does not get over a connection that was given up."""
+
+_TCP_RTO_MAX_MS = 44  # linux/tcp.h, since Linux 6.15
+
+
+def send_again_soon() -> int:
+    """Make every TCP connection of this process retransmit within `AT_MOST_S`, for good.
+
+    What is dialled later waits as long as ever; those accepted by a socket that listens now do
+    not.
+
+    Returns:
+        How many sockets heed it: 0 before Linux 6.15, which has no such option.
+    """
+    count = 0
+    for each in sockets_here():
+        with contextlib.suppress(OSError):  # closed since, or a kernel without the option
+            if each.type == socket.SOCK_STREAM and each.family in {socket.AF_INET, socket.AF_INET6}:
+                each.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _GIVES_UP_S * 1000)
+                each.setsockopt(socket.IPPROTO_TCP, _TCP_RTO_MAX_MS, int(AT_MOST_S * 1000))
+                count += 1
+    return count
