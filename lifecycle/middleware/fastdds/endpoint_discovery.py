@@ -12,8 +12,8 @@ import ctypes
 import functools
 from typing import Any
 
-from lifecycle.middleware.fastdds.local_readers import RTPS, guid_prefix
-from lifecycle.middleware.fastdds.settings import fast_dds_function, participant_of
+from lifecycle.middleware.fastdds.factory import fast_dds_function
+from lifecycle.middleware.fastdds.local_readers import RTPS, guid_prefix, participant_of
 
 _WRITERS = (b"\x00\x00\x03\xc2", b"\x00\x00\x04\xc2")
 """EntityIds of the built-in writers of publications and subscriptions, DDSI-RTPS table 9.1."""

@@ -10,11 +10,11 @@ import ctypes
 import functools
 from typing import Any
 
-from lifecycle.middleware.fastdds.settings import (
-    fast_dds_address,
-    fast_dds_function,
-    participant_of,
-)
+from rclpy.utilities import get_rmw_implementation_identifier
+
+from lifecycle.errors import MiddlewareError
+from lifecycle.middleware.fastdds.factory import RMW, fast_dds_function, shared_library
+from lifecycle.middleware.rcl import abi
 
 RTPS = "8eprosima8fastrtps4rtps"
 POINTER_BYTES = ctypes.sizeof(ctypes.c_void_p)
@@ -99,3 +99,46 @@ def _find_reader() -> Any:
         "RSt10shared_ptrINS1_18LocalReaderPointerEERKNS1_6GUID_tE",
         *(None, pointer, pointer),
     )
+
+
+_PARTICIPANT_OF = "_ZN16rmw_fastrtps_cpp22get_domain_participantEP10rmw_node_s"
+
+
+def participant_of(rcl_node: int) -> int | None:
+    """Return the address of the DomainParticipant of a node; None where the libraries are others.
+
+    Args:
+        rcl_node: address of the rcl_node_t.
+    """
+    functions = _node_functions()
+    if functions is None:
+        return None
+    rmw_handle, domain_participant = functions
+    found: int | None = domain_participant(rmw_handle(rcl_node))
+    return found
+
+
+@functools.lru_cache(maxsize=1)
+def _node_functions() -> tuple[Any, Any] | None:
+    """Return rcl_node_get_rmw_handle and rmw_fastrtps_cpp's get_domain_participant, if they are."""
+    if not abi.is_known() or get_rmw_implementation_identifier() != RMW:
+        return None
+    pointer = ctypes.c_void_p
+    try:
+        return (
+            abi.bind("rcl", "rcl_node_get_rmw_handle", pointer, (pointer,)),
+            abi.bind(RMW, _PARTICIPANT_OF, pointer, (pointer,)),
+        )
+    except MiddlewareError:
+        return None
+
+
+def fast_dds_address(symbol: str) -> int | None:
+    """Return where a variable of libfastrtps 2.14 is, by its mangled name; None if there is none.
+
+    As for `fast_dds_function`.
+    """
+    try:
+        return ctypes.addressof(ctypes.c_char.in_dll(shared_library(), symbol))
+    except (OSError, ValueError):
+        return None

@@ -21,6 +21,7 @@ import functools
 from typing import Any
 
 from lifecycle.errors import MiddlewareError
+from lifecycle.middleware.fastdds.factory import fast_dds_function
 from lifecycle.middleware.fastdds.local_readers import (
     POINTER_BYTES,
     RTPS,
@@ -28,7 +29,6 @@ from lifecycle.middleware.fastdds.local_readers import (
     pointer_at,
     virtual_functions,
 )
-from lifecycle.middleware.fastdds.settings import fast_dds_function
 from lifecycle.middleware.versions import INSTALL
 
 _IGNORE_NONE_FLAGS, _IGNORE_ALL_FLAGS = 0, 7

@@ -32,7 +32,7 @@ _FILE_NAME = "quick_discovery.xml"
 _ANNOUNCEMENTS = 10
 _PERIOD_NS = 200_000_000
 
-LEASE_S = 8
+LEASE_S = 10
 """As long as a machine may be too busy for a participant to announce itself, or to take it in."""
 
 _AGAIN_S = 1

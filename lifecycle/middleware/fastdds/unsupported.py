@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 
 from lifecycle.errors import MiddlewareError
+from lifecycle.middleware.fastdds.factory import fast_dds_refusal
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
-from lifecycle.middleware.fastdds.settings import fast_dds_refusal
 from lifecycle.middleware.rcl import abi
 from lifecycle.middleware.versions import INSTALL
 from lifecycle.network.nfe import UniqueRequirement

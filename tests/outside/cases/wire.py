@@ -21,7 +21,7 @@ from tests.outside.case import OK, Case
 from tests.outside.cases.healthy import PAIR
 from tests.outside.running import GRACE_S, LIFECYCLE, PROGRAMS, Run
 
-LEAST_LEASE_S = 8.0
+LEAST_LEASE_S = 10.0
 
 
 def _announced(during: Callable[[Run], None], *, at_most: int) -> Callable[[Run], None]:

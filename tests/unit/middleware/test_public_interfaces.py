@@ -1,0 +1,58 @@
+"""What is below public interfaces, file by file: nothing is added without this table saying so."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import lifecycle
+
+ROOT = Path(lifecycle.__file__).parent
+
+CTYPES = {
+    "middleware/discovery/liveliness.py",  # asserts a publisher's liveliness without the GIL
+    "middleware/fastdds/endpoint_discovery.py",
+    "middleware/fastdds/factory.py",  # participants from profiles, eight public functions
+    "middleware/fastdds/local_readers.py",
+    "middleware/fastdds/nfe.py",  # rcl's network flow endpoints and the unique option
+    "middleware/fastdds/participant_discovery.py",
+    "middleware/process/prctl.py",  # prctl(2), and timers that end a process
+    "middleware/rcl/abi.py",  # rcl's C API, checked by version and layout
+    "middleware/rcl/graph_changes.py",  # rcl's graph guard condition
+}
+"""Files that call libraries other than by Python."""
+
+MANGLED = {
+    "middleware/fastdds/endpoint_discovery.py",
+    "middleware/fastdds/factory.py",
+    "middleware/fastdds/local_readers.py",
+    "middleware/fastdds/participant_discovery.py",
+}
+"""Files that name C++ functions; docs/decisions.md says which of them are to go."""
+
+FACTORY_SYMBOLS = 8
+
+
+def files(pattern: str) -> set[str]:
+    return {
+        path.relative_to(ROOT).as_posix()
+        for path in ROOT.rglob("*.py")
+        if re.search(pattern, path.read_text(encoding="utf-8"), re.MULTILINE)
+    }
+
+
+def test_only_these_files_call_libraries_other_than_by_python() -> None:
+    assert files(r"^\s*(import ctypes|from ctypes)") == CTYPES
+
+
+def test_only_these_files_name_functions_of_cpp() -> None:
+    assert files(r"_Z(N|TV)") == MANGLED
+
+
+def test_participants_are_made_by_eight_functions_of_fast_dds() -> None:
+    source = (ROOT / "middleware/fastdds/factory.py").read_text(encoding="utf-8")
+    assert len(re.findall(r"f\"_ZN", source)) == FACTORY_SYMBOLS
+
+
+def test_no_module_is_faked() -> None:
+    assert files(r"sys\.modules\[[^]]+\]\s*=") == set()
