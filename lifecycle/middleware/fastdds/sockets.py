@@ -20,7 +20,7 @@ import ipaddress
 import os
 import socket
 import struct
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from lifecycle import dataclasses
@@ -108,34 +108,10 @@ def own_udp_ports() -> frozenset[int]:
     return frozenset(each.port for each in open_sockets() if each.kind.is_udp)
 
 
-def own_udp_socket(family: int, port: int) -> socket.socket | None:
-    """Return a duplicate of a UDP socket of this process that has this port; None if none has.
-
-    What is set on it is set on the original. Close it.
-    """
-    for each in _own_udp_sockets():
-        if each.family == family and each.getsockname()[1] == port:
-            return _duplicate(each)
-    return None
-
-
 def udp_sockets(*, of_others: bool = False) -> tuple[OpenSocket, ...]:
     """Return the UDP sockets of our network namespace, or only those that others have."""
-    ours = set(_socket_inodes("self")) if of_others else set[int]()
+    ours = {each.inode for each in open_sockets()} if of_others else set[int]()
     return tuple(each for each in _listed() if each.inode not in ours)
-
-
-def udp_sockets_of(pids: Iterable[int]) -> dict[int, tuple[OpenSocket, ...]]:
-    """Return the UDP sockets of processes; those that are gone, or not ours, have none."""
-    inodes: dict[int, int] = {}
-    for pid in pids:
-        with contextlib.suppress(OSError):
-            inodes |= dict.fromkeys(_socket_inodes(str(pid)), pid)
-    found: dict[int, list[OpenSocket]] = {}
-    for each in _listed() if inodes else ():
-        if each.inode in inodes:
-            found.setdefault(inodes[each.inode], []).append(each)
-    return {pid: tuple(sockets) for pid, sockets in found.items()}
 
 
 def check_host(urls: Sequence[ConnectionUrl]) -> None:
@@ -407,11 +383,3 @@ def _listed() -> Iterator[OpenSocket]:
                         address=socket.inet_ntop(kind.socket_family, packed),
                         port=int(port, 16),
                     )
-
-
-def _socket_inodes(process: str) -> Iterator[int]:
-    for descriptor in Path("/proc", process, "fd").iterdir():
-        with contextlib.suppress(OSError):  # closed meanwhile
-            target = str(descriptor.readlink())
-            if target.startswith("socket:["):
-                yield int(target[len("socket:[") : -1])

@@ -16,7 +16,8 @@ from lifecycle.middleware.fastdds.sockets import (
     check_sockets,
     open_sockets,
     own_udp_ports,
-    own_udp_socket,
+    sockets_here,
+    udp_sockets,
 )
 from lifecycle.middleware.process.shared_memory import open_files
 from lifecycle.network.connection_url import parse
@@ -167,24 +168,20 @@ def test_a_duplicate_of_a_socket_leaves_the_original_waiting_or_not(
     with socket.socket(family, socket.SOCK_DGRAM) as own:
         own.bind(("", 0))
         own.setblocking(waits)
-        port = own.getsockname()[1]
-        assert port in own_udp_ports()
-        found = own_udp_socket(family, port)
-        assert found is not None
-        with found:
-            assert found.getsockname() == own.getsockname()
-            found.setsockopt(socket.IPPROTO_IP, socket.IP_TOS, 0x20)
-            assert own.getsockopt(socket.IPPROTO_IP, socket.IP_TOS) == 0x20
+        assert own.getsockname()[1] in own_udp_ports()
+        for each in sockets_here():
+            if each.family == family and each.getsockname() == own.getsockname():
+                each.setsockopt(socket.IPPROTO_IP, socket.IP_TOS, 0x20)
+        assert own.getsockopt(socket.IPPROTO_IP, socket.IP_TOS) == 0x20
         assert os.get_blocking(own.fileno()) is waits
     assert len(open_files()) == len(before)
 
 
-def test_one_of_another_family_or_protocol_is_not_taken_for_it() -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as stream:
-        stream.bind(("127.0.0.1", 0))
-        port = stream.getsockname()[1]
-        assert port not in own_udp_ports()
-        assert own_udp_socket(socket.AF_INET, port) is None
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as own:
-        own.bind(("127.0.0.1", 0))
-        assert own_udp_socket(socket.AF_INET6, own.getsockname()[1]) is None
+def test_udp_sockets_of_others_are_not_ours_and_those_of_tcp_are_neither() -> None:
+    with bound(*_UDP4) as own, bound(*_TCP4) as stream:
+        port, other = own.getsockname()[1], stream.getsockname()[1]
+        assert port in {each.port for each in udp_sockets()}
+        mine = {each.inode for each in udp_sockets()} & {each.inode for each in open_sockets()}
+        assert not mine & {each.inode for each in udp_sockets(of_others=True)}
+        assert own_udp_ports() >= {port}
+        assert other not in own_udp_ports()
