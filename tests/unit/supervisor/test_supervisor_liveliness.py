@@ -15,7 +15,6 @@ from lifecycle.manifest.model import DiscoveryRange, Machine, Run, RunKind, Time
 from lifecycle.middleware.process.busy_sign import BusySign, Overdue
 from lifecycle.node.host.control import HostSpec, Operation
 from lifecycle.plan.model import Plan
-from lifecycle.supervisor.gate.verification_loop import without_nodes
 from lifecycle.supervisor.health.liveliness import Cause, NodeArrivals, SilenceMonitor
 from lifecycle.supervisor.health.peer_supervisors import Listener, PeerSupervisors
 from lifecycle.supervisor.nodes.system import System
@@ -94,17 +93,17 @@ async def test_a_node_is_not_called_alive_that_has_not_started_or_is_not_in_the_
     await desk.peer_supervisors.close()
 
 
-def test_the_same_cause_twice_is_no_news() -> None:
-    ears = Ears()
-    ears.liveliness.fell_silent(["/camera"], Cause.HUNG, "it hangs")
-    ears.liveliness.fell_silent(["/camera"], Cause.HUNG, "it hangs")
-    assert (ears.kinds, ears.changes) == (["silent"], 1)
-
-
-def test_coming_back_from_what_was_not_noticed_is_no_news() -> None:
+def test_what_is_no_change_is_no_news() -> None:
     ears = Ears()
     ears.liveliness.came_back(["/camera"], Cause.HUNG)
     assert (ears.kinds, ears.changes) == ([], 0)
+    for _ in range(2):
+        ears.liveliness.fell_silent(["/camera"], Cause.HUNG, "it hangs")
+        assert (ears.kinds, ears.changes) == (["silent"], 1)
+    # A dead process is not silent.
+    ears.liveliness.forget(["/camera"])
+    ears.liveliness.came_back(["/camera"], Cause.HUNG)
+    assert (ears.kinds, ears.liveliness.findings()) == (["silent"], ())
 
 
 def test_a_silent_node_violates_and_the_finding_says_why() -> None:
@@ -119,14 +118,6 @@ def test_a_silent_node_violates_and_the_finding_says_why() -> None:
     )
     assert finding.message == "cannot rely on '/camera': it was stopped, and it hangs"
     assert finding.observed == "stopped, hung"
-
-
-def test_a_dead_process_is_not_silent() -> None:
-    ears = Ears()
-    ears.liveliness.fell_silent(["/camera"], Cause.HUNG, "it hangs")
-    ears.liveliness.forget(["/camera"])
-    ears.liveliness.came_back(["/camera"], Cause.HUNG)
-    assert (ears.kinds, ears.liveliness.findings()) == (["silent"], ())
 
 
 def test_who_hangs_may_come_back_and_who_is_stopped_or_lost_is_out_of_reach() -> None:
@@ -150,13 +141,6 @@ def test_nodes_join_and_leave_between_two_looks() -> None:
         NodeJoined(node="/c"),
         NodeLeft(node="/a"),
     ]
-
-
-def test_a_silent_node_is_not_asked_for_anything() -> None:
-    plan = plan_of(planned_node("camera"), planned_node("viewer"))
-    left = without_nodes(plan, {"/camera": "it hangs"})
-    assert [each.full_name for each in left.nodes] == ["/viewer"]
-    assert without_nodes(plan, {}) is plan
 
 
 class FakeEar:
@@ -235,9 +219,9 @@ class Desk:
     def desk(self) -> Listener:
         return self.air.ears["robot/desk"].listener
 
-    def told(self) -> list[tuple[str, str]]:
+    def told(self) -> list[tuple[str, bool | str]]:
         return [
-            (each.kind, each.machine if isinstance(each, MachineConnection) else each.node)
+            (each.kind, each.established if isinstance(each, MachineConnection) else each.node)
             for each in self.events
             if isinstance(each, (MachineConnection, NodeSilent, NodeAlive))
         ]
@@ -249,52 +233,34 @@ async def settle() -> None:
         await asyncio.sleep(0)
 
 
-async def test_with_a_machine_its_nodes_are_lost_and_found(tmp_path: Path) -> None:
+UP, GONE = ("connection", True), ("connection", False)
+LOST = [("silent", "/viewer"), ("silent", "/lamp")]
+FOUND = [("alive", "/viewer"), ("alive", "/lamp")]
+
+
+@pytest.mark.parametrize(
+    ("said", "told"),
+    [
+        ([True, False, True], [UP, GONE, *LOST, UP, *FOUND]),
+        ([False], []),  # it was never heard, and so is not lost
+        ([True, None], [UP, GONE]),  # it left properly
+        ([True, False, None], [UP, GONE, *LOST]),  # that DDS forgets it changes nothing
+    ],
+)
+async def test_with_a_machine_its_nodes_are_lost_and_found(
+    tmp_path: Path, said: list[bool | None], told: list[tuple[str, bool | str]]
+) -> None:
     desk = Desk(tmp_path)
-    desk.desk.alive(True)
-    await settle()
-    desk.desk.alive(False)
-    await settle()
-    desk.desk.alive(True)
-    await settle()
-    assert desk.told() == [
-        ("connection", "desk"),
-        ("connection", "desk"),
-        ("silent", "/viewer"),
-        ("silent", "/lamp"),
-        ("connection", "desk"),
-        ("alive", "/viewer"),
-        ("alive", "/lamp"),
-    ]
-    states = [each.established for each in desk.events if isinstance(each, MachineConnection)]
-    assert states == [True, False, True]
-    await desk.peer_supervisors.close()
-
-
-async def test_a_machine_that_was_never_heard_is_not_lost(tmp_path: Path) -> None:
-    desk = Desk(tmp_path)
-    desk.desk.alive(False)
-    await settle()
-    assert desk.told() == []
-    await desk.peer_supervisors.close()
-
-
-async def test_a_supervisor_that_leaves_properly_loses_no_node(tmp_path: Path) -> None:
-    desk = Desk(tmp_path)
-    desk.desk.alive(True)
-    desk.desk.left()
-    await settle()
-    assert desk.told() == [("connection", "desk"), ("connection", "desk")]
-    await desk.peer_supervisors.close()
-
-
-async def test_that_dds_forgets_a_lost_machine_changes_nothing(tmp_path: Path) -> None:
-    desk = Desk(tmp_path)
-    desk.desk.alive(True)
-    desk.desk.alive(False)
-    desk.desk.left()
-    await settle()
-    assert set(desk.system.liveliness.silent) == {"/viewer", "/lamp"}
+    for each in said:
+        if each is None:
+            desk.desk.left()
+        else:
+            desk.desk.alive(each)
+        await settle()
+    assert desk.told() == told
+    # Who is lost to us is not told to others.
+    await asyncio.sleep(1)
+    assert desk.air.voices["robot/robot"].told == []
     await desk.peer_supervisors.close()
 
 
@@ -318,15 +284,6 @@ async def test_our_own_silent_nodes_are_told_again_and_again_until_it_is_over(
     desk.system.liveliness.came_back(["/camera"], Cause.HUNG)
     await asyncio.sleep(1)
     assert desk.air.voices["robot/robot"].told == [{"/camera": "it hangs"}] * 3 + [{}] * 3
-    await desk.peer_supervisors.close()
-
-
-async def test_who_is_lost_to_us_is_not_told_to_others(tmp_path: Path) -> None:
-    desk = Desk(tmp_path)
-    desk.desk.alive(True)
-    desk.desk.alive(False)
-    await asyncio.sleep(1)
-    assert desk.air.voices["robot/robot"].told == []
     await desk.peer_supervisors.close()
 
 

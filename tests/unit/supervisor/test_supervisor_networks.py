@@ -6,13 +6,14 @@ import asyncio
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
 
 from lifecycle.errors import ExitCode
 from lifecycle.plan.model import Plan
+from lifecycle.programming.apply.programmer import open_programmer
 from lifecycle.programming.apply.target import (
     ChangeKind,
     FlowChange,
@@ -20,7 +21,7 @@ from lifecycle.programming.apply.target import (
     TargetChanges,
 )
 from lifecycle.programming.apply.targets.registry import target_kind
-from lifecycle.run_directory import OWN_CHILD, RunDirectory, new_run_id
+from lifecycle.run_directory import OWN_CHILD, RunDirectory, new_run_id, run_name
 from lifecycle.supervisor.connections.networks import Networks, open_networks, remove_programmed
 from lifecycle.supervisor.control.client import down
 from lifecycle.supervisor.processes.orphans import reap_adopted
@@ -34,6 +35,7 @@ from tests.unit.programming.apply.servers import TOKEN, NefServer
 from tests.unit.programming.rules.samples import plan, report
 
 _BOUND_S = 5.0
+REAL_TIME = True
 
 
 class FakePrograms:
@@ -105,45 +107,34 @@ class Told:
             self.notices.append(event.message)
 
 
-def test_flows_are_programmed_at_the_gate_followed_afterwards_and_removed_in_the_end(
+async def test_flows_are_programmed_at_the_gate_followed_afterwards_and_removed_in_the_end(
     tmp_path: Path,
 ) -> None:
-    told = Told()
-
-    async def run() -> FakePrograms:
-        programs = FakePrograms()
-        networks = Networks("s", tmp_path, told.emit, programs)
-        told.emit(heard("/before"))
-        await networks.begin(verdict("/gate"))
-        assert programs.seen == [("/gate",)]
-        networks.replan(plan())
-        assert programs.plans == [plan()]
-        programs.asked.clear()
-        told.emit(heard("/later"))
-        await asyncio.wait_for(programs.asked.wait(), _BOUND_S)
-        await networks.close()
-        told.emit(heard("/after"))
-        await asyncio.sleep(0)
-        return programs
-
-    programs = asyncio.run(run())
-
+    told, programs = Told(), FakePrograms()
+    networks = Networks("s", tmp_path, told.emit, programs)
+    told.emit(heard("/before"))
+    await networks.begin(verdict("/gate"))
+    assert programs.seen == [("/gate",)]
+    networks.replan(plan())
+    assert programs.plans == [plan()]
+    programs.asked.clear()
+    told.emit(heard("/later"))
+    await programs.asked.wait()
+    await networks.close()
+    told.emit(heard("/after"))
+    await asyncio.sleep(0)
     assert programs.seen == [("/gate",), ("/later",), ("closed",)]
     assert told.notices[0] == "fake: 1 created, 0 unchanged\n  + k: w"
 
 
-def test_a_first_failure_ends_the_run_and_names_the_privilege(tmp_path: Path) -> None:
-    async def run() -> tuple[StepFailedError, FakePrograms]:
-        programs = FakePrograms()
-        programs.fail = 1
-        networks = Networks("s", tmp_path, Emitter(), programs)
-        with pytest.raises(StepFailedError) as caught:
-            await networks.begin(verdict("/gate"))
-        await networks.close()
-        return caught.value, programs
-
-    error, programs = asyncio.run(run())
-
+async def test_a_first_failure_ends_the_run_and_names_the_privilege(tmp_path: Path) -> None:
+    programs = FakePrograms()
+    programs.fail = 1
+    networks = Networks("s", tmp_path, Emitter(), programs)
+    with pytest.raises(StepFailedError) as caught:
+        await networks.begin(verdict("/gate"))
+    await networks.close()
+    error = caught.value
     assert error.exit_code is ExitCode.BRING_UP_FAILED
     assert (error.rule.id, error.subject) == ("run.not-programmed", "s")
     assert str(error) == (
@@ -153,58 +144,45 @@ def test_a_first_failure_ends_the_run_and_names_the_privilege(tmp_path: Path) ->
     assert programs.seen == [("closed",)]
 
 
-def test_a_later_failure_is_a_notice_and_tried_again(
+async def test_a_later_failure_is_a_notice_and_tried_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("lifecycle.supervisor.connections.networks._AGAIN_S", (0.001, 0.01))
-    told = Told()
-
-    async def run() -> None:
-        programs = FakePrograms()
-        networks = Networks("s", tmp_path, told.emit, programs)
-        await networks.begin(verdict("/gate"))
-        programs.fail = 1
-        told.emit(heard("/later"))
-        programs.asked.clear()  # before each look: what is asked after it wakes us
-        while programs.seen[-1:] != [("/later",)]:
-            await asyncio.wait_for(programs.asked.wait(), _BOUND_S)
-            programs.asked.clear()
-        await networks.close()
-
-    asyncio.run(run())
-
+    told, programs = Told(), FakePrograms()
+    networks = Networks("s", tmp_path, told.emit, programs)
+    await networks.begin(verdict("/gate"))
+    programs.fail = 1
+    told.emit(heard("/later"))
+    programs.asked.clear()  # before each look: what is asked after it wakes us
+    while programs.seen[-1:] != [("/later",)]:
+        await programs.asked.wait()
+        programs.asked.clear()
+    await networks.close()
     said = [each.partition(":")[0] for each in told.notices]
     assert said[:2] == ["fake", "cannot write nft table inet flowqos_s"]
 
 
-def test_without_program_nothing_is_programmed(tmp_path: Path) -> None:
+async def test_without_program_nothing_is_programmed(tmp_path: Path) -> None:
     told = Told()
-
-    async def run() -> None:
-        networks = Networks("s", tmp_path, told.emit)
-        await networks.begin(verdict("/gate"))
-        told.emit(heard("/later"))
-        await networks.close()
-
-    asyncio.run(run())
-
+    networks = Networks("s", tmp_path, told.emit)
+    await networks.begin(verdict("/gate"))
+    told.emit(heard("/later"))
+    await networks.close()
     assert told.notices == []
-    assert list(tmp_path.iterdir()) == []
+    assert list(tmp_path.iterdir()) == []  # noqa: ASYNC240
 
 
 class Applied:
     """A NEF subscription that somebody, or a supervisor, made for a run."""
 
     def __init__(self, directory: Path, server: NefServer) -> None:
+        self.server = server
         settings = nef_settings(server.url, devices=["10.77.0.1"])
         self.options = target_kind("nef").read({"config": settings_file(directory, nef=settings)})
         self.root = directory / "lifecycle"
         self.environment = {"XDG_RUNTIME_DIR": str(directory)}
 
     def apply(self, *, owned: bool = False) -> Path:
-        from lifecycle.programming.apply.programmer import open_programmer
-        from lifecycle.run_directory import run_name
-
         programmer = open_programmer(
             plan(), [self.options], environment=self.environment, owned=owned
         )
@@ -213,72 +191,51 @@ class Applied:
 
 
 @pytest.fixture
-def token(monkeypatch: pytest.MonkeyPatch) -> None:
+def applied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Applied]:
+    """A server that takes subscriptions, and a token for it."""
     monkeypatch.setenv("TEST_TOKEN", TOKEN)
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
-
-
-@pytest.mark.usefixtures("token")
-def test_what_somebody_applied_by_hand_goes_with_the_system(tmp_path: Path) -> None:
-    told = Told()
     with NefServer() as server:
-        directory = Applied(tmp_path, server).apply()
-        assert len(server.subscriptions) == 1
-
-        asyncio.run(Networks("s", directory, told.emit).close())
-
-        assert server.subscriptions == {}
-    assert ": 1 deleted, 0 unchanged" in told.notices[0]
+        yield Applied(tmp_path, server)
 
 
-@pytest.mark.usefixtures("token")
-def test_what_cannot_be_removed_in_the_end_is_a_notice_and_stays_listed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("may", [True, False])
+def test_what_somebody_applied_by_hand_goes_with_the_system_or_stays_listed(
+    applied: Applied, may: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told = Told()
-    with NefServer() as server:
-        directory = Applied(tmp_path, server).apply()
+    directory = applied.apply()
+    assert len(applied.server.subscriptions) == 1
+    if not may:
         monkeypatch.delenv("TEST_TOKEN")
+    asyncio.run(Networks("s", directory, told.emit).close())
+    said = "1 deleted, 0 unchanged" if may else "TEST_TOKEN: it is empty or not set"
+    assert said in told.notices[0]
+    assert len(applied.server.subscriptions) == (not may)
+    assert (directory / "programmed.json").exists() is not may
 
-        asyncio.run(Networks("s", directory, told.emit).close())
 
-    assert "environment variable TEST_TOKEN: it is empty or not set" in told.notices[0]
-    assert (directory / "programmed.json").exists()
-
-
-@pytest.mark.usefixtures("token")
-def test_down_of_a_dead_supervisors_run_removes_what_it_programmed(tmp_path: Path) -> None:
-    with NefServer() as server:
-        directory = Applied(tmp_path, server).apply(owned=True)
-
-        assert down(directory, _BOUND_S) is ExitCode.OK
-
-        assert server.subscriptions == {}
+def test_down_of_a_dead_supervisors_run_removes_what_it_programmed(applied: Applied) -> None:
+    directory = applied.apply(owned=True)
+    assert down(directory, _BOUND_S) is ExitCode.OK
+    assert applied.server.subscriptions == {}
     assert remove_programmed(directory) == ()
 
 
-@pytest.mark.usefixtures("token")
 def test_before_it_programs_a_run_removes_what_dead_runs_left_even_its_own(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    applied: Applied,
 ) -> None:
     told = Told()
-    with NefServer() as server:
-        applied = Applied(tmp_path, server)
-        path = applied.apply(owned=True)
-        ledger = path / "programmed.json"
-        ledger.write_text(ledger.read_text().replace(f'"pid":{os.getpid()}', '"pid":1'))
-        directory = RunDirectory.acquire(path.parent, path.name, new_run_id())
-        try:
-            without = UpOptions()
-            open_networks(plan(), without, directory, told.emit, environment=applied.environment)
-            assert len(server.subscriptions) == 1
-
-            options = UpOptions(program=(applied.options,))
+    path = applied.apply(owned=True)
+    ledger = path / "programmed.json"
+    ledger.write_text(ledger.read_text().replace(f'"pid":{os.getpid()}', '"pid":1'))
+    directory = RunDirectory.acquire(path.parent, path.name, new_run_id())
+    try:
+        for options, left in ((UpOptions(), 1), (UpOptions(program=(applied.options,)), 0)):
             open_networks(plan(), options, directory, told.emit, environment=applied.environment)
-        finally:
-            directory.release()
-
-        assert server.subscriptions == {}
+            assert len(applied.server.subscriptions) == left
+    finally:
+        directory.release()
     assert told.notices[0].startswith("left by a killed supervisor: nef at ")
 
 

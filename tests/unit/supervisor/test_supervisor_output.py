@@ -337,11 +337,36 @@ def test_the_live_table_fits_the_terminal(count: int) -> None:
     assert bool(more) == (count > 24)
 
 
-def test_a_status_is_a_head_and_a_line_for_each_node() -> None:
-    assert status_text(STATUS) == (
-        "robot: active, verdict ok, domain 30, supervisor 1, up for 1.5 s\n"
+CONNECTIONS = (
+    ConnectionReport(
+        name="net",
+        urls=("udpv4://10.77.0.1:7911",),
+        established=True,
+        mappings=("publishers/video",),
+    ),
+    ConnectionReport(name="far", urls=("tcpv4://10.77.0.1:5100",), error="no route"),
+    ConnectionReport(name="idle", urls=("shm://",)),
+)
+
+
+def test_a_status_is_a_head_a_line_for_each_node_and_its_connections_below_it() -> None:
+    dead = msgspec.structs.replace(
+        STATUS.nodes[0],
+        node="/arm",
+        process_state=ProcessState.EXITED,
+        state="",
+        matched=0,
+        died="pid 7 died: killed by SIGKILL",
+    )
+    connected = msgspec.structs.replace(STATUS.nodes[0], connections=CONNECTIONS)
+    assert status_text(msgspec.structs.replace(STATUS, nodes=(dead, connected))) == (
+        "robot: active 1/2, verdict ok, domain 30, supervisor 1, up for 1.5 s\n"
         "node     process  pid  state   matched  unique flows\n"
-        "/camera  running  7    active  1/2      1/3"
+        "/arm     exited   7    dead    0/2      1/3           pid 7 died: killed by SIGKILL\n"
+        "/camera  running  7    active  1/2      1/3\n"
+        "  connection net established; udpv4://10.77.0.1:7911; carries publishers/video\n"
+        "  connection far failed: no route; tcpv4://10.77.0.1:5100; carries nothing\n"
+        "  connection idle waits for peers; shm://; carries nothing"
     )
 
 
@@ -427,46 +452,3 @@ def test_ends_that_form_no_ip_flow_are_shown_as_what_they_tell() -> None:
     flow = dataclasses.replace(FLOW, source=(memory,), destination=())
     (_, row) = render_flows([flow], "text").splitlines()
     assert " ".join(row.split()).startswith("/video /camera /viewer shm unknown – – EF = DSCP 46")
-
-
-def test_a_status_lists_connections_below_their_node() -> None:
-    node = msgspec.structs.replace(
-        STATUS.nodes[0],
-        connections=(
-            ConnectionReport(
-                name="net",
-                urls=("udpv4://10.77.0.1:7911",),
-                established=True,
-                mappings=("publishers/video",),
-            ),
-            ConnectionReport(name="far", urls=("tcpv4://10.77.0.1:5100",), error="no route"),
-            ConnectionReport(name="idle", urls=("shm://",)),
-        ),
-    )
-    lines = status_text(msgspec.structs.replace(STATUS, nodes=(node,))).splitlines()
-    assert lines[3:] == [
-        "  connection net established; udpv4://10.77.0.1:7911; carries publishers/video",
-        "  connection far failed: no route; tcpv4://10.77.0.1:5100; carries nothing",
-        "  connection idle waits for peers; shm://; carries nothing",
-    ]
-
-
-def test_a_dead_node_is_shown_as_dead_with_how_it_ended() -> None:
-    dead = msgspec.structs.replace(
-        STATUS.nodes[0],
-        process_state=ProcessState.EXITED,
-        state="",
-        matched=0,
-        died="pid 7 died: killed by SIGKILL",
-    )
-    lines = status_text(msgspec.structs.replace(STATUS, nodes=(dead, *STATUS.nodes))).splitlines()
-    assert lines[0].startswith("robot: active 1/2, verdict ok, ")
-    assert lines[2].split(maxsplit=6) == [
-        "/camera",
-        "exited",
-        "7",
-        "dead",
-        "0/2",
-        "1/3",
-        "pid 7 died: killed by SIGKILL",
-    ]

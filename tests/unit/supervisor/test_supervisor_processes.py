@@ -485,41 +485,38 @@ def test_a_process_is_confined_with_all_that_it_starts_and_a_limit_too_high_fail
     assert done.stderr.endswith("; allowed: 77\n")
 
 
-def test_what_runs_without_a_supervisor_is_confined_as_well(tmp_path: Path) -> None:
-    manifest = tmp_path / "one.lifecycle.yaml"
-    manifest.write_text(
-        "manifest_version: 1\nsystem: one\nnodes:\n  it:\n    managed: false\n    run:\n"
-        "      command: [bash, -c, 'grep NoNewPrivs /proc/self/status; ulimit -n', bash]\n"
-        "      no_new_privileges: true\n      limits: {nofile: 77}\n"
-    )
-    words = [sys.executable, "-m", "lifecycle", "run", str(manifest), "it"]
-    done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=60)
-    assert (done.stdout.split(), done.stderr) == (["NoNewPrivs:", "1", "77"], "")
+CONFINED = """{command: [bash, -c, 'grep NoNewPrivs /proc/self/status; ulimit -n', bash],
+    no_new_privileges: true, limits: {nofile: 77}}"""
 
 
 @pytest.mark.parametrize(
-    ("resources", "said"),
+    ("run", "printed", "said"),
     [
         (
-            "{memory_max_mib: 64, cpu_quota_percent: 50}",
+            CONFINED,
+            ["NoNewPrivs:", "1", "77"],
+            "",
+        ),
+        (
+            "{command: ['true'], resources: {memory_max_mib: 64, cpu_quota_percent: 50}}",
+            [],
             "systemd-run --user --scope -p MemoryMax=64M -p CPUQuota=50% lifecycle run ...",
         ),
-        ("{}", ""),
+        ("{command: ['true'], resources: {}}", [], ""),
     ],
 )
-def test_what_runs_without_a_supervisor_is_not_limited_and_says_so(
-    tmp_path: Path, resources: str, said: str
+def test_what_runs_without_a_supervisor_is_confined_and_its_resources_are_said_not_to_be(
+    tmp_path: Path, run: str, printed: list[str], said: str
 ) -> None:
     manifest = tmp_path / "one.lifecycle.yaml"
     manifest.write_text(
-        "manifest_version: 1\nsystem: one\nnodes:\n  it:\n    managed: false\n"
-        f"    run: {{command: ['true'], resources: {resources}}}\n"
+        f"manifest_version: 1\nsystem: one\nnodes:\n  it: {{managed: false, run: {run}}}\n"
     )
     words = [sys.executable, "-m", "lifecycle", "run", str(manifest), "it"]
     done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=60)
     if said:
         said = f"warning: the resources of /it are not limited here, as by lifecycle up: {said}\n"
-    assert (done.returncode, done.stderr) == (0, said)
+    assert (done.returncode, done.stdout.split(), done.stderr) == (0, printed, said)
 
 
 _SYSTEMD_RUN = """\

@@ -88,27 +88,23 @@ def test_what_has_only_just_become_expected_may_be_missing_for_a_moment(
 
 
 @pytest.mark.parametrize(
-    "finding",
+    ("findings", "plan"),
     [
-        ("graph.missing-endpoint", "/chatter", "/talker"),
-        ("flow.wrong-medium", "/chatter: /talker → /listener", ""),
-        ("graph.missing-node", "/talker", "/talker"),
-        ("connection.missing", "/talker", "/talker"),
+        ([("graph.missing-endpoint", "/chatter", "/talker")], AFTER),
+        ([("flow.wrong-medium", "/chatter: /talker → /listener", "")], AFTER),
+        ([("graph.missing-node", "/talker", "/talker")], AFTER),
+        ([("connection.missing", "/talker", "/talker")], AFTER),
+        # It was expected at the first look already.
+        ([("graph.missing-endpoint", "/chatter", "/talker")], BEFORE),
+        # With whatever else is wrong all of it is told.
+        ([YOUNG[0], ("graph.missing-node", "/talker", "/talker")], AFTER),
     ],
-    ids=lambda each: each[0],
 )
-def test_what_was_expected_before_may_not(finding: tuple[str, str, str]) -> None:
+def test_what_was_expected_before_may_not(findings: list[tuple[str, str, str]], plan: Plan) -> None:
     grace_period = GracePeriod()
     grace_period.after(None, OK, BEFORE, 10.0)
-    bad = found(finding)
-    assert grace_period.after(OK, bad, AFTER, 20.0) == (bad, None)
-
-
-def test_what_was_expected_at_the_first_look_may_not_be_missing_for_a_moment_later() -> None:
-    grace_period = GracePeriod()
-    grace_period.after(None, OK, BEFORE, 10.0)
-    bad = found(("graph.missing-endpoint", "/chatter", "/talker"))
-    assert grace_period.after(OK, bad, BEFORE, 10.25) == (bad, None)
+    bad = found(*findings)
+    assert grace_period.after(OK, bad, plan, 20.0) == (bad, None)
 
 
 def test_a_connection_that_was_only_just_negotiated_may_be_missing_for_a_moment() -> None:
@@ -119,13 +115,6 @@ def test_a_connection_that_was_only_just_negotiated_may_be_missing_for_a_moment(
     grace_period.after(None, OK, plan, 10.0)
     bad = found(("connection.missing", "/talker", "/talker"))
     assert grace_period.after(OK, bad, source.expected, 20.0) == (OK, PASSING_S)
-
-
-def test_whatever_else_is_wrong_is_told_at_once_with_all_of_it() -> None:
-    grace_period = GracePeriod()
-    grace_period.after(None, OK, BEFORE, 10.0)
-    bad = found(YOUNG[0], ("graph.missing-node", "/talker", "/talker"))
-    assert grace_period.after(OK, bad, AFTER, 20.0) == (bad, None)
 
 
 def test_what_healed_is_told_at_once_too() -> None:
