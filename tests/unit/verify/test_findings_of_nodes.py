@@ -688,7 +688,7 @@ violated graph.unmatched-client: /robot/dock: /viewer → /robot/camera
 cannot see /viewer → /robot/camera matched on action /robot/dock: the client counts no server as
   available
 expected matched, observed the client counts no server as available
-at robot.lifecycle.yaml:20:9, on /viewer (action client)
+at robot.lifecycle.yaml:20:9, on /viewer (action client), of /viewer and /robot/camera
 """,
     ),
     "a client does not say whether it has a server": (
@@ -698,7 +698,7 @@ unverifiable graph.unmatched-client: /robot/camera/calibrate: /viewer → /robot
 cannot verify that /viewer → /robot/camera are matched on service /robot/camera/calibrate: its
   client does not tell
 expected matched, observed its client does not tell
-at robot.lifecycle.yaml:19:9, on /viewer (service client)
+at robot.lifecycle.yaml:19:9, on /viewer (service client), of /viewer and /robot/camera
 """,
     ),
     "a client has one of three servers": (
@@ -716,7 +716,7 @@ cannot verify that /viewer → /robot/camera are matched on service /robot/camer
   has 3 servers, and the client does not tell which it is matched with
 expected matched, observed it has 3 servers, and the client does not tell which it is matched
   with
-at robot.lifecycle.yaml:19:9, on /viewer (service client)
+at robot.lifecycle.yaml:19:9, on /viewer (service client), of /viewer and /robot/camera
 """,
     ),
     "a node is in another state": (

@@ -36,6 +36,7 @@ from tests.unit.verify.edits import (
     drop_report,
 )
 from tests.unit.verify.perfect import perfect
+from tests.unit.verify.told import told as all_told
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
 URL = "udpv4://10.77.0.1:7911?multicast=off&peer=10.77.0.2:7910"
@@ -113,55 +114,6 @@ def test_a_url_may_be_spelled_in_another_order() -> None:
     assert findings(reported(other)) == []
 
 
-@pytest.mark.parametrize(
-    ("edit", "expected", "words"),
-    [
-        (
-            change_configuration("/camera", connections=()),
-            ("connection.missing", "violated", "/camera"),
-            "cannot find connection 'net' of /camera; it has no connection",
-        ),
-        (
-            reported(name="other"),
-            ("connection.missing", "violated", "/camera"),
-            "cannot find connection 'net' of /camera; it has 'other'",
-        ),
-        (
-            reported(error="port 7911 is taken"),
-            ("connection.failed", "violated", "/camera"),
-            f"cannot connect /camera to 'net' ({URL}): port 7911 is taken",
-        ),
-        (
-            reported("shm://"),
-            ("connection.differs", "violated", "/camera"),
-            "cannot accept connection 'net' of /camera: it was connected to shm:// and must be to "
-            + URL,
-        ),
-        (
-            change_report(PUB, "/video", connection=""),
-            ("connection.wrong-mapping", "violated", "/video"),
-            (
-                "cannot accept the publisher of /video in /camera: it is mapped onto the node's own"
-                " participant and must be onto connection 'net'"
-            ),
-        ),
-        (
-            change_report(SUB, "/video", connection="late"),
-            ("connection.wrong-mapping", "violated", "/video"),
-            (
-                "cannot accept the subscription of /video in /viewer: it is mapped onto connection"
-                " 'late' and must be onto the node's own participant"
-            ),
-        ),
-    ],
-)
-def test_a_connection_or_mapping_otherwise_than_planned_is_violated(
-    edit: Edit, expected: tuple[str, str, str], words: str
-) -> None:
-    assert findings(edit) == [expected]
-    assert message(edit) == words
-
-
 def told(edit: Edit, plan: Plan = PLAN) -> Finding:
     """The finding on a connection."""
     (finding,) = (
@@ -178,65 +130,6 @@ def with_urls(*urls: str, first_port: int = 7910) -> Plan:
         PLAN,
         nodes=(connected(PLAN.nodes[0], *urls), PLAN.nodes[1]),
         discovery=dataclasses.replace(PLAN.discovery, first_port=first_port),
-    )
-
-
-def test_a_connection_that_is_missing_is_told_whole() -> None:
-    others = tuple(ConnectionReport(name=name) for name in ("", "b", "a"))
-    assert told(change_configuration("/camera", connections=others)) == Finding(
-        rule="connection.missing",
-        outcome=Outcome.VIOLATED,
-        subject="/camera",
-        expected="connection net",
-        observed="'b', 'a'",
-        message="cannot find connection 'net' of /camera; it has 'b', 'a'",
-        at="robot.lifecycle.yaml:3:3",
-        node="/camera",
-        hint="see who was to make it: the node at connect, or the supervisor by connect_to",
-    )
-
-
-def test_a_connection_that_nobody_reports_is_told_whole() -> None:
-    assert told(unchanged, plan_of(run=Run(kind=RunKind.ATTACH))) == Finding(
-        rule="connection.missing",
-        outcome=Outcome.UNVERIFIABLE,
-        subject="/camera",
-        expected="connection net",
-        observed="unknown",
-        message="cannot verify connection 'net' of /camera: the node does not report its"
-        " connections",
-        at="robot.lifecycle.yaml:3:3",
-        node="/camera",
-        hint="see who was to make it: the node at connect, or the supervisor by connect_to",
-    )
-
-
-def test_a_connection_that_failed_is_told_whole_with_the_urls_that_were_tried() -> None:
-    assert told(reported("shm://", URL, error="port 7911 is taken")) == Finding(
-        rule="connection.failed",
-        outcome=Outcome.VIOLATED,
-        subject="/camera",
-        expected="connection net",
-        observed="port 7911 is taken",
-        message=f"cannot connect /camera to 'net' (shm://, {URL}): port 7911 is taken",
-        at="robot.lifecycle.yaml:3:3",
-        node="/camera",
-        hint="read the reason: addresses and ports of a URL must be free on the node's own machine",
-    )
-
-
-def test_a_connection_to_other_urls_is_told_whole() -> None:
-    assert told(reported("udpv4://", "udpv6://"), with_urls("shm://", URL)) == Finding(
-        rule="connection.differs",
-        outcome=Outcome.VIOLATED,
-        subject="/camera",
-        expected=f"shm://, {URL}",
-        observed="udpv4://, udpv6://",
-        message="cannot accept connection 'net' of /camera: it was connected to udpv4://, udpv6://"
-        f" and must be to shm://, {URL}",
-        at="robot.lifecycle.yaml:3:3",
-        node="/camera",
-        hint="see who called connect_to; disconnect it, and let its authority make it again",
     )
 
 
@@ -272,22 +165,6 @@ def test_what_a_node_has_after_a_restart_is_as_planned(
     plan = with_urls(URL, TCP.format(port=6100, peer=6101), first_port=first_port)
     found = findings(reported(URL, TCP.format(port=port, peer=8200)), plan)
     assert [each[0] for each in found] == (["connection.differs"] if differs else [])
-
-
-def test_a_mapping_otherwise_than_planned_is_told_whole() -> None:
-    assert told(change_report(PUB, "/video", connection="late")) == Finding(
-        rule="connection.wrong-mapping",
-        outcome=Outcome.VIOLATED,
-        subject="/video",
-        expected="connection 'net'",
-        observed="connection 'late'",
-        message="cannot accept the publisher of /video in /camera: it is mapped onto connection"
-        " 'late' and must be onto connection 'net'",
-        at="robot.lifecycle.yaml:10:9",
-        node="/camera",
-        endpoint=PUB,
-        hint="see who called map_to; map it back, or change the node's `connections`",
-    )
 
 
 @pytest.mark.parametrize(
@@ -337,23 +214,115 @@ def own_urls(*urls: str) -> Plan:
     return dataclasses.replace(PLAN, nodes=(PLAN.nodes[0], viewer))
 
 
-def test_an_own_participant_that_was_connected_otherwise_is_told_whole() -> None:
-    own = (
-        ConnectionReport(name="net", urls=("udpv6://",)),
-        ConnectionReport(name="", urls=("udpv4://",)),
-    )
-    assert told(change_configuration("/viewer", connections=own), own_urls("shm://")) == Finding(
-        rule="connection.differs",
-        outcome=Outcome.VIOLATED,
-        subject="/viewer",
-        expected="shm://",
-        observed="udpv4://",
-        message="cannot accept the own participant of /viewer: it was connected to udpv4:// and"
-        " must be to shm://",
-        at="robot.lifecycle.yaml:3:3",
-        node="/viewer",
-        hint="see who called connect_to; disconnect it, and let its authority make it again",
-    )
+OTHERS = tuple(ConnectionReport(name=name) for name in ("", "b", "a"))
+OWN = (
+    ConnectionReport(name="net", urls=("udpv6://",)),
+    ConnectionReport(name="", urls=("udpv4://",)),
+)
+SAYS: dict[str, tuple[Edit, Plan, str]] = {
+    "a node has no connection": (
+        change_configuration("/camera", connections=()),
+        PLAN,
+        """\
+violated connection.missing: /camera
+cannot find connection 'net' of /camera; it has no connection
+expected connection net, observed no connection
+at robot.lifecycle.yaml:3:3, on /camera
+""",
+    ),
+    "a node has other connections": (
+        change_configuration("/camera", connections=OTHERS),
+        PLAN,
+        """\
+violated connection.missing: /camera
+cannot find connection 'net' of /camera; it has 'b', 'a'
+expected connection net, observed 'b', 'a'
+at robot.lifecycle.yaml:3:3, on /camera
+""",
+    ),
+    "a node does not report its connections": (
+        unchanged,
+        plan_of(run=Run(kind=RunKind.ATTACH)),
+        """\
+unverifiable connection.missing: /camera
+cannot verify connection 'net' of /camera: the node does not report its connections
+expected connection net, observed unknown
+at robot.lifecycle.yaml:3:3, on /camera
+""",
+    ),
+    "a connection failed": (
+        reported("shm://", URL, error="port 7911 is taken"),
+        PLAN,
+        """\
+violated connection.failed: /camera
+cannot connect /camera to 'net' (shm://,
+  udpv4://10.77.0.1:7911?multicast=off&peer=10.77.0.2:7910): port 7911 is taken
+expected connection net, observed port 7911 is taken
+at robot.lifecycle.yaml:3:3, on /camera
+""",
+    ),
+    "a connection is to other URLs": (
+        reported("udpv4://", "udpv6://"),
+        with_urls("shm://", URL),
+        """\
+violated connection.differs: /camera
+cannot accept connection 'net' of /camera: it was connected to udpv4://, udpv6:// and must be to
+  shm://, udpv4://10.77.0.1:7911?multicast=off&peer=10.77.0.2:7910
+expected shm://, udpv4://10.77.0.1:7911?multicast=off&peer=10.77.0.2:7910, observed udpv4://,
+  udpv6://
+at robot.lifecycle.yaml:3:3, on /camera
+""",
+    ),
+    "an own participant was connected otherwise": (
+        change_configuration("/viewer", connections=OWN),
+        own_urls("shm://"),
+        """\
+violated connection.differs: /viewer
+cannot accept the own participant of /viewer: it was connected to udpv4:// and must be to shm://
+expected shm://, observed udpv4://
+at robot.lifecycle.yaml:3:3, on /viewer
+""",
+    ),
+    "a publisher is mapped onto another connection": (
+        change_report(PUB, "/video", connection="late"),
+        PLAN,
+        """\
+violated connection.wrong-mapping: /video
+cannot accept the publisher of /video in /camera: it is mapped onto connection 'late' and must
+  be onto connection 'net'
+expected connection 'net', observed connection 'late'
+at robot.lifecycle.yaml:10:9, on /camera (publisher)
+""",
+    ),
+    "a publisher is mapped onto the own participant": (
+        change_report(PUB, "/video", connection=""),
+        PLAN,
+        """\
+violated connection.wrong-mapping: /video
+cannot accept the publisher of /video in /camera: it is mapped onto the node's own participant
+  and must be onto connection 'net'
+expected connection 'net', observed the node's own participant
+at robot.lifecycle.yaml:10:9, on /camera (publisher)
+""",
+    ),
+    "a subscription is mapped onto a connection": (
+        change_report(SUB, "/video", connection="late"),
+        PLAN,
+        """\
+violated connection.wrong-mapping: /video
+cannot accept the subscription of /video in /viewer: it is mapped onto connection 'late' and
+  must be onto the node's own participant
+expected the node's own participant, observed connection 'late'
+at robot.lifecycle.yaml:10:9, on /viewer (subscription)
+""",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", SAYS)
+def test_a_finding_on_a_connection_is_told_whole_where(case: str) -> None:
+    edit, plan, text = SAYS[case]
+    assert all_told([told(edit, plan)]) == text
 
 
 @pytest.mark.parametrize(
@@ -366,29 +335,6 @@ def test_an_own_participant_is_compared_where_both_say_what_it_is_connected_to(
     own = (ConnectionReport(name="", urls=urls),)
     found = findings(change_configuration("/viewer", connections=own), own_urls(*planned_urls))
     assert [each for each in found if each[0].startswith("connection.")] == []
-
-
-def test_the_own_participant_is_judged_by_its_urls_too() -> None:
-    viewer = dataclasses.replace(
-        PLAN.nodes[1], connections=ParticipantConnections(urls=("shm://",))
-    )
-    plan = dataclasses.replace(PLAN, nodes=(PLAN.nodes[0], viewer))
-    own = ConnectionReport(name="", urls=("udpv4://",))
-    assert findings(change_configuration("/viewer", connections=(own,)), plan) == [
-        ("connection.differs", "violated", "/viewer")
-    ]
-
-
-def test_what_a_foreign_node_is_connected_to_is_unverifiable() -> None:
-    plan = plan_of(run=Run(kind=RunKind.ATTACH))
-    found = [each for each in findings(unchanged, plan) if each[0].startswith("connection.")]
-    assert found == [("connection.missing", "unverifiable", "/camera")]
-
-
-def test_a_hidden_node_of_a_connection_is_nobody_else() -> None:
-    seen = perfect(PLAN)
-    assert "/_camera_net" in {each.full_name for each in seen.nodes}
-    assert findings(unchanged) == []
 
 
 # --- what discovery cannot show

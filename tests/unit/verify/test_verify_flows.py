@@ -37,6 +37,7 @@ from tests.unit.verify.edits import (
     drop_report,
 )
 from tests.unit.verify.perfect import perfect
+from tests.unit.verify.told import told
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
 PLAN = build_plan(teleop(), environment={})
@@ -202,19 +203,6 @@ def test_a_link_demands_weakly_or_strongly_unique_flows(demanded, unique_ends, o
     )
 
 
-def test_an_unmet_link_says_which_end_is_not_unique():
-    plan = planned(
-        node("one", publisher("a"), publisher("b")),
-        node("two", subscription("a")),
-        links=[link("/a", "one", "two", unique=UniqueHow.STRONGLY)],
-    )
-    (finding,) = verify(plan, perfect(plan), stage=Stage.CONNECTED).findings
-    assert finding.message == (
-        "cannot accept the flow /one → /two on /a: its link demands a strongly unique flow;"
-        " publisher not unique, subscription unique"
-    )
-
-
 def test_a_link_between_nodes_that_declare_no_such_endpoints_is_unmatched():
     plan = planned(node("one"), node("two"), links=[link("/a", "one", "two")])
     (finding,) = verify(plan, perfect(plan), stage=Stage.CONNECTED).findings
@@ -227,14 +215,6 @@ def test_a_link_between_nodes_that_declare_no_such_endpoints_is_unmatched():
 # --- what findings on flows say
 
 STRICTLY = UniqueRequirement.STRICTLY_REQUIRED
-NOT_UNIQUE_FIX = (
-    "ask for `unique:` on the endpoint itself, so that it gets sockets of its own; see"
-    " `lifecycle flows`"
-)
-UNVERIFIABLE_FIX = (
-    "run the node with `run: python` under rmw_fastrtps_cpp, which reports network flow"
-    " endpoints; or ask for `unique: optionally_required`, or drop the link's `unique`"
-)
 
 
 def of_flows(edit: Edit, plan: Plan) -> list[Finding]:
@@ -284,63 +264,191 @@ SHARED = both(
 )
 
 
-def test_a_strict_endpoint_that_shares_its_flow_is_told_whole():
-    shared = "shm, udp 0.0.0.0:40000, udp [fd00::1]:40001"
-    assert of_flows(SHARED, strict()) == [
-        Finding(
-            rule="flow.not-unique",
-            outcome=Outcome.VIOLATED,
-            subject="/a",
-            expected="unique publisher",
-            observed=f"shares {shared}",
-            message="cannot accept the publisher of /a in /one: it strictly requires a unique"
-            f" network flow and shares {shared} with other publishers",
-            at="robot.lifecycle.yaml:11:9",
-            node="/one",
-            endpoint=PUB,
-            hint=NOT_UNIQUE_FIX,
+def marked(*, enforce: bool = True) -> Plan:
+    return planned(
+        node(
+            "one",
+            publisher("a"),
+            publisher("b"),
+            needs=[need(PUB, name, dscp=46, enforce=enforce) for name in ("a", "b")],
         )
-    ]
+    )
+
+
+def unlinked_ends(how: UniqueHow) -> Plan:
+    """Ends that share their flows, and a link that demands one of its own."""
+    return planned(
+        node("one", publisher("a"), publisher("b")),
+        node("two", subscription("a"), subscription("b")),
+        links=[link("/a", "one", "two", unique=how)],
+    )
+
+
+RATE = (Quantity(name="rate_hz", value=5, at=at(22, 3)),)
+DELAY = (Quantity(name="max_delay_ms", value=2, at=at(40, 7)),)
+NUMBERS = planned(
+    node("one", publisher("a"), needs=[need(PUB, "a", quantities=RATE)]),
+    node("two", subscription("a")),
+    links=[link("/a", "one", "two", quantities=DELAY)],
+)
+SAYS: dict[str, tuple[Edit, Plan, str]] = {
+    "a strict endpoint shares its flow": (
+        SHARED,
+        strict(),
+        """\
+violated flow.not-unique: /a
+cannot accept the publisher of /a in /one: it strictly requires a unique network flow and shares
+  shm, udp 0.0.0.0:40000, udp [fd00::1]:40001 with other publishers
+expected unique publisher, observed shares shm, udp 0.0.0.0:40000, udp [fd00::1]:40001
+at robot.lifecycle.yaml:11:9, on /one (publisher)
+""",
+    ),
+    "the RMW of a strict endpoint reports no network flow endpoints": (
+        change_report(PUB, "/a", nfes=None),
+        strict(),
+        """\
+violated flow.unverifiable: /a
+cannot accept the publisher of /a in /one: it strictly requires a unique network flow, which
+  cannot be proven: its RMW does not report network flow endpoints
+expected unique publisher, observed network flow endpoints not reported
+at robot.lifecycle.yaml:11:9, on /one (publisher)
+""",
+    ),
+    "an endpoint beside a strict one reports none": (
+        change_report(PUB, "/b", nfes=None),
+        strict(),
+        """\
+violated flow.unverifiable: /a
+cannot accept the publisher of /a in /one: it strictly requires a unique network flow, which
+  cannot be proven: its process has endpoints whose network flow endpoints are not reported
+expected unique publisher, observed network flow endpoints not reported
+at robot.lifecycle.yaml:11:9, on /one (publisher)
+""",
+    ),
+    "the node of a strict endpoint reports it by its participant alone": (
+        both(carried("/one", "/a"), drop_endpoint_report(PUB, "/a")),
+        strict(),
+        """\
+violated flow.unverifiable: /a
+cannot accept the publisher of /a in /one: it strictly requires a unique network flow, which
+  cannot be proven: /one does not report its network flow endpoints
+expected unique publisher, observed network flow endpoints not reported
+at robot.lifecycle.yaml:11:9, on /one (publisher)
+""",
+    ),
+    "nothing can reach a subscription": (
+        change_report(SUB, "/a", nfes=()),
+        strict(),
+        """\
+violated flow.broken-endpoint: /a
+cannot reach the subscription of /a in /two: it has no network flow endpoint
+expected at least one network flow endpoint, observed none
+at robot.lifecycle.yaml:13:9, on /two (subscription)
+""",
+    ),
+    "a link that demands a weakly unique flow has none": (
+        unchanged,
+        unlinked_ends(UniqueHow.WEAKLY),
+        """\
+violated flow.not-unique: /a: /one → /two
+cannot accept the flow /one → /two on /a: its link demands a weakly unique flow; publisher not
+  unique, subscription not unique
+expected weakly unique flow, observed publisher not unique, subscription not unique
+at robot.lifecycle.yaml:10:9, on no node, of /one and /two
+""",
+    ),
+    "a link that demands a strongly unique flow has none": (
+        unchanged,
+        unlinked_ends(UniqueHow.STRONGLY),
+        """\
+violated flow.not-unique: /a: /one → /two
+cannot accept the flow /one → /two on /a: its link demands a strongly unique flow; publisher not
+  unique, subscription not unique
+expected strongly unique flow, observed publisher not unique, subscription not unique
+at robot.lifecycle.yaml:10:9, on no node, of /one and /two
+""",
+    ),
+    "the demand of a link cannot be proven": (
+        change_report(SUB, "/a", nfes=None),
+        strict(linked=UniqueHow.STRONGLY),
+        """\
+violated flow.unverifiable: /a: /one → /two
+cannot accept the flow /one → /two on /a: its link demands a strongly unique flow, which cannot
+  be proven; publisher unique, subscription unknown
+expected strongly unique flow, observed publisher unique, subscription unknown
+at robot.lifecycle.yaml:13:9, on no node, of /one and /two
+""",
+    ),
+    "nobody measures numbers": (
+        unchanged,
+        NUMBERS,
+        """\
+unverifiable flow.not-measured: /a
+cannot verify rate_hz 5 of the publisher of /a in /one: nothing measures it
+expected rate_hz 5, observed not measured
+at robot.lifecycle.yaml:22:3, on /one (publisher)
+
+unverifiable flow.not-measured: /a: /one → /two
+cannot verify max_delay_ms 2 of the flow /one → /two on /a: nothing measures it
+expected max_delay_ms 2, observed not measured
+at robot.lifecycle.yaml:40:7, on no node, of /one and /two
+""",
+    ),
+    "sockets carry another DSCP": (
+        change_report(PUB, "/a", dscp=8),
+        marked(),
+        """\
+violated flow.dscp-not-applied: /a
+cannot accept the publisher of /a in /one: its sockets carry CS1 = DSCP 8 = TOS 32 (0x20) and
+  not EF = DSCP 46 = TOS 184 (0xb8)
+expected EF = DSCP 46 = TOS 184 (0xb8), observed CS1 = DSCP 8 = TOS 32 (0x20)
+at robot.lifecycle.yaml:10:9, on /one (publisher)
+""",
+    ),
+    "sockets carry another DSCP, which is not enforced": (
+        change_report(PUB, "/a", dscp=8),
+        marked(enforce=False),
+        """\
+unverifiable flow.dscp-not-applied: /a
+cannot accept the publisher of /a in /one: its sockets carry CS1 = DSCP 8 = TOS 32 (0x20) and
+  not EF = DSCP 46 = TOS 184 (0xb8); the manifest does not enforce it
+expected EF = DSCP 46 = TOS 184 (0xb8), observed CS1 = DSCP 8 = TOS 32 (0x20)
+at robot.lifecycle.yaml:10:9, on /one (publisher)
+to do: see the node's log for the refused option
+""",
+    ),
+    "nobody read a DSCP back": (
+        change_report(PUB, "/a", dscp=None),
+        marked(),
+        """\
+unverifiable flow.dscp-unverifiable: /a
+cannot verify the DSCP of the publisher of /a in /one: nobody read it back
+expected EF = DSCP 46 = TOS 184 (0xb8), observed not read back
+at robot.lifecycle.yaml:10:9, on /one (publisher)
+""",
+    ),
+    "a DSCP is that of a participant alone": (
+        both(carried("/one", "/a"), drop_endpoint_report(PUB, "/a")),
+        marked(),
+        """\
+unverifiable flow.dscp-unverifiable: /a
+cannot verify the DSCP of the publisher of /a in /one: nobody read it back
+expected EF = DSCP 46 = TOS 184 (0xb8), observed not read back
+at robot.lifecycle.yaml:10:9, on /one (publisher)
+""",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", SAYS)
+def test_a_finding_on_a_flow_is_told_whole_where(case: str):
+    edit, plan, text = SAYS[case]
+    assert told(of_flows(edit, plan)) == text
 
 
 def test_a_strict_publisher_without_any_socket_is_not_unique():
     (found,) = of_flows(change_report(PUB, "/a", nfes=(SHM,)), strict())
     assert (found.rule, found.observed) == ("flow.not-unique", "shares shm")
-
-
-@pytest.mark.parametrize(
-    ("edit", "why"),
-    [
-        (
-            change_report(PUB, "/a", nfes=None),
-            "its RMW does not report network flow endpoints",
-        ),
-        (
-            change_report(PUB, "/b", nfes=None),
-            "its process has endpoints whose network flow endpoints are not reported",
-        ),
-        (
-            both(carried("/one", "/a"), drop_endpoint_report(PUB, "/a")),
-            "/one does not report its network flow endpoints",
-        ),
-    ],
-)
-def test_a_strict_endpoint_whose_flow_cannot_be_proven_is_told_whole(edit: Edit, why: str):
-    assert of_flows(edit, strict()) == [
-        Finding(
-            rule="flow.unverifiable",
-            outcome=Outcome.VIOLATED,
-            subject="/a",
-            expected="unique publisher",
-            observed="network flow endpoints not reported",
-            message="cannot accept the publisher of /a in /one: it strictly requires a unique"
-            f" network flow, which cannot be proven: {why}",
-            at="robot.lifecycle.yaml:11:9",
-            node="/one",
-            endpoint=PUB,
-            hint=UNVERIFIABLE_FIX,
-        )
-    ]
 
 
 @pytest.mark.parametrize(
@@ -374,24 +482,6 @@ def test_one_endpoint_that_says_nothing_does_not_end_the_judgement_of_the_others
     ]
 
 
-def test_a_subscription_that_nothing_can_reach_is_told_whole():
-    assert of_flows(change_report(SUB, "/a", nfes=()), strict()) == [
-        Finding(
-            rule="flow.broken-endpoint",
-            outcome=Outcome.VIOLATED,
-            subject="/a",
-            expected="at least one network flow endpoint",
-            observed="none",
-            message="cannot reach the subscription of /a in /two: it has no network flow endpoint",
-            at="robot.lifecycle.yaml:13:9",
-            node="/two",
-            endpoint=SUB,
-            hint="look for two processes with the same fixed ports, or an interface whitelist that"
-            " matches no interface",
-        )
-    ]
-
-
 @pytest.mark.parametrize(
     "edit",
     [
@@ -406,49 +496,6 @@ def test_only_a_subscription_that_was_made_and_has_no_nfe_is_broken(edit: Edit):
 
 
 # --- links
-
-
-@pytest.mark.parametrize("how", [UniqueHow.WEAKLY, UniqueHow.STRONGLY])
-def test_a_link_whose_demand_is_not_met_is_told_whole(how: UniqueHow):
-    plan = planned(
-        node("one", publisher("a"), publisher("b")),
-        node("two", subscription("a"), subscription("b")),
-        links=[link("/a", "one", "two", unique=how)],
-    )
-    observed = "publisher not unique, subscription not unique"
-    assert of_flows(unchanged, plan) == [
-        Finding(
-            rule="flow.not-unique",
-            outcome=Outcome.VIOLATED,
-            subject="/a: /one → /two",
-            ends=("/one", "/two"),
-            expected=f"{how.value} unique flow",
-            observed=observed,
-            message="cannot accept the flow /one → /two on /a: its link demands a"
-            f" {how.value} unique flow; {observed}",
-            at="robot.lifecycle.yaml:10:9",
-            hint=NOT_UNIQUE_FIX,
-        )
-    ]
-
-
-def test_a_link_whose_demand_cannot_be_proven_is_told_whole():
-    plan = strict(linked=UniqueHow.STRONGLY)
-    observed = "publisher unique, subscription unknown"
-    assert of_flows(change_report(SUB, "/a", nfes=None), plan) == [
-        Finding(
-            rule="flow.unverifiable",
-            outcome=Outcome.VIOLATED,
-            subject="/a: /one → /two",
-            ends=("/one", "/two"),
-            expected="strongly unique flow",
-            observed=observed,
-            message="cannot accept the flow /one → /two on /a: its link demands a strongly unique"
-            f" flow, which cannot be proven; {observed}",
-            at="robot.lifecycle.yaml:13:9",
-            hint=UNVERIFIABLE_FIX,
-        )
-    ]
 
 
 @pytest.mark.parametrize(
@@ -491,46 +538,6 @@ def test_a_link_that_demands_nothing_does_not_end_the_judgement_of_the_others():
 # --- numbers
 
 
-def test_a_number_that_nobody_measures_is_told_whole():
-    rate = Quantity(name="rate_hz", value=5, at=at(22, 3))
-    delay = Quantity(name="max_delay_ms", value=2, at=at(40, 7))
-    plan = planned(
-        node("one", publisher("a"), needs=[need(PUB, "a", quantities=(rate,))]),
-        node("two", subscription("a")),
-        links=[link("/a", "one", "two", quantities=(delay,))],
-    )
-    fix = (
-        "nothing here measures it: measure it where the data are used, or leave it out of the"
-        " manifest; `--strict` refuses it, and so does `policy.unverifiable: block`"
-    )
-    assert of_flows(unchanged, plan) == [
-        Finding(
-            rule="flow.not-measured",
-            outcome=Outcome.UNVERIFIABLE,
-            subject="/a",
-            expected="rate_hz 5",
-            observed="not measured",
-            message="cannot verify rate_hz 5 of the publisher of /a in /one: nothing measures it",
-            at="robot.lifecycle.yaml:22:3",
-            node="/one",
-            endpoint=PUB,
-            hint=fix,
-        ),
-        Finding(
-            rule="flow.not-measured",
-            outcome=Outcome.UNVERIFIABLE,
-            subject="/a: /one → /two",
-            ends=("/one", "/two"),
-            expected="max_delay_ms 2",
-            observed="not measured",
-            message="cannot verify max_delay_ms 2 of the flow /one → /two on /a: nothing measures"
-            " it",
-            at="robot.lifecycle.yaml:40:7",
-            hint=fix,
-        ),
-    ]
-
-
 @pytest.mark.parametrize(
     ("edit", "named"),
     [
@@ -560,78 +567,7 @@ def test_numbers_are_named_of_what_is_there_and_of_nothing_else(edit, named):
 # --- DSCP
 
 
-def marked(*, enforce: bool = True) -> Plan:
-    return planned(
-        node(
-            "one",
-            publisher("a"),
-            publisher("b"),
-            needs=[need(PUB, name, dscp=46, enforce=enforce) for name in ("a", "b")],
-        )
-    )
-
-
 EF, CS1 = "EF = DSCP 46 = TOS 184 (0xb8)", "CS1 = DSCP 8 = TOS 32 (0x20)"
-
-
-@pytest.mark.parametrize(
-    ("enforce", "outcome", "waived", "hint"),
-    [
-        (
-            True,
-            Outcome.VIOLATED,
-            "",
-            "see the node's log for the refused socket option; `enforce: false` makes it a warning",
-        ),
-        (
-            False,
-            Outcome.UNVERIFIABLE,
-            "; the manifest does not enforce it",
-            "see the node's log for the refused option",
-        ),
-    ],
-)
-def test_sockets_that_carry_another_dscp_are_told_whole(enforce, outcome, waived, hint):
-    assert of_flows(change_report(PUB, "/a", dscp=8), marked(enforce=enforce)) == [
-        Finding(
-            rule="flow.dscp-not-applied",
-            outcome=outcome,
-            subject="/a",
-            expected=EF,
-            observed=CS1,
-            message="cannot accept the publisher of /a in /one: its sockets carry"
-            f" {CS1} and not {EF}{waived}",
-            at="robot.lifecycle.yaml:10:9",
-            node="/one",
-            endpoint=PUB,
-            hint=hint,
-        )
-    ]
-
-
-@pytest.mark.parametrize(
-    "edit",
-    [
-        change_report(PUB, "/a", dscp=None),
-        both(carried("/one", "/a"), drop_endpoint_report(PUB, "/a")),
-    ],
-)
-def test_a_dscp_that_nobody_read_back_is_told_whole(edit: Edit):
-    assert of_flows(edit, marked()) == [
-        Finding(
-            rule="flow.dscp-unverifiable",
-            outcome=Outcome.UNVERIFIABLE,
-            subject="/a",
-            expected=EF,
-            observed="not read back",
-            message="cannot verify the DSCP of the publisher of /a in /one: nobody read it back",
-            at="robot.lifecycle.yaml:10:9",
-            node="/one",
-            endpoint=PUB,
-            hint="only nodes in our host mark and read back; mark a foreign node's flow in the"
-            " network",
-        )
-    ]
 
 
 def test_the_dscp_of_an_endpoint_that_only_its_node_tells_of_is_judged():

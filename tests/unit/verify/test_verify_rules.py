@@ -14,7 +14,6 @@ from lifecycle.manifest.model import (
     Quantity,
     Run,
     RunKind,
-    UniqueHow,
 )
 from lifecycle.manifest.qos import (
     Durability,
@@ -76,13 +75,11 @@ ATTACH = Run(kind=RunKind.ATTACH)
 PLAN = build_plan(teleop(), environment={})
 
 
-def findings_after(
-    edit: Edit, *, plan: Plan = PLAN, stage: Stage = Stage.CONNECTED
-) -> list[tuple[str, str, str]]:
+def findings_after(edit: Edit, *, plan: Plan = PLAN, stage: Stage = Stage.CONNECTED) -> list[str]:
     """All that is found but `flow.unreported`, which has tests of its own."""
     verdict = verify(plan, edit(perfect(plan, stage)), stage=stage)
     return [
-        (each.rule, each.outcome.value, each.subject)
+        f"{each.outcome.value} {each.rule}: {each.subject}"
         for each in verdict.findings
         if each.rule != "flow.unreported"
     ]
@@ -101,10 +98,10 @@ def test_a_system_exactly_as_planned_is_ok(stage: Stage):
     assert [flow.outcome for flow in verdict.flows] == [Outcome.OK] * 3
 
 
-FIRES: dict[str, tuple[Edit, list[tuple[str, str, str]]]] = {
+FIRES: dict[str, tuple[Edit, list[str]]] = {
     "a node is gone from the graph, its endpoints still there": (
         drop_node("/viewer"),
-        [("graph.missing-node", "violated", "/viewer")],
+        ["violated graph.missing-node: /viewer"],
     ),
     "nothing of a node is seen": (
         both(
@@ -114,93 +111,84 @@ FIRES: dict[str, tuple[Edit, list[tuple[str, str, str]]]] = {
                 seen, endpoints=tuple(e for e in seen.endpoints if e.node != "/viewer")
             ),
         ),
-        [
-            ("graph.missing-node", "violated", "/viewer"),
-            ("graph.unmatched-link", "violated", FLOW),
-        ],
+        ["violated graph.missing-node: /viewer", f"violated graph.unmatched-link: {FLOW}"],
     ),
-    "one more node": (
-        add_node("/spy"),
-        [("graph.undeclared-node", "violated", "/spy")],
-    ),
+    "one more node": (add_node("/spy"), ["violated graph.undeclared-node: /spy"]),
     "an endpoint of a node that discovery does not list yet": (
         add_endpoint(SUB, "/spy", STATUS, gid="99", qos=QosProfile(depth=0)),
-        [("graph.undeclared-node", "violated", "/spy")],
+        ["violated graph.undeclared-node: /spy"],
     ),
     "two nodes of one name": (
         change_node("/viewer", count=2),
-        [("graph.duplicate-node", "violated", "/viewer")],
+        ["violated graph.duplicate-node: /viewer"],
     ),
     "a node name listed twice": (
         add_node("/viewer", state="inactive", managed=True),
-        [("graph.duplicate-node", "violated", "/viewer")],
+        ["violated graph.duplicate-node: /viewer"],
     ),
     "a missing publisher that no link names": (
         drop_endpoint(PUB, STATUS),
-        [("graph.missing-endpoint", "violated", STATUS)],
+        [f"violated graph.missing-endpoint: {STATUS}"],
     ),
     "a missing publisher of a link": (
         drop_endpoint(PUB, VIDEO),
-        [
-            ("graph.missing-endpoint", "violated", VIDEO),
-            ("graph.unmatched-link", "violated", FLOW),
-        ],
+        [f"violated graph.missing-endpoint: {VIDEO}", f"violated graph.unmatched-link: {FLOW}"],
     ),
     "a missing subscription": (
         drop_endpoint(SUB, BATTERY),
-        [("graph.missing-endpoint", "violated", BATTERY)],
+        [f"violated graph.missing-endpoint: {BATTERY}"],
     ),
     "a missing service server": (
         drop_endpoint(SERVER, "/robot/camera/calibrate"),
-        [("graph.missing-endpoint", "violated", "/robot/camera/calibrate")],
+        ["violated graph.missing-endpoint: /robot/camera/calibrate"],
     ),
     "a missing service client": (
         drop_endpoint(CLIENT, "/robot/camera/calibrate"),
-        [("graph.missing-endpoint", "violated", "/robot/camera/calibrate")],
+        ["violated graph.missing-endpoint: /robot/camera/calibrate"],
     ),
     "a missing action server": (
         drop_endpoint(ACTION_SERVER, "/robot/dock"),
-        [("graph.missing-endpoint", "violated", "/robot/dock")],
+        ["violated graph.missing-endpoint: /robot/dock"],
     ),
     "a missing action client": (
         drop_endpoint(ACTION_CLIENT, "/robot/dock"),
-        [("graph.missing-endpoint", "violated", "/robot/dock")],
+        ["violated graph.missing-endpoint: /robot/dock"],
     ),
     "an undeclared publisher": (
         add_endpoint(PUB, "/viewer", "/extra", gid="99"),
-        [("graph.undeclared-publisher", "violated", "/extra")],
+        ["violated graph.undeclared-publisher: /extra"],
     ),
     "a second publisher where one is declared": (
         add_endpoint(PUB, "/robot/camera", STATUS, gid="99", qos=QosProfile()),
-        [("graph.undeclared-publisher", "violated", STATUS)],
+        [f"violated graph.undeclared-publisher: {STATUS}"],
     ),
     "an undeclared subscription": (
         add_endpoint(SUB, "/viewer", "/extra", gid="99"),
-        [("graph.undeclared-subscription", "violated", "/extra")],
+        ["violated graph.undeclared-subscription: /extra"],
     ),
     "an undeclared service server": (
         add_endpoint(SERVER, "/viewer", "/extra", type="std_srvs/srv/Trigger"),
-        [("graph.undeclared-service-server", "violated", "/extra")],
+        ["violated graph.undeclared-service-server: /extra"],
     ),
     "an undeclared service client": (
         add_endpoint(CLIENT, "/viewer", "/extra", type="std_srvs/srv/Trigger"),
-        [("graph.undeclared-service-client", "violated", "/extra")],
+        ["violated graph.undeclared-service-client: /extra"],
     ),
     "an undeclared action server": (
         add_endpoint(ACTION_SERVER, "/viewer", "/extra", type="a/action/B"),
-        [("graph.undeclared-action-server", "violated", "/extra")],
+        ["violated graph.undeclared-action-server: /extra"],
     ),
     "an undeclared action client": (
         add_endpoint(ACTION_CLIENT, "/viewer", "/extra", type="a/action/B"),
-        [("graph.undeclared-action-client", "violated", "/extra")],
+        ["violated graph.undeclared-action-client: /extra"],
     ),
     "a publisher in a hidden participant that is not the owner's": (
         add_endpoint(PUB, "/robot/_camera_flow_0", "/extra", gid="99"),
-        [("graph.undeclared-node", "violated", "/robot/_camera_flow_0")],
+        ["violated graph.undeclared-node: /robot/_camera_flow_0"],
     ),
     "a part of an action of another type": (
         add_endpoint(PUB, "/robot/camera", "/robot/dock/_action/status", gid="99"),
-        [("graph.type-mismatch", "violated", "/robot/dock")],
+        ["violated graph.type-mismatch: /robot/dock"],
     ),
     "a publisher of another type": (
         both(
@@ -208,7 +196,7 @@ FIRES: dict[str, tuple[Edit, list[tuple[str, str, str]]]] = {
             change_report(PUB, STATUS, type="std_msgs/msg/Int32", matched=0),
             change_report(SUB, STATUS, matched=0),
         ),
-        [("graph.type-mismatch", "violated", STATUS)],
+        [f"violated graph.type-mismatch: {STATUS}"],
     ),
     "a publisher of a link of another type": (
         both(
@@ -216,43 +204,38 @@ FIRES: dict[str, tuple[Edit, list[tuple[str, str, str]]]] = {
             change_report(PUB, VIDEO, type="std_msgs/msg/Int32", matched=0),
             change_report(SUB, VIDEO, matched=0),
         ),
-        [
-            ("graph.type-mismatch", "violated", VIDEO),
-            ("graph.unmatched-link", "violated", FLOW),
-        ],
+        [f"violated graph.type-mismatch: {VIDEO}", f"violated graph.unmatched-link: {FLOW}"],
     ),
     "a service of another type": (
         change_endpoint(SERVER, "/robot/camera/calibrate", type="std_srvs/srv/Empty"),
-        [("graph.type-mismatch", "violated", "/robot/camera/calibrate")],
+        ["violated graph.type-mismatch: /robot/camera/calibrate"],
     ),
     "a node that could not make an endpoint": (
         both(
             drop_endpoint(PUB, STATUS),
             change_report(PUB, STATUS, gid="", nfes=None, matched=None, error="not feasible"),
         ),
-        [("endpoint.error", "violated", STATUS)],
+        [f"violated endpoint.error: {STATUS}"],
     ),
     "an endpoint whose node is not known": (
         add_endpoint(PUB, "", "/extra", gid="99"),
-        [("graph.unattributed-endpoint", "violated", "/extra")],
+        ["violated graph.unattributed-endpoint: /extra"],
     ),
     "an announced policy that differs": (
-        both(
-            change_announced_qos(SUB, STATUS, reliability=Reliability.BEST_EFFORT),
-        ),
-        [("graph.qos-differs", "violated", STATUS)],
+        both(change_announced_qos(SUB, STATUS, reliability=Reliability.BEST_EFFORT)),
+        [f"violated graph.qos-differs: {STATUS}"],
     ),
     "a reported depth that differs": (
         change_reported_qos(SUB, STATUS, depth=1),
-        [("graph.qos-differs", "violated", STATUS)],
+        [f"violated graph.qos-differs: {STATUS}"],
     ),
     "two announced policies that differ": (
         change_announced_qos(PUB, STATUS, deadline_ns=10**9, durability=Durability.TRANSIENT_LOCAL),
-        [("graph.qos-differs", "violated", STATUS), ("graph.qos-differs", "violated", STATUS)],
+        [f"violated graph.qos-differs: {STATUS}", f"violated graph.qos-differs: {STATUS}"],
     ),
     "a report without QoS": (
         change_report(SUB, STATUS, qos=None),
-        [("graph.qos-unverifiable", "unverifiable", "/viewer")],
+        ["unverifiable graph.qos-unverifiable: /viewer"],
     ),
     "a pair that is incompatible": (
         both(
@@ -261,8 +244,8 @@ FIRES: dict[str, tuple[Edit, list[tuple[str, str, str]]]] = {
             change_report(SUB, STATUS, matched=0),
         ),
         [
-            ("graph.qos-differs", "violated", STATUS),
-            ("graph.qos-incompatible", "violated", "/robot/status: /robot/camera → /viewer"),
+            f"violated graph.qos-differs: {STATUS}",
+            "violated graph.qos-incompatible: /robot/status: /robot/camera → /viewer",
         ],
     ),
     "an incompatible pair with an undeclared end": (
@@ -270,8 +253,8 @@ FIRES: dict[str, tuple[Edit, list[tuple[str, str, str]]]] = {
             PUB, "/viewer", STATUS, gid="99", qos=QosProfile(reliability=Reliability.BEST_EFFORT)
         ),
         [
-            ("graph.undeclared-publisher", "violated", STATUS),
-            ("graph.qos-incompatible", "violated", "/robot/status: /viewer → /viewer"),
+            f"violated graph.undeclared-publisher: {STATUS}",
+            "violated graph.qos-incompatible: /robot/status: /viewer → /viewer",
         ],
     ),
     "a pair whose policy is not known": (
@@ -280,32 +263,32 @@ FIRES: dict[str, tuple[Edit, list[tuple[str, str, str]]]] = {
             change_reported_qos(PUB, STATUS, reliability=Reliability.UNKNOWN),
         ),
         [
-            ("graph.qos-unverifiable", "unverifiable", "/robot/camera"),
-            ("graph.qos-incompatible", "unverifiable", "/robot/status: /robot/camera → /viewer"),
+            "unverifiable graph.qos-unverifiable: /robot/camera",
+            "unverifiable graph.qos-incompatible: /robot/status: /robot/camera → /viewer",
         ],
     ),
     "a flow that both ends say is unmatched": (
         both(change_report(PUB, STATUS, matched=0), change_report(SUB, STATUS, matched=0)),
-        [("graph.unmatched-flow", "violated", "/robot/status: /robot/camera → /viewer")],
+        ["violated graph.unmatched-flow: /robot/status: /robot/camera → /viewer"],
     ),
     "a link that both ends say is unmatched": (
         both(change_report(PUB, VIDEO, matched=0), change_report(SUB, VIDEO, matched=0)),
-        [("graph.unmatched-link", "violated", FLOW)],
+        [f"violated graph.unmatched-link: {FLOW}"],
     ),
     "a flow that the only end with a count says is unmatched": (
         both(change_report(PUB, STATUS, matched=None), change_report(SUB, STATUS, matched=0)),
-        [("graph.unmatched-flow", "violated", "/robot/status: /robot/camera → /viewer")],
+        ["violated graph.unmatched-flow: /robot/status: /robot/camera → /viewer"],
     ),
     "a flow of which one end says that it is unmatched": (
         change_report(PUB, STATUS, matched=0),
-        [("graph.unmatched-flow", "violated", "/robot/status: /robot/camera → /viewer")],
+        ["violated graph.unmatched-flow: /robot/status: /robot/camera → /viewer"],
     ),
     "an end that only counts, fewer than could be": (
         both(
             add_endpoint(SUB, "/_ros2cli_4711", STATUS, gid="99", qos=QosProfile(depth=0)),
             change_report(SUB, STATUS, matched=None),
         ),
-        [("graph.unmatched-flow", "unverifiable", "/robot/status: /robot/camera → /viewer")],
+        ["unverifiable graph.unmatched-flow: /robot/status: /robot/camera → /viewer"],
     ),
     "an end that counts fewer than could be, and the other all": (
         add_endpoint(SUB, "/_ros2cli_4711", STATUS, gid="99", qos=QosProfile(depth=0)),
@@ -313,48 +296,48 @@ FIRES: dict[str, tuple[Edit, list[tuple[str, str, str]]]] = {
     ),
     "more matches than the graph shows": (
         change_report(PUB, STATUS, matched=5),
-        [("graph.unknown-peer", "violated", STATUS)],
+        [f"violated graph.unknown-peer: {STATUS}"],
     ),
     "a tool that publishes on a declared topic": (
         add_endpoint(PUB, "/rqt_robot_steering", STATUS, gid="99", qos=QosProfile()),
-        [("graph.undeclared-publisher", "violated", STATUS)],
+        [f"violated graph.undeclared-publisher: {STATUS}"],
     ),
     "a tool of any namespace that serves a declared service": (
         add_endpoint(SERVER, "/far/rviz2", "/robot/camera/calibrate", type="std_srvs/srv/Trigger"),
         [
-            ("graph.undeclared-service-server", "violated", "/robot/camera/calibrate"),
-            ("graph.unmatched-client", "unverifiable", CALIBRATE),
+            "violated graph.undeclared-service-server: /robot/camera/calibrate",
+            f"unverifiable graph.unmatched-client: {CALIBRATE}",
         ],
     ),
     "a tool that publishes a part of a declared action": (
         add_endpoint(PUB, "/rviz2", "/robot/dock/_action/feedback"),
-        [("graph.undeclared-publisher", "violated", "/robot/dock/_action/feedback")],
+        ["violated graph.undeclared-publisher: /robot/dock/_action/feedback"],
     ),
     "a tool that serves a declared node's own service": (
         add_endpoint(SERVER, "/rviz2", "/viewer/get_state", type="lifecycle_msgs/srv/GetState"),
-        [("graph.undeclared-service-server", "violated", "/viewer/get_state")],
+        ["violated graph.undeclared-service-server: /viewer/get_state"],
     ),
     "a node that calls itself one of our observers and publishes": (
         add_endpoint(PUB, "/_lifecycle_observer_1", STATUS, gid="99", qos=QosProfile()),
-        [("graph.undeclared-publisher", "violated", STATUS)],
+        [f"violated graph.undeclared-publisher: {STATUS}"],
     ),
     "a service client that counts no server": (
         change_report(CLIENT, "/robot/camera/calibrate", server_matched=False),
-        [("graph.unmatched-client", "violated", CALIBRATE)],
+        [f"violated graph.unmatched-client: {CALIBRATE}"],
     ),
     "an action client that counts no server": (
         change_report(ACTION_CLIENT, "/robot/dock", server_matched=False),
-        [("graph.unmatched-client", "violated", "/robot/dock: /viewer → /robot/camera")],
+        ["violated graph.unmatched-client: /robot/dock: /viewer → /robot/camera"],
     ),
     "a client whose RMW does not tell": (
         change_report(CLIENT, "/robot/camera/calibrate", server_matched=None),
-        [("graph.unmatched-client", "unverifiable", CALIBRATE)],
+        [f"unverifiable graph.unmatched-client: {CALIBRATE}"],
     ),
     "a client that has a server, with several of that name": (
         add_endpoint(SERVER, "/viewer", "/robot/camera/calibrate", type="std_srvs/srv/Trigger"),
         [
-            ("graph.undeclared-service-server", "violated", "/robot/camera/calibrate"),
-            ("graph.unmatched-client", "unverifiable", CALIBRATE),
+            "violated graph.undeclared-service-server: /robot/camera/calibrate",
+            f"unverifiable graph.unmatched-client: {CALIBRATE}",
         ],
     ),
     "a node still unconfigured": (
@@ -362,74 +345,65 @@ FIRES: dict[str, tuple[Edit, list[tuple[str, str, str]]]] = {
             change_node("/viewer", state="unconfigured"),
             change_configuration("/viewer", state="unconfigured", connected=False),
         ),
-        [("state.wrong-state", "violated", "/viewer")],
+        ["violated state.wrong-state: /viewer"],
     ),
     "a node active before the gate": (
         change_node("/viewer", state="active"),
-        [("state.wrong-state", "violated", "/viewer")],
+        ["violated state.wrong-state: /viewer"],
     ),
     "a node not connected": (
         change_configuration("/viewer", connected=False),
-        [("state.wrong-state", "violated", "/viewer")],
+        ["violated state.wrong-state: /viewer"],
     ),
     "a managed node without lifecycle services that tells no state": (
         both(change_node("/viewer", managed=False), change_configuration("/viewer", state="")),
-        [("state.wrong-state", "violated", "/viewer")],
+        ["violated state.wrong-state: /viewer"],
     ),
     "a node that does not report": (
         drop_report("/robot/camera"),
         [
-            ("graph.undeclared-node", "violated", "/robot/_camera_flow_0"),
-            ("graph.undeclared-node", "violated", "/robot/_camera_flow_1"),
-            ("graph.missing-endpoint", "violated", "/robot/video"),
-            ("graph.missing-endpoint", "violated", "/robot/battery"),
-            ("graph.qos-unverifiable", "unverifiable", "/robot/camera"),
-            ("graph.unmatched-link", "violated", "/robot/video: /robot/camera → /viewer"),
-            ("config.missing-report", "violated", "/robot/camera"),
+            "violated graph.undeclared-node: /robot/_camera_flow_0",
+            "violated graph.undeclared-node: /robot/_camera_flow_1",
+            "violated graph.missing-endpoint: /robot/video",
+            "violated graph.missing-endpoint: /robot/battery",
+            "unverifiable graph.qos-unverifiable: /robot/camera",
+            "violated graph.unmatched-link: /robot/video: /robot/camera → /viewer",
+            "violated config.missing-report: /robot/camera",
         ],
     ),
     "a report that leaves an endpoint out": (
         drop_endpoint_report(ACTION_CLIENT, "/robot/dock"),
-        [("config.incomplete-report", "violated", "/robot/dock")],
+        ["violated config.incomplete-report: /robot/dock"],
     ),
     "a strict publisher that shares its socket": (
         both(
             change_report(PUB, VIDEO, nfes=(nfe("0.0.0.0", 40000),), dscp=46),
             change_report(PUB, STATUS, nfes=(nfe("0.0.0.0", 40000),), dscp=46),
         ),
-        [
-            ("flow.not-unique", "violated", VIDEO),
-            ("flow.not-unique", "violated", FLOW),
-        ],
+        [f"violated flow.not-unique: {VIDEO}", f"violated flow.not-unique: {FLOW}"],
     ),
     "a strict subscription that shares its socket": (
         both(
             change_report(SUB, VIDEO, nfes=(nfe("10.77.0.2", 7413),)),
             change_report(SUB, STATUS, nfes=(nfe("10.77.0.2", 7413),)),
         ),
-        [
-            ("flow.not-unique", "violated", VIDEO),
-            ("flow.not-unique", "violated", FLOW),
-        ],
+        [f"violated flow.not-unique: {VIDEO}", f"violated flow.not-unique: {FLOW}"],
     ),
     "an RMW that does not tell NFEs": (
         change_report(SUB, VIDEO, nfes=None),
-        [
-            ("flow.unverifiable", "violated", VIDEO),
-            ("flow.unverifiable", "violated", FLOW),
-        ],
+        [f"violated flow.unverifiable: {VIDEO}", f"violated flow.unverifiable: {FLOW}"],
     ),
     "a subscription without any NFE": (
         change_report(SUB, STATUS, nfes=()),
-        [("flow.broken-endpoint", "violated", STATUS)],
+        [f"violated flow.broken-endpoint: {STATUS}"],
     ),
     "a DSCP that was not applied": (
         change_report(PUB, BATTERY, dscp=0),
-        [("flow.dscp-not-applied", "violated", BATTERY)],
+        [f"violated flow.dscp-not-applied: {BATTERY}"],
     ),
     "a DSCP that nobody read back": (
         change_report(PUB, BATTERY, dscp=None),
-        [("flow.dscp-unverifiable", "unverifiable", BATTERY)],
+        [f"unverifiable flow.dscp-unverifiable: {BATTERY}"],
     ),
 }
 
@@ -529,11 +503,15 @@ def test_every_rule_has_a_case_in_which_it_fires():
     remote_nodes |= {"node.unhealthy", "node.without-health"}  # no node of this plan is asked
     remote_nodes.add("declaration.unproven")  # test_verify_parameters.py
     remote_nodes.add("state.activated-at-closed-gate")  # tests/unit/supervisor, it is the guard's
-    fired = {rule for _, expected in FIRES.values() for rule, _, _ in expected}
+    fired = {each.split()[1][:-1] for _, expected in FIRES.values() for each in expected}
     assert fired | remote_nodes == {rule.id for rule in RULES}
 
 
-_NO_HEALTH = "cannot ask node /viewer whether it is healthy: its class has no method 'health'"
+def asking(health: Health) -> Plan:
+    """The viewer is asked for its health."""
+    nodes = (PLAN.nodes[0], dataclasses.replace(PLAN.nodes[1], health=health))
+    assert nodes[1].key == "viewer"
+    return dataclasses.replace(PLAN, nodes=nodes)
 
 
 @pytest.mark.parametrize(
@@ -550,7 +528,10 @@ _NO_HEALTH = "cannot ask node /viewer whether it is healthy: its class has no me
         ),
         (
             None,
-            f"violated {_NO_HEALTH}",
+            (
+                "violated cannot ask node /viewer whether it is healthy: its class has no method"
+                " 'health'"
+            ),
         ),
     ],
 )
@@ -559,36 +540,22 @@ def test_the_health_that_a_node_reports_is_judged_where_the_manifest_asks_it(
 ):
     edit = change_configuration("/viewer", health=health)
     assert findings_after(edit) == []
-    nodes = tuple(
-        dataclasses.replace(each, health=Health(check=True)) if each.key == "viewer" else each
-        for each in PLAN.nodes
-    )
-    plan = dataclasses.replace(PLAN, nodes=nodes)
+    plan = asking(Health(check=True))
     verdict = verify(plan, edit(perfect(plan, Stage.ACTIVE)), stage=Stage.ACTIVE)
     assert "; ".join(f"{each.outcome.value} {each.message}" for each in verdict.findings) == found
     # What /diagnostics says of it counts as well, once it may publish.
-    asked = Health(check=True, diagnostics=("viewer: *",))
-    nodes = tuple(
-        dataclasses.replace(each, health=asked) if each.key == "viewer" else each
-        for each in PLAN.nodes
-    )
-    both_ways = dataclasses.replace(PLAN, nodes=nodes)
+    plan = asking(Health(check=True, diagnostics=("viewer: *",)))
     said = HealthReport(ok=False, message="'viewer: lens': dirty")
-    *_, worse = verify(
-        both_ways,
-        both(edit, change_node("/viewer", health=said))(perfect(both_ways, Stage.ACTIVE)),
-        stage=Stage.ACTIVE,
-    ).findings
-    assert worse.rule == "node.unhealthy"
-    assert worse.outcome is Outcome.VIOLATED
+    seen = both(edit, change_node("/viewer", health=said))(perfect(plan, Stage.ACTIVE))
+    *_, worse = verify(plan, seen, stage=Stage.ACTIVE).findings
+    assert (worse.rule, worse.outcome) == ("node.unhealthy", Outcome.VIOLATED)
     assert worse.message.endswith("'viewer: lens': dirty")
-    early = findings_after(edit, plan=both_ways, stage=Stage.CONNECTED)
     rule = "node.unhealthy" if health else "node.without-health"
-    assert early == [(rule, found.partition(" ")[0], "/viewer")] * bool(found)
+    expected = [f"{found.partition(' ')[0]} {rule}: /viewer"] * bool(found)
+    assert findings_after(edit, plan=plan) == expected
     # It is asked from when it is connected.
     early = both(edit, change_configuration("/viewer", connected=False))
-    rules = {rule for rule, _, _ in findings_after(early, plan=plan)}
-    assert rules.isdisjoint({"node.unhealthy", "node.without-health"})
+    assert findings_after(early, plan=plan) == ["violated state.wrong-state: /viewer"]
 
 
 def test_a_node_that_has_ended_as_it_may_is_unverifiable_and_not_missing():
@@ -630,12 +597,10 @@ def test_an_open_world_still_compares_a_foreign_publisher_with_ours():
         add_endpoint(PUB, "/other", VIDEO, gid="99", type="std_msgs/msg/Int32"),
         change_announced_qos(SUB, STATUS, durability=Durability.TRANSIENT_LOCAL),
     )
-    assert ("graph.type-mismatch", "violated", VIDEO) in findings_after(edit, plan=plan)
-    assert (
-        "graph.qos-incompatible",
-        "violated",
-        "/robot/status: /other → /viewer",
-    ) in findings_after(edit, plan=plan)
+    assert f"violated graph.type-mismatch: {VIDEO}" in findings_after(edit, plan=plan)
+    assert "violated graph.qos-incompatible: /robot/status: /other → /viewer" in findings_after(
+        edit, plan=plan
+    )
 
 
 @pytest.mark.parametrize(
@@ -648,7 +613,7 @@ def test_an_open_world_still_compares_a_foreign_publisher_with_ours():
 def test_an_open_world_still_compares_a_foreign_end_of_a_service_or_action(kind, name, type_):
     plan = with_policy(undeclared_nodes=EndpointPolicy.OPEN)
     edit = both(add_node("/other"), add_endpoint(kind, "/other", name, type=type_))
-    assert findings_after(edit, plan=plan) == [("graph.type-mismatch", "violated", name)]
+    assert findings_after(edit, plan=plan) == [f"violated graph.type-mismatch: {name}"]
     same = both(add_node("/other"), add_endpoint(kind, "/other", "/x", type=type_))
     assert findings_after(same, plan=plan) == []
 
@@ -703,12 +668,8 @@ def test_a_dscp_that_is_not_enforced_is_reported_and_never_blocks():
         policy=Policy(unverifiable_blocks=True),
     )
     verdict = verify(plan, change_report(PUB, "/a", dscp=0)(perfect(plan)), stage=Stage.CONNECTED)
-    (finding,) = verdict.findings
+    assert len(verdict.findings) == 1
     assert (verdict.verdict, verdict.blocking) == (Outcome.UNVERIFIABLE, False)
-    assert finding.message == (
-        "cannot accept the publisher of /a in /one: its sockets carry DF = DSCP 0 = TOS 0 (0x00)"
-        " and not EF = DSCP 46 = TOS 184 (0xb8); the manifest does not enforce it"
-    )
 
 
 # --- nodes that others start
@@ -766,29 +727,14 @@ def test_a_foreign_depth_is_unverifiable_under_fast_dds():
         )
     )
     assert findings_after(edit, plan=plan) == [
-        ("graph.qos-unverifiable", "unverifiable", "/talker"),
-        ("graph.qos-unverifiable", "unverifiable", "/listener"),
+        "unverifiable graph.qos-unverifiable: /talker",
+        "unverifiable graph.qos-unverifiable: /listener",
     ]
 
 
 def test_a_plain_node_has_no_state_to_judge():
     edit = change_node("/listener", state=None, managed=False)
     assert findings_after(edit, plan=foreign()) == []
-
-
-def test_a_link_demands_what_is_violated_when_it_cannot_be_proven():
-    plan = planned(
-        node("talker", publisher("chatter"), run=ATTACH, managed=False),
-        node("listener", subscription("chatter"), run=ATTACH, managed=False),
-        links=[link("/chatter", "talker", "listener", unique=UniqueHow.WEAKLY)],
-    )
-    match, finding = verify(plan, perfect(plan), stage=Stage.CONNECTED).findings
-    assert (match.rule, match.outcome) == ("graph.unmatched-link", Outcome.UNVERIFIABLE)
-    assert (finding.rule, finding.outcome) == ("flow.unverifiable", Outcome.VIOLATED)
-    assert finding.message == (
-        "cannot accept the flow /talker → /listener on /chatter: its link demands a weakly unique"
-        " flow, which cannot be proven; publisher unknown, subscription unknown"
-    )
 
 
 def test_what_is_optionally_required_of_a_foreign_node_is_no_finding():
@@ -844,15 +790,15 @@ def test_only_the_policies_that_are_written_are_compared():
     plan = unwritten("reliability")
     assert findings_after(hidden(Reliability.RELIABLE, deadline_ns=5), plan=plan) == []
     assert findings_after(hidden(Reliability.BEST_EFFORT), plan=plan) == [
-        ("graph.qos-differs", "violated", "/chatter"),
-        ("graph.qos-differs", "violated", "/chatter"),
+        "violated graph.qos-differs: /chatter",
+        "violated graph.qos-differs: /chatter",
     ]
 
 
 def test_ends_that_do_not_fit_are_violated_although_nobody_wrote_their_qos():
     edit = change_announced_qos(PUB, "/chatter", reliability=Reliability.BEST_EFFORT)
     assert findings_after(edit, plan=unwritten()) == [
-        ("graph.qos-incompatible", "violated", "/chatter: /talker → /listener")
+        "violated graph.qos-incompatible: /chatter: /talker → /listener"
     ]
 
 
@@ -889,47 +835,20 @@ def test_a_written_depth_needs_keep_last_and_is_one_finding_for_all_endpoints_of
 
 
 def test_each_declared_number_is_unverifiable_by_name_at_its_place():
-    video = need(
-        PUB,
-        "a",
-        max_delay_ms=0.0001,
-        rate_hz=500.0,
-        quantities=(
-            Quantity(name="max_delay_ms", value=0.0001, at=at(21, 40)),
-            Quantity(name="rate_hz", value=500, at=at(22, 11)),
-        ),
+    numbers = (
+        Quantity(name="max_delay_ms", value=0.0001, at=at(21, 40)),
+        Quantity(name="rate_hz", value=500, at=at(22, 11)),
     )
     plan = planned(
-        node("one", publisher("a"), needs=[video]),
+        node("one", publisher("a"), needs=[need(PUB, "a", quantities=numbers)]),
         node("two", subscription("a")),
-        links=[
-            link(
-                "/a", "one", "two", quantities=(Quantity(name="max_delay_ms", value=5, at=at(40)),)
-            )
-        ],
+        links=[link("/a", "one", "two", quantities=numbers[:1])],
     )
     verdict = verify(plan, perfect(plan), stage=Stage.CONNECTED)
-    assert [
-        (each.rule, each.outcome.value, each.message, each.at) for each in verdict.findings
-    ] == [
-        (
-            "flow.not-measured",
-            "unverifiable",
-            "cannot verify max_delay_ms 0.0001 of the publisher of /a in /one: nothing measures it",
-            "robot.lifecycle.yaml:21:40",
-        ),
-        (
-            "flow.not-measured",
-            "unverifiable",
-            "cannot verify rate_hz 500 of the publisher of /a in /one: nothing measures it",
-            "robot.lifecycle.yaml:22:11",
-        ),
-        (
-            "flow.not-measured",
-            "unverifiable",
-            "cannot verify max_delay_ms 5 of the flow /one → /two on /a: nothing measures it",
-            "robot.lifecycle.yaml:40:1",
-        ),
+    assert [(each.outcome, each.expected, each.at) for each in verdict.findings] == [
+        (Outcome.UNVERIFIABLE, "max_delay_ms 0.0001", "robot.lifecycle.yaml:21:40"),
+        (Outcome.UNVERIFIABLE, "rate_hz 500", "robot.lifecycle.yaml:22:11"),
+        (Outcome.UNVERIFIABLE, "max_delay_ms 0.0001", "robot.lifecycle.yaml:21:40"),
     ]
     assert verdict.flows[0].outcome is Outcome.OK, "what it is, is proven; what it does, is not"
 
@@ -938,7 +857,7 @@ def test_numbers_of_an_endpoint_that_is_missing_are_not_named_besides():
     measured = need(PUB, "a", quantities=(Quantity(name="rate_hz", value=1, at=at(22)),))
     plan = planned(node("one", publisher("a"), needs=[measured]))
     edit = both(drop_endpoint(PUB, "/a"), drop_report("/one"))
-    assert "flow.not-measured" not in {rule for rule, _, _ in findings_after(edit, plan=plan)}
+    assert "flow.not-measured" not in " ".join(findings_after(edit, plan=plan))
 
 
 # --- definitions of types
@@ -946,21 +865,14 @@ def test_numbers_of_an_endpoint_that_is_missing_are_not_named_besides():
 HERE, OTHER = "RIHS01_" + "a" * 64, "RIHS01_" + "b" * 64
 
 
-def defined(installed: str, plan: Plan | None = None) -> Plan:
-    """A foreign pair, or another plan, and what is installed here of its type."""
-    plan = plan or foreign()
-    return dataclasses.replace(
-        plan,
-        nodes=tuple(
-            dataclasses.replace(
-                each,
-                endpoints=tuple(
-                    dataclasses.replace(end, type_hash=installed) for end in each.endpoints
-                ),
-            )
-            for each in plan.nodes
-        ),
-    )
+def defined(installed: str) -> Plan:
+    """A foreign pair, and what is installed here of its type."""
+    plan = foreign()
+    nodes = []
+    for each in plan.nodes:
+        ends = (dataclasses.replace(end, type_hash=installed) for end in each.endpoints)
+        nodes.append(dataclasses.replace(each, endpoints=tuple(ends)))
+    return dataclasses.replace(plan, nodes=tuple(nodes))
 
 
 def hashes(publishes: str | None, subscribes: str | None) -> Edit:
@@ -981,7 +893,7 @@ def test_a_stranger_of_another_definition_does_not_put_declared_ends_in_the_wron
 
 def test_two_ends_that_agree_on_another_definition_than_the_installed_are_violated():
     found = findings_after(hashes(OTHER, OTHER), plan=defined(HERE))
-    assert found == [("graph.type-definition-differs", "violated", "/chatter")] * 2
+    assert found == ["violated graph.type-definition-differs: /chatter"] * 2
 
 
 def test_without_any_hash_there_is_nothing_to_compare():
@@ -992,12 +904,6 @@ def test_without_any_hash_there_is_nothing_to_compare():
 # --- what findings say
 
 
-def test_a_client_without_a_server_names_both_as_who_may_be_undiscovered():
-    edit = change_report(CLIENT, "/robot/camera/calibrate", server_matched=False)
-    (finding,) = verify(PLAN, edit(perfect(PLAN)), stage=Stage.CONNECTED).findings
-    assert finding.ends == ("/viewer", "/robot/camera")
-
-
 def test_a_service_that_a_user_calls_as_the_node_interface_does_is_not_hidden():
     edit = both(
         drop_report("/viewer"),
@@ -1005,16 +911,14 @@ def test_a_service_that_a_user_calls_as_the_node_interface_does_is_not_hidden():
             SERVER, "/viewer", "/viewer/disconnect", type="rcl_interfaces/srv/SetParameters"
         ),
     )
-    assert ("graph.undeclared-service-server", "violated", "/viewer/disconnect") in findings_after(
-        edit
-    )
+    assert "violated graph.undeclared-service-server: /viewer/disconnect" in findings_after(edit)
 
 
 def test_an_endpoint_that_only_the_report_tells_of_is_undeclared_already():
     camera = perfect(PLAN).configurations[0]
     extra = dataclasses.replace(camera.endpoints[2], name="", resolved="/extra", gid="99")
     edit = change_configuration("/robot/camera", endpoints=(*camera.endpoints, extra))
-    assert findings_after(edit) == [("graph.undeclared-publisher", "violated", "/extra")]
+    assert findings_after(edit) == ["violated graph.undeclared-publisher: /extra"]
 
 
 @pytest.mark.parametrize(
@@ -1027,7 +931,7 @@ def test_an_endpoint_that_only_the_report_tells_of_is_undeclared_already():
 )
 def test_a_placeholder_for_an_unknown_node_is_not_taken_for_a_name(placeholder: str):
     edit = both(add_node(placeholder), add_endpoint(PUB, placeholder, "/extra", gid="99"))
-    assert findings_after(edit) == [("graph.unattributed-endpoint", "violated", "/extra")]
+    assert findings_after(edit) == ["violated graph.unattributed-endpoint: /extra"]
     assert findings_after(change_endpoint(PUB, STATUS, node=placeholder)) == []
 
 
@@ -1038,11 +942,9 @@ def test_what_is_declared_is_no_noise():
     )
     assert findings_after(lambda seen: seen, plan=plan) == []
     assert findings_after(drop_endpoint(SUB, "/clock"), plan=plan) == [
-        ("graph.missing-endpoint", "violated", "/clock")
+        "violated graph.missing-endpoint: /clock"
     ]
-    assert findings_after(drop_node("/rviz2"), plan=plan) == [
-        ("graph.missing-node", "violated", "/rviz2")
-    ]
+    assert findings_after(drop_node("/rviz2"), plan=plan) == ["violated graph.missing-node: /rviz2"]
 
 
 def test_after_the_gate_an_endpoint_of_an_unknown_node_is_unverifiable():

@@ -16,11 +16,12 @@ def told(findings: Iterable[Finding]) -> str:
 
 def _paragraph(finding: Finding) -> str:
     kind = f" ({finding.endpoint.noun})" if finding.endpoint else ""
+    of = f", of {' and '.join(finding.ends)}" if finding.ends else ""
     facts = [
         f"{finding.outcome.value} {finding.rule}: {finding.subject}",
         finding.message,
         f"expected {finding.expected}, observed {finding.observed}",
-        f"at {finding.at or 'nowhere'}, on {finding.node or 'no node'}{kind}",
+        f"at {finding.at or 'nowhere'}, on {finding.node or 'no node'}{kind}{of}",
     ]
     if finding.hint != rule(finding.rule).fix:
         facts.append(f"to do: {finding.hint}")
