@@ -93,96 +93,60 @@ UP = (TransitionRequest.CONFIGURE, TransitionRequest.CONNECT, TransitionRequest.
 
 
 @pytest.mark.parametrize(
-    ("path", "request_", "did"),
+    ("path", "asked", "did"),
     [
-        ((), TransitionRequest.CONFIGURE, ["prepare", "on_configure"]),
-        (UP[:1], TransitionRequest.CONNECT, ["make", "on_connect"]),
-        (UP[:1], TransitionRequest.ACTIVATE, ["make", "on_connect", "on_activate"]),
-        (UP[:2], TransitionRequest.ACTIVATE, ["on_activate"]),
-        (UP, TransitionRequest.DEACTIVATE, ["on_deactivate"]),
-        (UP[:2], TransitionRequest.DISCONNECT, ["on_disconnect", "remove"]),
-        (UP[:1], TransitionRequest.CLEANUP, ["on_cleanup", "unprepare"]),
-        (UP[:2], TransitionRequest.CLEANUP, ["on_disconnect", "remove", "on_cleanup", "unprepare"]),
-        ((), TransitionRequest.SHUTDOWN, ["on_shutdown", "remove", "unprepare"]),
-        (UP, TransitionRequest.SHUTDOWN, ["on_shutdown", "remove", "unprepare"]),
+        ((), "configure", "prepare on_configure"),
+        (UP[:1], "connect", "make on_connect"),
+        (UP[:1], "activate", "make on_connect on_activate"),
+        (UP[:2], "activate", "on_activate"),
+        (UP, "deactivate", "on_deactivate"),
+        (UP[:2], "disconnect", "on_disconnect remove"),
+        (UP[:1], "cleanup", "on_cleanup unprepare"),
+        (UP[:2], "cleanup", "on_disconnect remove on_cleanup unprepare"),
+        ((), "shutdown", "on_shutdown remove unprepare"),
+        (UP, "shutdown", "on_shutdown remove unprepare"),
     ],
 )
 def test_a_transition_does_these_things_in_this_order(
     controller: Controller,
     node: FakeNode,
     path: tuple[TransitionRequest, ...],
-    request_: TransitionRequest,
-    did: list[str],
+    asked: str,
+    did: str,
 ) -> None:
     bring(controller, node, *path)
-    assert run(controller.change(request_)).outcome is CallbackOutcome.SUCCESS
-    assert node.did == did
+    result = run(controller.change(TransitionRequest(asked)))
+    assert result.outcome is CallbackOutcome.SUCCESS
+    assert node.did == did.split()
 
 
 @pytest.mark.parametrize(
-    ("path", "request_", "callback", "did", "state"),
+    ("path", "asked", "did", "state"),
     [
-        (
-            (),
-            TransitionRequest.CONFIGURE,
-            "on_configure",
-            ["prepare", "on_configure", "unprepare"],
-            NodeState.UNCONFIGURED,
-        ),
-        (
-            UP[:1],
-            TransitionRequest.CONNECT,
-            "on_connect",
-            ["make", "on_connect", "remove"],
-            NodeState.INACTIVE_DISCONNECTED,
-        ),
-        (
-            UP[:1],
-            TransitionRequest.ACTIVATE,
-            "on_activate",
-            ["make", "on_connect", "on_activate"],
-            NodeState.INACTIVE_CONNECTED,
-        ),
-        (
-            UP[:2],
-            TransitionRequest.DISCONNECT,
-            "on_disconnect",
-            ["on_disconnect"],
-            NodeState.INACTIVE_CONNECTED,
-        ),
-        (
-            UP[:2],
-            TransitionRequest.CLEANUP,
-            "on_cleanup",
-            ["on_disconnect", "remove", "on_cleanup"],
-            NodeState.INACTIVE_DISCONNECTED,
-        ),
-        (UP, TransitionRequest.DEACTIVATE, "on_deactivate", ["on_deactivate"], NodeState.ACTIVE),
-        (
-            UP,
-            TransitionRequest.SHUTDOWN,
-            "on_shutdown",
-            ["on_shutdown", "remove", "unprepare"],
-            NodeState.FINALIZED,
-        ),
+        ((), "configure", "prepare on_configure unprepare", NodeState.UNCONFIGURED),
+        (UP[:1], "connect", "make on_connect remove", NodeState.INACTIVE_DISCONNECTED),
+        (UP[:1], "activate", "make on_connect on_activate", NodeState.INACTIVE_CONNECTED),
+        (UP[:2], "disconnect", "on_disconnect", NodeState.INACTIVE_CONNECTED),
+        (UP[:2], "cleanup", "on_disconnect remove on_cleanup", NodeState.INACTIVE_DISCONNECTED),
+        (UP, "deactivate", "on_deactivate", NodeState.ACTIVE),
+        (UP, "shutdown", "on_shutdown remove unprepare", NodeState.FINALIZED),
     ],
 )
 def test_a_failure_undoes_its_own_step_and_no_other(
     controller: Controller,
     node: FakeNode,
     path: tuple[TransitionRequest, ...],
-    request_: TransitionRequest,
-    callback: str,
-    did: list[str],
+    asked: str,
+    did: str,
     state: NodeState,
 ) -> None:
     bring(controller, node, *path)
-    node.callbacks[callback] = lambda: CallbackOutcome.FAILURE
-    result = run(controller.change(request_))
+    node.callbacks[f"on_{asked}"] = lambda: CallbackOutcome.FAILURE
+    result = run(controller.change(TransitionRequest(asked)))
     assert result == Result(
-        outcome=CallbackOutcome.FAILURE, error=f"/camera: {callback} returned FAILURE"
+        outcome=CallbackOutcome.FAILURE, error=f"/camera: on_{asked} returned FAILURE"
     )
-    assert node.did == did
+    assert node.did == did.split()
     assert controller.machine.state is state
 
 

@@ -18,50 +18,22 @@ from lifecycle.node.lifecycle.machine import (
 
 OK, FAILURE, ERROR = CallbackOutcome.SUCCESS, CallbackOutcome.FAILURE, CallbackOutcome.ERROR
 
-PATHS: dict[NodeState, tuple[TransitionRequest | CallbackOutcome, ...]] = {
-    NodeState.UNCONFIGURED: (),
-    NodeState.CONFIGURING: (TransitionRequest.CONFIGURE,),
-    NodeState.INACTIVE_DISCONNECTED: (TransitionRequest.CONFIGURE, OK),
-    NodeState.CONNECTING: (TransitionRequest.CONFIGURE, OK, TransitionRequest.CONNECT),
-    NodeState.INACTIVE_CONNECTED: (TransitionRequest.CONFIGURE, OK, TransitionRequest.CONNECT, OK),
-    NodeState.DISCONNECTING: (
-        TransitionRequest.CONFIGURE,
-        OK,
-        TransitionRequest.CONNECT,
-        OK,
-        TransitionRequest.DISCONNECT,
-    ),
-    NodeState.ACTIVATING_DISCONNECTED: (
-        TransitionRequest.CONFIGURE,
-        OK,
-        TransitionRequest.ACTIVATE,
-    ),
-    NodeState.ACTIVATING_CONNECTED: (
-        TransitionRequest.CONFIGURE,
-        OK,
-        TransitionRequest.ACTIVATE,
-        OK,
-    ),
-    NodeState.ACTIVE: (TransitionRequest.CONFIGURE, OK, TransitionRequest.ACTIVATE, OK, OK),
-    NodeState.DEACTIVATING: (
-        TransitionRequest.CONFIGURE,
-        OK,
-        TransitionRequest.ACTIVATE,
-        OK,
-        OK,
-        TransitionRequest.DEACTIVATE,
-    ),
-    NodeState.CLEANINGUP_CONNECTED: (
-        TransitionRequest.CONFIGURE,
-        OK,
-        TransitionRequest.CONNECT,
-        OK,
-        TransitionRequest.CLEANUP,
-    ),
-    NodeState.CLEANINGUP_DISCONNECTED: (TransitionRequest.CONFIGURE, OK, TransitionRequest.CLEANUP),
-    NodeState.SHUTTINGDOWN: (TransitionRequest.SHUTDOWN,),
-    NodeState.ERRORPROCESSING: (TransitionRequest.CONFIGURE, ERROR),
-    NodeState.FINALIZED: (TransitionRequest.SHUTDOWN, OK),
+PATHS: dict[NodeState, str] = {
+    NodeState.UNCONFIGURED: "",
+    NodeState.CONFIGURING: "configure",
+    NodeState.INACTIVE_DISCONNECTED: "configure OK",
+    NodeState.CONNECTING: "configure OK connect",
+    NodeState.INACTIVE_CONNECTED: "configure OK connect OK",
+    NodeState.DISCONNECTING: "configure OK connect OK disconnect",
+    NodeState.ACTIVATING_DISCONNECTED: "configure OK activate",
+    NodeState.ACTIVATING_CONNECTED: "configure OK activate OK",
+    NodeState.ACTIVE: "configure OK activate OK OK",
+    NodeState.DEACTIVATING: "configure OK activate OK OK deactivate",
+    NodeState.CLEANINGUP_CONNECTED: "configure OK connect OK cleanup",
+    NodeState.CLEANINGUP_DISCONNECTED: "configure OK cleanup",
+    NodeState.SHUTTINGDOWN: "shutdown",
+    NodeState.ERRORPROCESSING: "configure ERROR",
+    NodeState.FINALIZED: "shutdown OK",
 }
 
 TAKEN: dict[tuple[NodeState, TransitionRequest], NodeState] = {
@@ -111,11 +83,11 @@ def machine_in(state: NodeState, changes: list[StateChange] | None = None) -> Li
     """Return a machine that was brought to `state`; `changes` hears of what comes after."""
     heard: list[StateChange] = [] if changes is None else changes
     machine = LifecycleMachine(heard.append)
-    for step in PATHS[state]:
-        if isinstance(step, TransitionRequest):
-            machine.request(step)
+    for step in PATHS[state].split():
+        if step in ("OK", "ERROR"):
+            machine.finish(OK if step == "OK" else ERROR)
         else:
-            machine.finish(step)
+            machine.request(TransitionRequest(step))
     assert machine.state is state
     heard.clear()
     return machine
