@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import io
 import os
 import random
@@ -26,7 +27,6 @@ import psutil
 
 from lifecycle.cli import main
 from lifecycle.errors import ExitCode
-from lifecycle.middleware.process.shared_memory import leftovers
 from tests.ros.supervisor.running import ROOT, environment, left_of, marked
 
 BOUND_S = 30.0
@@ -75,6 +75,13 @@ class Attack:
 
     name: str
     run: Callable[[Any], None]
+
+
+class Attacks(list[Attack]):
+    """Attacks of one class while they are made."""
+
+    def add(self, name: str, function: Callable[..., None], *arguments: object) -> None:
+        self.append(Attack(name=name, run=functools.partial(function, *arguments)))
 
 
 def _bare(place: Place, attacks: Sequence[Attack]) -> AbstractContextManager[Any]:
@@ -213,11 +220,6 @@ def in_a_process(*words: str, runtime: Path, limit_s: float = BOUND_S, **options
         done = ended(process, mark, runtime, limit_s=limit_s)
     check_text(done.out, done.err)
     return done
-
-
-def unused_segments(before: Sequence[str]) -> list[str]:
-    """Return shared memory of Fast DDS that nobody uses any more and that was not there before."""
-    return [each for each in leftovers() if each not in before]
 
 
 def mutated(data: bytes, rng: random.Random) -> bytes:

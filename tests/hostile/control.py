@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import json
 import os
 import random
 import signal
 import socket
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
 from lifecycle.codec import to_json, to_plain
 from lifecycle.manifest.loading import load
@@ -19,6 +18,7 @@ from lifecycle.run_directory import connect
 from lifecycle.supervisor.control.protocol import Answer, ControlRequest, Question, ask
 from tests.hostile.attack import (
     Attack,
+    Attacks,
     HostileClass,
     Place,
     Unhandled,
@@ -194,11 +194,8 @@ ANSWERED: dict[str, bytes | None] = {
 
 
 def attacks(rng: random.Random) -> list[Attack]:
-    found: list[Attack] = []
-
-    def add(name: str, function: Callable[..., None], *arguments: object) -> None:
-        found.append(Attack(name=name, run=functools.partial(function, *arguments)))
-
+    found = Attacks()
+    add = found.add
     good = to_json(Question(ask=ControlRequest.STATUS)) + b"\n"
     for number in range(40):
         then = rng.choice(("hang up", "reset", "read", "stay"))

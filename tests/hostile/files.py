@@ -6,7 +6,6 @@ Verbs that need no ROS run in this process; what may block runs in one of its ow
 from __future__ import annotations
 
 import contextlib
-import functools
 import json
 import os
 import random
@@ -19,6 +18,7 @@ from lifecycle.errors import ExitCode
 from tests.hostile.attack import (
     CODES,
     Attack,
+    Attacks,
     HostileClass,
     Place,
     Unhandled,
@@ -301,11 +301,8 @@ def _run_directory(make: Callable[[Path], object], words: tuple[str, ...], place
 
 
 def attacks(rng: random.Random) -> list[Attack]:
-    found = []
-
-    def add(name: str, function: Callable[..., None], *arguments: object) -> None:
-        found.append(Attack(name=name, run=functools.partial(function, *arguments)))
-
+    found = Attacks()
+    add = found.add
     for kind, make in KINDS.items():
         for verb in ("check", "plan", "export", "down"):
             add(f"manifest, {kind}: {verb}", _manifest, make, verb)

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import os
 import random
 import shlex
 import shutil
 import subprocess
-from collections.abc import Callable
 from pathlib import Path
 
 from tests.hostile.attack import (
     BOUND_S,
     Attack,
+    Attacks,
     HostileClass,
     Place,
     Unhandled,
@@ -153,11 +152,8 @@ def may_mount() -> bool:
 
 def attacks(rng: random.Random) -> list[Attack]:
     del rng
-    found = []
-
-    def add(name: str, function: Callable[..., None], *arguments: object) -> None:
-        found.append(Attack(name=name, run=functools.partial(function, *arguments)))
-
+    found = Attacks()
+    add = found.add
     for limit in LIMITS:
         for verb in ("check", "up"):
             add(f"{limit}: {verb}", _under, limit, verb, "")

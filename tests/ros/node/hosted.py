@@ -82,9 +82,6 @@ class Plain(Node):
         print("label", label, file=sys.stderr, flush=True)
 
 
-NOT_A_CLASS = 1
-
-
 class Ending(Node):
     """Shuts rclpy down, as scripts do once they have what they want."""
 

@@ -47,7 +47,6 @@ LABELS = [
     "Configure",
     "nonsense",
 ]
-BEHAVIOURS = ["SUCCESS", "FAILURE", "raise", "ERROR"]
 ON_ERROR = ["SUCCESS", "FAILURE", "ERROR", "raise"]
 
 

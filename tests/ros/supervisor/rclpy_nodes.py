@@ -137,8 +137,3 @@ class Caller(Node):
 def pair(word: str) -> list[Node]:
     """Return a talker and a listener."""
     return [Listener(), Talker(word)]
-
-
-def forgetful() -> None:
-    """Make a node and return nothing."""
-    Talker()

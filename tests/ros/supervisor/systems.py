@@ -97,14 +97,6 @@ class Counting(Talker):
         self.publisher("chatter").publish(String(data=str(self._count)))
 
 
-class Parameterised(Talker):
-    """Declares a parameter that no manifest has."""
-
-    def on_configure(self, state):
-        super().on_configure(state)
-        self.declare_parameter("rate", 7)
-
-
 class Stillborn(Talker):
     """Is killed once before it has started, when others have discovered its endpoints."""
 
