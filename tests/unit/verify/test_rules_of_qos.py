@@ -33,6 +33,7 @@ from tests.unit.verify.edits import (
     drop_endpoint,
 )
 from tests.unit.verify.perfect import perfect
+from tests.unit.verify.told import told
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
 ATTACH = Run(kind=RunKind.ATTACH)
@@ -68,26 +69,6 @@ def differing(edit: Edit, plan: Plan) -> list[str]:
 
 
 # --- declared against actual
-
-
-def test_a_policy_that_differs_is_told_whole():
-    edit = change_announced_qos(PUB, "/a", deadline_ns=NS)
-    assert of("graph.qos-differs", edit, pair(QosProfile())) == [
-        Finding(
-            rule="graph.qos-differs",
-            outcome=Outcome.VIOLATED,
-            subject="/a",
-            expected="deadline_ns infinite",
-            observed="deadline_ns 1000000000 ns",
-            message="cannot accept the publisher of /a in /one: deadline_ns is declared infinite"
-            " and is 1000000000 ns",
-            at="robot.lifecycle.yaml:11:9",
-            node="/one",
-            endpoint=PUB,
-            hint="correct the profile in the manifest or in the node; look for an XML profile or a"
-            " qos_overrides parameter",
-        )
-    ]
 
 
 @pytest.mark.parametrize(
@@ -229,25 +210,6 @@ def test_a_policy_that_is_not_written_does_not_end_the_comparison():
 # --- what is not known
 
 
-def test_what_nobody_announces_of_one_endpoint_is_told_whole():
-    edit = change_announced_qos(PUB, "/a", history=History.UNKNOWN, depth=0)
-    assert findings(edit, pair(QosProfile())) == (
-        Finding(
-            rule="graph.qos-unverifiable",
-            outcome=Outcome.UNVERIFIABLE,
-            subject="/one",
-            expected="/a (publisher): history KEEP_LAST, depth 10",
-            observed="not announced",
-            message="cannot verify history, depth of /one on /a (publisher): neither discovery nor"
-            " the node reports the actual value",
-            at="robot.lifecycle.yaml:11:9",
-            node="/one",
-            hint="Fast DDS does not announce history and depth: only a node that reports its"
-            " configuration can prove them; a policy that is not written is not required",
-        ),
-    )
-
-
 def test_of_an_endpoint_whose_qos_nobody_knows_every_written_policy_is_unverifiable():
     found = of("graph.qos-unverifiable", change_endpoint(SUB, "/a", qos=None), pair(QosProfile()))
     assert [each.expected for each in found] == [
@@ -291,35 +253,57 @@ def incompatible(edit: Edit, plan: Plan) -> list[tuple[str, str, str]]:
 LESS = change_announced_qos(PUB, "/a", reliability=Reliability.BEST_EFFORT)
 
 
-def test_an_incompatible_pair_is_told_whole():
-    plan = pair(QosProfile(), QosProfile())
-    assert of("graph.qos-incompatible", LESS, plan) == [
-        Finding(
-            rule="graph.qos-incompatible",
-            outcome=Outcome.VIOLATED,
-            subject="/a: /one → /two",
-            ends=("/one", "/two"),
-            expected="reliability of at least RELIABLE offered",
-            observed="reliability BEST_EFFORT offered",
-            message="cannot match /one → /two on /a: /one offers reliability BEST_EFFORT, /two"
-            " requests reliability RELIABLE",
-            at="robot.lifecycle.yaml:11:9",
-            hint="offer more or request less: DDS does not match them, and no data flows",
-        )
-    ]
+SAYS: dict[str, tuple[Edit, Plan, str]] = {
+    "a policy differs": (
+        change_announced_qos(PUB, "/a", deadline_ns=NS),
+        pair(QosProfile()),
+        """\
+violated graph.qos-differs: /a
+cannot accept the publisher of /a in /one: deadline_ns is declared infinite and is 1000000000 ns
+expected deadline_ns infinite, observed deadline_ns 1000000000 ns
+at robot.lifecycle.yaml:11:9, on /one (publisher)
+""",
+    ),
+    "nobody announces a policy": (
+        change_announced_qos(PUB, "/a", history=History.UNKNOWN, depth=0),
+        pair(QosProfile()),
+        """\
+unverifiable graph.qos-unverifiable: /one
+cannot verify history, depth of /one on /a (publisher): neither discovery nor the node reports
+  the actual value
+expected /a (publisher): history KEEP_LAST, depth 10, observed not announced
+at robot.lifecycle.yaml:11:9, on /one
+""",
+    ),
+    "a pair is incompatible": (
+        LESS,
+        pair(QosProfile(), QosProfile()),
+        """\
+violated graph.qos-incompatible: /a: /one → /two
+cannot match /one → /two on /a: /one offers reliability BEST_EFFORT, /two requests reliability
+  RELIABLE
+expected reliability of at least RELIABLE offered, observed reliability BEST_EFFORT offered
+at robot.lifecycle.yaml:11:9, on no node, of /one and /two
+""",
+    ),
+    "a pair may be incompatible": (
+        change_announced_qos(PUB, "/a", reliability=Reliability.UNKNOWN),
+        pair(QosProfile(), QosProfile()),
+        """\
+unverifiable graph.qos-incompatible: /a: /one → /two
+cannot verify that these match: /one → /two on /a: /one offers reliability UNKNOWN, /two
+  requests reliability RELIABLE
+expected reliability of at least RELIABLE offered, observed reliability UNKNOWN offered
+at robot.lifecycle.yaml:11:9, on no node, of /one and /two
+""",
+    ),
+}
 
 
-def test_a_pair_that_may_be_incompatible_is_unverifiable_and_told_whole():
-    edit = change_announced_qos(PUB, "/a", reliability=Reliability.UNKNOWN)
-    (found,) = of("graph.qos-incompatible", edit, pair(QosProfile(), QosProfile()))
-    assert (found.outcome, found.observed, found.message) == (
-        Outcome.UNVERIFIABLE,
-        "reliability UNKNOWN offered",
-        (
-            "cannot verify that these match: /one → /two on /a: /one offers reliability UNKNOWN,"
-            " /two requests reliability RELIABLE"
-        ),
-    )
+@pytest.mark.parametrize("case", SAYS)
+def test_a_finding_on_qos_is_told_whole_where(case: str):
+    edit, plan, text = SAYS[case]
+    assert told(of(text.split()[1][:-1], edit, plan)) == text
 
 
 def open_world(*endpoints: object) -> Plan:
