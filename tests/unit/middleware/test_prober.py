@@ -99,7 +99,7 @@ def test_it_is_one_participant_of_its_own_that_soon_leaves_by_a_message(
     # PID_STATUS_INFO says that it left; PID_PARTICIPANT_LEASE_DURATION for how long it is there.
     left = struct.pack("<HH", 0x0071, 4) + b"\x00\x00\x00\x03"
     assert [left in each for each in messages] == [False, True, False, True]
-    lease = struct.pack("<HHiI", 0x0002, 8, 8, 0)
+    lease = struct.pack("<HHiI", 0x0002, 8, 10, 0)
     assert [lease in each for each in messages] == [True, False, True, False]
     # After INFO_TS, and the head of DATA: flags, what follows, the two ends of discovery.
     sequences = [struct.unpack_from("<iI", each, 20 + 12 + 16) for each in messages]

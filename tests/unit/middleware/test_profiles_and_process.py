@@ -28,7 +28,7 @@ def test_the_profile_only_sets_announcements_and_the_lease() -> None:
     leaves = [
         (each.tag.removeprefix(space), each.text) for each in participant.iter() if not len(each)
     ]
-    assert leaves == [("count", "10"), ("nanosec", "200000000"), ("sec", "8"), ("sec", "1")]
+    assert leaves == [("count", "10"), ("nanosec", "200000000"), ("sec", "10"), ("sec", "1")]
 
 
 def test_endpoints_are_sent_by_multicast_where_it_is_asked_for() -> None:
