@@ -19,7 +19,6 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from std_msgs.msg import String
 
 from lifecycle.graph.status import (
@@ -30,24 +29,17 @@ from lifecycle.graph.status import (
     encode,
     new_instance,
 )
+from lifecycle.middleware.rcl.qos import latched
 from lifecycle.verify.observation import NodeConfiguration
 from lifecycle.verify.tool_filter import GRAPH_TOPIC
 
 _logger = logging.getLogger(__name__)
 
 
-def _latched(depth: int) -> QoSProfile:
-    return QoSProfile(
-        depth=depth,
-        reliability=QoSReliabilityPolicy.RELIABLE,
-        durability=QoSDurabilityPolicy.TRANSIENT_LOCAL,
-    )
-
-
-STATUS_QOS = _latched(1)
+STATUS_QOS = latched(1)
 """Of who sends: the last status is the state."""
 
-_RECEIVING_QOS = _latched(1000)
+_RECEIVING_QOS = latched(1000)
 """Of who receives: the statuses of all nodes arrive at once when it comes."""
 
 

@@ -83,7 +83,7 @@ INSTALL = (
 def installed() -> Distribution:
     """Return the distribution whose rcl this Python imports; Jazzy where it is not known.
 
-    Names of its are harmless then, and what is loaded is looked at before it is used.
+    Its names do no harm there: what is loaded is looked at before it is used.
     """
     return of_rcl(rcl_version()) or JAZZY
 

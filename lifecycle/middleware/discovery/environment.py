@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import ipaddress
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -196,6 +196,21 @@ def _addresses_of(kind: Medium, *, loopback: bool = False) -> dict[str, tuple[st
         if (loopback or not each.is_loopback) and not (each.version == 6 and each.is_link_local):
             found[name] = (*found.get(name, ()), str(each))
     return found
+
+
+def all_by_multicast(
+    machines: Iterable[str], own: Collection[str], environment: Mapping[str, str]
+) -> bool:
+    """Return whether all participants of a system can send their endpoints by multicast.
+
+    So it is on one host, where no other is looked for by its address: routers pass no multicast.
+
+    Args:
+        machines: those of the system's nodes.
+        own: machines that are this host.
+        environment: where ROS_STATIC_PEERS is looked up.
+    """
+    return set(machines) <= set(own) and not environment.get(PEERS_VARIABLE)
 
 
 def is_served(urls: Sequence[ConnectionUrl], environment: Mapping[str, str]) -> bool:

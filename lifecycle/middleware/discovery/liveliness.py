@@ -42,6 +42,7 @@ from std_msgs.msg import Empty, String
 from lifecycle.codec import from_json
 from lifecycle.manifest.names import ALIVE_PULSE
 from lifecycle.middleware.rcl import abi
+from lifecycle.middleware.rcl.qos import latched
 
 LEASE_S = 0.85
 """A participant whose liveliness was not asserted for so long is lost: within a second with all
@@ -61,15 +62,7 @@ def node_topic(full_name: str) -> str:
     return f"{full_name}/_alive"
 
 
-def _latched(depth: int) -> QoSProfile:
-    return QoSProfile(
-        depth=depth,
-        reliability=ReliabilityPolicy.RELIABLE,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL,
-    )
-
-
-_NOTICES = _latched(1)
+_NOTICES = latched(1)
 _ASSERTED = QoSProfile(
     depth=1,
     reliability=ReliabilityPolicy.RELIABLE,
@@ -287,7 +280,7 @@ class PlanNotices:
             String,
             PLANS_TOPIC,
             lambda message: on_notice(message.data),
-            _latched(_KEPT),
+            latched(_KEPT),
             event_callbacks=_no_subscription_events(),
         )
         # rclpy's own methods: a managed node's would gate them.

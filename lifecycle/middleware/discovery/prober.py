@@ -1,6 +1,6 @@
 """The prober: a DDS participant that makes every other one that can be reached answer at once.
 
-Owns: what it sends and receives, and for how long discovery may still miss somebody. It is a
+Owns: what it sends and receives, and for how long discovery may still miss another one. It is a
 participant of its own (DDSI-RTPS 2.3 §8.5.3, §9.6.2): it has a GUID prefix and a vendor id that no
 other has, no endpoints but those by which participants find each other, and it leaves by a message
 once it has asked. Must not import rclpy.
@@ -254,7 +254,7 @@ def _send(sender: socket.socket, message: bytes, targets: Iterable[Target]) -> N
 
 
 class Settling:
-    """For how long what discovery shows may still miss somebody.
+    """For how long what discovery shows may still miss a participant.
 
     A participant that answered the prober and whose node is not known is on its way into the graph,
     and so is one of this host that has a port for discovery and did not answer. Where nobody can be
@@ -289,7 +289,7 @@ class Settling:
         return self._settle_s if self._prober is None else 0.0
 
     def left_s(self, named: frozenset[str]) -> float:
-        """Return for how many seconds a look may still miss somebody; 0 once it cannot.
+        """Return for how many seconds a look may still miss a participant; 0 once it cannot.
 
         Args:
             named: GUID prefixes (24 hex digits) of participants of which some node is known now.

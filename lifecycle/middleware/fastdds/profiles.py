@@ -35,6 +35,8 @@ _PERIOD_NS = 200_000_000
 LEASE_S = 10
 """As long as a machine may be too busy for a participant to announce itself, or to take it in."""
 
+_BY_MULTICAST = "<avoid_builtin_multicast>false</avoid_builtin_multicast>"
+
 _AGAIN_S = 1
 """Who was there before and who was started again know each other within so long."""
 
@@ -57,8 +59,7 @@ def discovery_profile(
         for kind in (udp_to(address),)
     )
     searched = f"<initialPeersList>{locators}</initialPeersList>" if locators else ""
-    avoided = "<avoid_builtin_multicast>false</avoid_builtin_multicast>"
-    together = avoided if multicast_endpoints else ""
+    multicast = _BY_MULTICAST if multicast_endpoints else ""
     return f"""<?xml version="1.0" encoding="UTF-8"?>
 <dds xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
   <profiles>
@@ -69,7 +70,7 @@ def discovery_profile(
       </initialAnnouncements>
       <leaseDuration><sec>{LEASE_S}</sec></leaseDuration>
       <leaseAnnouncement><sec>{_AGAIN_S}</sec></leaseAnnouncement>
-      </discovery_config>{together}{searched}</builtin></rtps>
+      </discovery_config>{multicast}{searched}</builtin></rtps>
     </participant>
   </profiles>
 </dds>
@@ -92,7 +93,7 @@ def discovery_environment(
         directory: exists; it must outlive every process that is given the variables.
         environment: what those processes otherwise get; None for this process's.
         peers: see `discovery_profile`.
-        multicast_endpoints: likewise.
+        multicast_endpoints: see `discovery_profile`.
 
     Raises:
         MiddlewareError: the file cannot be written.

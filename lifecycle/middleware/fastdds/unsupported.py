@@ -41,7 +41,7 @@ def refuse_unsupported(nodes: Iterable[PlannedNode]) -> None:
 
 
 def _chosen(node: PlannedNode) -> Iterator[str]:
-    """Yield for what participants of a node are not as rmw_fastrtps makes them."""
+    """Yield the keys for which rmw_fastrtps alone cannot make the participants of a node."""
     if ParticipantSettings.of_node(node):
         yield "'connections', 'transport' or 'discovery' as declared"
     for each in node.participants:

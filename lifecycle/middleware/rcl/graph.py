@@ -141,7 +141,7 @@ _UNREADABLE = EndpointInfo(
     ),
     type_hash="",
 )
-"""Stands for all endpoints of a topic of which one has a name that is no UTF-8."""
+"""In place of all endpoints of a topic of which one has a name that is no UTF-8."""
 
 
 def _ros_type(dds_type: str) -> str:
@@ -270,7 +270,7 @@ class GraphObserver:
 
     Attributes:
         urls: of its connections; none where the RMW chooses.
-        settling: for how long it may still miss somebody.
+        settling: for how long it may still miss a participant.
         owns_node: the node is its own, and is spun and destroyed by nothing else.
 
     Raises:
@@ -491,11 +491,11 @@ class GraphObserver:
         """
         if self._destroyed:
             return
-        homes, own = self._homes(), self.prefix
+        homes = self._homes()
+        own = next(iter(homes.get(self._name, ())), "")
         claimed = {*reported, *(prefix for name in nodes for prefix in homes.get(name, ()))}
-        for each in claimed:
-            if own and is_of_process(each, pid, own):
-                self.ended_participant(each)
+        theirs = (each for each in claimed if own and is_of_process(each, pid, own))
+        self._count_no_more(theirs, own)
 
     def ended_participant(self, prefix: str) -> None:
         """Count participants of an ended process no more.
@@ -503,9 +503,12 @@ class GraphObserver:
         Args:
             prefix: of the GUID of one of them, 24 hex digits.
         """
-        process = prefix[:PROCESS_DIGITS]
-        if process != self.prefix[:PROCESS_DIGITS]:
-            self._dead |= {process}
+        self._count_no_more((prefix,), self.prefix)
+
+    def _count_no_more(self, prefixes: Iterable[str], own: str) -> None:
+        ended = {each[:PROCESS_DIGITS] for each in prefixes} - {own[:PROCESS_DIGITS]}
+        if not ended <= self._dead:
+            self._dead |= ended
             self._changed()
 
     def _is_dead(self, info: EndpointInfo) -> bool:

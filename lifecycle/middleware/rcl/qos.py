@@ -32,6 +32,19 @@ _UNSPECIFIED_NS = 0
 _INFINITE_NS = 2**63 - 1
 
 
+def latched(depth: int) -> QoSProfile:
+    """Return rclpy's profile whose last samples DDS keeps for subscriptions that come later.
+
+    Args:
+        depth: samples, ≥ 1.
+    """
+    return QoSProfile(
+        depth=depth,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL,
+    )
+
+
 def to_rclpy(qos: QosProfile | QoSProfile) -> QoSProfile:
     """Return rclpy's profile for ours, for creating an endpoint with; its own as it is."""
     if isinstance(qos, QoSProfile):

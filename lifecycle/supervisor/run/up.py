@@ -20,7 +20,13 @@ from pathlib import Path
 from lifecycle import dataclasses
 from lifecycle.errors import ExitCode, MiddlewareError
 from lifecycle.manifest.model import Authority, DataLayerSource, EndpointPolicy, RunKind
-from lifecycle.middleware.discovery.environment import discovery_peers, peers_environment
+from lifecycle.middleware.discovery.environment import (
+    PEERS_VARIABLE,
+    RANGE_VARIABLE,
+    all_by_multicast,
+    discovery_peers,
+    peers_environment,
+)
 from lifecycle.middleware.fastdds.profiles import discovery_environment
 from lifecycle.middleware.process.control import check_descriptors, check_memory, check_threads
 from lifecycle.middleware.process.prctl import adopt_orphans, exit_after
@@ -398,8 +404,8 @@ def _started(system: System, observer_participant: ObserverParticipant, logs: st
 
 _GRAPH_VARIABLES = (
     "ROS_DOMAIN_ID",
-    "ROS_AUTOMATIC_DISCOVERY_RANGE",
-    "ROS_STATIC_PEERS",
+    RANGE_VARIABLE,
+    PEERS_VARIABLE,
     *(each.profiles_variable for each in DISTRIBUTIONS),
 )
 
@@ -431,12 +437,11 @@ def _enter_graph(plan: Plan, options: UpOptions, directory: RunDirectory) -> Non
     hosted = (each for each in plan.processes if each.run.kind is RunKind.PYTHON)
     refuse_unsupported(plan.node(k) for each in hosted if each.machine in own for k in each.nodes)
     os.environ["ROS_DOMAIN_ID"] = str(plan.domain_id)
-    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = plan.discovery_range.name
+    os.environ[RANGE_VARIABLE] = plan.discovery_range.name
     hosts = reached_hosts(plan, own)
     os.environ.update(peers_environment(hosts, os.environ))
     peers = discovery_peers(plan.domain_id, hosts, os.environ)
-    is_one_host = own.issuperset(each.machine for each in plan.nodes)
-    multicast = is_one_host and not os.environ.get("ROS_STATIC_PEERS")
+    multicast = all_by_multicast((each.machine for each in plan.nodes), own, os.environ)
     os.environ.update(
         discovery_environment(directory.path, peers=peers, multicast_endpoints=multicast)
     )

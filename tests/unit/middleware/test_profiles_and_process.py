@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from lifecycle.errors import MiddlewareError
+from lifecycle.middleware.discovery.environment import all_by_multicast
 from lifecycle.middleware.fastdds.profiles import discovery_environment, discovery_profile
 from lifecycle.middleware.fastdds.sockets import widen_discovery_buffers
 from lifecycle.middleware.process.prctl import exit_after
@@ -35,6 +36,21 @@ def test_endpoints_are_sent_by_multicast_where_it_is_asked_for() -> None:
     root = ET.fromstring(discovery_profile(multicast_endpoints=True))
     (avoided,) = (each for each in root.iter() if each.tag.endswith("avoid_builtin_multicast"))
     assert avoided.text == "false"
+
+
+@pytest.mark.parametrize(
+    ("machines", "own", "environment", "expected"),
+    [
+        (["", ""], {""}, {}, True),
+        (["a", "b"], {"", "a", "b"}, {"ROS_STATIC_PEERS": ""}, True),
+        (["a", "b"], {"a"}, {}, False),
+        ([""], {""}, {"ROS_STATIC_PEERS": "10.0.2.1"}, False),
+    ],
+)
+def test_endpoints_go_by_multicast_only_where_no_other_host_is_looked_for(
+    machines: list[str], own: set[str], environment: dict[str, str], *, expected: bool
+) -> None:
+    assert all_by_multicast(machines, own, environment) is expected
 
 
 def test_the_environment_names_a_complete_file(tmp_path: Path) -> None:
