@@ -68,7 +68,7 @@ class SilenceMonitor:
         self._is_there = is_there
         self._listeners = [changed]
         self._silent: dict[str, _Silence] = {}
-        self._unanswering: dict[str, str] = {}
+        self._unanswering: dict[str, Finding] = {}
 
     @property
     def silent(self) -> Mapping[str, str]:
@@ -135,9 +135,8 @@ class SilenceMonitor:
     def unanswered(self, node: str, after_s: float) -> None:
         """Note that a node that is in no host of ours has answered no request for so long."""
         if node not in self._unanswering:
-            detail = f"it has answered no request for {after_s:g} s: it hangs, or nobody spins it"
-            self._unanswering[node] = detail
-            self._emit(Notice(message=_message(node, detail)))
+            found = self._unanswering[node] = not_answering(node, after_s)
+            self._emit(Notice(message=found.message))
             self._tell()
 
     @property
@@ -219,16 +218,7 @@ class SilenceMonitor:
             )
             for name, silence in sorted(self._silent.items())
         ) + tuple(
-            NOT_ANSWERING.finding(
-                Outcome.UNVERIFIABLE,
-                subject=name,
-                expected="alive",
-                observed="no answer",
-                message=_message(name, why),
-                node=name,
-            )
-            for name, why in sorted(self._unanswering.items())
-            if name not in self._silent
+            found for name, found in sorted(self._unanswering.items()) if name not in self._silent
         )
 
     def by_now(self, verdict: Verdict) -> Verdict:
@@ -275,6 +265,19 @@ class NodeArrivals:
 
 def _why(silence: _Silence) -> str:
     return ", and ".join(silence.causes.values())
+
+
+def not_answering(node: str, after_s: float) -> Finding:
+    """Return the finding of a node in no host of ours that answered no request for so long."""
+    why = f"it has answered no request for {after_s:g} s: it hangs, or nobody spins it"
+    return NOT_ANSWERING.finding(
+        Outcome.UNVERIFIABLE,
+        subject=node,
+        expected="alive",
+        observed="no answer",
+        message=_message(node, why),
+        node=node,
+    )
 
 
 def _message(name: str, why: str) -> str:

@@ -13,7 +13,7 @@ import asyncio
 import contextlib
 import logging
 import os
-from collections.abc import Awaitable, Callable, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -36,6 +36,8 @@ from lifecycle.supervisor.control.protocol import ProcessState, Reach, SystemSta
 from lifecycle.supervisor.control.server import SupervisorSnapshot, follow
 from lifecycle.supervisor.gate.gate import closes
 from lifecycle.supervisor.gate.verification_loop import GracePeriod
+from lifecycle.supervisor.health.answering import ANSWER_S, TRIES
+from lifecycle.supervisor.health.liveliness import not_answering
 from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant, settled
 from lifecycle.supervisor.processes.scope import unlimited
 from lifecycle.supervisor.run.options import onlooker_connections, own_machines
@@ -207,14 +209,27 @@ def _judged(
     observer_participant: ObserverParticipant,
     *,
     may_be_over: bool = True,
+    unanswered: Iterable[str] = (),
 ) -> JudgedSystem:
-    """Judge what was seen; of a node that may end by itself and is not there, it may have ended."""
+    """Judge what was seen.
+
+    Args:
+        plan: what was declared.
+        observation: what was seen.
+        observer_participant: by which.
+        may_be_over: whether a node that may end by itself, and is not there, has ended.
+        unanswered: names of nodes that answered no request.
+    """
     expected = Expectation.of(plan, observation)
     over = {each.full_name: "" for each in expected.plan.nodes if each.may_end and may_be_over}
     verdict = verify(expected.plan, observation, stage=Stage.ACTIVE, over=over)
     own = own_machines(plan, "")
     ours = (each for each in plan.processes if each.machine in own)
-    found = (*expected.findings, *unlimited(ours))
+    found = (
+        *expected.findings,
+        *unlimited(ours),
+        *(not_answering(name, TRIES * ANSWER_S) for name in unanswered),
+    )
     return JudgedSystem(
         plan=expected.plan,
         observation=observation,
@@ -243,8 +258,25 @@ async def _judge(
             limit_s = min(empty_graph_s, timeout_s)
         left_s = began + limit_s - loop.time()
         if left_s <= 0 or not _worth_waiting(seen.verdict, strict=strict):
-            return _judged(plan, observation, observer_participant)
+            unanswered = await _unanswering(plan, observation, observer_participant)
+            return _judged(plan, observation, observer_participant, unanswered=unanswered)
         await _change(observer_participant, min(left_s, _ASK_AGAIN_S))
+
+
+async def _unanswering(
+    plan: Plan, observation: Observation, observer_participant: ObserverParticipant
+) -> tuple[str, ...]:
+    """Return the declared nodes that are there and answer no request; who reported has answered."""
+    there = {each.full_name for each in observation.nodes}
+    silent = there - {each.name for each in observation.configurations}
+    nodes = tuple(each for each in plan.nodes if each.full_name in silent)
+    for _ in range(TRIES):
+        answers = await asyncio.gather(
+            *(observer_participant.answers(each, timeout_s=ANSWER_S) for each in nodes),
+            return_exceptions=True,  # who cannot be asked is in the verdict by other rules
+        )
+        nodes = tuple(node for node, answer in zip(nodes, answers, strict=True) if answer is False)
+    return tuple(each.full_name for each in nodes)
 
 
 def _worth_waiting(verdict: Verdict, *, strict: bool) -> bool:

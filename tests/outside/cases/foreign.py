@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 from tests.outside.case import NOBODY, OK, VIOLATED, Case
 from tests.outside.running import Run
 
@@ -166,6 +168,15 @@ def noticed_and_healed(run: Run) -> None:
     run.until_says(r"'/base' answers again", timeout_s=12.0)
 
 
+def verify_beside_a_hang(run: Run) -> None:
+    """Ask for a verdict from outside while the node hangs."""
+    run.until_active()
+    time.sleep(2.0)
+    beside = run.lifecycle("verify", "{}", "--strict")
+    assert beside.returncode == 5, beside.stdout + beside.stderr
+    assert "run.not-answering" in beside.stdout, beside.stdout
+
+
 SHIFTY = {
     "shifty.py": '''\
 import os
@@ -276,6 +287,18 @@ CASES = (
             story=noticed_and_healed,
             exit_code=(0, 4, 5),
             before="ok, or noticed 16 s late",
+        )
+        for managed in (False, True)
+    ),
+    *(
+        Case(
+            attack=f"verify is asked while a {'managed' if managed else 'plain'} node hangs",
+            manifest=hanging(20.0, managed=managed),
+            files=HANGING,
+            verb=("up", "--stop-after", "12"),
+            story=verify_beside_a_hang,
+            exit_code=(0, 4, 5),
+            findings=("run.not-answering",),
         )
         for managed in (False, True)
     ),
