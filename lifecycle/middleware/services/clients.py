@@ -1,15 +1,15 @@
 """Clients of the lifecycle services and the node configuration of other processes' nodes.
 
-Owns: the requests to a managed node that we reach only through its services, ours or foreign, and
-how an unanswered request is understood: a change_state without a reply is not a failed transition,
-so the state is read again (rcl_lifecycle, lifecycle_msgs/srv/*).
+Owns: the requests to nodes that we reach only through their services, ours or foreign, and how an
+unanswered one is understood: a change_state without a reply is not a failed transition, so the
+state is read again (rcl_lifecycle, lifecycle_msgs/srv/*).
 """
 
 from __future__ import annotations
 
 import asyncio
 import importlib
-from collections.abc import Awaitable, Callable, Collection, Coroutine, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from lifecycle_msgs.msg import Transition, TransitionEvent
@@ -27,14 +27,13 @@ from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.rcl.graph import GraphObserver
 from lifecycle.middleware.services.parameters import (
     TYPES,
-    parameter_value,
+    differs,
+    given_values,
     read_parameters,
-    to_rclpy,
     type_word,
 )
 from lifecycle.middleware.services.service_calls import ServiceCalls, ServiceUnansweredError
 from lifecycle.plan.model import PlannedNode
-from lifecycle.plan.parameters import COMMAND, DEFAULT
 from lifecycle.verify.observation import (
     ConfigurationError,
     NodeConfiguration,
@@ -54,7 +53,6 @@ _Reply = TypeVar("_Reply")
 _REREAD_S = 1.0
 _LEAST_S = 0.001
 _EVENT_DEPTH = 10
-_TRANSITIONS = "transition_event"
 _GOALS = {
     "configure": "inactive",
     "cleanup": "unconfigured",
@@ -71,7 +69,12 @@ _PARAMETER_SERVICES = ("list_parameters", "describe_parameters", "get_parameters
 
 
 class NodeClients:
-    """Asks and drives nodes through their services. `destroy` it before the observer."""
+    """Asks and drives nodes through their services. `destroy` it before the observer.
+
+    Nodes are fully qualified names; deadlines are seconds, > 0. Every request raises
+    ServiceUnansweredError where nothing offers the service or the answer does not come in time, and
+    MiddlewareError with the reason where the node refuses.
+    """
 
     def __init__(self, observer: GraphObserver) -> None:
         self._observer = observer
@@ -80,27 +83,14 @@ class NodeClients:
         self._diagnostics_timer: Timer | None = None
 
     async def get_state(self, node: str, *, timeout_s: float = TIMEOUT_S) -> str:
-        """Return the label of a managed node's state (lifecycle_msgs/State).
-
-        Args:
-            node: fully qualified name.
-            timeout_s: seconds, > 0.
-
-        Raises:
-            ServiceUnansweredError: no such service, or no answer.
-        """
+        """Return the label of a managed node's state (lifecycle_msgs/State)."""
         response = await self._request(f"{node}/get_state", GetState, timeout_s)
-        label: str = response.current_state.label
-        return label
+        return str(response.current_state.label)
 
     async def get_available_transitions(
         self, node: str, *, timeout_s: float = TIMEOUT_S
     ) -> tuple[str, ...]:
-        """Return the labels of the transitions that may be asked for now.
-
-        Raises:
-            ServiceUnansweredError: no such service, or no answer.
-        """
+        """Return the labels of the transitions that may be asked for now."""
         service = f"{node}/get_available_transitions"
         response = await self._request(service, GetAvailableTransitions, timeout_s)
         return tuple(each.transition.label for each in response.available_transitions)
@@ -113,22 +103,16 @@ class NodeClients:
         timeout_s: float,
         before: Callable[[], Awaitable[None]] | None = None,
     ) -> bool:
-        """Ask for one transition and wait until it is over.
+        """Ask for one transition, wait until it is over, and return whether it succeeded.
 
         The request is sent once. While the reply is missing, the state is read now and then: one
         that has reached the transition's goal counts as the reply.
 
         Args:
-            node: fully qualified name.
+            node: whose state.
             transition: label, "configure", "activate", …
-            timeout_s: seconds, > 0, for service, callback and reply together.
+            timeout_s: for service, callback and reply together.
             before: awaited when the request is about to leave; what it raises keeps it back.
-
-        Returns:
-            Whether the node accepted and completed it.
-
-        Raises:
-            ServiceUnansweredError: no such service, or neither reply nor goal state in time.
         """
         loop = asyncio.get_running_loop()
         deadline = loop.time() + timeout_s
@@ -161,19 +145,12 @@ class NodeClients:
     async def get_configuration(
         self, node: str, *, timeout_s: float = TIMEOUT_S, expected: bool = False
     ) -> NodeConfiguration | None:
-        """Read the node configuration interface of `node`.
+        """Read the node configuration interface; None where discovery shows none on the node.
 
         Args:
-            node: fully qualified name.
-            timeout_s: seconds, > 0.
+            node: that has it.
+            timeout_s: for the answer.
             expected: the node has one, so that it is waited for if discovery does not show it yet.
-
-        Returns:
-            None where discovery shows no such interface on the node.
-
-        Raises:
-            ServiceUnansweredError: it is there, but did not answer.
-            MiddlewareError: the node could not give it, or it is not what the schema says.
         """
         service = f"{node}/get_configuration"
         if not expected and not self._observer.offers(node, service):
@@ -187,14 +164,84 @@ class NodeClients:
             hint = "the node may run another version of lifecycle"
             raise MiddlewareError(f"cannot {what}: {error}", hint=hint) from error
 
+    async def load_component(
+        self, node: PlannedNode, container: str, *, timeout_s: float = TIMEOUT_S
+    ) -> Callable[[], Awaitable[None]]:
+        """Have a component container load a node (composition_interfaces/srv/LoadNode).
+
+        The request is sent once. While the reply is missing the container is asked now and then
+        what it has loaded: this node counts as the reply. So it is with what unloads.
+
+        Returns:
+            What has the container unload it again; raises as this does.
+
+        Raises:
+            MiddlewareError: also where composition_interfaces is not installed.
+        """
+        what = f"load {node.run.component!r} into {container!r}"
+        try:
+            services = importlib.import_module("composition_interfaces.srv")
+        except ImportError as error:
+            raise MiddlewareError(
+                f"cannot {what}: composition_interfaces is not installed",
+                hint="install it, or start the node as a command",
+            ) from error
+        at = f"{container}/_container"
+
+        async def loaded() -> dict[int, str] | None:
+            """Return what the container has, full names by number; None if it does not answer."""
+            try:
+                there = await self._request(f"{at}/list_nodes", services.ListNodes, _REREAD_S)
+            except ServiceUnansweredError:
+                return None
+            return dict(zip(there.unique_ids, there.full_node_names, strict=True))
+
+        async def ask(service: str, type_: type[Any], what: str, **fields: Any) -> Any:
+            response = await self._request(
+                f"{at}/{service}", type_, timeout_s, repeat=False, **fields
+            )
+            _check(what, response.success, response.error_message)
+            return response
+
+        async def load() -> int:
+            package, _, plugin = node.run.component.partition("/")
+            extra = (Parameter(name, value=value) for name, value in node.run.extra_arguments)
+            response = await ask(
+                "load_node",
+                services.LoadNode,
+                what,
+                package_name=package,
+                plugin_name=plugin,
+                node_name=node.name,
+                node_namespace=node.namespace,
+                remap_rules=[f"{source}:={target}" for source, target in node.remap],
+                parameters=_messages(given_values(node).values()),
+                extra_arguments=_messages(extra),
+            )
+            return int(response.unique_id)
+
+        async def is_loaded() -> int | None:
+            there = await loaded() or {}
+            named = (number for number, name in there.items() if name == node.full_name)
+            return max(named, default=None)
+
+        number = await _reply(load(), is_loaded)
+
+        async def is_unloaded() -> bool | None:
+            there = await loaded()
+            return None if there is None or number in there else True
+
+        async def unload() -> None:
+            what = f"unload {node.full_name!r} from {container!r}"
+            asking = ask("unload_node", services.UnloadNode, what, unique_id=number)
+            await _reply(asking, is_unloaded)
+
+        return unload
+
     async def get_parameters(
         self, node: str, *, timeout_s: float = TIMEOUT_S
     ) -> tuple[CapturedParameter, ...]:
-        """Read every parameter that `node` declares, with types, values and descriptions.
-
-        Raises:
-            ServiceUnansweredError: the node serves no parameters, or did not answer.
-        """
+        """Read every parameter that a node declares, with types, values and descriptions."""
         from lifecycle.export.captured import CapturedParameter
 
         found = await read_parameters(self._calls, node, None, timeout_s=timeout_s)
@@ -209,107 +256,37 @@ class NodeClients:
             for descriptor, type_, value in found
         )
 
-    async def load_component(
-        self, node: PlannedNode, container: str, *, timeout_s: float = TIMEOUT_S
-    ) -> Callable[[], Awaitable[None]]:
-        """Have a component container load a node (composition_interfaces/srv/LoadNode).
-
-        The request is sent once. While the reply is missing the container is asked now and then
-        what it has loaded: this node counts as the reply. So it is with what unloads.
-
-        Args:
-            node: whose run names the component.
-            container: full name of the container's node.
-            timeout_s: seconds, > 0.
-
-        Returns:
-            What has the container unload it again; raises as this does.
-
-        Raises:
-            ServiceUnansweredError: no such container, or no answer.
-            MiddlewareError: composition_interfaces is not installed, or the container refuses.
-        """
-        what = f"load {node.run.component!r} into {container!r}"
-        try:
-            services = importlib.import_module("composition_interfaces.srv")
-        except ImportError as error:
-            raise MiddlewareError(
-                f"cannot {what}: composition_interfaces is not installed",
-                hint="install it, or start the node as a command",
-            ) from error
-        package, _, plugin = node.run.component.partition("/")
-        extra = (Parameter(name, value=value) for name, value in node.run.extra_arguments)
-        at = f"{container}/_container"
-
-        async def loaded() -> dict[int, str] | None:
-            """Return what the container has, full names by number; None if it does not answer."""
-            try:
-                there = await self._request(f"{at}/list_nodes", services.ListNodes, _REREAD_S)
-            except ServiceUnansweredError:
-                return None
-            return dict(zip(there.unique_ids, there.full_node_names, strict=True))
-
-        async def load() -> int:
-            response = await self._request(
-                f"{at}/load_node",
-                services.LoadNode,
-                timeout_s,
-                repeat=False,
-                package_name=package,
-                plugin_name=plugin,
-                node_name=node.name,
-                node_namespace=node.namespace,
-                remap_rules=[f"{source}:={target}" for source, target in node.remap],
-                parameters=[each.to_parameter_msg() for each in _given_values(node).values()],
-                extra_arguments=[each.to_parameter_msg() for each in extra],
+    async def report_parameters(
+        self, node: str, names: Collection[str] | None, *, timeout_s: float = TIMEOUT_S
+    ) -> tuple[ParameterReport, ...]:
+        """Read those parameters of a node that are named and that it has; None reads all."""
+        found = await read_parameters(self._calls, node, names, timeout_s=timeout_s)
+        return tuple(
+            ParameterReport.of(
+                descriptor.name,
+                type_ or type_word(descriptor.type),
+                value,
+                read_only=descriptor.read_only,
             )
-            _check(what, response.success, response.error_message)
-            return int(response.unique_id)
-
-        async def is_loaded() -> int | None:
-            there = await loaded() or {}
-            named = (number for number, name in there.items() if name == node.full_name)
-            return max(named, default=None)
-
-        number = await _reply(load(), is_loaded)
-
-        async def ask_to_unload() -> bool:
-            response = await self._request(
-                f"{at}/unload_node", services.UnloadNode, timeout_s, repeat=False, unique_id=number
-            )
-            what = f"unload {node.full_name!r} from {container!r}"
-            _check(what, response.success, response.error_message)
-            return True
-
-        async def is_unloaded() -> bool | None:
-            there = await loaded()
-            return None if there is None or number in there else True
-
-        async def unload() -> None:
-            await _reply(ask_to_unload(), is_unloaded)
-
-        return unload
+            for descriptor, type_, value in found
+        )
 
     async def give_parameters(self, planned: PlannedNode, *, timeout_s: float = TIMEOUT_S) -> None:
-        """Set the parameters that a running node has with other values than its plan gives it.
-
-        Raises:
-            ServiceUnansweredError: the node serves no parameters, or did not answer.
-            MiddlewareError: it refuses a value, with its reason.
-        """
+        """Set the parameters that a running node has with other values than its plan gives it."""
         node = planned.full_name
         if not any(each.value is not None for each in planned.expected_parameters):
             return
         has = {each.name: each for each in await self.report_parameters(node, None)}
-        values = _given_values(planned, {name: each.type for name, each in has.items()})
+        values = given_values(planned, {name: each.type for name, each in has.items()})
         wanted = {
-            name: each for name, each in values.items() if name in has and _differs(has[name], each)
+            name: each for name, each in values.items() if name in has and differs(has[name], each)
         }
         if not wanted:
             return
-        parameters = [each.to_parameter_msg() for each in wanted.values()]
-        service = f"{node}/set_parameters"
-        response = await self._request(service, SetParameters, timeout_s, parameters=parameters)
+        given = _messages(wanted.values())
+        response = await self._request(
+            f"{node}/set_parameters", SetParameters, timeout_s, parameters=given
+        )
         for name, result in zip(wanted, response.results, strict=False):
             _check(f"set parameter {name!r} of {node!r}", result.successful, result.reason)
 
@@ -324,26 +301,31 @@ class NodeClients:
         """Set parameters of a running node, all or none (rcl_interfaces, SetParametersAtomically).
 
         Args:
-            node: fully qualified name.
+            node: whose they are.
             values: by parameter.
             types: by parameter, names of rcl_interfaces: "int", "double_array".
-            timeout_s: seconds, > 0.
-
-        Raises:
-            ServiceUnansweredError: the node serves no parameters, or did not answer.
-            MiddlewareError: it refuses, with its reason.
+            timeout_s: for the answer.
         """
-        parameters = [
-            Parameter(name, TYPES[types[name]], value).to_parameter_msg()
-            for name, value in values.items()
-        ]
-        service = f"{node}/set_parameters_atomically"
+        given = _messages(Parameter(name, TYPES[types[name]], values[name]) for name in values)
         response = await self._request(
-            service, SetParametersAtomically, timeout_s, parameters=parameters
+            f"{node}/set_parameters_atomically",
+            SetParametersAtomically,
+            timeout_s,
+            parameters=given,
         )
-        names = ", ".join(map(repr, values))
-        what = f"set {names} of {node!r} while it runs"
+        what = f"set {', '.join(map(repr, values))} of {node!r} while it runs"
         _check(what, response.result.successful, response.result.reason)
+
+    def serves_parameters(self, node: str) -> bool | None:
+        """Return whether a node has parameter services; None while discovery may not show them yet.
+
+        Client libraries make them before the type description service, and discovery shows one
+        participant's services in order: where it shows the latter alone, there are none.
+        """
+        offered = self._observer.services_of(node)
+        if {f"{node}/{each}" for each in _PARAMETER_SERVICES} <= offered:
+            return True
+        return False if f"{node}/get_type_description" in offered else None
 
     async def answers(
         self, node: str, *, managed: bool, timeout_s: float, repeat: bool = False
@@ -351,9 +333,9 @@ class NodeClients:
         """Return whether a node answers one small request; None where it serves nothing to ask.
 
         Args:
-            node: fully qualified name.
+            node: that is asked.
             managed: it has a state, which is asked for; else it is asked for no parameter.
-            timeout_s: seconds, > 0.
+            timeout_s: for the answer.
             repeat: see ServiceCalls; else a reply that is lost is none.
         """
         type_ = GetState if managed else GetParameters
@@ -366,42 +348,50 @@ class NodeClients:
             return False if error.found else None
         return True
 
-    async def report_parameters(
-        self, node: str, names: Collection[str] | None, *, timeout_s: float = TIMEOUT_S
-    ) -> tuple[ParameterReport, ...]:
-        """Read those parameters of `node` that are named and that it has; None reads all.
+    async def wire(
+        self,
+        node: str,
+        operation: str,
+        name: str,
+        value: str | Sequence[str] = "",
+        *,
+        timeout_s: float,
+    ) -> None:
+        """Call a service of a node's interface that changes how its endpoints are connected.
 
-        Raises:
-            ServiceUnansweredError: the node serves no parameters, or did not answer.
+        Args:
+            node: that is wired.
+            operation: "connect_to" makes a connection, "map_to" carries an endpoint by one,
+                "disconnect" removes one, "remap" gives an endpoint another name.
+            name: of the connection, or of the endpoint, `publishers/video`.
+            value: URLs of connect_to, at least one; connection of map_to, "" is the node's own;
+                new name of remap.
+            timeout_s: for the answer.
         """
-        found = await read_parameters(self._calls, node, names, timeout_s=timeout_s)
-        return tuple(
-            ParameterReport.of(
-                descriptor.name,
-                type_ or type_word(descriptor.type),
-                value,
-                read_only=descriptor.read_only,
-            )
-            for descriptor, type_, value in found
+        is_text = isinstance(value, str)
+        type_ = TYPES["string" if is_text else "string_array"]
+        given = _messages([Parameter(name, type_, value if is_text else list(value))])
+        # Each of them makes the same state again when it arrives twice.
+        response = await self._request(
+            f"{node}/{operation}", SetParameters, timeout_s, parameters=given
         )
+        what = f"{operation} {name!r} of {node!r}"
+        if len(response.results) != 1:
+            raise MiddlewareError(
+                f"cannot {what}: it answered with {len(response.results)} results instead of one"
+            )
+        _check(what, response.results[0].successful, response.results[0].reason)
 
-    def serves_parameters(self, node: str) -> bool | None:
-        """Return whether `node` has parameter services; None while discovery may not show them yet.
+    # What nodes publish; callbacks are called in the executor thread. To ask again for the same
+    # topic changes nothing.
 
-        Client libraries make them before the type description service, and discovery shows one
-        participant's services in order: where it shows the latter alone, there are none.
-        """
-        offered = self._observer.services_of(node)
-        if {f"{node}/{each}" for each in _PARAMETER_SERVICES} <= offered:
-            return True
-        return False if f"{node}/get_type_description" in offered else None
+    def on_transition(self, node: str, callback: Callable[[], None]) -> None:
+        """Have `callback` called after each transition of a node, until `forget`."""
+        topic = f"{node}/transition_event"
+        self._subscribe(TransitionEvent, topic, lambda _: callback(), _EVENT_DEPTH)
 
     def on_parameters(self, callback: Callable[[str, frozenset[str]], None]) -> None:
-        """Have `callback` called in the executor thread with each change of any node's parameters.
-
-        It is given the node's full name and the names of the parameters. Once: asking again
-        changes nothing.
-        """
+        """Have `callback` called with a node and the names of its parameters that changed."""
 
         def arrived(event: ParameterEvent) -> None:
             changed = (*event.new_parameters, *event.changed_parameters, *event.deleted_parameters)
@@ -410,10 +400,9 @@ class NodeClients:
         self._subscribe(ParameterEvent, "/parameter_events", arrived, qos_profile_parameter_events)
 
     def on_diagnostics(self, callback: Callable[[Sequence[tuple[str, int, str]]], None]) -> None:
-        """Have `callback` called in the executor thread with each message on /diagnostics.
+        """Have `callback` called with name, level and message of each entry on /diagnostics.
 
-        It is given name, level and message of each entry; and each second none, so that it sees
-        which are old. Once: asking again changes nothing.
+        It is called each second without any, so that it sees which are old.
         """
         if self._diagnostics_timer is not None:
             return
@@ -430,57 +419,10 @@ class NodeClients:
             1.0, lambda: callback(()), group, clock=Clock(clock_type=ClockType.STEADY_TIME)
         )
 
-    async def wire(
-        self,
-        node: str,
-        operation: str,
-        name: str,
-        value: str | Sequence[str] = "",
-        *,
-        timeout_s: float,
-    ) -> None:
-        """Call a service of a node's interface that changes how its endpoints are connected.
-
-        Args:
-            node: fully qualified name.
-            operation: "connect_to" makes a connection, "map_to" carries an endpoint by one,
-                "disconnect" removes one, "remap" gives an endpoint another name.
-            name: of the connection, or of the endpoint, `publishers/video`.
-            value: URLs of connect_to, at least one; connection of map_to, "" is the node's own;
-                new name of remap.
-            timeout_s: seconds, > 0.
-
-        Raises:
-            ServiceUnansweredError: no such service, or no answer.
-            MiddlewareError: the node refused, with its reason.
-        """
-        is_text = isinstance(value, str)
-        given = Parameter(
-            name, TYPES["string" if is_text else "string_array"], value if is_text else list(value)
-        )
-        # Each of them makes the same state again when it arrives twice.
-        response = await self._request(
-            f"{node}/{operation}", SetParameters, timeout_s, parameters=[given.to_parameter_msg()]
-        )
-        what = f"{operation} {name!r} of {node!r}"
-        if len(response.results) != 1:
-            raise MiddlewareError(
-                f"cannot {what}: it answered with {len(response.results)} results instead of one"
-            )
-        _check(what, response.results[0].successful, response.results[0].reason)
-
-    def on_transition(self, node: str, callback: Callable[[], None]) -> None:
-        """Have `callback` called in the executor thread after each transition of `node`.
-
-        One callback per node, until `forget`; asking again for the same node changes nothing.
-        """
-        topic = f"{node}/{_TRANSITIONS}"
-        self._subscribe(TransitionEvent, topic, lambda _: callback(), _EVENT_DEPTH)
-
     def forget(self, node: str) -> None:
         """Drop the clients and the subscription of a node that left the graph."""
         self._calls.forget(f"{node}/")
-        self._unsubscribe(f"{node}/{_TRANSITIONS}")
+        self._unsubscribe(f"{node}/transition_event")
 
     def destroy(self) -> None:
         """Stop the executor thread and drop every client; again is harmless."""
@@ -494,7 +436,6 @@ class NodeClients:
     def _subscribe(
         self, type_: type[Any], topic: str, callback: Callable[[Any], None], qos: QoSProfile | int
     ) -> None:
-        """Subscribe once: asking again for the same topic changes nothing."""
         if topic not in self._subscriptions:
             self._subscriptions[topic] = self._observer.node.create_subscription(
                 type_, topic, callback, qos, callback_group=self._calls.group
@@ -516,14 +457,9 @@ class NodeClients:
         **fields: Any,
     ) -> Any:
         """Send a request of these fields and return the response; see `ServiceCalls.call`."""
+        request = type_.Request(**fields)
         return await self._calls.call(
-            service,
-            type_,
-            type_.Request(**fields),
-            timeout_s=timeout_s,
-            repeat=repeat,
-            fresh=fresh,
-            before=before,
+            service, type_, request, timeout_s=timeout_s, repeat=repeat, fresh=fresh, before=before
         )
 
 
@@ -553,36 +489,5 @@ def _check(what: str, accepted: bool, reason: str) -> None:
         raise MiddlewareError(f"cannot {what}: it says {reason!r}")
 
 
-def _given_values(node: PlannedNode, has: Mapping[str, str] | None = None) -> dict[str, Any]:
-    """Return what a plan gives a node's parameters, by name, but by its command line.
-
-    Empty arrays are among them, too: rcl reads none from a command line. One whose type is declared
-    nowhere is given by the type that the node has for it, and not at all where that is unknown.
-
-    Args:
-        node: as it is planned.
-        has: types of what the node has, by name; None while it is not made.
-    """
-    given = {}
-    for each in node.expected_parameters:
-        word = (has or {}).get(each.name, "") if each.type == "array" else each.type
-        known = TYPES.get(word)
-        if each.value is None or known is None or each.source == DEFAULT:
-            continue
-        if each.source == COMMAND and each.value != ():
-            continue
-        if each.type == "array" and not word.endswith("_array"):
-            continue
-        given[each.name] = Parameter(each.name, known, to_rclpy(each.raw, word))
-    return given
-
-
-def _differs(has: ParameterReport, given: Parameter) -> bool:
-    """Whether a node has another value than it is given; what is not a number equals itself."""
-    wanted = ParameterReport.of(
-        has.name,
-        type_word(given.type_.value),
-        parameter_value(given.value),
-        read_only=has.read_only,
-    )
-    return has != wanted
+def _messages(parameters: Iterable[Parameter]) -> list[Any]:
+    return [each.to_parameter_msg() for each in parameters]

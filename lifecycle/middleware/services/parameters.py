@@ -1,13 +1,13 @@
 """Parameters of other processes' nodes, read and set through their parameter services.
 
-Owns: the requests to rcl_interfaces' services and how its types become ours, those of a node in
-this process too. Nodes that serve no parameters have none of these services.
+Owns: the requests that read them, what a plan gives, and how rcl_interfaces' types become ours,
+those of a node in this process too.
 """
 
 from __future__ import annotations
 
 import array
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING, Any
 
 from rcl_interfaces.msg import ParameterDescriptor
@@ -16,6 +16,9 @@ from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters
 from rclpy.parameter import Parameter, parameter_value_to_python
 
 from lifecycle.manifest.model import ParameterValue
+from lifecycle.plan.model import PlannedNode
+from lifecycle.plan.parameters import COMMAND, DEFAULT
+from lifecycle.verify.observation import ParameterReport
 
 if TYPE_CHECKING:
     from lifecycle.middleware.services.service_calls import ServiceCalls
@@ -111,3 +114,29 @@ def to_rclpy(value: ParameterValue, type_: str) -> Any:
     if type_ == "double" and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     return value
+
+
+def given_values(planned: PlannedNode, has: Mapping[str, str] | None = None) -> dict[str, Any]:
+    """Return what a plan gives a node's parameters, by name, but by its command line.
+
+    Empty arrays are among them, too: rcl reads none from a command line. One whose type is declared
+    nowhere is given by the type that the node has for it, and not at all where that is unknown.
+
+    Args:
+        planned: the node.
+        has: types of what the node has, by name; None while it is not made.
+    """
+    given = {}
+    for each in planned.expected_parameters:
+        word = (has or {}).get(each.name, "") if each.type == "array" else each.type
+        is_known = word in TYPES and (each.type != "array" or word.endswith("_array"))
+        is_given = each.value is not None and each.source != DEFAULT
+        if is_known and is_given and (each.source != COMMAND or each.value == ()):
+            given[each.name] = Parameter(each.name, TYPES[word], to_rclpy(each.raw, word))
+    return given
+
+
+def differs(has: ParameterReport, given: Parameter) -> bool:
+    """Whether a node has another value than it is given; what is not a number equals itself."""
+    type_, value = type_word(given.type_.value), parameter_value(given.value)
+    return has != ParameterReport.of(has.name, type_, value, read_only=has.read_only)

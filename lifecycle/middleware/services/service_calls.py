@@ -98,41 +98,24 @@ class ServiceCalls:
             ServiceUnansweredError: at the deadline, or as soon as the service is forgotten once the
                 request was sent.
         """
+        deadline = asyncio.get_running_loop().time() + timeout_s
         try:
-            loop = asyncio.get_running_loop()
-            deadline = loop.time() + timeout_s
             client = await self._usable(service, type_, deadline, fresh=fresh)
             if client is None:
                 raise ServiceUnansweredError(service, found=False, timeout_s=timeout_s)
             if before is not None:
                 await before()
-            answer: asyncio.Future[Any] = loop.create_future()
-
-            def arrived(pending: Future) -> None:
-                with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
-                    loop.call_soon_threadsafe(_deliver, answer, pending)
-
             attempt_s = _FIRST_ATTEMPT_S if repeat else timeout_s
-            sent = []
-            try:
-                while (left_s := deadline - loop.time()) > 0:
-                    sent.append(client.call_async(request))
-                    sent[-1].add_done_callback(arrived)
-                    await asyncio.wait((answer,), timeout=min(attempt_s, left_s))
-                    if answer.done():
-                        return answer.result()
-                    attempt_s = min(2 * attempt_s, _LONGEST_ATTEMPT_S)
-            finally:
-                for pending in sent:
-                    client.remove_pending_request(pending)
-                answer.cancel()
-            raise ServiceUnansweredError(service, found=True, timeout_s=timeout_s)
+            answer = await _ask(client, request, deadline, attempt_s)
         except InvalidHandle as error:
             # Its node left, and its client was destroyed meanwhile.
             raise ServiceUnansweredError(service, found=False, timeout_s=timeout_s) from error
         finally:
             if fresh:
                 self._drop((service, type_, True))
+        if answer is None:
+            raise ServiceUnansweredError(service, found=True, timeout_s=timeout_s)
+        return answer
 
     def open(self, service: str, type_: type[Any]) -> bool:
         """Make the client of a service now; False if there is one already."""
@@ -187,20 +170,11 @@ class ServiceCalls:
         Returns:
             Whether it is in the graph; False only at the deadline.
         """
-        loop = asyncio.get_running_loop()
         if client.service_is_ready():
             return True
-        changed: asyncio.Future[None] = loop.create_future()
-
-        def change() -> None:
-            if not changed.done():
-                changed.set_result(None)
-
-        def notify() -> None:
-            with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
-                loop.call_soon_threadsafe(change)
-
-        remove = self._observer.on_change(notify)
+        loop = asyncio.get_running_loop()
+        changed = asyncio.Event()
+        remove = self._observer.on_change(lambda: _post(loop, changed.set))
         try:
             check_s = _MATCH_CHECK_S
             offered_s: float | None = None
@@ -214,14 +188,52 @@ class ServiceCalls:
                     return True
                 if now_s >= deadline:
                     return offered_s is not None
-                wait_s = min(check_s, deadline - now_s)
                 # Not wait_for: of Python 3.10 and 3.11 it may swallow our cancellation.
-                await asyncio.wait((changed,), timeout=wait_s)
-                check_s = _MATCH_CHECK_S if changed.done() else min(2 * check_s, 1.0)
-                changed = loop.create_future()
+                waiting = asyncio.ensure_future(changed.wait())
+                try:
+                    await asyncio.wait((waiting,), timeout=min(check_s, deadline - now_s))
+                finally:
+                    waiting.cancel()
+                check_s = _MATCH_CHECK_S if changed.is_set() else min(2 * check_s, 1.0)
+                changed.clear()
         finally:
             remove()
         return True
+
+
+async def _ask(client: Client, request: object, deadline: float, attempt_s: float) -> Any:
+    """Send a request, again after each attempt, ever longer; None if no answer came in time."""
+    loop = asyncio.get_running_loop()
+    answer: asyncio.Future[Any] = loop.create_future()
+    sent: list[Future] = []
+    try:
+        while (left_s := deadline - loop.time()) > 0:
+            sent.append(client.call_async(request))
+            sent[-1].add_done_callback(lambda done: _post(loop, lambda: _deliver(answer, done)))
+            await asyncio.wait((answer,), timeout=min(attempt_s, left_s))
+            if answer.done():
+                return answer.result()
+            attempt_s = min(2 * attempt_s, _LONGEST_ATTEMPT_S)
+        return None
+    finally:
+        for pending in sent:
+            client.remove_pending_request(pending)
+        answer.cancel()
+
+
+def _post(loop: asyncio.AbstractEventLoop, work: Callable[[], object]) -> None:
+    with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
+        loop.call_soon_threadsafe(work)
+
+
+def _deliver(answer: asyncio.Future[Any], pending: Future) -> None:
+    if answer.done() or pending.cancelled():
+        return
+    error = pending.exception()
+    if error is not None:
+        answer.set_exception(error)
+    else:
+        answer.set_result(pending.result())
 
 
 class _Spinner:
@@ -253,13 +265,3 @@ class _Spinner:
                 with contextlib.suppress(InvalidHandle):
                     self._executor.spin()
                     return
-
-
-def _deliver(answer: asyncio.Future[Any], pending: Future) -> None:
-    if answer.done() or pending.cancelled():
-        return
-    error = pending.exception()
-    if error is not None:
-        answer.set_exception(error)
-    else:
-        answer.set_result(pending.result())
