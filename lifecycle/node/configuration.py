@@ -34,8 +34,8 @@ from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.fastdds.nfe import SHARED_MEMORY, get_network_flow_endpoints, senders_of
 from lifecycle.middleware.process.control import machine_id
 from lifecycle.middleware.process.hosted import vouch_for
-from lifecycle.middleware.rcl.graph import EndpointInfo, endpoints_of, endpoints_of_node
 from lifecycle.middleware.rcl.graph_changes import is_server_matched
+from lifecycle.middleware.rcl.graph_queries import endpoints_of, endpoints_of_node
 from lifecycle.middleware.rcl.qos import from_rclpy
 from lifecycle.middleware.rcl.rclpy_nodes import interface_of
 from lifecycle.network.medium import CONNECTABLE, Medium
@@ -48,7 +48,13 @@ from lifecycle.node.endpoints.making import CLIENTS
 from lifecycle.node.endpoints.mapping import Mapping, count_peers, wire_name
 from lifecycle.plan.model import PlannedEndpoint, PlannedNode
 from lifecycle.plan.negotiation.data_layer import PARADIGMS, SERIALIZATIONS
-from lifecycle.verify.observation import EndpointReport, HealthReport, Identity, NodeConfiguration
+from lifecycle.verify.observation import (
+    EndpointReport,
+    HealthReport,
+    Identity,
+    NodeConfiguration,
+    ObservedEndpoint,
+)
 from lifecycle.verify.outcome import ConnectionReport
 from lifecycle.verify.tool_filter import PREFIX_DIGITS
 
@@ -347,7 +353,7 @@ def _with_matches(report: EndpointReport, witness: Node, entity: Any) -> Endpoin
     )
 
 
-def _own_endpoint(node: Node, topic: str, kind: EndpointKind) -> EndpointInfo | None:
+def _own_endpoint(node: Node, topic: str, kind: EndpointKind) -> ObservedEndpoint | None:
     """Return what this process's graph cache says of the node's own endpoint on `topic`.
 
     It knows own endpoints at once, discovery has no part in it. None if there is none, or if
@@ -392,7 +398,7 @@ def _prefix_of(connection: Connection) -> str:
     for kind in (each for each in EndpointKind if not each.is_action):
         for each, _ in endpoints_of_node(node, kind, name) or ():
             infos = endpoints_of(node, kind, each)
-            found.update(info.prefix for info in infos if info.node == name)
+            found.update(info.gid[:PREFIX_DIGITS] for info in infos if info.node == name)
     return found.pop() if len(found) == 1 else ""
 
 
@@ -421,13 +427,12 @@ def _dscp(connection: Connection | None) -> int | None:
         return None  # likewise: sockets that cannot be read are "not read"
 
 
-def _actual_qos(entity: Any, info: EndpointInfo | None) -> QosProfile:
+def _actual_qos(entity: Any, info: ObservedEndpoint | None) -> QosProfile:
     """Return the QoS in force; history and depth, which the graph lacks, as they were asked for."""
     asked = from_rclpy(entity.qos_profile)
-    if info is None:
+    if info is None or info.qos is None:
         return asked
-    actual = info.qos
-    return dataclasses.replace(actual, history=asked.history, depth=asked.depth)
+    return dataclasses.replace(info.qos, history=asked.history, depth=asked.depth)
 
 
 def _transports(endpoints: tuple[EndpointReport, ...]) -> tuple[str, ...]:

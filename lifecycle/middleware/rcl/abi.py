@@ -12,15 +12,16 @@ from __future__ import annotations
 import ctypes
 import functools
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.versions import INSTALL, KNOWN_RCL, of_rcl, rcl_version
 
 RCL_RET_OK = 0
-RCL_RET_UNSUPPORTED = 3
 RCL_RET_TIMEOUT = 2
+RCL_RET_UNSUPPORTED = 3
+_FOR_EVER = -1
 _ERROR_LOCATION = re.compile(r", at [^,]+?:\d+(?=,|$)")
 
 
@@ -179,7 +180,9 @@ class Rcl:
             )
             for kind in ("publisher", "subscription")
         }
-        self.graph_guard = _bind(rcl, "rcl_node_get_graph_guard_condition", pointer, (pointer,))
+        self.graph_guard: Callable[[int], int] = _bind(
+            rcl, "rcl_node_get_graph_guard_condition", pointer, (pointer,)
+        )
         self.zero_wait_set = _bind(rcl, "rcl_get_zero_initialized_wait_set", WaitSet)
         self.wait_set_init = _bind(
             rcl, "rcl_wait_set_init", integer, (pointer, *([size] * 6), pointer, Allocator)
@@ -222,6 +225,54 @@ class Rcl:
         self.nfe_set_address(ctypes.byref(probe), b"192.0.2.1", 9)
         if probe[0].internet_address != b"192.0.2.1" or bytes(probe[1]).strip(b"\0"):
             raise _layout_error("rmw_network_flow_endpoint_t", version)
+
+
+class GuardWait:
+    """Waits for guard conditions of one context; `close` it after the last `wait` has returned.
+
+    Args:
+        context: address of the rcl_context_t.
+        count: how many guard conditions there are.
+
+    Raises:
+        MiddlewareError: rcl refuses.
+    """
+
+    def __init__(self, context: int, count: int) -> None:
+        self._rcl = load()
+        self._set = self._rcl.zero_wait_set()
+        sizes = (0, count, 0, 0, 0, 0)
+        allocator = self._rcl.default_allocator
+        self._check(self._rcl.wait_set_init(ctypes.byref(self._set), *sizes, context, allocator))
+
+    def wait(self, guards: Sequence[int], timeout_s: float | None) -> bool:
+        """Return whether one of the guard conditions was triggered in time.
+
+        Args:
+            guards: addresses of rcl_guard_condition_t; what they belong to must stay.
+            timeout_s: None for ever.
+
+        Raises:
+            MiddlewareError: rcl cannot wait.
+        """
+        wait_set = ctypes.byref(self._set)
+        self._check(self._rcl.wait_set_clear(wait_set))
+        for each in guards:
+            self._check(self._rcl.wait_set_add_guard(wait_set, each, None))
+        timeout_ns = _FOR_EVER if timeout_s is None else round(timeout_s * 1e9)
+        result = self._rcl.wait(wait_set, timeout_ns)
+        if result == RCL_RET_TIMEOUT:
+            return False
+        self._check(result)
+        return True
+
+    def close(self) -> None:
+        """Free it."""
+        self._rcl.wait_set_fini(ctypes.byref(self._set))
+
+    def _check(self, result: int) -> None:
+        if result != RCL_RET_OK:
+            raise MiddlewareError(f"cannot wait for graph changes: {self._rcl.take_error()}")
 
 
 def load() -> Rcl:

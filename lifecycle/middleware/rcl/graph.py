@@ -1,16 +1,10 @@
 """ROS graph observer: snapshots of nodes and endpoints as discovery shows them, without polling.
 
-Owns: the graph queries of rclpy, put with the names that the RMW has, which rclpy neither expands
-nor validates; the observer's participant; and the translation into observation types. Entities that
-tools add are left out by `lifecycle.verify.tool_filter`.
+Owns: the observer's participant, and what of the graph's answers is a node, its endpoints and its
+services. Entities that tools add are left out by `lifecycle.verify.tool_filter`.
 
 A node is there while an endpoint is its own: rmw_dds_common may keep the names of nodes that have
-left. The type hashes (REP-2016) of services are found at their request and reply endpoints, by
-their DDS names; rmw_fastrtps and rmw_cyclonedds announce hashes since Iron.
-
-Any participant may announce names that are no UTF-8, at which rclpy's queries raise. Such a name is
-shown escaped, and a topic of which nothing can be read as one of an unknown node: neither is ever
-verified.
+left.
 """
 
 from __future__ import annotations
@@ -27,18 +21,12 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import rclpy
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 from rclpy.subscription import Subscription
-from rclpy.topic_endpoint_info import TopicEndpointInfo
-from rclpy.utilities import get_rmw_implementation_identifier
 
 from lifecycle import dataclasses
-from lifecycle.errors import MiddlewareError
-from lifecycle.manifest.installed_types import join
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.manifest.qos import Durability, History, Liveliness, QosProfile, Reliability
 from lifecycle.middleware.discovery.environment import is_served, missing_port, reach, settle_s
 from lifecycle.middleware.discovery.prefixes import PROCESS_DIGITS, is_of_host, is_of_process
 from lifecycle.middleware.discovery.prober import Settling
@@ -50,8 +38,22 @@ from lifecycle.middleware.fastdds.participant_profile import (
 from lifecycle.middleware.fastdds.settings import observer_settings
 from lifecycle.middleware.process.hosted import is_vouched_for
 from lifecycle.middleware.rcl.graph_changes import GraphGuard
+from lifecycle.middleware.rcl.graph_queries import (
+    OVER_DDS,
+    RAW,
+    Ends,
+    endpoints_of,
+    endpoints_of_node,
+    node_names,
+    rmw_topics,
+    service_ends,
+    service_hash,
+    services_in,
+    topic_endpoints,
+    topic_names,
+    unreadable,
+)
 from lifecycle.middleware.rcl.hidden_node import quiet_node
-from lifecycle.middleware.rcl.qos import from_rclpy
 from lifecycle.plan.model import ParticipantConnections
 from lifecycle.verify.observation import ObservedEndpoint, ObservedNode
 from lifecycle.verify.tool_filter import (
@@ -61,7 +63,6 @@ from lifecycle.verify.tool_filter import (
     DeclaredNames,
     fold_actions,
     is_noise_endpoint,
-    known_node,
     our_nodes,
     without_noise,
 )
@@ -69,178 +70,10 @@ from lifecycle.verify.tool_filter import (
 if TYPE_CHECKING:  # nodes ask what is in the graph as well, and capture nothing
     from lifecycle.export.programs import CapturedProgram
 
-RAW = "dds:"
-"""What names of topics begin with here that are no names of ROS."""
-
-_OVER_DDS = not get_rmw_implementation_identifier().startswith("rmw_zenoh")
-"""The RMW adds `rt`, `rq` or `rr` to names of ROS, as DDS has them (rmw_dds_common)."""
-
-_TOPIC, _REQUEST, _REPLY = ("rt{}", "rq{}Request", "rr{}Reply") if _OVER_DDS else ("{}",) * 3
-
-_NODES = "ros_discovery_info"
-"""Every participant of rmw_fastrtps and rmw_cyclonedds writes it, and no other."""
-
 _PARAMETER_EVENTS = "/parameter_events"
 """rclcpp and rclpy give every node one publisher of it."""
 
 _OF_SERVICES = (EndpointKind.SERVICE_SERVER, EndpointKind.SERVICE_CLIENT)
-
-_REFUSED = (ValueError, rclpy_implementation.RCLError)
-"""What rclpy's queries raise where a name or a value cannot be had: UnicodeDecodeError is one."""
-
-
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class EndpointInfo:
-    """A publisher or subscription of the RMW as discovery shows it.
-
-    Attributes:
-        node: fully qualified name of its node; empty while that is not known.
-        type: `std_msgs/msg/String`, of a service's `std_srvs/srv/Trigger`.
-        gid: hex, 32 digits; empty of one that could not be read.
-        qos: history and depth are UNKNOWN and 0 over Fast DDS.
-        type_hash: `RIHS01_df66…`; empty if it announces none.
-    """
-
-    node: str
-    type: str
-    gid: str
-    qos: QosProfile
-    type_hash: str
-
-    @property
-    def prefix(self) -> str:
-        """What its participant's GUID begins with, 24 hex digits."""
-        return self.gid[:PREFIX_DIGITS]
-
-    @classmethod
-    def of(cls, info: TopicEndpointInfo) -> EndpointInfo:
-        """Return it as rclpy has it."""
-        space = info.node_namespace.rstrip("/")
-        announced = info.topic_type_hash
-        return cls(
-            node=known_node(f"{space}/{info.node_name}"),
-            type=_ros_type(info.topic_type),
-            gid=bytes(info.endpoint_gid[:_GID_BYTES]).hex(),
-            qos=from_rclpy(info.qos_profile),
-            type_hash=str(announced) if announced.version > 0 else "",
-        )
-
-
-_GID_BYTES = 16
-
-_UNREADABLE = EndpointInfo(
-    node="",
-    type="",
-    gid="",
-    qos=QosProfile(
-        history=History.UNKNOWN,
-        depth=0,
-        reliability=Reliability.UNKNOWN,
-        durability=Durability.UNKNOWN,
-        liveliness=Liveliness.UNKNOWN,
-    ),
-    type_hash="",
-)
-"""In place of all endpoints of a topic of which one has a name that is no UTF-8."""
-
-
-def _ros_type(dds_type: str) -> str:
-    """Return `std_msgs/msg/String` for `std_msgs::msg::dds_::String_`; others as they are."""
-    package, ours, name = dds_type.partition("dds_::")
-    if not ours or not name.endswith("_"):
-        return dds_type
-    if not package.endswith("msg::"):  # one of a service
-        name = name.removesuffix("_Request_").removesuffix("_Response_")
-    return package.replace("::", "/") + name.removesuffix("_")
-
-
-def _publishers(node: Node, name: str) -> list[EndpointInfo]:
-    return _read(node.get_publishers_info_by_topic, name)
-
-
-def _subscriptions(node: Node, name: str) -> list[EndpointInfo]:
-    return _read(node.get_subscriptions_info_by_topic, name)
-
-
-def _read(query: Callable[..., list[Any]], name: str) -> list[EndpointInfo]:
-    try:
-        return [EndpointInfo.of(info) for info in query(name, no_mangle=True)]
-    except _REFUSED:
-        return [_UNREADABLE]
-
-
-def endpoints_of(node: Node, kind: EndpointKind, name: str) -> list[EndpointInfo]:
-    """Return what `node` sees of the publishers or subscriptions of a topic.
-
-    Args:
-        node: that queries.
-        kind: PUBLISHER or SUBSCRIPTION; of a service SERVICE_SERVER, for what reads its requests,
-            or SERVICE_CLIENT, for what writes them.
-        name: fully qualified.
-    """
-    pattern = _TOPIC if kind.is_topic else _REQUEST
-    writes = kind in (EndpointKind.PUBLISHER, EndpointKind.SERVICE_CLIENT)
-    return (_publishers if writes else _subscriptions)(node, pattern.format(name))
-
-
-_Listed = tuple[tuple[str, str], ...]
-"""Names and types."""
-
-
-def endpoints_of_node(node: Node, kind: EndpointKind, full_name: str) -> _Listed | None:
-    """Return name and type of a node's publishers, subscriptions, servers or clients.
-
-    Returns:
-        None where rcl shows no such node: it has left, or has a name that no rcl would give it.
-    """
-    query = {
-        EndpointKind.PUBLISHER: node.get_publisher_names_and_types_by_node,
-        EndpointKind.SUBSCRIPTION: node.get_subscriber_names_and_types_by_node,
-        EndpointKind.SERVICE_SERVER: node.get_service_names_and_types_by_node,
-        EndpointKind.SERVICE_CLIENT: node.get_client_names_and_types_by_node,
-    }[kind]
-    namespace, _, name = full_name.rpartition("/")
-    try:
-        return tuple(
-            (each, type_) for each, types in query(name, namespace or "/") for type_ in types
-        )
-    except _REFUSED:
-        return None
-
-
-def _node_names(node: Node) -> list[str]:
-    """Return the names that the RMW has, of nodes that have left too; none if it cannot say all."""
-    try:
-        found = node.get_node_names_and_namespaces()
-    except _REFUSED:
-        return []
-    return [f"{space.rstrip('/')}/{name}" for name, space in found]
-
-
-_Ends = tuple[list[EndpointInfo], list[EndpointInfo]]
-"""Of a service's servers or clients: what reads or writes requests, then replies."""
-
-
-def _ends(node: Node, kind: EndpointKind, service: str) -> _Ends:
-    if not _OVER_DDS:
-        return [], []
-    requests, replies = _REQUEST.format(service), _REPLY.format(service)
-    if kind is EndpointKind.SERVICE_SERVER:
-        return _subscriptions(node, requests), _publishers(node, replies)
-    return _publishers(node, requests), _subscriptions(node, replies)
-
-
-def _service_hash(ends: _Ends, node: str) -> str | None:
-    """Return the joined hashes of a node's ends, empty while only half of it is seen; else None.
-
-    None means that the RMW has no such topics, or that nothing of them is seen.
-    """
-    hashes = [{info.type_hash for info in side if info.node == node} for side in ends]
-    if not any(hashes):
-        return None
-    # A node with several servers or clients of one name is one end: all of them count.
-    return join(["" if "" in each else "|".join(sorted(each)) for each in hashes])
-
 
 _AGREED_S = 5.0
 """A server that listens agrees within so long, on a busy machine too."""
@@ -300,7 +133,7 @@ class GraphObserver:
         self._context: rclpy.Context | None = None
         if node is None:
             self._context, node = _observing_node(domain_id, settings)
-            reached = reach(domain_id, settings.urls, os.environ) if _OVER_DDS else ()
+            reached = reach(domain_id, settings.urls, os.environ) if OVER_DDS else ()
             self.settling = Settling(reached, settle_s(settings.urls, os.environ))
         else:
             self.settling = Settling(())
@@ -368,17 +201,22 @@ class GraphObserver:
             return self._look(declared, names)
 
     def _look(self, declared: Collection[str], names: DeclaredNames) -> Snapshot:
-        topics, illegible = self._topics(names)
+        wanted = (_PARAMETER_EVENTS, *names.of_kind(EndpointKind.PUBLISHER))
+        topics, illegible = topic_names(self.node, self._topics_before | rmw_topics(wanted))
         shown: dict[str, list[ObservedEndpoint]] = {}
         if illegible:
-            shown[""] = [_observed(EndpointKind.PUBLISHER, illegible, _UNREADABLE)]
+            shown[""] = [unreadable(EndpointKind.PUBLISHER, illegible)]
+        else:
+            self._topics_before = frozenset(topics)
         homes: dict[str, Counter[str]] = {}
-        for kind, topic, info in self._topic_endpoints(topics):
-            if info.node:
-                has_events = kind is EndpointKind.PUBLISHER and topic == _PARAMETER_EVENTS
-                homes.setdefault(info.node, Counter())[info.prefix] += has_events
-            if not _is_noise(kind, topic, info, declared, names):
-                shown.setdefault(info.node, []).append(self._timed(_observed(kind, topic, info)))
+        for each in topic_endpoints(self.node, topics):
+            if self._is_dead(each):
+                continue
+            if each.node:
+                has_events = (each.kind, each.name) == (EndpointKind.PUBLISHER, _PARAMETER_EVENTS)
+                homes.setdefault(each.node, Counter())[each.gid[:PREFIX_DIGITS]] += has_events
+            if not _is_noise(each, declared, names):
+                shown.setdefault(each.node, []).append(self._timed(each))
         self._named = frozenset(itertools.chain.from_iterable(homes.values()))
         # A participant may have several nodes of one name.
         counts = {name: sum(max(1, each) for each in on.values()) for name, on in homes.items()}
@@ -389,9 +227,9 @@ class GraphObserver:
             del counts[ourselves]
             own = shown.pop(ourselves, [])
             shown[ourselves] = [each for each in own if names.looks_for(each.kind, each.name)]
-        ends = functools.cache(functools.partial(_ends, self.node))
-        wanted = _declared_services(names) | (set() if are_all else _services_in(topics))
-        others = self._services_by_name(wanted, services, ends)
+        ends = functools.cache(functools.partial(service_ends, self.node))
+        sought = _declared_services(names) | (set() if are_all else services_in(topics))
+        others = self._services_by_name(sought, services, ends)
         for each in itertools.chain(*services.values(), others):
             shown.setdefault(each.node, []).append(each)
             if each.node:
@@ -405,7 +243,9 @@ class GraphObserver:
         endpoints: list[ObservedEndpoint] = []
         for name in sorted(shown):
             but = NO_NAMES if name in declared else names
-            endpoints += self._hashed(name, shown[name], but, ends)
+            judged = without_noise(shown[name], but=but, ours=self._ours)
+            folded = fold_actions(self._hashed(name, judged, ends))
+            endpoints += sorted(folded if name else self._located(folded), key=_order)
         return tuple(nodes), tuple(endpoints)
 
     def settling_s(self) -> float:
@@ -427,7 +267,7 @@ class GraphObserver:
     @property
     def prefix(self) -> str:
         """GUID prefix of its own participant, 24 hex digits; empty where that is not known."""
-        return next(iter(self._homes().get(self._name, ())), "")
+        return self._homes()[1]
 
     def hosted(self, nodes: Iterable[str]) -> dict[str, bool]:
         """Return which nodes of this machine are in hosts of ours, see `process/hosted.py`.
@@ -435,8 +275,8 @@ class GraphObserver:
         Args:
             nodes: fully qualified names; those on other machines are not in the result.
         """
-        homes, found = self._homes(), {}
-        own = next(iter(homes.get(self._name, ())), "")
+        homes, own = self._homes()
+        found = {}
         for name in nodes:
             here = [each for each in homes.get(name, ()) if own and is_of_host(each, own)]
             if here:
@@ -446,8 +286,8 @@ class GraphObserver:
     def offers(self, node: str, service: str) -> bool:
         """Return whether discovery shows `service` (a fully qualified name) on `node`."""
         return service in self.services_of(node) or any(
-            info.node == node
-            for info in endpoints_of(self.node, EndpointKind.SERVICE_SERVER, service)
+            each.node == node
+            for each in endpoints_of(self.node, EndpointKind.SERVICE_SERVER, service)
         )
 
     def services_of(self, node: str) -> frozenset[str]:
@@ -491,8 +331,7 @@ class GraphObserver:
         """
         if self._destroyed:
             return
-        homes = self._homes()
-        own = next(iter(homes.get(self._name, ())), "")
+        homes, own = self._homes()
         claimed = {*reported, *(prefix for name in nodes for prefix in homes.get(name, ()))}
         theirs = (each for each in claimed if own and is_of_process(each, pid, own))
         self._count_no_more(theirs, own)
@@ -511,16 +350,16 @@ class GraphObserver:
             self._dead |= ended
             self._changed()
 
-    def _is_dead(self, info: EndpointInfo) -> bool:
-        return info.prefix[:PROCESS_DIGITS] in self._dead
+    def _is_dead(self, endpoint: ObservedEndpoint) -> bool:
+        return endpoint.gid[:PROCESS_DIGITS] in self._dead
 
-    def _homes(self) -> dict[str, set[str]]:
-        """Return by full name the prefixes of the participants that nodes are on now."""
+    def _homes(self) -> tuple[dict[str, set[str]], str]:
+        """Return by full name the prefixes of the participants that nodes are on, and our own."""
         homes: dict[str, set[str]] = {}
         for each in endpoints_of(self.node, EndpointKind.PUBLISHER, _PARAMETER_EVENTS):
             if each.node and not self._is_dead(each):
-                homes.setdefault(each.node, set()).add(each.prefix)
-        return homes
+                homes.setdefault(each.node, set()).add(each.gid[:PREFIX_DIGITS])
+        return homes, next(iter(homes.get(self._name, ())), "")
 
     def programs(self, environment: Mapping[str, str]) -> dict[str, dict[str, CapturedProgram]]:
         """Return how the processes of this host's nodes were started.
@@ -533,8 +372,7 @@ class GraphObserver:
         """
         from lifecycle.middleware.process.process_table import programs_of
 
-        homes = self._homes()
-        own = next(iter(homes.get(self._name, ())), "")
+        homes, own = self._homes()
         if not own:
             return {}
         known = programs_of((each for home in homes.values() for each in home), own, environment)
@@ -583,44 +421,6 @@ class GraphObserver:
         for callback in self._callbacks:
             callback()
 
-    def _topics(self, names: DeclaredNames) -> tuple[Collection[str], str]:
-        """Return the topics that the RMW has, and one name that is no UTF-8, escaped.
-
-        Where there is such a name rclpy says no other: then those count that were there before, or
-        are looked for.
-        """
-        try:
-            found = self.node.get_topic_names_and_types(no_demangle=True)
-        except UnicodeDecodeError as error:
-            wanted = (_PARAMETER_EVENTS, *names.of_kind(EndpointKind.PUBLISHER))
-            illegible = error.object.decode(errors="backslashreplace")
-            return self._topics_before | set(map(_TOPIC.format, wanted)), _of_ros(illegible)
-        except _REFUSED as error:
-            raise MiddlewareError(f"cannot read the topics of the graph: {error}") from error
-        self._topics_before = frozenset(topic for topic, _ in found)
-        return self._topics_before, ""
-
-    def _topic_endpoints(
-        self, topics: Iterable[str]
-    ) -> Iterator[tuple[EndpointKind, str, EndpointInfo]]:
-        """Yield kind, topic and endpoint of all publishers and subscriptions.
-
-        A topic of a node that avoids the naming conventions of ROS has its name of DDS behind
-        `dds:`: `dds:/chatter` is not `/chatter`.
-        """
-        for topic in topics:
-            if topic == _NODES or (_OVER_DDS and topic.startswith(("rq/", "rr/"))):
-                continue
-            name = _of_ros(topic)
-            shown = f"{RAW}{topic}" if _OVER_DDS and name == topic else name
-            for kind, query in (
-                (EndpointKind.PUBLISHER, _publishers),
-                (EndpointKind.SUBSCRIPTION, _subscriptions),
-            ):
-                for info in query(self.node, topic):
-                    if not self._is_dead(info):
-                        yield kind, shown, info
-
     def _timed(self, endpoint: ObservedEndpoint) -> ObservedEndpoint:
         """Say of who publishes /clock that no time came from it, while that is so."""
         publishes = (endpoint.kind, endpoint.name) == (EndpointKind.PUBLISHER, CLOCK[0])
@@ -642,7 +442,7 @@ class GraphObserver:
         """
         listed: dict[str, list[ObservedEndpoint]] = {}
         are_all = True
-        named = Counter(_node_names(self.node))
+        named = Counter(node_names(self.node))
         for name in counts.keys() | named.keys():
             found = [(kind, endpoints_of_node(self.node, kind, name)) for kind in _OF_SERVICES]
             if name == ourselves:
@@ -658,7 +458,7 @@ class GraphObserver:
         return listed, are_all
 
     def _services_by_name(
-        self, names: Iterable[str], listed: Collection[str], ends: Callable[..., _Ends]
+        self, names: Iterable[str], listed: Collection[str], ends: Callable[..., Ends]
     ) -> Iterator[ObservedEndpoint]:
         """Yield the endpoints of services on nodes of which rcl lists none.
 
@@ -667,52 +467,41 @@ class GraphObserver:
         Args:
             names: of the services.
             listed: nodes whose services are known.
-            ends: see `_ends`.
+            ends: see `service_ends`.
         """
         for name, kind in itertools.product(sorted(names), _OF_SERVICES):
             shown: set[str] = set()
-            for info in itertools.chain(*ends(kind, name)):
-                owner = info.node or info.prefix
-                if info.node in listed or owner in shown or self._is_dead(info):
-                    continue
-                shown.add(owner)
-                gid = "" if info.node else info.gid
-                yield ObservedEndpoint(
-                    kind=kind, node=info.node, name=name, type=info.type, gid=gid
-                )
+            for each in itertools.chain(*ends(kind, name)):
+                owner = each.node or each.gid[:PREFIX_DIGITS]
+                if each.node not in listed and owner not in shown and not self._is_dead(each):
+                    shown.add(owner)
+                    gid = "" if each.node else each.gid
+                    yield dataclasses.replace(each, qos=None, type_hash=None, gid=gid)
 
     def _hashed(
-        self,
-        name: str,
-        shown: Iterable[ObservedEndpoint],
-        but: DeclaredNames,
-        ends: Callable[..., _Ends],
-    ) -> Iterable[ObservedEndpoint]:
-        """Return what is judged of one node's endpoints.
+        self, name: str, endpoints: Iterable[ObservedEndpoint], ends: Callable[..., Ends]
+    ) -> Iterator[ObservedEndpoint]:
+        """Yield one node's endpoints, its services with their hashes and its servers with GIDs.
 
         The graph lists services by name and type only; their requests and replies are DDS topics
         like all others, whose endpoints announce the hashes. A client has no GID: whoever asks may
         ask with several.
         """
-        hashed: list[ObservedEndpoint] = []
-        for each in without_noise(shown, but=but, ours=self._ours):
+        for each in endpoints:
             if each.kind not in _OF_SERVICES:
-                hashed.append(each)
+                yield each
                 continue
             both = ends(each.kind, each.name)
             gids = {each.gid}
             if not each.gid and each.kind is EndpointKind.SERVICE_SERVER:
                 gids = {
-                    info.gid
-                    for info in both[0]
-                    if (info.node, info.type) == (name, each.type) and not self._is_dead(info)
+                    end.gid
+                    for end in both[0]
+                    if (end.node, end.type) == (name, each.type) and not self._is_dead(end)
                 } or {""}
-            type_hash = _service_hash(both, name)
-            hashed += (
-                dataclasses.replace(each, type_hash=type_hash, gid=gid) for gid in sorted(gids)
-            )
-        folded = fold_actions(hashed)
-        return sorted(folded if name else self._located(folded), key=_order)
+            type_hash = service_hash(both, name)
+            for gid in sorted(gids):
+                yield dataclasses.replace(each, type_hash=type_hash, gid=gid)
 
     def _located(self, endpoints: Iterable[ObservedEndpoint]) -> Iterator[ObservedEndpoint]:
         """Add their participants' addresses to endpoints of no known node.
@@ -762,39 +551,17 @@ def _as_super_client() -> Iterator[None]:
         del os.environ[_SUPER_CLIENT_VARIABLE]
 
 
-def _of_ros(topic: str) -> str:
-    """Return the name that ROS has for a topic of the RMW; one that is none of ROS as it is."""
-    return topic.removeprefix("rt") if _OVER_DDS and topic.startswith("rt/") else topic
-
-
-def _is_noise(
-    kind: EndpointKind,
-    topic: str,
-    info: EndpointInfo,
-    declared: Collection[str],
-    names: DeclaredNames,
-) -> bool:
+def _is_noise(endpoint: ObservedEndpoint, declared: Collection[str], names: DeclaredNames) -> bool:
     """Return whether a publisher or subscription is the housekeeping of a client library.
 
     One on a topic of DDS that no ROS name has is shown if it is a node's; of plain DDS programs
     only what has the names of ROS concerns a system of ROS.
     """
-    if topic.startswith(RAW):
-        return not info.node
-    wanted = info.node not in declared and names.looks_for(kind, topic)
-    return not wanted and is_noise_endpoint(kind, info.node, topic, info.type, ours=False)
-
-
-def _observed(kind: EndpointKind, topic: str, info: EndpointInfo) -> ObservedEndpoint:
-    return ObservedEndpoint(
-        kind=kind,
-        node=info.node,
-        name=topic,
-        type=info.type,
-        qos=info.qos,
-        gid=info.gid,
-        type_hash=info.type_hash,
-    )
+    kind, node, name = endpoint.kind, endpoint.node, endpoint.name
+    if name.startswith(RAW):
+        return not node
+    wanted = node not in declared and names.looks_for(kind, name)
+    return not wanted and is_noise_endpoint(kind, node, name, endpoint.type, ours=False)
 
 
 def _declared_services(names: DeclaredNames) -> set[str]:
@@ -806,15 +573,6 @@ def _declared_services(names: DeclaredNames) -> set[str]:
             for action in names.of_kind(EndpointKind.ACTION_SERVER)
             for part in ("send_goal", "cancel_goal", "get_result")
         ),
-    }
-
-
-def _services_in(topics: Iterable[str]) -> set[str]:
-    """Return the names of the services whose requests are among topics of the RMW."""
-    return {
-        topic.removeprefix("rq").removesuffix("Request")
-        for topic in topics
-        if topic.startswith("rq/") and topic.endswith("Request")
     }
 
 

@@ -13,13 +13,11 @@ that for all three services, and a publisher of feedback (rcl_action_server_is_a
 from __future__ import annotations
 
 import atexit
-import contextlib
-import ctypes
 import logging
 import threading
 import typing
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import TYPE_CHECKING, TypeAlias
 
 from rclpy.client import Client
@@ -38,14 +36,15 @@ if TYPE_CHECKING:
 
     AnyClient: TypeAlias = Client | ActionClient
 
+Callback = Callable[[], bool | None]
 
 _logger = logging.getLogger(__name__)
-_FOR_EVER = -1
-_STOP, _GUARDS = 1, 2
 _SOON_S, _AGAIN_S = 0.002, 0.2
 """Pauses, ever longer, while a callback says that what it waits for may follow a change: discovery
 shows an endpoint a moment before it is matched, and no event reports the match."""
 _COMPARE_S = 0.5
+_GONE = (InvalidHandle, ValueError, rclpy_implementation.RCLError)
+"""What rclpy raises of what was destroyed meanwhile, and where a name cannot be had."""
 
 
 @typing.final
@@ -62,10 +61,8 @@ class GraphGuard:
     def __init__(self) -> None:
         self.failure: MiddlewareError | None = None
         self._lock = threading.Lock()
-        self._callbacks: dict[object, tuple[Node, Callable[[], bool | None]]] = {}
-        self._node: Node | None = None  # through which the thread waits
-        self._source: _Condition | _Comparison
-        self._thread: threading.Thread
+        self._callbacks: dict[object, tuple[Node, Callback]] = {}
+        self._watch: _Comparison | None = None
 
     @classmethod
     def of(cls, node: Node) -> GraphGuard:
@@ -77,7 +74,7 @@ class GraphGuard:
                 node.context.on_shutdown(guard.close)
         return guard
 
-    def follow(self, node: Node, callback: Callable[[], bool | None]) -> Callable[[], None]:
+    def follow(self, node: Node, callback: Callback) -> Callable[[], None]:
         """Have `callback` called in the thread after each change.
 
         Args:
@@ -94,7 +91,7 @@ class GraphGuard:
         """
         key = object()
         with self._lock:
-            if self._node is None:
+            if self._watch is None:
                 self._start(node)
             self._callbacks = {**self._callbacks, key: (node, callback)}
         return lambda: self._remove(key)
@@ -109,7 +106,7 @@ class GraphGuard:
         with self._lock:
             self._callbacks = {other: it for other, it in self._callbacks.items() if other != key}
             nodes = [node for node, _ in self._callbacks.values()]
-            if self._node is None or self._node in nodes:
+            if self._watch is None or self._watch.node in nodes:
                 return
             self._stop()
             if nodes:
@@ -117,30 +114,22 @@ class GraphGuard:
                 self._notify()  # changes in between were not reported
 
     def _start(self, node: Node) -> None:
-        source = _Condition(node) if abi.is_known() else _Comparison(node)
-        self._node, self._source, self.failure = node, source, None
-        self._thread = threading.Thread(
-            target=self._run, args=[source], name="graph-guard", daemon=True
+        watch = _Guarded(node) if abi.is_known() else _Comparison(node)
+        self._watch, self.failure = watch, None
+        watch.thread = threading.Thread(
+            target=self._run, args=[watch], name="graph-guard", daemon=True
         )
-        self._thread.start()
+        watch.thread.start()
 
     def _stop(self) -> None:
-        if self._node is not None:
-            self._source.stop()
-            self._thread.join()
-            self._node = None
+        if self._watch is not None:
+            self._watch.stop()
+            self._watch.thread.join()
+            self._watch = None
 
-    def _run(self, source: _Condition | _Comparison) -> None:
-        pause_s: float | None = None
+    def _run(self, watch: _Comparison) -> None:
         try:
-            with source.held():
-                while (changed := source.wait(pause_s)) is not None:
-                    if not self._notify():
-                        pause_s = None
-                    elif changed or pause_s is None:
-                        pause_s = _SOON_S
-                    else:
-                        pause_s = min(2 * pause_s, _AGAIN_S)
+            watch.run(self._notify)
         except MiddlewareError as error:
             _logger.exception("the graph is no longer watched")
             self.failure = error
@@ -152,7 +141,7 @@ class GraphGuard:
         return any(wanted)
 
 
-def _call(callback: Callable[[], bool | None]) -> bool:
+def _call(callback: Callback) -> bool:
     try:
         return bool(callback())
     except Exception:
@@ -171,78 +160,32 @@ def _let_go() -> None:
         guard.close()
 
 
-class _Condition:
-    """Waits on rcl's graph guard condition, and on one of its own by which it is stopped."""
-
-    def __init__(self, node: Node) -> None:
-        self._rcl = abi.load()
-        self._node = node
-        self._stopped = GuardCondition(None, None, context=node.context)
-        self._stopping = False
-        self._wait_set = self._rcl.zero_wait_set()
-        self._check(
-            self._rcl.wait_set_init(
-                ctypes.byref(self._wait_set),
-                *(0, _GUARDS, 0, 0, 0, 0),
-                node.context.handle.pointer,
-                self._rcl.default_allocator,
-            )
-        )
-
-    @contextlib.contextmanager
-    def held(self) -> Iterator[None]:
-        """Keep rclpy from freeing what the C code of `wait` points at; free the rest after it."""
-        try:
-            with self._node.context.handle, self._node.handle, self._stopped.handle:
-                yield
-        finally:
-            self._rcl.wait_set_fini(ctypes.byref(self._wait_set))
-            self._stopped.destroy()
-
-    def wait(self, pause_s: float | None) -> bool | None:
-        """Block until the graph changed (True), a pause is over (False) or `stop` came (None)."""
-        wait_set = ctypes.byref(self._wait_set)
-        graph = self._rcl.graph_guard(self._node.handle.pointer)
-        pause_ns = _FOR_EVER if pause_s is None else round(pause_s * 1e9)
-        while True:
-            self._check(self._rcl.wait_set_clear(wait_set))
-            for each in (graph, self._stopped.handle.pointer):
-                self._check(self._rcl.wait_set_add_guard(wait_set, each, None))
-            result = self._rcl.wait(wait_set, pause_ns)
-            if self._stopping or self._wait_set.guard_conditions[_STOP]:
-                return None
-            if result == abi.RCL_RET_OK:
-                return True
-            if result != abi.RCL_RET_TIMEOUT:
-                self._check(result)
-            elif pause_s is not None:
-                return False
-
-    def stop(self) -> None:
-        """Have `wait` return None, now and later."""
-        self._stopping = True
-        self._stopped.trigger()
-
-    def _check(self, result: int) -> None:
-        if result != abi.RCL_RET_OK:
-            raise MiddlewareError(f"cannot wait for graph changes: {self._rcl.take_error()}")
-
-
 class _Comparison:
-    """Reads the graph twice a second: all that is left with an rcl that is not known."""
+    """Reads the graph that a node sees twice a second, in `thread`, until it is stopped."""
 
     def __init__(self, node: Node) -> None:
-        self._node = node
+        self.node = node
+        self.thread: threading.Thread
         self._stopped = threading.Event()
         self._last: object = None
 
-    @contextlib.contextmanager
-    def held(self) -> Iterator[None]:
-        """Hold nothing: rclpy does that in each of its functions."""
-        yield
+    def run(self, notify: Callable[[], bool]) -> None:
+        """Call `notify` after each change, and while it returns True after ever longer pauses."""
+        pause_s: float | None = None
+        while (changed := self._wait(pause_s)) is not None:
+            if not notify():
+                pause_s = None
+            elif changed or pause_s is None:
+                pause_s = _SOON_S
+            else:
+                pause_s = min(2 * pause_s, _AGAIN_S)
 
-    def wait(self, pause_s: float | None) -> bool | None:
-        """As that of `_Condition`."""
+    def stop(self) -> None:
+        """Have it end, now or later."""
+        self._stopped.set()
+
+    def _wait(self, pause_s: float | None) -> bool | None:
+        """Block until the graph changed (True), a pause is over (False) or `stop` came (None)."""
         while not self._stopped.wait(_COMPARE_S if pause_s is None else pause_s):
             found = self._read()
             changed, self._last = found != self._last, found
@@ -252,7 +195,7 @@ class _Comparison:
 
     def _read(self) -> object:
         """Return what differs when the graph has changed; None where that cannot be read."""
-        node = self._node
+        node = self.node
         try:
             listed = sorted(node.get_topic_names_and_types(no_demangle=True))
             queries = node.get_publishers_info_by_topic, node.get_subscriptions_info_by_topic
@@ -263,12 +206,36 @@ class _Comparison:
                 for info in query(name, no_mangle=True)
             }
             return listed, gids, sorted(node.get_node_names_and_namespaces())
-        except (ValueError, InvalidHandle, rclpy_implementation.RCLError):
+        except _GONE:
             return None
 
+
+class _Guarded(_Comparison):
+    """Waits on rcl's graph guard condition, and on one of its own by which it is stopped."""
+
+    def __init__(self, node: Node) -> None:
+        super().__init__(node)
+        self._graph = abi.load().graph_guard(node.handle.pointer)
+        self._wake = GuardCondition(None, None, context=node.context)
+        self._guards = abi.GuardWait(node.context.handle.pointer, 2)
+
+    def run(self, notify: Callable[[], bool]) -> None:
+        """As without a guard condition, while rclpy frees nothing of what is waited for."""
+        try:
+            with self.node.context.handle, self.node.handle, self._wake.handle:
+                super().run(notify)
+        finally:
+            self._guards.close()
+            self._wake.destroy()
+
     def stop(self) -> None:
-        """Have `wait` return None, now and later."""
-        self._stopped.set()
+        """Have it end, now or later."""
+        super().stop()
+        self._wake.trigger()
+
+    def _wait(self, pause_s: float | None) -> bool | None:
+        triggered = self._guards.wait((self._graph, self._wake.handle.pointer), pause_s)
+        return None if self._stopped.is_set() else triggered
 
 
 _COUNTING_BOTH_WAYS = ("rmw_fastrtps_cpp", "rmw_fastrtps_dynamic_cpp")
@@ -319,7 +286,7 @@ class ServerWatch:
             if has_changed:
                 self._changed()
             return not matched and self._is_offered()
-        except (InvalidHandle, rclpy_implementation.RCLError):
+        except _GONE:
             return False  # it was destroyed meanwhile
 
     def _is_offered(self) -> bool:

@@ -1,17 +1,17 @@
 """Nodes of rclpy's own classes: their construction, their endpoints and their state machine.
 
-Owns: hooks into rclpy.node.Node, by which a process that hosts nodes gives them their planned names
-and knows each publisher, subscription, service, client and action that they make; a service of
-rclpy's that is made later than rclpy makes it; and the state
-machine of rclpy.lifecycle's nodes, driven in this process: rclpy 7 swallows what its callbacks
-raise, and an invalid request by service ends the process (rclpy/lifecycle/node.py).
+Owns: wrappers of public methods of rclpy.node.Node, by which a process that hosts nodes gives them
+their planned names and knows each publisher, subscription, service, client and action that they
+make; and the state machine of rclpy.lifecycle's nodes, driven in this process: rclpy 7 swallows
+what its callbacks raise, and an invalid request by service ends the process
+(rclpy/lifecycle/node.py). Of rclpy it takes private names as Jazzy and Kilted have them, and
+refuses to drive a node that has others.
 """
 
 from __future__ import annotations
 
 import contextlib
 import functools
-import sys
 import traceback
 from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Any, Protocol
@@ -21,7 +21,9 @@ from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.lifecycle import LifecycleNodeMixin, TransitionCallbackReturn
 from rclpy.node import Node
 
+from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.model import EndpointKind
+from lifecycle.middleware.versions import KNOWN_RCL
 
 RCLError = _rclpy.RCLError
 
@@ -143,12 +145,28 @@ def _noting_actions(add: Callable[..., Any], hooks: NodeHooks) -> Callable[..., 
         kind = next((_ACTIONS[each] for each in names if each in _ACTIONS), None)
         if kind is None:
             return
-        # rclpy 7 does not keep the name; its constructor, which calls this, has it.
-        name = sys._getframe(1).f_locals.get("action_name", "")  # noqa: SLF001
-        waitable.action_name = name
+        waitable.action_name = _action_name(self, kind, waitable)
         hooks.endpoint_made(self, kind, waitable)
 
     return add_waitable
+
+
+def _action_name(node: Node, kind: EndpointKind, action: Any) -> str:
+    """Return the fully qualified name of an action that was just made; rclpy 7 does not keep it."""
+    from rclpy import action as graph  # imported by who made it: late, it takes 100 ms
+
+    query = (
+        graph.get_action_server_names_and_types_by_node
+        if kind is EndpointKind.ACTION_SERVER
+        else graph.get_action_client_names_and_types_by_node
+    )
+    class_ = interface_of(action)
+    type_ = f"{class_.__module__.partition('.')[0]}/action/{class_.__name__}"
+    found = query(node, node.get_name(), node.get_namespace())
+    listed = [str(name) for name, types in found if type_ in types]
+    known = {getattr(each, "action_name", "") for each in node.waitables}
+    new = [name for name in listed if name not in known]
+    return next(iter(new or listed), "")  # a second client of a name brings none
 
 
 def interface_of(entity: Any) -> type[Any]:
@@ -190,7 +208,7 @@ _DONE_IN = {
     Transition.TRANSITION_DEACTIVATE: ("inactive",),
 }
 """Labels of the states in which nothing is left to do of a transition."""
-_CHANGE = "_LifecycleNodeMixin__change_state"
+_CHANGE, _CALLBACKS = "_LifecycleNodeMixin__change_state", "_callbacks"
 
 
 class RclpyStateMachine:
@@ -204,12 +222,15 @@ class RclpyStateMachine:
     Args:
         node: whose class derives from LifecycleNodeMixin, of which the constructor may still run.
         owner: decides on activation, and is notified.
+
+    Raises:
+        MiddlewareError: rclpy keeps its state machine otherwise than is known.
     """
 
     def __init__(self, node: LifecycleNodeMixin, owner: MachineOwner) -> None:
         self._node = node
         self._owner = owner
-        self._change = getattr(node, _CHANGE)
+        self._change = _private(node, _CHANGE)
         self._is_complete = False
         self._is_asked = False  # by its supervisor or a client
         self._has_said = False
@@ -221,7 +242,7 @@ class RclpyStateMachine:
         if self._is_complete:
             return
         self._is_complete = True
-        callbacks = self._node._callbacks  # noqa: SLF001 - registered once, by its constructor
+        callbacks = _private(self._node, _CALLBACKS)  # registered once, by its constructor
         for state, callback in tuple(callbacks.items()):
             callbacks[state] = self._reporting(callback)
         service = getattr(self._node, "_service_change_state", None)
@@ -321,6 +342,17 @@ class RclpyStateMachine:
         return answer
 
 
+def _private(node: object, name: str) -> Any:
+    found = getattr(node, name, None)
+    if found is None:
+        raise MiddlewareError(
+            f"cannot hold {type(node).__name__}, a node of rclpy.lifecycle: this rclpy has no "
+            f"{name}, as that of {KNOWN_RCL} has",
+            hint="start the node as a command (run.command), or install one of these",
+        )
+    return found
+
+
 def is_rclpy_managed(node: object) -> bool:
     """Whether an object, or a class, is of rclpy.lifecycle."""
     if isinstance(node, type):
@@ -344,10 +376,15 @@ class Watching:
         self.waitables: list[Any] = []
 
     def take_services(self, node: Node, services: Collection[Any]) -> None:
-        """Serve what a node offers, whoever spins the node; destroy them before it."""
+        """Serve what a node offers, whoever spins the node; destroy them before it.
+
+        Where rclpy does not list them as is known, whoever spins the node serves them.
+        """
+        listed = getattr(node, "_services", [])  # what Node.destroy_service removes them from
         for each in services:
-            node._services.remove(each)  # noqa: SLF001 - what Node.destroy_service does
-            self.services.append(each)
+            if each in listed:
+                listed.remove(each)
+                self.services.append(each)
         self._wake()
 
     def drop_services(self, services: Collection[Any]) -> None:

@@ -44,7 +44,6 @@ from lifecycle.middleware.rcl.rclpy_nodes import (
 )
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.node import configuration
-from lifecycle.node.actions import resolve_action_name
 from lifecycle.node.author import parameters
 from lifecycle.node.author.managed import HostedState, Managed, Undeclared
 from lifecycle.node.author.node import LifecycleNode
@@ -262,8 +261,6 @@ class ForeignNode:
         callback = getattr(entity, "callback", None) if kind is EndpointKind.SUBSCRIPTION else None
         if isinstance(getattr(callback, "__self__", None), TimeSource):
             return  # /clock belongs to rclpy
-        if kind.is_action:
-            entity.action_name = resolve_action_name(self._node, entity.action_name)
         if kind is EndpointKind.PUBLISHER:
             self._gate.add(entity, HeldPublisher(entity, self._node.get_logger().warning))
         touch = self.configuration_changes.touch

@@ -26,7 +26,8 @@ from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import Durability, History, QosProfile, Reliability
 from lifecycle.middleware.discovery.prober import ANSWER_S
 from lifecycle.middleware.fastdds.participant import FlowParticipant
-from lifecycle.middleware.rcl.graph import GraphObserver, endpoints_of
+from lifecycle.middleware.rcl.graph import GraphObserver
+from lifecycle.middleware.rcl.graph_queries import endpoints_of
 from lifecycle.middleware.rcl.hidden_node import quiet_node
 from lifecycle.middleware.rcl.qos import to_rclpy
 from lifecycle.verify.observation import ObservedNode

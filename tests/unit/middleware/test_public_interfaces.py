@@ -18,7 +18,6 @@ CTYPES = {
     "middleware/fastdds/participant_discovery.py",
     "middleware/process/prctl.py",  # prctl(2), and timers that end a process
     "middleware/rcl/abi.py",  # rcl's C API, checked by version and layout
-    "middleware/rcl/graph_changes.py",  # rcl's graph guard condition
 }
 """Files that call libraries other than by Python."""
 

@@ -1,0 +1,219 @@
+"""The graph queries of rclpy, put with the names that the RMW has, and answered in our types.
+
+Owns: how names of ROS and of DDS become each other, and what is made of answers that rclpy cannot
+give. Names of DDS are neither expanded nor validated by rclpy (`no_mangle`, `no_demangle`).
+
+Any participant may announce names that are no UTF-8, at which rclpy's queries raise. Such a name is
+shown escaped, and a topic of which nothing can be read as one of an unknown node: neither is ever
+verified.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator
+
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from rclpy.topic_endpoint_info import TopicEndpointInfo
+from rclpy.utilities import get_rmw_implementation_identifier
+
+from lifecycle.errors import MiddlewareError
+from lifecycle.manifest.installed_types import join
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.manifest.qos import Durability, History, Liveliness, QosProfile, Reliability
+from lifecycle.middleware.rcl.qos import from_rclpy
+from lifecycle.verify.observation import ObservedEndpoint
+from lifecycle.verify.tool_filter import known_node
+
+RAW = "dds:"
+"""What names of topics begin with here that are no names of ROS."""
+
+OVER_DDS = not get_rmw_implementation_identifier().startswith("rmw_zenoh")
+"""The RMW adds `rt`, `rq` or `rr` to names of ROS, as DDS has them (rmw_dds_common)."""
+
+_TOPIC, _REQUEST, _REPLY = ("rt{}", "rq{}Request", "rr{}Reply") if OVER_DDS else ("{}",) * 3
+
+_NODES = "ros_discovery_info"
+"""Every participant of rmw_fastrtps and rmw_cyclonedds writes it, and no other."""
+
+_GID_BYTES = 16
+
+_REFUSED = (ValueError, rclpy_implementation.RCLError)
+"""What rclpy's queries raise where a name or a value cannot be had: UnicodeDecodeError is one."""
+
+_UNKNOWN_QOS = QosProfile(
+    history=History.UNKNOWN,
+    depth=0,
+    reliability=Reliability.UNKNOWN,
+    durability=Durability.UNKNOWN,
+    liveliness=Liveliness.UNKNOWN,
+)
+
+Ends = tuple[list[ObservedEndpoint], list[ObservedEndpoint]]
+"""Of a service's servers or clients: what reads or writes requests, then replies."""
+
+
+def endpoints_of(node: Node, kind: EndpointKind, name: str) -> list[ObservedEndpoint]:
+    """Return what `node` sees of the endpoints of a kind and name.
+
+    Args:
+        node: that queries.
+        kind: PUBLISHER or SUBSCRIPTION; of a service SERVICE_SERVER, for what reads its requests,
+            or SERVICE_CLIENT, for what writes them.
+        name: fully qualified.
+    """
+    writes = kind in (EndpointKind.PUBLISHER, EndpointKind.SERVICE_CLIENT)
+    pattern = _TOPIC if kind.is_topic else _REQUEST
+    return _read(node, kind, name, pattern.format(name), writes=writes)
+
+
+def service_ends(node: Node, kind: EndpointKind, service: str) -> Ends:
+    """Return what `node` sees of a service's servers or clients; nothing where no DDS topic is.
+
+    The type hashes (REP-2016) of services are found there: rmw_fastrtps and rmw_cyclonedds announce
+    them since Iron.
+    """
+    if not OVER_DDS:
+        return [], []
+    asks = kind is EndpointKind.SERVICE_CLIENT
+    return (
+        _read(node, kind, service, _REQUEST.format(service), writes=asks),
+        _read(node, kind, service, _REPLY.format(service), writes=not asks),
+    )
+
+
+def service_hash(ends: Ends, node: str) -> str | None:
+    """Return the joined hashes of a node's ends, empty while only half of it is seen; else None.
+
+    None means that the RMW has no such topics, or that nothing of them is seen.
+    """
+    hashes = [{each.type_hash or "" for each in side if each.node == node} for side in ends]
+    if not any(hashes):
+        return None
+    # A node with several servers or clients of one name is one end: all of them count.
+    return join(["" if "" in each else "|".join(sorted(each)) for each in hashes])
+
+
+def topic_endpoints(node: Node, topics: Iterable[str]) -> Iterator[ObservedEndpoint]:
+    """Yield all publishers and subscriptions of topics of the RMW, but those of services.
+
+    A topic of a node that avoids the naming conventions of ROS has its name of DDS behind `dds:`:
+    `dds:/chatter` is not `/chatter`.
+    """
+    for topic in topics:
+        if topic == _NODES or (OVER_DDS and topic.startswith(("rq/", "rr/"))):
+            continue
+        name = _of_ros(topic)
+        shown = f"{RAW}{topic}" if OVER_DDS and name == topic else name
+        for kind in (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION):
+            yield from _read(node, kind, shown, topic, writes=kind is EndpointKind.PUBLISHER)
+
+
+def topic_names(node: Node, otherwise: Collection[str]) -> tuple[Collection[str], str]:
+    """Return the topics that the RMW has, and one name that is no UTF-8, escaped; else empty.
+
+    Args:
+        node: that queries.
+        otherwise: where there is such a name rclpy says no other; then these are returned.
+
+    Raises:
+        MiddlewareError: they cannot be read.
+    """
+    try:
+        found = node.get_topic_names_and_types(no_demangle=True)
+    except UnicodeDecodeError as error:
+        return otherwise, _of_ros(error.object.decode(errors="backslashreplace"))
+    except _REFUSED as error:
+        raise MiddlewareError(f"cannot read the topics of the graph: {error}") from error
+    return frozenset(topic for topic, _ in found), ""
+
+
+def rmw_topics(names: Iterable[str]) -> set[str]:
+    """Return what the RMW calls topics of ROS."""
+    return set(map(_TOPIC.format, names))
+
+
+def services_in(topics: Iterable[str]) -> set[str]:
+    """Return the names of the services whose requests are among topics of the RMW."""
+    return {
+        topic.removeprefix("rq").removesuffix("Request")
+        for topic in topics
+        if topic.startswith("rq/") and topic.endswith("Request")
+    }
+
+
+def endpoints_of_node(
+    node: Node, kind: EndpointKind, full_name: str
+) -> tuple[tuple[str, str], ...] | None:
+    """Return name and type of a node's publishers, subscriptions, servers or clients.
+
+    Returns:
+        None where rcl shows no such node: it has left, or has a name that no rcl would give it.
+    """
+    query = {
+        EndpointKind.PUBLISHER: node.get_publisher_names_and_types_by_node,
+        EndpointKind.SUBSCRIPTION: node.get_subscriber_names_and_types_by_node,
+        EndpointKind.SERVICE_SERVER: node.get_service_names_and_types_by_node,
+        EndpointKind.SERVICE_CLIENT: node.get_client_names_and_types_by_node,
+    }[kind]
+    namespace, _, name = full_name.rpartition("/")
+    try:
+        return tuple(
+            (each, type_) for each, types in query(name, namespace or "/") for type_ in types
+        )
+    except _REFUSED:
+        return None
+
+
+def node_names(node: Node) -> list[str]:
+    """Return the names that the RMW has, of nodes that have left too; none if it cannot say all."""
+    try:
+        found = node.get_node_names_and_namespaces()
+    except _REFUSED:
+        return []
+    return [f"{space.rstrip('/')}/{name}" for name, space in found]
+
+
+def unreadable(kind: EndpointKind, name: str) -> ObservedEndpoint:
+    """Return what stands for all endpoints of a topic of which one has a name that is no UTF-8."""
+    return ObservedEndpoint(
+        kind=kind, node="", name=name, type="", qos=_UNKNOWN_QOS, gid="", type_hash=""
+    )
+
+
+def _read(
+    node: Node, kind: EndpointKind, name: str, topic: str, *, writes: bool
+) -> list[ObservedEndpoint]:
+    query = node.get_publishers_info_by_topic if writes else node.get_subscriptions_info_by_topic
+    try:
+        return [_observed(kind, name, info) for info in query(topic, no_mangle=True)]
+    except _REFUSED:
+        return [unreadable(kind, name)]
+
+
+def _observed(kind: EndpointKind, name: str, info: TopicEndpointInfo) -> ObservedEndpoint:
+    announced = info.topic_type_hash
+    return ObservedEndpoint(
+        kind=kind,
+        node=known_node(f"{info.node_namespace.rstrip('/')}/{info.node_name}"),
+        name=name,
+        type=_ros_type(info.topic_type),
+        gid=bytes(info.endpoint_gid[:_GID_BYTES]).hex(),
+        qos=from_rclpy(info.qos_profile),
+        type_hash=str(announced) if announced.version > 0 else "",
+    )
+
+
+def _ros_type(dds_type: str) -> str:
+    """Return `std_msgs/msg/String` for `std_msgs::msg::dds_::String_`; others as they are."""
+    package, ours, name = dds_type.partition("dds_::")
+    if not ours or not name.endswith("_"):
+        return dds_type
+    if not package.endswith("msg::"):  # one of a service
+        name = name.removesuffix("_Request_").removesuffix("_Response_")
+    return package.replace("::", "/") + name.removesuffix("_")
+
+
+def _of_ros(topic: str) -> str:
+    """Return the name that ROS has for a topic of the RMW; one that is none of ROS as it is."""
+    return topic.removeprefix("rt") if OVER_DDS and topic.startswith("rt/") else topic
