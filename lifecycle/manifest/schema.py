@@ -129,8 +129,9 @@ def unknown_key(key: str, known: Iterable[str]) -> tuple[str, str]:
     if key in _GONE:
         why, hint = _GONE[key]
         return f"cannot use {quote(key)} any more: {why}", hint
-    message = f"cannot use the unknown key {quote(key)}; allowed: {', '.join(words)}"
-    return message, did_you_mean(key, words)
+    message = f"cannot use the unknown key {quote(key)}"
+    near = did_you_mean(key, words)
+    return (message, near) if near else (f"{message}; allowed: {', '.join(words)}", "")
 
 
 def missing_key(key: str, schema: Mapping[str, Any]) -> tuple[str, str]:
