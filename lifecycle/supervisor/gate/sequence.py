@@ -69,6 +69,9 @@ UNCHANGED_S = 5.0
 """Who is discovered at all over TCP is after 0.1–1.6 s, on a machine with both processors busy
 after 1–4 s; findings that have not changed for so long do not change any more."""
 
+SAY_S = 2.0
+"""A gate that stays closed for so long says what it waits for, and until when."""
+
 TRIES = 3
 """So many nodes are started again before a gate at most: each takes 1–5 s of the bring-up."""
 
@@ -600,6 +603,22 @@ class GateSequence:
         """
         loop = asyncio.get_running_loop()
         deadline = loop.time() + timeout_s
+        saying = loop.call_later(SAY_S, self._say_waiting, timeout_s)
+        try:
+            await self._until_clear(deadline)
+        finally:
+            saying.cancel()
+
+    def _say_waiting(self, timeout_s: float) -> None:
+        verdict = self._judge.latest
+        if verdict is not None and closes(verdict, strict=self._gate.strict):
+            left_s = max(0.0, timeout_s - SAY_S)
+            self._emit(
+                Notice(message=f"waits up to {left_s:.0f} s more for its gate: {not_ok(verdict)}")
+            )
+
+    async def _until_clear(self, deadline: float) -> None:
+        loop = asyncio.get_running_loop()
         tries: dict[str, int] = {}
         phase = self.phase
         while True:

@@ -253,6 +253,11 @@ async def test_a_bring_up_that_takes_too_long_names_what_is_missing(tmp_path: Pa
 # The gate
 
 
+def waits(most_s: int, what: str = "missing: /viewer (node)") -> str:
+    """What is said of a gate that is not open after 2 s."""
+    return f"[notice] waits up to {most_s} s more for its gate: {what}"
+
+
 async def test_nothing_is_activated_before_the_verdict_is_ok(tmp_path: Path) -> None:
     world = SessionWorld(CHAIN, tmp_path, stop_after_s=0.0)
     world.graph.unseen = {"/viewer"}
@@ -260,8 +265,9 @@ async def test_nothing_is_activated_before_the_verdict_is_ok(tmp_path: Path) -> 
         await asyncio.sleep(7.0)
         world.graph.unseen.clear()
         world.graph.note()
-    assert world.since("[system] connected")[1:5] == [
+    assert world.since("[system] connected")[1:6] == [
         "[verdict] connected violated graph.missing-node /viewer",
+        waits(28),
         "[verdict] connected ok",
         "[system] verified at 7.0 s",
         "networks programmed (ok)",
@@ -295,6 +301,7 @@ async def test_a_node_that_does_not_appear_is_waited_for_as_long_as_there_is_tim
     await world.run()
     assert world.since("[system] connected")[1:] == [
         "[verdict] connected violated graph.missing-node /viewer",
+        waits(3),
         f"[stopping] at 8.0 s: the verdict keeps the gate closed, and {time_over(8)}",
         *BACK,
         *over(4),
@@ -313,6 +320,7 @@ async def test_what_cannot_be_verified_is_taken_on_trust_by_name_or_refused_if_s
     assert judged[0] == "[verdict] connected unverifiable state.unverifiable /base"
     if strict:
         assert judged[1:] == [
+            waits(28, "unknown: /base (state.unverifiable)"),
             "[stopping] at 3.5 s: the verdict keeps the gate closed",
             "/base cleanup",
             *CAMERA_DOWN,
@@ -609,6 +617,7 @@ async def test_a_node_that_is_not_discovered_over_tcp_is_started_again_on_a_fres
     again = [line for attempt in range(needed) for line in started_again(attempt + 1)]
     assert world.since("[system] connected")[1:-ENDING] == [
         "[verdict] connected violated graph.missing-node /viewer",
+        waits(28),
         *again,
         "[verdict] connected ok",
         f"[system] verified at {5 * needed:.1f} s",
@@ -631,6 +640,7 @@ async def test_a_node_that_is_never_discovered_is_started_three_times_and_then_w
     await world.run()
     again = [line for attempt in (1, 2, 3) for line in started_again(attempt)]
     assert world.since("[verdict]")[1:] == [
+        waits(28),
         *again,
         f"[stopping] at 30.0 s: the verdict keeps the gate closed, and {time_over(30)}",
         *BACK,
@@ -645,8 +655,9 @@ async def test_a_node_that_would_get_no_other_port_is_waited_for(tmp_path: Path)
         await asyncio.sleep(12.0)
         world.graph.unseen.clear()
         world.graph.note()
-    assert world.since("[system] connected")[1:4] == [
+    assert world.since("[system] connected")[1:5] == [
         "[verdict] connected violated graph.missing-node /camera",
+        waits(28, "missing: /camera (node)"),
         "[verdict] connected ok",
         "[system] verified at 12.0 s",
     ]
