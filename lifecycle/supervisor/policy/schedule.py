@@ -367,13 +367,13 @@ class RestartSchedule:
     def _gave_up(self, name: str, record: _Record, failure: StepFailedError) -> GaveUpError:
         how = record.policy.how
         history = record.history[-how.start_limit_burst :]
-        lines = "".join(f"\n  at {each.elapsed_s:.1f} s: {each.message}" for each in history)
+        each_time = "; ".join(f"at {each.elapsed_s:.1f} s, {each.message}" for each in history)
         last = record.history[-1]
         burst = how.start_limit_burst
         within = f"within {how.start_limit_interval_sec:g} s" if self.was_up else "during bring-up"
         message = (
             f"cannot keep {name!r} running: it was started {burst} time{'s' * (burst != 1)} "
-            f"{within} (start_limit_burst, start_limit_interval_sec) and failed again:{lines}"
+            f"{within} (start_limit_burst, start_limit_interval_sec) and failed again: {each_time}"
         )
         self._emit(
             GaveUp(process=name, restarts=record.policy.restarts, history=tuple(record.history))

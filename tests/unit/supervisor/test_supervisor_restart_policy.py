@@ -235,10 +235,10 @@ async def test_a_process_that_fails_again_and_again_is_given_up_loudly_with_its_
     ]
     assert world.messages[0] == (
         "cannot keep 'camera' running: it was started 3 times within 10 s (start_limit_burst, "
-        "start_limit_interval_sec) and failed again:\n"
-        "  at 0.0 s: cannot keep '/camera' running: pid 5000001 died: killed by SIGSEGV\n"
-        "  at 0.5 s: cannot configure '/camera': no device\n"
-        "  at 1.0 s: cannot configure '/camera': no device"
+        "start_limit_interval_sec) and failed again: "
+        "at 0.0 s, cannot keep '/camera' running: pid 5000001 died: killed by SIGSEGV; "
+        "at 0.5 s, cannot configure '/camera': no device; "
+        "at 1.0 s, cannot configure '/camera': no device"
     )
 
 
