@@ -76,6 +76,8 @@ class Launched:
 def evaluate(path: Path, arguments: Mapping[str, str]) -> Launched:
     """Evaluate a launch file, in Python, XML or YAML, without starting what it describes.
 
+    What the file prints and launch logs goes to standard error: standard output has the manifest.
+
     Args:
         path: the file.
         arguments: launch arguments by name.
@@ -83,6 +85,11 @@ def evaluate(path: Path, arguments: Mapping[str, str]) -> Launched:
     Raises:
         UsageError: `launch` is not installed, there is no such file, or it cannot be evaluated.
     """
+    with contextlib.redirect_stdout(sys.stderr):
+        return _evaluated(path, arguments)
+
+
+def _evaluated(path: Path, arguments: Mapping[str, str]) -> Launched:
     try:
         launch = importlib.import_module("launch")
     except ModuleNotFoundError as problem:
