@@ -111,6 +111,7 @@ class Live:
 
     def finish(self, result: UpResult) -> None:
         """Show the verdict below the last table."""
+        self._verdict = ""  # the last of the table may be another than the one that holds
         self._draw()
         self._live.stop()
         flows = result.verdict.verdict is not Outcome.VIOLATED

@@ -37,6 +37,7 @@ from lifecycle.supervisor.run.events import (
     NodeSilent,
     Notice,
     ProcessChanged,
+    RequestSent,
     Restarted,
     RestartScheduled,
     RunStarted,
@@ -247,13 +248,40 @@ class Rollback:
         return False
 
 
+class Narrator:
+    """Gives the line of each event of one run, and none where it repeats the one before.
+
+    States that a node passes through because we ask it to have no lines: how far it is says enough.
+    """
+
+    def __init__(self) -> None:
+        self._reached: dict[str, Reach] = {}
+        self._asked: set[str] = set()
+
+    def line(self, event: Event) -> str | None:
+        """Return the line about the next event; None if it has none."""
+        if isinstance(event, RequestSent):
+            self._asked.add(event.node)
+        if isinstance(event, NodeChanged):
+            before = self._reached.get(event.node)
+            self._reached[event.node] = event.reach
+            if before is not event.reach:
+                self._asked.discard(event.node)
+            elif event.node in self._asked or not _is_lost(event):
+                return None
+        return describe(event)
+
+
+_LOST = ("unconfigured", "inactive", "finalized", "errorprocessing")
+"""States (lifecycle_msgs/State) to which somebody else has brought a node that is to be active."""
+
+
 class PlainLines:
     """One line per event, for logs and pipes."""
 
     def __init__(self, writer: Writer) -> None:
         self._writer = writer
-        self._reached: dict[str, Reach] = {}
-        self._stopping = False
+        self._narrator = Narrator()
         self._judged: str | None = None
         self._active = False
         self._rollback = Rollback()
@@ -263,13 +291,10 @@ class PlainLines:
 
     def __call__(self, event: Event) -> None:
         """Write one event, if it has a line for people."""
-        self._stopping = self._stopping or isinstance(event, Stopping)
         hidden = self._rollback.hides(event)
-        if hidden or (isinstance(event, NodeChanged) and self._is_on_the_way(event)):
-            return
+        line = self._narrator.line(event)
         if isinstance(event, SystemReached):
             self._active = event.reached == "active"
-        line = describe(event)
         if isinstance(event, VerdictChanged):
             if event.stage is Stage.ACTIVE and not self._active and missing(event.verdict):
                 # Not a system that broke: nodes become active one by one, and host by host.
@@ -278,15 +303,8 @@ class PlainLines:
             if line == self._judged:
                 return
             self._judged = line
-        if line is not None:
+        if line is not None and not hidden:
             self._writer.put(line + "\n", kept=not isinstance(event, LogLine))
-
-    def _is_on_the_way(self, event: NodeChanged) -> bool:
-        """Whether a change is one of the many between two steps, which a log need not hold."""
-        before = self._reached.get(event.node)
-        self._reached[event.node] = event.reach
-        by_somebody_else = event.reach is Reach.ACTIVE and event.state != "active"
-        return before is event.reach and (self._stopping or not by_somebody_else)
 
     def finish(self, result: UpResult) -> None:
         """Write the verdict, in full where it is not ok."""
@@ -311,8 +329,12 @@ def _process_changed(event: ProcessChanged) -> str:
 
 
 def _node_changed(event: NodeChanged) -> str:
-    same = not event.state or event.reach is not Reach.ACTIVE or event.state == "active"
-    return f"{event.node}: {event.reach.value}" + ("" if same else f", but {event.state}")
+    but = f", but {event.state}" if _is_lost(event) else ""
+    return f"{event.node}: {event.reach.value}{but}"
+
+
+def _is_lost(event: NodeChanged) -> bool:
+    return event.reach is Reach.ACTIVE and event.state in _LOST
 
 
 def _wiring_changed(event: WiringChanged) -> str:

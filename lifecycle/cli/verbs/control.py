@@ -78,11 +78,16 @@ def row(node: NodeStatus) -> tuple[str, ...]:
         process,
         str(node.pid or "–"),
         "dead" if node.died else (node.state if node.managed else node.reach.value) or "–",
-        f"{node.matched}/{node.endpoints}",
+        _matched(node),
         f"{node.unique_flows}/{node.flows}",
         node.died or (f"silent: {node.silent}" if node.silent else node.doing) or _history(node),
     )
     return tuple(map(one_line, cells))
+
+
+def _matched(node: NodeStatus) -> str:
+    known = node.matched or node.unreported < node.endpoints or not node.endpoints
+    return f"{node.matched if known else '–'}/{node.endpoints}"
 
 
 def _history(node: NodeStatus) -> str:

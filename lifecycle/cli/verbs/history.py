@@ -85,10 +85,10 @@ def command(*, run: str | None, system: str, format_: str) -> int:
 
 
 def _timeline(recorded: RecordedRun) -> Iterator[str]:
-    from lifecycle.cli.up_output import describe
-    from lifecycle.supervisor.run.events import NodeChanged, Stopped, VerdictChanged
+    from lifecycle.cli.up_output import Narrator
+    from lifecycle.supervisor.run.events import Stopped, VerdictChanged
 
-    over, said = False, dict[str, str]()
+    over, narrator = False, Narrator()
     found: tuple[Finding, ...] = ()
     ahead_s: float | None = None
     for each in recorded.moments:
@@ -100,12 +100,7 @@ def _timeline(recorded: RecordedRun) -> Iterator[str]:
         if abs(set_s) >= _SET_S:
             way = "forward" if set_s > 0 else "back"
             yield f"{at}  the clock of this host was set {way} by {abs(set_s):.1f} s"
-        text = each.event and describe(each.event)
-        if isinstance(each.event, NodeChanged) and text:
-            # Its state changes more often than how far it is, of which the line is.
-            before, said[each.event.node] = said.get(each.event.node), text
-            text = "" if before == text else text
-        if text:
+        if each.event and (text := narrator.line(each.event)):
             yield f"{at}  {text}"
         if isinstance(each.event, VerdictChanged):
             yield from _changes(found, each.event.verdict)

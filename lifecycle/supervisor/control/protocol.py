@@ -82,7 +82,8 @@ class NodeStatus(msgspec.Struct, frozen=True, kw_only=True):
         pid: of its process; 0 if this supervisor does not run it.
         state: lifecycle_msgs/State label; empty for a node that is not managed.
         doing: what it does or waits for; empty when nothing.
-        matched: publishers and subscriptions that report at least one match.
+        matched: publishers and subscriptions with at least one match.
+        unreported: those of which no end reports whether they match.
         endpoints: declared publishers and subscriptions.
         unique_flows: flows from or to it that are weakly or strongly unique.
         flows: flows from or to it.
@@ -115,6 +116,7 @@ class NodeStatus(msgspec.Struct, frozen=True, kw_only=True):
     unique_flows: int
     flows: int
     findings: int
+    unreported: int = 0
     silent: str = ""
     died: str = ""
     connections: tuple[ConnectionReport, ...] = ()

@@ -7,15 +7,20 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from lifecycle.manifest.model import RunKind, UniqueHow
+from lifecycle.manifest.model import EndpointKind, RunKind, UniqueHow
 from lifecycle.supervisor.control.protocol import NodeStatus, SystemStatus
 from lifecycle.supervisor.processes.usage import resource_use
 from lifecycle.verify.judge import not_ok
-from lifecycle.verify.verdict import Verdict
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.rules.state import WRONG_STATE
+from lifecycle.verify.verdict import FlowReport, Verdict
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from lifecycle.supervisor.nodes.system import NodeRun, System
     from lifecycle.supervisor.policy.schedule import RestartSchedule
+    from lifecycle.verify.observation import NodeConfiguration
 
 
 def node_status(
@@ -40,12 +45,12 @@ def node_status(
     known = None if process is None else schedule
     died = _died(node)
     configuration = None if died else node.configuration
-    reports = () if configuration is None else configuration.endpoints
     flows = [
         flow
         for flow in (() if verdict is None else verdict.flows)
         if node.name in (flow.publisher, flow.subscription)
     ]
+    matches = _matches(node, configuration, flows)
     use = resource_use(process.pid) if runs and process is not None else None
     external = node.planned.run.kind is RunKind.ATTACH
     return NodeStatus(
@@ -55,10 +60,11 @@ def node_status(
         pid=node.pid,
         managed=node.planned.managed,
         reach=node.reach,
-        state="" if died else node.state,
+        state="" if died else _state(node, verdict),
         doing=node.doing or node.withheld,
-        matched=sum(each.kind.is_topic and bool(each.matched) for each in reports),
-        endpoints=sum(each.kind.is_topic for each in node.planned.endpoints),
+        matched=matches.count(True),
+        unreported=matches.count(None),
+        endpoints=len(matches),
         unique_flows=sum(flow.unique in (UniqueHow.WEAKLY, UniqueHow.STRONGLY) for flow in flows),
         flows=len(flows),
         findings=sum(
@@ -80,6 +86,41 @@ def node_status(
         rss_bytes=None if use is None else use.rss_bytes,
         threads=None if use is None else use.threads,
     )
+
+
+def _state(node: NodeRun, verdict: Verdict | None) -> str:
+    """Return a node's state; of one that others can drive unseen, what the last judgement saw."""
+    judged = (
+        each.observed
+        for each in (() if verdict is None or node.reports_changes else verdict.findings)
+        if each.rule == WRONG_STATE.id and each.node == node.name
+    )
+    return next(judged, node.state)
+
+
+def _matches(
+    node: NodeRun, configuration: NodeConfiguration | None, flows: Sequence[FlowReport]
+) -> list[bool | None]:
+    """Return of each declared publisher and subscription whether it matches; None if unknown.
+
+    Nodes that report nothing of themselves match where a flow of theirs is ok.
+    """
+    reported = {
+        (each.kind, each.resolved): bool(each.matched)
+        for each in (() if configuration is None else configuration.endpoints)
+        if each.matched is not None
+    }
+    ok = {
+        (kind, flow.topic)
+        for flow in flows
+        for kind, name in (
+            (EndpointKind.PUBLISHER, flow.publisher),
+            (EndpointKind.SUBSCRIPTION, flow.subscription),
+        )
+        if name == node.name and flow.outcome is Outcome.OK
+    }
+    places = [(each.kind, each.resolved) for each in node.planned.endpoints if each.kind.is_topic]
+    return [reported.get(each, True if each in ok else None) for each in places]
 
 
 def _died(node: NodeRun) -> str:

@@ -13,7 +13,7 @@ import pytest
 from rich.console import Console
 
 from lifecycle.cli.live_view import Live
-from lifecycle.cli.up_output import JsonLines, PlainLines, Timings
+from lifecycle.cli.up_output import JsonLines, Narrator, PlainLines, Timings
 from lifecycle.cli.verbs.control import status_text
 from lifecycle.cli.verbs.flows import render_flows
 from lifecycle.errors import ExitCode
@@ -318,6 +318,33 @@ def test_the_live_table_shows_each_node_and_scrolls_what_it_prints() -> None:
     assert "verdict: ok" in shown
 
 
+def test_the_last_verdict_is_shown_alone() -> None:
+    stream = io.StringIO()
+    with Live(Console(file=stream, force_terminal=True, width=100, color_system=None)) as live:
+        live.watch(lambda: STATUS)
+        live(VerdictChanged(stage=Stage.ACTIVE, verdict=verdict_of(Outcome.OK)))
+        stream.seek(0)
+        stream.truncate()
+        live.finish(UpResult(exit_code=ExitCode.VIOLATED, verdict=verdict_of(Outcome.VIOLATED)))
+    assert "verdict: violated" in stream.getvalue()
+    assert "verdict ok" not in stream.getvalue()
+
+
+def test_states_on_the_way_down_have_no_lines_and_those_that_others_cause_have() -> None:
+    def changed(state: str, reach: Reach = Reach.ACTIVE) -> NodeChanged:
+        return NodeChanged(node="/camera", reach=reach, state=state, connected=True)
+
+    down = (changed("deactivating"), changed("inactive"), changed("cleaningup"))
+    asked = RequestSent(node="/camera", operation=Operation.DEACTIVATE)
+    narrator = Narrator()
+    events = (changed("active"), *down, asked, *down, changed("finalized", Reach.STOPPED))
+    assert [line for event in events if (line := narrator.line(event))] == [
+        "/camera: active",
+        "/camera: active, but inactive",
+        "/camera: stopped",
+    ]
+
+
 @pytest.mark.parametrize("count", [3, 60])
 def test_the_live_table_fits_the_terminal(count: int) -> None:
     (node,) = STATUS.nodes
@@ -368,6 +395,15 @@ def test_a_status_is_a_head_a_line_for_each_node_and_its_connections_below_it() 
         "  connection far failed: no route; tcpv4://10.77.0.1:5100; carries nothing\n"
         "  connection idle waits for peers; shm://; carries nothing"
     )
+
+
+def test_matches_that_nobody_reports_are_not_shown_as_none() -> None:
+    (node,) = STATUS.nodes
+    unknown = msgspec.structs.replace(node, matched=0, unreported=2)
+    known = msgspec.structs.replace(node, matched=0, unreported=1)
+    for each, cell in ((unknown, "–/2"), (known, "0/2"), (node, "1/2")):
+        text = status_text(msgspec.structs.replace(STATUS, nodes=(each,)))
+        assert text.splitlines()[2].split()[4] == cell
 
 
 FLOW = FlowReport(
