@@ -44,10 +44,6 @@ DISCOVERY_SERVER_VARIABLE = "ROS_DISCOVERY_SERVER"
 """Makes every participant a client of that server."""
 
 
-_IGNORE_ALL = ("FILTER_DIFFERENT_PROCESS", "FILTER_DIFFERENT_HOST", "FILTER_SAME_PROCESS")
-"""Not the first two alone: a participant that has those makes no transports."""
-
-_SELDOM = 4, 500
 _OFTEN = 60, 50
 """One that is made while we announce ourselves so knows us at once, and not within 3 s."""
 
@@ -73,8 +69,6 @@ class ParticipantSettings:
         super_client: as a client of a discovery server, receive everything.
         static_participants: whose endpoints are known without being announced, its own too.
         static_name: its own name among them; its context must have it as its enclave.
-        unannounced: ignores all others until `Unannounced.announce`, where a profile leaves that
-            open; see `lifecycle.middleware.fastdds.participant_discovery`.
         announces_often: at first, where a profile of the user's does not say how often.
 
     Raises:
@@ -88,7 +82,6 @@ class ParticipantSettings:
     super_client: bool = False
     static_participants: tuple[StaticParticipant, ...] = ()
     static_name: str = ""
-    unannounced: bool = False
     announces_often: bool = False
 
     @classmethod
@@ -177,7 +170,6 @@ class ParticipantSettings:
         return (
             self.chooses_transports
             or self.max_datagram_bytes is not None
-            or self.unannounced
             or self.announces_often
             or self.super_client
         )
@@ -314,16 +306,12 @@ def _set_discovery(rtps: ET.Element, settings: ParticipantSettings, *, is_users:
     config = rtps.find("builtin/discovery_config/leaseDuration/..")
     if not is_users and config is not None and config.find("leaseAnnouncement") is None:
         config.append(announced_again())
-    if not (settings.announces_often or settings.unannounced):
+    if is_users or not settings.announces_often:
         return
     config = _child(_child(rtps, "builtin"), "discovery_config")
-    if settings.unannounced:
-        _text(config, "ignoreParticipantFlags", "|".join(_IGNORE_ALL))
-    if not is_users:
-        for each in config.findall("initialAnnouncements"):
-            config.remove(each)
-        # All the others listen when one that was unannounced is announced.
-        config.append(announcements(*(_OFTEN if settings.announces_often else _SELDOM)))
+    for each in config.findall("initialAnnouncements"):
+        config.remove(each)
+    config.append(announcements(*_OFTEN))
 
 
 def without_shared_memory(environment: Mapping[str, str]) -> tuple[Medium, ...]:

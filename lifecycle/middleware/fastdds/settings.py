@@ -37,7 +37,6 @@ from lifecycle.middleware.fastdds.participant_profile import (
     profile,
     without_shared_memory,
 )
-from lifecycle.middleware.fastdds.profiles import PROFILE_NAME
 from lifecycle.middleware.fastdds.sockets import (
     check_free,
     check_host,
@@ -90,24 +89,6 @@ def observer_settings(settings: ParticipantSettings, *, super_client: bool) -> P
     except MiddlewareError:
         # An error of a profile is reported where the profile is needed; Fast DDS ignores it.
         return settings
-
-
-def host_settings(settings: ParticipantSettings) -> ParticipantSettings:
-    """Return the settings of a host's first participant that is to be unannounced, if it can be.
-
-    It cannot with another RMW, an unknown version of Fast DDS, a discovery server, connection URLs
-    or a profile of the user's.
-    """
-    if get_rmw_implementation_identifier() != RMW or settings.urls or fast_dds_refusal():
-        return settings
-    try:
-        base = default_profile()
-    except MiddlewareError:
-        # An error of a profile is reported where the profile is needed; Fast DDS ignores it.
-        return settings
-    if os.environ.get(DISCOVERY_SERVER_VARIABLE) or (base and base.name != PROFILE_NAME):
-        return settings
-    return dataclasses.replace(settings, unannounced=True)
 
 
 _RANGE, _PEERS = "ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_STATIC_PEERS"

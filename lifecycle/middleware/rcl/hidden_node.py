@@ -28,11 +28,6 @@ from rclpy.subscription import Subscription
 from rclpy.waitable import Waitable
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.fastdds.endpoint_discovery import (
-    SOON_S,
-    resend_endpoints_soon,
-    together_s,
-)
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.middleware.fastdds.settings import (
     discovery_by_profile,
@@ -90,8 +85,6 @@ def quiet_node(
             + (known.message if known else " ".join(str(error).split())),
             hint=known.hint if known else _security_hint(),
         ) from error
-    with node.handle:
-        resend_endpoints_soon(node.handle.pointer)
     _hidden.add(node)
     return context, node
 
@@ -119,18 +112,14 @@ def made_participant(
     settings: ParticipantSettings,
     *,
     is_new: bool = False,
-    meeting: int = 1,
-) -> Iterator[int]:
+) -> Iterator[None]:
     """Make the participant of a context with these settings; construct its first node in the block.
-
-    Yields the address of an rcl_node_t of it.
 
     Args:
         context: initialised in `discovery_by_profile`; settings have no effect where it has a
             participant already.
         settings: of the participant.
         is_new: it has none yet.
-        meeting: how many participants are announced together with it, if it is unannounced.
 
     Raises:
         MiddlewareError: as `participant_settings`.
@@ -139,10 +128,8 @@ def made_participant(
     try:
         with participant_settings(context, settings), noting_shared_memory(context, is_new=is_new):
             first = bare_node(context)
-        delay_s = together_s(meeting) if settings.unannounced else SOON_S
-        resend_endpoints_soon(first.pointer, delay_s)
         widen_discovery_buffers(context.get_domain_id())
-        yield first.pointer
+        yield
     finally:
         if first is not None:
             first.destroy_when_not_in_use()

@@ -424,8 +424,6 @@ class LifecycleNode(Declarations, LocalInterface, GatedFactories):
             served=enable_communication_interface,
             health=None if type(self).health is LifecycleNode.health else self.health,
         )
-        if construction is not None:
-            construction.constructed()
         if construction is None and mode is Mode.AUTO:
             self.lifecycle.bring_up_when_spun()
 

@@ -51,8 +51,6 @@ class Construction:
         use_global_arguments: take remaps from the process's own --ros-args.
         supervisor: name of the system whose supervisor alone may activate the node, once its gate
             is open; empty for a node that runs by itself.
-        constructed: called when LifecycleNode has made the node; what the user's class does in
-            its constructor after that is still to come.
     """
 
     spec: PlannedNode | None
@@ -60,7 +58,6 @@ class Construction:
     context: Context | None = None
     use_global_arguments: bool = False
     supervisor: str = ""
-    constructed: Callable[[], None] = lambda: None
 
 
 _CURRENT: contextvars.ContextVar[Construction | Adoption | None] = contextvars.ContextVar(

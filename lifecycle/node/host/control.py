@@ -51,9 +51,7 @@ class Operation(enum.Enum):
     # announce to the graph anew which nodes are here.
     SEND_AGAIN_SOON = "send_again_soon"
     REPUBLISH_NAMES = "republish_names"
-    # Those that are not answered: all have gathered, go on; and the end of file that follows is
-    # orderly, not that of a killed supervisor.
-    PROCEED = "proceed"
+    # Not answered: the end of file that follows is orderly, not that of a killed supervisor.
     END = "end"
 
 
@@ -62,8 +60,6 @@ class HostSpec:
     """First line from the supervisor: what this process hosts.
 
     Attributes:
-        gathers: how many hosts meet; > 0: its participant is unannounced until its node is
-            constructed; then it reports that and waits for `PROCEED`, see `Unannounced`.
         folders: absolute, of the manifest and what it includes: modules are looked for there.
         log: file that it appends its output to once its supervisor was killed; empty for none.
     """
@@ -73,7 +69,6 @@ class HostSpec:
     domain_id: int
     discovery_range: DiscoveryRange
     nodes: tuple[PlannedNode, ...]
-    gathers: int = 0
     folders: tuple[str, ...] = ()
     log: str = ""
 
@@ -102,8 +97,8 @@ class Event:
     """Host → supervisor; exactly one of the groups below is set.
 
     Attributes:
-        kind: "gathered" (it waits for PROCEED), "ready" (all nodes constructed, executor spinning),
-            "failed" (construction failed; `error` says why, the process exits),
+        kind: "ready" (all nodes constructed, executor spinning), "failed" (construction failed;
+            `error` says why, the process exits),
             "state" (a node's state changed), "reply", "beat" (the executor has returned from a
             callback that took too long), "configuration" (it changed: endpoints, connections,
             mappings or matches).

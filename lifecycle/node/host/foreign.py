@@ -567,7 +567,6 @@ class Adoption:
         spinner: runs the callbacks of nodes that are not ours.
         supervisor: name of the system whose gate holds the nodes; empty for none.
         use_global_arguments: nodes take remaps from the process's own --ros-args.
-        constructed: called for each node of rclpy that is made, and when one of ours is.
 
     Attributes:
         made: rclpy node by key of the plan, with its ForeignNode unless it is one of ours.
@@ -581,10 +580,8 @@ class Adoption:
         supervisor: str = "",
         mode: Mode | None = Mode.MANUAL,
         use_global_arguments: bool = False,
-        constructed: Callable[[], None] = lambda: None,
     ) -> None:
         self._carrying = carrying
-        self._constructed = constructed
         self._spinner = spinner
         self._supervisor = supervisor
         self._mode = mode
@@ -668,7 +665,6 @@ class Adoption:
             use_global_arguments=self._use_global_arguments,
             # Of a plain node no states are driven.
             supervisor=self._supervisor if planned.managed else "",
-            constructed=self._constructed,
         )
 
     @contextlib.contextmanager
@@ -693,8 +689,6 @@ class Adoption:
             foreign = ForeignNode(node, planned, supervisor=self._supervisor, spinner=self._spinner)
             self._foreign[id(node)] = foreign
         self.made[planned.key] = (node, foreign)
-        if not ours:
-            self._constructed()
 
     def make_endpoint(self, node: Node, kind: EndpointKind, arguments: Mapping[str, Any]) -> Any:
         """Make an endpoint that is planned otherwise than rclpy would make it; else None."""

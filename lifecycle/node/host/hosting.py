@@ -29,9 +29,8 @@ from lifecycle import codec
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import Executor
 from lifecycle.middleware.discovery.tcp import send_again_soon
-from lifecycle.middleware.fastdds.participant_discovery import Unannounced
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
-from lifecycle.middleware.fastdds.settings import discovery_by_profile, host_settings
+from lifecycle.middleware.fastdds.settings import discovery_by_profile
 from lifecycle.middleware.process.busy_sign import BusySign
 from lifecycle.middleware.process.teardown import leave_and_exit
 from lifecycle.middleware.rcl.hidden_node import made_participant
@@ -75,17 +74,10 @@ class Participants:
 
     Args:
         default: that context.
-        meeting: how many hosts meet once all have their nodes, ≥ 0; > 0: its participant is to be
-            unannounced, if it can be.
-
-    Attributes:
-        unannounced: the default context's participant, until it is announced.
     """
 
-    def __init__(self, default: Context, *, meeting: int = 0) -> None:
-        self.unannounced: Unannounced | None = None
+    def __init__(self, default: Context) -> None:
         self._default = default
-        self._meeting = meeting
         self._made: dict[ParticipantSettings, Context] = {}
 
     @contextlib.contextmanager
@@ -106,11 +98,7 @@ class Participants:
             context = Context()
             with discovery_by_profile(settings):
                 context.init(args=[], domain_id=self._default.get_domain_id())
-        wanted = host_settings(settings) if self._meeting and not is_new else settings
-        made = made_participant(context, wanted, is_new=is_new, meeting=self._meeting)
-        with made as rcl_node:
-            if wanted.unannounced:
-                self.unannounced = Unannounced.of(rcl_node)
+        with made_participant(context, settings, is_new=is_new):
             yield context
         self._made[settings] = context
 
@@ -269,9 +257,6 @@ class HostCommands:
         )
 
 
-_GATHER_S = 15.0
-"""The supervisor says far sooner that all participants are there, or waits no more."""
-
 _LEAVE_S = 0.5
 """For the participants of nodes that were constructed while another's module is imported."""
 
@@ -296,15 +281,13 @@ class Host:
         self._ended = False
         self._output = _Output(spec.log)
         self._is_orderly = False
-        self._proceed = threading.Event()
         self._left = threading.Event()
         self._nodes: dict[str, Hosted] = {}
-        self._participants = Participants(context, meeting=spec.gathers)
+        self._participants = Participants(context)
         self._adoption = Adoption(
             self._participants.carrying,
             self._loop,
             supervisor=spec.system,
-            constructed=self._meet,
         )
         self._commands = HostCommands(
             self._nodes,
@@ -329,7 +312,6 @@ class Host:
                         continue  # by the same call as one before it
                     maker = self._import(planned)
                     self._construct(planned, maker)
-                    self._meet()  # at the latest
                 except Exception as error:  # noqa: BLE001 - reported to the supervisor
                     failure = error
                 if failure is not None:
@@ -338,14 +320,6 @@ class Host:
             self._loop.call_soon(self._ready)
             self._loop.spin_and_exit(self._channel.drain)
         raise AssertionError("spin_and_exit returned")
-
-    def _meet(self) -> None:
-        """Be discovered, once the other processes are ready to be: a node has its endpoints."""
-        unannounced, self._participants.unannounced = self._participants.unannounced, None
-        if unannounced is not None:
-            self._channel.write(Event(kind="gathered"))
-            self._proceed.wait(_GATHER_S)
-            unannounced.announce()
 
     def _import(self, planned: PlannedNode) -> Callable[..., Any]:
         """Import a node's class; ending the process meanwhile need not wait for it."""
@@ -381,7 +355,6 @@ class Host:
 
     def _end(self, reason: str) -> None:
         """Shut down and leave; from any thread but the main one."""
-        self._proceed.set()
         self._left.set()
         with self._lock:
             self._ended = True
@@ -468,9 +441,7 @@ class Host:
                 # Both ends are ours: this is a bug, and the log is where it can be found.
                 logging.getLogger(__name__).exception("cannot read command %r", line)
                 continue
-            if command.operation is Operation.PROCEED:
-                self._proceed.set()
-            elif command.operation is Operation.END:
+            if command.operation is Operation.END:
                 self._is_orderly = True
             else:
                 self._loop.call_soon(self._execute, command)
@@ -478,7 +449,6 @@ class Host:
     def _lose_supervisor(self) -> None:
         """Deactivate what is active, and leave, bounded: the supervisor was killed."""
         self._output.take_over()
-        self._proceed.set()
         with self._lock:
             self._ended = True
             if self._imports:

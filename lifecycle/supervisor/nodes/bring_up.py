@@ -81,64 +81,6 @@ _TO_UNDO = (Operation.CONFIGURE, Operation.CONNECT)
 """What is left to undo of a node that was deactivated."""
 
 
-_GATHERED_S = 0.5
-"""For so long no further host has come: what is still missing imports something big."""
-
-
-class Gathering:
-    """Has hosts meet when all of them are ready for it (HostSpec.gathers).
-
-    Args:
-        size: how many hosts there are, > 1.
-        limit_s: seconds, > 0, that any of them waits for the others at most.
-    """
-
-    def __init__(self, size: int, limit_s: float) -> None:
-        self.size = size
-        self._limit_s = limit_s
-        self._missing: set[ControlChannel] = set()
-        self._waiting: list[ControlChannel] = []
-        self._tasks: set[asyncio.Task[None]] = set()
-        self._limit: asyncio.TimerHandle | None = None
-        self._quiet: asyncio.TimerHandle | None = None
-
-    def expect(self, channel: ControlChannel) -> None:
-        """Wait for one more host, which is started now."""
-        self._missing.add(channel)
-        task = asyncio.ensure_future(self._await(channel))
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
-
-    async def _await(self, channel: ControlChannel) -> None:
-        came = await channel.gathered()
-        self._missing.discard(channel)
-        if came:
-            self._waiting.append(channel)
-        if not self._missing:
-            self._proceed()
-            return
-        loop = asyncio.get_running_loop()
-        if self._waiting and self._limit is None:
-            self._limit = loop.call_later(self._limit_s, self._proceed)
-        if self._quiet is not None:
-            self._quiet.cancel()
-        self._quiet = loop.call_later(_GATHERED_S, self._proceed)
-
-    def _proceed(self) -> None:
-        for timer in (self._limit, self._quiet):
-            if timer is not None:
-                timer.cancel()
-        self._limit = self._quiet = None
-        for channel in self._waiting:
-            channel.proceed()
-        self._waiting = []
-
-    async def close(self) -> None:
-        """Have connect wait for no further host."""
-        self._proceed()
-        await ended(*self._tasks)
-
-
 class BringUp:
     """Brings one system up.
 
@@ -151,7 +93,6 @@ class BringUp:
             services is the only one of its name, or raises VerificationError.
         recorded: called after each spawn, to keep the record of children true.
         gives: sets the parameters of a running node that its command line does not give it.
-        unannounced: whether hosts can be, see HostSpec.gathers.
         loads: has the container of this full name load a node, and returns what unloads it.
         wirer: wires each node between its configure and its connect; None leaves it to the nodes.
     """
@@ -168,10 +109,7 @@ class BringUp:
         gives: Callable[[PlannedNode], Awaitable[None]] | None = None,
         alone: Callable[[NodeRun], None] | None = None,
         loads: Callable[[PlannedNode, str], Awaitable[Callable[[], Awaitable[None]]]] | None = None,
-        unannounced: Callable[[], bool] = lambda: False,
     ) -> None:
-        self._unannounced = unannounced
-        self._gathering: Gathering | None = None
         self._gives = gives
         self._alone = alone
         self._loads = loads
@@ -275,20 +213,13 @@ class BringUp:
 
     async def _connect_all(self, nodes: Iterable[NodeRun]) -> None:
         nodes = tuple(nodes)
-        hosts = {node.planned.process for node in nodes if node.planned.run.kind is RunKind.PYTHON}
-        if len(hosts) > 1 and self._unannounced():  # one alone has nobody to meet
-            limit_s = min(node.planned.timeouts.start_s for node in nodes) / 2
-            self._gathering = Gathering(len(hosts), limit_s)
         try:
             await self._side_by_side(self._walk(node) for node in nodes)
         finally:
             # A process that is started again later is another one.
-            gathering, self._gathering = self._gathering, None
             starts, self._starts = tuple(self._starts.values()), {}
             for start in starts:
                 start.cancel()
-            if gathering is not None:
-                await gathering.close()
             await ended(*starts)
 
     async def _side_by_side(self, walks: Iterable[Coroutine[Any, Any, None]]) -> None:
@@ -619,15 +550,12 @@ class BringUp:
                     domain_id=self._system.plan.domain_id,
                     discovery_range=self._system.plan.discovery_range,
                     nodes=tuple(node.planned for node in nodes),
-                    gathers=0 if self._gathering is None else self._gathering.size,
                     folders=manifest_folders(node.planned for node in nodes),
                     log=process.log.shown,
                 ),
                 self._system.on_host_event,
                 hung,
             )
-        if channel is not None and self._gathering is not None:
-            self._gathering.expect(channel)
         try:
             await process.spawn(self._spawner_of(process), channel)
         except (BringUpError, OSError) as error:

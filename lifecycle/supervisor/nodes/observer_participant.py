@@ -193,13 +193,6 @@ class ObserverParticipant:
         except Exception as error:  # rclpy has no root of its own errors
             raise MiddlewareError(" ".join(str(error).split())) from error
 
-    def can_be_unannounced(self) -> bool:
-        """Return whether participants like ours can be, see HostSpec."""
-        from lifecycle.middleware.fastdds.participant_discovery import can_be_unannounced
-
-        with self._node.handle:
-            return can_be_unannounced(self._node.handle.pointer)
-
     def send_again_soon(self) -> None:
         """Have what waits for a link to come back be sent soon when it does."""
         from lifecycle.middleware.discovery.tcp import send_again_soon

@@ -10,7 +10,6 @@ import asyncio
 import contextlib
 import socket
 from collections.abc import Callable
-from typing import Any
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import BringUpError
@@ -75,7 +74,6 @@ class ControlChannel:
         self._ready: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         # The host may end before a caller waits for "ready".
         self._ready.add_done_callback(lambda done: done.cancelled() or done.exception())
-        self._gathered = asyncio.Event()
         self._writer: asyncio.StreamWriter | None = None
         self._task: asyncio.Task[None] | None = None
 
@@ -122,19 +120,6 @@ class ControlChannel:
             ChannelClosedError: the host ended without a reason.
         """
         await asyncio.shield(self._ready)
-
-    async def gathered(self) -> bool:
-        """Wait until the host waits for `proceed`; False once it will not do so any more."""
-        there: asyncio.Future[Any] = asyncio.ensure_future(self._gathered.wait())
-        try:
-            await asyncio.wait({there, self._ready}, return_when=asyncio.FIRST_COMPLETED)
-        finally:
-            there.cancel()
-        return not self._ready.done()
-
-    def proceed(self) -> None:
-        """Have the host go on, see HostSpec.gathers."""
-        self._tell(Operation.PROCEED)
 
     def _tell(self, operation: Operation) -> None:
         """Send what is not answered."""
@@ -214,8 +199,6 @@ class ControlChannel:
             reply = self._replies.get(event.id)
             if reply is not None and not reply.done():
                 reply.set_result(event)
-        elif event.kind == "gathered":
-            self._gathered.set()
         elif event.kind == "ready":
             if not self._ready.done():
                 self._ready.set_result(None)

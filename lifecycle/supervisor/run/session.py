@@ -220,7 +220,6 @@ class Session:
             gives=observer_participant.clients.give_parameters,
             loads=observer_participant.load,
             alone=self._alone,
-            unannounced=observer_participant.can_be_unannounced,
         )
         self._gate_sequence = GateSequence(
             system,

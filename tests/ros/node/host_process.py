@@ -35,8 +35,6 @@ class HostProcess:
         domain_id: int,
         nodes: tuple[PlannedNode, ...],
         log: Path,
-        *,
-        gathers: int = 0,
     ) -> None:
         ours, theirs = socket.socketpair()
         ours.settimeout(30)
@@ -63,7 +61,6 @@ class HostProcess:
             domain_id=domain_id,
             discovery_range=DiscoveryRange.LOCALHOST,
             nodes=nodes,
-            gathers=gathers,
         )
         self.send(spec)
 

@@ -15,13 +15,12 @@ from pathlib import Path
 import psutil
 import pytest
 from host_process import HostProcess, driver_in, hosted
-from lifecycle_driver import Driver
 from planning import publisher, subscription
 from std_msgs.msg import String
 
 from lifecycle import codec
 from lifecycle.manifest.model import DiscoveryRange, Executor, Run, RunKind, Timeouts
-from lifecycle.node.host.control import Command, Event, HostSpec, Operation
+from lifecycle.node.host.control import Event, HostSpec, Operation
 
 HERE = Path(__file__).parent
 CONFIGURE, CONNECT, ACTIVATE = Operation.CONFIGURE, Operation.CONNECT, Operation.ACTIVATE
@@ -49,39 +48,6 @@ def test_two_nodes_in_one_process_are_brought_up_and_end_with_the_channel(start:
     assert (told.name, told.identity.process_id) == ("/one", host.process.pid)
     host.hang_up()
     assert host.wait() == 0
-
-
-@pytest.mark.parametrize("class_", ["Good", "Plain", "Theirs"])
-def test_an_unannounced_host_is_discovered_once_it_may_be_and_with_all_it_has(
-    start: Start, fresh_domain: int, wait_until: Callable[..., None], class_: str
-) -> None:
-    host = start(hosted("one", class_, managed=class_ != "Plain"), gathers=2)
-    assert host.read() == Event(kind="gathered")
-    other = start(hosted("other", "Good"))
-    other.until("ready")
-    with driver_in(fresh_domain) as driver:
-        # Who came later is there with all it has: the first one would be, too.
-        wait_until(lambda: _services(driver, "other"))
-        assert "one" not in driver.node.get_node_names()
-        host.send(Command(id=0, node="", operation=Operation.PROCEED))
-        host.until("ready")
-        wait_until(lambda: _services(driver, "one"))
-    host.hang_up()
-    assert host.wait() == 0
-
-
-def _services(driver: Driver, node: str) -> list[str]:
-    """Return the services of a node; none before it is in the graph."""
-    if node not in driver.node.get_node_names():
-        return []
-    return [name for name, _ in driver.node.get_service_names_and_types_by_node(node, "/")]
-
-
-def test_an_unannounced_host_that_is_ended_while_it_gathers_ends(start: Start) -> None:
-    host = start(hosted("one", "Good"), gathers=2)
-    assert host.read() == Event(kind="gathered")
-    host.hang_up()
-    assert host.wait(5.0) == 0
 
 
 @pytest.mark.parametrize("class_", ["Good", "Plain", "Theirs"])

@@ -84,44 +84,6 @@ ctypes.CDLL = Library
 """
 
 
-NOTES_ANNOUNCING = """
-from lifecycle.middleware.fastdds.participant_discovery import Unannounced
-from tests.ros.supervisor.systems import Listener, Talker
-
-announce = Unannounced.announce
-
-
-def noted(unannounced):
-    print("announced", flush=True)
-    announce(unannounced)
-
-
-Unannounced.announce = noted
-"""
-
-
-def test_processes_that_start_together_are_discovered_once_they_have_their_endpoints(
-    tmp_path: Path, fresh_domain: int
-) -> None:
-    (tmp_path / "noting.py").write_text(NOTES_ANNOUNCING)
-    edit = {
-        f"nodes/{name.lower()}/run": {"python": f"noting:{name}"} for name in ("Talker", "Listener")
-    }
-    edit["nodes/listener/after"] = {}
-    edit["nodes/talker/restart"] = "always"
-    with up(pair(tmp_path, fresh_domain, edit=edit), runtime=tmp_path) as run:
-        run.until("system", reached="active")
-        # One that is started again has nobody to wait for, and is announced when it is made.
-        os.kill(run.pid_of("talker"), signal.SIGKILL)
-        run.until("restarted")
-        run.signal(signal.SIGINT)
-        assert run.finish() == ExitCode.INTERRUPTED
-        run.assert_gate_held()
-        for name in ("talker", "listener"):
-            said = verb("logs", name, runtime=tmp_path).stdout
-            assert said.count("announced") == 1, said
-
-
 def test_with_libraries_that_are_not_known_all_but_unique_flows_is_verified(
     tmp_path: Path, fresh_domain: int
 ) -> None:

@@ -134,21 +134,6 @@ def test_quick_discovery_is_kept(tmp_path: Path) -> None:
     assert texts(made(UDP, base=base), ".//initialAnnouncements/count") == ["10"]
 
 
-def test_an_unannounced_participant_ignores_all_and_announces_itself_less(tmp_path: Path) -> None:
-    path = tmp_path / "quick.xml"
-    path.write_text(discovery_profile())
-    base = default_profile({"FASTRTPS_DEFAULT_PROFILES_FILE": str(path)})
-    root = made(ParticipantSettings(unannounced=True), base=base)
-    (flags,) = texts(root, ".//discovery_config/ignoreParticipantFlags")
-    assert set(flags.split("|")) == {
-        "FILTER_DIFFERENT_HOST",
-        "FILTER_DIFFERENT_PROCESS",
-        "FILTER_SAME_PROCESS",
-    }
-    assert texts(root, ".//initialAnnouncements/count") == ["4"]
-    assert texts(root, ".//initialAnnouncements/period/nanosec") == ["500000000"]
-
-
 def test_an_observer_announces_itself_often_at_first() -> None:
     root = made(ParticipantSettings(announces_often=True))
     assert texts(root, ".//initialAnnouncements/count") == ["60"]

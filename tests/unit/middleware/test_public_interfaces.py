@@ -11,21 +11,15 @@ ROOT = Path(lifecycle.__file__).parent
 
 CTYPES = {
     "middleware/discovery/liveliness.py",  # asserts a publisher's liveliness without the GIL
-    "middleware/fastdds/endpoint_discovery.py",
     "middleware/fastdds/factory.py",  # participants from profiles, eight public functions
-    "middleware/fastdds/local_readers.py",
     "middleware/fastdds/nfe.py",  # rcl's network flow endpoints and the unique option
-    "middleware/fastdds/participant_discovery.py",
     "middleware/process/prctl.py",  # prctl(2), and timers that end a process
     "middleware/rcl/abi.py",  # rcl's C API, checked by version and layout
 }
 """Files that call libraries other than by Python."""
 
 MANGLED = {
-    "middleware/fastdds/endpoint_discovery.py",
     "middleware/fastdds/factory.py",
-    "middleware/fastdds/local_readers.py",
-    "middleware/fastdds/participant_discovery.py",
 }
 """Files that name C++ functions; docs/decisions.md says which of them are to go."""
 

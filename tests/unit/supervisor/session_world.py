@@ -287,9 +287,6 @@ class FakeParticipant:
     def ended(self, pid: int, *, nodes: Iterable[str], reported: Iterable[str]) -> None:
         """Nothing is left in this graph."""
 
-    def can_be_unannounced(self) -> bool:
-        return False
-
     def announce_machine(self, system: str, machine: str) -> _Connection:
         raise AssertionError(f"{system} has no other machine than {machine}")
 

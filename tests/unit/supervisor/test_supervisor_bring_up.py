@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import signal
-from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -16,7 +15,7 @@ from lifecycle.supervisor.control.protocol import Reach
 from lifecycle.supervisor.gate.gate import Gate, Permit
 from lifecycle.supervisor.gate.verification_loop import ChangeCounter, VerificationLoop
 from lifecycle.supervisor.health.process_monitor import ProcessMonitor
-from lifecycle.supervisor.nodes.bring_up import ALSO_S, Gathering
+from lifecycle.supervisor.nodes.bring_up import ALSO_S
 from lifecycle.supervisor.processes.control_channel import ControlChannel
 from lifecycle.supervisor.processes.process import ProcessExit, SpawnRequest
 from lifecycle.supervisor.run.events import Notice
@@ -381,48 +380,3 @@ def test_a_failure_is_one_finding_with_the_log_that_says_more() -> None:
     assert finding.hint.endswith("the last lines of its log: /log/a.log")
     assert with_failure(verdict, failure).findings == verdict.findings
     assert not verdict.judged
-
-
-class _Host:
-    """A host's control channel, as Gathering sees it."""
-
-    def __init__(self, participant_s: float, *, fails: bool = False) -> None:
-        self._participant_s = participant_s
-        self._fails = fails
-        self.proceeded_at: float | None = None
-
-    async def gathered(self) -> bool:
-        await asyncio.sleep(self._participant_s)
-        return not self._fails
-
-    def proceed(self) -> None:
-        self.proceeded_at = asyncio.get_running_loop().time()
-
-
-@pytest.mark.parametrize(
-    ("hosts", "limit_s", "proceeded_at"),
-    [
-        ((_Host(0.1), _Host(0.4), _Host(0.3)), 5.0, [0.4, 0.4, 0.4]),
-        ((_Host(0.1), _Host(0.2, fails=True)), 5.0, [0.2, None]),
-        # One that imports for long is not waited for.
-        ((_Host(0.1), _Host(0.3), _Host(9.0)), 5.0, [0.8, 0.8, 9.0]),
-        ((_Host(0.1, fails=True), _Host(0.3), _Host(0.7)), 5.0, [None, 0.7, 0.7]),
-        ([_Host(0.4 * (each + 1)) for each in range(5)], 1.0, [1.4, 1.4, 1.4, 2.0, 2.0]),
-    ],
-)
-def test_hosts_meet_once_the_last_of_them_has_its_endpoints(
-    hosts: Sequence[_Host], limit_s: float, proceeded_at: list[float | None]
-) -> None:
-    async def main() -> list[float | None]:
-        gathering = Gathering(3, limit_s)
-        began = asyncio.get_running_loop().time()
-        for host in hosts:
-            gathering.expect(host)  # type: ignore[arg-type]
-        await asyncio.sleep(60.0)
-        await gathering.close()
-        return [
-            None if host.proceeded_at is None else round(host.proceeded_at - began, 2)
-            for host in hosts
-        ]
-
-    assert run(main()) == proceeded_at
