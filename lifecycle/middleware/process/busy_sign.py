@@ -8,7 +8,9 @@ import rclpy.
 
 Time during which the thread could have run and got no processor is not its own: on an overloaded
 machine a callback of milliseconds takes seconds. The kernel counts it for each thread (run_delay of
-/proc/TID/schedstat, Documentation/scheduler/sched-stats.rst), up to its last turn.
+/proc/TID/schedstat, Documentation/scheduler/sched-stats.rst), up to its last turn. One that is
+ready to run hangs once it has run for long beyond the limit; another, once the limit has passed
+without what it waited for a processor.
 
 The page has room for what the busy one does, in words, and the file behind it for where its threads
 stand (stacks.py).
@@ -24,7 +26,6 @@ import time
 import typing
 from pathlib import Path
 
-from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.process import stacks
 
@@ -34,11 +35,8 @@ _WHAT = 64
 _WHAT_BYTES = 256
 _NS = 1_000_000_000
 
-_AGAIN_NS = 30_000_000
-"""Between two looks at a thread that is ready to run: a kernel counts its turns at each tick, up to
-10 ms apart."""
-
 _SLOW_PARTS = 4
+"""Whoever has run for this part of the limit beyond it is slow by itself."""
 _UNSERVED_LIMITS = 5
 """So many times the limit without a processor is a fault of its own."""
 
@@ -50,23 +48,14 @@ class Overdue(enum.Enum):
     UNSERVED = "unserved"  # it is ready to run, and the machine has no processor for it
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class _Turns:
-    """What a thread had of the processors until its last turn.
+class _Turns(typing.NamedTuple):
+    """What a thread had of the processors until its last turn."""
 
-    Attributes:
-        thread: its id; of a process, negative, it is what all of its threads waited together.
-        at_ns: when this was read, CLOCK_MONOTONIC.
-        ran_ns: time on a processor.
-        waited_ns: time ready to run, without one.
-        ready: it runs, or could.
-    """
-
-    thread: int
-    at_ns: int
-    ran_ns: int
-    waited_ns: int
-    ready: bool
+    thread: int  # its id; of a process, negative, it is what all of its threads waited together
+    at_ns: int  # when this was read, CLOCK_MONOTONIC
+    ran_ns: int  # time on a processor
+    waited_ns: int  # time ready to run, without one
+    ready: bool  # it runs, or could
 
 
 @typing.final
@@ -82,9 +71,9 @@ class BusySign:
         self._words = memoryview(self._memory).cast("q")
         self._of_process = False
         self._looked_at: tuple[int, Overdue | None] = (0, None)
-        self._last: _Turns | None = None
-        self._before: _Turns | None = None
-        self._overdue: _Turns | None = None
+        self._last: _Turns | None = None  # at the last look
+        self._before: _Turns | None = None  # at the last look before it became busy
+        self._overdue: _Turns | None = None  # at the first look beyond the limit
 
     @classmethod
     def make(cls, limit_s: float) -> BusySign:
@@ -157,47 +146,36 @@ class BusySign:
             self._looked_at = (since, None)
             self._before, self._overdue = self._last, None
         self._last = turns
-        why, left = None, since + limit - now if since else limit
-        if left <= 0:
-            own, again = self._own_ns(since, now, turns)
-            left = min(again or limit, limit - own)
-            if own >= limit:
-                why = Overdue.HANGS
-            elif now - since >= _UNSERVED_LIMITS * limit:
-                why = Overdue.UNSERVED
-        news = why if why is not self._looked_at[1] else None
-        if why is not None:
-            self._looked_at = (since, why)
-        return news, (limit if left <= 0 else min(left, limit)) / _NS
+        left = since + limit - now if since else limit
+        if left > 0:
+            return None, min(left, limit) / _NS
+        why, said = None, self._looked_at[1]
+        own = self._own_ns(since, now, turns)
+        if own >= limit:
+            why = Overdue.HANGS
+        elif now - since >= _UNSERVED_LIMITS * limit:
+            why = Overdue.UNSERVED
+        self._looked_at = (since, why or said)
+        part = limit // _SLOW_PARTS
+        return why if why is not said else None, (limit - own if part < own < limit else part) / _NS
 
-    def _own_ns(self, since: int, now: int, turns: _Turns | None) -> tuple[int, int]:
+    def _own_ns(self, since: int, now: int, turns: _Turns | None) -> int:
         """Return for how much of the time since then the holder ran, or waited for something else.
 
-        What it waited for a processor is known from the last look before; so this is at most the
-        truth, and a hang on an overloaded machine is noticed later. Who still runs, and has run for
-        a quarter of the limit since that was over, is slow by itself: then all of it is its own.
-
-        Returns:
-            The time, and after how much time another look will know more; 0 where this is known.
+        It is at most the truth: so a hang on an overloaded machine is noticed later.
         """
         if turns is None:  # a kernel that does not count: all of the time is its own
-            return now - since, 0
-        if self._before is None or self._before.thread != turns.thread:
-            self._before = turns
-        own = now - max(since, self._before.at_ns) - (turns.waited_ns - self._before.waited_ns)
-        if not turns.ready:
-            return own, 0
-        # It may have been ready for long without a turn, which is counted at its next one.
-        if (first := self._overdue) is None:
+            return now - since
+        if self._overdue is None or self._overdue.thread != turns.thread:
             self._overdue = turns
-            return 0, _AGAIN_NS
-        part = self._words[_LIMIT] // _SLOW_PARTS
-        ran, counted = turns.ran_ns - first.ran_ns, turns.waited_ns - first.waited_ns
-        if not ran and not counted:
-            return 0, max(_AGAIN_NS, part)
-        if ran >= part:
-            return now - since, 0
-        return own - max(0, now - first.at_ns - ran - counted), part
+        if turns.ready:
+            # It may have been ready for long without a turn, which is counted at its next one.
+            part = self._words[_LIMIT] // _SLOW_PARTS
+            return now - since if turns.ran_ns - self._overdue.ran_ns >= part else 0
+        before = self._before
+        if before is None or before.thread != turns.thread:
+            before = self._before = turns
+        return now - max(since, before.at_ns) - (turns.waited_ns - before.waited_ns)
 
     @property
     def busy_s(self) -> float:
