@@ -285,11 +285,17 @@ class GraphState:
         self._look = look
 
     def observation(self) -> Observation:
-        """Return what `lifecycle.verify` judges: the last look, and what is given of nodes now."""
+        """Return what `lifecycle.verify` judges: the last look, and what is given of nodes now.
+
+        A node that has no endpoint, and so nothing that discovery shows, is there by its report.
+        """
         look, given = self._look, self._given
         asked = {name: configuration for name, (_, configuration) in look.answers.items()}
         states = {name: state for name, (state, _) in look.answers.items()}
         states |= {name: each.state for name, each in given.items()}
+        shown = {each.full_name for each in look.nodes}
+        bare = (each for each in given.values() if not each.endpoints and each.name not in shown)
+        reported = [ObservedNode(full_name=each.name, managed=bool(each.state)) for each in bare]
         return Observation(
             nodes=tuple(
                 dataclasses.replace(
@@ -297,7 +303,7 @@ class GraphState:
                     state=states.get(each.full_name),
                     health=look.health.get(each.full_name),
                 )
-                for each in look.nodes
+                for each in (*look.nodes, *reported)
             ),
             endpoints=look.endpoints,
             configurations=tuple(each for each in {**given, **asked}.values() if each is not None),

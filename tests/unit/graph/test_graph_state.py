@@ -8,12 +8,12 @@ from typing import Any
 import pytest
 
 from lifecycle.graph.model import End, GraphChange, NodeView, link, match_ends
-from lifecycle.graph.state import GraphState
+from lifecycle.graph.state import GraphState, Look
 from lifecycle.graph.status import NodeStatus, decode, encode
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import QosProfile, Reliability
 from lifecycle.network.nfe import TransportProtocol
-from lifecycle.verify.observation import EndpointReport, Identity
+from lifecycle.verify.observation import EndpointReport, Identity, ObservedNode
 from lifecycle.verify.outcome import ConnectionReport, Outcome
 from tests.builders import configuration, nfe
 
@@ -121,6 +121,21 @@ def test_what_was_given_is_judged_and_shown_until_it_is_dropped(state: GraphStat
     assert state.observation().configurations == (given,)
     state.drop_configuration("/given")
     assert (state.nodes(), state.observation().configurations) == ((), ())
+
+
+def test_a_node_without_any_endpoint_is_there_by_its_report(state: GraphState) -> None:
+    bare, other = configuration("/bare"), configuration("/other", endpoint("/t"))
+    state.put_configuration(bare)
+    state.put_configuration(other)  # discovery shows what it has, or it is cut off
+    seen = state.observation()
+    assert [(each.full_name, each.state, each.managed) for each in seen.nodes] == [
+        ("/bare", bare.state, True)
+    ]
+    state.put_look(Look(nodes=(ObservedNode(full_name="/bare", count=2, managed=True),)))
+    assert [each.count for each in state.observation().nodes] == [2]
+    state.drop_configuration("/bare")
+    state.put_look(Look())
+    assert state.observation().nodes == ()
 
 
 def test_who_asks_for_what_is_known_gets_each_node_and_then_its_changes(state: GraphState) -> None:
