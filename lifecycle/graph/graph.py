@@ -17,7 +17,7 @@ from rclpy.node import Node
 
 from lifecycle.graph.events import GraphEvents
 from lifecycle.graph.loop import GraphLoop
-from lifecycle.graph.observer import BURST_S, QUIET_S, Observer
+from lifecycle.graph.observer import Observer
 from lifecycle.graph.reporter import receive
 from lifecycle.graph.state import GraphState
 from lifecycle.middleware.rcl.graph import GraphObserver
@@ -46,8 +46,6 @@ class Graph(Observer):
         *,
         in_loop: bool = False,
         messages: bool = True,
-        quiet_s: float = QUIET_S,
-        burst_s: float = BURST_S,
         unplanned: bool = False,
     ) -> None:
         """Put the layers together; with a thread of its own the graph also follows every node."""
@@ -55,8 +53,6 @@ class Graph(Observer):
             discovery,
             NodeClients(discovery),
             GraphLoop(own_thread=not in_loop),
-            quiet_s=quiet_s,
-            burst_s=burst_s,
             unplanned=unplanned,
         )
         self.events = GraphEvents(self.state)
@@ -105,8 +101,6 @@ class Graph(Observer):
         *,
         messages: bool = False,
         unplanned: bool = False,
-        quiet_s: float = QUIET_S,
-        burst_s: float = BURST_S,
     ) -> Graph:
         """Look at the graph of a domain with a participant of its own, as a supervisor does.
 
@@ -118,20 +112,12 @@ class Graph(Observer):
             connections: how the participant is connected; None leaves it to the RMW.
             messages: receive what nodes say of themselves; a change is worth another look.
             unplanned: also ask nodes that are not planned, as far as they have our node interface.
-            quiet_s: a burst of changes is over when nothing changed for so long, ≥ 0.
-            burst_s: a burst is cut off after so long, ≥ quiet_s.
 
         Raises:
             MiddlewareError: no participant could be made.
         """
-        return cls(
-            GraphObserver(domain_id, connections),
-            in_loop=True,
-            messages=messages,
-            quiet_s=quiet_s,
-            burst_s=burst_s,
-            unplanned=unplanned,
-        )
+        discovery = GraphObserver(domain_id, connections)
+        return cls(discovery, in_loop=True, messages=messages, unplanned=unplanned)
 
     # -- judging
 

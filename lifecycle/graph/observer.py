@@ -10,14 +10,14 @@ from __future__ import annotations
 import asyncio
 import functools
 import logging
-from collections.abc import Awaitable, Collection, Coroutine, Iterable, Iterator, Mapping
+from collections.abc import Awaitable, Collection, Coroutine, Iterable, Iterator
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.graph.diagnostics import DiagnosticReadings
 from lifecycle.graph.loop import GraphLoop, set_within
 from lifecycle.graph.model import GraphChange
-from lifecycle.graph.parameters import ParameterReadings
+from lifecycle.graph.parameters import Names, ParameterReadings
 from lifecycle.graph.state import Answer, GraphState, Look
 from lifecycle.graph.status import NodeStatus
 from lifecycle.plan.model import Plan
@@ -44,8 +44,10 @@ _logger = logging.getLogger(__name__)
 
 _T = TypeVar("_T")
 
-QUIET_S = 0.02
-BURST_S = 0.1
+_BURST_S = (0.02, 0.1)
+_BURST_JUDGED_S = (0.005, 0.05)
+"""A burst of changes is over when nothing changed for so long, and is cut off after so long. Who
+judges waits less: bring-up is a race, and a look costs a few milliseconds."""
 
 FORGET_AFTER_S = 600.0
 """A node that was silent for so long has left."""
@@ -80,8 +82,6 @@ class Observer:
         discovery: what is there.
         clients: services of nodes.
         loop: where everything runs.
-        quiet_s: a burst of changes is over when nothing changed for so long, ≥ 0.
-        burst_s: a burst is cut off after so long, ≥ quiet_s.
         unplanned: `observe` also asks nodes that are not planned, as far as they have our node
             interface.
 
@@ -90,6 +90,8 @@ class Observer:
         discovery: what discovery shows.
         clients: of nodes' services; to be used in the loop.
         changes: changes so far, each counted at once: before its burst has passed (`wait_change`).
+        quiet_s: a burst of changes is over when nothing changed for so long, ≥ 0.
+        burst_s: it is cut off after so long, ≥ quiet_s.
     """
 
     def __init__(
@@ -98,8 +100,6 @@ class Observer:
         clients: NodeClients,
         loop: GraphLoop,
         *,
-        quiet_s: float = QUIET_S,
-        burst_s: float = BURST_S,
         unplanned: bool = False,
     ) -> None:
         self.changes = 0
@@ -107,8 +107,7 @@ class Observer:
         self.discovery = discovery
         self.clients = clients
         self._loop = loop
-        self._quiet_s = quiet_s
-        self._burst_s = burst_s
+        self.quiet_s, self.burst_s = _BURST_S if loop.has_thread else _BURST_JUDGED_S
         self._unplanned = unplanned
         self._follows = loop.has_thread
         self._present: frozenset[str] = frozenset()
@@ -154,17 +153,10 @@ class Observer:
                 break
             # To look costs more than the moment in which the rest of a burst comes.
             if await set_within(self._changed, settling_s):
-                await asyncio.sleep(min(self._quiet_s, settling_s))
+                await asyncio.sleep(min(self.quiet_s, settling_s))
         self._show(nodes)
         given = self.state.given
-        judged = {
-            node.full_name: None
-            if node.has_all_parameters
-            else frozenset(each.name for each in node.expected_parameters)
-            for node in plan.nodes
-            if (node.expected_parameters or node.has_all_parameters)
-            and node.full_name in self._present - given.keys()
-        }
+        judged = _judged_parameters(plan, self._present - given.keys())
         self._parameters.listen(judged)
         self._diagnostics.listen(
             {
@@ -173,17 +165,10 @@ class Observer:
                 if node.health is not None and node.health.diagnostics
             }
         )
-        answers = self._believed(plan, await self._ask_all(plan, nodes, planned, given))
-        self._answered = {
-            name: configuration
-            for name, (_, configuration) in answers.items()
-            if configuration is not None
-        }
-        reporting = {
-            name
-            for name, each in {**self.state.given, **self._answered}.items()
-            if each.parameters is not None
-        }
+        answers = await self._ask_all(plan, nodes, planned - given.keys())
+        self._answered = {name: said for name, (_, said) in answers.items() if said is not None}
+        said = {**self.state.given, **self._answered}
+        reporting = {name for name, each in said.items() if each.parameters is not None}
         if await self._parameters.follow(sorted(judged.keys() - reporting), reporting=reporting):
             return await self.observe(plan)  # each node is waited for once
         self.state.put_look(
@@ -224,11 +209,11 @@ class Observer:
         """
         loop = self._bind()
         await self._changed.wait()
-        end = loop.time() + self._burst_s
+        end = loop.time() + self.burst_s
         while (left_s := end - loop.time()) > 0:
             self._changed.clear()
             # Not at each change: while nodes come there is one for each of their endpoints.
-            await asyncio.sleep(min(self._quiet_s, left_s))
+            await asyncio.sleep(min(self.quiet_s, left_s))
             if not self._changed.is_set():
                 break
         self._changed.clear()
@@ -248,39 +233,29 @@ class Observer:
     # -- asking
 
     async def _ask_all(
-        self,
-        plan: Plan,
-        nodes: Iterable[ObservedNode],
-        planned: Collection[str],
-        given: Collection[str],
+        self, plan: Plan, nodes: Iterable[ObservedNode], wanted: Collection[str]
     ) -> dict[str, Answer]:
-        asking = []
-        for node in nodes:
-            name = node.full_name
-            if name in planned:
-                if name not in given:
-                    asking.append(self._ask(node))
-            elif (
-                self._unplanned
-                and node.managed
-                and not tolerating_pattern(name, plan.policy.tolerated_nodes)
-            ):
-                asking.append(self._ask_unplanned(name))
-        return dict(await asyncio.gather(*asking))
+        """Ask wanted nodes, and those that are not planned if those are to be asked.
 
-    def _believed(self, plan: Plan, answers: Mapping[str, Answer]) -> dict[str, Answer]:
-        """Leave out what nodes say of themselves that are in no host of ours.
-
-        On this machine a host shows that it is one. Of another machine's nodes those count that the
-        plan has in a host: its supervisor started them there.
+        What nodes say of themselves that are in no host of ours is left out. On this machine a host
+        shows that it is one. Of another machine's nodes those count that the plan has in a host:
+        its supervisor started them there.
         """
-        here = self.discovery.hosted(
-            name for name, (_, configuration) in answers.items() if configuration is not None
-        )
-        elsewhere = {each.full_name: bool(each.run.python) for each in plan.nodes}
+        planned = {each.full_name: bool(each.run.python) for each in plan.nodes}
+        asking = [self._ask(node) for node in nodes if node.full_name in wanted]
+        if self._unplanned:
+            asking += [
+                self._ask_unplanned(node.full_name)
+                for node in nodes
+                if node.managed
+                and node.full_name not in planned
+                and not tolerating_pattern(node.full_name, plan.policy.tolerated_nodes)
+            ]
+        answers = dict(await asyncio.gather(*asking))
+        here = self.discovery.hosted(name for name, (_, said) in answers.items() if said)
         return {
-            name: (state, configuration if here.get(name, elsewhere.get(name, True)) else None)
-            for name, (state, configuration) in answers.items()
+            name: (state, said if here.get(name, planned.get(name, True)) else None)
+            for name, (state, said) in answers.items()
         }
 
     async def _ask(self, node: ObservedNode) -> tuple[str, Answer]:
@@ -345,18 +320,10 @@ class Observer:
         name, after = change.node, change.after
         if after is not None and after.silent:
             self._loop.bind().call_later(FORGET_AFTER_S, self.state.forget, after)
-        if not change.status_changed or name in self.state.given:
-            return
-        status = None if after is None else after.status
-        answer = self._answered.get(name)
-        if (
-            self._follows
-            or status is None
-            or answer is None
-            or (status.state, status.connected, status.checksum)
-            != (answer.state, answer.connected, answer.checksum)
-        ):
-            self._wake()
+        if change.status_changed and name not in self.state.given:
+            status = None if after is None else after.status
+            if self._follows or not _says_as_before(status, self._answered.get(name)):
+                self._wake()
 
     def _show(self, nodes: Iterable[ObservedNode]) -> None:
         """Have nodes join that discovery shows, and forget those that it shows no more."""
@@ -445,6 +412,24 @@ class Observer:
         else:
             del self._read_as[name]
             self._bind().call_later(_AGAIN_S, self._wake)
+
+
+def _judged_parameters(plan: Plan, present: Collection[str]) -> dict[str, Names]:
+    """Return of which nodes that are there parameters are judged, and of which names."""
+    return {
+        node.full_name: None
+        if node.has_all_parameters
+        else frozenset(each.name for each in node.expected_parameters)
+        for node in plan.nodes
+        if (node.expected_parameters or node.has_all_parameters) and node.full_name in present
+    }
+
+
+def _says_as_before(status: NodeStatus | None, answer: NodeConfiguration | None) -> bool:
+    if status is None or answer is None:
+        return False
+    said = (answer.state, answer.connected, answer.checksum)
+    return (status.state, status.connected, status.checksum) == said
 
 
 def _seen_configuration(

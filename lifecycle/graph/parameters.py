@@ -206,9 +206,8 @@ class _Node:
         return NodeParameters(node=self._name, parameters=found, error=error)
 
     async def _ask(self, limit_s: float) -> tuple[ParameterReport, ...] | None:
-        asking = asyncio.ensure_future(
-            self._clients.report_parameters(self._name, self.names, timeout_s=limit_s)
-        )
+        reading = self._clients.report_parameters(self._name, self.names, timeout_s=limit_s)
+        asking = asyncio.ensure_future(reading)
         try:
             await asyncio.wait({asking}, timeout=limit_s)  # not wait_for, see set_within
             return asking.result() if asking.done() else None

@@ -10,8 +10,11 @@ import functools
 import re
 import sys
 from pathlib import Path
+from typing import Any
 
 import msgspec
+
+from lifecycle.errors import MiddlewareError
 
 
 class Distribution(msgspec.Struct, frozen=True, kw_only=True):
@@ -92,6 +95,20 @@ def of_rcl(version: str) -> Distribution | None:
     """Return the distribution with this version of rcl, empty for any; None if it is not known."""
     major = version.partition(".")[0] or JAZZY.rcl_major
     return next((each for each in DISTRIBUTIONS if each.rcl_major == major), None)
+
+
+def private(owner: object, name: str, what: str) -> Any:
+    """Return what an object of rclpy has under a private name.
+
+    Raises:
+        MiddlewareError: it has nothing there: this rclpy is built otherwise than those known.
+    """
+    found = getattr(owner, name, None)
+    if found is None:
+        raise MiddlewareError(
+            f"cannot {what}: this rclpy has no {name}, which that of {KNOWN_RCL} has", hint=INSTALL
+        )
+    return found
 
 
 def rcl_version() -> str:

@@ -10,6 +10,7 @@ import ctypes
 import functools
 import os
 import signal
+import struct
 import time
 from collections.abc import Callable
 
@@ -52,19 +53,6 @@ def refuse_new_privileges() -> None:
     _prctl(_PR_SET_NO_NEW_PRIVS, 1)
 
 
-class _CapabilityHeader(ctypes.Structure):
-    _fields_ = (("version", ctypes.c_uint32), ("pid", ctypes.c_int))
-
-
-class _CapabilitySets(ctypes.Structure):
-    # The first of two has capabilities 0 to 31.
-    _fields_ = (
-        ("effective", ctypes.c_uint32),
-        ("permitted", ctypes.c_uint32),
-        ("inheritable", ctypes.c_uint32),
-    )
-
-
 def drop_network_administration() -> None:
     """Give up CAP_NET_ADMIN, see capabilities(7), for this process and all that it starts.
 
@@ -73,29 +61,18 @@ def drop_network_administration() -> None:
     Raises:
         MiddlewareError: the kernel refused.
     """
-    header = _CapabilityHeader(_CAPABILITY_VERSION_3, 0)
-    sets = (_CapabilitySets * 2)()
-    if _libc().capget(ctypes.byref(header), sets) != 0:
+    # struct __user_cap_header_struct, and two of __user_cap_data_struct: effective, permitted and
+    # inheritable of capabilities 0 to 31 in the first.
+    header = struct.pack("=Ii", _CAPABILITY_VERSION_3, 0)
+    sets = ctypes.create_string_buffer(24)
+    if _libc().capget(header, sets) != 0:
         raise _failed("capget")
+    words = struct.unpack("=6I", sets)
     kept = 0xFFFFFFFF ^ (1 << _CAP_NET_ADMIN)
-    sets[0].effective &= kept
-    sets[0].permitted &= kept
-    sets[0].inheritable &= kept
+    sets.raw = struct.pack("=6I", *(each & kept for each in words[:3]), *words[3:])
     _prctl(_PR_CAP_AMBIENT, _PR_CAP_AMBIENT_LOWER, _CAP_NET_ADMIN)
-    if _libc().capset(ctypes.byref(header), sets) != 0:
+    if _libc().capset(header, sets) != 0:
         raise _failed("capset")
-
-
-class _SignalEvent(ctypes.Structure):
-    # struct sigevent: glibc pads it to 64 bytes.
-    _fields_ = (
-        ("value", ctypes.c_int64),  # union sigval
-        ("signo", ctypes.c_int),
-        ("notify", ctypes.c_int),
-        ("function", ctypes.c_void_p),
-        ("attributes", ctypes.c_void_p),
-        ("padding", ctypes.c_char * 32),
-    )
 
 
 def exit_after(seconds: float, code: int) -> Callable[[], None]:
@@ -118,14 +95,12 @@ def exit_after(seconds: float, code: int) -> Callable[[], None]:
     if seconds <= 0 or not 0 <= code <= 0xFF:
         raise ValueError(f"cannot exit with {code} after {seconds} s: 0–255 after more than 0 s")
     signal.setitimer(signal.ITIMER_REAL, seconds + _KILLED_S)
-    ends = _SignalEvent(
-        value=code,
-        notify=_SIGEV_THREAD,
-        function=ctypes.cast(_libc()._exit, ctypes.c_void_p),  # noqa: SLF001 - C's name
-    )
+    exits = ctypes.cast(_libc()._exit, ctypes.c_void_p).value  # noqa: SLF001 - C's name
+    # struct sigevent: value, signal, how, function; glibc pads it to 64 bytes.
+    ends = struct.pack("qiiP", code, 0, _SIGEV_THREAD, exits).ljust(64, b"\0")
     timer = ctypes.c_void_p()
     clock = time.CLOCK_MONOTONIC
-    is_made = _libc().timer_create(clock, ctypes.byref(ends), ctypes.byref(timer)) == 0
+    is_made = _libc().timer_create(clock, ends, ctypes.byref(timer)) == 0
 
     def arm(ns: int) -> None:
         # struct itimerspec: the interval, then the value, of seconds and nanoseconds each.

@@ -174,12 +174,17 @@ def move(entity: MovedEndpoint, maker: Node, host: Node) -> None:
         host.add_waitable(entity)
         return
     name = _LISTS[type(entity)]
+    if not (hasattr(maker, name) and hasattr(host, name)):
+        if host.executor is not None:  # of another rclpy: all that is on the maker is spun there
+            host.executor.add_node(maker)
+        return
     getattr(maker, name).remove(entity)
     getattr(host, name).append(entity)
     for handler in entity.event_handlers if isinstance(entity, Subscription) else ():
         maker.remove_waitable(handler)
         host.add_waitable(handler)
-    host._wake_executor()  # noqa: SLF001 - as Node.create_… does
+    if host.executor is not None:
+        host.executor.wake()
 
 
 def dismiss(entity: MovedEndpoint, host: Node) -> None:

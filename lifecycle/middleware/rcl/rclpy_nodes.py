@@ -21,9 +21,8 @@ from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.lifecycle import LifecycleNodeMixin, TransitionCallbackReturn
 from rclpy.node import Node
 
-from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.middleware.versions import KNOWN_RCL
+from lifecycle.middleware.versions import private
 
 RCLError = _rclpy.RCLError
 
@@ -209,6 +208,7 @@ _DONE_IN = {
 }
 """Labels of the states in which nothing is left to do of a transition."""
 _CHANGE, _CALLBACKS = "_LifecycleNodeMixin__change_state", "_callbacks"
+_DRIVE = "drive a node of rclpy.lifecycle in this process"
 
 
 class RclpyStateMachine:
@@ -230,7 +230,7 @@ class RclpyStateMachine:
     def __init__(self, node: LifecycleNodeMixin, owner: MachineOwner) -> None:
         self._node = node
         self._owner = owner
-        self._change = _private(node, _CHANGE)
+        self._change = private(node, _CHANGE, _DRIVE)
         self._is_complete = False
         self._is_asked = False  # by its supervisor or a client
         self._has_said = False
@@ -242,7 +242,7 @@ class RclpyStateMachine:
         if self._is_complete:
             return
         self._is_complete = True
-        callbacks = _private(self._node, _CALLBACKS)  # registered once, by its constructor
+        callbacks = private(self._node, _CALLBACKS, _DRIVE)  # registered once, by its constructor
         for state, callback in tuple(callbacks.items()):
             callbacks[state] = self._reporting(callback)
         service = getattr(self._node, "_service_change_state", None)
@@ -340,17 +340,6 @@ class RclpyStateMachine:
                 return response
 
         return answer
-
-
-def _private(node: object, name: str) -> Any:
-    found = getattr(node, name, None)
-    if found is None:
-        raise MiddlewareError(
-            f"cannot hold {type(node).__name__}, a node of rclpy.lifecycle: this rclpy has no "
-            f"{name}, as that of {KNOWN_RCL} has",
-            hint="start the node as a command (run.command), or install one of these",
-        )
-    return found
 
 
 def is_rclpy_managed(node: object) -> bool:

@@ -21,6 +21,7 @@ from rclpy.task import Future
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.rcl.graph_changes import ServerWatch
+from lifecycle.middleware.versions import private
 
 if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup
@@ -202,6 +203,8 @@ class GoalServer(ActionServer):  # type: ignore[misc]  # rclpy is not typed
         self._log = node.get_logger().get_child("action_server")
         self._destroyed = False
         self.action_name = ""
+        for private_name in ("_execute_goal", "_send_result_response"):
+            private(super(), private_name, f"make action server {name!r}")
         super().__init__(
             node,
             action_type,
@@ -225,7 +228,8 @@ class GoalServer(ActionServer):  # type: ignore[misc]  # rclpy is not typed
             goal: aborted, if it has not ended.
             result: of the action's result class; None for an empty one.
         """
-        future = self._result_futures.get(bytes(goal.goal_id.uuid))
+        futures = private(self, "_result_futures", "answer who waits for a goal")
+        future = futures.get(bytes(goal.goal_id.uuid))
         if future is None or future.done():  # None: rcl has forgotten a goal that ended long ago
             return
         if goal.is_active:

@@ -33,10 +33,6 @@ if TYPE_CHECKING:
     from lifecycle.middleware.rcl.graph import GraphObserver
     from lifecycle.middleware.services.ros_interface import RosInterface
 
-_QUIET_S = 0.005
-_BURST_S = 0.05
-"""Shorter than a graph's own: bring-up is a race, and a look costs a few milliseconds."""
-
 
 class ObserverParticipant:
     """What a supervisor observes and reaches of one domain. `destroy` it, or use it in a `with`.
@@ -78,14 +74,7 @@ class ObserverParticipant:
         from lifecycle.graph.graph import Graph
         from lifecycle.middleware.fastdds.sockets import widen_discovery_buffers
 
-        graph = Graph.in_loop(
-            domain_id,
-            connections,
-            messages=events,
-            unplanned=unplanned,
-            quiet_s=_QUIET_S,
-            burst_s=_BURST_S,
-        )
+        graph = Graph.in_loop(domain_id, connections, messages=events, unplanned=unplanned)
         widen_discovery_buffers(domain_id)
         if settle_s is not None:
             graph.discovery.settling.within(settle_s)

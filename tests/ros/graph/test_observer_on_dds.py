@@ -104,7 +104,8 @@ def test_a_burst_of_changes_wakes_a_few_times_only(
 
     async def follow() -> None:
         # Longer than a busy machine tears one burst apart.
-        with Graph.in_loop(domain_id, quiet_s=0.3, burst_s=BOUND_S) as observer:
+        with Graph.in_loop(domain_id) as observer:
+            observer.quiet_s, observer.burst_s = 0.3, BOUND_S
             await observer.observe(system)
             node = make_node("n")
             for number in range(publishers):

@@ -160,7 +160,9 @@ def observing(graph: FakeGraph, clients: FakeClients, **options: Any) -> Observe
 
 @pytest.fixture
 def observer(graph: FakeGraph, clients: FakeClients) -> Observer:
-    return observing(graph, clients, quiet_s=0.01, burst_s=0.05)
+    observer = observing(graph, clients)
+    observer.quiet_s, observer.burst_s = 0.01, 0.05
+    return observer
 
 
 def run(awaitable: Awaitable[T]) -> T:
