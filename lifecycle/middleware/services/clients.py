@@ -84,7 +84,7 @@ class NodeClients:
 
     async def get_state(self, node: str, *, timeout_s: float = TIMEOUT_S) -> str:
         """Return the label of a managed node's state (lifecycle_msgs/State)."""
-        response = await self._request(f"{node}/get_state", GetState, timeout_s)
+        response = await self._calls.call(f"{node}/get_state", GetState, timeout_s)
         return str(response.current_state.label)
 
     async def get_available_transitions(
@@ -92,7 +92,7 @@ class NodeClients:
     ) -> tuple[str, ...]:
         """Return the labels of the transitions that may be asked for now."""
         service = f"{node}/get_available_transitions"
-        response = await self._request(service, GetAvailableTransitions, timeout_s)
+        response = await self._calls.call(service, GetAvailableTransitions, timeout_s)
         return tuple(each.transition.label for each in response.available_transitions)
 
     async def change_state(
@@ -120,12 +120,12 @@ class NodeClients:
         if self._calls.open(service, ChangeState):
             # The node drops its reply if it does not know this client's reader yet. It learns of
             # our readers in order: a reply to one made later proves that it knows this one.
-            await self._request(f"{node}/get_state", GetState, timeout_s, fresh=True)
+            await self._calls.call(f"{node}/get_state", GetState, timeout_s, fresh=True)
         left_s = max(deadline - loop.time(), _LEAST_S)
 
         async def ask() -> bool:
             wanted = Transition(label=transition)
-            reply = await self._request(
+            reply = await self._calls.call(
                 service, ChangeState, left_s, repeat=False, before=before, transition=wanted
             )
             return bool(reply.success)
@@ -155,7 +155,7 @@ class NodeClients:
         service = f"{node}/get_configuration"
         if not expected and not self._observer.offers(node, service):
             return None
-        response = await self._request(service, Trigger, timeout_s)
+        response = await self._calls.call(service, Trigger, timeout_s)
         what = f"read the configuration of {node!r}"
         _check(what, response.success, response.message)
         try:
@@ -191,13 +191,13 @@ class NodeClients:
         async def loaded() -> dict[int, str] | None:
             """Return what the container has, full names by number; None if it does not answer."""
             try:
-                there = await self._request(f"{at}/list_nodes", services.ListNodes, _REREAD_S)
+                there = await self._calls.call(f"{at}/list_nodes", services.ListNodes, _REREAD_S)
             except ServiceUnansweredError:
                 return None
             return dict(zip(there.unique_ids, there.full_node_names, strict=True))
 
         async def ask(service: str, type_: type[Any], what: str, **fields: Any) -> Any:
-            response = await self._request(
+            response = await self._calls.call(
                 f"{at}/{service}", type_, timeout_s, repeat=False, **fields
             )
             _check(what, response.success, response.error_message)
@@ -284,7 +284,7 @@ class NodeClients:
         if not wanted:
             return
         given = _messages(wanted.values())
-        response = await self._request(
+        response = await self._calls.call(
             f"{node}/set_parameters", SetParameters, timeout_s, parameters=given
         )
         for name, result in zip(wanted, response.results, strict=False):
@@ -307,7 +307,7 @@ class NodeClients:
             timeout_s: for the answer.
         """
         given = _messages(Parameter(name, TYPES[types[name]], values[name]) for name in values)
-        response = await self._request(
+        response = await self._calls.call(
             f"{node}/set_parameters_atomically",
             SetParametersAtomically,
             timeout_s,
@@ -343,7 +343,7 @@ class NodeClients:
         if not self._observer.offers(node, service):
             return None
         try:
-            await self._request(service, type_, timeout_s, repeat=repeat)
+            await self._calls.call(service, type_, timeout_s, repeat=repeat)
         except ServiceUnansweredError as error:
             return False if error.found else None
         return True
@@ -372,7 +372,7 @@ class NodeClients:
         type_ = TYPES["string" if is_text else "string_array"]
         given = _messages([Parameter(name, type_, value if is_text else list(value))])
         # Each of them makes the same state again when it arrives twice.
-        response = await self._request(
+        response = await self._calls.call(
             f"{node}/{operation}", SetParameters, timeout_s, parameters=given
         )
         what = f"{operation} {name!r} of {node!r}"
@@ -444,23 +444,6 @@ class NodeClients:
     def _unsubscribe(self, topic: str) -> None:
         if topic in self._subscriptions:
             self._observer.node.destroy_subscription(self._subscriptions.pop(topic))
-
-    async def _request(
-        self,
-        service: str,
-        type_: type[Any],
-        timeout_s: float,
-        *,
-        repeat: bool = True,
-        fresh: bool = False,
-        before: Callable[[], Awaitable[None]] | None = None,
-        **fields: Any,
-    ) -> Any:
-        """Send a request of these fields and return the response; see `ServiceCalls.call`."""
-        request = type_.Request(**fields)
-        return await self._calls.call(
-            service, type_, request, timeout_s=timeout_s, repeat=repeat, fresh=fresh, before=before
-        )
 
 
 async def _reply(

@@ -58,9 +58,7 @@ async def read_parameters(
     import asyncio  # late: a host, which needs `parameter_value` only, has no use for it
 
     async def ask(service: str, type_: type[Any], **fields: object) -> Any:
-        request = type_.Request(**fields)
-        name = f"{node}/{service}"
-        return await calls.call(name, type_, request, timeout_s=timeout_s, repeat=True)
+        return await calls.call(f"{node}/{service}", type_, timeout_s, **fields)
 
     async def get(asked: list[str]) -> list[Any]:
         return list((await ask("get_parameters", GetParameters, names=asked)).values)

@@ -18,7 +18,6 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.client import Client
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ExternalShutdownException, ShutdownException, SingleThreadedExecutor
-from rclpy.node import Node
 from rclpy.task import Future
 
 from lifecycle.errors import MiddlewareError
@@ -68,31 +67,35 @@ class ServiceCalls:
         self._clients: dict[tuple[str, type[Any], bool], Client] = {}
         self.group = ReentrantCallbackGroup()
         self._destroyed = False
-        self._spinner: _Spinner | None = None
+        self._executor: SingleThreadedExecutor | None = None
         if observer.owns_node:
-            self._spinner = _Spinner(observer.node, thread="service-calls")
+            # Never EventsExecutor: on Jazzy's wheels it spins at full load and loses every call.
+            self._executor = SingleThreadedExecutor(context=observer.node.context)
+            self._executor.add_node(observer.node)
+            self._thread = threading.Thread(target=self._spin, name="service-calls", daemon=True)
+            self._thread.start()
 
     async def call(
         self,
         service: str,
         type_: type[Any],
-        request: object,
-        *,
         timeout_s: float,
-        repeat: bool,
+        *,
+        repeat: bool = True,
         fresh: bool = False,
         before: Callable[[], Awaitable[None]] | None = None,
+        **fields: Any,
     ) -> Any:
-        """Wait for `service`, send `request`, and return the response.
+        """Wait for `service`, send a request of these fields, and return the response.
 
         Args:
             service: fully qualified name.
             type_: service class.
-            request: of that class.
             timeout_s: seconds, > 0, for all of it.
             repeat: the request does no harm when it arrives twice.
             fresh: by a client that is made now and dropped afterwards.
             before: awaited when the first request is about to leave; what it raises keeps it back.
+            fields: of the request, as its class takes them.
 
         Raises:
             ServiceUnansweredError: at the deadline, or as soon as the service is forgotten once the
@@ -106,7 +109,7 @@ class ServiceCalls:
             if before is not None:
                 await before()
             attempt_s = _FIRST_ATTEMPT_S if repeat else timeout_s
-            answer = await _ask(client, request, deadline, attempt_s)
+            answer = await _ask(client, type_.Request(**fields), deadline, attempt_s)
         except InvalidHandle as error:
             # Its node left, and its client was destroyed meanwhile.
             raise ServiceUnansweredError(service, found=False, timeout_s=timeout_s) from error
@@ -132,9 +135,19 @@ class ServiceCalls:
     def destroy(self) -> None:
         """Stop the thread and drop the clients; again is harmless."""
         self._destroyed = True
-        if self._spinner is not None:
-            self._spinner.stop()
+        if self._executor is not None:
+            self._executor.shutdown()
+            self._thread.join()
         self.forget("")
+
+    def _spin(self) -> None:
+        assert self._executor is not None
+        with contextlib.suppress(ExternalShutdownException, ShutdownException):
+            while not self._destroyed:
+                # Another thread may destroy something of the node while it is put in a wait set.
+                with contextlib.suppress(InvalidHandle):
+                    self._executor.spin()
+                    return
 
     def _client(self, service: str, type_: type[Any], *, fresh: bool = False) -> Client:
         client = self._clients.get((service, type_, fresh))
@@ -234,34 +247,3 @@ def _deliver(answer: asyncio.Future[Any], pending: Future) -> None:
         answer.set_exception(error)
     else:
         answer.set_result(pending.result())
-
-
-class _Spinner:
-    """Spins one node in a thread, from now until `stop` or the end of its context.
-
-    Args:
-        node: an observer's own.
-        thread: its name.
-    """
-
-    def __init__(self, node: Node, *, thread: str) -> None:
-        # Never EventsExecutor: on Jazzy's wheels it spins at full load and loses every call.
-        self._executor = SingleThreadedExecutor(context=node.context)
-        self._executor.add_node(node)
-        self._stopped = False
-        self._thread = threading.Thread(target=self._spin, name=thread, daemon=True)
-        self._thread.start()
-
-    def stop(self) -> None:
-        """End the thread; again is harmless."""
-        self._stopped = True
-        self._executor.shutdown()
-        self._thread.join()
-
-    def _spin(self) -> None:
-        with contextlib.suppress(ExternalShutdownException, ShutdownException):
-            while not self._stopped:
-                # Another thread may destroy something of the node while it is put in a wait set.
-                with contextlib.suppress(InvalidHandle):
-                    self._executor.spin()
-                    return

@@ -165,8 +165,8 @@ def test_a_lost_reply_to_change_state_is_made_good_by_the_state(
 ) -> None:
     call = clients._calls.call
 
-    async def lose_reply(service: str, type_: type[Any], request: Any, **options: Any) -> Any:
-        response = await call(service, type_, request, **options)
+    async def lose_reply(service: str, type_: type[Any], *rest: Any, **options: Any) -> Any:
+        response = await call(service, type_, *rest, **options)
         if type_ is ChangeState:
             await asyncio.sleep(30)
         return response

@@ -67,13 +67,9 @@ def set_parameter(fresh_domain: int) -> Iterator[Set]:
         calls = ServiceCalls(observer)
 
         def set_it(node: str, name: str, **value: Any) -> None:
-            request = SetParameters.Request(
-                parameters=[Parameter(name=name, value=ParameterValue(**value))]
-            )
             service = f"{node}/set_parameters"
-            answer = asyncio.run(
-                calls.call(service, SetParameters, request, timeout_s=BOUND_S, repeat=True)
-            )
+            given = [Parameter(name=name, value=ParameterValue(**value))]
+            answer = asyncio.run(calls.call(service, SetParameters, BOUND_S, parameters=given))
             assert [each.successful for each in answer.results] == [True], answer
 
         try:

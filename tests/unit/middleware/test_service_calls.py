@@ -56,9 +56,8 @@ def test_a_fresh_client_is_made_for_one_call_and_dropped_with_it_or_with_its_nod
         calls = ServiceCalls(observer)
 
         def ask(*, fresh: bool) -> asyncio.Future[Any]:
-            request = GetState.Request()
             return asyncio.ensure_future(
-                calls.call(SERVICE, GetState, request, timeout_s=5.0, repeat=False, fresh=fresh)
+                calls.call(SERVICE, GetState, 5.0, repeat=False, fresh=fresh)
             )
 
         kept = ask(fresh=False)
