@@ -57,7 +57,7 @@ async def read_parameters(
     """
     import asyncio  # late: a host, which needs `parameter_value` only, has no use for it
 
-    async def ask(service: str, type_: type[Any], **fields: object) -> Any:
+    async def ask(service: str, type_: type[Any], **fields: Any) -> Any:
         return await calls.call(f"{node}/{service}", type_, timeout_s, **fields)
 
     async def get(asked: list[str]) -> list[Any]:
