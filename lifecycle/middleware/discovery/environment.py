@@ -14,13 +14,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.fastdds.participant_profile import (
+from lifecycle.middleware.fastdds.profiles import (
     DISCOVERY_SERVER_VARIABLE,
+    PEERS_VARIABLE,
+    RANGE_VARIABLE,
     DefaultProfile,
     default_profile,
 )
-from lifecycle.middleware.fastdds.profiles import PROFILE_NAME
-from lifecycle.middleware.fastdds.sockets import open_sockets, own_udp_ports, udp_sockets
+from lifecycle.middleware.fastdds.sockets import open_sockets, udp_sockets
 from lifecycle.middleware.fastdds.url_profile import (
     DISCOVERY_GROUP,
     UrlTransport,
@@ -45,11 +46,6 @@ SETTLE_S = 3.5
 _CONNECTED_S = 1.5
 """So much later those are known that make TCP connections first."""
 
-RANGE_VARIABLE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
-PEERS_VARIABLE = "ROS_STATIC_PEERS"
-_RMW_VARIABLE = "RMW_IMPLEMENTATION"
-_WITHOUT_SERVER = ("", "SIMPLE", "NONE")
-_WITH_UDP = ("", "DEFAULT", "UDPV4", "LARGE_DATA")
 _CONNECTING = ("TCPv4", "TCPv6", "LARGE_DATA")
 _CHOICES = frozenset(
     {
@@ -109,15 +105,16 @@ def reach(
     Returns:
         One per address family; none where others cannot be asked, or may only be from one port.
     """
-    found = families(urls)
-    if any(url.server or url.output_port for url in urls) or not all(each.udp for each in found):
+    found = families(urls) or (UrlTransport(kind=RMW_DISCOVERY),)
+    if any(url.server or url.output_port for url in urls):
+        return ()
+    if not all(family.kind.is_udp for family in found):
         return ()
     if not urls and (chosen_otherwise(environment) or _connects_first(environment)):
         return ()
     if urls and not leaves_discovery_open(urls):
         return tuple(_listed(domain_id, family) for family in found)
-    kinds = tuple(family.kind for family in found) or (RMW_DISCOVERY,)
-    return tuple(_around(domain_id, kind, environment) for kind in kinds)
+    return tuple(_around(domain_id, family.kind, environment) for family in found)
 
 
 def settle_s(urls: Sequence[ConnectionUrl], environment: Mapping[str, str]) -> float:
@@ -136,8 +133,9 @@ def _around(domain_id: int, kind: Medium, environment: Mapping[str, str]) -> Rea
         addresses += [each for found in by_interface.values() for each in found]
         targets += _groups(domain_id, kind, by_interface)
         for peer in _static_peers(environment):
-            if (":" in peer) == (kind.ip_version == 6):
-                targets += _well_known(domain_id, peer, LOCALHOST_PEERS_RANGE)
+            with contextlib.suppress(ValueError):  # a name would have to be looked up
+                if ipaddress.ip_address(peer).version == kind.ip_version:
+                    targets += _well_known(domain_id, peer, LOCALHOST_PEERS_RANGE)
     return Reach(kind, tuple(targets), tuple(addresses), _receivers(domain_id, kind))
 
 
@@ -168,10 +166,9 @@ def _receivers(domain_id: int, kind: Medium) -> tuple[int, ...]:
 
     Read from the kernel, never inferred: a taken port moves a participant to another one.
     """
-    first = participant_ports(domain_id, 0).discovery_unicast
-    last = participant_ports(domain_id, 0).discovery_multicast + DG
-    ports = {each.port for each in open_sockets() if each.kind == kind}
-    return tuple(sorted(p for p in ports if first <= p < last and (p - first) % 2 == 0))
+    ports = participant_ports(domain_id, 0)
+    possible = range(ports.discovery_unicast, ports.discovery_multicast + DG, 2)
+    return tuple(sorted({e.port for e in open_sockets() if e.kind == kind and e.port in possible}))
 
 
 def _well_known(domain_id: int, address: str, participants: int) -> Iterator[Target]:
@@ -217,11 +214,9 @@ def is_served(urls: Sequence[ConnectionUrl], environment: Mapping[str, str]) -> 
     """Return whether a participant of these URLs finds others by a discovery server."""
     if any(url.server for url in urls) or environment.get(DISCOVERY_SERVER_VARIABLE):
         return True
-    with contextlib.suppress(MiddlewareError):  # as for `chosen_otherwise`
-        profile = default_profile(environment)
-        protocols = () if profile is None or urls else profile.element.iter("discoveryProtocol")
-        return any((each.text or "").strip() not in _WITHOUT_SERVER for each in protocols)
-    return False
+    profile = None if urls else _users_profile(environment)
+    protocols = () if profile is None else profile.element.iter("discoveryProtocol")
+    return any((each.text or "").strip() not in ("", "SIMPLE", "NONE") for each in protocols)
 
 
 def missing_port(
@@ -244,7 +239,7 @@ def missing_port(
     if urls or chosen_otherwise(environment) or _range(environment) != "SUBNET":
         return None
     port = participant_ports(domain_id, 0).discovery_multicast
-    if _static_peers(environment) or port in own_udp_ports():
+    if _static_peers(environment) or any(each.port == port for each in open_sockets()):
         return None
     return port if any(each.port == port for each in udp_sockets()) else None
 
@@ -257,7 +252,7 @@ def chosen_otherwise(environment: Mapping[str, str]) -> bool:
     """
     if environment.get(DISCOVERY_SERVER_VARIABLE) or not _has_udpv4(environment):
         return True
-    if "zenoh" in environment.get(_RMW_VARIABLE, ""):
+    if "zenoh" in environment.get("RMW_IMPLEMENTATION", ""):
         return True
     profile = _users_profile(environment)
     return profile is not None and any(each.tag in _CHOICES for each in profile.element.iter())
@@ -283,7 +278,7 @@ def _users_profile(environment: Mapping[str, str]) -> DefaultProfile | None:
     """Return the default profile of the user's; ours adds to Fast DDS's defaults."""
     with contextlib.suppress(MiddlewareError):  # Fast DDS cannot read it either, and takes those
         found = default_profile(environment)
-        return None if found is None or found.name == PROFILE_NAME else found
+        return found if found is not None and found.is_users else None
     return None
 
 
@@ -293,16 +288,12 @@ def _range(environment: Mapping[str, str]) -> str:
 
 def _has_udpv4(environment: Mapping[str, str]) -> bool:
     builtin = environment.get(TRANSPORTS_VARIABLE, "").partition("?")[0].upper()
-    return builtin in _WITH_UDP
+    return builtin in ("", "DEFAULT", "UDPV4", "LARGE_DATA")
 
 
 def _static_peers(environment: Mapping[str, str]) -> tuple[str, ...]:
-    """Return the addresses among ROS_STATIC_PEERS; a name would have to be looked up."""
-    found = []
-    for text in environment.get(PEERS_VARIABLE, "").split(";"):
-        with contextlib.suppress(ValueError):
-            found.append(str(ipaddress.ip_address(text.strip())))
-    return tuple(found)
+    listed = environment.get(PEERS_VARIABLE, "").split(";")
+    return tuple(filter(None, map(str.strip, listed)))
 
 
 def peers_environment(hosts: Iterable[str], environment: Mapping[str, str]) -> Mapping[str, str]:
@@ -318,8 +309,7 @@ def peers_environment(hosts: Iterable[str], environment: Mapping[str, str]) -> M
     """
     if environment.get(DISCOVERY_SERVER_VARIABLE) or not _has_udpv4(environment):
         return {}
-    given = [each.strip() for each in environment.get(PEERS_VARIABLE, "").split(";")]
-    every = dict.fromkeys([*filter(None, given), *hosts])
+    every = dict.fromkeys([*_static_peers(environment), *hosts])
     return {PEERS_VARIABLE: ";".join(every)} if every else {}
 
 

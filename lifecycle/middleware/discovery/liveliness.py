@@ -18,7 +18,6 @@ lifecycle.plan.comparison.
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import functools
 import json
 import logging
@@ -171,31 +170,15 @@ class _Pulse:
         with self._changed:
             while not self._ended:
                 if self._publisher is not None:
-                    with contextlib.suppress(InvalidHandle):  # its node was destroyed first
-                        _assert_liveliness(self._publisher)
+                    self._assert(self._publisher)
                 self._changed.wait(None if self._publisher is None else ASSERTED_EACH_S)
 
-
-def _assert_liveliness(publisher: Publisher) -> None:
-    """Assert it without the GIL, which rclpy's own call keeps.
-
-    Fast DDS takes locks there, and was seen not to give them back while peers left: with the GIL
-    the whole process stood still, deadlines too.
-
-    Raises:
-        InvalidHandle: it was destroyed.
-    """
-    with publisher.handle:
-        if _asserting()(publisher.handle.pointer):
-            _logger.debug("liveliness was not asserted: %s", abi.load().take_error())
-
-
-@functools.cache
-def _asserting() -> Callable[[int], int]:
-    asserts: Callable[[int], int] = abi.bind(
-        "rcl", "rcl_publisher_assert_liveliness", ctypes.c_int, (ctypes.c_void_p,)
-    )
-    return asserts
+    def _assert(self, publisher: Publisher) -> None:
+        # Not by rclpy's own call, which keeps the GIL: Fast DDS takes locks there, and was seen not
+        # to give them back while peers left.
+        with contextlib.suppress(InvalidHandle), publisher.handle:  # its node was destroyed first
+            if not abi.assert_liveliness(publisher.handle.pointer):
+                _logger.debug("liveliness was not asserted")
 
 
 @typing.final

@@ -27,7 +27,7 @@ from collections.abc import Iterable, Sequence
 
 from lifecycle.middleware.discovery.environment import SETTLE_S, Reach, Target
 from lifecycle.middleware.discovery.prefixes import PROCESS_DIGITS, is_of_host
-from lifecycle.middleware.fastdds.profiles import LEASE_S
+from lifecycle.middleware.fastdds.profiles import PARTICIPANT_LEASE_S
 from lifecycle.middleware.fastdds.sockets import OpenSocket, udp_sockets
 
 ANSWER_S = 0.15
@@ -83,7 +83,7 @@ def joins(prefix: bytes, sequence: int, locators: Iterable[tuple[str, int]]) -> 
         (0x0015, b"\x02\x03\x00\x00"),  # PID_PROTOCOL_VERSION
         (0x0016, _VENDOR + b"\x00\x00"),  # PID_VENDORID
         (0x0050, prefix + _PARTICIPANT),  # PID_PARTICIPANT_GUID
-        (0x0002, struct.pack("<iI", LEASE_S, 0)),  # PID_PARTICIPANT_LEASE_DURATION
+        (0x0002, struct.pack("<iI", PARTICIPANT_LEASE_S, 0)),  # PID_PARTICIPANT_LEASE_DURATION
         (0x0058, struct.pack("<I", 0x3)),  # PID_BUILTIN_ENDPOINT_SET: announcer and detector
         *located,
     )

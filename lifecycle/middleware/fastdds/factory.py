@@ -46,38 +46,19 @@ class _String(ctypes.Structure):
     )
 
 
-@functools.lru_cache(maxsize=1)
-def shared_library() -> ctypes.CDLL:
-    """Return the installed Fast DDS, loaded.
-
-    Raises:
-        OSError: there is none of a version that is known.
-    """
-    return ctypes.CDLL(installed().library)
-
-
 class _FastDds:
     """The loaded library; get it from `_library`."""
 
     def __init__(self) -> None:
         try:
-            shared_library()
+            self._library = ctypes.CDLL(installed().library)
         except OSError as error:
             raise MiddlewareError(
                 f"cannot use Fast DDS, only {KNOWN_FAST_DDS} is known: {error}", hint=INSTALL
             ) from error
         pointer = ctypes.c_void_p
         code = ctypes.c_uint32  # ReturnCode_t is a trivially copyable class of one uint32_t
-
-        def bind(symbol: str, result: Any, *arguments: Any) -> Any:
-            function = fast_dds_function(symbol, result, *arguments)
-            if function is None:
-                raise MiddlewareError(
-                    f"cannot find {symbol!r} in Fast DDS: only {KNOWN_FAST_DDS} is known",
-                    hint=INSTALL,
-                )
-            return function
-
+        bind = self._bind
         self.factory = bind(f"_ZN{_FACTORY}12get_instanceEv", pointer)
         self.load_profiles = bind(f"_ZN{_FACTORY}13load_profilesEv", code, pointer)
         self.load_string = bind(
@@ -99,6 +80,16 @@ class _FastDds:
         self.loaded: set[str] = set()
         self.static: dict[tuple[bool, str], int] = {}
         self.lock = threading.RLock()
+
+    def _bind(self, symbol: str, result: Any, *arguments: Any) -> Any:
+        try:
+            function = self._library[symbol]
+        except AttributeError as error:
+            raise MiddlewareError(
+                f"cannot find {symbol!r} in Fast DDS: only {KNOWN_FAST_DDS} is known", hint=INSTALL
+            ) from error
+        function.restype, function.argtypes = result, arguments
+        return function
 
     def load(self, xml: str) -> int:
         """Make profiles known to this process; returns the code."""
@@ -122,20 +113,6 @@ class _FastDds:
 @functools.lru_cache(maxsize=1)
 def _library() -> _FastDds:
     return _FastDds()
-
-
-@functools.cache
-def fast_dds_function(symbol: str, result: Any, *arguments: Any) -> Any:
-    """Return a function of Fast DDS by its mangled name; None where there is none.
-
-    It loads the library: only where a participant of it is.
-    """
-    try:
-        function = shared_library()[symbol]
-    except (OSError, AttributeError):
-        return None
-    function.restype, function.argtypes = result, arguments
-    return function
 
 
 def fast_dds_refusal() -> str:

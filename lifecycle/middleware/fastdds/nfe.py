@@ -1,9 +1,9 @@
 """Network flow endpoints (NFEs) of publishers and subscriptions; subscriptions with unique ones.
 
-Owns: the call into rmw that rclpy lacks, and the creation option that it cannot set, rcl's
-`require_unique_network_flow_endpoints`: the subscription is made by rclpy, re-initialised in place
-with the option, and only then given event handlers and shown to the node, so that neither an
-executor nor an event ever sees the handle while it changes. See *Unique Network Flows*
+Owns: reading NFEs, which rclpy cannot, and the creation option that it cannot set, rcl's
+`require_unique_network_flow_endpoints`: the subscription is made by rclpy, made again in place with
+the option, and only then given event handlers and shown to the node, so that neither an executor
+nor an event ever sees the handle while it changes. See *Unique Network Flows*
 (rmw_unique_network_flow_endpoints_requirement_t).
 
 An NFE list says which network resources an endpoint may use, not which transport carried a message;
@@ -14,7 +14,6 @@ for the value the kernel really uses).
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import weakref
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -33,9 +32,7 @@ from rclpy.validate_topic_name import validate_topic_name
 from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.qos import QosProfile
-from lifecycle.middleware.fastdds.settings import noted_shared_memory
 from lifecycle.middleware.fastdds.sockets import udp_sockets
-from lifecycle.middleware.process.shared_memory import own_segments
 from lifecycle.middleware.rcl import abi
 from lifecycle.middleware.rcl.qos import to_rclpy
 from lifecycle.middleware.versions import INSTALL
@@ -59,6 +56,9 @@ SHARED_MEMORY = NetworkFlowEndpoint(
 )
 """The NFE of shared memory; a subscription's has the number of a Fast DDS port on top."""
 
+_UNIQUE_PORTS = range(7000, 7400)
+"""Fast DDS looks for a unique port in [portBase − 400, portBase), in every domain."""
+
 
 class NetworkFlowEndpointsUnsupported(MiddlewareError):  # noqa: N818 - states a fact, not a fault
     """The RMW cannot report network flow endpoints.
@@ -69,6 +69,25 @@ class NetworkFlowEndpointsUnsupported(MiddlewareError):  # noqa: N818 - states a
 
     def __init__(self, message: str, *, reason: str, hint: str = "") -> None:
         super().__init__(message, hint=hint)
+        self.reason = reason
+
+
+class UniqueFlowNotFeasible(MiddlewareError):  # noqa: N818 - states a fact, not a fault
+    """The RMW cannot give this endpoint network flow endpoints of its own; none was made.
+
+    Attributes:
+        topic: fully qualified.
+        reason: the RMW's own message.
+    """
+
+    def __init__(
+        self, kind: str, topic: str, unique: UniqueRequirement, reason: str, hint: str
+    ) -> None:
+        super().__init__(
+            f"cannot create {kind} {topic!r} with network flow endpoints {unique.value}: {reason}",
+            hint=hint,
+        )
+        self.topic = topic
         self.reason = reason
 
 
@@ -103,9 +122,8 @@ def senders_of(node: Node) -> tuple[NetworkFlowEndpoint, ...]:
     """Return the sender sockets of a node's participant, which all its publishers have.
 
     They do not change (see `lifecycle.middleware.fastdds.sockets`), and are asked for once in a
-    participant's life: do so before it has peers. Fast DDS 2.14 keeps them in a list with its
-    senders by shared memory and TCP, which a thread of discovery extends when the first peer that
-    has these is matched, and lists them without the lock
+    participant's life: do so before it has peers. Fast DDS 2.14 lists them without the lock under
+    which a thread of discovery extends the list for the first peer by shared memory or TCP
     (RTPSParticipantImpl::get_sending_locators).
 
     Raises:
@@ -120,36 +138,19 @@ def senders_of(node: Node) -> tuple[NetworkFlowEndpoint, ...]:
     return known
 
 
-def has_shared_memory(node: Node) -> bool:
-    """Return whether the participant of `node` has a shared memory transport.
-
-    It is noted when this package makes a participant. Of one that was made otherwise it is what the
-    process has: segments of Fast DDS in /dev/shm.
-    """
-    noted = noted_shared_memory(node.context)
-    return bool(own_segments()) if noted is None else noted
-
-
 def read_handle(handle: Any, kind: str) -> tuple[NetworkFlowEndpoint, ...]:
     """Ask rmw for the NFEs of rclpy's bare handle of a `kind`."""
     rcl = abi.load()
-    array = abi.NfeArray()
     with handle:
-        result = rcl.nfes[kind](
-            handle.pointer, ctypes.byref(rcl.default_allocator), ctypes.byref(array)
-        )
-    if result != abi.RCL_RET_OK:
+        code, found = rcl.flow_endpoints(kind, handle.pointer)
+    if code != abi.RCL_RET_OK:
         reason = rcl.take_error()
         message = f"cannot read the network flow endpoints of a {kind}: {reason}"
-        if result == abi.RCL_RET_UNSUPPORTED:
+        if code == abi.RCL_RET_UNSUPPORTED:
             hint = f"set RMW_IMPLEMENTATION={DEFAULT_RMW}"
             raise NetworkFlowEndpointsUnsupported(message, reason=reason, hint=hint)
         raise MiddlewareError(message)
-    try:
-        return tuple(_convert(array.items[index]) for index in range(array.size))
-    finally:
-        if array.allocator:  # an empty list was never initialised, and fini would complain of it
-            rcl.nfe_array_fini(ctypes.byref(array))
+    return tuple(map(_convert, found))
 
 
 def _convert(nfe: abi.Nfe) -> NetworkFlowEndpoint:
@@ -165,25 +166,6 @@ def _convert(nfe: abi.Nfe) -> NetworkFlowEndpoint:
         dscp=nfe.dscp,
         internet_address=nfe.internet_address.decode("ascii", errors="replace"),
     )
-
-
-_SUBSCRIPTION_HINT = f"ask for optionally_required, or set RMW_IMPLEMENTATION={DEFAULT_RMW}"
-_UNIQUE_PORTS = range(7000, 7400)
-"""Fast DDS looks for a unique port in [portBase − 400, portBase), in every domain."""
-
-
-class UniqueFlowNotFeasible(MiddlewareError):  # noqa: N818 - states a fact, not a fault
-    """The RMW cannot give this endpoint network flow endpoints of its own; none was made.
-
-    Attributes:
-        topic: fully qualified.
-        reason: the RMW's own message.
-    """
-
-    def __init__(self, message: str, *, topic: str, reason: str, hint: str = "") -> None:
-        super().__init__(message, hint=hint)
-        self.topic = topic
-        self.reason = reason
 
 
 def create_subscription(
@@ -203,8 +185,8 @@ def create_subscription(
 
     NOT_REQUIRED is plain rclpy, and so is OPTIONALLY_REQUIRED with an rcl that is not known. The
     others pass the option to the RMW; STRICTLY_REQUIRED then also demands proof, because some RMWs
-    accept the option and ignore it. Fast DDS takes the first free
-    UDP port of 7000–7399. Destroy it as any other, with `node.destroy_subscription`.
+    accept the option and ignore it. Fast DDS takes the first free UDP port of 7000–7399. Destroy it
+    as any other, with `node.destroy_subscription`.
 
     Fast DDS 2.14 gives the port (with its socket, two threads and about 170 kB) back only when the
     participant ends, not with the subscription: whatever re-creates unique subscriptions again and
@@ -257,37 +239,14 @@ def create_subscription(
     return subscription
 
 
-class _ContentFilter(ctypes.Structure):
-    """rcl_subscription_content_filter_options_t."""
-
-    _fields_ = (
-        ("expression", ctypes.c_void_p),
-        ("count", ctypes.c_size_t),
-        ("parameters", ctypes.c_void_p),
-        ("allocator", abi.Allocator),
-    )
-
-
 def _filter(
     node: Node, subscription: Subscription, expression: str, parameters: tuple[str, ...]
 ) -> None:
-    """Have the middleware take those messages alone that a filter lets through."""
     rcl = abi.load()
-    values = (ctypes.c_char_p * len(parameters))(*(each.encode() for each in parameters))
-    options = _ContentFilter()
-    at = ctypes.byref(options)
-    pointer, code = ctypes.c_void_p, ctypes.c_int
-    prefix = "rcl_subscription_content_filter_options"
-    arguments = (pointer, ctypes.c_char_p, ctypes.c_size_t, pointer, pointer)
-    init = abi.bind("rcl", f"{prefix}_init", code, arguments)
-    apply = abi.bind("rcl", "rcl_subscription_set_content_filter", code, (pointer, pointer))
-    end = abi.bind("rcl", f"{prefix}_fini", code, (pointer, pointer))
     with subscription.handle:
-        made = subscription.handle.pointer
-        failed = init(made, expression.encode(), len(parameters), values, at) or apply(made, at)
-        reason = rcl.take_error() if failed else ""
-        end(made, at)
-    if failed:
+        code = rcl.filter(subscription.handle.pointer, expression, parameters)
+        reason = rcl.take_error() if code != abi.RCL_RET_OK else ""
+    if reason:
         topic = subscription.topic_name
         node.destroy_subscription(subscription)
         raise MiddlewareError(
@@ -305,43 +264,26 @@ def create_publisher(
     unique: UniqueRequirement = UniqueRequirement.NOT_REQUIRED,
     callback_group: CallbackGroup | None = None,
     event_callbacks: PublisherEventCallbacks | None = None,
-    publisher_class: type[Publisher] = Publisher,
 ) -> Publisher:
     """Create a publisher on `node`, on the node's own participant.
 
     No RMW gives a publisher flow endpoints of its own: all refuse STRICTLY_REQUIRED, or neither
     check it nor list any, and ignore OPTIONALLY_REQUIRED. A publisher becomes unique on a
-    `FlowParticipant`. Arguments as `create_subscription`; `publisher_class` as in rclpy.
+    `FlowParticipant`. Arguments as `create_subscription`.
 
     Raises:
         UniqueFlowNotFeasible: STRICTLY_REQUIRED; nothing was made.
     """
     if unique is UniqueRequirement.STRICTLY_REQUIRED:
-        raise _not_feasible(
-            node.resolve_topic_name(topic),
+        raise UniqueFlowNotFeasible(
             "publisher",
+            node.resolve_topic_name(topic),
             unique,
             "Unique network flow endpoints not supported on publishers",
             "give the publisher its own participant, or ask for optionally_required",
         )
     return node.create_publisher(
-        type_,
-        topic,
-        to_rclpy(qos),
-        callback_group=callback_group,
-        event_callbacks=event_callbacks,
-        publisher_class=publisher_class,
-    )
-
-
-def _not_feasible(
-    topic: str, kind: str, unique: UniqueRequirement, reason: str, hint: str
-) -> UniqueFlowNotFeasible:
-    return UniqueFlowNotFeasible(
-        f"cannot create {kind} {topic!r} with network flow endpoints {unique.value}: {reason}",
-        topic=topic,
-        reason=reason,
-        hint=hint,
+        type_, topic, to_rclpy(qos), callback_group=callback_group, event_callbacks=event_callbacks
     )
 
 
@@ -351,90 +293,77 @@ def _is_plain(node: Node, topic: str, unique: UniqueRequirement) -> bool:
     Raises:
         UniqueFlowNotFeasible: STRICTLY_REQUIRED, with an rcl that is not known.
     """
-    if unique is UniqueRequirement.NOT_REQUIRED:
-        return True
-    if abi.is_known():
-        return False
-    if unique is UniqueRequirement.OPTIONALLY_REQUIRED:
-        return True
-    raise _not_feasible(
-        node.resolve_topic_name(topic),
-        "subscription",
-        unique,
-        abi.refusal(),
-        f"ask for optionally_required, or {INSTALL}",
-    )
-
-
-class _RefusedError(Exception):
-    """The RMW said no; the text is its reason."""
+    if unique is UniqueRequirement.STRICTLY_REQUIRED and not abi.is_known():
+        raise UniqueFlowNotFeasible(
+            "subscription",
+            node.resolve_topic_name(topic),
+            unique,
+            abi.refusal(),
+            f"ask for optionally_required, or {INSTALL}",
+        )
+    return unique is UniqueRequirement.NOT_REQUIRED or not abi.is_known()
 
 
 @contextlib.contextmanager
 def _unique_handle(
     node: Node, type_: type[Any], topic: str, *, profile: QoSProfile, unique: UniqueRequirement
 ) -> Iterator[Any]:
-    """Yield rclpy's C++ handle, with the rcl subscription inside re-initialised with the option.
+    """Yield rclpy's C++ handle, with the rcl subscription inside made again with the option.
 
     It is destroyed if the block raises.
     """
     check_is_valid_msg_type(type_)  # also loads the type support
     validate_topic_name(topic)  # names the character at fault, which resolving does not
-    resolved = node.resolve_topic_name(topic)  # for messages; unreadable while re-initialising
+    resolved = node.resolve_topic_name(topic)  # for messages; unreadable while it is made again
     with node.handle:
         handle = rclpy_implementation.Subscription(
             node.handle, type_, topic, profile.get_c_qos_profile()
         )
     try:
-        with handle, node.handle:
-            _reinitialise(handle.pointer, node.handle.pointer, type_, topic, unique)
-        if unique is UniqueRequirement.STRICTLY_REQUIRED:
-            _prove(handle)
-        yield handle
-    except BaseException as error:
-        # A handle whose init failed is zero inside; rcl's fini accepts that.
+        refusal = _made_unique(handle, node, type_, topic, unique)
+        if not refusal:
+            yield handle
+            return
+    except BaseException:
         handle.destroy_when_not_in_use()
-        if not isinstance(error, _RefusedError):
-            raise
-        hint = _subscription_hint()
-        raise _not_feasible(resolved, "subscription", unique, str(error), hint) from error
+        raise
+    # A handle whose init failed is zero inside; rcl's fini accepts that.
+    handle.destroy_when_not_in_use()
+    raise UniqueFlowNotFeasible("subscription", resolved, unique, refusal, _subscription_hint())
 
 
-def _reinitialise(
-    entity: int, node: int, type_: type[Any], topic: str, unique: UniqueRequirement
-) -> None:
+def _made_unique(
+    handle: Any, node: Node, type_: type[Any], topic: str, unique: UniqueRequirement
+) -> str:
+    """Make a subscription again with the option; return why the RMW refuses, empty if it does not.
+
+    Where it is strictly required the RMW has to show something for it.
+    """
     rcl = abi.load()
-    held = rcl.options(entity).contents
-    options = type(held).from_buffer_copy(held)  # fini frees the original
-    options.rmw.unique = unique.rmw_value
-    if rcl.subscription_fini(entity, node) != abi.RCL_RET_OK:
-        raise MiddlewareError(f"cannot re-create subscription {topic!r}: {rcl.take_error()}")
-    # The unresolved name, as rclpy gave it: rcl must apply remap rules exactly once.
-    result = rcl.subscription_init(
-        entity, node, abi.type_support(type_), topic.encode(), ctypes.byref(options)
-    )
-    if result != abi.RCL_RET_OK:
-        raise _RefusedError(rcl.take_error())
-
-
-def _prove(handle: Any) -> None:
-    """Refuse a subscription whose RMW accepted STRICTLY_REQUIRED but shows nothing for it."""
+    with handle, node.handle:
+        owner = node.handle.pointer
+        code = rcl.remake_unique(handle.pointer, owner, type_, topic, unique.rmw_value)
+        if code != abi.RCL_RET_OK:
+            return rcl.take_error()
+    if unique is not UniqueRequirement.STRICTLY_REQUIRED:
+        return ""
     try:
         nfes = read_handle(handle, "subscription")
     except NetworkFlowEndpointsUnsupported as error:
-        raise _RefusedError(error.reason) from error
+        return error.reason
     if not nfes:
-        raise _RefusedError("the RMW lists no network flow endpoint for it")
+        return "the RMW lists no network flow endpoint for it"
     if not any(is_ip(each) for each in nfes):
         # The article defines network flows for UDP and TCP over IP only.
-        raise _RefusedError("the RMW lists only shared memory for it, which is no network flow")
+        return "the RMW lists only shared memory for it, which is no network flow"
+    return ""
 
 
 def _subscription_hint() -> str:
     """Say so when the host's unique ports are used up: rcl's own reason does not."""
     taken = {each.port for each in udp_sockets()}
     if not taken.issuperset(_UNIQUE_PORTS):
-        return _SUBSCRIPTION_HINT
+        return f"ask for optionally_required, or set RMW_IMPLEMENTATION={DEFAULT_RMW}"
     return (
         f"all {len(_UNIQUE_PORTS)} ports {_UNIQUE_PORTS[0]}–{_UNIQUE_PORTS[-1]} of this host are "
         "taken; Fast DDS frees one only when the participant that used it ends: restart the "

@@ -1,8 +1,7 @@
 """An extra DDS participant for one network flow or connection: its DSCP, ports and shared memory.
 
-Owns: the hidden node in its own rclpy context that such endpoints live on; and what a participant's
-URLs request and what of that it has got: its one DSCP, the sockets on the ports that its URLs name,
-and whether it has shared memory.
+Owns: the hidden node in its own rclpy context that such endpoints live on; its one DSCP, the
+sockets on the ports that its URLs name, and whether it has shared memory.
 
 Fast DDS opens sockets per participant, so a publisher becomes distinguishable on the network by
 getting a participant; see *Unique Network Flows*, "Alternatives". A connection (`connect_to` of
@@ -30,12 +29,8 @@ from rclpy.subscription import Subscription
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.fastdds import nfe, sockets
-from lifecycle.middleware.fastdds.nfe import (
-    has_shared_memory,
-    senders_of,
-)
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
-from lifecycle.middleware.fastdds.sockets import open_sockets
+from lifecycle.middleware.fastdds.settings import has_shared_memory
 from lifecycle.middleware.fastdds.static_edp import find_endpoint
 from lifecycle.middleware.rcl import hidden_node
 from lifecycle.middleware.rcl.abi import is_known
@@ -44,50 +39,6 @@ from lifecycle.middleware.rcl.qos import to_rclpy
 from lifecycle.network.medium import Medium
 from lifecycle.network.nfe import NetworkFlowEndpoint, UniqueRequirement
 from lifecycle.plan.model import ParticipantConnections
-
-_UDP_ALONE = "only UDP sockets can be marked"
-
-
-def one_dscp(dscp: int | None, settings: ParticipantSettings) -> int | None:
-    """Return the requested DSCP, from whichever source.
-
-    Fast DDS opens TCP connections whenever it has something to send and lists none of them, so
-    marking them is always too late (ip(7): a connection is marked by its own socket).
-
-    Raises:
-        MiddlewareError: by several, and differently; or for what has no UDP socket.
-    """
-    if (
-        dscp is not None
-        and settings.urls
-        and not any(url.transport.is_udp for url in settings.urls)
-    ):
-        listed = " and ".join(repr(str(url)) for url in settings.urls)
-        raise MiddlewareError(
-            f"cannot mark what {listed} carries with DSCP {dscp}: {_UDP_ALONE}",
-            hint="remove the mark, or carry it by udpv4://",
-        )
-    asked = {
-        each: None for each in (dscp, *(url.dscp for url in settings.urls)) if each is not None
-    }
-    if len(asked) > 1:
-        raise MiddlewareError(
-            f"cannot mark one participant with DSCPs {' and '.join(map(str, asked))}",
-            hint="give the URLs to different connections",
-        )
-    return next(iter(asked), None)
-
-
-def fixed_sockets(settings: ParticipantSettings) -> set[int]:
-    """Return this process's sockets that have a port which the URLs name, by their inodes."""
-    ports = {
-        port
-        for url in settings.urls
-        for port in (url.port, url.metatraffic_port, url.output_port)
-        if port is not None
-    }
-    return {each.inode for each in open_sockets() if each.port in ports} if ports else set()
-
 
 _RELEASE_S = 0.2
 """An executor that waits for endpoints lets go of them within a millisecond of being woken."""
@@ -106,15 +57,18 @@ class FlowParticipant:
         namespace: absolute.
         domain_id: 0–232.
         dscp: 0–63, set on its sender sockets before any user data can leave them; None leaves them.
-        transports: all that it may use, UDPV4, UDPV6; empty leaves it to the RMW, which
-            prefers shared memory on one host. Both means that a peer with both gets data twice.
-        max_datagram_bytes: largest UDP payload it sends, 500–65500: longer messages are split by
-            RTPS, so that IP has nothing to fragment; 1400 fits Ethernet. None leaves it to the RMW.
-        non_blocking_send: never wait for room in a socket's buffer: what finds it full is dropped,
-            and lost unless the publisher is reliable.
+        transports: see ParticipantSettings, as the next two are.
+        max_datagram_bytes: largest UDP payload it sends, 500–65500.
+        non_blocking_send: never wait for room in a socket's buffer.
         connections: what it is connected to and by; then `transports` must be empty.
         served: the node whose executor runs the callbacks of subscriptions, services and clients
             made here, gated by its callback groups; None leaves them to the executor of `node`.
+
+    Attributes:
+        name: likewise.
+        node: the hidden node.
+        settings: of the participant.
+        has_shared_memory: it has that transport.
 
     Raises:
         ConnectionUrlError: a URL that is none.
@@ -138,34 +92,30 @@ class FlowParticipant:
     ) -> None:
         if dscp is not None:
             sockets.check_dscp(dscp)
-        settings = ParticipantSettings.of(
+        self.name = name
+        self.settings = ParticipantSettings.of(
             connections or ParticipantConnections(),
             transports=tuple(transports),
             max_datagram_bytes=max_datagram_bytes,
             non_blocking_send=non_blocking_send,
         )
-        dscp = one_dscp(dscp, settings)
-        self.name = name
-        self.settings = settings
+        self._dscp = _one_dscp(dscp, self.settings)
         self._served = served
         self._moved: list[hidden_node.MovedEndpoint] = []
-        self._dscp = dscp
-        self._context: rclpy.Context | None
         self._nfes: tuple[NetworkFlowEndpoint, ...] = ()
-        before = fixed_sockets(settings)
+        before = self._on_fixed_ports()
         # Without ROS arguments: endpoint names come here resolved.
-        self._context, self.node = quiet_node(name, namespace, domain_id, settings=settings)
-        self._fixed = fixed_sockets(settings) - before
-        said = [url.transport.is_network for url in settings.urls]
-        self.has_shared_memory = not all(said) if said else has_shared_memory(self.node)
+        self._context: rclpy.Context | None
+        self._context, self.node = quiet_node(name, namespace, domain_id, settings=self.settings)
+        self._fixed = self._on_fixed_ports() - before
+        self.has_shared_memory = has_shared_memory(self.node)
         try:
             # Every publisher of a participant lists the same sender sockets; rclpy's parameter
             # event publisher lists them before there is any publisher of the user's.
             probe = next(iter(self.node.publishers))
-            if dscp is not None or is_known():
-                self._nfes = senders_of(self.node)
-            if dscp is not None:
-                sockets.set_dscp(self._nfes, dscp)
+            if self._dscp is not None or is_known():
+                self._nfes = nfe.senders_of(self.node)
+            self.ensure_dscp()
             # It would share the sockets that are to be unique.
             self.node.destroy_publisher(probe)
         except BaseException:
@@ -258,12 +208,9 @@ class FlowParticipant:
             MiddlewareError: the participant's endpoints are discovered statically.
         """
         self._refuse_static("service server", name)
+        group = self._group(callback_group)
         service = self.node.create_service(
-            type_,
-            name,
-            callback,
-            qos_profile=to_rclpy(qos),
-            callback_group=self._group(callback_group),
+            type_, name, callback, qos_profile=to_rclpy(qos), callback_group=group
         )
         self._receive(service)
         return service
@@ -282,11 +229,9 @@ class FlowParticipant:
             MiddlewareError: the participant's endpoints are discovered statically.
         """
         self._refuse_static("service client", name)
+        group = self._group(callback_group)
         client = self.node.create_client(
-            type_,
-            name,
-            qos_profile=to_rclpy(qos),
-            callback_group=self._group(callback_group),
+            type_, name, qos_profile=to_rclpy(qos), callback_group=group
         )
         self._receive(client)
         return client
@@ -314,17 +259,14 @@ class FlowParticipant:
         if isinstance(entity, Publisher):
             self.node.destroy_publisher(entity)
             return
-        host = self._served or self.node
-        hidden_node.dismiss(entity, host)
+        hidden_node.dismiss(entity, self._served or self.node)
         if entity in self._moved:
             self._moved.remove(entity)
 
     def ensure_dscp(self) -> None:
-        """Mark sender sockets that lost their mark since the participant was made.
+        """Mark sender sockets that are not, or not any more; before an endpoint is handed out.
 
-        It is called before a publisher or subscription is handed out, and by no reading: what reads
-        and marks at once finds every mark in place. No socket of Fast DDS 2.14 opens later (see
-        `lifecycle.middleware.fastdds.sockets`).
+        No socket of Fast DDS 2.14 opens later (see `lifecycle.middleware.fastdds.sockets`).
 
         Raises:
             MiddlewareError: the mark cannot be set.
@@ -341,12 +283,10 @@ class FlowParticipant:
         it sends must carry the mark, so a single socket without it is what counts.
 
         Raises:
-            MiddlewareError: it has no socket, or its sockets differ and none was to be marked.
+            MiddlewareError: it has no socket.
         """
-        if self._dscp is None:
-            return sockets.get_dscp(self._nfes)
-        others = sockets.get_dscps(self._nfes) - {self._dscp}
-        return min(others, default=self._dscp)
+        found = sockets.get_dscps(self._nfes)
+        return min(found - {self._dscp}, default=min(found))
 
     def destroy(self) -> None:
         """Destroy its endpoints, the hidden node and the participant; again is harmless.
@@ -365,9 +305,23 @@ class FlowParticipant:
             self._context = None
         # An executor of another thread may still hold what it waits for.
         deadline = time.monotonic() + _RELEASE_S
-        while self._fixed & fixed_sockets(self.settings) and time.monotonic() < deadline:
+        while self._fixed & self._on_fixed_ports() and time.monotonic() < deadline:
             time.sleep(0.001)
         self._fixed = set()
+
+    def _on_fixed_ports(self) -> set[int]:
+        """Return this process's sockets that have a port which the URLs name, by their inodes."""
+        ports = {
+            port
+            for url in self.settings.urls
+            for port in (url.port, url.metatraffic_port, url.output_port)
+            if port is not None
+        }
+        return (
+            {each.inode for each in sockets.open_sockets() if each.port in ports}
+            if ports
+            else set()
+        )
 
     def _group(self, group: CallbackGroup | None) -> CallbackGroup | None:
         if group is None and self._served is not None:
@@ -381,12 +335,11 @@ class FlowParticipant:
 
     def _check_static(self, type_: type[Any], topic: str, *, writer: bool) -> None:
         """Refuse an endpoint that the table of static discovery does not have, if there is one."""
-        endpoints = self.settings.static_endpoints
-        if not endpoints:
+        if not self.settings.static_endpoints:
             return
         package, kind = type_.__module__.split(".")[:2]
         find_endpoint(
-            endpoints,
+            self.settings.static_endpoints,
             writer=writer,
             profile=self.node.resolve_topic_name(topic),
             type_name=f"{package}::{kind}::dds_::{type_.__name__}_",
@@ -405,3 +358,28 @@ class FlowParticipant:
 
     def __exit__(self, *_: object) -> None:
         self.destroy()
+
+
+def _one_dscp(dscp: int | None, settings: ParticipantSettings) -> int | None:
+    """Return the requested DSCP, from whichever source.
+
+    Fast DDS opens TCP connections whenever it has something to send and lists none of them, so
+    marking them is always too late (ip(7): a connection is marked by its own socket).
+
+    Raises:
+        MiddlewareError: by several, and differently; or for what has no UDP socket.
+    """
+    urls = settings.urls
+    if dscp is not None and urls and not any(url.transport.is_udp for url in urls):
+        listed = " and ".join(repr(str(url)) for url in urls)
+        raise MiddlewareError(
+            f"cannot mark what {listed} carries with DSCP {dscp}: only UDP sockets can be marked",
+            hint="remove the mark, or carry it by udpv4://",
+        )
+    asked = dict.fromkeys(each for each in (dscp, *(url.dscp for url in urls)) if each is not None)
+    if len(asked) > 1:
+        raise MiddlewareError(
+            f"cannot mark one participant with DSCPs {' and '.join(map(str, asked))}",
+            hint="give the URLs to different connections",
+        )
+    return next(iter(asked), None)

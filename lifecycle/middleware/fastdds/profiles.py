@@ -1,49 +1,41 @@
-"""Fast DDS participant profiles applied through the environment, and the XML elements of profiles.
+"""Default participant profiles of Fast DDS: the one that `up` gives its processes, and the user's.
 
-Owns: the quick discovery profile, and text elements and locators as Fast DDS's XML parser reads
-them. Must not import rclpy.
+Owns: the quick discovery profile, which is applied by an environment variable so that children in
+any language inherit it; reading the default profile that is in force; and the XML elements that
+profiles are made of. Must not import rclpy.
 
-Fast DDS announces a new participant five times at 100 ms and then once each 3 s; where those five
-are lost or arrive too early, discovery stalls. Announcements for 2 s remove the stall, and later
-ones each second the same for who is started again. One that is dropped without a word (its process
-was killed, its link is cut) is there for its lease: 20 s by default. The environment is used, not
-Fast DDS's C++ API: the children of a supervisor, whatever they are written in, inherit it.
-
-Endpoints are sent to each participant by itself unless a profile asks for multicast
-(`avoid_builtin_multicast`): of fifty processes on one host, each endpoint and each heartbeat fifty
-times (docs/performance.md has the measurement).
+By default Fast DDS announces a new participant five times at 100 ms and then each 3 s, and drops
+one that ended without a word after 20 s. Endpoints are sent to each participant by itself, unless a
+profile asks for multicast (docs/performance.md has the measurements).
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
+from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.versions import DISTRIBUTIONS, installed
-from lifecycle.network.medium import Medium, udp_to
+from lifecycle.network.medium import udp_to
 
 PROFILE_NAME = "lifecycle_quick_discovery"
+DISCOVERY_SERVER_VARIABLE = "ROS_DISCOVERY_SERVER"
+"""Makes every participant a client of that server."""
+RANGE_VARIABLE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+PEERS_VARIABLE = "ROS_STATIC_PEERS"
 _FILE_NAME = "quick_discovery.xml"
+_SKIP_DEFAULT_FILE_VARIABLE = "SKIP_DEFAULT_XML"
 
-
-_ANNOUNCEMENTS = 10
-_PERIOD_NS = 200_000_000
-
-LEASE_S = 10
+PARTICIPANT_LEASE_S = 10
 """As long as a machine may be too busy for a participant to announce itself, or to take it in."""
-
-_BY_MULTICAST = "<avoid_builtin_multicast>false</avoid_builtin_multicast>"
 
 _ONE_SAMPLE = (
     "<topic><resourceLimitsQos><allocated_samples>1</allocated_samples></resourceLimitsQos></topic>"
 )
 """A service takes 47 KiB and not 104 KiB: histories grow to their depth when they are used."""
-
-_AGAIN_S = 1
-"""Who was there before and who was started again know each other within so long."""
 
 
 def discovery_profile(
@@ -54,9 +46,8 @@ def discovery_profile(
     Args:
         peers: IP addresses and UDP ports that it is announced to; all of them, because they replace
             the groups by which Fast DDS otherwise does.
-        multicast_endpoints: endpoints are sent once by multicast to all participants that listen to
-            it, and not to each. Only where all that have to find each other are on this host:
-            routers pass no multicast, and WLANs send it slowly.
+        multicast_endpoints: endpoints are sent once by multicast, and not to each participant. Only
+            where all that have to find each other are on this host: routers pass no multicast.
     """
     locators = "".join(
         f"<locator><{kind}><address>{address}</address><port>{port}</port></{kind}></locator>"
@@ -64,18 +55,18 @@ def discovery_profile(
         for kind in (udp_to(address),)
     )
     searched = f"<initialPeersList>{locators}</initialPeersList>" if locators else ""
-    multicast = _BY_MULTICAST if multicast_endpoints else ""
+    multicast = "<avoid_builtin_multicast>false</avoid_builtin_multicast>"
     return f"""<?xml version="1.0" encoding="UTF-8"?>
 <dds xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
   <profiles>
     <participant profile_name="{PROFILE_NAME}" is_default_profile="true">
       <rtps><builtin><discovery_config><initialAnnouncements>
-        <count>{_ANNOUNCEMENTS}</count>
-        <period><nanosec>{_PERIOD_NS}</nanosec></period>
+        <count>10</count>
+        <period><nanosec>200000000</nanosec></period>
       </initialAnnouncements>
-      <leaseDuration><sec>{LEASE_S}</sec></leaseDuration>
-      <leaseAnnouncement><sec>{_AGAIN_S}</sec></leaseAnnouncement>
-      </discovery_config>{multicast}{searched}</builtin></rtps>
+      <leaseDuration><sec>{PARTICIPANT_LEASE_S}</sec></leaseDuration>
+      <leaseAnnouncement><sec>1</sec></leaseAnnouncement>
+      </discovery_config>{multicast if multicast_endpoints else ""}{searched}</builtin></rtps>
     </participant>
     <data_writer profile_name="lifecycle_writer" is_default_profile="true">
       {_ONE_SAMPLE}
@@ -128,19 +119,75 @@ def discovery_environment(
     return {version.profiles_variable: str(path)}
 
 
-def announcements(count: int, period_ms: int) -> ET.Element:
-    """Return how often a participant announces itself at first."""
-    element = ET.Element("initialAnnouncements")
-    text(element, "count", str(count))
-    text(child(element, "period"), "nanosec", str(period_ms * 1_000_000))
-    return element
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class DefaultProfile:
+    """A participant profile that every participant of the process gets.
+
+    Attributes:
+        file: that holds it.
+        name: its `profile_name`.
+        element: <participant>, without namespaces.
+    """
+
+    file: str
+    name: str
+    element: ET.Element
+
+    @property
+    def is_users(self) -> bool:
+        """Whether it is not the quick discovery profile."""
+        return self.name != PROFILE_NAME
+
+    @property
+    def chosen_transports(self) -> str:
+        """The element by which it chooses transports; empty if it chooses none."""
+        choices = ("userTransports", "useBuiltinTransports", "builtinTransports")
+        return next(
+            (each.tag for each in self.element.iterfind("rtps/*") if each.tag in choices), ""
+        )
 
 
-def announced_again() -> ET.Element:
-    """Return how often a participant announces itself later."""
-    element = ET.Element("leaseAnnouncement")
-    text(element, "sec", str(_AGAIN_S))
-    return element
+def default_profile(environment: Mapping[str, str] | None = None) -> DefaultProfile | None:
+    """Return the default participant profile that Fast DDS loads; None if there is none.
+
+    It reads the file that FASTRTPS_DEFAULT_PROFILES_FILE (Fast DDS 3: FASTDDS_…) names and then,
+    unless SKIP_DEFAULT_XML=1, DEFAULT_FASTRTPS_PROFILES.xml (DEFAULT_FASTDDS_…) of the working
+    directory; the last default profile counts.
+
+    Args:
+        environment: None for this process's.
+
+    Raises:
+        MiddlewareError: a file cannot be read, or is no XML.
+    """
+    current = os.environ if environment is None else environment
+    version = installed()
+    files = [each for each in map(current.get, version.profiles_variables) if each][:1]
+    skipped = current.get(_SKIP_DEFAULT_FILE_VARIABLE, "").startswith("1")
+    if not skipped and Path(version.default_profiles).exists():
+        files.append(version.default_profiles)
+    found = None
+    for file in files:
+        for element in _default_participants(file):
+            name = element.get("profile_name", "")
+            found = DefaultProfile(file=file, name=name, element=element)
+    return found
+
+
+def _default_participants(file: str) -> Iterator[ET.Element]:
+    try:
+        root = ET.fromstring(Path(file).read_bytes())  # noqa: S314 - Fast DDS trusts it, too
+    except OSError as error:
+        raise MiddlewareError(f"cannot read profiles {file!r}: {error.strerror}") from error
+    except ET.ParseError as error:
+        raise MiddlewareError(f"cannot read profiles {file!r}: {error}") from error
+    for element in root.iter():
+        # Fast DDS does not look at namespaces; with them, no name would be found here.
+        if isinstance(element.tag, str):
+            element.tag = element.tag.rpartition("}")[2]
+    for element in root.iter("participant"):
+        if element.get("is_default_profile") == "true":
+            yield element
 
 
 def child(parent: ET.Element, tag: str) -> ET.Element:
@@ -149,44 +196,12 @@ def child(parent: ET.Element, tag: str) -> ET.Element:
     return ET.SubElement(parent, tag) if found is None else found
 
 
+def drop(parent: ET.Element, *tags: str) -> None:
+    """Remove the children of these names."""
+    for each in [each for each in parent if each.tag in tags]:
+        parent.remove(each)
+
+
 def text(parent: ET.Element, tag: str, content: str) -> None:
     """Add a child with text."""
     ET.SubElement(parent, tag).text = content
-
-
-def locator(parent: ET.Element, kind: Medium, address: str, port: int | None) -> None:
-    """Add a UDP locator to a list.
-
-    Args:
-        parent: the list.
-        kind: UDPV4 or UDPV6.
-        address: empty for any.
-        port: None for the well-known one.
-    """
-    element = ET.SubElement(ET.SubElement(parent, "locator"), kind.value)
-    if address:
-        text(element, "address", address)
-    if port is not None:
-        text(element, "port", str(port))
-
-
-def tcp_locator(
-    parent: ET.Element, kind: Medium, address: str, physical: int | None, logical: int | None
-) -> None:
-    """Add a TCP locator to a list.
-
-    Args:
-        parent: the list.
-        kind: TCPV4.
-        address: empty for any.
-        physical: the port that is listened on; None for the transport's.
-        logical: the port inside the connection, which Fast DDS separates traffic by; None for
-            the well-known ones.
-    """
-    element = ET.SubElement(ET.SubElement(parent, "locator"), kind.value)
-    if address:
-        text(element, "address", address)
-    if physical is not None:
-        text(element, "physical_port", str(physical))
-    if logical is not None:
-        text(element, "port", str(logical))

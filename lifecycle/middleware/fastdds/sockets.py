@@ -1,10 +1,10 @@
 """Sockets of this process and host: ports of connection URLs, DSCP of participants, buffers.
 
 Owns: what a host must have before a participant is made from connection URLs, and what the
-participant's sockets must be afterwards; the socket options IP_TOS and IPV6_TCLASS (ip(7), ipv6(7),
-RFC 2474) on the sockets that a participant sends from; the receive buffers of those on which it
-receives discovery. Linux: sockets are found among a process's descriptors and in proc(5). Must not
-import rclpy.
+participant's sockets must be afterwards; the DSCP (IP_TOS of ip(7), IPV6_TCLASS of ipv6(7), RFC
+2474) of the sockets that a participant sends from; the receive buffers of those on which it
+receives discovery. Sockets are found among a process's descriptors and in proc(5). Must not import
+rclpy.
 
 Fast DDS says nothing when a fixed port is taken or a whitelist matches nothing: the participant
 exists and receives nothing. Fast DDS 2.14 has no DSCP setting, always lists 0 in its network flow
@@ -25,11 +25,10 @@ from pathlib import Path
 
 from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.fastdds.url_profile import UrlTransport, families
 from lifecycle.middleware.process.control import interface_addresses
 from lifecycle.middleware.process.shared_memory import open_files
 from lifecycle.network.connection_url import ConnectionUrl
-from lifecycle.network.medium import CONNECTABLE, UDP_UNICAST, Medium
+from lifecycle.network.medium import CONNECTABLE, UDP_UNICAST, Medium, udp_to
 from lifecycle.network.nfe import InternetProtocol, NetworkFlowEndpoint, TransportProtocol
 from lifecycle.network.ports import DG, participant_ports
 
@@ -103,11 +102,6 @@ def open_sockets() -> tuple[OpenSocket, ...]:
     return tuple(found)
 
 
-def own_udp_ports() -> frozenset[int]:
-    """Return the ports of this process's UDP sockets."""
-    return frozenset(each.port for each in open_sockets() if each.kind.is_udp)
-
-
 def udp_sockets(*, of_others: bool = False) -> tuple[OpenSocket, ...]:
     """Return the UDP sockets of our network namespace, or only those that others have."""
     ours = {each.inode for each in open_sockets()} if of_others else set[int]()
@@ -146,34 +140,22 @@ def check_free(urls: Sequence[ConnectionUrl]) -> None:
     Raises:
         MiddlewareError: names the URL and the port.
     """
-    for family in families(urls):
-        for url, what, port in _ports(family):
-            group = url.transport.is_group
-            if group and port == url.port:
-                continue  # a group's port is shared
-            if not _is_free(family.kind, "" if group else url.address, port):
-                raise _taken(url, what, port)
-
-
-def check_sockets(urls: Sequence[ConnectionUrl], opened: Sequence[OpenSocket]) -> None:
-    """Refuse a participant that has not all the ports of its URLs.
-
-    Args:
-        urls: that it was made from.
-        opened: the sockets that were opened for it.
-
-    Raises:
-        MiddlewareError: names the URL and the port that another process has.
-    """
-    for family in families(urls):
-        ports = {each.port for each in opened if each.kind == family.kind}
-        for url, what, port in _ports(family):
-            if port not in ports:
-                raise _taken(url, what, port)
-        if family.udp and not ports:
-            raise MiddlewareError(
-                f"cannot connect by {str(family.urls[0])!r}: Fast DDS opened no socket for it"
-            )
+    for url in urls:
+        protocol = "TCP" if url.transport.is_tcp else "UDP"
+        group = url.transport.is_group
+        address = "" if group else url.address
+        for what, port in (
+            (protocol, None if group else url.port),  # a group's port is shared
+            (f"{protocol} metatraffic port", url.metatraffic_port),
+            (f"{protocol} output port", url.output_port),
+        ):
+            kind = udp_to(url.address) if group else url.transport
+            if port is not None and not _is_free(kind, address, port):
+                where = f"{url.address}:{port}" if url.address else f"port {port}"
+                raise MiddlewareError(
+                    f"cannot connect by {str(url)!r}: {what} {where} is not free on this host",
+                    hint="end who has it (`ss -lnp`), or choose another port",
+                )
 
 
 @contextlib.contextmanager
@@ -196,7 +178,9 @@ def own_sockets(nfes: Sequence[NetworkFlowEndpoint]) -> Iterator[list[socket.soc
                 continue
             address, port = each.getsockname()[:2]
             if (each.family, each.type, _address(address), port) in wanted:
-                found.append(stack.enter_context(_duplicate(each)))
+                # Not by its own dup(), which would make the original wait where it must not.
+                duplicate = socket.socket(fileno=os.dup(each.fileno()))
+                found.append(stack.enter_context(duplicate))
         if not found:
             listed = ", ".join(f"{nfe.internet_address}:{nfe.transport_port}" for nfe in nfes)
             raise MiddlewareError(
@@ -221,33 +205,15 @@ def set_dscp(nfes: Sequence[NetworkFlowEndpoint], dscp: int) -> None:
         MiddlewareError: `dscp` out of range, no socket found, or the kernel kept another value.
     """
     check_dscp(dscp)
-    with own_sockets(nfes) as sockets:
-        for each in sockets:
+    with own_sockets(nfes) as found:
+        for each in found:
             option = _DSCP_OPTION[each.family]
             try:
                 each.setsockopt(*option, dscp << 2)
             except OSError as error:
-                raise MiddlewareError(
-                    f"cannot set DSCP {dscp} on {_where(each)}: {error.strerror}"
-                ) from error
+                raise MiddlewareError(f"cannot set DSCP {dscp}: {error.strerror}") from error
             if (kept := each.getsockopt(*option) >> 2) != dscp:
                 raise MiddlewareError(f"cannot set DSCP {dscp}: the kernel keeps {kept}")
-
-
-def get_dscp(nfes: Sequence[NetworkFlowEndpoint]) -> int:
-    """Return the DSCP (0–63) that the sockets named by `nfes` send with, asked of the kernel.
-
-    Raises:
-        MiddlewareError: no socket found, or they differ.
-    """
-    values = _read(nfes)
-    distinct = set(values.values())
-    if len(distinct) != 1:
-        raise MiddlewareError(
-            "cannot tell one DSCP: "
-            + ", ".join(f"{name} sends with {value}" for name, value in sorted(values.items()))
-        )
-    return distinct.pop()
 
 
 def get_dscps(nfes: Sequence[NetworkFlowEndpoint]) -> set[int]:
@@ -256,7 +222,8 @@ def get_dscps(nfes: Sequence[NetworkFlowEndpoint]) -> set[int]:
     Raises:
         MiddlewareError: no socket found.
     """
-    return set(_read(nfes).values())
+    with own_sockets(nfes) as found:
+        return {each.getsockopt(*_DSCP_OPTION[each.family]) >> 2 for each in found}
 
 
 def check_dscp(dscp: int) -> None:
@@ -292,23 +259,14 @@ def widen_discovery_buffers(domain_id: int) -> int:
     first = participant_ports(domain_id, 0).discovery_multicast
     ports = range(first, first + DG, 2)
     count = 0
-    for each in _own_udp_sockets():
+    for each in sockets_here():
+        if each.type != socket.SOCK_DGRAM or each.family not in _DSCP_OPTION:
+            continue
         before = each.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
         if before < _DISCOVERY_BYTES and each.getsockname()[1] in ports:
             each.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _DISCOVERY_BYTES)
             count += each.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) > before
     return count
-
-
-def _own_udp_sockets() -> Iterator[socket.socket]:
-    for each in sockets_here():
-        if each.type == socket.SOCK_DGRAM and each.family in _DSCP_OPTION:
-            yield each
-
-
-def _duplicate(each: socket.socket) -> socket.socket:
-    # Not by its own dup(), which would make the original wait where it must not.
-    return socket.socket(fileno=os.dup(each.fileno()))
 
 
 def _address(text: str) -> str:
@@ -317,16 +275,6 @@ def _address(text: str) -> str:
         return str(ipaddress.ip_address(text.partition("%")[0]))
     except ValueError:
         return text
-
-
-def _where(each: socket.socket) -> str:
-    address, port = each.getsockname()[:2]
-    return f"{address}:{port}"
-
-
-def _read(nfes: Sequence[NetworkFlowEndpoint]) -> dict[str, int]:
-    with own_sockets(nfes) as sockets:
-        return {_where(each): each.getsockopt(*_DSCP_OPTION[each.family]) >> 2 for each in sockets}
 
 
 def _is_free(kind: Medium, address: str, port: int) -> bool:
@@ -342,27 +290,6 @@ def _is_free(kind: Medium, address: str, port: int) -> bool:
         except OSError:
             return False
     return True
-
-
-def _taken(url: ConnectionUrl, what: str, port: int) -> MiddlewareError:
-    where = f"{url.address}:{port}" if url.address else f"port {port}"
-    return MiddlewareError(
-        f"cannot connect by {str(url)!r}: {what} {where} is not free on this host",
-        hint="end who has it (`ss -lnp`), or choose another port",
-    )
-
-
-def _ports(family: UrlTransport) -> Iterator[tuple[ConnectionUrl, str, int]]:
-    """Yield each port that a URL fixes, with the URL and what the port is."""
-    protocol = "TCP" if family.kind.is_tcp else "UDP"
-    for url in family.urls:
-        for what, port in (
-            (protocol, url.port),
-            (f"{protocol} metatraffic port", url.metatraffic_port),
-            (f"{protocol} output port", url.output_port),
-        ):
-            if port is not None:
-                yield url, what, port
 
 
 def _listed() -> Iterator[OpenSocket]:

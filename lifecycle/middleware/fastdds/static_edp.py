@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from xml.etree import ElementTree as ET
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.fastdds.profiles import text as _text
+from lifecycle.middleware.fastdds.profiles import text
 from lifecycle.plan.model import StaticEndpoint, StaticParticipant
 
 
@@ -22,17 +22,17 @@ def endpoint_table(participants: Sequence[StaticParticipant]) -> str:
     root = ET.Element("staticdiscovery")
     for participant in participants:
         element = ET.SubElement(root, "participant")
-        _text(element, "name", participant.name)
+        text(element, "name", participant.name)
         for endpoint in participant.endpoints:
             line = ET.SubElement(element, "writer" if endpoint.writer else "reader")
-            _text(line, "userId", str(endpoint.user_id))
-            _text(line, "topicName", endpoint.topic)
-            _text(line, "topicDataType", endpoint.type)
-            _text(line, "topicKind", "NO_KEY")
+            text(line, "userId", str(endpoint.user_id))
+            text(line, "topicName", endpoint.topic)
+            text(line, "topicDataType", endpoint.type)
+            text(line, "topicKind", "NO_KEY")
             reliability = "RELIABLE" if endpoint.reliable else "BEST_EFFORT"
-            _text(line, "reliabilityQos", f"{reliability}_RELIABILITY_QOS")
+            text(line, "reliabilityQos", f"{reliability}_RELIABILITY_QOS")
             durability = "TRANSIENT_LOCAL" if endpoint.transient_local else "VOLATILE"
-            _text(line, "durabilityQos", f"{durability}_DURABILITY_QOS")
+            text(line, "durabilityQos", f"{durability}_DURABILITY_QOS")
     return ET.tostring(root, encoding="unicode")
 
 
@@ -43,7 +43,7 @@ def endpoint_profiles(endpoints: Sequence[StaticEndpoint]) -> str:
     for endpoint in endpoints:
         tag = "data_writer" if endpoint.writer else "data_reader"
         element = ET.SubElement(profiles, tag, profile_name=endpoint.profile)
-        _text(element, "userDefinedID", str(endpoint.user_id))
+        text(element, "userDefinedID", str(endpoint.user_id))
     return ET.tostring(root, encoding="unicode", xml_declaration=True)
 
 

@@ -1,4 +1,4 @@
-"""What a plan requires of libraries that are not known here, refused before anything is started."""
+"""What libraries that are not known here cost, and what a plan requires of them."""
 
 from __future__ import annotations
 
@@ -11,6 +11,25 @@ from lifecycle.middleware.rcl import abi
 from lifecycle.middleware.versions import INSTALL
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.plan.model import PlannedNode
+
+
+def unknown_versions() -> str:
+    """Return which of the libraries here are not known, and what that costs; empty if all are.
+
+    It needs rclpy, and loads nothing that rclpy has not loaded.
+    """
+    unknown = []
+    if refusal := abi.refusal():
+        unknown.append(
+            f"{refusal}: nodes, endpoints and states are "
+            "verified; network flow endpoints cannot be read or made unique, so that what requires "
+            "them is unverifiable or refused"
+        )
+    if refusal := fast_dds_refusal():
+        unknown.append(
+            f"{refusal}: participants get no connections, transports or DSCP of their own"
+        )
+    return "; ".join(unknown)
 
 
 def refuse_unsupported(nodes: Iterable[PlannedNode]) -> None:

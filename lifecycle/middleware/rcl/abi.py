@@ -102,6 +102,17 @@ class SubscriptionOptions(ctypes.Structure):
     )
 
 
+class _ContentFilter(ctypes.Structure):
+    """rcl_subscription_content_filter_options_t."""
+
+    _fields_ = (
+        ("expression", ctypes.c_void_p),
+        ("count", ctypes.c_size_t),
+        ("parameters", ctypes.c_void_p),
+        ("allocator", Allocator),
+    )
+
+
 class WaitSet(ctypes.Structure):
     """rcl_wait_set_t."""
 
@@ -200,6 +211,62 @@ class Rcl:
         text: str = self._get_error_string().text.decode(errors="replace")
         self._reset_error()
         return _ERROR_LOCATION.sub("", text).strip() or "no reason given"
+
+    def flow_endpoints(self, kind: str, entity: int) -> tuple[int, list[Nfe]]:
+        """Return the code of rcl and the NFEs of a publisher or subscription, copied.
+
+        Args:
+            kind: "publisher" or "subscription".
+            entity: address of its rcl struct.
+        """
+        array = NfeArray()
+        code = self.nfes[kind](entity, ctypes.byref(self.default_allocator), ctypes.byref(array))
+        if code != RCL_RET_OK:
+            return code, []
+        found = [Nfe.from_buffer_copy(array.items[index]) for index in range(array.size)]
+        if array.allocator:  # an empty list was never initialised, and fini would complain of it
+            self.nfe_array_fini(ctypes.byref(array))
+        return code, found
+
+    def remake_unique(
+        self, subscription: int, node: int, type_: object, topic: str, unique: int
+    ) -> int:
+        """Make a subscription again in place, with the option for unique NFEs; return the code.
+
+        Args:
+            subscription: address of its rcl_subscription_t.
+            node: address of its rcl_node_t.
+            type_: message class that rclpy has used.
+            topic: as rclpy was given it: rcl must apply remap rules exactly once.
+            unique: of rmw_unique_network_flow_endpoints_requirement_t.
+
+        Raises:
+            MiddlewareError: it could not be ended; it is as before.
+        """
+        held = self.options(subscription).contents
+        options = type(held).from_buffer_copy(held)  # fini frees the original
+        options.rmw.unique = unique
+        if self.subscription_fini(subscription, node) != RCL_RET_OK:
+            raise MiddlewareError(f"cannot re-create subscription {topic!r}: {self.take_error()}")
+        made = self.subscription_init(
+            subscription, node, type_support(type_), topic.encode(), ctypes.byref(options)
+        )
+        return int(made)
+
+    def filter(self, subscription: int, expression: str, parameters: Sequence[str]) -> int:
+        """Have the middleware take only what a content filter lets through; return the code."""
+        values = (ctypes.c_char_p * len(parameters))(*(each.encode() for each in parameters))
+        options = _ContentFilter()
+        at, pointer, integer = ctypes.byref(options), ctypes.c_void_p, ctypes.c_int
+        prefix = "rcl_subscription_content_filter_options"
+        arguments = (pointer, ctypes.c_char_p, ctypes.c_size_t, pointer, pointer)
+        init = bind("rcl", f"{prefix}_init", integer, arguments)
+        apply = bind("rcl", "rcl_subscription_set_content_filter", integer, (pointer, pointer))
+        end = bind("rcl", f"{prefix}_fini", integer, (pointer, pointer))
+        code = init(subscription, expression.encode(), len(parameters), values, at)
+        code = code or apply(subscription, at)
+        end(subscription, at)
+        return int(code)
 
     def _check_layout(self, version: str) -> None:
         """Compare what the libraries put into our structs with what must be there.
@@ -304,6 +371,16 @@ def _loaded() -> Rcl | MiddlewareError:
         return Rcl()
     except MiddlewareError as error:
         return error
+
+
+def assert_liveliness(publisher: int) -> bool:
+    """Assert the liveliness of an rcl_publisher_t without the GIL; return whether it was."""
+    return bool(_asserting()(publisher) == RCL_RET_OK)
+
+
+@functools.lru_cache(maxsize=1)
+def _asserting() -> Any:
+    return bind("rcl", "rcl_publisher_assert_liveliness", ctypes.c_int, (ctypes.c_void_p,))
 
 
 def type_support(message_type: object) -> int:

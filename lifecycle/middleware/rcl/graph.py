@@ -31,10 +31,8 @@ from lifecycle.middleware.discovery.environment import is_served, missing_port, 
 from lifecycle.middleware.discovery.prefixes import PROCESS_DIGITS, is_of_host, is_of_process
 from lifecycle.middleware.discovery.prober import Settling
 from lifecycle.middleware.discovery.tcp import give_up_dead_connections, is_used
-from lifecycle.middleware.fastdds.participant_profile import (
-    DISCOVERY_SERVER_VARIABLE,
-    ParticipantSettings,
-)
+from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
+from lifecycle.middleware.fastdds.profiles import DISCOVERY_SERVER_VARIABLE
 from lifecycle.middleware.fastdds.settings import observer_settings
 from lifecycle.middleware.process.hosted import is_vouched_for
 from lifecycle.middleware.rcl.graph_changes import GraphGuard

@@ -31,7 +31,6 @@ from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.middleware.fastdds.settings import (
     discovery_by_profile,
-    noting_shared_memory,
     participant_settings,
 )
 from lifecycle.middleware.fastdds.sockets import widen_discovery_buffers
@@ -66,8 +65,7 @@ def quiet_node(
     try:
         with discovery_by_profile(settings):
             context.init(args=[*enclave], domain_id=domain_id, initialize_logging=False)
-        shared_memory = noting_shared_memory(context, is_new=True)
-        with participant_settings(context, settings), shared_memory:
+        with participant_settings(context, settings, is_new=True):
             node = Node(
                 name,
                 namespace=namespace,
@@ -126,7 +124,7 @@ def made_participant(
     """
     first: Any = None
     try:
-        with participant_settings(context, settings), noting_shared_memory(context, is_new=is_new):
+        with participant_settings(context, settings, is_new=is_new):
             first = bare_node(context)
         widen_discovery_buffers(context.get_domain_id())
         yield

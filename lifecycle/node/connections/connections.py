@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING
 
 from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError, MiddlewareError, nearest
-from lifecycle.middleware.fastdds.nfe import has_shared_memory, senders_of
+from lifecycle.middleware.fastdds.nfe import senders_of
 from lifecycle.middleware.fastdds.participant import FlowParticipant
+from lifecycle.middleware.fastdds.settings import has_shared_memory
 from lifecycle.network.connection_url import ConnectionUrl
 from lifecycle.plan.model import ParticipantConnections, PlannedParticipant
 

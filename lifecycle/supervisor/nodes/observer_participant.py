@@ -90,7 +90,7 @@ class ObserverParticipant:
     @property
     def unknown_versions(self) -> str:
         """Which installed libraries are not known, and what that costs; empty if all are."""
-        from lifecycle.middleware.fastdds.settings import unknown_versions
+        from lifecycle.middleware.fastdds.unsupported import unknown_versions
 
         return unknown_versions()
 

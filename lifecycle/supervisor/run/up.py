@@ -21,13 +21,15 @@ from lifecycle import dataclasses
 from lifecycle.errors import ExitCode, MiddlewareError
 from lifecycle.manifest.model import Authority, DataLayerSource, EndpointPolicy, RunKind
 from lifecycle.middleware.discovery.environment import (
-    PEERS_VARIABLE,
-    RANGE_VARIABLE,
     all_by_multicast,
     discovery_peers,
     peers_environment,
 )
-from lifecycle.middleware.fastdds.profiles import discovery_environment
+from lifecycle.middleware.fastdds.profiles import (
+    PEERS_VARIABLE,
+    RANGE_VARIABLE,
+    discovery_environment,
+)
 from lifecycle.middleware.process.control import check_descriptors, check_memory, check_threads
 from lifecycle.middleware.process.prctl import adopt_orphans, exit_after
 from lifecycle.middleware.process.shared_memory import check_room, sweep

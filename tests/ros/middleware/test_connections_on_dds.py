@@ -29,11 +29,11 @@ from lifecycle.middleware.discovery.discovery_server import (
 )
 from lifecycle.middleware.fastdds.nfe import (
     get_network_flow_endpoints,
-    has_shared_memory,
     senders_of,
 )
 from lifecycle.middleware.fastdds.participant import FlowParticipant
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
+from lifecycle.middleware.fastdds.settings import has_shared_memory
 from lifecycle.middleware.fastdds.sockets import OpenSocket, open_sockets
 from lifecycle.middleware.rcl.graph import GraphObserver
 from lifecycle.network.connection_url import ConnectionUrl

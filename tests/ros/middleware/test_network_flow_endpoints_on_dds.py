@@ -27,7 +27,7 @@ from lifecycle.middleware.fastdds.nfe import (
     senders_of,
 )
 from lifecycle.middleware.fastdds.participant import FlowParticipant
-from lifecycle.middleware.fastdds.sockets import get_dscp
+from lifecycle.middleware.fastdds.sockets import get_dscps
 from lifecycle.middleware.versions import installed
 from lifecycle.network.nfe import TransportProtocol, UniqueRequirement
 
@@ -223,7 +223,7 @@ def test_the_dscp_of_a_participant_is_read_back_from_every_sender_socket(
     ):
         assert marked.read_dscp() == 46
         assert other.read_dscp() == 8
-        assert get_dscp(get_network_flow_endpoints(plain)) == 0
+        assert get_dscps(get_network_flow_endpoints(plain)) == {0}
         # Discovery opens shared memory meanwhile, but no socket.
         sockets_in_use = sockets()
         marked.read_dscp()

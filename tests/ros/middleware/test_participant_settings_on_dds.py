@@ -22,12 +22,11 @@ from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.fastdds.nfe import (
     SHARED_MEMORY,
     get_network_flow_endpoints,
-    has_shared_memory,
     senders_of,
 )
 from lifecycle.middleware.fastdds.participant import FlowParticipant
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
-from lifecycle.middleware.fastdds.settings import participant_settings
+from lifecycle.middleware.fastdds.settings import has_shared_memory, participant_settings
 from lifecycle.middleware.fastdds.sockets import own_sockets
 from lifecycle.network.nfe import NetworkFlowEndpoint, TransportProtocol
 from lifecycle.verify.observation import Identity

@@ -136,7 +136,7 @@ _ALONE = """
 import sys
 from tests.ros.node.planning import planned
 from lifecycle import LifecycleNode
-from lifecycle.middleware.fastdds.nfe import has_shared_memory
+from lifecycle.middleware.fastdds.settings import has_shared_memory
 from lifecycle.node import run
 
 class It(LifecycleNode):

@@ -9,13 +9,12 @@ from xml.etree import ElementTree as ET
 import pytest
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.fastdds.participant_profile import (
+from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings, profile
+from lifecycle.middleware.fastdds.profiles import (
     DefaultProfile,
-    ParticipantSettings,
     default_profile,
-    profile,
+    discovery_profile,
 )
-from lifecycle.middleware.fastdds.profiles import discovery_profile
 
 UDP = ParticipantSettings(transports=("udpv4",))
 USERS = """<?xml version="1.0"?>
@@ -107,10 +106,10 @@ def test_localhost_is_discovered_as_rmw_fastrtps_does_for_each_transport() -> No
     searched = root.findall(".//initialPeersList/locator/*")
     assert [(each.tag, each.findtext("address")) for each in searched] == [
         ("udpv4", "10.0.0.7"),
-        ("udpv6", "fd00::7"),
         ("udpv4", "robot.local"),
-        ("udpv6", "robot.local"),
         ("udpv4", "127.0.0.1"),
+        ("udpv6", "fd00::7"),
+        ("udpv6", "robot.local"),
         ("udpv6", "::1"),
     ]
 

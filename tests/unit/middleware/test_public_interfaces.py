@@ -10,9 +10,7 @@ import lifecycle
 ROOT = Path(lifecycle.__file__).parent
 
 CTYPES = {
-    "middleware/discovery/liveliness.py",  # asserts a publisher's liveliness without the GIL
     "middleware/fastdds/factory.py",  # participants from profiles, eight public functions
-    "middleware/fastdds/nfe.py",  # rcl's network flow endpoints and the unique option
     "middleware/process/prctl.py",  # prctl(2), and timers that end a process
     "middleware/rcl/abi.py",  # rcl's C API, checked by version and layout
 }
