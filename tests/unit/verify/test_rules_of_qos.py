@@ -253,57 +253,34 @@ def incompatible(edit: Edit, plan: Plan) -> list[tuple[str, str, str]]:
 LESS = change_announced_qos(PUB, "/a", reliability=Reliability.BEST_EFFORT)
 
 
-SAYS: dict[str, tuple[Edit, Plan, str]] = {
+SAYS: dict[str, tuple[Edit, Plan, list[str]]] = {
     "a policy differs": (
         change_announced_qos(PUB, "/a", deadline_ns=NS),
         pair(QosProfile()),
-        """\
-violated graph.qos-differs: /a
-cannot accept the publisher of /a in /one: deadline_ns is declared infinite and is 1000000000 ns
-expected deadline_ns infinite, observed deadline_ns 1000000000 ns
-at robot.lifecycle.yaml:11:9, on /one (publisher)
-""",
+        ["violated graph.qos-differs: /a"],
     ),
     "nobody announces a policy": (
         change_announced_qos(PUB, "/a", history=History.UNKNOWN, depth=0),
         pair(QosProfile()),
-        """\
-unverifiable graph.qos-unverifiable: /one
-cannot verify history, depth of /one on /a (publisher): neither discovery nor the node reports
-  the actual value
-expected /a (publisher): history KEEP_LAST, depth 10, observed not announced
-at robot.lifecycle.yaml:11:9, on /one
-""",
+        ["unverifiable graph.qos-unverifiable: /one"],
     ),
     "a pair is incompatible": (
         LESS,
         pair(QosProfile(), QosProfile()),
-        """\
-violated graph.qos-incompatible: /a: /one → /two
-cannot match /one → /two on /a: /one offers reliability BEST_EFFORT, /two requests reliability
-  RELIABLE
-expected reliability of at least RELIABLE offered, observed reliability BEST_EFFORT offered
-at robot.lifecycle.yaml:11:9, on no node, of /one and /two
-""",
+        ["violated graph.qos-incompatible: /a: /one → /two"],
     ),
     "a pair may be incompatible": (
         change_announced_qos(PUB, "/a", reliability=Reliability.UNKNOWN),
         pair(QosProfile(), QosProfile()),
-        """\
-unverifiable graph.qos-incompatible: /a: /one → /two
-cannot verify that these match: /one → /two on /a: /one offers reliability UNKNOWN, /two
-  requests reliability RELIABLE
-expected reliability of at least RELIABLE offered, observed reliability UNKNOWN offered
-at robot.lifecycle.yaml:11:9, on no node, of /one and /two
-""",
+        ["unverifiable graph.qos-incompatible: /a: /one → /two"],
     ),
 }
 
 
 @pytest.mark.parametrize("case", SAYS)
-def test_a_finding_on_qos_is_told_whole_where(case: str):
+def test_what_is_found_of_qos_where(case: str):
     edit, plan, text = SAYS[case]
-    assert told(of(text.split()[1][:-1], edit, plan)) == text
+    assert told(of(text[0].split()[1][:-1], edit, plan)) == text
 
 
 def open_world(*endpoints: object) -> Plan:
