@@ -31,6 +31,7 @@ from lifecycle.middleware.fastdds.url_profile import (
 from lifecycle.middleware.process.control import interface_addresses
 from lifecycle.network.connection_url import ConnectionUrl
 from lifecycle.network.medium import RMW_DISCOVERY, TRANSPORTS_VARIABLE, Medium
+from lifecycle.network.nfe import parse_address
 from lifecycle.network.ports import (
     DG,
     LOCALHOST_PEERS_RANGE,
@@ -133,9 +134,9 @@ def _around(domain_id: int, kind: Medium, environment: Mapping[str, str]) -> Rea
         addresses += [each for found in by_interface.values() for each in found]
         targets += _groups(domain_id, kind, by_interface)
         for peer in _static_peers(environment):
-            with contextlib.suppress(ValueError):  # a name would have to be looked up
-                if ipaddress.ip_address(peer).version == kind.ip_version:
-                    targets += _well_known(domain_id, peer, LOCALHOST_PEERS_RANGE)
+            parsed = parse_address(peer)  # a name would have to be looked up
+            if parsed is not None and parsed.version == kind.ip_version:
+                targets += _well_known(domain_id, peer, LOCALHOST_PEERS_RANGE)
     return Reach(kind, tuple(targets), tuple(addresses), _receivers(domain_id, kind))
 
 

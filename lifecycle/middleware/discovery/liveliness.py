@@ -43,12 +43,12 @@ from lifecycle.manifest.names import ALIVE_PULSE
 from lifecycle.middleware.rcl import abi
 from lifecycle.middleware.rcl.qos import latched
 
-LEASE_S = 0.85
+ALIVE_LEASE_S = 0.85
 """A participant whose liveliness was not asserted for so long is lost: within a second with all
 that follows."""
 
 ASSERTED_EACH_S = 0.06
-"""Fourteen fit into LEASE_S; one takes about 150 bytes to each participant that discovered us."""
+"""Fourteen fit into the lease; one takes about 150 bytes to each participant that discovered us."""
 
 _LONGEST_NOTICE = 1 << 16
 """Characters of a notice; a line for each silent node."""
@@ -67,7 +67,7 @@ _ASSERTED = QoSProfile(
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.VOLATILE,
     liveliness=LivelinessPolicy.MANUAL_BY_TOPIC,
-    liveliness_lease_duration=Duration(nanoseconds=round(LEASE_S * 1e9)),
+    liveliness_lease_duration=Duration(nanoseconds=round(ALIVE_LEASE_S * 1e9)),
 )
 _no_publisher_events = functools.partial(PublisherEventCallbacks, use_default_callbacks=False)
 _no_subscription_events = functools.partial(SubscriptionEventCallbacks, use_default_callbacks=False)

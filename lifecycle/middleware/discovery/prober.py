@@ -42,7 +42,7 @@ _OFTEN_S = 2.0
 _VENDOR = b"LC"
 """Vendor ids of others begin with 1 (DDSI-RTPS 2.3 §9.3.1.2)."""
 
-_PREFIX_BYTES = 12
+_PREFIX = slice(8, 20)
 _HEADER = b"RTPS\x02\x03" + _VENDOR
 _PARTICIPANT = b"\x00\x00\x01\xc1"
 _SPDP_READER, _SPDP_WRITER = b"\x00\x01\x00\xc7", b"\x00\x01\x00\xc2"
@@ -107,29 +107,19 @@ def _message(prefix: bytes, sequence: int, flags: int, content: bytes) -> bytes:
     return _HEADER + prefix + info_timestamp + data
 
 
-def announced(data: bytes) -> tuple[str, frozenset[int]]:
-    """Return the GUID prefix of the participant that announced itself, and its UDP ports.
-
-    The prefix is empty if none did.
-    """
-    prefix = data[len(_HEADER) : len(_HEADER) + _PREFIX_BYTES]
-    if len(prefix) < _PREFIX_BYTES or not data.startswith(b"RTPS") or _LEFT in data:
-        return "", frozenset()
-    ports = {int.from_bytes(each[1], "little") for each in _LOCATOR.finditer(data)}
-    ports |= {int.from_bytes(each[1], "big") for each in _SWAPPED.finditer(data)}
-    return prefix.hex(), frozenset(ports)
-
-
 class Prober:
     """One participant that joins and leaves as often as all others are to answer; `close` it.
 
     Args:
         reached: whom it asks, and where.
+
+    Attributes:
+        ports: at which those that answered receive discovery, as they say.
     """
 
     def __init__(self, reached: Sequence[Reach]) -> None:
         self._reached = reached
-        self._prefix = _VENDOR + os.urandom(_PREFIX_BYTES - len(_VENDOR))
+        self._prefix = _VENDOR + os.urandom(10)
         self._sequence = 0
         self._joined = False
         self._timer: threading.Timer | None = None
@@ -185,12 +175,16 @@ class Prober:
             for own in self._sockets:
                 with contextlib.suppress(BlockingIOError):
                     while True:
-                        data, source = own.recvfrom(65536, socket.MSG_DONTWAIT)
-                        prefix, ports = announced(data)
-                        if prefix:
-                            self._answers[prefix] = source[0]
-                            self.ports |= ports
+                        self._take(*own.recvfrom(65536, socket.MSG_DONTWAIT))
             return dict(self._answers)
+
+    def _take(self, data: bytes, source: tuple[str, int]) -> None:
+        prefix = data[_PREFIX]
+        if len(prefix) < 12 or not data.startswith(b"RTPS") or _LEFT in data:
+            return
+        self._answers[prefix.hex()] = source[0]
+        self.ports.update(int.from_bytes(each[1], "little") for each in _LOCATOR.finditer(data))
+        self.ports.update(int.from_bytes(each[1], "big") for each in _SWAPPED.finditer(data))
 
     def listeners(self) -> frozenset[OpenSocket]:
         """Return the UDP sockets of other processes on this host that are asked."""

@@ -18,9 +18,8 @@ import weakref
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from rclpy.callback_groups import CallbackGroup
 from rclpy.context import Context
-from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -176,10 +175,8 @@ def create_subscription(
     qos: QosProfile | QoSProfile,
     *,
     unique: UniqueRequirement = UniqueRequirement.NOT_REQUIRED,
-    callback_group: CallbackGroup | None = None,
-    event_callbacks: SubscriptionEventCallbacks | None = None,
-    raw: bool = False,
     content_filter: tuple[str, tuple[str, ...]] | None = None,
+    **options: Any,
 ) -> Subscription:
     """Create a subscription on `node`, with network flow endpoints of its own where asked.
 
@@ -199,11 +196,9 @@ def create_subscription(
         callback: takes the message, or the message and its info.
         qos: the manifest's profile or rclpy's.
         unique: the requirement.
-        callback_group: None for the node's default one.
-        event_callbacks: as in rclpy.
-        raw: give the callback serialized bytes.
         content_filter: expression, and the values of its parameters (DDS 1.4, annex B); rclpy 7 has
             no way to give one.
+        **options: of rclpy's `create_subscription`: callback_group, event_callbacks, raw.
 
     Raises:
         UniqueFlowNotFeasible: not possible here; no endpoint is left.
@@ -213,18 +208,11 @@ def create_subscription(
     if content_filter is not None:
         abi.load()  # before anything is made
     if _is_plain(node, topic, unique):
-        subscription = node.create_subscription(
-            type_,
-            topic,
-            callback,
-            profile,
-            callback_group=callback_group,
-            event_callbacks=event_callbacks,
-            raw=raw,
-        )
+        subscription = node.create_subscription(type_, topic, callback, profile, **options)
     else:
-        group = callback_group or node.default_callback_group
-        events = event_callbacks or SubscriptionEventCallbacks()
+        group = options.get("callback_group") or node.default_callback_group
+        raw = options.get("raw", False)
+        events = options.get("event_callbacks") or SubscriptionEventCallbacks()
         with _unique_handle(node, type_, topic, profile=profile, unique=unique) as handle:
             subscription = Subscription(
                 *(handle, type_, topic, callback, group, profile, raw), event_callbacks=events
@@ -262,8 +250,7 @@ def create_publisher(
     qos: QosProfile | QoSProfile,
     *,
     unique: UniqueRequirement = UniqueRequirement.NOT_REQUIRED,
-    callback_group: CallbackGroup | None = None,
-    event_callbacks: PublisherEventCallbacks | None = None,
+    **options: Any,
 ) -> Publisher:
     """Create a publisher on `node`, on the node's own participant.
 
@@ -282,9 +269,7 @@ def create_publisher(
             "Unique network flow endpoints not supported on publishers",
             "give the publisher its own participant, or ask for optionally_required",
         )
-    return node.create_publisher(
-        type_, topic, to_rclpy(qos), callback_group=callback_group, event_callbacks=event_callbacks
-    )
+    return node.create_publisher(type_, topic, to_rclpy(qos), **options)
 
 
 def _is_plain(node: Node, topic: str, unique: UniqueRequirement) -> bool:

@@ -18,12 +18,10 @@ from typing import Any
 
 import rclpy
 from rclpy.callback_groups import CallbackGroup
-from rclpy.client import Client
-from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile, qos_profile_services_default
-from rclpy.service import Service
+from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 
 from lifecycle.errors import MiddlewareError
@@ -37,7 +35,7 @@ from lifecycle.middleware.rcl.abi import is_known
 from lifecycle.middleware.rcl.hidden_node import forget_hidden, quiet_node
 from lifecycle.middleware.rcl.qos import to_rclpy
 from lifecycle.network.medium import Medium
-from lifecycle.network.nfe import NetworkFlowEndpoint, UniqueRequirement
+from lifecycle.network.nfe import NetworkFlowEndpoint
 from lifecycle.plan.model import ParticipantConnections
 
 _RELEASE_S = 0.2
@@ -123,29 +121,23 @@ class FlowParticipant:
             raise
 
     def create_publisher(
-        self,
-        type_: type[Any],
-        topic: str,
-        qos: QosProfile | QoSProfile,
-        *,
-        callback_group: CallbackGroup | None = None,
-        event_callbacks: PublisherEventCallbacks | None = None,
-        publisher_class: type[Publisher] = Publisher,
+        self, type_: type[Any], topic: str, qos: QosProfile | QoSProfile, **options: Any
     ) -> Publisher:
         """Create a publisher on this participant; `topic` should be fully qualified.
 
         Events (matched, deadline, …) are only handled if an executor spins `self.node`; without
         `event_callbacks` none are set up.
+
+        Args:
+            type_: message class.
+            topic: its name.
+            qos: the manifest's profile or rclpy's.
+            **options: of rclpy's `create_publisher`.
         """
         self._check_static(type_, topic, writer=True)
-        publisher = self.node.create_publisher(
-            type_,
-            topic,
-            to_rclpy(qos),
-            callback_group=callback_group,
-            event_callbacks=event_callbacks or PublisherEventCallbacks(use_default_callbacks=False),
-            publisher_class=publisher_class,
-        )
+        if not options.get("event_callbacks"):
+            options["event_callbacks"] = PublisherEventCallbacks(use_default_callbacks=False)
+        publisher = self.node.create_publisher(type_, topic, to_rclpy(qos), **options)
         try:
             self.ensure_dscp()
         except BaseException:
@@ -160,30 +152,20 @@ class FlowParticipant:
         callback: Callable[..., Any],
         qos: QosProfile | QoSProfile,
         *,
-        unique: UniqueRequirement = UniqueRequirement.NOT_REQUIRED,
         callback_group: CallbackGroup | None = None,
-        event_callbacks: SubscriptionEventCallbacks | None = None,
-        raw: bool = False,
-        content_filter: tuple[str, tuple[str, ...]] | None = None,
+        **options: Any,
     ) -> Subscription:
         """Create a subscription on this participant; `topic` should be fully qualified.
 
         Its callback runs in the executor of the node served, else in that of `self.node`.
         Its port is given back when the participant is destroyed, which is never for a unique
-        subscription on a node that stays (see `create_subscription` of this room).
+        subscription on a node that stays. Arguments as `nfe.create_subscription`.
         """
         self._check_static(type_, topic, writer=False)
+        if callback_group is None and self._served is not None:
+            callback_group = self._served.default_callback_group
         subscription = nfe.create_subscription(
-            self.node,
-            type_,
-            topic,
-            callback,
-            qos,
-            unique=unique,
-            callback_group=self._group(callback_group),
-            event_callbacks=event_callbacks,
-            raw=raw,
-            content_filter=content_filter,
+            self.node, type_, topic, callback, qos, callback_group=callback_group, **options
         )
         try:
             self.ensure_dscp()
@@ -193,53 +175,10 @@ class FlowParticipant:
         self._receive(subscription)
         return subscription
 
-    def create_service(
-        self,
-        type_: type[Any],
-        name: str,
-        callback: Callable[..., Any],
-        *,
-        qos: QosProfile | QoSProfile = qos_profile_services_default,
-        callback_group: CallbackGroup | None = None,
-    ) -> Service:
-        """Create a service server on this participant; spun as a subscription is.
-
-        Raises:
-            MiddlewareError: the participant's endpoints are discovered statically.
-        """
-        self._refuse_static("service server", name)
-        group = self._group(callback_group)
-        service = self.node.create_service(
-            type_, name, callback, qos_profile=to_rclpy(qos), callback_group=group
-        )
-        self._receive(service)
-        return service
-
-    def create_client(
-        self,
-        type_: type[Any],
-        name: str,
-        *,
-        qos: QosProfile | QoSProfile = qos_profile_services_default,
-        callback_group: CallbackGroup | None = None,
-    ) -> Client:
-        """Create a service client on this participant; spun as a subscription is.
-
-        Raises:
-            MiddlewareError: the participant's endpoints are discovered statically.
-        """
-        self._refuse_static("service client", name)
-        group = self._group(callback_group)
-        client = self.node.create_client(
-            type_, name, qos_profile=to_rclpy(qos), callback_group=group
-        )
-        self._receive(client)
-        return client
-
-    def create_action(
-        self, make: Callable[[Node], hidden_node.Action], what: str, name: str
+    def create(
+        self, make: Callable[[Node], hidden_node.MovedEndpoint], what: str, name: str
     ) -> Any:
-        """Create an action server or client on this participant; spun as a subscription is.
+        """Create an end of a service or action on this participant; spun as a subscription is.
 
         Args:
             make: makes it on a node; its callback group is one of the node served.
@@ -249,10 +188,15 @@ class FlowParticipant:
         Raises:
             MiddlewareError: the participant's endpoints are discovered statically.
         """
-        self._refuse_static(what, name)
-        action = make(self.node)
-        self._receive(action)
-        return action
+        if self.settings.static_participants:
+            raise MiddlewareError(
+                f"cannot make {what} {name!r} on {self.name!r}: its endpoints are discovered "
+                "statically, which services and actions are not",
+                hint="map it to the node's own participant",
+            )
+        entity = make(self.node)
+        self._receive(entity)
+        return entity
 
     def destroy_endpoint(self, entity: Publisher | hidden_node.MovedEndpoint) -> None:
         """Destroy an endpoint that was made here; again is harmless."""
@@ -323,11 +267,6 @@ class FlowParticipant:
             else set()
         )
 
-    def _group(self, group: CallbackGroup | None) -> CallbackGroup | None:
-        if group is None and self._served is not None:
-            return self._served.default_callback_group
-        return group
-
     def _receive(self, entity: hidden_node.MovedEndpoint) -> None:
         if self._served is not None:
             hidden_node.move(entity, self.node, self._served)
@@ -344,14 +283,6 @@ class FlowParticipant:
             profile=self.node.resolve_topic_name(topic),
             type_name=f"{package}::{kind}::dds_::{type_.__name__}_",
         )
-
-    def _refuse_static(self, what: str, name: str) -> None:
-        if self.settings.static_participants:
-            raise MiddlewareError(
-                f"cannot make {what} {name!r} on {self.name!r}: its endpoints are discovered "
-                "statically, which services and actions are not",
-                hint="map it to the node's own participant",
-            )
 
     def __enter__(self) -> FlowParticipant:
         return self

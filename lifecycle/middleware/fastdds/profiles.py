@@ -29,8 +29,11 @@ PEERS_VARIABLE = "ROS_STATIC_PEERS"
 _FILE_NAME = "quick_discovery.xml"
 _SKIP_DEFAULT_FILE_VARIABLE = "SKIP_DEFAULT_XML"
 
+DEFAULT_LEASE_S = 20
+"""Fast DDS drops a participant that ended without a word after so long, if no profile says."""
+
 PARTICIPANT_LEASE_S = 10
-"""As long as a machine may be too busy for a participant to announce itself, or to take it in."""
+"""The same in what `up` starts: as long as a machine may be too busy for it to announce itself."""
 
 _ONE_SAMPLE = (
     "<topic><resourceLimitsQos><allocated_samples>1</allocated_samples></resourceLimitsQos></topic>"

@@ -16,7 +16,6 @@ TCP connections are opened later, are in no NFE list, and are not marked.
 from __future__ import annotations
 
 import contextlib
-import ipaddress
 import os
 import socket
 import struct
@@ -29,7 +28,7 @@ from lifecycle.middleware.process.control import interface_addresses
 from lifecycle.middleware.process.shared_memory import open_files
 from lifecycle.network.connection_url import ConnectionUrl
 from lifecycle.network.medium import CONNECTABLE, UDP_UNICAST, Medium, udp_to
-from lifecycle.network.nfe import InternetProtocol, NetworkFlowEndpoint, TransportProtocol
+from lifecycle.network.nfe import NetworkFlowEndpoint, canonical, is_wildcard
 from lifecycle.network.ports import DG, participant_ports
 
 _TYPE = {True: socket.SOCK_STREAM, False: socket.SOCK_DGRAM}  # by Medium.is_tcp
@@ -38,8 +37,6 @@ _KINDS = {
     for each in CONNECTABLE
     if each.is_network and not each.is_group
 }
-_FAMILIES = {InternetProtocol.IPV4: socket.AF_INET, InternetProtocol.IPV6: socket.AF_INET6}
-_TYPES = {TransportProtocol.UDP: socket.SOCK_DGRAM, TransportProtocol.TCP: socket.SOCK_STREAM}
 _DSCP_OPTION = {
     socket.AF_INET: (socket.IPPROTO_IP, socket.IP_TOS),
     socket.AF_INET6: (socket.IPPROTO_IPV6, socket.IPV6_TCLASS),
@@ -118,8 +115,7 @@ def check_host(urls: Sequence[ConnectionUrl]) -> None:
     addresses = {text for _, text in interface_addresses(socket.AF_INET, socket.AF_INET6)}
     for url in urls:
         wanted = [each for each in url.interfaces if each not in names]
-        group = url.transport.is_group
-        if url.address and not group and not ipaddress.ip_address(url.address).is_unspecified:
+        if url.address and not url.transport.is_group and not is_wildcard(url.address):
             wanted.append(url.address)
         for each in wanted:
             if each.partition("%")[0] not in addresses:
@@ -165,19 +161,15 @@ def own_sockets(nfes: Sequence[NetworkFlowEndpoint]) -> Iterator[list[socket.soc
     Raises:
         MiddlewareError: there is none.
     """
-    wanted = {
-        (family, type_, _address(nfe.internet_address), nfe.transport_port)
-        for nfe in nfes
-        if (family := _FAMILIES.get(nfe.internet_protocol)) is not None
-        and (type_ := _TYPES.get(nfe.transport_protocol)) is not None
-    }
+    wanted = {(nfe.medium, _address(nfe.internet_address), nfe.transport_port) for nfe in nfes}
     with contextlib.ExitStack() as stack:
         found = []
         for each in sockets_here():
-            if each.family not in _DSCP_OPTION:
+            kind = _KINDS.get((each.family, each.type))
+            if kind is None:
                 continue
             address, port = each.getsockname()[:2]
-            if (each.family, each.type, _address(address), port) in wanted:
+            if (kind, _address(address), port) in wanted:
                 # Not by its own dup(), which would make the original wait where it must not.
                 duplicate = socket.socket(fileno=os.dup(each.fileno()))
                 found.append(stack.enter_context(duplicate))
@@ -270,11 +262,8 @@ def widen_discovery_buffers(domain_id: int) -> int:
 
 
 def _address(text: str) -> str:
-    try:
-        # A scope (fe80::1%eth0) distinguishes interfaces; rmw leaves it out.
-        return str(ipaddress.ip_address(text.partition("%")[0]))
-    except ValueError:
-        return text
+    # A scope (fe80::1%eth0) distinguishes interfaces; rmw leaves it out.
+    return canonical(text.partition("%")[0])
 
 
 def _is_free(kind: Medium, address: str, port: int) -> bool:

@@ -10,7 +10,6 @@ DDS would send everything twice.
 
 from __future__ import annotations
 
-import ipaddress
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from xml.etree import ElementTree as ET
@@ -21,6 +20,7 @@ from lifecycle.middleware.fastdds.profiles import child, drop, text
 from lifecycle.middleware.versions import installed
 from lifecycle.network.connection_url import ConnectionUrl, Peer
 from lifecycle.network.medium import Medium, udp_to
+from lifecycle.network.nfe import is_wildcard, parse_address
 from lifecycle.network.ports import LOCALHOST_PEERS_RANGE, participant_ports
 
 DISCOVERY_GROUP = {Medium.UDPV4: "239.255.0.1", Medium.UDPV6: "ff1e::ffff:efff:1"}
@@ -178,7 +178,7 @@ def _describe(made: ET.Element, family: UrlTransport, *, is_local: bool) -> None
     if family.interfaces:
         allowed = ET.SubElement(made, "interfaceWhiteList")
         for each in family.interfaces:
-            text(allowed, "address" if _ip_version(each) else "interface", each)
+            text(allowed, "address" if parse_address(each) else "interface", each)
     if family.kind.is_tcp:
         # Fast DDS 2.14 dials first and says then which port it wants inside the connection; an
         # answer to the former that comes in between leaves the connection unused for good. A
@@ -212,8 +212,8 @@ def _list_udp(
     for peer in family.peers:
         _locator(lists[_SEARCHED], kind, peer.address, port=peer.port)
     for address in () if localhost_peers is None else (*localhost_peers, kind.loopback):
-        # A name may be of any family.
-        if _ip_version(address) in (None, kind.ip_version):
+        parsed = parse_address(address)  # None of a name, which may be of any family
+        if parsed is None or parsed.version == kind.ip_version:
             _locator(lists[_SEARCHED], kind, address)
 
 
@@ -308,7 +308,7 @@ def _interfaces(urls: Sequence[ConnectionUrl]) -> tuple[str, ...]:
 
 
 def _own_address(url: ConnectionUrl) -> tuple[str, ...]:
-    is_any = not url.address or ipaddress.ip_address(url.address).is_unspecified
+    is_any = not url.address or is_wildcard(url.address)
     return () if is_any or url.transport.is_group else (url.address,)
 
 
@@ -364,11 +364,3 @@ def _add_servers(config: ET.Element, urls: Sequence[ConnectionUrl], *, super_cli
             physical = server.port if url.transport.is_tcp else None
             kind = udp_to(url.address) if url.transport.is_group else url.transport
             _locator(listened, kind, server.address, port=server.port, physical=physical)
-
-
-def _ip_version(address: str) -> int | None:
-    """Return 4 or 6; None for a name."""
-    try:
-        return ipaddress.ip_address(address).version
-    except ValueError:
-        return None

@@ -157,34 +157,40 @@ class Maker:
 
     def _service(self, mapping: Mapping, connection: Connection) -> Any:
         assert mapping.handler is not None
-        make: Callable[..., Any] = self._node.create_service
-        if connection.participant is not None:
-            make = connection.participant.create_service
-        entity = make(
-            mapping.interface,
-            self._name(mapping, connection),
-            _answering(mapping.handler),
-            callback_group=mapping.options.callback_group,
-            **_qos(mapping, connection),
-        )
+        handler = _answering(mapping.handler)
+        group = mapping.options.callback_group or self._node.default_callback_group
+        name, qos = self._name(mapping, connection), _qos(mapping)
+
+        def make(node: Node) -> Any:
+            return node.create_service(
+                mapping.interface, name, handler, callback_group=group, **qos
+            )
+
+        entity = self._made(mapping, connection, name, make)
         self._survive_late_answers(entity, mapping.endpoint)
         return entity
 
     def _client(self, mapping: Mapping, connection: Connection) -> Any:
         from lifecycle.node.author.node import refuse_to_deadlock
 
-        make: Callable[..., Any] = self._node.create_client
-        if connection.participant is not None:
-            make = connection.participant.create_client
-        client = make(
-            mapping.interface,
-            self._name(mapping, connection),
-            callback_group=mapping.options.callback_group or self._turns.group,
-            **_qos(mapping, connection),
-        )
+        group = mapping.options.callback_group or self._turns.group
+        name, qos = self._name(mapping, connection), _qos(mapping)
+
+        def make(node: Node) -> Any:
+            return node.create_client(mapping.interface, name, callback_group=group, **qos)
+
+        client = self._made(mapping, connection, name, make)
         if connection.participant is not None:  # the node's own factory has done it
             refuse_to_deadlock(client)
         return client
+
+    def _made(
+        self, mapping: Mapping, connection: Connection, name: str, make: Callable[[Node], Any]
+    ) -> Any:
+        """Have an end of a service or action made where it belongs."""
+        if connection.participant is None:
+            return make(self._node)
+        return connection.participant.create(make, mapping.endpoint.kind.noun, name)
 
     def _action_server(self, mapping: Mapping, connection: Connection) -> Any:
         from lifecycle.middleware.services.actions import GoalServer  # late: numpy, 100 ms
@@ -233,15 +239,9 @@ class Maker:
     ) -> Any:
         """Make an action server or client where it belongs, and have it know its name."""
         name = self._name(mapping, connection)
-        if connection.participant is None:
-            # rcl applies rules to the hidden names itself; torn apart, the action is not made.
-            resolved = resolve_action_name(self._node, name)
-            action = make(self._node, name)
-        else:
-            resolved, noun = name, mapping.endpoint.kind.noun
-            action = connection.participant.create_action(
-                lambda node: make(node, resolved), noun, resolved
-            )
+        # rcl applies rules to the hidden names itself; torn apart, the action is not made.
+        resolved = name if connection.participant else resolve_action_name(self._node, name)
+        action = self._made(mapping, connection, name, lambda node: make(node, name))
         action.action_name = resolved
         return action
 
@@ -277,12 +277,10 @@ class Maker:
         service.send_response = send_response
 
 
-def _qos(mapping: Mapping, connection: Connection) -> dict[str, Any]:
+def _qos(mapping: Mapping) -> dict[str, Any]:
     """Return the keyword for a declared QoS; nothing keeps the default for services."""
     if mapping.endpoint.qos is None:
         return {}
-    if connection.participant is not None:
-        return {"qos": mapping.endpoint.qos}
     return {"qos_profile": to_rclpy(mapping.endpoint.qos)}
 
 

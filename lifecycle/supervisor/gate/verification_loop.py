@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 from lifecycle import dataclasses
 from lifecycle.graph.loop import set_within
 from lifecycle.manifest.model import EndpointKind
+from lifecycle.middleware.fastdds.profiles import DEFAULT_LEASE_S
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.control.protocol import ProcessState
@@ -53,8 +54,8 @@ PASSING_S = 1.0
 """Discovery shows a newcomer's endpoints before its name, measured 0.02–0.45 s earlier; what nodes
 have only just been asked for, or have just made in code, is seen 0.01–0.1 s later."""
 
-LEASE_S = 21.0
-"""Fast DDS forgets a participant that left without notice after 20 s, by default."""
+FORGOTTEN_S = DEFAULT_LEASE_S + 1.0
+"""A participant that left without notice is in the graph no more, whoever made its profile."""
 
 DISCOVERED_S = 3.5
 """A participant whose first announcements were lost is discovered with the next one, after 3 s by
@@ -333,7 +334,7 @@ class VerificationLoop:
         if not isinstance(event, ProcessChanged) or event.state is not ProcessState.EXITED:
             return
         process = self._system.processes.get(event.process)
-        until_s = asyncio.get_running_loop().time() + LEASE_S
+        until_s = asyncio.get_running_loop().time() + FORGOTTEN_S
         for key in () if process is None else process.planned.nodes:
             if (node := self._system.nodes.get(key)) is not None:
                 self._left.update({each.resolved: until_s for each in node.planned.endpoints})

@@ -13,7 +13,7 @@ from collections.abc import Coroutine, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from lifecycle.supervisor.control.protocol import ProcessState
-from lifecycle.supervisor.gate.verification_loop import LEASE_S, ChangeCounter
+from lifecycle.supervisor.gate.verification_loop import FORGOTTEN_S, ChangeCounter
 from lifecycle.supervisor.nodes.bring_up import ALSO_S, died
 from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.processes.process import ManagedProcess
@@ -178,7 +178,7 @@ class Sightings:
     async def vanishes(self, name: str) -> None:
         """Wait until discovery shows no node of this name, or its lease must have run out."""
         loop = asyncio.get_running_loop()
-        deadline = loop.time() + LEASE_S
+        deadline = loop.time() + FORGOTTEN_S
         while (left_s := deadline - loop.time()) > 0:
             count = self._changes.count
             if not await self._is_there(name):

@@ -267,8 +267,15 @@ def test_services_and_clients_answer_in_the_executor_of_the_node_they_serve(
             "_client", "/", fresh_domain, connections=connect("shm://"), served=spun
         ) as asking,
     ):
-        serving.create_service(Trigger, "/ask", answer)
-        client = asking.create_client(Trigger, "/ask")
+        group = spun.default_callback_group
+        serving.create(
+            lambda node: node.create_service(Trigger, "/ask", answer, callback_group=group),
+            *("service server", "/ask"),
+        )
+        client = asking.create(
+            lambda node: node.create_client(Trigger, "/ask", callback_group=group),
+            *("service client", "/ask"),
+        )
         wait_until(client.service_is_ready)
         answers = []
 

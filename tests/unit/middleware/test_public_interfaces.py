@@ -19,7 +19,7 @@ CTYPES = {
 MANGLED = {
     "middleware/fastdds/factory.py",
 }
-"""Files that name C++ functions; docs/decisions.md says which of them are to go."""
+"""Files that name C++ functions."""
 
 FACTORY_SYMBOLS = 8
 
