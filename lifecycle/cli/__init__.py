@@ -1,8 +1,7 @@
 """The command line: one file per verb, thin. Owns argument parsing and the one error boundary.
 
-A verb's module is imported only when it is used, so that ROS-free verbs start fast. Each module
-`lifecycle.cli.verbs.NAME` holds one click command named `command` whose function returns an exit
-code (None means 0); small ones share a module, `control` for one, as `NAME_command`.
+`VERBS` is the table of all verbs. A verb's module is imported only when it is used, so that verbs
+that need no ROS start fast; its function returns an exit code (None means 0).
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ import os
 import signal
 import sys
 from types import FrameType
-from typing import NoReturn
+from typing import NamedTuple, NoReturn
 
 import click
 from click.shell_completion import CompletionItem
@@ -23,47 +22,125 @@ from lifecycle.cli.standard_streams import own_streams
 from lifecycle.errors import ExitCode, LifecycleError, UsageError, did_you_mean, exhausted
 from lifecycle.printable import lines
 
-VERBS: dict[str, str] = {
-    "check": "check a manifest without running anything; needs no ROS",
-    "plan": "show the computational graph, participants, ports and bring-up order",
-    "up": "start, configure, connect, verify, and only then activate; Ctrl-C ends",
-    "pause": "deactivate a running system in reverse order: data stops",
-    "resume": "verify a paused system again, and activate it",
-    "restart": "take one node or all of a running system down, and up again through the gate",
-    "mode": "enter another mode of a running system: who is active, through the gate",
-    "apply": "have a running system run by another manifest, through the gate, or back",
-    "down": "end a running system in reverse order",
-    "status": "show what a running supervisor sees",
-    "verify": "judge a running system, started by anyone; for CI",
-    "flows": "show every network flow and how unique it is",
-    "graph": "picture of what runs, beside what was declared",
-    "export": "write a manifest for other systems: systemd, containers' engines, sros2",
-    "import": "write a manifest from a ROS 2 launch file, gaps marked; starts nothing",
-    "capture": "write a manifest from a running system, gaps marked",
-    "logs": "show what the processes of the latest run have written, or follow it",
-    "history": "show what happened in a run, from its journal",
-    "run": "run one node of a manifest in this terminal, without a supervisor",
-    "ports": "DDS port arithmetic and platform limits",
-    "init": "make a package of one's own: nodes, manifest, tests, CI workflow",
-    "schema": "print the manifest's JSON Schema, or install it for editors",
-}
 
-_ELSEWHERE = {
-    **dict.fromkeys(("pause", "resume", "restart", "mode", "down", "status"), "control"),
-    "schema": "init",
-    "import": "import_",
-}
-"""Verb → module that has it, as `VERB_command`; all others have a module of their name."""
+class Verb(NamedTuple):
+    """One verb.
 
-_PARTICIPANTS = frozenset({"up", "verify", "flows", "graph", "capture", "run"})
-"""Verbs that make participants, here or in processes that they start."""
+    Attributes:
+        about: one line for the list of verbs.
+        example: how it is used, below its --help.
+        needs: ROS: it makes participants, here or in processes that it starts; LINUX: it is about
+            what runs or ran; empty: it is about manifests.
+        module: below cli/verbs/, which has it as `command`; `MODULE:NAME` has it as `NAME_command`;
+            empty for one of the verb's name.
+    """
+
+    about: str
+    example: str
+    needs: str = ""
+    module: str = ""
+
+
+ROS, LINUX = "ros", "linux"
+
+VERBS = {
+    "check": Verb(
+        "check a manifest without running anything; needs no ROS",
+        "check robot.lifecycle.yaml --strict",
+    ),
+    "plan": Verb(
+        "show the computational graph, participants, ports and bring-up order",
+        "plan robot.lifecycle.yaml --format json",
+    ),
+    "up": Verb(
+        "start, configure, connect, verify, and only then activate; Ctrl-C ends",
+        "up robot.lifecycle.yaml rate:=5 --report verdict.json",
+        ROS,
+    ),
+    "pause": Verb(
+        "deactivate a running system in reverse order: data stops",
+        "pause robot",
+        LINUX,
+        "control:pause",
+    ),
+    "resume": Verb(
+        "verify a paused system again, and activate it", "resume robot", LINUX, "control:resume"
+    ),
+    "restart": Verb(
+        "take one node or all of a running system down, and up again through the gate",
+        "restart robot /camera",
+        LINUX,
+        "control:restart",
+    ),
+    "mode": Verb(
+        "enter another mode of a running system: who is active, through the gate",
+        "mode robot docking",
+        LINUX,
+        "control:mode",
+    ),
+    "apply": Verb(
+        "have a running system run by another manifest, through the gate, or back",
+        "apply robot.lifecycle.yaml --dry-run",
+        LINUX,
+    ),
+    "down": Verb("end a running system in reverse order", "down robot", LINUX, "control:down"),
+    "status": Verb(
+        "show what a running supervisor sees", "status robot --watch", LINUX, "control:status"
+    ),
+    "verify": Verb(
+        "judge a running system, started by anyone; for CI",
+        "verify robot.lifecycle.yaml --format junit",
+        ROS,
+    ),
+    "flows": Verb("show every network flow and how unique it is", "flows robot --export nft", ROS),
+    "graph": Verb(
+        "picture of what runs, beside what was declared",
+        "graph robot --format svg --output robot.svg",
+        ROS,
+    ),
+    "export": Verb(
+        "write a manifest for other systems: systemd, containers' engines, sros2",
+        "export systemd robot.lifecycle.yaml -o units",
+    ),
+    "import": Verb(
+        "write a manifest from a ROS 2 launch file, gaps marked; starts nothing",
+        "import robot.launch.py > robot.lifecycle.yaml",
+        "",
+        "import_",
+    ),
+    "capture": Verb(
+        "write a manifest from a running system, gaps marked",
+        "capture --domain 7 --output robot.lifecycle.yaml",
+        ROS,
+    ),
+    "logs": Verb(
+        "show what the processes of the latest run have written, or follow it",
+        "logs camera --follow",
+        LINUX,
+    ),
+    "history": Verb(
+        "show what happened in a run, from its journal", "history --system robot", LINUX
+    ),
+    "run": Verb(
+        "run one node of a manifest in this terminal, without a supervisor",
+        "run robot.lifecycle.yaml camera --manual",
+        ROS,
+    ),
+    "ports": Verb("DDS port arithmetic and platform limits", "ports --domain 7 --participant 3"),
+    "init": Verb(
+        "make a package of one's own: nodes, manifest, tests, CI workflow", "init my_robot"
+    ),
+    "schema": Verb(
+        "print the manifest's JSON Schema, or install it for editors",
+        "schema --install",
+        "",
+        "init:schema",
+    ),
+}
+"""All verbs, in the order of the pipeline."""
 
 _ORDERLY = frozenset({ExitCode.OK, ExitCode.VIOLATED, ExitCode.UNVERIFIABLE})
 """Exit codes that no exception becomes: what made participants has closed them itself."""
-
-_RUNS = {"pause", "resume", "restart", "mode", "apply", "down", "status", "logs", "history"}
-_LINUX = _PARTICIPANTS | _RUNS
-"""Verbs that run nodes, or are about what runs or ran."""
 
 
 def _ros_hint() -> str:
@@ -111,14 +188,15 @@ class _Verbs(click.Group):
         if args and args[0] not in VERBS and not args[0].startswith("-"):
             hint = did_you_mean(args[0], VERBS) or "lifecycle --help lists the verbs"
             raise UsageError(f"cannot find the verb {args[0]!r}", hint=hint)
-        if args and args[0] in _LINUX and sys.platform != "linux":
+        verb = VERBS.get(args[0]) if args else None
+        if verb and verb.needs and sys.platform != "linux":
             raise UsageError(
                 f"cannot run 'lifecycle {args[0]}' on {sys.platform}: nodes are run and watched on "
                 "Linux",
                 hint="what is about manifests works here: check, plan, export, import, init, "
                 "schema",
             )
-        if args and args[0] in _PARTICIPANTS and not {"-h", "--help"} & {*args}:
+        if verb and verb.needs == ROS and not {"-h", "--help"} & {*args}:
             _check_ros(args[0])
         return super().resolve_command(ctx, args)
 
@@ -131,9 +209,9 @@ class _Verbs(click.Group):
         if incomplete.startswith("-"):
             return click.Command.shell_complete(self, ctx, incomplete)
         return [
-            CompletionItem(verb, help=about)
-            for verb, about in VERBS.items()
-            if verb.startswith(incomplete)
+            CompletionItem(name, help=verb.about)
+            for name, verb in VERBS.items()
+            if name.startswith(incomplete)
         ]
 
     def get_command(
@@ -141,13 +219,17 @@ class _Verbs(click.Group):
         ctx: click.Context,  # noqa: ARG002 - click's signature
         cmd_name: str,
     ) -> click.Command | None:
-        """Import the verb's module, see above."""
+        """Import the module of a verb."""
         if cmd_name not in VERBS:
             return None
-        module = _ELSEWHERE.get(cmd_name, cmd_name.replace("-", "_"))
-        name = f"{cmd_name}_command" if cmd_name in _ELSEWHERE else "command"
-        found = getattr(importlib.import_module(f"lifecycle.cli.verbs.{module}"), name)
+        verb = VERBS[cmd_name]
+        module, _, name = (verb.module or cmd_name).partition(":")
+        found = getattr(
+            importlib.import_module(f"lifecycle.cli.verbs.{module}"),
+            f"{name}_command" if name else "command",
+        )
         assert isinstance(found, click.Command)
+        found.epilog = f"Example: lifecycle {verb.example}"
         return found
 
     def format_commands(
@@ -157,7 +239,7 @@ class _Verbs(click.Group):
     ) -> None:
         """List verbs without importing them."""
         with formatter.section("Verbs"):
-            formatter.write_dl(list(VERBS.items()))
+            formatter.write_dl([(name, verb.about) for name, verb in VERBS.items()])
 
 
 @click.command(cls=_Verbs, context_settings={"help_option_names": ["-h", "--help"]})

@@ -100,23 +100,42 @@ def command(
     """
     plan = load_plan(manifest, assignments, machine=machine)
     path = _run_of(plan, machine)
-    said = _asked(path, plan, dry_run=True, timeout_s=0.0, wait_s=_SHOWN_S)
     as_text = format_ == "text"
-    if said.error or said.change is None:
-        return _end(_report("refused", path, plan, said), as_text=as_text)
-    if not said.change.differences:
-        return _end(_report("unchanged", path, plan, said), as_text=as_text)
+    answer = _asked(path, plan, dry_run=True, timeout_s=0.0, wait_s=_SHOWN_S)
+    change = answer.change
+    if answer.error or change is None:
+        outcome = "refused"
+    elif not change.differences:
+        outcome = "unchanged"
+    else:
+        if as_text:
+            click.echo(lines("\n".join(_changed(change))))
+        outcome = "would_apply"
+    if outcome == "would_apply" and not dry_run:
+        wait_s = 2 * timeout + _SPARE_S
+        answer = _asked(path, plan, dry_run=False, timeout_s=timeout, wait_s=wait_s)
+        change = answer.change or change
+        outcome = "applied"
+        if answer.error:
+            outcome = "refused" if answer.exit_code == ExitCode.USAGE else "rolled_back"
+    shown = {} if change is None else {each: getattr(change, each) for each in _SHOWN}
+    report = ApplyReport(
+        outcome=outcome,
+        exit_code=answer.exit_code or ExitCode.OK,
+        system=path.name,
+        manifest=plan.manifest_path,
+        error=answer.error,
+        **{"revision": 0, **shown},
+    )
     if as_text:
-        click.echo(lines("\n".join(_change(said.change))))
-    if dry_run:
-        return _end(_report("would_apply", path, plan, said), as_text=as_text)
-    wait_s = 2 * timeout + _SPARE_S
-    done = _asked(path, plan, dry_run=False, timeout_s=timeout, wait_s=wait_s)
-    outcome = "applied"
-    if done.error:
-        outcome = "refused" if done.exit_code == ExitCode.USAGE else "rolled_back"
-    report = _report(outcome, path, plan, done, said.change)
-    return _end(report, as_text=as_text)
+        _say(report)
+    else:
+        click.echo(json_text(to_json(report).decode()))
+    return report.exit_code
+
+
+_SHOWN = ("revision", "differences", "added", "removed", "restarted", "parameters")
+"""What a report has from the supervisor."""
 
 
 def _run_of(plan: Plan, machine: str) -> Path:
@@ -170,31 +189,8 @@ def _asked(path: Path, plan: Plan, *, dry_run: bool, timeout_s: float, wait_s: f
         ) from error
 
 
-def _report(
-    outcome: str, path: Path, plan: Plan, answer: Answer, change: ChangedNodes | None = None
-) -> ApplyReport:
-    from lifecycle.supervisor.control.protocol import ChangedNodes
-
-    shown = answer.change or change or ChangedNodes(revision=0)
-    return ApplyReport(
-        outcome=outcome,
-        exit_code=answer.exit_code or ExitCode.OK,
-        system=path.name,
-        manifest=plan.manifest_path,
-        revision=shown.revision,
-        differences=shown.differences,
-        added=shown.added,
-        removed=shown.removed,
-        restarted=shown.restarted,
-        parameters=shown.parameters,
-        error=answer.error,
-    )
-
-
-def _end(report: ApplyReport, *, as_text: bool) -> int:
-    if not as_text:
-        click.echo(json_text(to_json(report).decode()))
-    elif report.error:
+def _say(report: ApplyReport) -> None:
+    if report.error:
         click.echo(lines(report.error), err=True)
     elif report.outcome == "unchanged":
         click.echo(f"{report.manifest} is what {report.system} runs, revision {report.revision}")
@@ -202,10 +198,9 @@ def _end(report: ApplyReport, *, as_text: bool) -> int:
         click.echo(
             f"{report.system} runs by {report.manifest}, verified, revision {report.revision}"
         )
-    return report.exit_code
 
 
-def _change(change: ChangedNodes) -> list[str]:
+def _changed(change: ChangedNodes) -> list[str]:
     """Return how the manifests differ, and what becomes of which node."""
     what = {
         "added": change.added,

@@ -6,8 +6,7 @@ Owns: how an order is given and what its outcome is as an exit code; a status as
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -32,8 +31,6 @@ if TYPE_CHECKING:
 
     from lifecycle.supervisor.control.protocol import NodeStatus, SystemStatus
     from lifecycle.verify.outcome import ConnectionReport
-
-F = TypeVar("F", bound=Callable[..., Any])
 
 HEADS = ("node", "process", "pid", "state", "matched", "unique flows", "")
 
@@ -198,31 +195,17 @@ def _list_running(format_: str) -> int:
     return ExitCode.OK
 
 
-def order_timeout(function: F) -> F:
-    """Add `--timeout` to a verb that orders something."""
-    return timeout_option(60.0, "How long to wait for it.")(function)
-
-
-def give_order(  # noqa: PLR0917 - in the order of the command line
+def _give_order(
     verb: str,
     target: str,
     assignments: tuple[str, ...],
+    *,
     machine: str,
     timeout: float,
     node: str = "",
-    *,
     mode: str = "",
 ) -> int:
     """Have a running supervisor carry out an order; say why where it does not.
-
-    Args:
-        verb: an order.
-        target: a manifest, or a running system.
-        assignments: `name:=value` of the manifest.
-        machine: as it was given to `up`.
-        timeout: seconds.
-        node: for `restart`, one node; empty for all.
-        mode: for `mode`, the one to enter.
 
     Returns:
         Its exit code: 2 if the order does not fit what the system is doing, 4 or 5 if the gate
@@ -248,6 +231,9 @@ def give_order(  # noqa: PLR0917 - in the order of the command line
         click.echo(lines(answer.error), err=True)
     assert answer.exit_code is not None
     return answer.exit_code
+
+
+_order_timeout = timeout_option(60.0, "How long to wait for it.")
 
 
 @click.command("down")
@@ -277,28 +263,28 @@ def down_command(
 
 @click.command("pause")
 @target_arguments
-@order_timeout
-def pause_command(target: str, assignments: tuple[str, ...], machine: str, timeout: float) -> int:
+@_order_timeout
+def pause_command(target: str, assignments: tuple[str, ...], **options: Any) -> int:
     """Deactivate every managed node of a running system, in reverse order: data stops.
 
     Processes, connections and flows stay as they are. TARGET is a manifest, or the name of a
     running system as `lifecycle status` shows it. Only an active system can be paused; a manifest
     that has changed since it was started is said, and does not keep it from being paused.
     """
-    return give_order("pause", target, assignments, machine, timeout)
+    return _give_order("pause", target, assignments, **options)
 
 
 @click.command("resume")
 @target_arguments
-@order_timeout
-def resume_command(target: str, assignments: tuple[str, ...], machine: str, timeout: float) -> int:
+@_order_timeout
+def resume_command(target: str, assignments: tuple[str, ...], **options: Any) -> int:
     """Verify a paused system again, and activate it only if the gate opens.
 
     TARGET is a manifest, or the name of a running system as `lifecycle status` shows it. Exits
     with 4 if the gate stays closed: then the system stays paused, and can be asked again; with 2 if
     the manifest is not the one that runs.
     """
-    return give_order("resume", target, assignments, machine, timeout)
+    return _give_order("resume", target, assignments, **options)
 
 
 @click.command("restart")
@@ -310,8 +296,8 @@ def resume_command(target: str, assignments: tuple[str, ...], machine: str, time
     shell_complete=completing("nodes arguments"),
 )
 @machine_option("As it was given to `lifecycle up`.")
-@order_timeout
-def restart_command(target: str, words: tuple[str, ...], machine: str, timeout: float) -> int:
+@_order_timeout
+def restart_command(target: str, words: tuple[str, ...], **options: Any) -> int:
     """Take a running system down and bring it up again, or only the process of NODE.
 
     What comes back is verified together with what stayed, and activated only if the gate opens: in
@@ -321,11 +307,10 @@ def restart_command(target: str, words: tuple[str, ...], machine: str, timeout: 
     What is restarted is what was started. A manifest or parameter file that has changed since is
     refused (exit 2), naming what differs; `lifecycle apply MANIFEST` takes it.
     """
-    nodes = [word for word in words if ":=" not in word]
+    nodes, assignments = _split(words)
     if len(nodes) > 1:
         raise UsageError(f"cannot restart {', '.join(nodes)} at once; name one node, or none")
-    assignments = tuple(word for word in words if ":=" in word)
-    return give_order("restart", target, assignments, machine, timeout, *nodes)
+    return _give_order("restart", target, assignments, node="".join(nodes), **options)
 
 
 @click.command("mode")
@@ -337,8 +322,8 @@ def restart_command(target: str, words: tuple[str, ...], machine: str, timeout: 
     shell_complete=completing("arguments"),
 )
 @machine_option("As it was given to `lifecycle up`.")
-@order_timeout
-def mode_command(*, target: str, words: tuple[str, ...], machine: str, timeout: float) -> int:
+@_order_timeout
+def mode_command(target: str, words: tuple[str, ...], **options: Any) -> int:
     """Enter a mode of a running system: another set of its nodes is active.
 
     Nodes that the mode keeps inactive are deactivated in reverse order; those that it has active
@@ -346,8 +331,13 @@ def mode_command(*, target: str, words: tuple[str, ...], machine: str, timeout: 
     closed the system goes back to the mode before, and this exits with 4. NAME is one of `modes:`
     of the manifest; `lifecycle status` shows which it is in.
     """
-    names = [word for word in words if ":=" not in word]
+    names, assignments = _split(words)
     if len(names) != 1:
         raise UsageError("cannot enter a mode without its name; name one of the manifest's")
-    assignments = tuple(word for word in words if ":=" in word)
-    return give_order("mode", target, assignments, machine, timeout, mode=names[0])
+    return _give_order("mode", target, assignments, mode=names[0], **options)
+
+
+def _split(words: tuple[str, ...]) -> tuple[list[str], tuple[str, ...]]:
+    """Return the words that are none, and those that are `NAME:=VALUE`."""
+    names = [word for word in words if ":=" not in word]
+    return names, tuple(word for word in words if ":=" in word)

@@ -19,7 +19,7 @@ from lifecycle.printable import lines, one_line
 @click.argument("assignments", nargs=-1, metavar="[NAME:=VALUE]...")
 @output_option("manifest")
 @click.option("--system", default="", help="Name to give the system; default: the file's.")
-def import_command(
+def command(
     *, launch_file: Path, assignments: tuple[str, ...], output: Path | None, system: str
 ) -> int:
     """Write what a launch file describes as a manifest.

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import os
+import shlex
 import subprocess
 import sys
 from pathlib import Path
 
+import click
 import pytest
+
+from lifecycle.cli import VERBS, cli
 
 MANIFEST = """
 manifest_version: 1
@@ -85,3 +89,16 @@ def test_click_prints_the_script_that_switches_it_on() -> None:
         check=True,
     )
     assert "_LIFECYCLE_COMPLETE=bash_complete" in done.stdout
+
+
+@pytest.mark.parametrize("name", VERBS)
+def test_the_help_of_a_verb_ends_with_an_example_that_the_verb_takes(name: str) -> None:
+    context = click.Context(cli)
+    verb = cli.get_command(context, name)
+    assert verb is not None
+    shown = verb.get_help(click.Context(verb, info_name=name, parent=context))
+    program, *words = shlex.split(shown.rsplit("Example: ", 1)[1].split(" >")[0])
+    assert (program, words[0]) == ("lifecycle", name)
+    while isinstance(verb, click.Group) and words[1] in verb.commands:
+        verb, words = verb.commands[words[1]], words[1:]
+    verb.make_parser(click.Context(verb)).parse_args(words[1:])
