@@ -20,6 +20,10 @@ SERIALIZATIONS = ("cdr",)
 """OMG's Common Data Representation, the one wire format of ROS 2's DDS and zenoh RMWs."""
 
 
+End = tuple[str, EndpointKind, str]
+"""An endpoint that takes part: key of its party, kind, declared name."""
+
+
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class PartyEndpoint:
     """One publisher or subscription that takes part.
@@ -149,7 +153,7 @@ class NegotiatedConnection:
     reason: str
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True, order=True)
 class NegotiationProblem:
     """A pair that cannot be connected.
 

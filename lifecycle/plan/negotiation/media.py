@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Collection
 
 from lifecycle import dataclasses
-from lifecycle.manifest.model import FlowTransport
+from lifecycle.manifest.model import EndpointKind, FlowTransport
 from lifecycle.network.medium import CONNECTABLE, Medium, is_fragmented, max_unfragmented
-from lifecycle.plan.negotiation.data_layer import Party, PartyEndpoint
+from lifecycle.plan.negotiation.data_layer import End, Party, PartyEndpoint
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -27,6 +27,14 @@ class Pair:
     subscription: Party
     reader: PartyEndpoint
     link: FlowTransport = FlowTransport.ANY
+
+    @property
+    def ends(self) -> tuple[End, End]:
+        """The publisher and the subscription, as keys."""
+        return (
+            (self.publisher.key, EndpointKind.PUBLISHER, self.writer.name),
+            (self.subscription.key, EndpointKind.SUBSCRIPTION, self.reader.name),
+        )
 
     @property
     def same_host(self) -> bool:
