@@ -22,7 +22,6 @@ from lifecycle.manifest.model import (
 from lifecycle.network.connection_url import parse
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.plan.build import build_plan, check_plan
-from lifecycle.plan.connections.hosts import demand
 from lifecycle.plan.model import PlanError
 from lifecycle.plan.render import render_text
 from tests.builders import (
@@ -198,11 +197,7 @@ def test_who_has_shared_memory_alone_needs_no_port():
     plan = planned(
         node("talker", publisher("t")), node("listener", subscription("t")), discovery=IN_MEMORY
     )
-    (here,) = demand(plan)
-    assert [(each.owner, each.user_port, each.shared_memory) for each in here.participants] == [
-        (owner, 0, True) for owner in ("supervisor", "talker", "listener")
-    ]
-    assert "none: shared memory alone" in render_text(plan)
+    assert render_text(plan).count("none: shared memory alone") == 3
 
 
 def test_a_command_with_shared_memory_alone_looks_further_than_loopback():
