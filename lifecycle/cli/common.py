@@ -274,6 +274,7 @@ def export_option(function: F) -> F:
     return _network(
         click.option(
             "--export",
+            "export_",
             type=click.Choice(NETWORKS),
             help="Print the verified flows as rules, settings or request bodies of another system "
             "instead.",

@@ -1,7 +1,7 @@
 """`lifecycle flows`: show every network flow and how unique it is, export them, program networks.
 
 Owns: flows as a table, JSON or CSV, `--export`, and the subcommands `apply`, `diff` and `remove`.
-The exported texts and what is done to networks are programming's.
+Exported texts and what is done to networks are programming's.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import click
 
 from lifecycle.cli.common import (
     NETWORKS,
+    F,
     assignments_argument,
     export_option,
     format_option,
@@ -112,51 +113,65 @@ def _ends(nfes: Sequence[NetworkFlowEndpoint]) -> str:
     return " ".join(dict.fromkeys(each.describe() for each in nfes)) or "unknown"
 
 
-class Export:
-    """One export, with its options checked before anything is looked at.
-
-    Args:
-        name: of NETWORKS.
-        mapping, flow_labels: see read_treatment.
-        given: what the network needs, by option.
+def export(
+    plan: Plan, flows: Sequence[FlowReport], network: TargetOptions, treatment: Treatment
+) -> None:
+    """Print flows as a network takes them; those that are not in it, and why, go to stderr.
 
     Raises:
-        UsageError: the options do not fit.
+        UsageError: it cannot be exported so.
     """
-
-    def __init__(self, name: str, *, mapping: str, flow_labels: bool, **given: Any) -> None:
-        from lifecycle.programming.apply.programmer import read_treatment
-        from lifecycle.programming.apply.targets.registry import read_targets
-
-        # What is exported for a network takes what programming it takes.
-        (self._network,) = read_targets((name,), given, option="--export")
-        self._treatment = read_treatment(mapping, label_flows=flow_labels)
-
-    def write(self, plan: Plan, flows: Sequence[FlowReport]) -> None:
-        """Print the text; flows that are not in it, and why, go to stderr.
-
-        Raises:
-            UsageError: it cannot be exported so.
-        """
-        rules = _open(plan, (), self._treatment).rules(flows)
-        try:
-            text = self._network.export(rules, plan.system)
-        except ValueError as error:
-            raise UsageError(str(error), hint=self._network.hint) from error
-        click.echo(text, nl=False)
-        _show_left_out(rules.left_out)
+    rules = _open(plan, (), treatment).rules(flows)
+    try:
+        text = network.export(rules, plan.system)
+    except ValueError as error:
+        raise UsageError(str(error), hint=network.hint) from error
+    click.echo(text, nl=False)
+    _show_left_out(rules.left_out)
 
 
 _EMPTY_GRAPH_S = 1.5
 """Some node of what runs is seen within so long; a system without any is waited for if asked."""
 
 
-@click.command("flows")
+_timeout = timeout_option(5.0, "How long flows that are not complete may still become so.")
+
+
+class _ShowsByDefault(click.Group):
+    """`flows apply …` is a subcommand, `flows TARGET …` shows."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Take what names no subcommand for what to show."""
+        known = args and args[0] in (*self.commands, "-h", "--help")
+        return super().parse_args(ctx, args if known else ["show", *args])
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """List the options of showing, then the subcommands."""
+        self.commands["show"].format_options(ctx, formatter)
+        self.format_commands(ctx, formatter)
+
+
+@click.group(
+    "flows",
+    cls=_ShowsByDefault,
+    subcommand_metavar="TARGET [NAME:=VALUE]... | apply|diff|remove MANIFEST ...",
+)
+def command() -> None:
+    """Show every publisher → subscription pair of a running system.
+
+    TARGET is a manifest, or the name of a system that a supervisor runs on this host.
+
+    One line per network flow: its 5-tuple, on IPv6 its flow label, DSCP and TOS byte, how unique it
+    is, what was required and the verdict. Exits as `lifecycle verify` does.
+    """
+
+
+@command.command("show", hidden=True)
 @target_argument
 @assignments_argument
 @format_option("text", "json", "csv")
 @click.option("--watch", is_flag=True, help="Show them again whenever they change; Ctrl-C ends.")
-@timeout_option(5.0, "How long flows that are not complete may still become so.")
+@_timeout
 @export_option
 def _show(
     *,
@@ -165,23 +180,18 @@ def _show(
     format_: str,
     watch: bool,
     timeout: float,
-    export: str | None,
+    export_: str | None,
     **rest: Any,
 ) -> int:
-    """Show every publisher → subscription pair of a running system.
-
-    TARGET is a manifest, or the name of a system that a supervisor runs on this host.
-
-    One line per network flow: its 5-tuple, on IPv6 its flow label, DSCP and TOS byte, how unique it
-    is, what was required and the verdict. Exits as `lifecycle verify` does.
-    """
     from lifecycle.supervisor.run.looking import follow_running, judge_running, supervisor_of
 
-    exporter = None
-    if export is not None:
+    exported = None
+    if export_ is not None:
         if watch:
             raise UsageError("cannot use --export with --watch; export once")
-        exporter = Export(export, **rest)
+        # What is exported for a network takes what programming it takes.
+        (network,), treatment = _read((export_,), rest, option="--export")
+        exported = (network, treatment)
     elif any(rest.values()):
         raise UsageError(
             "cannot say how to treat flows that are only shown",
@@ -198,8 +208,8 @@ def _show(
     seen = judge_running(plan, timeout_s=timeout, strict=False, empty_graph_s=empty_graph_s)
     for each in seen.notices:
         click.echo(lines(each), err=True)
-    if exporter is not None:
-        exporter.write(seen.plan, seen.verdict.flows)
+    if exported is not None:
+        export(seen.plan, seen.verdict.flows, *exported)
     else:
         click.echo(render_flows(seen.verdict.flows, format_))
     return exit_code(seen.verdict, strict=False)
@@ -273,68 +283,70 @@ def remove(plan: Plan) -> int:
     return ExitCode.OK
 
 
-@click.command("apply")
-@manifest_arguments
-@network_options("--target", "Network to program; may be given several times.")
+def _programming(function: F) -> F:
+    """Add what the subcommands that program networks take."""
+    function = network_options("--target", "Network to program; may be given several times.")(
+        _timeout(function)
+    )
+    return manifest_arguments(function)
+
+
+@command.command("apply")
+@_programming
 @click.option("--dry-run", is_flag=True, help="Print what would be sent; check it if possible.")
-@timeout_option(5.0, "How long flows that are not complete may still become so.")
-def apply_command(
+def _apply(
     *,
     manifest: str,
     assignments: tuple[str, ...],
     targets: tuple[str, ...],
     dry_run: bool,
     timeout: float,
-    mapping: str,
-    flow_labels: bool,
     **rest: Any,
 ) -> int:
     """Program networks with the verified flows of a running system.
 
     Only flows whose verdict is ok; only what is ours is touched; a second time changes nothing.
     """
-    options, treatment = _asked(targets, rest, mapping, flow_labels=flow_labels)
+    options, treatment = _read(targets, rest)
     plan, verdict = _judged(manifest, assignments, timeout)
     done = apply(plan, verdict.flows, options, dry_run=dry_run, treatment=treatment)
     return done or exit_code(verdict, strict=False)
 
 
-@click.command("diff")
-@manifest_arguments
-@network_options("--target", "Network to program; may be given several times.")
-@timeout_option(5.0, "How long flows that are not complete may still become so.")
-def diff_command(
+@command.command("diff")
+@_programming
+def _diff(
     *,
     manifest: str,
     assignments: tuple[str, ...],
     targets: tuple[str, ...],
     timeout: float,
-    mapping: str,
-    flow_labels: bool,
     **rest: Any,
 ) -> int:
     """Compare networks with the verified flows; exits with 4 where they differ."""
-    options, treatment = _asked(targets, rest, mapping, flow_labels=flow_labels)
+    options, treatment = _read(targets, rest)
     plan, verdict = _judged(manifest, assignments, timeout)
-    return diff(plan, verdict.flows, options, treatment=treatment) or exit_code(
-        verdict, strict=False
-    )
+    differs = diff(plan, verdict.flows, options, treatment=treatment)
+    return differs or exit_code(verdict, strict=False)
 
 
-@click.command("remove")
+@command.command("remove")
 @manifest_arguments
-def remove_command(manifest: str, assignments: tuple[str, ...]) -> int:
+def _remove(manifest: str, assignments: tuple[str, ...]) -> int:
     """Remove from networks everything that was applied for a system, running or not."""
     return remove(load_plan(manifest, assignments))
 
 
-def _asked(
-    targets: tuple[str, ...], given: Mapping[str, Any], mapping: str, *, flow_labels: bool
+def _read(
+    targets: tuple[str, ...], given: Mapping[str, Any], option: str = "--target"
 ) -> tuple[tuple[TargetOptions, ...], Treatment]:
+    """Read the options of networks, and of what flows get, before anything is looked at."""
     from lifecycle.programming.apply.programmer import read_treatment
     from lifecycle.programming.apply.targets.registry import read_targets
 
-    options = read_targets(targets, given)
+    given = dict(given)
+    mapping, flow_labels = given.pop("mapping"), given.pop("flow_labels")
+    options = read_targets(targets, given, option=option)
     if not options:
         raise UsageError(f"cannot program no network; give --target {'|'.join(NETWORKS)}")
     return options, read_treatment(mapping, label_flows=flow_labels)
@@ -366,42 +378,3 @@ def _show_left_out(flows: Iterable[object]) -> None:
     """On stderr, beside a ruleset or bodies that go to a file."""
     for each in flows:
         click.echo(lines(f"left out: {each}"), err=True)
-
-
-class WithSubcommands(click.Group):
-    """`flows apply …` is a subcommand, `flows MANIFEST …` is the command itself."""
-
-    def __init__(self, show: click.Command, subcommands: Sequence[click.Command]) -> None:
-        super().__init__(
-            show.name, params=[], help=show.help, commands=list(subcommands), add_help_option=True
-        )
-        self._show = show
-
-    def make_context(
-        self,
-        info_name: str | None,
-        args: list[str],
-        parent: click.Context | None = None,
-        **extra: Any,
-    ) -> click.Context:
-        """Choose by the first argument."""
-        if args and args[0] in (*self.commands, "-h", "--help"):
-            return super().make_context(info_name, args, parent=parent, **extra)
-        return self._show.make_context(info_name, args, parent=parent, **extra)
-
-    def format_usage(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Show the command's own usage first."""
-        self._show.format_usage(ctx, formatter)
-        formatter.write_usage(ctx.command_path, "apply|diff|remove ...")
-
-    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Show the command's own options, then the subcommands."""
-        self._show.format_options(ctx, formatter)
-        self.format_commands(ctx, formatter)
-
-    def invoke(self, ctx: click.Context) -> Any:
-        """Run what the context was made for; below another group, click does so itself."""
-        return super().invoke(ctx) if ctx.command is self else ctx.command.invoke(ctx)
-
-
-command = WithSubcommands(_show, (apply_command, diff_command, remove_command))

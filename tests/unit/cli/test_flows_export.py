@@ -9,16 +9,20 @@ import pytest
 from click.testing import CliRunner
 
 from lifecycle.cli.common import NETWORKS
-from lifecycle.cli.verbs import flows, up
-from lifecycle.cli.verbs.flows import Export
+from lifecycle.cli.verbs import flows as verb
+from lifecycle.cli.verbs import up
 from lifecycle.errors import UsageError
-from lifecycle.programming.apply.targets.registry import TARGETS
+from lifecycle.programming.apply.programmer import read_treatment
+from lifecycle.programming.apply.targets.registry import TARGETS, read_targets
+from lifecycle.verify.verdict import FlowReport
 from tests.unit.programming.apply.samples import camara_settings, nef_settings, settings_file
 from tests.unit.programming.rules.samples import plan, report
 
 
-def export(name: str, *, mapping: str = "", **given: object) -> Export:
-    return Export(name, mapping=mapping, flow_labels=False, **given)
+def export(name: str, *flows: FlowReport, **given: object) -> None:
+    """Export flows for a network, `given` what it takes."""
+    (network,) = read_targets((name,), given, option="--export")
+    verb.export(plan(), flows or [report()], network, read_treatment("", label_flows=False))
 
 
 @pytest.mark.parametrize("name", NETWORKS)
@@ -33,9 +37,7 @@ def test_every_export_shows_the_flow_and_names_what_it_left_out(
     )
     needs = {"tc": {"device": "eth0", "rate": "10mbit"}}
     given = needs.get(name, {"config": file} if name in ("nef", "camara") else {})
-    export(name, **given).write(
-        plan(), [report(), report("/robot/status", source=(), destination=())]
-    )
+    export(name, report(), report("/robot/status", source=(), destination=()), **given)
     text = capsys.readouterr().out
     assert text.endswith("\n")
     assert "/robot/video" in text
@@ -45,13 +47,13 @@ def test_every_export_shows_the_flow_and_names_what_it_left_out(
 
 
 def test_verified_flows_are_exported_as_nft_takes_them(capsys: pytest.CaptureFixture[str]) -> None:
-    export("nft").write(plan(), [report()])
+    export("nft")
 
     assert "table inet flowqos_" in capsys.readouterr().out
 
 
 def test_a_device_comes_from_its_option(capsys: pytest.CaptureFixture[str]) -> None:
-    export("tc", device="e0", rate="20mbit").write(plan(), [report()])
+    export("tc", device="e0", rate="20mbit")
 
     assert " dev e0 " in capsys.readouterr().out
 
@@ -61,7 +63,7 @@ def test_bodies_take_the_settings_of_their_server(
 ) -> None:
     file = settings_file(tmp_path, nef=nef_settings("https://nef.test", devices=["10.77.0.1"]))
 
-    export("nef", config=file).write(plan(), [report()])
+    export("nef", config=file)
 
     (subscription,) = json.loads(capsys.readouterr().out)["subscriptions"]
     assert subscription["body"]["ueIpv4Addr"] == "10.77.0.1"
@@ -85,7 +87,7 @@ def test_bodies_take_the_settings_of_their_server(
 )
 def test_an_export_without_what_it_needs_is_refused(name: str, message: str) -> None:
     with pytest.raises(UsageError) as caught:
-        export(name).write(plan(), [report()])
+        export(name)
 
     assert str(caught.value) == message
 
@@ -108,7 +110,7 @@ def test_an_export_without_what_it_needs_is_refused(name: str, message: str) -> 
     ],
 )
 def test_flows_refuses_options_that_do_not_fit(options: list[str], message: str) -> None:
-    result = CliRunner().invoke(flows.command, ["m.yaml", *options])
+    result = CliRunner().invoke(verb.command, ["m.yaml", *options])
 
     assert str(result.exception) == message
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-import click
 import pytest
 from click.testing import CliRunner
 
@@ -18,8 +17,6 @@ from tests.builders import nfe
 from tests.unit.programming.apply.samples import nef_settings, settings_file
 from tests.unit.programming.apply.servers import TOKEN, NefServer
 from tests.unit.programming.rules.samples import plan, report
-
-SUBCOMMANDS = (flows_verb.apply_command, flows_verb.diff_command, flows_verb.remove_command)
 
 
 @pytest.fixture
@@ -36,37 +33,16 @@ def nef_options(tmp_path: Path, url: str) -> tuple[TargetOptions, ...]:
     return (target_kind("nef").read({"config": settings_file(tmp_path, nef=settings)}),)
 
 
-@click.command("flows")
-@click.argument("manifest")
-@click.option("--watch", is_flag=True)
-def show(manifest: str, watch: bool) -> int:
-    """Show flows."""
-    click.echo(f"shown {manifest} {watch}")
-    return 5
-
-
-def test_flows_of_a_manifest_are_shown_and_a_subcommand_is_a_subcommand() -> None:
-    flows = flows_verb.WithSubcommands(show, SUBCOMMANDS)
+def test_a_subcommand_is_a_subcommand_and_everything_else_is_shown() -> None:
     run = CliRunner()
-
-    assert run.invoke(flows, ["a.yaml", "--watch"], standalone_mode=False).return_value == 5
-    assert run.invoke(flows, ["a.yaml", "--watch"]).output == "shown a.yaml True\n"
-    assert "Missing argument 'MANIFEST'" in run.invoke(flows, []).output
+    assert "Missing argument 'TARGET'" in run.invoke(flows_verb.command, []).output
+    shown = run.invoke(flows_verb.command, ["a.yaml", "--export", "nft", "--watch"])
+    assert str(shown.exception) == "cannot use --export with --watch; export once"
     for verb in ("apply", "diff", "remove"):
-        assert "MANIFEST" in run.invoke(flows, [verb, "-h"]).output or "--help" in (
-            run.invoke(flows, [verb, "--help"]).output
-        )
-    listed = run.invoke(flows, ["--help"]).output
+        assert "MANIFEST" in run.invoke(flows_verb.command, [verb, "--help"]).output
+    listed = run.invoke(flows_verb.command, ["--help"]).output
     assert "apply" in listed
     assert "--watch" in listed
-
-
-def test_it_can_be_mounted_below_other_groups() -> None:
-    group = click.Group("lifecycle", commands=[flows_verb.WithSubcommands(show, SUBCOMMANDS)])
-
-    result = CliRunner().invoke(group, ["flows", "a.yaml"], standalone_mode=False)
-
-    assert (result.output, result.return_value) == ("shown a.yaml False\n", 5)
 
 
 def test_options_of_tc_are_read_with_their_units() -> None:
