@@ -11,14 +11,13 @@ fixed, not shared memory beside UDP. Pure.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 from lifecycle import dataclasses
 from lifecycle.manifest.model import Discovery, DiscoveryMode, FlowTransport, RunKind
 from lifecycle.network.connection_url import ConnectionUrl, Peer, parse
 from lifecycle.network.medium import DEFAULT_TCP, LOOPBACK, RMW_DEFAULT, UDP_UNICAST, Medium, udp_to
 from lifecycle.plan.connections.hosts import (
-    Contact,
     Hosts,
     PortPool,
     contacts_of,
@@ -43,15 +42,19 @@ class Control:
     Attributes:
         transport: of own participants; ANY leaves it to the RMW.
         server: the discovery server, if there is one.
-        observers: how each host's observer is connected so far, (host, connections).
-        observer_ports: given out to each host's observer where it needs them: metatraffic, user
+        observers: by host, how its observer is connected so far.
+        observer_ports: by host, given out to its observer where it needs them: metatraffic, user
             data and source port of UDP, and a listening port of TCP.
     """
 
     transport: FlowTransport
     server: PlannedServer | None = None
-    observers: tuple[tuple[str, ParticipantConnections], ...] = ()
-    observer_ports: tuple[tuple[str, tuple[int, ...]], ...] = ()
+    observers: Mapping[str, ParticipantConnections]
+    observer_ports: Mapping[str, tuple[int, ...]]
+
+
+_Slot = tuple[str, str, str]
+"""A participant: what it is of ("observer", "process", "extra"), whose, and its own name."""
 
 
 def control_transport(discovery: Discovery, hosts: Hosts) -> FlowTransport:
@@ -94,23 +97,66 @@ def connect_control(
         PlanError: a host has no address, or too few ports.
     """
     transport = control_transport(discovery, hosts)
-    extra = discovery.mode is not DiscoveryMode.STATIC_ENDPOINTS
     server = None
     if discovery.mode is DiscoveryMode.SERVER:
-        server = _server(
-            discovery, hosts, pool, tcp=bool(transport.medium and transport.medium.is_tcp)
-        )
-    ports = tuple((host, pool.take(host, 4)) for host in hosts.used)
-    control = Control(transport=transport, server=server, observer_ports=ports)
+        tcp = transport.medium is not None and transport.medium.is_tcp
+        server = _server(discovery, hosts, pool, tcp=tcp)
+    ports = {host: pool.take(host, 4) for host in hosts.used}
     if transport is FlowTransport.ANY:
+        nobody = dict.fromkeys(hosts.used, ParticipantConnections())
+        control = Control(
+            transport=transport, server=server, observers=nobody, observer_ports=ports
+        )
         return tuple(nodes), control
     (kind,) = transport.media
-    if discovery.mode is DiscoveryMode.DYNAMIC or not kind.is_network:
-        same = ParticipantConnections(urls=(str(ConnectionUrl(transport=kind)),))
-        connected = _connected(nodes, lambda _: same, lambda *_: same if extra else None)
-        observers = tuple((host, same) for host in hosts.used)
-        return connected, dataclasses.replace(control, observers=observers)
-    return _with_ports(nodes, control, kind, hosts, pool, extra=extra)
+    planned = discovery.mode is not DiscoveryMode.DYNAMIC and kind.is_network
+    extra = discovery.mode is not DiscoveryMode.STATIC_ENDPOINTS
+    slots: dict[_Slot, tuple[str, tuple[int, ...]]] = {
+        ("observer", host, ""): (host, taken[3:] if kind.is_tcp else taken[:3])
+        for host, taken in ports.items()
+    }
+    ours = [node for node in nodes if node.run.kind is RunKind.PYTHON]
+    wanted = [(("process", node.process, ""), node.machine) for node in ours]
+    wanted += [
+        (("extra", node.key, each.name), node.machine)
+        for node in ours
+        for each in node.participants
+        if extra and not each.connections.urls
+    ]
+    for slot, machine in wanted:
+        if slot not in slots:
+            host = hosts.host(machine)
+            slots[slot] = (host, pool.take(host, kind.ports) if planned else ())
+    urls = dict.fromkeys(slots, str(ConnectionUrl(transport=kind)))
+    if planned:
+        urls = _urls(slots, kind, server, hosts)
+
+    def connected(slot: _Slot) -> ParticipantConnections:
+        told = server is not None and slot[0] == "observer"
+        return ParticipantConnections(urls=(urls[slot],), super_client=told)
+
+    def participant(node: PlannedNode, each: PlannedParticipant) -> PlannedParticipant:
+        slot = ("extra", node.key, each.name)
+        if slot not in slots:
+            return each
+        return dataclasses.replace(each, transports=(), connections=connected(slot))
+
+    return tuple(
+        dataclasses.replace(
+            node,
+            transports=(),  # the URLs say so
+            connections=connected(("process", node.process, "")),
+            participants=tuple(participant(node, each) for each in node.participants),
+        )
+        if node.run.kind is RunKind.PYTHON
+        else node
+        for node in nodes
+    ), Control(
+        transport=transport,
+        server=server,
+        observers={host: connected(("observer", host, "")) for host in hosts.used},
+        observer_ports=ports,
+    )
 
 
 def _server(discovery: Discovery, hosts: Hosts, pool: PortPool, *, tcp: bool) -> PlannedServer:
@@ -125,84 +171,12 @@ def _server(discovery: Discovery, hosts: Hosts, pool: PortPool, *, tcp: bool) ->
     )
 
 
-def _connected(
-    nodes: Sequence[PlannedNode],
-    own: Callable[[PlannedNode], ParticipantConnections],
-    extra: Callable[[PlannedNode, PlannedParticipant], ParticipantConnections | None],
-) -> tuple[PlannedNode, ...]:
-    """Connect own participants of our nodes, and extra ones that something is given for.
-
-    What is connected no longer has transports of its own.
-    """
-
-    def participant(node: PlannedNode, each: PlannedParticipant) -> PlannedParticipant:
-        given = None if each.connections.urls else extra(node, each)
-        return (
-            each if given is None else dataclasses.replace(each, transports=(), connections=given)
-        )
-
-    return tuple(
-        dataclasses.replace(
-            node,
-            transports=(),
-            connections=own(node),
-            participants=tuple(participant(node, each) for each in node.participants),
-        )
-        if node.run.kind is RunKind.PYTHON
-        else node
-        for node in nodes
-    )
-
-
-def _with_ports(
-    nodes: Sequence[PlannedNode],
-    control: Control,
-    kind: Medium,
-    hosts: Hosts,
-    pool: PortPool,
-    *,
-    extra: bool,
-) -> tuple[tuple[PlannedNode, ...], Control]:
-    """Give each participant its own ports, and all the others as peers or the server."""
-    count = kind.ports
-    slots: dict[tuple[str, str, str], tuple[str, tuple[int, ...]]] = {}
-    for host, ports in control.observer_ports:
-        slots["observer", host, ""] = (host, ports[3:] if kind.is_tcp else ports[:3])
-    ours = [node for node in nodes if node.run.kind is RunKind.PYTHON]
-    for node in ours:
-        key = ("process", node.process, "")
-        host = hosts.host(node.machine)
-        if key not in slots:
-            slots[key] = (host, pool.take(host, count))
-    for node in ours:
-        for each in node.participants:
-            if extra and not each.connections.urls:
-                host = hosts.host(node.machine)
-                slots["extra", node.key, each.name] = (host, pool.take(host, count))
-    urls = _urls(slots, kind, control.server, hosts)
-
-    def connected(key: tuple[str, str, str]) -> ParticipantConnections:
-        return ParticipantConnections(
-            urls=(urls[key],), super_client=control.server is not None and key[0] == "observer"
-        )
-
-    def of_extra(node: PlannedNode, each: PlannedParticipant) -> ParticipantConnections | None:
-        key = ("extra", node.key, each.name)
-        return connected(key) if key in slots else None
-
-    connected_nodes = _connected(
-        nodes, lambda node: connected(("process", node.process, "")), of_extra
-    )
-    observers = tuple((host, connected(("observer", host, ""))) for host in hosts.used)
-    return connected_nodes, dataclasses.replace(control, observers=observers)
-
-
 def _urls(
-    slots: dict[tuple[str, str, str], tuple[str, tuple[int, ...]]],
+    slots: Mapping[_Slot, tuple[str, tuple[int, ...]]],
     kind: Medium,
     server: PlannedServer | None,
     hosts: Hosts,
-) -> dict[tuple[str, str, str], str]:
+) -> dict[_Slot, str]:
     """Spell each participant's URL."""
     v6 = kind.ip_version == 6
     alone = {
@@ -215,12 +189,10 @@ def _urls(
             key: str(dataclasses.replace(url, server=at, multicast=True))
             for key, url in alone.items()
         }
-    contacts: dict[tuple[str, str, str], Contact] = {
-        key: contacts_of(slots[key][0], (str(url),))[0] for key, url in alone.items()
-    }
+    contacts = {key: contacts_of(slots[key][0], (str(url),))[0] for key, url in alone.items()}
     order = {key: index for index, key in enumerate(alone)}
 
-    def looks_for(key: tuple[str, str, str], other: tuple[str, str, str]) -> bool:
+    def looks_for(key: _Slot, other: _Slot) -> bool:
         # Two ends that dial each other refuse both connections (Fast DDS 2.14). Observers are
         # first, so that they are there when dialled.
         return order[other] < order[key] if kind.is_tcp else other != key
@@ -238,15 +210,12 @@ def _urls(
     }
 
 
-def with_tcp(control: Control, hosts: Hosts) -> tuple[tuple[str, ParticipantConnections], ...]:
-    """Return the observers as they are if they must also be found by TCP."""
-    return tuple(
-        (
-            host,
-            dataclasses.replace(base, urls=tuple(map(str, _with_tcp(base, control, host, hosts)))),
-        )
-        for host, base in _bases(control, hosts).items()
-    )
+def with_tcp(control: Control, hosts: Hosts) -> dict[str, ParticipantConnections]:
+    """Return the observers as they are if they must also be found by TCP, by host."""
+    return {
+        host: dataclasses.replace(each, urls=tuple(map(str, _with_tcp(each, control, host, hosts))))
+        for host, each in control.observers.items()
+    }
 
 
 def connect_observers(
@@ -256,7 +225,7 @@ def connect_observers(
     *,
     fixed: bool,
     may_use_tcp: bool = False,
-) -> tuple[tuple[str, ParticipantConnections], ...]:
+) -> dict[str, ParticipantConnections]:
     """Return how the observer of each host is connected.
 
     Args:
@@ -267,7 +236,7 @@ def connect_observers(
         may_use_tcp: connections that are not planned may use TCP.
 
     Returns:
-        (host, connections); nothing for a host whose observer the RMW may connect.
+        By host; nothing for a host whose observer the RMW may connect.
     """
     urls = [
         (hosts.host(node.machine), parse(text))
@@ -279,56 +248,44 @@ def connect_observers(
     kinds = {url.transport.unicast for _, url in urls if url.transport.is_network}
     if may_use_tcp:
         kinds.add(DEFAULT_TCP)
+    if fixed:
+        kinds = {each for each in kinds if each.is_tcp}
     # A peer found by multicast, or that looks for the observer, need not be looked for.
     ours = {
         contact.peer
-        for host, each in with_tcp(control, hosts)
+        for host, each in with_tcp(control, hosts).items()
         for contact in contacts_of(host, each.urls)
     }
     contacts = [
         contact
         for host, url in urls
-        if not url.multicast or url.transport.is_tcp
-        if not ours & {*url.peers}
+        if (not url.multicast or url.transport.is_tcp) and not ours & {*url.peers}
         for contact in contacts_of(host, (str(url),))
     ]
-    if fixed:
-        kinds = {each for each in kinds if each.is_tcp}
-    found = (
-        (host, _observer(host, base, kinds, contacts, control, hosts))
-        for host, base in _bases(control, hosts).items()
-    )
-    return tuple((host, each) for host, each in found if each.urls)
 
+    def connected(host: str, base: ParticipantConnections) -> ParticipantConnections:
+        if control.server is not None:
+            return base  # the server announces everything to it
+        known = {contact.peer for contact in contacts_of(host, base.urls)}
+        wanted = [each for each in contacts if each.peer not in known]
+        found = _base_urls(base)
+        needed = kinds - {url.transport.unicast for url in found if url.transport.is_network}
+        if any(each.is_tcp for each in needed):
+            found = _with_tcp(base, control, host, hosts)
+        found += [ConnectionUrl(transport=kind) for kind in UDP_UNICAST if kind in needed]
+        new = [{*peers_by(url.transport, wanted, host=host)} - {*url.peers} for url in found]
+        if not needed and not any(new):
+            return base
+        return dataclasses.replace(
+            base,
+            urls=tuple(
+                str(dataclasses.replace(url, peers=(*url.peers, *sorted(peers))))
+                for url, peers in zip(found, new, strict=True)
+            ),
+        )
 
-def _bases(control: Control, hosts: Hosts) -> Mapping[str, ParticipantConnections]:
-    known = dict(control.observers)
-    return {host: known.get(host, ParticipantConnections()) for host in hosts.used}
-
-
-def _observer(  # noqa: PLR0917 - all are needed, and it is called once
-    host: str,
-    base: ParticipantConnections,
-    kinds: set[Medium],
-    contacts: Sequence[Contact],
-    control: Control,
-    hosts: Hosts,
-) -> ParticipantConnections:
-    if control.server is not None:
-        return base  # the server announces everything to it
-    own = {contact.peer for contact in contacts_of(host, base.urls)}
-    wanted = [each for each in contacts if each.peer not in own]
-    urls = _base_urls(base)
-    has = {url.transport.unicast for url in urls if url.transport.is_network}
-    needed = kinds - has
-    if not needed and not any(_peers(url, wanted, host) for url in urls):
-        return base
-    if any(each.is_tcp for each in needed):
-        urls = _with_tcp(base, control, host, hosts)
-    for kind in UDP_UNICAST:
-        if kind in needed:
-            urls.append(ConnectionUrl(transport=kind))
-    return dataclasses.replace(base, urls=tuple(str(_meeting(url, wanted, host)) for url in urls))
+    observers = {host: connected(host, base) for host, base in control.observers.items()}
+    return {host: each for host, each in observers.items() if each.urls}
 
 
 def _base_urls(base: ParticipantConnections) -> list[ConnectionUrl]:
@@ -344,24 +301,10 @@ def _with_tcp(
     urls = _base_urls(base)
     if control.transport.medium and control.transport.medium.is_tcp:
         return urls
-    port = dict(control.observer_ports)[host][3]
     # TCP is IPv4 here; where the host is declared by IPv6, only its own nodes can use it.
     address = LOOPBACK if ":" in host else hosts.address(host) if host or not hosts.several else ""
-    return [
-        *urls,
-        ConnectionUrl(transport=DEFAULT_TCP, address=address, port=port),
-    ]
-
-
-def _peers(url: ConnectionUrl, contacts: Sequence[Contact], host: str) -> tuple[Contact, ...]:
-    known = set(peers_by(url.transport, contacts, host=host)) - {*url.peers}
-    return tuple(each for each in contacts if each.peer in known)
-
-
-def _meeting(url: ConnectionUrl, contacts: Sequence[Contact], host: str) -> ConnectionUrl:
-    """Return a URL that also looks for these."""
-    new = {each.peer for each in _peers(url, contacts, host)}
-    return dataclasses.replace(url, peers=(*url.peers, *sorted(new)))
+    port = control.observer_ports[host][3]
+    return [*urls, ConnectionUrl(transport=DEFAULT_TCP, address=address, port=port)]
 
 
 def participant_name(node_name: str, connection: str) -> str:

@@ -314,11 +314,11 @@ def variables_of(discovery: Discovery, server: PlannedServer | None) -> tuple[tu
 
 
 def _by_machine(
-    observers: Sequence[tuple[str, ParticipantConnections]], hosts: Hosts
+    observers: Mapping[str, ParticipantConnections], hosts: Hosts
 ) -> list[tuple[str, ParticipantConnections]]:
     """Return observers by machine; by no name where there is one host or none has a name."""
     found = []
-    for host, each in observers:
+    for host, each in observers.items():
         names = hosts.names(host)
         if not hosts.several or not names:
             found.append(("", each))

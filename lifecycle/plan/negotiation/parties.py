@@ -178,9 +178,6 @@ def _participant(
     )
 
 
-Observers = Sequence[tuple[str, ParticipantConnections]]
-
-
 def hosts_of(plan: Plan) -> Hosts:
     """Return the hosts of a plan."""
     machines = [node.machine for node in plan.nodes]
@@ -198,7 +195,7 @@ def terms_of(plan: Plan) -> Terms:
         plan.data_layer,
         plan.nodes,
         hosts,
-        observers=tuple(observers.items()),
+        observers=observers,
         server=plan.server,
         domain_id=plan.domain_id,
         max_datagram_bytes=plan.max_datagram_bytes,
@@ -211,7 +208,7 @@ def make_terms(
     nodes: Sequence[PlannedNode],
     hosts: Hosts,
     *,
-    observers: Observers,
+    observers: Mapping[str, ParticipantConnections],
     server: PlannedServer | None,
     domain_id: int,
     max_datagram_bytes: int | None,
@@ -223,13 +220,13 @@ def make_terms(
         data_layer: as declared.
         nodes: with the connections that they have whatever is negotiated.
         hosts: of the system.
-        observers: (host, how its supervisor's own participant is connected).
+        observers: by host, how its supervisor's own participant is connected.
         server: the discovery server; None without.
         domain_id: 0–232.
         max_datagram_bytes: UDP payload that the path carries unfragmented; None assumes Ethernet.
     """
     taken = written_ports(nodes, hosts, discovery, domain_id=domain_id)
-    for host, each in observers:
+    for host, each in observers.items():
         taken.setdefault(host, set()).update(ports_of(parse(text) for text in each.urls))
     if server is not None:
         taken.setdefault(hosts.host(server.machine), set()).add(server.port)
@@ -242,7 +239,7 @@ def make_terms(
         multicast_group=data_layer.multicast_group,
         max_datagram_bytes=max_datagram_bytes,
         observers=tuple(
-            contact for host, each in observers for contact in contacts_of(host, each.urls)
+            contact for host, each in observers.items() for contact in contacts_of(host, each.urls)
         ),
     )
 
