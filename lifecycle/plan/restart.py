@@ -11,13 +11,13 @@ for all of its partners that stayed: none of them can know that port.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from types import MappingProxyType
 
 from lifecycle import dataclasses
 from lifecycle.network.connection_url import ConnectionUrl, Peer, parse
 from lifecycle.plan.connections.hosts import PortPool, contacts_of
-from lifecycle.plan.model import ParticipantConnections, Plan, PlanError, PlannedNode
+from lifecycle.plan.model import ParticipantConnections, Plan, PlanError
 from lifecycle.plan.negotiation.parties import hosts_of, terms_of
 
 RESTART_PORTS_FROM = 2000
@@ -39,22 +39,19 @@ _Place = tuple[str, str]
 their process and ""; for an observer, "" and its machine."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class _Listener:
-    """One participant with a TCP port. `url` is the one of its URLs with that port."""
+_Listener = tuple[str, ConnectionUrl]
+"""A participant with a TCP port: its host, and the one of its URLs that has the port."""
 
-    host: str
-    url: ConnectionUrl
 
-    @property
-    def peer(self) -> Peer:
-        """Where it is dialled."""
-        return contacts_of(self.host, (str(self.url),))[0].peer
+def _peer(listener: _Listener) -> Peer:
+    """Return where it is dialled."""
+    host, url = listener
+    return contacts_of(host, (str(url),))[0].peer
 
-    @property
-    def moves(self) -> bool:
-        """Whether it needs another port when it returns: it is not only dialled."""
-        return bool(self.url.peers or self.url.server)
+
+def _moves(url: ConnectionUrl) -> bool:
+    """Whether a participant needs another port when it returns: it is not only dialled."""
+    return bool(url.peers or url.server)
 
 
 def restarted(
@@ -73,19 +70,40 @@ def restarted(
     """
     original, current = _listeners(first), _listeners(plan, reported)
     processes = {node.process for node in first.nodes if node.key in keys}
-    own = {place for place in original if not place[1] and place[0] in processes}
-    new = {
-        place: dataclasses.replace(each, url=_on_next_port(first, original, place, current[place]))
-        for place, each in original.items()
-        if (place in own or place[0] in keys) and each.moves
+    again = {
+        place: (host, _on_next_port(first, original, place, current[place]))
+        for place, (host, url) in original.items()
+        if (place[0] in (keys if place[1] else processes)) and _moves(url)
     }
-    reached = {**current, **new}
-    urls = {
-        place: str(dataclasses.replace(each.url, peers=_peers(place, original, reached, set(new))))
-        for place, each in new.items()
-    }
+    reached = {place: _peer(each) for place, each in {**current, **again}.items()}
+    urls = {}
+    for place, (_, url) in again.items():
+        peers = _peers(place, original, reached, again)
+        urls[place] = str(dataclasses.replace(url, peers=peers))
+
+    def moved(connections: ParticipantConnections, place: _Place) -> ParticipantConnections:
+        if place not in urls:
+            return connections
+        texts = tuple(urls[place] if _has_port(parse(each)) else each for each in connections.urls)
+        return dataclasses.replace(connections, urls=texts)
+
     return dataclasses.replace(
-        plan, nodes=tuple(_moved(node, urls) if node.key in keys else node for node in plan.nodes)
+        plan,
+        nodes=tuple(
+            dataclasses.replace(
+                node,
+                connections=moved(node.connections, (node.process, "")),
+                participants=tuple(
+                    dataclasses.replace(
+                        each, connections=moved(each.connections, (node.key, each.name))
+                    )
+                    for each in node.participants
+                ),
+            )
+            if node.key in keys
+            else node
+            for node in plan.nodes
+        ),
     )
 
 
@@ -111,9 +129,7 @@ def moved_observer(
             hint="lower 'discovery.first_port'",
         )
     urls = tuple(
-        str(dataclasses.replace(url, port=port))
-        if url.transport.is_tcp and url.port is not None
-        else str(url)
+        str(dataclasses.replace(url, port=port) if _has_port(url) else url)
         for url in map(parse, connections.urls)
     )
     return dataclasses.replace(connections, urls=urls)
@@ -121,7 +137,7 @@ def moved_observer(
 
 def moving_nodes(plan: Plan) -> frozenset[str]:
     """Return the keys of the nodes that get TCP ports of their own when they are started again."""
-    places = {place for place, each in _listeners(plan).items() if place[0] and each.moves}
+    places = {place for place, (_, url) in _listeners(plan).items() if place[0] and _moves(url)}
     return frozenset(
         node.key
         for node in plan.nodes
@@ -145,37 +161,37 @@ def is_restarted_url(planned: str, reported: str, *, first_port: int) -> bool:
         ConnectionUrlError: one of them is none.
     """
     was, now = parse(planned), parse(reported)
-    if not was.transport.is_tcp or not (was.peers or was.server):
+    if not was.transport.is_tcp or not _moves(was):
         return False
     if was.port is None or now.port is None or now.port < first_port + RESTART_PORTS_FROM:
         return False
     return dataclasses.replace(now, port=was.port, peers=was.peers) == was
 
 
+def _has_port(url: ConnectionUrl) -> bool:
+    return url.transport.is_tcp and url.port is not None
+
+
 def _listeners(plan: Plan, reported: Reported = _NOTHING) -> dict[_Place, _Listener]:
     """Return every participant with a TCP port, in plan order, observers first."""
     hosts = hosts_of(plan)
     found: dict[_Place, _Listener] = {}
+
+    def listen(place: _Place, machine: str, urls: Iterable[str]) -> None:
+        # A participant has at most one such URL.
+        found.update(
+            (place, (hosts.host(machine), url)) for url in map(parse, urls) if _has_port(url)
+        )
+
     for machine, connections in plan.observers:
-        for url in _with_port(connections.urls):
-            found["", machine] = _Listener(host=hosts.host(machine), url=url)
+        listen(("", machine), machine, connections.urls)
     for node in plan.nodes:
         said = reported.get(node.full_name, {})
-        host = hosts.host(node.machine)
-        for url in _with_port(said.get("") or node.connections.urls):
-            found[node.process, ""] = _Listener(host=host, url=url)
+        listen((node.process, ""), node.machine, said.get("") or node.connections.urls)
         for each in node.participants:
-            for url in _with_port(said.get(each.connection) or each.connections.urls):
-                found[node.key, each.name] = _Listener(host=host, url=url)
+            urls = said.get(each.connection) or each.connections.urls
+            listen((node.key, each.name), node.machine, urls)
     return found
-
-
-def _with_port(urls: Collection[str]) -> Iterator[ConnectionUrl]:
-    """Yield the URL with the TCP port; a participant has at most one."""
-    for text in urls:
-        url = parse(text)
-        if url.transport.is_tcp and url.port is not None:
-            yield url
 
 
 def _on_next_port(
@@ -186,55 +202,33 @@ def _on_next_port(
     Every participant of a host has one port of each round, whichever restarts it: supervisors that
     share a host need not ask each other.
     """
-    listeners = [each for each in original if each[0] and original[each].host == now.host]
-    taken = {host: set(ports) for host, ports in terms_of(first).taken}
+    host, url = now
+    listeners = [each for each, (other, _) in original.items() if each[0] and other == host]
+    taken = {each: set(ports) for each, ports in terms_of(first).taken}
     pool = PortPool(first.discovery.first_port + RESTART_PORTS_FROM, taken)
-    mine = listeners.index(place)
-    port = pool.take(now.host, len(listeners))[mine]
-    if now.url.port != original[place].url.port:
-        while port <= (now.url.port or 0):
-            port = pool.take(now.host, len(listeners))[mine]
-    return dataclasses.replace(now.url, port=port)
+    mine, had = listeners.index(place), url.port or 0
+    port = pool.take(host, len(listeners))[mine]
+    if had != original[place][1].port:
+        while port <= had:
+            port = pool.take(host, len(listeners))[mine]
+    return dataclasses.replace(url, port=port)
 
 
 def _peers(
     place: _Place,
     original: Mapping[_Place, _Listener],
-    reached: Mapping[_Place, _Listener],
+    reached: Mapping[_Place, Peer],
     again: Collection[_Place],
 ) -> tuple[Peer, ...]:
     """Return whom a restarted participant looks for: as planned, but for those who stay."""
-    mine = original[place]
-    if mine.url.server:
+    _, url = original[place]
+    if url.server:
         return ()
-    found = set()
-    for other, each in original.items():
-        dials = each.peer in mine.url.peers
-        is_dialled = mine.peer in each.url.peers
-        if dials or (is_dialled and other not in again):
-            found.add(reached[other].peer)
-    unknown = {*mine.url.peers} - {each.peer for each in original.values()}
-    return tuple(sorted(found | unknown))
-
-
-def _moved(node: PlannedNode, urls: Mapping[_Place, str]) -> PlannedNode:
-    """Return a node with the new URLs of its participants."""
-
-    def moved(connections: ParticipantConnections, place: _Place) -> ParticipantConnections:
-        if place not in urls:
-            return connections
-        return dataclasses.replace(
-            connections,
-            urls=tuple(
-                urls[place] if [*_with_port((text,))] else text for text in connections.urls
-            ),
-        )
-
-    return dataclasses.replace(
-        node,
-        connections=moved(node.connections, (node.process, "")),
-        participants=tuple(
-            dataclasses.replace(each, connections=moved(each.connections, (node.key, each.name)))
-            for each in node.participants
-        ),
-    )
+    mine = _peer(original[place])
+    planned = {other: _peer(each) for other, each in original.items()}
+    found = {
+        reached[other]
+        for other, (_, each) in original.items()
+        if planned[other] in url.peers or (mine in each.peers and other not in again)
+    }
+    return tuple(sorted(found | ({*url.peers} - {*planned.values()})))
