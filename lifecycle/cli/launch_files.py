@@ -37,6 +37,7 @@ class LaunchedNode:
     Attributes:
         name: empty where the node's code chooses it.
         run: as the manifest has it.
+        restart: `restart` and its like, as the manifest has them.
         parameters: (name, value), later ones win.
         container: full name of the component container that loads it; empty for a process.
         gaps: what a manifest cannot say of it, or launch does not say.
@@ -46,6 +47,7 @@ class LaunchedNode:
     namespace: str
     run: dict[str, Tree]
     managed: bool
+    restart: dict[str, Tree] = dataclasses.field(default_factory=dict)
     parameter_files: list[str] = dataclasses.field(default_factory=list)
     parameters: dict[str, ParameterValue] = dataclasses.field(default_factory=dict)
     remap: dict[str, str] = dataclasses.field(default_factory=dict)
@@ -229,17 +231,32 @@ class _Walk:
         )
         self._settings(node, _private(action, "parameters"), _private(action, "remappings"))
         self._ros_arguments(node, action)
-        described = getattr(action, "process_description", None)
-        for name in ("respawn", "shell", "env"):
-            value = _private(action, name) or getattr(action, name, None)
-            value = value or (getattr(described, "env", None) if name == "env" else None)
-            if value and not (isinstance(value, list) and self._text(value).lower() == "false"):
-                node.gaps.append(f"{name}: a manifest has nothing like it")
+        self._respawn(node, action)
+        if self._is_true(_private(action, "shell") or getattr(action, "shell", None)):
+            node.gaps.append("shell: a manifest has nothing like it")
+        if getattr(getattr(action, "process_description", None), "env", None):
+            node.gaps.append("env: launch gives it these variables alone, here they are added")
         if _private(action, "on_exit"):
             node.gaps.append("on_exit: what its end does to others is the supervisor's")
         self.found.nodes.append(node)
         for each in _private(action, "composable_node_descriptions") or ():
             self._component(each, node.full_name, notes)
+
+    def _respawn(self, node: LaunchedNode, action: Any) -> None:
+        if not self._is_true(_private(action, "respawn")):
+            return
+        node.restart["restart"] = "always"
+        delay_s = _private(action, "respawn_delay")
+        if isinstance(delay_s, (int, float)):
+            node.restart["restart_sec"] = delay_s
+        retries = _private(action, "respawn_max_retries")
+        if isinstance(retries, int) and retries >= 0:
+            node.gaps.append(
+                f"respawn_max_retries {retries}: `start_limit_burst` counts starts within a time"
+            )
+
+    def _is_true(self, value: Any) -> bool:
+        return value is not None and self._text(value).lower() in ("true", "1")
 
     def _run(self, action: Any) -> dict[str, Tree]:
         package, executable = (
@@ -269,7 +286,8 @@ class _Walk:
             for name, value in self._context.environment.items()
             if self._environment.get(name) != value
         }
-        for name, value in _private(description, "additional_env") or ():
+        given = [*(_private(description, "env") or ())]
+        for name, value in (*given, *(_private(description, "additional_env") or ())):
             environment[self._text(name)] = self._text(value)
         if environment:
             run["environment"] = {name: literal(each) for name, each in environment.items()}
@@ -492,6 +510,7 @@ def _tree(node: LaunchedNode, by_name: Mapping[str, str], folder: Path) -> Tree:
         tree["remap"] = {source: literal(target) for source, target in node.remap.items()}
     if node.log_level:
         tree["log_level"] = node.log_level
+    tree |= node.restart
     note = "a launch file says nothing of its interface: lifecycle capture shows it once it runs"
     tree["endpoints"] = Noted(value="open", note=f"gap: {note}")
     return Noted(value=tree, note="; ".join(f"gap: {each}" for each in gaps)) if gaps else tree

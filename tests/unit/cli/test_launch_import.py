@@ -15,6 +15,7 @@ import pytest
 
 from lifecycle.cli.launch_files import Launched, LaunchedNode, to_launched_manifest
 from lifecycle.manifest.loading import load
+from lifecycle.manifest.model import Restart
 
 
 def _is_installed(name: str) -> bool:
@@ -27,7 +28,7 @@ needs_launch = pytest.mark.skipif(not HAS_LAUNCH, reason="launch and launch_ros 
 ROBOT = """
 from launch import LaunchDescription
 from launch.actions import (DeclareLaunchArgument, ExecuteProcess, GroupAction,
-    IncludeLaunchDescription, OpaqueFunction, RegisterEventHandler, SetEnvironmentVariable,
+    IncludeLaunchDescription, LogInfo, OpaqueFunction, RegisterEventHandler, SetEnvironmentVariable,
     TimerAction)
 from launch.conditions import IfCondition, UnlessCondition
 from launch.event_handlers import OnProcessExit
@@ -41,7 +42,8 @@ HERE = Path(__file__).parent
 def generate_launch_description():
     talker = Node(
         package="demo", executable="talker", name="talker", output="screen", prefix="nice -n 5",
-        remappings=[("chatter", "words")], additional_env={"A": "b"}, respawn=True,
+        remappings=[("chatter", "words")], additional_env={"A": "b"},
+        respawn=True, respawn_delay=2.5,
         parameters=[str(HERE / "talker.yaml"), {"rate": 5.0, "a": {"b": [1, 2]}},
                     {"mode": LaunchConfiguration("mode")}])
     return LaunchDescription([
@@ -58,7 +60,9 @@ def generate_launch_description():
              ros_arguments=["--log-level", "warn"]),
         IncludeLaunchDescription(str(HERE / "part.launch.xml")),
         OpaqueFunction(function=lambda context: [Node(executable="/bin/own", name="own")]),
-        TimerAction(period=2.0, actions=[Node(package="demo", executable="late", name="late")]),
+        TimerAction(period=2.0, actions=[
+            LogInfo(msg="said to people"),
+            Node(package="demo", executable="late", name="late", env={"ONLY": "this"})]),
         RegisterEventHandler(OnProcessExit(
             target_action=talker, on_exit=[Node(package="demo", executable="x", name="after")])),
         ExecuteProcess(cmd=["touch", str(HERE / "STARTED")]),
@@ -123,15 +127,19 @@ def test_a_launch_file_is_evaluated_and_nothing_of_it_started(tmp_path: Path) ->
     assert (talker.run.package, talker.run.executable) == ("demo", "talker")
     assert talker.run.prefix == ("nice", "-n", "5")
     assert dict(talker.run.environment) == {"ROBOT": "r2", "A": "b"}
+    assert talker.supervision.restart is Restart.ALWAYS
+    assert talker.supervision.restart_sec == 2.5
+    assert dict(nodes["/late"].run.environment)["ONLY"] == "this"
     assert [node.key for node in manifest.nodes if node.managed] == ["arm"]
     assert nodes["/real"].log_level == "warn"
     assert nodes["/part/part"].run.command[1:] == ("--fast", "3")
     assert nodes["/own"].run.command == ("/bin/own",)
     assert result.stderr.splitlines() == [
+        "[INFO] [launch.user]: said to people",
         f"gap: the process 'touch {tmp_path}/STARTED' is no node: a manifest starts nodes only",
         "gap: /left/talker: launch lets talker.yaml win over parameters before it; here they win",
-        "gap: /left/talker: respawn: a manifest has nothing like it",
         "gap: /late: launch starts it 2 s later; `after:` says what it waits for",
+        "gap: /late: env: launch gives it these variables alone, here they are added",
         "gap: /after: launch starts it on an event, OnProcessExit; `after:` says what it waits for",
     ]
 
@@ -204,7 +212,7 @@ def test_what_launch_leaves_open_is_marked(tmp_path: Path) -> None:
                 namespace="/",
                 run={"command": ["/bin/talk", "$$(date)"]},
                 managed=False,
-                gaps=["respawn: a manifest has nothing like it"],
+                gaps=["shell: a manifest has nothing like it"],
             ),
             LaunchedNode(
                 name="a",
@@ -242,5 +250,5 @@ def test_what_launch_leaves_open_is_marked(tmp_path: Path) -> None:
         "  unpublished: ignore",
         "  unheard: ignore",
         "nodes:",
-        f"  talk:  # gap: {first}; gap: respawn: a manifest has nothing like it",
+        f"  talk:  # gap: {first}; gap: shell: a manifest has nothing like it",
     ]
