@@ -94,5 +94,5 @@ def test_those_that_choose_or_name_a_medium_know_it_and_all_others_ask_it() -> N
         "programming/rules/rules.py",
         "middleware/fastdds/url_profile.py",  # what Fast DDS calls it
         "plan/negotiation/media.py",  # which medium two ends get
-        "plan/negotiation/negotiate.py",
+        "plan/negotiation/connecting.py",
     }
