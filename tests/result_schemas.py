@@ -1,7 +1,7 @@
 """Write the JSON Schemas of what lifecycle prints, from its types: `make schemas`.
 
-Ranges and patterns are on the types, descriptions are those of their docstrings. `BY_HAND` says
-which schemas are not generated, and why.
+Ranges and patterns are on the types, descriptions are those of their docstrings. So is the
+schema of a manifest, in which `$(…)` may stand wherever no free text may.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import json
 import re
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import msgspec
 
@@ -21,15 +21,14 @@ from lifecycle.cli.verbs.apply import ApplyReport
 from lifecycle.cli.verbs.check import CheckReport
 from lifecycle.export.picture.model import Picture
 from lifecycle.graph.status import NodeStatus
+from lifecycle.manifest import written
+from lifecycle.network.dscp import MAX_DSCP, code_points
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.run.journal import JournalLine
 from lifecycle.verify.observation import NodeConfiguration
 from lifecycle.verify.verdict import Verdict
 
 FOLDER = Path(__file__).parents[1] / "schemas"
-BY_HAND = {
-    "manifest": "it is what users write; the types are made from it",
-}
 
 _Schema = dict[str, Any]
 _ATTRIBUTE = re.compile(r"^    (\w+(?:, \w+)*): (.*(?:\n {8}.*)*)", re.MULTILINE)
@@ -138,16 +137,28 @@ def generate(name: str) -> str:
 
 def _types(hint: Any) -> Iterator[type]:
     """Yield the structs, dataclasses and enums that a type is made of, itself among them."""
-    for each in get_args(hint):
-        yield from _types(each)
-    if isinstance(hint, type) and issubclass(hint, enum.Enum):
-        yield hint
-    elif isinstance(hint, type) and (
+    for each in _parts(hint, set()):
+        if isinstance(each, type) and (issubclass(each, enum.Enum) or _is_section(each)):
+            yield each
+
+
+def _parts(hint: Any, seen: set[Any]) -> Iterator[Any]:
+    """Yield all that a type is made of; a struct or dataclass once, before its fields."""
+    if _is_section(hint):
+        if hint in seen:
+            return
+        seen.add(hint)
+    yield hint
+    for each in get_args(hint) if get_origin(hint) is not Literal else ():
+        yield from _parts(each, seen)
+    for each in get_type_hints(hint).values() if _is_section(hint) else ():
+        yield from _parts(each, seen)
+
+
+def _is_section(hint: Any) -> bool:
+    return isinstance(hint, type) and (
         dataclasses.is_dataclass(hint) or issubclass(hint, msgspec.Struct)
-    ):
-        yield hint
-        for each in get_type_hints(hint).values():
-            yield from _types(each)
+    )
 
 
 def _described(type_: type, schema: _Schema, result: Result) -> _Schema:
@@ -179,6 +190,183 @@ def _summary(type_: type) -> str:
     return inspect.cleandoc(type_.__doc__ or "").partition("\n\n")[0]
 
 
+_SUBSTITUTION = {"$ref": "#/$defs/substitution"}
+
+
+def generate_manifest() -> str:
+    """Return the text of the schema of what users write."""
+    types = (written.Manifest, written.TREE, written.ForRules, written.EnterMode)
+    (_, tree, for_rules, _), defs = msgspec.json.schema_components(
+        types,
+        schema_hook=lambda type_: {"$ref": f"#/$defs/{type_.__name__}"},
+        ref_template="#/$defs/{name}",
+    )
+    found = {each.__name__: each for type_ in types for each in _types(type_)}
+    words = {
+        each: [each.value for each in type_] for each, type_ in found.items() if _is_enum(type_)
+    }
+    for name, type_ in found.items():
+        if name not in words:
+            defs[name] = _section(type_, defs[name])
+    reaction = {"enum": list(get_args(written.Reaction))}
+    for_rules["not"] = {"required": ["mode"]}
+    names = [name for each in code_points() for name in (each.name, *each.aliases)]
+    special = {
+        written.ParameterTree: tree["anyOf"],
+        written.OnViolation: [reaction, for_rules, {"$ref": "#/$defs/EnterMode"}],
+        written.Dscp: [{"enum": names}, {"type": "integer", "minimum": 0, "maximum": MAX_DSCP}],
+    }
+    for type_, branches in special.items():
+        defs[type_.__name__] = {"description": _about(type_), "anyOf": branches}
+    parts = [part for each in types for part in _parts(each, set())]
+    order = {
+        frozenset(get_args(each)): get_args(each) for each in parts if get_origin(each) is Literal
+    }
+    opening = _Opening(words=words, order=order)
+    whole = {name: opening.section(each) for name, each in defs.items() if name not in words}
+    schema: _Schema = {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "$id": "urn:ros-lifecycle-manifests:manifest:v1",
+        **whole.pop("Manifest"),
+        "title": "Manifest of a ROS 2 system, version 1",
+        "$defs": {**dict(sorted(whole.items())), "substitution": _A_SUBSTITUTION},
+    }
+    return json.dumps(schema, indent=2, ensure_ascii=False) + "\n"
+
+
+def _is_enum(type_: type) -> bool:
+    return issubclass(type_, enum.Enum)
+
+
+_A_SUBSTITUTION = {
+    "title": "Substitution",
+    "description": "$(arg NAME), $(env NAME [DEFAULT]), $(find-pkg-share PACKAGE), $(file PATH), "
+    "$(command PROGRAM …), $(equals A B), $(not-equals A B), $(not A), $(and A B) or $(or A B), "
+    "also inside other text and each other. Resolved before values are checked.",
+    "type": "string",
+    "pattern": r"\$\(",
+}
+
+
+def _about(type_: type) -> str:
+    """Return all that a type's docstring says before its attributes."""
+    text = inspect.cleandoc(type_.__doc__ or "").partition("\n\nAttributes:")[0]
+    return " ".join(text.split())
+
+
+def _section(type_: type, schema: _Schema) -> _Schema:
+    """Return the schema of a mapping with the texts of its type and its rules across keys."""
+    words: dict[str, str] = {}
+    order: list[str] = []
+    for base in type_.__mro__:
+        if not (issubclass(base, msgspec.Struct) and base is not msgspec.Struct):
+            continue
+        for names, text in _ATTRIBUTE.findall(inspect.cleandoc(base.__doc__ or "")):
+            for name in names.split(", "):
+                words.setdefault(name, " ".join(text.split()))
+        own = {each.name: each.encode_name for each in msgspec.structs.fields(base)}
+        order += [own[name] for name in vars(base).get("__annotations__", {}) if name in own]
+    properties = {}
+    for name in dict.fromkeys(order):
+        each = {"title": name.replace("_", " ").capitalize(), "description": words.get(name)}
+        each |= schema["properties"][name]
+        properties[name] = {key: value for key, value in each.items() if value is not None}
+    ways = {"oneOf": getattr(type_, "ONE_OF", ()), "anyOf": getattr(type_, "ANY_OF", ())}
+    return {
+        "title": schema["title"],
+        "description": _about(type_),
+        "type": "object",
+        "properties": properties,
+        "additionalProperties": False,
+        **({"required": schema["required"]} if schema["required"] else {}),
+        **{key: [{"required": list(way)} for way in each] for key, each in ways.items() if each},
+    }
+
+
+_NOTES = ("title", "description", "default", "examples")
+_MERGED = ("string", "integer", "number", "boolean")
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class _Opening:
+    """Makes of a type's schema what editors need: `$(…)` where no free text may be, and no null.
+
+    Attributes:
+        words: of each enum, by its name.
+        order: of the words of each `Literal`.
+    """
+
+    words: Mapping[str, list[str]]
+    order: Mapping[frozenset[Any], tuple[Any, ...]]
+
+    def section(self, schema: _Schema) -> _Schema:
+        """Return the schema of a mapping with known keys; of anything else, as `value` does."""
+        if "properties" not in schema:
+            return self.value(schema)
+        properties = {key: self.value(each) for key, each in schema["properties"].items()}
+        return {**schema, "properties": properties}
+
+    def value(self, schema: _Schema) -> _Schema:
+        """Return the schema of one value."""
+        notes = {key: schema[key] for key in _NOTES if key in schema}
+        if notes.get("default") in (None, "", (), []) or isinstance(notes["default"], dict):
+            notes.pop("default", None)
+        rest = {key: each for key, each in schema.items() if key not in _NOTES}
+        written = rest.get("anyOf", [rest])
+        branches = [self._branch(each) for each in written if each != {"type": "null"}]
+        branches = _merged(branches)
+        if any(_is_closed(each) for each in branches) and not any(map(_is_text, branches)):
+            branches.append(_SUBSTITUTION)
+        return notes | (branches[0] if len(branches) == 1 else {"anyOf": branches})
+
+    def _branch(self, schema: _Schema) -> _Schema:
+        schema = dict(schema)
+        name = str(schema.get("$ref", "")).rpartition("/")[2]
+        if name in self.words:
+            schema.setdefault("enum", self.words[name])
+            del schema["$ref"]
+        for key in ("items", "additionalProperties"):
+            if isinstance(schema.get(key), dict):
+                schema[key] = self.value(schema[key])
+        if "enum" in schema:
+            words = self.order.get(frozenset(schema["enum"]), schema["enum"])
+            schema["enum"] = list(words)
+            if all(isinstance(each, str) for each in words):
+                schema = {"type": "string", **schema}
+            if len(words) == 1 and not isinstance(words[0], str):
+                schema["const"] = schema.pop("enum")[0]
+        for each in (schema, schema.get("propertyNames", {})):
+            if "pattern" in each:  # \Z is Python's, and $ ECMA 262's
+                each["pattern"] = each["pattern"].replace(r"\Z", "$")
+        return schema
+
+
+def _merged(branches: list[_Schema]) -> list[_Schema]:
+    """Return a choice in which the types of scalars are one branch."""
+    types = [each["type"] for each in branches if each.keys() == {"type"}]
+    scalars = [each for each in _MERGED if each in types]
+    if len(scalars) < 2:
+        return branches
+    rest = [each for each in branches if each.keys() != {"type"} or each["type"] not in scalars]
+    return [{"type": scalars}, *rest]
+
+
+def _is_closed(branch: _Schema) -> bool:
+    """Whether it is a scalar that text cannot be, whatever the text is."""
+    kinds = {"enum", "const", "pattern"} & branch.keys()
+    return bool(kinds) or branch.get("type") in ("integer", "number", "boolean")
+
+
+def _is_text(branch: _Schema) -> bool:
+    types = branch.get("type", ())
+    return (types == "string" or "string" in types) and not _is_closed(branch)
+
+
+def texts() -> dict[str, str]:
+    """Return the text of each schema by its name."""
+    return {name: generate(name) for name in RESULTS} | {"manifest": generate_manifest()}
+
+
 if __name__ == "__main__":
-    for each in RESULTS:
-        (FOLDER / f"{each}.v1.schema.json").write_text(generate(each), encoding="utf-8")
+    for name, text in texts().items():
+        (FOLDER / f"{name}.v1.schema.json").write_text(text, encoding="utf-8")

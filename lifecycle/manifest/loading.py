@@ -15,6 +15,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 
+import msgspec
+
 from lifecycle import dataclasses
 from lifecycle.manifest.building import (
     build_data_layer,
@@ -558,8 +560,10 @@ class _Loading:
         outer = self._outermost
         for key in ("discovery", "network", "data_layer", "policy", "on_violation", "modes"):
             mine, holds = getattr(manifest, key), getattr(outer, key)
-            if key not in ("policy", "on_violation", "modes"):
+            if key == "network":
                 mine = dataclasses.replace(mine, at=holds.at)
+            elif key in ("discovery", "data_layer"):
+                mine = msgspec.structs.replace(mine, at=holds.at)
             if key in root and mine != holds:
                 message = f"cannot use the {key} of an included manifest; the including one's holds"
                 at = root.document.key_at((key,))
@@ -572,7 +576,7 @@ def _misspelt(document: Document, place: Place) -> list[Diagnostic]:
     if value is None:
         return []
     part = Document(file=document.file, root=value, place=place)
-    kind = str(place[-2]).removesuffix("s")
+    kind = str(place[-2]).removesuffix("s").capitalize()
     return [each for _, each in validate(part, definition=kind, is_resolved=False)]
 
 

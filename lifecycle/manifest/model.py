@@ -10,8 +10,11 @@ import bisect
 import enum
 from typing import Annotated
 
+import msgspec
+from msgspec import Meta
+
 from lifecycle import dataclasses
-from lifecycle.codec import DomainId, Positive, says
+from lifecycle.codec import Positive, says
 from lifecycle.manifest.diagnostics import Diagnostic, Position, Severity
 from lifecycle.manifest.qos import POLICIES, QosProfile
 from lifecycle.network.connection_url import ConnectionUrl
@@ -194,25 +197,31 @@ class FlowIdentification(enum.Enum):
     DSCP = "dscp"  # a DSCP of their own as the sixth element of the tuple; at most 64
 
 
+Text = Annotated[str, Meta(min_length=1)]
+Seconds = Annotated[float, Meta(gt=0, le=86400)]
+SecondsOrNone = Annotated[float, Meta(ge=0, le=86400)]
+
 ParameterValue = bool | int | float | str | tuple[bool | int | float | str, ...]
 """A ROS parameter value; arrays are tuples of one scalar type."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Limits:
-    """Resource limits of a process, after LimitAS= and the like of systemd.exec(5); None: as ours.
+class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Limits of a process by setrlimit(2), after LimitAS= and the like of systemd.exec(5).
+
+    What is left out is as for the supervisor.
 
     Attributes:
-        as_mib: address space, MiB (RLIMIT_AS).
-        cpu_sec: processor time, seconds; the process is ended by SIGXCPU then (RLIMIT_CPU).
-        nofile: open files (RLIMIT_NOFILE).
-        nproc: processes and threads of its user, all together (RLIMIT_NPROC).
+        as_mib: Address space of the process in MiB, as LimitAS=.
+        cpu_sec: Processor time in seconds, as LimitCPU=; SIGXCPU ends the process then.
+        nofile: Open files of the process, as LimitNOFILE=.
+        nproc: Processes and threads of its user, all together, as LimitNPROC=; the kernel does not
+            apply it to root.
     """
 
-    as_mib: Positive | None = None
-    cpu_sec: Positive | None = None
-    nofile: Positive | None = None
-    nproc: Positive | None = None
+    as_mib: Annotated[int, Meta(ge=1, le=2**24)] | None = None
+    cpu_sec: Annotated[int, Meta(ge=1, le=31_536_000)] | None = None
+    nofile: Annotated[int, Meta(ge=1, le=2**20)] | None = None
+    nproc: Annotated[int, Meta(ge=1, le=2**22)] | None = None
 
     def resources(self) -> tuple[tuple[str, int], ...]:
         """Return name and value for setrlimit(2) of those that are set."""
@@ -225,28 +234,27 @@ class Limits:
         return tuple((name, value) for name, value in found if value is not None)
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Resources:
+class ResourceLimits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What a process and all that it starts may use together, as systemd.resource-control(5).
 
     None sets no limit. systemd sets them, for a scope of the process.
 
     Attributes:
-        at: of the key `resources`.
-        memory_max_mib: MiB, beyond which the kernel kills (MemoryMax=).
-        memory_high_mib: MiB, beyond which it is slowed down and memory reclaimed (MemoryHigh=).
-        cpu_quota_percent: of one CPU, 250 is two and a half (CPUQuota=).
-        cpu_weight: 1–10000, its share among siblings that want more than there is; 100 is the
-            kernel's default (CPUWeight=).
-        tasks_max: processes and threads (TasksMax=).
+        memory_max_mib: Memory in MiB beyond which the kernel kills, as MemoryMax=.
+        memory_high_mib: Memory in MiB beyond which the kernel slows down and reclaims, as
+            MemoryHigh=.
+        cpu_quota_percent: Processor time in percent of one CPU, as CPUQuota=; 250 is two CPUs and a
+            half.
+        cpu_weight: Share of the processors among siblings that want more than there is, as
+            CPUWeight=; 100 without it.
+        tasks_max: Processes and threads, as TasksMax=.
     """
 
-    at: Position = dataclasses.field(compare=False)
-    memory_max_mib: Positive | None = None
-    memory_high_mib: Positive | None = None
-    cpu_quota_percent: Positive | None = None
-    cpu_weight: Positive | None = None
-    tasks_max: Positive | None = None
+    memory_max_mib: Annotated[int, Meta(ge=1, le=2**24)] | None = None
+    memory_high_mib: Annotated[int, Meta(ge=1, le=2**24)] | None = None
+    cpu_quota_percent: Annotated[int, Meta(ge=1, le=102_400)] | None = None
+    cpu_weight: Annotated[int, Meta(ge=1, le=10_000)] | None = None
+    tasks_max: Annotated[int, Meta(ge=1, le=2**22)] | None = None
 
     def properties(self) -> tuple[str, ...]:
         """Return the limits as systemd.resource-control(5) spells them, `MemoryMax=64M`."""
@@ -258,6 +266,18 @@ class Resources:
             ("TasksMax", self.tasks_max, ""),
         )
         return tuple(f"{name}={value}{unit}" for name, value, unit in found if value is not None)
+
+
+class Resources(ResourceLimits, frozen=True, kw_only=True):
+    """What a process may use, and where that is written, which is no difference."""
+
+    at: Position
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Resources) and self.properties() == other.properties()
+
+    def __hash__(self) -> int:
+        return hash(self.properties())
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -314,23 +334,29 @@ class After:
     at: Position
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Timeouts:
-    """Deadlines in seconds, > 0, of each step of one node.
+class Timeouts(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Deadline of each step of a node, in seconds.
 
     Attributes:
-        silent_s: the node is silent once one of its callbacks has run for so long; transitions
-            have deadlines of their own. Nodes of one process share the longest.
+        start_s: Seconds from starting the process until the node answers.
+        configure_s: Seconds for configure.
+        connect_s: Seconds for connect.
+        activate_s: Seconds for activate.
+        deactivate_s: Seconds for deactivate.
+        cleanup_s: Seconds for cleanup.
+        shutdown_s: Seconds for shutdown.
+        silent_s: Seconds that a callback other than a transition's may take before the node counts
+            as silent; nodes of one process share the longest.
     """
 
-    start_s: float = 10.0
-    configure_s: float = 10.0
-    connect_s: float = 10.0
-    activate_s: float = 10.0
-    deactivate_s: float = 5.0
-    cleanup_s: float = 5.0
-    shutdown_s: float = 5.0
-    silent_s: float = 0.8
+    start_s: Seconds = 10.0
+    configure_s: Seconds = 10.0
+    connect_s: Seconds = 10.0
+    activate_s: Seconds = 10.0
+    deactivate_s: Seconds = 5.0
+    cleanup_s: Seconds = 5.0
+    shutdown_s: Seconds = 5.0
+    silent_s: Seconds = 0.8
 
 
 class Restart(enum.Enum):
@@ -349,38 +375,41 @@ class OnFailure(enum.Enum):
     ALL = "all"
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Supervision:
+class Supervision(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What is done when the process of a node fails; as systemd spells it.
 
-    All nodes of one process have the same. Seconds.
+    All nodes of one process have the same.
 
     Attributes:
-        restart: ON_FAILURE: it ended with another status than 0 or by a signal, a step on one of
-            its nodes failed, or its watchdog ended it; ALWAYS: also with exit status 0.
-        restart_sec: from the failure to the next start, >= 0.
-        restart_steps: failures in a row until the delay is `restart_max_delay_sec`; 0: it does not
-            grow.
-        restart_max_delay_sec: None if the delay does not grow.
-        start_limit_burst: so many starts within the interval, and no more, >= 1.
-        start_limit_interval_sec: 0 for no limit; after running for so long the delay is again
-            `restart_sec`.
-        on_failure: who goes down, and comes again, with it.
-        watchdog_sec: a process that is stopped by a signal or hangs in a callback for so long is
-            ended with SIGKILL, which is a failure; 0 for never.
+        restart: When the process of a node is started again that ended unasked: 'on-failure' for
+            any end but exit status 0, for a step that failed and for the watchdog, 'always' also
+            for exit status 0.
+        restart_sec: Seconds from a failure to the next start.
+        restart_steps: Failures in a row over which the delay grows from 'restart_sec' to
+            'restart_max_delay_sec'.
+        restart_max_delay_sec: Longest delay in seconds, reached after 'restart_steps' failures in a
+            row.
+        start_limit_burst: Starts within 'start_limit_interval_sec', after which supervision gives
+            up.
+        start_limit_interval_sec: Seconds in which starts are counted, 0 for no limit; a process
+            that ran for so long begins anew with 'restart_sec'.
+        on_failure: What is restarted together with a process that failed: nothing else, those that
+            have it in 'after', directly or through others, or the whole system.
+        watchdog_sec: Seconds after which a process that is stopped or hangs in a callback is ended,
+            and started again; 0 for never.
     """
 
     restart: Restart = Restart.NO
-    restart_sec: float = 0.1
-    restart_steps: int = 0
-    restart_max_delay_sec: float | None = None
-    start_limit_burst: int = 5
-    start_limit_interval_sec: float = 10.0
+    restart_sec: SecondsOrNone = 0.1
+    restart_steps: Annotated[int, Meta(ge=0, le=1000)] = 0
+    restart_max_delay_sec: SecondsOrNone | None = None
+    start_limit_burst: Annotated[int, Meta(ge=1, le=1000)] = 5
+    start_limit_interval_sec: SecondsOrNone = 10.0
     on_failure: OnFailure = OnFailure.NODE
-    watchdog_sec: float = 3.0
+    watchdog_sec: SecondsOrNone = 3.0
 
 
-SUPERVISION_KEYS = tuple(each.name for each in dataclasses.fields(Supervision))
+SUPERVISION_KEYS = Supervision.__struct_fields__
 
 
 class Consequence(enum.Enum):
@@ -555,22 +584,21 @@ class ConnectionDeclaration:
     at: Position
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Health:
-    """What shows whether a node is healthy, which it must be.
+class Health(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What shows whether the node is healthy, which it then must be (rule node.unhealthy).
 
     Attributes:
-        check: its own `health` method does.
-        diagnostics: patterns of the names of its entries on /diagnostics, which do, too;
-            `*` matches any characters, `?` one.
-        interval_s: between two calls of that, > 0.
-        timeout_s: until an `async` one must have returned, > 0.
+        check: Its own method `health`, of a lifecycle.LifecycleNode.
+        diagnostics: Names of its entries on /diagnostics, patterns with '*' and '?'.
+        interval_s: Seconds between two calls of that method.
+        timeout_s: Seconds within which it must have returned where it is async; one that is not is
+            noticed by timeouts.silent_s.
     """
 
     check: bool = False
-    diagnostics: tuple[str, ...] = ()
-    interval_s: float = 1.0
-    timeout_s: float = 1.0
+    diagnostics: tuple[Text, ...] = ()
+    interval_s: Seconds = 1.0
+    timeout_s: Seconds = 1.0
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -673,46 +701,78 @@ class Machine:
     at: Position
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Discovery:
-    """How participants find each other.
+DISCOVER_BY = tuple(
+    each for each in FlowTransport if each not in (FlowTransport.NETWORK, FlowTransport.MULTICAST)
+)
+"""What participants may find each other by."""
+
+
+class DiscoveryKeys(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How DDS participants find each other.
 
     Attributes:
-        domain_id: 0–232; None takes ROS_DOMAIN_ID, else 0.
-        transport: what the nodes' own participants use, UDPV4, UDPV6, TCPV4 or SHM; ANY leaves it
-            to the middleware, or takes what the mode needs: UDPV4 for STATIC and STATIC_ENDPOINTS,
-            TCPV4 for SERVER.
-        first_port: first of the ports given out where the mode fixes them, per machine, 1024–65535.
-        server_machine: runs the discovery server; empty for the first machine.
-        settle_s: in which a supervisor sees everybody, where it can ask none, > 0; None takes what
-            Fast DDS needs.
+        domain_id: DDS domain; ROS_DOMAIN_ID, else 0, if left out.
+        mode: How participants find each other: by multicast (dynamic); at planned addresses and
+            ports, nobody else (static); likewise, and endpoints known without being told
+            (static_endpoints); by a discovery server that the supervisor starts and watches
+            (server).
+        range: ROS_AUTOMATIC_DISCOVERY_RANGE.
+        transport: What the nodes' own participants use: the middleware's default, or what the mode
+            needs, UDP or for 'server' TCP (any); shared memory alone, so that a node has no IP
+            socket until it is connected (shm); one kind of IP socket.
+        first_port: First of the ports given out on each machine, where the mode or a connection
+            fixes them.
+        server_machine: Key of the machine that runs the discovery server; the first one if left
+            out.
+        settle_s: Seconds in which a supervisor sees everybody who is there, where it can ask none:
+            3.5, or 5 with LARGE_DATA, if left out.
     """
 
-    domain_id: DomainId | None = None
+    domain_id: Annotated[int, Meta(ge=0, le=232)] | None = None
     mode: DiscoveryMode = DiscoveryMode.DYNAMIC
     range: DiscoveryRange = DiscoveryRange.SYSTEM_DEFAULT
-    transport: FlowTransport = FlowTransport.ANY
-    first_port: Annotated[int, says(minimum=1024, maximum=65535)] = 7910
+    transport: Annotated[
+        FlowTransport, Meta(extra_json_schema={"enum": [each.value for each in DISCOVER_BY]})
+    ] = FlowTransport.ANY
+    first_port: Annotated[int, Meta(ge=1024, le=65535)] = 7910
     server_machine: str = ""
-    settle_s: float | None = None
+    settle_s: Seconds | None = None
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a transport that carries data alone."""
+        if self.transport not in DISCOVER_BY:
+            raise ValueError(f"no participant is found by {self.transport.value}")
+
+
+class Discovery(DiscoveryKeys, frozen=True, kw_only=True):
+    """How participants find each other, and where that is written."""
+
     at: Position | None = None
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class DataLayer:
-    """How endpoints are mapped to connections; for the whole system.
+class DataLayerKeys(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How endpoints come onto connections; for the whole system.
 
     Attributes:
-        authority: who calls connect_to and map_to.
-        source: what the data layer graph is made from.
-        events: connections and mappings are followed by graph events, and made again when lost.
-        multicast_group: where groups are given out from, one per topic sent by multicast.
+        authority: Who calls connect_to and map_to: each node by itself, as it was told at its start
+            (nodes), or the supervisor (supervisor).
+        source: What connections are made from: this manifest (static), or the node configurations,
+            read while the system runs (dynamic).
+        events: Whether nodes tell the graph of connections made and lost, and lost ones are made
+            again.
+        multicast_group: First of the IPv4 groups given out, one to each topic that goes by
+            multicast.
     """
 
     authority: Authority = Authority.NODES
     source: DataLayerSource = DataLayerSource.STATIC
     events: bool = False
-    multicast_group: str = "239.255.1.1"
+    multicast_group: Text = "239.255.1.1"
+
+
+class DataLayer(DataLayerKeys, frozen=True, kw_only=True):
+    """How endpoints come onto connections, and where that is written."""
+
     at: Position | None = None
 
 

@@ -72,7 +72,7 @@ class _Reader:
             known = {name: value for name, value in parameters.items() if value is not None}
             entries["parameters"] = dataclasses.replace(each, data=known)
         inline = dataclasses.replace(document, root=dataclasses.replace(root, data=entries))
-        found = [each for _, each in validate(inline, definition="interface")]
+        found = [each for _, each in validate(inline, definition="Interface")]
         if not found:
             self.interface = build_inline(Cursor.root(inline), found)
         rules = {"manifest.duplicate-name": "nodl.duplicate"}

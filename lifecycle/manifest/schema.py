@@ -16,8 +16,11 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import msgspec
+
 from lifecycle import dataclasses
 from lifecycle.errors import did_you_mean, nearest
+from lifecycle.manifest import written
 from lifecycle.manifest.diagnostics import Diagnostic
 from lifecycle.manifest.yaml.document import Document, Place, error
 from lifecycle.manifest.yaml.yaml_parser import (
@@ -272,8 +275,7 @@ def validate(
 
     Args:
         document: what to check.
-        definition: name under `$defs` of the manifest's schema, for a part of a manifest that
-            is in a file of its own; the whole manifest if empty.
+        definition: name of a type in `written`, for a part of a manifest; the whole if empty.
         ignore: values already reported; nothing is reported about them or anything inside.
         is_resolved: its substitutions are; of one that is left out they never will be.
 
@@ -282,8 +284,11 @@ def validate(
     """
     found: list[tuple[Place, Diagnostic]] = []
     seen: set[tuple[Place, str]] = set()
+    type_ = getattr(written, definition or "Manifest")
+    if is_resolved and not ignore and _fits(document, type_):
+        return ()
     plain = document.root.plain()
-    errors = _validator(definition, is_resolved).iter_errors(plain)
+    errors = validator(definition, is_resolved).iter_errors(plain)
     broken = list(violations(errors))
     enums = {each.place for each in broken if each.keyword == "enum"}
     # The allowed values are more precise than that they are strings.
@@ -304,8 +309,21 @@ def validate(
     return tuple(found)
 
 
+_NULL = object()
+"""What stands for null where a document is read: no value of a manifest may be that."""
+
+
+def _fits(document: Document, type_: type) -> bool:
+    try:
+        written.read(document.root.plain(null=_NULL), type_)
+    except msgspec.ValidationError:
+        return False
+    return True
+
+
 @functools.cache
-def _validator(definition: str, is_resolved: bool) -> Draft202012Validator:
+def validator(definition: str, is_resolved: bool) -> Draft202012Validator:
+    """Return what asks jsonschema about a part of a manifest; the arguments are `validate`'s."""
     from jsonschema import Draft202012Validator
 
     return Draft202012Validator(_schema(definition, is_resolved))

@@ -11,6 +11,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 
+import msgspec
+
 from lifecycle import dataclasses
 from lifecycle.manifest.building import build_parameters
 from lifecycle.manifest.checks.parameters import is_implicit, read_sections, shown_path
@@ -111,7 +113,7 @@ class Shared:
         values = {key: value for key, (value, _) in given.items()}
         return dataclasses.replace(
             node,
-            supervision=dataclasses.replace(node.supervision, **values),  # type: ignore[arg-type]
+            supervision=msgspec.structs.replace(node.supervision, **values),
             shared=node.shared | given.keys(),
             positions=(*node.positions, *((key, at) for key, (_, at) in given.items())),
         )
@@ -165,7 +167,7 @@ def _own_supervision(node: Node) -> dict[str, object]:
 
 def _as_its_process(node: Node, process: Mapping[str, object]) -> Node:
     values = {**process, **_own_supervision(node)}
-    supervision = dataclasses.replace(node.supervision, **values)  # type: ignore[arg-type]
+    supervision = msgspec.structs.replace(node.supervision, **values)
     return dataclasses.replace(node, supervision=supervision) if process else node
 
 

@@ -15,6 +15,8 @@ import hashlib
 import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 
+import msgspec
+
 from lifecycle import dataclasses
 from lifecycle.errors import UsageError
 from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position
@@ -224,7 +226,7 @@ def build_plan(
     """
     variables = os.environ if environment is None else environment
     if domain_id is not None:
-        discovery = dataclasses.replace(manifest.discovery, domain_id=domain_id)
+        discovery = msgspec.structs.replace(manifest.discovery, domain_id=domain_id)
         manifest = dataclasses.replace(manifest, discovery=discovery)
     domain_id = effective_domain(manifest.discovery, variables)
     discovery_range = effective_range(manifest.discovery, variables)

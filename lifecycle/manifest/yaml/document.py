@@ -65,13 +65,13 @@ class Value:
     text: str = ""
     quoted: bool = False
 
-    def plain(self) -> Plain:
-        """Return the value without positions."""
+    def plain(self, *, null: Any = None) -> Any:
+        """Return the value without positions, as `Plain`; `null` is put for each null."""
         if isinstance(self.data, tuple):
-            return [each.plain() for each in self.data]
+            return [each.plain(null=null) for each in self.data]
         if isinstance(self.data, Mapping):
-            return {key: each.plain() for key, each in self.data.items()}
-        return self.data
+            return {key: each.plain(null=null) for key, each in self.data.items()}
+        return null if self.data is None else self.data
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import msgspec
+
 from lifecycle import dataclasses
 from lifecycle.plan.model import PlannedNode
 from lifecycle.verify.observation import HealthReport
@@ -83,7 +85,7 @@ def _judge(view: View, facts: NodeFacts) -> Iterator[Finding]:
     # is active; until then its state, or the lack of a report, says enough.
     asks = not facts.is_ours or (report is not None and report.connected)
     works = not node.holds or view.stage is Stage.ACTIVE or facts.name in view.ahead
-    asked = dataclasses.replace(
+    asked = msgspec.structs.replace(
         node.health,
         check=node.health.check and asks and not lacks,
         diagnostics=node.health.diagnostics if works else (),

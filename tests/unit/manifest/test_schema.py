@@ -2,46 +2,33 @@
 
 from __future__ import annotations
 
-import enum
+import copy
 import json
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import jsonschema
+import msgspec
 import pytest
 import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from lifecycle.manifest.model import (
-    Authority,
-    Condition,
-    DataLayerSource,
-    DiscoveryMode,
-    DiscoveryRange,
-    EndpointKind,
-    EndpointPolicy,
-    FlowTransport,
-    UniqueHow,
-)
-from lifecycle.manifest.qos import PRESETS, Durability, History, Liveliness, Reliability
-from lifecycle.manifest.schema import MANIFEST, read_schema, validate
+from lifecycle.manifest import written
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.manifest.qos import PRESETS
+from lifecycle.manifest.schema import MANIFEST, read_schema, validate, validator
 from lifecycle.manifest.yaml.source import parse
-from lifecycle.network.dscp import code_points
-from lifecycle.network.nfe import UniqueRequirement
 
 ROOT = Path(__file__).parents[3]
 SCHEMA: Any = read_schema(MANIFEST)
 DEFS = SCHEMA["$defs"]
-
-
-def _enum_of(schema: dict[str, Any]) -> list[str]:
-    """Return the words of a property, with or without the branch for substitutions."""
-    branches = [schema, *schema.get("anyOf", [])]
-    return next(branch["enum"] for branch in branches if "enum" in branch)
-
-
-def _words(type_: type[enum.Enum], *, without: str = "") -> list[str]:
-    return [each.value for each in type_ if each.value != without]
+RESOLVED = validator("", True)
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "schemas").glob("*.json")), ids=lambda p: p.name)
@@ -60,42 +47,10 @@ def test_the_package_ships_exactly_the_schemas_of_the_repository() -> None:
     assert MANIFEST in shipped
 
 
-@pytest.mark.parametrize(
-    ("schema", "words"),
-    [
-        (DEFS["qos_preset"], list(PRESETS)),
-        (DEFS["qos_profile"]["properties"]["history"], _words(History, without="UNKNOWN")),
-        (DEFS["qos_profile"]["properties"]["reliability"], _words(Reliability, without="UNKNOWN")),
-        (DEFS["qos_profile"]["properties"]["durability"], _words(Durability, without="UNKNOWN")),
-        (DEFS["qos_profile"]["properties"]["liveliness"], _words(Liveliness, without="UNKNOWN")),
-        (DEFS["unique"], _words(UniqueRequirement)),
-        (DEFS["link"]["properties"]["unique"], _words(UniqueHow)),
-        (DEFS["discovery"]["properties"]["range"], _words(DiscoveryRange)),
-        (DEFS["discovery"]["properties"]["mode"], _words(DiscoveryMode)),
-        (
-            DEFS["discovery"]["properties"]["transport"],
-            [each for each in _words(FlowTransport) if each not in {"network", "multicast"}],
-        ),
-        (DEFS["flow_transport"], _words(FlowTransport)),
-        (DEFS["data_layer"]["properties"]["authority"], _words(Authority)),
-        (DEFS["data_layer"]["properties"]["source"], _words(DataLayerSource)),
-        (DEFS["node"]["properties"]["endpoints"], _words(EndpointPolicy)),
-        (DEFS["node"]["properties"]["after"]["additionalProperties"], _words(Condition)),
-        (
-            DEFS["flows"]["properties"]["publishers"]["additionalProperties"]["properties"]["dscp"],
-            [name for each in code_points() for name in (each.name, *each.aliases)],
-        ),
-    ],
-)
-def test_the_words_of_the_schema_are_those_of_the_types(
-    schema: dict[str, Any], words: list[str]
-) -> None:
-    assert sorted(_enum_of(schema)) == sorted(words)
-
-
-def test_the_lists_of_an_interface_are_the_kinds_of_endpoint() -> None:
-    lists = list(DEFS["interface"]["properties"])
-    assert lists == [*_words(EndpointKind), "parameters"]
+def test_the_presets_and_the_lists_of_an_interface_are_those_of_the_model() -> None:
+    assert sorted(DEFS["TopicEndpoint"]["properties"]["qos"]["anyOf"][0]["enum"]) == sorted(PRESETS)
+    lists = list(DEFS["Interface"]["properties"])
+    assert lists == [*(each.value for each in EndpointKind), "parameters"]
 
 
 def _objects(schema: object, place: str = "") -> list[tuple[str, dict[str, Any]]]:
@@ -168,3 +123,68 @@ def test_more_findings_than_a_person_reads_are_summed_up() -> None:
     )
     assert len(found) == 201
     assert str(found[-1][1]) == "f:1:1: cannot list more than 200 findings; fix these first"
+
+
+def _fits(plain: object, *, strict: bool) -> bool:
+    try:
+        written.read(plain, written.Manifest, strict=strict)
+    except msgspec.ValidationError:
+        return False
+    return True
+
+
+def _places(value: object, place: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
+    yield place
+    inner = (
+        value.items()
+        if isinstance(value, dict)
+        else enumerate(value)
+        if isinstance(value, list)
+        else ()
+    )
+    for key, each in inner:
+        yield from _places(each, (*place, key))
+
+
+def _every_key() -> Any:
+    text = (ROOT / "tests/corpus/valid/every_key.lifecycle.yaml").read_text(encoding="utf-8")
+    text = text.replace("$(arg rate)", "10")
+    return yaml.safe_load(re.sub(r"\$\((equals|not) [^)]*\)", "true", text))
+
+
+EVERY_KEY = _every_key()
+VALUES = (
+    *(True, -1, 0, 1, 5.0, 1.5, 1e12, "", "x", "a/b", "x\n", "default", "$(arg x)"),
+    *([], {}, ["x"], [1], {"mode": "x"}, {"x": "x"}, {"default": "stop"}),
+)
+
+
+def test_every_key_may_be_written() -> None:
+    assert _fits(EVERY_KEY, strict=True)
+    assert RESOLVED.is_valid(EVERY_KEY)
+
+
+@settings(max_examples=400, deadline=None)
+@given(place=st.sampled_from([*_places(EVERY_KEY)][1:]), value=st.sampled_from([..., *VALUES]))
+def test_the_types_and_the_schema_take_and_refuse_the_same(
+    place: tuple[str | int, ...], value: object
+) -> None:
+    document = copy.deepcopy(EVERY_KEY)
+    around = document
+    for step in place[:-1]:
+        around = around[step]
+    if value is ...:
+        del around[place[-1]]
+    else:
+        around[place[-1]] = value
+    resolved = RESOLVED.is_valid(document)
+    assert not _fits(document, strict=True) or resolved
+    assert not resolved or _fits(document, strict=False)
+
+
+def test_a_good_manifest_is_read_without_jsonschema() -> None:
+    program = (
+        "import sys; from lifecycle.manifest import load; load('manifests/teleop.lifecycle.yaml');"
+        "sys.exit('jsonschema' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", program], cwd=ROOT, check=False).returncode == 0

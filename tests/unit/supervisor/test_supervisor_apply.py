@@ -9,6 +9,7 @@ import random
 from collections.abc import AsyncIterator
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from lifecycle.manifest.model import Condition, EndpointPolicy, Mode, Policy, Restart, Supervision
@@ -265,7 +266,7 @@ async def test_one_that_takes_too_long_is_rolled_back(tmp_path: Path) -> None:
 async def test_the_death_of_another_rolls_back_and_then_counts_as_ever(
     tmp_path: Path, stage: str, policy: Restart
 ) -> None:
-    camera = dataclasses.replace(CAMERA, supervision=dataclasses.replace(AGAIN, restart=policy))
+    camera = dataclasses.replace(CAMERA, supervision=msgspec.structs.replace(AGAIN, restart=policy))
     plan, other = plan_of(camera, VIEWER), plan_of(camera, LOUD, ARM)
     ends = policy is Restart.NO
 
@@ -327,7 +328,7 @@ async def test_a_node_of_the_manifest_before_that_does_not_come_back_ends_the_ru
 async def test_a_failing_node_is_started_at_once_by_a_manifest_that_mends_it(
     tmp_path: Path,
 ) -> None:
-    slow = dataclasses.replace(AGAIN, restart_sec=1000.0, restart_max_delay_sec=1000.0)
+    slow = msgspec.structs.replace(AGAIN, restart_sec=1000.0, restart_max_delay_sec=1000.0)
     plan = plan_of(CAMERA, dataclasses.replace(VIEWER, supervision=slow))
     mended = plan_of(CAMERA, dataclasses.replace(LOUD, supervision=slow))
     async with active(tmp_path, plan) as world:

@@ -21,7 +21,6 @@ from lifecycle.manifest.model import (
     Supervision,
 )
 from lifecycle.manifest.model import Restart as RestartWhen
-from lifecycle.manifest.schema import MANIFEST, read_schema
 from lifecycle.node.host.control import Event as HostEvent
 from lifecycle.plan.model import Plan, in_mode
 from lifecycle.supervisor.control.protocol import Reach
@@ -32,7 +31,6 @@ from lifecycle.supervisor.policy.consequences import reaction_of
 from lifecycle.supervisor.run.events import Emitter
 from lifecycle.verify.observation import HealthReport
 from lifecycle.verify.outcome import Outcome
-from lifecycle.verify.rules import RULES
 from lifecycle.verify.verdict import Finding
 from tests.builders import HERE, configuration, plan_of, planned_node
 from tests.unit.supervisor.session_world import DOWN, SessionWorld, over
@@ -58,13 +56,6 @@ def _said(pairs: Said) -> OnViolation:
 
 
 # What is asked for
-
-
-def test_the_manifest_knows_every_rule_and_family() -> None:
-    definition = read_schema(MANIFEST)["$defs"]["on_violation"]
-    names = definition["anyOf"][1]["propertyNames"]["enum"]
-    families = dict.fromkeys(each.family for each in RULES)
-    assert names == ["default", *families, *(each.id for each in RULES)]
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
+import msgspec
 import pytest
 
 from lifecycle.manifest.model import Condition, OnFailure, Restart, RunKind, Supervision
@@ -139,7 +140,7 @@ def _component(key: str, *, of: str) -> PlannedNode:
 
 # Sessions
 
-DEPENDENTS = dataclasses.replace(ON_FAILURE, on_failure=OnFailure.DEPENDENTS)
+DEPENDENTS = msgspec.structs.replace(ON_FAILURE, on_failure=OnFailure.DEPENDENTS)
 
 
 def _chain(camera: Supervision = ON_FAILURE, viewer: Supervision = ON_FAILURE) -> Plan:
@@ -211,7 +212,7 @@ async def test_a_node_that_crashed_comes_again_through_its_gate_and_the_others_a
 async def test_a_process_that_fails_again_and_again_is_given_up_loudly_with_its_history(
     tmp_path: Path,
 ) -> None:
-    how = dataclasses.replace(ON_FAILURE, restart_sec=0.5, start_limit_burst=3)
+    how = msgspec.structs.replace(ON_FAILURE, restart_sec=0.5, start_limit_burst=3)
     world = SessionWorld(_chain(how), tmp_path)
     async with world.running("[system] active"):
         world.hosts.ways["/camera configure"] = "no device"
@@ -261,7 +262,7 @@ async def test_a_node_that_dies_during_bring_up_comes_again_while_the_others_wai
 async def test_a_start_counts_towards_the_limit_also_where_another_s_failure_took_it_down(
     tmp_path: Path,
 ) -> None:
-    twice = dataclasses.replace(ON_FAILURE, start_limit_burst=2, start_limit_interval_sec=3600)
+    twice = msgspec.structs.replace(ON_FAILURE, start_limit_burst=2, start_limit_interval_sec=3600)
     world = SessionWorld(_chain(DEPENDENTS, twice), tmp_path, stop_after_s=60.0)
     async with world.running("[system] active"):
         for times in (1, 2):  # more starts than the limit, and no failure of its own
@@ -275,7 +276,7 @@ async def test_a_start_counts_towards_the_limit_also_where_another_s_failure_too
 async def test_a_start_that_was_cut_off_by_another_s_failure_counts_and_is_no_failure(
     tmp_path: Path,
 ) -> None:
-    thrice = dataclasses.replace(ON_FAILURE, start_limit_burst=3, start_limit_interval_sec=3600)
+    thrice = msgspec.structs.replace(ON_FAILURE, start_limit_burst=3, start_limit_interval_sec=3600)
     plan = plan_of(PAIR.nodes[0], planned_node("viewer", supervision=thrice))
     world = SessionWorld(plan, tmp_path, stop_after_s=60.0)
     async with world.running("[system] active"):
@@ -311,7 +312,7 @@ async def test_a_node_that_fails_to_activate_is_restarted_and_what_is_active_sta
 
 
 async def test_dependents_go_down_in_order_and_come_again_with_it(tmp_path: Path) -> None:
-    how = dataclasses.replace(ON_FAILURE, on_failure=OnFailure.DEPENDENTS)
+    how = msgspec.structs.replace(ON_FAILURE, on_failure=OnFailure.DEPENDENTS)
     world = SessionWorld(_chain(how, Supervision()), tmp_path, stop_after_s=5.0)
     async with world.running("[system] active"):
         world.kill("camera")
@@ -461,7 +462,7 @@ async def test_who_is_restarted_by_hand_in_its_backoff_takes_its_dependents_with
 ) -> None:
     """They wait for nothing else; its own gate would stay closed until their delay is over."""
 
-    how = dataclasses.replace(ON_FAILURE, on_failure=OnFailure.DEPENDENTS)
+    how = msgspec.structs.replace(ON_FAILURE, on_failure=OnFailure.DEPENDENTS)
     world = SessionWorld(_chain(how, Supervision()), tmp_path, stop_after_s=5.0)
     async with world.running("[system] active"):
         world.kill("camera")
@@ -489,7 +490,7 @@ async def test_an_order_during_a_restart_waits_for_its_step_and_not_for_its_gate
 async def test_a_clean_exit_is_started_again_after_only_by_always(
     tmp_path: Path, restart: Restart, code: int
 ) -> None:
-    how = dataclasses.replace(ON_FAILURE, restart=restart)
+    how = msgspec.structs.replace(ON_FAILURE, restart=restart)
     world = SessionWorld(_chain(how), tmp_path, stop_after_s=5.0)
     async with world.running("[system] active"):
         world.hosts.processes["camera"].end(ProcessExit(status=0))
@@ -532,7 +533,7 @@ async def test_status_says_what_failed_and_when_it_is_started_again(tmp_path: Pa
 def test_a_component_that_cannot_be_loaded_is_its_container_s_failure(
     restart: Restart, taken: bool
 ) -> None:
-    how = dataclasses.replace(ON_FAILURE, restart=restart)
+    how = msgspec.structs.replace(ON_FAILURE, restart=restart)
     helper = NodeRun(planned_node("helper", supervision=how), Emitter())
     part = NodeRun(_component("part", of="helper"), Emitter())
     process: Any = SimpleNamespace(

@@ -72,8 +72,9 @@ def test_nobody_reads_from_the_id_of_a_rule_what_the_rule_says(room: str):
 
 def test_a_manifest_may_name_every_rule_and_every_family_in_on_violation() -> None:
     schema = json.loads((PAGE.parents[1] / "schemas" / "manifest.v1.schema.json").read_text())
-    names = schema["$defs"]["on_violation"]["anyOf"][1]["propertyNames"]["enum"]
+    names = schema["$defs"]["OnViolation"]["anyOf"][1]["propertyNames"]["enum"]
     assert sorted(names) == sorted(
         {"default", *(each.family for each in RULES), *(each.id for each in RULES)}
     )
-    assert sorted(schema["$defs"]["rule_id"]["enum"]) == sorted(each.id for each in RULES)
+    trusted = schema["$defs"]["Policy"]["properties"]["trust"]["items"]["anyOf"][0]["enum"]
+    assert sorted(trusted) == sorted(each.id for each in RULES)

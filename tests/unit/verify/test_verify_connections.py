@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 
+import msgspec
 import pytest
 
 from lifecycle.manifest.model import (
@@ -129,7 +130,7 @@ def with_urls(*urls: str, first_port: int = 7910) -> Plan:
     return dataclasses.replace(
         PLAN,
         nodes=(connected(PLAN.nodes[0], *urls), PLAN.nodes[1]),
-        discovery=dataclasses.replace(PLAN.discovery, first_port=first_port),
+        discovery=msgspec.structs.replace(PLAN.discovery, first_port=first_port),
     )
 
 

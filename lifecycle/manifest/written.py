@@ -1,0 +1,928 @@
+"""A manifest as it is written: one type a section, whose fields are the keys that it may have.
+
+Owns: which keys there are, what their values may be, and what editors and messages say of them:
+`schemas/manifest.v1.schema.json` is generated from these types and the texts of their docstrings
+(`make schemas`). Sections that `model` has as they are written have their type there. Pure.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
+
+import msgspec
+from msgspec import Meta, Struct, field
+
+from lifecycle.manifest.model import (
+    TOLERATED_NODES,
+    Condition,
+    DataLayerKeys,
+    DiscoveryKeys,
+    EndpointPolicy,
+    Executor,
+    FlowIdentification,
+    FlowTransport,
+    Limits,
+    Output,
+    ResourceLimits,
+    RosArguments,
+    RosInterfaceAccess,
+    Supervision,
+    TargetState,
+    Text,
+    Timeouts,
+    UniqueHow,
+)
+from lifecycle.manifest.model import Health as NodeHealth
+from lifecycle.network.dscp import code_points, parse_dscp
+from lifecycle.network.nfe import UniqueRequirement
+
+T = TypeVar("T")
+
+
+def spelled(pattern: str, message: str) -> Meta:
+    """Return the pattern of a string, with what is said of one that does not match."""
+    return Meta(pattern=pattern, extra_json_schema={"patternErrorMessage": message})
+
+
+_WORD = "[A-Za-z_][A-Za-z0-9_]*"
+_TYPE = "[a-zA-Z][a-zA-Z0-9_]*"
+
+Name = Annotated[str, spelled(rf"^{_WORD}\Z", "use letters, digits and '_', not a digit first")]
+NodeKey = Annotated[
+    str, spelled(rf"^{_WORD}(/{_WORD})*\Z", "write a node's key, as in 'camera' or 'left/camera'")
+]
+Namespace = Annotated[
+    str, spelled(rf"^/?({_WORD}(/{_WORD})*)?\Z", "write a namespace, as in /left")
+]
+Prefix = Annotated[
+    str, spelled(rf"^{_WORD}(/{_WORD})*\Z", "use letters, digits and '_', parts joined by '/'")
+]
+Milliseconds = Annotated[float, Meta(gt=0, le=86_400_000)]
+Nanoseconds = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+UInt32 = Annotated[int, Meta(ge=0, le=2**32 - 1)]
+Octet = Annotated[int, Meta(ge=0, le=255)]
+
+Scalar = str | int | float | bool
+"""A value that is one word: where its text counts, whatever scalar it is."""
+
+Values = Scalar | tuple[Scalar, ...]
+"""The value of a ROS parameter or of an argument of a Python class."""
+
+Truth = Literal[0, 1, "true", "false", "True", "False", "0", "1"] | bool
+"""What `if:` and `unless:` may be once their substitutions are resolved."""
+
+
+class Special:
+    """A value for which msgspec has no type; `read_special` reads it."""
+
+    def __init__(self, value: Any) -> None:
+        self.value = value
+
+
+class ParameterTree(Special):
+    """Value of a ROS parameter, or a mapping of further parameters."""
+
+
+TREE = Values | Annotated[dict[str, ParameterTree], Meta(min_length=1)]
+"""What a `ParameterTree` may be."""
+
+Ways = tuple[tuple[str, ...], ...]
+"""Sets of keys; a set is written if all of its keys are."""
+
+
+def _written(section: object, ways: Ways) -> int:
+    """Return how many of these sets of keys are written."""
+    return sum(all(getattr(section, key) is not None for key in way) for way in ways)
+
+
+def _require(condition: bool) -> None:
+    if not condition:
+        raise ValueError("a section whose keys do not fit each other")
+
+
+RULE_IDS = tuple(
+    f"{family}.{name}"
+    for family, names in (
+        ("graph", "missing-node ended-node undeclared-node duplicate-node missing-endpoint"),
+        ("graph", "unseen-endpoint undeclared-publisher undeclared-subscription"),
+        ("graph", "undeclared-service-server undeclared-service-client undeclared-action-server"),
+        ("graph", "undeclared-action-client type-mismatch type-definition-differs"),
+        ("graph", "unattributed-endpoint qos-differs qos-unverifiable qos-incompatible"),
+        ("graph", "unmatched-link unmatched-flow unknown-peer unmatched-client"),
+        ("endpoint", "error"),
+        ("flow", "unreported not-unique unverifiable broken-endpoint not-measured"),
+        ("flow", "wrong-transport wrong-medium dscp-not-applied dscp-unverifiable"),
+        ("state", "wrong-state unverifiable activated-at-closed-gate"),
+        ("node", "unhealthy without-health"),
+        ("config", "missing-report incomplete-report"),
+        ("param", "missing undeclared type-differs value-differs read-only-differs unverifiable"),
+        ("param", "reached-none"),
+        ("declaration", "unproven"),
+        ("time", "no-clock several-clocks undeclared-clock silent-clock"),
+        ("connection", "missing failed differs wrong-mapping"),
+        ("run", "process-died gave-up start-failed transition-failed deadline not-programmed"),
+        ("run", "not-wired silent-node not-answering plans-differ plan-unknown"),
+    )
+    for name in names.split()
+)
+"""The rules of docs/rules.md."""
+
+RULES_AND_FAMILIES = (
+    "default",
+    *dict.fromkeys(each.partition(".")[0] for each in RULE_IDS),
+    *RULE_IDS,
+)
+"""Keys of `on_violation:`."""
+
+RuleId = Annotated[str, Meta(extra_json_schema={"enum": [*RULE_IDS]})]
+RuleOrFamily = Annotated[
+    str,
+    Meta(
+        extra_json_schema={
+            "enum": [*RULES_AND_FAMILIES],
+            "patternErrorMessage": "use 'default', a family of rules as 'flow', or the id of a"
+            " rule (docs/rules.md)",
+        }
+    ),
+]
+
+Reaction = Literal["report", "deactivate", "pause", "stop"]
+
+
+class EnterMode(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A mode that is entered.
+
+    Attributes:
+        mode: Name of the mode to enter.
+    """
+
+    mode: Annotated[str, Meta(examples=["safe"])]
+
+
+class OnViolation(Special):
+    """What is done about violations of an active system.
+
+    No more than to report it, deactivate the nodes that it is about (all where it is about none of
+    the system), enter a mode, pause the whole system, or end the run in order with exit code 4. One
+    value for all rules, or by id or family of rules; the node's counts before the system's.
+    """
+
+
+ForRules = Annotated[dict[RuleOrFamily, Reaction | EnterMode], Meta(min_length=1)]
+"""What is done by rule or family."""
+
+
+def read_special(type_: type, value: object) -> object:
+    """Return what msgspec has no types for: a type that holds itself, a choice of two mappings.
+
+    Raises:
+        msgspec.ValidationError: the value does not fit.
+        ValueError: likewise.
+    """
+    if type_ is ParameterTree:
+        return ParameterTree(msgspec.convert(value, TREE, dec_hook=read_special))
+    if type_ is Dscp:
+        names = {name for each in code_points() for name in (each.name, *each.aliases)}
+        if isinstance(value, str):
+            _require(value in names)
+            return Dscp(parse_dscp(value))
+        return Dscp(parse_dscp(msgspec.convert(value, int, strict=isinstance(value, bool))))
+    if not isinstance(value, dict):
+        return OnViolation(msgspec.convert(value, Reaction))
+    if [*value] == ["mode"]:
+        return OnViolation(msgspec.convert(value, EnterMode))
+    _require(value.keys() <= {*RULES_AND_FAMILIES})
+    return OnViolation(msgspec.convert(value, ForRules))
+
+
+def read(plain: object, type_: type[T], *, strict: bool = True) -> T:
+    """Return a part of a document as its type.
+
+    Args:
+        plain: lists, mappings and scalars, substitutions resolved.
+        type_: what the part must be.
+        strict: whether 5.0 is refused where an integer must be.
+
+    Raises:
+        msgspec.ValidationError: it does not fit. This says one thing that is wrong, and not well.
+    """
+    return msgspec.convert(plain, type_, strict=strict, dec_hook=read_special)
+
+
+class Argument(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One argument.
+
+    Attributes:
+        default: Value when none is given. Without it the argument is required.
+        description: What the argument means; shown by messages that ask for it.
+        choices: The only values allowed.
+    """
+
+    default: Scalar | None = None
+    description: str = ""
+    choices: Annotated[tuple[Scalar, ...], Meta(min_length=1)] | None = None
+
+
+class Machine(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One host.
+
+    Attributes:
+        address: IPv4 or IPv6 address; this host if left out.
+    """
+
+    address: Annotated[str, Meta(examples=["10.77.0.1", "fd00::1"])] = ""
+
+
+class PriorityMapping(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How a 'transport_priority' becomes a TOS byte, as RTI Connext Micro computes it.
+
+    Attributes:
+        mask: Bits of the priority that take part; 0xFF with the defaults of 'low' and 'high' takes
+            the priority as the TOS byte, 0 sets nothing.
+        low: TOS byte of the lowest priority.
+        high: TOS byte of the highest priority.
+    """
+
+    mask: UInt32
+    low: Octet = 0
+    high: Octet = 255
+
+
+class Network(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How flow needs become network resources.
+
+    Attributes:
+        flow_identification: How publishers that need a unique flow get one: sockets of their own
+            (participant), or a DSCP of their own as a sixth element of the tuple (dscp; at most 64,
+            and no router may read them as classes).
+        five_qi_dscp: Marks publishers that ask for a 5QI and no DSCP: a file of yours, or the name
+            of a published mapping. No mapping is normative; without this key a 5QI marks nothing.
+        max_datagram_bytes: UDP payload that the path carries without fragments; 1472 on Ethernet
+            with IPv4 if left out.
+    """
+
+    flow_identification: FlowIdentification = FlowIdentification.PARTICIPANT
+    transport_priority_mapping: PriorityMapping | None = None
+    five_qi_dscp: (
+        Annotated[Text, Meta(examples=["azure_private_5g_core", "our_network.json"])] | None
+    ) = None
+    max_datagram_bytes: Annotated[int, Meta(ge=1200, le=65500)] | None = None
+
+
+class Policy(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How strict checks and verification are.
+
+    Attributes:
+        undeclared_nodes: Whether nodes that no manifest declares may be in the graph.
+        tolerated_nodes: Names of nodes that may be there although no manifest declares them, as
+            long as they only listen: tools. `*` stands for any characters, `?` for one; a pattern
+            with a slash is compared with the full name, any other with the base name.
+        unverifiable: Whether what cannot be observed keeps the gate closed (block), or is taken on
+            trust and named when it opens (allow).
+        trust: Ids of rules (docs/rules.md) of which what cannot be verified is taken on trust: it
+            is reported, and neither closes the gate nor counts for --strict. What is violated is
+            never trusted.
+        unpublished: A subscription that no declared node publishes to.
+        unheard: A publisher that no declared node subscribes to.
+        ros_interface: What the supervisor offers in ROS once the system is active, or is held up on
+            its way there: nothing (off), /diagnostics, a status topic and a service for it
+            (read_only), or also services that pause, resume, restart and end the system (full).
+    """
+
+    undeclared_nodes: EndpointPolicy = EndpointPolicy.DECLARED
+    tolerated_nodes: tuple[Annotated[str, Meta(pattern=r"^[A-Za-z0-9_/*?]+\Z")], ...] = (
+        TOLERATED_NODES
+    )
+    unverifiable: Literal["allow", "block"] = "allow"
+    trust: Annotated[tuple[RuleId, ...], Meta(examples=[["flow.unreported"]])] = ()
+    unpublished: Literal["error", "warning", "ignore"] = "error"
+    unheard: Literal["error", "warning", "ignore"] = "warning"
+    ros_interface: RosInterfaceAccess = RosInterfaceAccess.READ_ONLY
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a rule that there is not."""
+        _require({*self.trust} <= {*RULE_IDS})
+
+
+class Mode(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One mode.
+
+    Attributes:
+        inactive: Keys of the nodes that are kept inactive in it; all others are as declared.
+        parameters: Values that parameters have in it, by key of the node; all others are as they
+            are given. Nested mappings are joined with dots.
+    """
+
+    inactive: tuple[NodeKey, ...] = ()
+    parameters: dict[NodeKey, dict[str, ParameterTree]] = field(default_factory=dict)
+
+
+class Run(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How the node comes to run; exactly one way.
+
+    Attributes:
+        python: Node class, module:Class, or a function that returns nodes, module:function.
+        arguments: Keyword arguments that the class or function of 'python' is called with.
+        executor: What runs the callbacks of the Python process; nodes that share it must agree.
+        threads: Threads of 'executor: multi'; one for each processor, at least two, if left out.
+        command: Program and its arguments; ROS arguments are appended as 'ros_args' says.
+        package: Installed package that holds 'executable'.
+        executable: Executable in lib/PACKAGE.
+        attach: Somebody else starts this node.
+        environment: Environment variables on top of the supervisor's.
+        working_directory: Folder the process starts in, relative to this manifest.
+        component: Plugin that a component container loads, package/Plugin.
+        container: Node that loads 'component': the key of a node here, or the full name of one that
+            others start.
+        extra_arguments: Extra arguments of the request that loads 'component' (LoadNode.srv), as
+            'use_intra_process_comms' of rclcpp_components.
+        ros_args: ROS arguments of a command: 'auto' appends those that 'name', 'namespace',
+            'remap', 'parameters' and 'log_level' ask for; 'none' never appends any.
+        prefix: Words before the process's command line, as gdb, nice, taskset and perf want it; as
+            one text, it is split as a shell does.
+        output: Where what the process prints goes: to the terminal, to its log file, or both.
+        no_new_privileges: Whether the process and what it starts can gain no privileges by running
+            a program, as NoNewPrivileges= of systemd.exec(5).
+        limits: Limits of what the process may use, by setrlimit(2); what is left out is as for the
+            supervisor.
+        resources: What the process and all that it starts may use together, as
+            systemd.resource-control(5); set by systemd where that runs, else unverifiable.
+    """
+
+    ONE_OF: ClassVar[Ways] = (
+        ("python",),
+        ("command",),
+        ("package", "executable"),
+        ("component", "container"),
+        ("attach",),
+    )
+
+    python: (
+        Annotated[
+            str,
+            spelled(
+                rf"^{_WORD}(\.{_WORD})*:{_WORD}\Z",
+                "write module:Class, as in examples.teleop.nodes:Camera",
+            ),
+            Meta(examples=["examples.teleop.nodes:Camera"]),
+        ]
+        | None
+    ) = None
+    arguments: (
+        dict[
+            Annotated[
+                str,
+                spelled(
+                    rf"^{_WORD}\Z", "name an argument: letters, digits and '_', not a digit first"
+                ),
+            ],
+            Values,
+        ]
+        | None
+    ) = None
+    executor: Executor = Executor.SINGLE
+    threads: Annotated[int, Meta(ge=1, le=256)] | None = None
+    command: Annotated[tuple[Scalar, ...], Meta(min_length=1)] | None = None
+    package: Text | None = None
+    executable: Text | None = None
+    attach: Annotated[bool, Meta(extra_json_schema={"const": True})] | None = None
+    environment: (
+        dict[
+            Annotated[
+                str,
+                spelled(rf"^{_WORD}\Z", "name an environment variable: letters, digits and '_'"),
+            ],
+            Scalar,
+        ]
+        | None
+    ) = None
+    working_directory: Text | None = None
+    component: (
+        Annotated[
+            str,
+            spelled(
+                rf"^[A-Za-z][A-Za-z0-9_]*/{_WORD}(::{_WORD})*\Z",
+                "write package/Plugin, as in image_tools/image_tools::Cam2Image",
+            ),
+            Meta(examples=["image_tools/image_tools::Cam2Image"]),
+        ]
+        | None
+    ) = None
+    container: Annotated[Text, Meta(examples=["container", "/robot/container"])] | None = None
+    extra_arguments: Annotated[dict[str, Values], Meta(min_length=1)] | None = None
+    ros_args: RosArguments = RosArguments.AUTO
+    prefix: (
+        Annotated[
+            Text | Annotated[tuple[Scalar, ...], Meta(min_length=1)],
+            Meta(examples=[["gdb", "-ex", "run", "--args"], "nice -n 5"]),
+        ]
+        | None
+    ) = None
+    output: Output = Output.BOTH
+    no_new_privileges: bool = False
+    limits: Limits | None = None
+    resources: ResourceLimits | None = None
+
+    def __post_init__(self) -> None:
+        """Raise ValueError unless exactly one way to start is written."""
+        _require(self.attach is not False and _written(self, self.ONE_OF) == 1)
+
+
+class TopicEndpoint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One publisher or subscription.
+
+    Attributes:
+        name: Name as the node's code uses it: relative, absolute or ~/private, before namespace and
+            remapping.
+        type: ROS type, package/msg/Type.
+        description: What it is for; for people.
+        qos: A preset by its ROS name, or a profile. Policies that are not written are defaults to
+            make the endpoint with; nothing requires them.
+    """
+
+    name: Text
+    type: Annotated[
+        str,
+        spelled(rf"^{_TYPE}/msg/{_TYPE}\Z", "write package/msg/Type, as in sensor_msgs/msg/Image"),
+        Meta(examples=["sensor_msgs/msg/Image"]),
+    ]
+    description: str = ""
+    qos: Preset | Qos | None = None
+
+
+class ServiceEndpoint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One server or client of a service.
+
+    Attributes:
+        name: Name as the node's code uses it: relative, absolute or ~/private, before namespace and
+            remapping.
+        type: ROS type, package/srv/Type.
+        description: What it is for; for people.
+        qos: A preset by its ROS name, or a profile. Policies that are not written are defaults to
+            make the endpoint with; nothing requires them.
+    """
+
+    name: Text
+    type: Annotated[
+        str,
+        spelled(rf"^{_TYPE}/srv/{_TYPE}\Z", "write package/srv/Type, as in std_srvs/srv/Trigger"),
+        Meta(examples=["std_srvs/srv/Trigger"]),
+    ]
+    description: str = ""
+    qos: Preset | Qos | None = None
+
+
+class ActionEndpoint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One server or client of an action.
+
+    Attributes:
+        name: Name as the node's code uses it: relative, absolute or ~/private, before namespace and
+            remapping.
+        type: ROS type, package/action/Type.
+        description: What it is for; for people.
+    """
+
+    name: Text
+    type: Annotated[
+        str,
+        spelled(
+            rf"^{_TYPE}/action/{_TYPE}\Z",
+            "write package/action/Type, as in example_interfaces/action/Fibonacci",
+        ),
+        Meta(examples=["example_interfaces/action/Fibonacci"]),
+    ]
+    description: str = ""
+
+
+Preset = Literal[
+    "default",
+    "sensor_data",
+    "parameters",
+    "parameter_events",
+    "services_default",
+    "system_default",
+    "best_available",
+    "rosout_default",
+    "clock",
+    "action_status_default",
+]
+"""A QoS profile by its ROS name (rmw/qos_profiles.h)."""
+
+
+class Qos(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """QoS profile in rmw's words.
+
+    What is left out is taken from 'preset', or from the default of the endpoint's kind.
+
+    Attributes:
+        preset: Preset by its ROS name (rmw/qos_profiles.h).
+        history: Which messages are kept.
+        depth: Messages kept under KEEP_LAST, at least 1.
+        reliability: Whether lost messages are sent again.
+        durability: Whether late subscriptions get earlier messages.
+        deadline_ns: Longest time between two messages, nanoseconds.
+        lifespan_ns: Age at which messages expire, nanoseconds.
+        liveliness: Who asserts that the publisher is alive.
+        liveliness_lease_duration_ns: Time without assertion after which a publisher counts as gone,
+            nanoseconds.
+    """
+
+    preset: Preset | None = None
+    history: Literal["SYSTEM_DEFAULT", "KEEP_LAST", "KEEP_ALL"] | None = None
+    depth: Annotated[int, Meta(ge=0, le=2**31 - 1)] | None = None
+    reliability: Literal["SYSTEM_DEFAULT", "RELIABLE", "BEST_EFFORT", "BEST_AVAILABLE"] | None = (
+        None
+    )
+    durability: (
+        Literal["SYSTEM_DEFAULT", "TRANSIENT_LOCAL", "VOLATILE", "BEST_AVAILABLE"] | None
+    ) = None
+    deadline_ns: Nanoseconds | None = None
+    lifespan_ns: Nanoseconds | None = None
+    liveliness: (
+        Literal["SYSTEM_DEFAULT", "AUTOMATIC", "MANUAL_BY_TOPIC", "BEST_AVAILABLE"] | None
+    ) = None
+    liveliness_lease_duration_ns: Nanoseconds | None = None
+
+
+ParameterType = Literal[
+    "bool",
+    "int",
+    "double",
+    "string",
+    "bool_array",
+    "int_array",
+    "double_array",
+    "string_array",
+    "byte_array",
+]
+
+
+class Parameter(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One parameter declaration.
+
+    Attributes:
+        type: Type, in the words of generate_parameter_library and rcl_interfaces.
+        default_value: Value when none is given.
+        description: What it means; for people.
+        read_only: It cannot change once the node runs.
+    """
+
+    type: ParameterType
+    default_value: Values | None = None
+    description: str = ""
+    read_only: bool = False
+
+
+class Interface(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What the node offers and needs, in NoDL v2 words.
+
+    Attributes:
+        publishers: Topics it publishes.
+        subscriptions: Topics it subscribes to.
+        service_servers: Services it offers.
+        service_clients: Services it calls.
+        action_servers: Actions it offers.
+        action_clients: Actions it calls.
+        parameters: Parameters it declares, by name; parts joined by dots.
+    """
+
+    publishers: tuple[TopicEndpoint, ...] = ()
+    subscriptions: tuple[TopicEndpoint, ...] = ()
+    service_servers: tuple[ServiceEndpoint, ...] = ()
+    service_clients: tuple[ServiceEndpoint, ...] = ()
+    action_servers: tuple[ActionEndpoint, ...] = ()
+    action_clients: tuple[ActionEndpoint, ...] = ()
+    parameters: dict[Text, Parameter] | None = None
+
+
+InterfaceReference = Annotated[
+    str,
+    spelled(r"^(local|nodl)://.", "write local://PATH or nodl://PACKAGE/NAME"),
+    Meta(
+        description="A NoDL document: local://PATH, relative to this manifest, or"
+        " nodl://PACKAGE/NAME through the ament index.",
+        examples=["local://camera.nodl.yaml"],
+    ),
+]
+
+
+class Dscp(Special):
+    """A differentiated services code point: a name (RFC 2474, 2597, 3246, …) or 0 to 63."""
+
+
+class SubscriptionFlow(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One subscription's flow.
+
+    Attributes:
+        unique: require_unique_network_flow_endpoints: whether this endpoint must have a network
+            flow endpoint that no other has.
+        dscp: Differentiated services code point of everything it sends, which is its
+            acknowledgements: the data carry the publisher's. A name (RFC 2474, 2597, 3246, …) or 0
+            to 63.
+        transport_priority: DDS TRANSPORT_PRIORITY of the DataReader, instead of 'dscp': goes
+            through 'network.transport_priority_mapping' to become a TOS byte, which is four times
+            the DSCP. Without a mapping it is the TOS byte.
+        enforce: Whether a DSCP that could not be applied is violated (true) or a warning (false).
+        transport: What carries it: what the planner chooses (any), an IP socket (network), shared
+            memory (shm), UDP (udpv4, udpv6), one datagram with TTL 0 for all subscriptions of the
+            host (multicast), TCP (tcpv4).
+        lossy: Whether the data bear an unreliable transport; what the node itself says if left out.
+    """
+
+    unique: UniqueRequirement = UniqueRequirement.NOT_REQUIRED
+    dscp: Dscp | None = None
+    transport_priority: Annotated[UInt32, Meta(examples=[184])] | None = None
+    enforce: bool = True
+    transport: FlowTransport = FlowTransport.ANY
+    lossy: bool | None = None
+
+
+class PublisherFlow(SubscriptionFlow, frozen=True, kw_only=True):
+    """One publisher's flow.
+
+    Attributes:
+        dscp: Differentiated services code point of everything it sends: a name (RFC 2474, 2597,
+            3246, …) or 0 to 63.
+        transport_priority: DDS TRANSPORT_PRIORITY, instead of 'dscp': goes through
+            'network.transport_priority_mapping' to become a TOS byte, which is four times the DSCP.
+            Without a mapping it is the TOS byte.
+        five_qi: 5G QoS identifier, 3GPP TS 23.501 Table 5.7.4-1; 'auto' proposes one from
+            'max_delay_ms', 'loss' and 'rate_hz' and says why.
+        max_delay_ms: Longest delay that this flow bears, milliseconds; that of the links of its
+            topic if left out.
+        loss: Highest share of messages lost or late that this flow bears.
+        rate_hz: Messages per second.
+        max_message_size: Largest serialized message, bytes; the bound of its type, where all its
+            fields have one, if left out.
+        non_blocking_send: Never wait for room in the socket's buffer: what finds it full is lost,
+            and only a RELIABLE publisher sends it again.
+    """
+
+    five_qi: Literal["auto"] | Annotated[int, Meta(ge=1, le=254)] | None = None
+    max_delay_ms: Milliseconds | None = None
+    loss: Annotated[float, Meta(gt=0, le=1)] | None = None
+    rate_hz: Annotated[float, Meta(gt=0, le=1_000_000)] | None = None
+    max_message_size: Annotated[int, Meta(ge=1, le=2**32 - 1)] | None = None
+    non_blocking_send: bool = False
+
+
+class Health(NodeHealth, frozen=True, kw_only=True):
+    """What shows whether the node is healthy, which it then must be (rule node.unhealthy)."""
+
+    ANY_OF: ClassVar[Ways] = (("check",), ("diagnostics",))
+
+    check: bool | None = None  # type: ignore[assignment]
+    diagnostics: Text | Annotated[tuple[Text, ...], Meta(min_length=1)] | None = None  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        """Raise ValueError unless something shows it."""
+        _require(_written(self, self.ANY_OF) > 0)
+
+
+class Flows(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What endpoints ask of their network flows, by declared name.
+
+    Attributes:
+        publishers: Needs of publishers.
+        subscriptions: Needs of subscriptions.
+    """
+
+    publishers: dict[str, PublisherFlow] = field(default_factory=dict)
+    subscriptions: dict[str, SubscriptionFlow] = field(default_factory=dict)
+
+
+class MappedEndpoints(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Declared names of endpoints, by kind.
+
+    Attributes:
+        publishers, subscriptions: Names as the interface declares them.
+        service_servers, service_clients: Names as the interface declares them.
+        action_servers, action_clients: Names as the interface declares them.
+    """
+
+    publishers: tuple[Text, ...] = ()
+    subscriptions: tuple[Text, ...] = ()
+    service_servers: tuple[Text, ...] = ()
+    service_clients: tuple[Text, ...] = ()
+    action_servers: tuple[Text, ...] = ()
+    action_clients: tuple[Text, ...] = ()
+
+
+class Connection(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One DDS participant of the node's, by one or more transports, and its endpoints.
+
+    Attributes:
+        urls: Connection URLs: TRANSPORT://[ADDRESS][:PORT][?OPTION=VALUE&…].
+        map: Declared names of the endpoints that it carries; 'all' for every one of the node.
+    """
+
+    urls: Annotated[
+        tuple[Text, ...],
+        Meta(
+            min_length=1,
+            examples=[
+                ["udpv4://10.77.0.1:7911?metatraffic_port=7910&peer=10.77.0.2:7910&multicast=off"]
+            ],
+        ),
+    ]
+    map: Literal["all"] | MappedEndpoints = MappedEndpoints()
+
+
+class Node(Supervision, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One node instance.
+
+    Attributes:
+        if: This is there only if it is true.
+        unless: This is there only if it is not true.
+        attach: Somebody else starts this node; short for run: {attach: true}.
+        machine: Key of a machine under 'machines'; this host if left out.
+        namespace: Namespace of the node, / if left out.
+        name: ROS name of the node; its key if left out.
+        process: Nodes with the same name here share one process.
+        managed: False for a node without the ROS 2 lifecycle; one that runs in a process of ours is
+            held all the same.
+        parameters: Parameter values. Nested mappings are joined with dots, as in ROS parameter
+            files.
+        parameter_files: ROS parameter files, relative to this manifest; later ones win,
+            'parameters' above all.
+        remap: Remap rules, from: to.
+        after: What each step waits for, by key of the other node: 'started' holds this node's
+            start, 'configured' its configure, 'connected' its connect, 'active' its activate; so
+            does 'healthy', until the other is active and healthy.
+        interface: What the node offers and needs, in NoDL v2 words, or a NoDL document.
+        connections: Connections that this node makes, by a name that is unique in it. Endpoints
+            that none carries stay with the node's own participant.
+        endpoints: Whether the node may have endpoints that its interface does not declare.
+        log_level: Lowest severity the node logs.
+        on_violation: What is done about violations that concern it.
+        state: State that a managed node is brought to and kept in.
+        may_end: Whether its process may end by itself with exit status 0, as that of a client does
+            after its last call.
+    """
+
+    ONE_OF: ClassVar[Ways] = (("run",), ("attach",))
+
+    if_: Truth | None = field(name="if", default=None)
+    unless: Truth | None = None
+    run: Run | None = None
+    attach: Annotated[bool, Meta(extra_json_schema={"const": True})] | None = None
+    machine: Text | None = None
+    namespace: Annotated[str, Meta(examples=["/robot"])] = ""
+    name: Text | None = None
+    process: Name | None = None
+    managed: bool = True
+    parameters: dict[str, ParameterTree] = field(default_factory=dict)
+    parameter_files: tuple[Text, ...] = ()
+    remap: dict[Text, Text] = field(default_factory=dict)
+    after: dict[NodeKey, Condition] = field(default_factory=dict)
+    timeouts: Timeouts = Timeouts()
+    interface: Interface | InterfaceReference | None = None
+    flows: Flows = Flows()
+    connections: dict[
+        Annotated[
+            str,
+            spelled(r"^[A-Za-z][A-Za-z0-9_]*\Z", "use letters, digits and '_', a letter first"),
+        ],
+        Connection,
+    ] = field(default_factory=dict)
+    endpoints: EndpointPolicy = EndpointPolicy.DECLARED
+    log_level: Literal["debug", "info", "warn", "error", "fatal"] | None = None
+    on_violation: OnViolation | None = None
+    health: Health | None = None
+    state: TargetState = TargetState.ACTIVE
+    may_end: bool = False
+
+    def __post_init__(self) -> None:
+        """Raise ValueError unless it is said in one way how it is started."""
+        _require(self.attach is not False and _written(self, self.ONE_OF) == 1)
+
+
+NodesByKey = Annotated[dict[Name, Node], Meta(min_length=1)]
+
+
+class Include(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One other manifest.
+
+    Attributes:
+        manifest: Path of the other manifest, relative to this one.
+        if: This is there only if it is true.
+        unless: This is there only if it is not true.
+        arguments: Values of its arguments.
+        namespace: Put before the namespace of each of its nodes.
+        prefix: Put before the key of each of its nodes: 'left' makes 'left/camera'.
+    """
+
+    manifest: Text
+    if_: Truth | None = field(name="if", default=None)
+    unless: Truth | None = None
+    arguments: dict[Name, Scalar] = field(default_factory=dict)
+    namespace: Namespace = ""
+    prefix: Prefix | None = None
+
+
+class Shared(Supervision, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Nodes of a document or group, and what they share.
+
+    Attributes:
+        use_sim_time: Short for the parameter use_sim_time of each node here and in what is
+            included.
+        parameters: Parameter values for each node here and in what is included; what a node, its
+            files or a group nearer to it set wins. They are compared where a node has them.
+        remap: Remap rules, from: to, for each node here and in what is included; a rule for the
+            same name that is nearer to a node wins.
+        groups: Nodes and includes that share a namespace, a condition, remaps or parameters.
+        nodes: Node instances, by a key that is unique in this document.
+        include: Other manifests whose nodes, machines and links become part of this system.
+            Discovery, network, data layer and policy are this document's own.
+    """
+
+    ANY_OF: ClassVar[Ways] = (("nodes",), ("include",), ("groups",))
+
+    use_sim_time: bool | None = None
+    parameters: dict[str, ParameterTree] = field(default_factory=dict)
+    remap: dict[Text, Text] = field(default_factory=dict)
+    groups: tuple[Group, ...] | None = None
+    nodes: NodesByKey | None = None
+    include: tuple[Include, ...] | None = None
+
+    def __post_init__(self) -> None:
+        """Raise ValueError where there can be no nodes."""
+        _require(_written(self, self.ANY_OF) > 0)
+
+
+class Group(Shared, frozen=True, kw_only=True):
+    """One group.
+
+    Attributes:
+        if: This is there only if it is true.
+        unless: This is there only if it is not true.
+        namespace: Put before the namespace of each of its nodes.
+        prefix: Put before the key of each of its nodes: 'left' makes 'left/camera'.
+        machine: Key of the machine of its nodes that name none.
+    """
+
+    if_: Truth | None = field(name="if", default=None)
+    unless: Truth | None = None
+    namespace: Namespace = ""
+    prefix: Prefix | None = None
+    machine: Text | None = None
+
+
+class Link(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One link.
+
+    Attributes:
+        topic: Fully qualified topic name, after namespace and remapping.
+        from: Key of the publishing node.
+        to: Key of the subscribing node.
+        unique: How unique the flow between them must be.
+        max_delay_ms: Longest delay allowed, milliseconds.
+        transport: What carries it: what the planner chooses (any), an IP socket (network), shared
+            memory (shm), UDP (udpv4, udpv6), one datagram with TTL 0 for all subscriptions of the
+            host (multicast), TCP (tcpv4).
+    """
+
+    topic: Annotated[Text, Meta(examples=["/robot/video"])]
+    from_node: NodeKey = field(name="from")
+    to_node: NodeKey = field(name="to")
+    unique: UniqueHow = UniqueHow.NOT
+    max_delay_ms: Milliseconds | None = None
+    transport: FlowTransport = FlowTransport.ANY
+
+
+class Manifest(Shared, frozen=True, kw_only=True):
+    """One system: what runs where, what it offers and needs, which network flows it must have.
+
+    YAML 1.2: only true and false are booleans; tags and merge keys are refused. $(arg NAME),
+    $(env NAME [DEFAULT]), $(find-pkg-share PACKAGE), $(file PATH), $(command PROGRAM …) and the
+    words of conditions may stand in every value; an unquoted value that is one whole substitution
+    takes the type of what it becomes.
+
+    Attributes:
+        manifest_version: Always 1 for documents that this schema describes.
+        system: Name of the system.
+        description: What the system is for; for people.
+        arguments: Values that the command line sets with name:=value. An argument without default
+            is required.
+        machines: Hosts, by name. Nodes without 'machine' run on this host.
+        modes: Named sets of active nodes and parameters; the first is entered at the start, others
+            by `lifecycle mode`.
+        links: What must hold between one publishing and one subscribing node.
+    """
+
+    manifest_version: Literal[1]
+    system: Annotated[
+        str,
+        spelled(r"^[A-Za-z][A-Za-z0-9_-]*\Z", "use letters, digits, '_' and '-', a letter first"),
+        Meta(examples=["teleop"]),
+    ]
+    description: str = ""
+    arguments: dict[Name, Argument] = field(default_factory=dict)
+    machines: dict[Name, Machine] = field(default_factory=dict)
+    discovery: DiscoveryKeys = DiscoveryKeys()
+    network: Network = Network()
+    data_layer: DataLayerKeys = DataLayerKeys()
+    policy: Policy = Policy()
+    on_violation: OnViolation | None = None
+    modes: Annotated[dict[Name, Mode], Meta(min_length=1)] | None = None
+    links: tuple[Link, ...] = ()
