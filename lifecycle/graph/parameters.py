@@ -86,12 +86,14 @@ class ParameterReadings:
         for name in reporting:
             self.forget(name)
         for name in nodes:
-            names = self._named[name]
-            known = self._nodes.get(name)
-            if known is None or known.names != names:
+            node = self._nodes.get(name)
+            if node is None or node.names != self._named[name]:
                 self.forget(name)
-                known = self._nodes[name] = _Node(name, names, self._clients, self._wake)
-            known.look()
+                node = self._nodes[name] = _Node(name, self._named[name])
+                node.task = asyncio.ensure_future(self._keep(node))
+            missing = node.latest is not None and node.latest.error == SERVES_NONE
+            if missing and self._clients.serves_parameters(name):
+                node.due.set()  # the services have come
         first = [each.first for each in self._nodes.values() if not each.first.done()]
         if first:
             await asyncio.wait(first)
@@ -106,7 +108,10 @@ class ParameterReadings:
         """Drop what is known of a node that left."""
         known = self._nodes.pop(node, None)
         if known is not None:
-            known.close()
+            if known.task is not None:
+                known.task.cancel()
+            if not known.first.done():
+                known.first.set_result(None)
 
     def close(self) -> None:
         """Stop reading."""
@@ -123,7 +128,10 @@ class ParameterReadings:
         """
         nodes = [each for name, each in self._nodes.items() if node in (None, name)]
         for each in nodes:
-            each.reread()
+            each.wanted += 1
+            if each.first.done():
+                each.first = asyncio.get_running_loop().create_future()
+            each.due.set()
         return bool(nodes)
 
     def _arrived(self, node: str, names: frozenset[str]) -> None:
@@ -139,83 +147,63 @@ class ParameterReadings:
         else:
             self._wake()  # it reports them itself, and is asked when there is another look
 
-
-class _Node:
-    """The parameters of one node, read again and again by a task."""
-
-    def __init__(
-        self, name: str, names: Names, clients: NodeClients, wake: Callable[[], None]
-    ) -> None:
-        self.names = names
-        self.latest: NodeParameters | None = None
-        self.due = asyncio.Event()
-        self.first: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._wanted = 0
-        self._name = name
-        self._clients = clients
-        self._wake = wake
-        self._task = asyncio.ensure_future(self._follow())
-
-    def look(self) -> None:
-        """Read at once if the services have come that were missing."""
-        missing = self.latest is not None and self.latest.error == SERVES_NONE
-        if missing and self._clients.serves_parameters(self._name):
-            self.due.set()
-
-    def reread(self) -> None:
-        """Read at once, and have who follows wait for it."""
-        self._wanted += 1
-        if self.first.done():
-            self.first = asyncio.get_running_loop().create_future()
-        self.due.set()
-
-    def close(self) -> None:
-        self._task.cancel()
-        if not self.first.done():
-            self.first.set_result(None)
-
-    async def _follow(self) -> None:
+    async def _keep(self, node: _Node) -> None:
+        """Read the parameters of a node again and again."""
         pause_s, unanswered, notified = AGAIN_S, 0, True
         while True:
-            self.due.clear()
-            wanted = self._wanted
-            found = await self._read()
+            node.due.clear()
+            wanted = node.wanted
+            found = await self._read(node)
             unanswered = unanswered + 1 if found.error == _NO_ANSWER else 0
             # A node that is busy for a moment, and of which no event says that it has changed,
             # is what it was.
             is_busy = unanswered == 1 and not notified
-            if found != self.latest and not is_busy:
-                is_first, self.latest = self.latest is None, found
+            if found != node.latest and not is_busy:
+                is_first, node.latest = node.latest is None, found
                 if not is_first:
                     self._wake()
-            if not self.first.done() and self._wanted == wanted:
-                self.first.set_result(None)
-            notified = await set_within(self.due, pause_s)
+            if not node.first.done() and node.wanted == wanted:
+                node.first.set_result(None)
+            notified = await set_within(node.due, pause_s)
             pause_s = AGAIN_S if notified else min(2 * pause_s, AGAIN_AT_MOST_S)
             await asyncio.sleep(_BETWEEN_S)
 
-    async def _read(self) -> NodeParameters:
-        if self._clients.serves_parameters(self._name) is None:
-            found = await self._ask(UNSHOWN_S)
-            if found is not None:
-                return NodeParameters(node=self._name, parameters=found)
-        if not self._clients.serves_parameters(self._name):
-            return NodeParameters(node=self._name, error=SERVES_NONE)
-        found = await self._ask(ANSWER_S)
+    async def _read(self, node: _Node) -> NodeParameters:
+        found = None
+        if (serves := self._clients.serves_parameters(node.name)) is None:
+            found = await self._ask(node, UNSHOWN_S)
+            serves = found is not None or self._clients.serves_parameters(node.name)
+        if not serves:
+            return NodeParameters(node=node.name, error=SERVES_NONE)
+        if found is None:
+            found = await self._ask(node, ANSWER_S)
         error = _NO_ANSWER if found is None else ""
-        return NodeParameters(node=self._name, parameters=found, error=error)
+        return NodeParameters(node=node.name, parameters=found, error=error)
 
-    async def _ask(self, limit_s: float) -> tuple[ParameterReport, ...] | None:
-        reading = self._clients.report_parameters(self._name, self.names, timeout_s=limit_s)
+    async def _ask(self, node: _Node, limit_s: float) -> tuple[ParameterReport, ...] | None:
+        reading = self._clients.report_parameters(node.name, node.names, timeout_s=limit_s)
         asking = asyncio.ensure_future(reading)
         try:
             await asyncio.wait({asking}, timeout=limit_s)  # not wait_for, see set_within
             return asking.result() if asking.done() else None
         except MiddlewareError as error:
-            _logger.info("parameters of %s unknown: %s", self._name, error)
+            _logger.info("parameters of %s unknown: %s", node.name, error)
         except Exception:
             # What a foreign node answers must not end the reading of its parameters.
-            _logger.exception("parameters of %s unknown", self._name)
+            _logger.exception("parameters of %s unknown", node.name)
         finally:
             asking.cancel()
         return None
+
+
+class _Node:
+    """What is known of the parameters of one node, and when they are to be read again."""
+
+    def __init__(self, name: str, names: Names) -> None:
+        self.name = name
+        self.names = names
+        self.latest: NodeParameters | None = None
+        self.due = asyncio.Event()
+        self.wanted = 0  # how often a reading was asked for that begins after that
+        self.first: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self.task: asyncio.Task[None] | None = None

@@ -76,38 +76,33 @@ def follow_nodes(hooks: NodeHooks) -> Callable[[], None]:
     Returns:
         What ends that.
     """
-    names = [name for name, _ in _FACTORIES]
-    before = {
-        name: getattr(Node, name)
-        for name in ("__init__", *names, *_REMOVERS, "add_waitable", "destroy_node")
-    }
-    initialise = Node.__init__
+    initialise, destroy = Node.__init__, Node.destroy_node
 
     @functools.wraps(initialise)
     def construct(self: Node, node_name: str, **options: Any) -> None:
         with hooks.constructing(self, node_name, options) as (name, changed):
             initialise(self, name, **changed)
 
-    Node.__init__ = construct
-    for name, kind in _FACTORIES:
-        setattr(Node, name, _noting(getattr(Node, name), kind, hooks))
-    for name in _REMOVERS:
-        setattr(Node, name, _forgetting(getattr(Node, name), hooks))
-    Node.add_waitable = _noting_actions(Node.add_waitable, hooks)
-    destroy = Node.destroy_node
-
     @functools.wraps(destroy)
     def destroy_node(self: Node) -> None:
         hooks.node_removed(self)
         destroy(self)
 
-    Node.destroy_node = destroy_node
+    wrapped: dict[str, Callable[..., Any]] = {
+        "__init__": construct,
+        "destroy_node": destroy_node,
+        "add_waitable": _noting_actions(Node.add_waitable, hooks),
+    }
+    wrapped |= {name: _noting(getattr(Node, name), kind, hooks) for name, kind in _FACTORIES}
+    wrapped |= {name: _forgetting(getattr(Node, name), hooks) for name in _REMOVERS}
+    before = {name: getattr(Node, name) for name in wrapped}
 
-    def undo() -> None:
-        for name, method in before.items():
+    def put(methods: Mapping[str, Callable[..., Any]]) -> None:
+        for name, method in methods.items():
             setattr(Node, name, method)
 
-    return undo
+    put(wrapped)
+    return functools.partial(put, before)
 
 
 def _noting(make: Callable[..., Any], kind: EndpointKind, hooks: NodeHooks) -> Callable[..., Any]:
