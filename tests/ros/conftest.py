@@ -92,7 +92,7 @@ def _files(names: Iterable[str]) -> Iterator[tuple[str, int]]:
 
 
 def _left(seen: _Seen) -> list[tuple[str, int]]:
-    return [each for each in _files(leftovers(only=[name for name, _ in seen])) if each in seen]
+    return [each for each in _files(leftovers()) if each in seen]
 
 
 @pytest.fixture(autouse=True)

@@ -17,7 +17,7 @@ import os
 import re
 import stat
 import time
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 from lifecycle.errors import MiddlewareError
@@ -108,12 +108,12 @@ def _no_room(free: int, who: str) -> MiddlewareError:
     )
 
 
-def sweep(only: Collection[str] | None = None, *, within_s: float = 0.0) -> tuple[str, ...]:
+def sweep(*, within_s: float = 0.0) -> tuple[str, ...]:
     """Remove the files of this user that no process uses.
 
+    What was made just now is left: its owner may not have locked it yet.
+
     Args:
-        only: names of files, whose groups are considered; None is all, but for what was made just
-            now: its owner may not have locked it yet.
         within_s: seconds to try again while others still use what no process owns. They let go of
             the port of a participant that left when they next send over shared memory.
 
@@ -123,25 +123,23 @@ def sweep(only: Collection[str] | None = None, *, within_s: float = 0.0) -> tupl
     deadline = time.monotonic() + within_s
     removed: tuple[str, ...] = ()
     while True:
-        found, in_use = _unused(only, remove=True)
+        found, in_use = _unused(remove=True)
         removed += found
         if not in_use or time.monotonic() >= deadline:
             return tuple(sorted(removed))
         time.sleep(_AGAIN_S)
 
 
-def leftovers(*, only: Collection[str] | None = None) -> tuple[str, ...]:
-    """Return what `sweep` would remove, sorted, and remove nothing; None considers all groups."""
-    return _unused(only, remove=False)[0]
+def leftovers() -> tuple[str, ...]:
+    """Return what `sweep` would remove, new or not, sorted, and remove nothing."""
+    return _unused(remove=False)[0]
 
 
-def _unused(only: Collection[str] | None, *, remove: bool) -> tuple[tuple[str, ...], bool]:
+def _unused(*, remove: bool) -> tuple[tuple[str, ...], bool]:
     """Return the names of unused files, and whether others use some that no process owns."""
-    wanted = None if only is None else {_group(name) for name in only}
     groups: dict[str, dict[Path, os.stat_result]] = {}
     for path in _files():
-        group = _group(path.name)
-        if group and (wanted is None or group in wanted):
+        if group := _group(path.name):
             with contextlib.suppress(FileNotFoundError):
                 groups.setdefault(group, {})[path] = path.lstat()
     found: list[str] = []
@@ -150,7 +148,7 @@ def _unused(only: Collection[str] | None, *, remove: bool) -> tuple[tuple[str, .
     for group, files in groups.items():
         if not all(_is_own(each) for each in files.values()):
             continue
-        if only is None and remove and any(_is_new(each) for each in files.values()):
+        if remove and any(_is_new(each) for each in files.values()):
             in_use = True
             continue
         with contextlib.suppress(OSError), contextlib.ExitStack() as locks:
@@ -158,7 +156,8 @@ def _unused(only: Collection[str] | None, *, remove: bool) -> tuple[tuple[str, .
             owned = [locks.enter_context(_lock(each)) for each in files if _is_lock(each)]
             if not owned or "_port" in group:
                 if mapped is None:
-                    mapped = frozenset().union(*map(_mapped, filter(str.isdigit, _processes())))
+                    processes = filter(str.isdigit, os.listdir("/proc"))  # noqa: PTH208 - names
+                    mapped = frozenset().union(*map(_mapped, processes))
                 if group in mapped:
                     in_use = True
                     continue
@@ -188,10 +187,6 @@ def _mapped(process: str) -> frozenset[str]:
             if own in line:
                 found.add(_group(line.rpartition("/")[2]))
     return frozenset(found - {""})
-
-
-def _processes() -> list[str]:
-    return os.listdir("/proc")  # noqa: PTH208 - names alone
 
 
 def _files() -> list[Path]:

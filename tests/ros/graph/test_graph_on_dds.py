@@ -63,7 +63,7 @@ _killed: set[str] = set()
 def _sweep() -> Iterator[None]:
     """Remove what killed processes leave, once no graph of the test has their ports open."""
     yield
-    sweep(_killed)
+    sweep(within_s=0.5)
     _killed.clear()
 
 

@@ -240,8 +240,8 @@ class Up:
     def assert_nothing_left(self) -> None:
         """Assert that no process of the run lives and no shared memory of it is there."""
         assert left_of(self.mark) == []
-        left = leftovers(only=self.segments)
-        assert left == (), left
+        left = set(self.segments).intersection(leftovers())
+        assert left == set(), left
 
     def assert_gate_held(self) -> None:
         """Assert that no activate request was sent before the gate opened on a passing verdict."""
@@ -273,7 +273,7 @@ class Up:
                 with contextlib.suppress(psutil.NoSuchProcess, ProcessLookupError):
                     _kill(each, deadline)
         if used:
-            sweep(used)
+            sweep(within_s=0.5)
         self.process.wait(BOUND_S)
         for reader in self._readers:
             reader.join(BOUND_S)

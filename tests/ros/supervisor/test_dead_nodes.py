@@ -51,7 +51,7 @@ def open_ports() -> Iterator[set[str]]:
     """
     ports: set[str] = set()
     yield ports
-    sweep(ports)
+    sweep(within_s=0.5)
 
 
 @pytest.fixture
