@@ -17,7 +17,6 @@ lifecycle.plan.comparison.
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import json
 import logging
@@ -34,7 +33,6 @@ from rclpy.event_handler import (
 )
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
-from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Empty, String
 
@@ -77,7 +75,8 @@ _no_subscription_events = functools.partial(SubscriptionEventCallbacks, use_defa
 class AlivePublisher:
     """Asserts the liveliness of the participant of `node` to its subscribers while it lives.
 
-    Nothing is asserted while there is no subscriber.
+    Nothing is asserted while there is no subscriber. The thread that asserts is there from the
+    start: there may be no room for another one later.
 
     Args:
         node: an executor spins it.
@@ -89,17 +88,19 @@ class AlivePublisher:
         self, node: Node, topic: str, on_listener: Callable[[], None] | None = None
     ) -> None:
         self._node = node
-        self._topic = topic
         self._on_listener = on_listener
-        self._pulse = _Pulse(node, topic + ALIVE_PULSE)
+        self._has_listeners = threading.Event()
+        self._ended = threading.Event()
         # rclpy's own methods: a managed node's would gate them.
-        self._publisher = Node.create_publisher(
-            node,
-            String,
-            topic,
-            _NOTICES,
-            event_callbacks=_no_publisher_events(matched=self._matched),
+        make = functools.partial(Node.create_publisher, node)
+        self._asserted = make(
+            Empty, topic + ALIVE_PULSE, _ASSERTED, event_callbacks=_no_publisher_events()
         )
+        self._publisher = make(
+            String, topic, _NOTICES, event_callbacks=_no_publisher_events(matched=self._matched)
+        )
+        self._thread = threading.Thread(target=self._assert, name="pulse", daemon=True)
+        self._thread.start()
 
     def notify(self, silent: Mapping[str, str]) -> None:
         """Publish which of our nodes are silent, and why each is; from any thread.
@@ -111,74 +112,32 @@ class AlivePublisher:
 
     def destroy(self) -> None:
         """Leave properly, which peers see and do not count as a loss."""
-        self._pulse.end()
-        Node.destroy_publisher(self._node, self._publisher)
+        self._ended.set()
+        self._has_listeners.set()
+        self._thread.join()
+        for each in (self._asserted, self._publisher):
+            Node.destroy_publisher(self._node, each)
 
     def _matched(self, info: QoSPublisherMatchedInfo) -> None:
-        if info.current_count == 0:
-            self._pulse.still()
+        if info.current_count:
+            self._has_listeners.set()
         else:
-            self._pulse.beat()
+            self._has_listeners.clear()
+            if self._ended.is_set():
+                self._has_listeners.set()
         if info.current_count_change > 0 and self._on_listener is not None:
             self._on_listener()
 
-
-class _Pulse:
-    """Asserts the liveliness of `topic` while it is on, in a thread that is there from the start.
-
-    There may be no room for another thread later.
-    """
-
-    def __init__(self, node: Node, topic: str) -> None:
-        self._node = node
-        self._topic = topic
-        self._publisher: Publisher | None = None
-        self._changed = threading.Condition()
-        self._ended = False
-        self._thread = threading.Thread(target=self._run, name="pulse", daemon=True)
-        self._thread.start()
-
-    def beat(self) -> None:
-        """Begin; again is harmless."""
-        with self._changed:
-            if self._publisher is None and not self._ended:
-                self._publisher = Node.create_publisher(
-                    self._node,
-                    Empty,
-                    self._topic,
-                    _ASSERTED,
-                    event_callbacks=_no_publisher_events(),
-                )
-                self._changed.notify()
-
-    def still(self) -> None:
-        """Leave properly, which peers do not count as a loss; harmless if it has not begun."""
-        with self._changed:
-            publisher, self._publisher = self._publisher, None
-            if publisher is not None:
-                Node.destroy_publisher(self._node, publisher)
-
-    def end(self) -> None:
-        """Leave for good."""
-        self.still()
-        with self._changed:
-            self._ended = True
-            self._changed.notify()
-        self._thread.join()
-
-    def _run(self) -> None:
-        with self._changed:
-            while not self._ended:
-                if self._publisher is not None:
-                    self._assert(self._publisher)
-                self._changed.wait(None if self._publisher is None else ASSERTED_EACH_S)
-
-    def _assert(self, publisher: Publisher) -> None:
-        # Not by rclpy's own call, which keeps the GIL: Fast DDS takes locks there, and was seen not
-        # to give them back while peers left.
-        with contextlib.suppress(InvalidHandle), publisher.handle:  # its node was destroyed first
-            if not abi.assert_liveliness(publisher.handle.pointer):
-                _logger.debug("liveliness was not asserted")
+    def _assert(self) -> None:
+        while self._has_listeners.wait() and not self._ended.is_set():
+            # Not by rclpy's own call, which keeps the GIL: Fast DDS takes locks there, and was seen
+            # not to give them back while peers left.
+            try:
+                with self._asserted.handle:
+                    abi.assert_liveliness(self._asserted.handle.pointer)
+            except InvalidHandle:
+                return  # its node was destroyed first
+            self._ended.wait(ASSERTED_EACH_S)
 
 
 @typing.final
