@@ -1,14 +1,11 @@
-"""TCP connections of Fast DDS in this process: those that are dead, those that are not used.
+"""TCP connections of Fast DDS in this process, as the kernel has them (TCP_INFO of tcp(7)).
 
-Owns: what is read of them from the kernel (TCP_INFO of tcp(7)), and how long it waits at most
-before it sends again. Must not import rclpy.
+Owns: which are dead, which are used, and how long the kernel waits before it sends again. Must not
+import rclpy.
 
 Fast DDS 2.14 never returns from the destruction of a participant whose connection is cut, until its
 socket is shut down; and it never uses a connection whose first answer arrived before the connecting
 thread had noted what to request next: only another participant, on another port, helps then.
-
-The kernel doubles the time between retransmissions each time, up to 120 s, so that after an outage
-nothing passes for about as long again (RFC 6298 §5.5).
 """
 
 from __future__ import annotations
@@ -16,6 +13,7 @@ from __future__ import annotations
 import contextlib
 import socket
 import struct
+from collections.abc import Iterator
 
 from lifecycle.middleware.fastdds.sockets import sockets_here
 
@@ -42,12 +40,18 @@ def give_up_dead_connections() -> int:
     For a process that is about to end: an accepted connection that is shut down is not made again.
     """
     count = 0
-    for each in sockets_here():
+    for each in _connections():
         with contextlib.suppress(OSError):  # closed since
-            if each.type == socket.SOCK_STREAM and _is_dead(each):
+            if _is_dead(each):
                 each.shutdown(socket.SHUT_RDWR)
                 count += 1
     return count
+
+
+def _connections() -> Iterator[socket.socket]:
+    for each in sockets_here():
+        if each.type == socket.SOCK_STREAM and each.family in (socket.AF_INET, socket.AF_INET6):
+            yield each
 
 
 def is_used(address: str, port: int) -> bool | None:
@@ -60,9 +64,7 @@ def is_used(address: str, port: int) -> bool | None:
     Returns:
         None while that is open: there is no connection yet, or it has only just begun.
     """
-    for each in sockets_here():
-        if (each.family, each.type) != (socket.AF_INET, socket.SOCK_STREAM):
-            continue
+    for each in _connections():
         with contextlib.suppress(OSError):  # not connected yet
             if each.getpeername() == (address, port):
                 return _is_used(each.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 256))
@@ -80,8 +82,6 @@ def _is_used(info: bytes) -> bool | None:
 
 
 def _is_dead(each: socket.socket) -> bool:
-    if each.family not in (socket.AF_INET, socket.AF_INET6):
-        return False
     info = each.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 8)
     if info[_STATE] == _SYN_SENT:
         return True
@@ -89,7 +89,8 @@ def _is_dead(each: socket.socket) -> bool:
 
 
 AT_MOST_S = 1.0
-"""The least that Linux allows, and what healing may take."""
+"""The least that Linux allows. By default the time doubles up to 120 s (RFC 6298 §5.5), so that
+after an outage nothing passes for about as long again."""
 
 _GIVES_UP_S = 924
 """As long as Linux tries by default (tcp_retries2 of tcp(7)): it counts how often it sent again,
@@ -108,10 +109,9 @@ def send_again_soon() -> int:
         How many sockets heed it: 0 before Linux 6.15, which has no such option.
     """
     count = 0
-    for each in sockets_here():
+    for each in _connections():
         with contextlib.suppress(OSError):  # closed since, or a kernel without the option
-            if each.type == socket.SOCK_STREAM and each.family in {socket.AF_INET, socket.AF_INET6}:
-                each.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _GIVES_UP_S * 1000)
-                each.setsockopt(socket.IPPROTO_TCP, _TCP_RTO_MAX_MS, int(AT_MOST_S * 1000))
-                count += 1
+            each.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _GIVES_UP_S * 1000)
+            each.setsockopt(socket.IPPROTO_TCP, _TCP_RTO_MAX_MS, int(AT_MOST_S * 1000))
+            count += 1
     return count

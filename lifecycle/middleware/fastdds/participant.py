@@ -88,8 +88,6 @@ class FlowParticipant:
         connections: ParticipantConnections | None = None,
         served: Node | None = None,
     ) -> None:
-        if dscp is not None:
-            sockets.check_dscp(dscp)
         self.name = name
         self.settings = ParticipantSettings.of(
             connections or ParticipantConnections(),

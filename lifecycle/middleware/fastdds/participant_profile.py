@@ -26,7 +26,7 @@ from lifecycle.middleware.fastdds.url_profile import (
 )
 from lifecycle.network.connection_url import ConnectionUrl
 from lifecycle.network.connection_url import parse as parse_url
-from lifecycle.network.medium import RMW_DEFAULT, TRANSPORTS_VARIABLE, UDP_UNICAST, Medium
+from lifecycle.network.medium import RMW_DEFAULT, TRANSPORTS_VARIABLE, Medium
 from lifecycle.plan.model import (
     ParticipantConnections,
     PlannedNode,
@@ -41,9 +41,6 @@ _CONNECTING_NS = 500_000_000
 """Over TCP Fast DDS 2.14 sends nothing while a connection or a port in it is being agreed on, and
 dials again only when there is something to send: what gets lost so comes with the next
 announcement, or with the one after it."""
-
-_DATAGRAM_BYTES = range(500, 65501)
-"""To s_maximumMessageSize of Fast DDS: what UDP over IPv4 can carry, less some headers."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,7 +63,7 @@ class ParticipantSettings:
         announces_often: at first, where a profile of the user's does not say how often.
 
     Raises:
-        MiddlewareError: out of range, or URLs that one participant cannot have together.
+        MiddlewareError: URLs that one participant cannot have together, or transports beside them.
     """
 
     transports: tuple[Medium, ...] = ()
@@ -91,7 +88,7 @@ class ParticipantSettings:
 
         Raises:
             ConnectionUrlError: a URL that is none.
-            MiddlewareError: out of range, or what one participant cannot have together.
+            MiddlewareError: what one participant cannot have together.
         """
         urls = tuple(parse_url(url) for url in connections.urls)
         sizes = [url.max_datagram_bytes for url in urls if url.max_datagram_bytes is not None]
@@ -124,24 +121,6 @@ class ParticipantSettings:
                 hint="leave one of them out",
             )
         families(self.urls)
-        if self.static_participants and not self.urls:
-            raise MiddlewareError(
-                "cannot discover endpoints statically without connection URLs",
-                hint="say where the participants are, udpv4://ADDRESS:PORT?metatraffic_port=…",
-            )
-        unknown = [each for each in self.transports if each not in UDP_UNICAST]
-        if unknown or len(set(self.transports)) != len(self.transports):
-            raise MiddlewareError(
-                f"cannot use transports {', '.join(map(repr, self.transports))}: allowed are "
-                f"{' and '.join(map(repr, UDP_UNICAST))}, each once"
-            )
-        size = self.max_datagram_bytes
-        if size is not None and size not in _DATAGRAM_BYTES:
-            raise MiddlewareError(
-                f"cannot send datagrams of at most {size} bytes: allowed are "
-                f"{_DATAGRAM_BYTES[0]}–{_DATAGRAM_BYTES[-1]}",
-                hint="1400 fits an Ethernet frame",
-            )
 
     @property
     def chooses_transports(self) -> bool:

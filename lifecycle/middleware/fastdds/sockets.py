@@ -41,7 +41,6 @@ _DSCP_OPTION = {
     socket.AF_INET: (socket.IPPROTO_IP, socket.IP_TOS),
     socket.AF_INET6: (socket.IPPROTO_IPV6, socket.IPV6_TCLASS),
 }
-_MAX_DSCP = 63
 _DISCOVERY_BYTES = 1 << 22
 
 
@@ -194,9 +193,8 @@ def set_dscp(nfes: Sequence[NetworkFlowEndpoint], dscp: int) -> None:
         dscp: 0–63.
 
     Raises:
-        MiddlewareError: `dscp` out of range, no socket found, or the kernel kept another value.
+        MiddlewareError: no socket found, or the kernel kept another value.
     """
-    check_dscp(dscp)
     with own_sockets(nfes) as found:
         for each in found:
             option = _DSCP_OPTION[each.family]
@@ -216,22 +214,6 @@ def get_dscps(nfes: Sequence[NetworkFlowEndpoint]) -> set[int]:
     """
     with own_sockets(nfes) as found:
         return {each.getsockopt(*_DSCP_OPTION[each.family]) >> 2 for each in found}
-
-
-def check_dscp(dscp: int) -> None:
-    """Refuse what is not a DSCP, a TOS byte with ECN bits in particular.
-
-    Raises:
-        MiddlewareError: `dscp` is not 0–63.
-    """
-    if 0 <= dscp <= _MAX_DSCP:
-        return
-    hint = ""
-    if _MAX_DSCP < dscp <= 0xFF:
-        hint = f"as a TOS byte, {dscp} is DSCP {dscp >> 2}"
-        if dscp & 3:
-            hint += " with ECN bits set, which belong to the network (RFC 3168)"
-    raise MiddlewareError(f"cannot use DSCP {dscp}: allowed are 0–{_MAX_DSCP}", hint=hint)
 
 
 def widen_discovery_buffers(domain_id: int) -> int:

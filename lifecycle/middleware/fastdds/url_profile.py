@@ -314,22 +314,17 @@ def _own_address(url: ConnectionUrl) -> tuple[str, ...]:
 
 def _check(found: Sequence[UrlTransport], urls: Sequence[ConnectionUrl]) -> None:
     for family in found:
-        for option in ("ttl", "output_port", "metatraffic_port"):
+        one_port = ("port",) if family.kind.is_tcp else ()
+        for option in ("ttl", "output_port", "metatraffic_port", *one_port):
             values = {getattr(url, option): url for url in family.urls}
             values.pop(None, None)
             if len(values) > 1:
                 spelt = " and ".join(repr(str(url)) for url in values.values())
+                what = "TCP port" if option == "port" else option
                 raise MiddlewareError(
-                    f"cannot use {spelt} together: one participant has one {option}",
+                    f"cannot use {spelt} together: one participant has one {what}",
                     hint="give them to different connections",
                 )
-        listening = [url for url in family.urls if url.port] if family.kind.is_tcp else []
-        if len(listening) > 1:
-            raise MiddlewareError(
-                f"cannot listen on {str(listening[0])!r} and {str(listening[1])!r}: one "
-                "participant has one TCP port",
-                hint="give them to different connections",
-            )
     fixed = [url for url in urls if url.transport.is_udp and url.port]
     if fixed and not all(family.kind.is_network for family in found):
         raise MiddlewareError(

@@ -190,39 +190,6 @@ def test_the_environments_choice_of_transports_is_not_replaced_by_a_default() ->
     assert "UDPv4" in profile("p", UDP, environment=environment), "the manifest is more precise"
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        (
-            {"transports": ("shm",)},
-            "cannot use transports 'shm': allowed are 'udpv4' and 'udpv6', each once",
-        ),
-        (
-            {"transports": ("udpv4", "udpv4")},
-            "cannot use transports 'udpv4', 'udpv4': allowed are 'udpv4' and 'udpv6', each once",
-        ),
-        (
-            {"max_datagram_bytes": 499},
-            (
-                "cannot send datagrams of at most 499 bytes: allowed are 500–65500; "
-                "1400 fits an Ethernet frame"
-            ),
-        ),
-        (
-            {"max_datagram_bytes": 65501},
-            (
-                "cannot send datagrams of at most 65501 bytes: allowed are 500–65500; "
-                "1400 fits an Ethernet frame"
-            ),
-        ),
-    ],
-)
-def test_settings_out_of_range_are_refused(settings: dict[str, Any], message: str) -> None:
-    with pytest.raises(MiddlewareError) as refused:
-        ParticipantSettings(**settings)
-    assert str(refused.value) == message
-
-
 def test_settings_that_need_nothing_are_false() -> None:
     assert not ParticipantSettings()
     assert UDP
