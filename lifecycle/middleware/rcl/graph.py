@@ -27,7 +27,7 @@ from rclpy.subscription import Subscription
 
 from lifecycle import dataclasses
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.middleware.discovery.environment import is_served, missing_port, reach, settle_s
+from lifecycle.middleware.discovery.environment import is_served, reach, settle_s
 from lifecycle.middleware.discovery.prefixes import PROCESS_DIGITS, is_of_host, is_of_process
 from lifecycle.middleware.discovery.prober import Settling
 from lifecycle.middleware.discovery.tcp import give_up_dead_connections, is_used
@@ -292,10 +292,6 @@ class GraphObserver:
         """Return the fully qualified names of the services that discovery shows on `node`."""
         listed = endpoints_of_node(self.node, EndpointKind.SERVICE_SERVER, node)
         return frozenset(name for name, _ in listed or ())
-
-    def missing_port(self) -> int | None:
-        """Return the UDP port that another process keeps from all participants of this host."""
-        return missing_port(self.domain_id, self.urls, os.environ)
 
     def reaches_servers(self) -> bool:
         """Wait, bounded, until the TCP discovery servers of its URLs can be asked; False if not.

@@ -23,6 +23,7 @@ from lifecycle.manifest.model import Authority, DataLayerSource, EndpointPolicy,
 from lifecycle.middleware.discovery.environment import (
     all_by_multicast,
     discovery_peers,
+    missing_port,
     peers_environment,
 )
 from lifecycle.middleware.fastdds.profiles import (
@@ -367,7 +368,9 @@ async def _observer_participant(
         )
     # Nodes elsewhere would be found: they answer to ports of ours.
     discovery = observer_participant.discovery
-    port = discovery.missing_port() if local_processes(plan, options.machine) else None
+    port = None
+    if local_processes(plan, options.machine):
+        port = missing_port(discovery.domain_id, discovery.urls, os.environ)
     if port is not None:
         observer_participant.prepare_to_leave()
         observer_participant.destroy()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import itertools
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
@@ -63,26 +62,6 @@ def test_a_node_is_made_by_an_rclpy_with_another_constructor(
     node = hidden_node.bare_node(context)
     assert node.pointer
     node.destroy_when_not_in_use()
-
-
-def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(abi.ctypes, "CDLL", lambda _: ctypes.cdll.LoadLibrary("libno.so"))
-    with pytest.raises(MiddlewareError) as refused:
-        abi.Rcl()
-    assert str(refused.value) == (
-        "cannot load 'librcutils.so': libno.so: cannot open shared object file: No such file or "
-        f"directory; {INSTALL}"
-    )
-
-
-def test_a_missing_symbol_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(abi, "_open", lambda _: ctypes.CDLL(None))
-    monkeypatch.setattr(abi, "rcl_version", lambda: "")
-    with pytest.raises(MiddlewareError) as refused:
-        abi._bind(ctypes.CDLL(None), "rcl_of_the_future", None)
-    assert str(refused.value) == (
-        "cannot find 'rcl_of_the_future' in the installed ROS libraries (rcl ?); " + INSTALL
-    )
 
 
 @pytest.fixture

@@ -11,7 +11,6 @@ import rclpy
 from rclpy.node import Node
 from std_msgs.msg import String
 
-from lifecycle.middleware.rcl import graph_changes
 from lifecycle.middleware.rcl.graph_changes import GraphGuard
 
 BOUND_S = 30.0
@@ -29,16 +28,14 @@ def nodes(context: rclpy.Context) -> Iterator[tuple[Node, Node]]:
 class Counted:
     """A callback that can be waited for."""
 
-    def __init__(self, *, again: bool = False) -> None:
+    def __init__(self) -> None:
         self.calls = 0
-        self._again = again
         self._called = threading.Condition()
 
-    def __call__(self) -> bool:
+    def __call__(self) -> None:
         with self._called:
             self.calls += 1
             self._called.notify_all()
-        return self._again
 
     def until(self, holds: Callable[[int], bool]) -> bool:
         with self._called:
@@ -82,16 +79,6 @@ def test_who_stays_goes_on_hearing_when_the_first_one_leaves(nodes: tuple[Node, 
         two.create_publisher(String, "/another", 1)
         assert second.until(lambda now: now > before)
         assert first.calls == calls
-
-
-def test_who_waits_for_what_follows_a_change_is_called_again_without_one(
-    nodes: tuple[Node, Node], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(graph_changes, "_AGAIN_S", 0.002)
-    waiting = Counted(again=True)
-    with followed(nodes[0], waiting):
-        nodes[0].create_publisher(String, "/topic", 1)
-        assert waiting.until(lambda calls: calls > 50)
 
 
 def test_nobody_follows_a_participant_any_more_once_its_context_is_shut_down(
