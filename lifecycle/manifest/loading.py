@@ -48,7 +48,7 @@ from lifecycle.manifest.yaml.substitutions import Programs, Surroundings, folder
 from lifecycle.manifest.yaml.yaml_parser import quote
 from lifecycle.network.dscp import TransportPriorityMapping
 from lifecycle.network.five_qi import DscpMapping, dscp_mappings, parse_mapping
-from lifecycle.network.nfe import parse_address
+from lifecycle.network.nfe import canonical, parse_address
 
 _MAX_MAPPING_BYTES = 1_000_000
 
@@ -163,7 +163,7 @@ def build_manifest(
 def _machines(root: Cursor, nodes: tuple[Node, ...], found: Findings) -> tuple[Machine, ...]:
     machines = []
     for name, cursor in root.entries("machines"):
-        address = cursor.text("address")
+        address = canonical(cursor.text("address"))
         if address and parse_address(address) is None:
             at = root.document.at((*cursor.place, "address"))
             message = f"cannot use {quote(address)} as an address; it must be IPv4 or IPv6"

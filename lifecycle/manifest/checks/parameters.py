@@ -13,7 +13,6 @@ An interface that declares no parameters leaves them open, so nothing is checked
 from __future__ import annotations
 
 import contextlib
-import functools
 import math
 import os
 import re
@@ -168,6 +167,15 @@ def _given(node: Node) -> Iterator[Diagnostic]:
             message = f"cannot set parameter {name!r}: the interface declares no such parameter"
             hint = did_you_mean(name, declared) or "declare it under 'interface.parameters'"
             yield error("check.parameter-undeclared", at, message, hint)
+    at = node.where("run.command")
+    for each in command_line_parameters(node):
+        declaration = declared.get(each.name)
+        read = given_value(each.text)
+        if declaration is None or read is None or each.node not in ("", node.name):
+            continue
+        if problem := misfit(read, declaration.type):
+            message = f"cannot set parameter {each.name!r} of {node.key!r} by '-p' to {problem}"
+            yield error("check.parameter-type", at, message, suggestion(read, declaration.type))
 
 
 def _for_no_node(node: Node, names: Collection[str]) -> Iterator[Diagnostic]:
@@ -344,15 +352,6 @@ PARAMETERS_KEY = "ros__parameters"
 _LAYOUT = f"write 'NODE: {{{PARAMETERS_KEY}: {{NAME: VALUE}}}}'"
 
 
-@functools.cache
-def _pattern(name: str) -> re.Pattern[str] | None:
-    # parameter_map_from() of rclcpp and rclpy: every "/*" becomes "(/\w+)", so "/**" "(/\w+)*".
-    try:
-        return re.compile(name.replace("/*", r"(/\w+)"), re.ASCII)
-    except re.error:
-        return None
-
-
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Section:
     """What a file sets for the nodes that match one name or pattern.
@@ -372,9 +371,23 @@ class Section:
         return "*" in self.pattern
 
     def matches(self, node: str) -> bool:
-        """Whether a node with this fully qualified name takes the section's values."""
-        pattern = _pattern(self.pattern)
-        return pattern is not None and pattern.fullmatch(node) is not None
+        """Whether a node with this fully qualified name takes the section's values.
+
+        As parameter_map_from() of rclcpp and rclpy have it for names: `*` is one part of a name,
+        `**` any number of them. What else a regular expression could say there is taken literally.
+        """
+        parts = node.split("/")[1:]
+        reached = {0}  # how many of the parts may be matched so far
+        for wanted in self.pattern.split("/")[1:]:
+            if wanted == "**":
+                reached = set(range(min(reached, default=len(parts) + 1), len(parts) + 1))
+            else:
+                reached = {
+                    count + 1
+                    for count in reached
+                    if count < len(parts) and wanted in ("*", parts[count])
+                }
+        return len(parts) in reached
 
 
 def read_sections(path: str, *, shown: str) -> tuple[tuple[Section, ...], tuple[Diagnostic, ...]]:

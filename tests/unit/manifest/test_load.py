@@ -491,3 +491,14 @@ def test_what_is_done_when_a_process_fails_is_its_nodes_or_nearest_to_it_or_any_
     assert found["left"] == found["right"] == arms
     assert found["viewer"] == found["logger"] == Supervision(restart_sec=0.5)
     assert found["others"] == Supervision()
+
+
+def test_an_address_is_one_address_however_it_is_spelled(tmp_path: Path) -> None:
+    path = tmp_path / "s.lifecycle.yaml"
+    path.write_text(
+        "manifest_version: 1\nsystem: s\nnodes: {a: {attach: true, machine: one}}\n"
+        "machines: {one: {address: fd00::1}, two: {address: 'FD00:0:0::1'}}\n",
+        encoding="utf-8",
+    )
+    machines = load(path).manifest.machines
+    assert [each.address for each in machines] == ["fd00::1", "fd00::1"]
