@@ -89,8 +89,23 @@ def parse_assignments(assignments: tuple[str, ...]) -> dict[str, str]:
     return values
 
 
+def run_commands_option(function: F) -> F:
+    """Add `--run-commands` to a verb that only looks at a manifest."""
+    return click.option(
+        "--run-commands",
+        is_flag=True,
+        help="Run the programs of $(command …), as `lifecycle up` does; without it what they would "
+        "write is left out, and said.",
+    )(function)
+
+
 def load_manifest(
-    path: str, assignments: tuple[str, ...], *, quiet: bool = False, machine: str | None = None
+    path: str,
+    assignments: tuple[str, ...],
+    *,
+    quiet: bool = False,
+    machine: str | None = None,
+    run_commands: bool = True,
 ) -> Loaded:
     """Load and check a manifest; print warnings to stderr unless `quiet`.
 
@@ -100,6 +115,7 @@ def load_manifest(
         quiet: print nothing.
         machine: what its nodes run is looked for, too, as `up --machine` would start it; None looks
             for nothing.
+        run_commands: see `load`.
 
     Raises:
         ManifestError: with every diagnostic.
@@ -107,7 +123,7 @@ def load_manifest(
     from lifecycle.manifest.diagnostics import ManifestError, Severity
     from lifecycle.manifest.loading import load
 
-    loaded = load(path, parse_assignments(assignments))
+    loaded = load(path, parse_assignments(assignments), run_commands=run_commands)
     warnings = loaded.warnings
     if machine is not None:
         found = resolve(loaded.manifest, machine).diagnostics
@@ -121,12 +137,20 @@ def load_manifest(
 
 
 def load_plan(
-    path: str, assignments: tuple[str, ...], *, quiet: bool = False, machine: str | None = None
+    path: str,
+    assignments: tuple[str, ...],
+    *,
+    quiet: bool = False,
+    machine: str | None = None,
+    run_commands: bool = True,
 ) -> Plan:
     """Load a manifest as `load_manifest` does, and return its plan."""
     from lifecycle.plan.build import build_plan
 
-    return build_plan(load_manifest(path, assignments, quiet=quiet, machine=machine).manifest)
+    loaded = load_manifest(
+        path, assignments, quiet=quiet, machine=machine, run_commands=run_commands
+    )
+    return build_plan(loaded.manifest)
 
 
 def resolve(manifest: Manifest, machine: str = "") -> Resolution:

@@ -220,6 +220,7 @@ def load(
     arguments: Mapping[str, str] = _NONE,
     *,
     environment: Mapping[str, str] | None = None,
+    run_commands: bool = True,
 ) -> Loaded:
     """Read and check a manifest, with everything it includes.
 
@@ -228,13 +229,15 @@ def load(
         arguments: values by argument name.
         environment: what `$(env NAME)` and the search for packages see; this process's environment
             if None.
+        run_commands: run the programs of `$(command …)`; else what they would write is left out
+            with a warning, and all else is judged.
 
     Raises:
         ManifestError: with every error and warning, sorted by position.
     """
     variables = os.environ if environment is None else environment
     origin = include.Origin.of(Path(path))
-    loading = _Loading(variables)
+    loading = _Loading(variables, Programs(variables) if run_commands else None)
     manifest = loading.read(origin, arguments, ())
     found = loading.found
 
@@ -368,11 +371,11 @@ class _Loading:
         files: as they were read.
     """
 
-    def __init__(self, environment: Mapping[str, str]) -> None:
+    def __init__(self, environment: Mapping[str, str], programs: Programs | None) -> None:
         self.found: list[Diagnostic] = []
         self.files: list[str] = []
         self._environment = environment
-        self._programs = Programs(environment)
+        self._programs = programs
         self._documents = 0
         self._outermost: Manifest | None = None
 

@@ -20,6 +20,7 @@ from lifecycle.cli.common import (
     manifest_arguments,
     parse_assignments,
     resolve,
+    run_commands_option,
 )
 from lifecycle.cli.report import (
     annotation,
@@ -196,6 +197,7 @@ def _result(rule: str, level: str, text: str, at: Position) -> Result:
 @click.option(
     "--arguments", "lists", is_flag=True, help="List the arguments that it takes, and end."
 )
+@run_commands_option
 @report_option
 def command(
     *,
@@ -205,6 +207,7 @@ def command(
     strict: bool,
     machine: str,
     lists: bool,
+    run_commands: bool,
     report: Path | None,
 ) -> int:
     """Check MANIFEST: schema, names, QoS compatibility, order, flows, and what its nodes run.
@@ -217,7 +220,9 @@ def command(
     if lists:
         return _list(manifest, format_, others=bool(assignments or strict or machine or report))
     try:
-        found = check(manifest, assignments, strict=strict, machine=machine)
+        found = check(
+            manifest, assignments, strict=strict, machine=machine, run_commands=run_commands
+        )
     except LifecycleError as error:
         if report is not None:
             _write(report, _refused(manifest, error), strict=strict)
@@ -269,7 +274,12 @@ def _refused(path: str, error: LifecycleError) -> CheckReport:
 
 
 def check(
-    path: str, assignments: tuple[str, ...], *, strict: bool, machine: str = ""
+    path: str,
+    assignments: tuple[str, ...],
+    *,
+    strict: bool,
+    machine: str = "",
+    run_commands: bool = False,
 ) -> CheckReport:
     """Load and plan a manifest, look for what it runs, and report on it instead of raising.
 
@@ -280,7 +290,7 @@ def check(
     loaded: Manifest | None = None
     resolution = Resolution()
     try:
-        result = load(path, parse_assignments(assignments))
+        result = load(path, parse_assignments(assignments), run_commands=run_commands)
         effective_domain(result.manifest.discovery, os.environ)
         resolution = resolve(result.manifest, machine)
         diagnostics = (

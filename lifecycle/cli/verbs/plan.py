@@ -7,7 +7,12 @@ import shutil
 import click
 
 from lifecycle import codec
-from lifecycle.cli.common import format_option, load_plan, manifest_arguments
+from lifecycle.cli.common import (
+    format_option,
+    load_plan,
+    manifest_arguments,
+    run_commands_option,
+)
 from lifecycle.errors import ExitCode
 from lifecycle.plan.model import Plan
 from lifecycle.plan.render import render_text
@@ -17,13 +22,17 @@ from lifecycle.plan.secrets import without_secrets
 @click.command("plan")
 @manifest_arguments
 @format_option("text", "json", "mermaid", "svg", "html")
-def command(manifest: str, assignments: tuple[str, ...], format_: str) -> int:
+@run_commands_option
+def command(
+    *, manifest: str, assignments: tuple[str, ...], format_: str, run_commands: bool
+) -> int:
     """Show what a manifest becomes: processes, order, nodes, participants, flows, ports.
 
     Starts nothing and needs no ROS. The other formats draw it, as `lifecycle graph` draws what runs
     beside it: mermaid for Markdown, svg and html for a browser.
     """
-    click.echo(render(load_plan(manifest, assignments), format_).rstrip("\n"))
+    plan = load_plan(manifest, assignments, run_commands=run_commands)
+    click.echo(render(plan, format_).rstrip("\n"))
     return ExitCode.OK
 
 

@@ -15,9 +15,10 @@ from collections.abc import Mapping
 from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError, did_you_mean
 from lifecycle.manifest.diagnostics import Diagnostic
-from lifecycle.manifest.yaml.document import Cursor, Document, Place, Scalar, Value, error
+from lifecycle.manifest.yaml.document import Cursor, Document, Place, Scalar, Value, error, warning
 from lifecycle.manifest.yaml.substitutions import (
     NOWHERE,
+    NotRunError,
     Substitution,
     Surroundings,
     Text,
@@ -31,6 +32,9 @@ MAX_TEXT = 1 << 20
 """Characters that the substitutions of one document may produce."""
 
 CONDITIONS = ("if", "unless")
+
+_ARGV = ("command", "prefix")
+"""Lists that are kept although a program that is not run would write one of their words."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,6 +93,7 @@ class _Substitution:
         self.found: list[Diagnostic] = []
         self.broken: list[Place] = []
         self.left_out: list[Place] = []
+        self.open: set[Place] = set()
         self._document = document
         self._surroundings = surroundings
         self._include = include
@@ -177,7 +182,23 @@ class _Substitution:
                 data[key] = dataclasses.replace(each, data=items)
             elif key not in CONDITIONS and (place or key != "arguments"):
                 data[key] = self.value(each, inside)
-        return dataclasses.replace(value, data=data)
+        return dataclasses.replace(value, data=self._known(data, place))
+
+    def _known(self, entries: Mapping[str, Value], place: Place) -> Mapping[str, Value]:
+        """Return the entries of a mapping whose values do not depend on programs."""
+        if not self.open:
+            return entries
+        return {key: each for key, each in entries.items() if (*place, key) not in self.open}
+
+    def _open(self, place: Place, problem: LifecycleError) -> None:
+        """Leave a value out that a program would write; what must be there is an error."""
+        if "arguments" in place[:1] or place[-1] in CONDITIONS:
+            self._report("manifest.command-not-run", place, problem.message, problem.hint)
+            self.broken.append(place)
+            return
+        self.open.add(place)
+        at = self._document.at(place)
+        self.found.append(warning("manifest.command-not-run", at, problem.message, problem.hint))
 
     def _nodes(self, value: Value, nodes: Mapping[str, Value], place: Place) -> Value:
         kept = {}
@@ -237,10 +258,12 @@ class _Substitution:
             items = tuple(
                 self.value(each, (*place, index)) for index, each in enumerate(value.data)
             )
+            if place[-1] not in _ARGV and any((*place, i) in self.open for i in range(len(items))):
+                self.open.add(place)
             return dataclasses.replace(value, data=items)
         if isinstance(value.data, Mapping):
             entries = {key: self.value(each, (*place, key)) for key, each in value.data.items()}
-            return dataclasses.replace(value, data=entries)
+            return dataclasses.replace(value, data=self._known(entries, place))
         if "$" not in value.text:
             return value
         if len(self.found) > MAX_FINDINGS:
@@ -260,6 +283,9 @@ class _Substitution:
             if whole and not value.quoted and text:
                 data = resolve(text)
                 check_finite(data, place)
+        except NotRunError as problem:
+            self._open(place, problem)
+            return value
         except LifecycleError as problem:
             if problem.message:
                 self._report("manifest.substitution", place, problem.message, problem.hint)
@@ -333,7 +359,13 @@ class _Substitution:
         if not words or not words[0]:
             message = f"cannot substitute {quote(written)}; it names no program"
             raise LifecycleError(message, hint="write $(command PROGRAM ARGUMENT …)")
-        return self._surroundings.programs.output(words, self._surroundings.folder)
+        programs = self._surroundings.programs
+        if programs is None:
+            raise NotRunError(
+                f"cannot say what {quote(written)} becomes: its program was not run",
+                hint="give --run-commands if you trust this manifest",
+            )
+        return programs.output(words, self._surroundings.folder)
 
     def _argument(self, name: str, place: Place) -> str:
         if name in self.values:

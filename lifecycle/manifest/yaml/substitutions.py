@@ -218,6 +218,10 @@ def _spelled(value: object) -> str:
     return "true" if value else "false"
 
 
+class NotRunError(LifecycleError):
+    """A value that a program would write, where none may be run."""
+
+
 class Programs:
     """What programs have written, each run once in a load.
 
@@ -346,11 +350,12 @@ class Surroundings:
     Attributes:
         environment: variables, and AMENT_PREFIX_PATH with them.
         folder: what relative paths start from, where programs are started.
+        programs: None: none is run.
     """
 
     environment: Mapping[str, str]
     folder: str
-    programs: Programs
+    programs: Programs | None
 
     def variable(self, name: str, default: Callable[[], str] | None) -> str:
         """Return an environment variable; the default where it is not set.
@@ -407,7 +412,7 @@ class Surroundings:
         return _without_last_break(text)
 
 
-NOWHERE = Surroundings(environment={}, folder=os.curdir, programs=Programs({}))
+NOWHERE = Surroundings(environment={}, folder=os.curdir, programs=None)
 """For documents that are not of a file."""
 
 

@@ -181,3 +181,54 @@ def test_the_arguments_of_a_manifest_are_listed_whatever_else_is_wrong_with_it(
     manifest.write_text("manifest_version: 1\nsystem: arm\nnodes: {}\n")
     assert main(["check", str(manifest), "--arguments"]) == 0
     assert capsys.readouterr().out == f"{manifest} takes no arguments\n"
+
+
+@pytest.mark.usefixtures("without_programs")
+@pytest.mark.parametrize(
+    ("verb", "flags", "code", "runs"),
+    [
+        ("check", [], 0, False),
+        ("check", ["--strict"], 5, False),
+        ("check", ["--strict", "--run-commands"], 0, True),
+        ("plan", [], 0, False),
+        ("plan", ["--run-commands"], 0, True),
+    ],
+)
+def test_programs_of_a_manifest_run_only_when_they_may(
+    verb: str,
+    flags: list[str],
+    code: int,
+    runs: bool,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    path, ran = tmp_path / "s.lifecycle.yaml", tmp_path / "ran"
+    path.write_text(
+        f"manifest_version: 1\nsystem: s\ndescription: $(command touch {ran})\n"
+        "nodes:\n  a:\n    run: {command: [sleep, $(command echo 5)]}\n    managed: false\n"
+        "    parameters: {names: [$(command echo x)], count: $(command echo 3)}\n"
+        "    timeouts: {start_s: $(command echo 3)}\n",
+        encoding="utf-8",
+    )
+    assert main([verb, str(path), *flags]) == code
+    assert ran.exists() is runs
+    said = "".join(capsys.readouterr())
+    assert said.count("its program was not run") == (0 if runs else 5)
+
+
+@pytest.mark.usefixtures("without_programs")
+@pytest.mark.parametrize(
+    "text",
+    [
+        "arguments: {a: {default: $(command echo x)}}\nnodes: {a: {attach: true}}\n",
+        "nodes: {a: {attach: true, if: $(command echo true)}}\n",
+    ],
+)
+def test_what_decides_about_the_rest_cannot_be_left_out(
+    text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "s.lifecycle.yaml"
+    path.write_text(f"manifest_version: 1\nsystem: s\n{text}", encoding="utf-8")
+    assert main(["check", str(path)]) == 3
+    assert "give --run-commands" in capsys.readouterr().out
+    assert main(["check", str(path), "--run-commands"]) == 0
