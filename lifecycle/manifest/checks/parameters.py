@@ -29,7 +29,7 @@ from lifecycle.manifest.model import ModeParameter, Node, ParameterValue, RunKin
 from lifecycle.manifest.nodl import nearest_file
 from lifecycle.manifest.yaml.document import Document, Place, Value, error, note, warning
 from lifecycle.manifest.yaml.source import read_document
-from lifecycle.manifest.yaml.yaml_parser import INT64_MAX, INT64_MIN, not_finite, quote
+from lifecycle.manifest.yaml.yaml_parser import EMPTY, INT64_MAX, INT64_MIN, not_finite, quote
 
 _SCALARS = {bool: "bool", int: "int", float: "double", str: "string"}
 _IMPLICIT = ("use_sim_time", "start_type_description_service")
@@ -404,6 +404,8 @@ def read_sections(path: str, *, shown: str) -> tuple[tuple[Section, ...], tuple[
     try:
         document = read_document(path, shown=shown, found=flaws)
     except ManifestError as problem:
+        if [each.message for each in problem.diagnostics] == [EMPTY]:
+            return (), ()
         return (), tuple(_reworded(each) for each in problem.diagnostics)
     # Infinite doubles, and integers that are too long and become doubles, are legal for rcl.
     broken = [_reworded(each) for each in flaws if each.rule != "yaml.number"]
@@ -436,18 +438,27 @@ class _Reading:
             message = f"cannot use {quote(value.plain())} before {PARAMETERS_KEY!r}"
             self._error(place, message, _LAYOUT)
             return
+        if value.alias:
+            self._alias(place)
+        above = False
         for key, inner in value.data.items():
             if key != PARAMETERS_KEY:
+                if above and _has_section(inner):
+                    message = f"cannot use a node below the {PARAMETERS_KEY!r} of another"
+                    self._error((*place, key), message, "move it above them, or write it in full")
                 self.walk((*place, key), inner)
             elif not place:
                 message = f"cannot use {PARAMETERS_KEY!r} without a node above it"
                 self._error((key,), message, _LAYOUT)
             elif isinstance(inner.data, Mapping):
+                above = True
                 self._section(place, inner)
-            elif inner.data is not None:
+            else:
                 self._error((*place, key), f"cannot use {quote(inner.plain())} as parameters")
 
     def _section(self, place: Place, value: Value) -> None:
+        if value.alias:
+            self._alias((*place, PARAMETERS_KEY))
         pattern = re.sub("/+", "/", "/" + "/".join(str(each) for each in place))
         parameters: list[tuple[str, ParameterValue, Position]] = []
         self._flatten((*place, PARAMETERS_KEY), "", value, parameters)
@@ -465,7 +476,9 @@ class _Reading:
         for key, inner in value.data.items():
             where: Place = (*place, key)
             name = f"{prefix}{key}"
-            if isinstance(inner.data, Mapping):
+            if inner.alias:
+                self._alias(where)
+            elif isinstance(inner.data, Mapping):
                 self._flatten(where, f"{name}.", inner, parameters)
             elif isinstance(inner.data, tuple):
                 if (array := self._array(where, inner.data)) is not None:
@@ -477,6 +490,9 @@ class _Reading:
                 self._error(where, f"cannot leave parameter {name!r} without a value")
 
     def _array(self, place: Place, items: tuple[Value, ...]) -> ParameterValue | None:
+        if any(each.alias for each in items):
+            self._alias(place)
+            return None
         if any(isinstance(each.data, (tuple, Mapping)) for each in items):
             self._error(place, "cannot nest in an array; a ROS array holds scalars of one type")
             return None
@@ -489,9 +505,17 @@ class _Reading:
             return None
         return values
 
+    def _alias(self, place: Place) -> None:
+        self._error(place, "cannot use an alias: ROS reads none in parameter files", "write it out")
+
     def _error(self, place: Place, message: str, hint: str = "") -> None:
         at = self._document.key_at(place)
         self.found.append(error("check.parameter-file", at, message, hint))
+
+
+def _has_section(value: Value) -> bool:
+    data = value.data if isinstance(value.data, Mapping) else {}
+    return PARAMETERS_KEY in data or any(map(_has_section, data.values()))
 
 
 @dataclasses.dataclass(slots=True, kw_only=True)

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position
 from lifecycle.manifest.yaml.document import Document, error
-from lifecycle.manifest.yaml.yaml_parser import compose, quote
+from lifecycle.manifest.yaml.yaml_parser import EMPTY, compose, quote
 
 MAX_BYTES = 1 << 20
 """Size limit of one file, 1 MiB."""
@@ -62,7 +62,7 @@ def parse(text: str, *, file: str, found: list[Diagnostic] | None = None) -> Doc
     if not isinstance(plain, Mapping):
         at = document.at()
         if plain is None:
-            raise ManifestError([error("yaml.empty", at, "cannot read an empty file", _START)])
+            raise ManifestError([error("yaml.empty", at, EMPTY, _START)])
         message = f"cannot use {quote(plain)} as a whole document; it must be a mapping of keys"
         raise ManifestError([error("yaml.root", at, message, _START)])
     return document

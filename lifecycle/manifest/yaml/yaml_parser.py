@@ -28,6 +28,8 @@ from lifecycle.manifest.yaml.document import Document, Place, Scalar, Value, err
 if TYPE_CHECKING:
     import yaml
 
+EMPTY = "cannot read an empty file"
+
 INT64_MIN = -(2**63)
 INT64_MAX = 2**63 - 1
 """ROS integers are int64 (rcl_interfaces/ParameterValue)."""
@@ -226,7 +228,7 @@ class _Composer:
             elif isinstance(event, yaml.ScalarEvent):
                 self._scalar(event, mark)
         if self._root is None:
-            self._stop((1, 1), "cannot read an empty file", "start with 'manifest_version: 1'")
+            self._stop((1, 1), EMPTY, "start with 'manifest_version: 1'")
         return Document(file=self._file, root=self._root), tuple(self._found)
 
     def _events(self, text: str) -> Iterator[yaml.Event]:
@@ -307,7 +309,7 @@ class _Composer:
         self._count(anchored.values, mark)
         if len(self._stack) + anchored.height > MAX_DEPTH:
             self._stop(mark, f"cannot read values nested deeper than {MAX_DEPTH} levels")
-        value = dataclasses.replace(anchored.value, line=mark[0], column=mark[1])
+        value = dataclasses.replace(anchored.value, line=mark[0], column=mark[1], alias=True)
         self._finish(value, None, anchored.values, anchored.height)
 
     def _key(self, data: Scalar, event: yaml.ScalarEvent, mark: tuple[int, int]) -> None:

@@ -180,8 +180,9 @@ nodes:
         (
             "",
             (
-                "yaml.limit p.yaml:1:1: cannot read an empty file; "
-                "write 'NODE: {ros__parameters: {NAME: VALUE}}'"
+                "check.parameter-file-unmatched 6:23: warning: nodes.camera.parameter_files[0]: "
+                "cannot find node '/camera' in 'p.yaml': it is for no node; name the section "
+                "/camera, or /** for every node"
             ),
         ),
         (
