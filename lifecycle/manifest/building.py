@@ -13,6 +13,7 @@ import shlex
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
+from lifecycle.manifest import written
 from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.interface import Findings, build_inline, scalar_tuple
 from lifecycle.manifest.model import (
@@ -47,7 +48,6 @@ from lifecycle.manifest.nodl import read_interface
 from lifecycle.manifest.yaml.document import Cursor, error, note
 from lifecycle.manifest.yaml.yaml_parser import YAML_1_1_BOOLEANS, has_leading_zero, quote
 from lifecycle.network.connection_url import ConnectionUrl, ConnectionUrlError, parse
-from lifecycle.network.dscp import parse_dscp
 
 _KINDS = {kind.value: kind for kind in EndpointKind}
 
@@ -86,13 +86,13 @@ def build_on_violation(cursor: Cursor) -> OnViolation:
 
 def _consequences(cursor: Cursor) -> Iterator[tuple[str, Cursor]]:
     """Yield the entries of `on_violation`; a single value is for every rule."""
-    written = cursor.get("on_violation")
-    if written is None:
+    reactions = cursor.get("on_violation")
+    if reactions is None:
         return
-    if isinstance(written.value.data, Mapping) and [*written.value.data] != ["mode"]:
-        yield from written.entries()
+    if isinstance(reactions.value.data, Mapping) and [*reactions.value.data] != ["mode"]:
+        yield from reactions.entries()
     else:
-        yield BY_DEFAULT, written
+        yield BY_DEFAULT, reactions
 
 
 def section_positions(root: Cursor) -> tuple[tuple[str, Position], ...]:
@@ -444,10 +444,10 @@ def _parameter(name: str, cursor: Cursor, found: Findings) -> ParameterValue | N
 
 
 def _health(cursor: Cursor) -> Health:
-    written = cursor.get("diagnostics")
-    if written is None or isinstance(written.value.data, tuple):
+    patterns = cursor.get("diagnostics")
+    if patterns is None or isinstance(patterns.value.data, tuple):
         return cursor.build(Health)
-    return cursor.build(Health, diagnostics=(written.value.text,))
+    return cursor.build(Health, diagnostics=(patterns.value.text,))
 
 
 def _timeouts(node: Cursor) -> Timeouts:
@@ -459,17 +459,16 @@ def _flows(node: Cursor) -> list[FlowNeed]:
     needs = []
     for kind in (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION):
         for name, cursor in node.entries("flows", kind.value):
-            dscp = cursor.get("dscp")
-            auto = cursor.text("five_qi") == "auto"
+            wanted = written.read(cursor.value.plain(), written.PublisherFlow, strict=False)
+            five_qi = wanted.five_qi
             needs.append(
                 cursor.build(
                     FlowNeed,
                     kind=kind,
                     name=name,
-                    # A number may be written as 46.0 or 0x2e: the scalar counts, not its text.
-                    dscp=None if dscp is None else parse_dscp(_dscp_word(dscp)),
-                    five_qi=None if auto else cursor.integer("five_qi"),
-                    five_qi_auto=auto,
+                    dscp=None if wanted.dscp is None else wanted.dscp.value,
+                    five_qi=None if five_qi == "auto" else five_qi,
+                    five_qi_auto=five_qi == "auto",
                     quantities=quantities(cursor),
                     at=cursor.key_at,
                 )
@@ -492,11 +491,6 @@ def quantities(cursor: Cursor) -> tuple[Quantity, ...]:
         if value is not None and isinstance(value.scalar, (int, float)):
             found.append(Quantity(name=name, value=value.scalar, at=value.at))
     return tuple(found)
-
-
-def _dscp_word(cursor: Cursor) -> str | int:
-    assert isinstance(cursor.scalar, (str, int, float))
-    return cursor.scalar if isinstance(cursor.scalar, str) else int(cursor.scalar)
 
 
 def _written_paths(node: Cursor) -> Iterator[tuple[str, str]]:

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
+import msgspec
+
 from lifecycle.manifest.diagnostics import Diagnostic
 from lifecycle.manifest.model import (
     Endpoint,
@@ -19,11 +21,8 @@ from lifecycle.manifest.model import (
 from lifecycle.manifest.qos import (
     POLICIES,
     PRESETS,
-    Durability,
     History,
-    Liveliness,
     QosProfile,
-    Reliability,
     not_written,
     problems,
 )
@@ -89,20 +88,13 @@ def _qos(endpoint: Cursor, default: QosProfile, found: Findings) -> QosProfile:
     if not isinstance(cursor.value.data, Mapping):
         return PRESETS[cursor.value.text]
     start = PRESETS[cursor.text("preset")] if "preset" in cursor else default
-    history = cursor.choice("history", History, start.history)
-    depth = cursor.integer("depth")
-    profile = QosProfile(
-        history=history,
-        depth=_depth(history, start.depth if depth is None else depth),
-        reliability=cursor.choice("reliability", Reliability, start.reliability),
-        durability=cursor.choice("durability", Durability, start.durability),
-        deadline_ns=_duration(cursor, "deadline_ns", start.deadline_ns),
-        lifespan_ns=_duration(cursor, "lifespan_ns", start.lifespan_ns),
-        liveliness=cursor.choice("liveliness", Liveliness, start.liveliness),
-        liveliness_lease_duration_ns=_duration(
-            cursor, "liveliness_lease_duration_ns", start.liveliness_lease_duration_ns
-        ),
-    )
+    policies = {name: each.scalar for name, each in cursor.entries() if name != "preset"}
+    plain = {**msgspec.to_builtins(start), **policies}
+    # rmw and NoDL alike: a duration of zero is none (RMW_DURATION_UNSPECIFIED).
+    plain |= {name: each or None for name, each in plain.items() if name.endswith("_ns")}
+    if plain["history"] == History.KEEP_ALL.value:
+        plain["depth"] = 0  # rmw ignores it there
+    profile = msgspec.convert(plain, QosProfile, strict=False)
     at = cursor.document.at((*cursor.place, "depth"))
     found.extend(error("manifest.qos", at, f"cannot {each}") for each in problems(profile))
     return profile
@@ -115,16 +107,6 @@ def _defaults(qos: Cursor | None) -> tuple[str, ...]:
     if not isinstance(qos.value.data, Mapping) or "preset" in qos:
         return ()
     return not_written([name for name, _ in qos.entries()])
-
-
-def _depth(history: History, depth: int) -> int:
-    return 0 if history is History.KEEP_ALL else depth  # rmw ignores it there
-
-
-def _duration(cursor: Cursor, key: str, default: int | None) -> int | None:
-    value = cursor.integer(key)
-    # rmw and NoDL alike: a duration of zero is none (RMW_DURATION_UNSPECIFIED).
-    return default if value is None else value or None
 
 
 def _declaration(name: str, cursor: Cursor, found: Findings) -> ParameterDeclaration:

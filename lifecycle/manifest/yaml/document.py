@@ -8,7 +8,6 @@ it as well. Pure.
 
 from __future__ import annotations
 
-import enum
 import functools
 import json
 import re
@@ -142,7 +141,6 @@ def note(rule: str, at: Position, message: str, hint: str = "") -> Diagnostic:
     return Diagnostic(rule=rule, severity=Severity.NOTE, at=at, message=message, hint=hint)
 
 
-E = TypeVar("E", bound=enum.Enum)
 T = TypeVar("T")
 
 _EXACT = 2**53
@@ -209,19 +207,6 @@ class Cursor:
         """Return a string; any other scalar as it was written."""
         cursor = self.get(key)
         return default if cursor is None else cursor.value.text
-
-    def integer(self, key: str) -> int | None:
-        """Return an integer; None where the key is missing. JSON Schema counts 5.0 as one."""
-        cursor = self.get(key)
-        if cursor is None:
-            return None
-        assert isinstance(cursor.scalar, (int, float))
-        return int(cursor.scalar)
-
-    def choice(self, key: str, type_: type[E], default: E) -> E:
-        """Return an enum by its value."""
-        cursor = self.get(key)
-        return default if cursor is None else type_(cursor.scalar)
 
     def build(self, type_: type[T], /, **computed: Any) -> T:
         """Return a dataclass whose fields are keys of this mapping.
