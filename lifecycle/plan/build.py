@@ -260,11 +260,13 @@ def build_plan(
 
 def with_files_of_now(plan: Plan) -> Plan:
     """Return a plan with the digests that its parameter files have now."""
+    digest_of = functools.cache(_digest)
     nodes = tuple(
         dataclasses.replace(
             node,
             files=tuple(
-                _planned_file(node.parameter_files, each.place, each.written) for each in node.files
+                _planned_file(node.parameter_files, each.place, each.written, digest_of)
+                for each in node.files
             ),
         )
         for node in plan.nodes
@@ -403,7 +405,8 @@ def _wired(
     needs = FlowNeeds(manifest, prefixes)
     files = ParameterFiles(manifest.path, manifest.modes)
     hash_of = functools.cache(functools.partial(installed_hash, prefixes=prefixes))
-    nodes = tuple(_planned_node(node, needs, hash_of, files) for node in manifest.nodes)
+    digest_of = functools.cache(_digest)
+    nodes = tuple(_planned_node(node, needs, files, hash_of, digest_of) for node in manifest.nodes)
     return wire(
         manifest,
         nodes,
@@ -479,7 +482,11 @@ def effective_range(discovery: Discovery, environment: Mapping[str, str]) -> Dis
 
 
 def _planned_node(
-    node: Node, needs: FlowNeeds, hash_of: Callable[[str], str], files: ParameterFiles
+    node: Node,
+    needs: FlowNeeds,
+    files: ParameterFiles,
+    hash_of: Callable[[str], str],
+    digest_of: Callable[[str], str],
 ) -> PlannedNode:
     endpoints = tuple(
         _planned_endpoint(node, endpoint, needs.of(node.key, endpoint.kind, endpoint.name), hash_of)
@@ -512,7 +519,8 @@ def _planned_node(
         endpoint_policy=node.endpoints,
         transports=needs.node_transports(node) if ours else (),
         files=tuple(
-            _planned_file(node.parameter_files, place, text) for place, text in node.written_paths
+            _planned_file(node.parameter_files, place, text, digest_of)
+            for place, text in node.written_paths
         ),
     )
 
@@ -530,17 +538,21 @@ def _held_by(node: Node) -> HeldBy:
     return HeldBy.SERVICES if node.managed else HeldBy.NOTHING
 
 
-def _planned_file(files: tuple[str, ...], place: str, written: str) -> PlannedFile:
+def _planned_file(
+    files: tuple[str, ...], place: str, written: str, digest_of: Callable[[str], str]
+) -> PlannedFile:
     part, _, index = place.partition(".")
-    if part != "parameter_files":
-        return PlannedFile(place=place, written=written)
+    digest = digest_of(files[int(index)]) if part == "parameter_files" else ""
+    return PlannedFile(place=place, written=written, digest=digest)
+
+
+def _digest(path: str) -> str:
+    """Return the digest of a file's contents; empty if it cannot be read."""
     try:
-        contents = read_bytes(files[int(index)], file=written)
+        contents = read_bytes(path, file=path)
     except ManifestError:
-        return PlannedFile(place=place, written=written)  # reported by check.parameter-file
-    return PlannedFile(
-        place=place, written=written, digest=hashlib.sha256(contents).hexdigest()[:16]
-    )
+        return ""  # reported by check.parameter-file
+    return hashlib.sha256(contents).hexdigest()[:16]
 
 
 def _resolved(node: Node, endpoint: Endpoint) -> str:

@@ -8,6 +8,7 @@ is an error; what only running it, or another host, can show is named as unresol
 
 from __future__ import annotations
 
+import functools
 import os
 import re
 import shutil
@@ -89,124 +90,129 @@ def resolve_programs(
         is_ours: whether a machine, by name, is this host; what is missing here of the others is
             unresolved. Code that is found here is judged for them, too.
     """
-    looking = _Looking(environment, manifest.data_layer.authority)
-    for node in manifest.nodes:
-        looking.look(node, is_ours=is_ours(node.machine))
-    return Resolution(diagnostics=tuple(looking.found), unresolved=tuple(looking.unresolved))
+    sources = functools.cache(Sources)
+
+    @functools.cache
+    def read(folders: tuple[str, ...], module: str, name: str) -> NodeClass:
+        return sources(folders).read_class(module, name)
+
+    found = [
+        each
+        for node in manifest.nodes
+        for each in _look(
+            node,
+            read,
+            environment=environment,
+            authority=manifest.data_layer.authority,
+            ours=is_ours(node.machine),
+        )
+    ]
+    return Resolution(
+        diagnostics=tuple(each for each in found if isinstance(each, Diagnostic)),
+        unresolved=tuple(each for each in found if isinstance(each, UnresolvedProgram)),
+    )
 
 
-class _Looking:
-    """One run over the nodes of a manifest."""
+_Found = Diagnostic | UnresolvedProgram
+_Read = Callable[[tuple[str, ...], str, str], NodeClass]
 
-    def __init__(self, environment: Mapping[str, str], authority: Authority) -> None:
-        self.found: list[Diagnostic] = []
-        self.unresolved: list[UnresolvedProgram] = []
-        self._environment = environment
-        self._authority = authority
-        self._sources: dict[tuple[str, ...], Sources] = {}
-        self._classes: dict[tuple[tuple[str, ...], str], NodeClass | LifecycleError] = {}
 
-    def look(self, node: Node, *, is_ours: bool) -> None:
-        """Look for what one node runs.
+def _look(
+    node: Node,
+    read: _Read,
+    *,
+    environment: Mapping[str, str],
+    authority: Authority,
+    ours: bool,
+) -> Iterator[_Found]:
+    """Look for what one node runs.
 
-        Args:
-            node: the node.
-            is_ours: its machine is this host.
-        """
-        run = node.run
-        if run.kind is RunKind.PYTHON:
-            self._python(node, is_ours=is_ours)
-        elif run.kind is RunKind.COMMAND and run.command:
-            subject = f"program {run.command[0]!r}"
-            try:
-                _find_command(run, self._environment)
-            except NotThereError as problem:
-                self._missing(node, "run.command", subject, problem, is_ours=is_ours)
-        elif run.kind is RunKind.COMMAND:
-            self._package(node, is_ours=is_ours)
-
-    def _unresolved(self, at: Position, subject: str, reason: str) -> None:
-        self.unresolved.append(UnresolvedProgram(at=at, subject=subject, reason=reason))
-
-    def _missing(
-        self, node: Node, part: str, subject: str, problem: LifecycleError, *, is_ours: bool
-    ) -> None:
-        at = _at(node, part)
-        if is_ours:
-            self.found.append(error(RULE, at, problem.message, problem.hint))
-        else:
-            here = problem.message.replace("cannot find", "there is no", 1)
-            self._unresolved(at, subject, f"it is for machine {node.machine!r}; here, {here}")
-
-    def _package(self, node: Node, *, is_ours: bool) -> None:
-        run = node.run
-        subject = f"executable {run.executable!r} of package {run.package!r}"
-        if not self._environment.get("AMENT_PREFIX_PATH"):
+    Args:
+        node: the node.
+        read: returns the class of a name in a module that is looked for in folders first.
+        environment: as for resolve_programs.
+        authority: of the data layer.
+        ours: its machine is this host.
+    """
+    run = node.run
+    if run.kind is RunKind.PYTHON:
+        yield from _python(node, read, authority=authority, ours=ours)
+    elif run.kind is RunKind.COMMAND:
+        part, subject = "run.command", f"program {run.command[0]!r}" if run.command else ""
+        if not run.command:
+            part = "run.executable"
+            subject = f"executable {run.executable!r} of package {run.package!r}"
+        if not run.command and not environment.get("AMENT_PREFIX_PATH"):
             reason = "AMENT_PREFIX_PATH is empty; source the setup file of its workspace"
-            self._unresolved(_at(node, "run.package"), subject, reason)
+            at = _at(node, "run.package")
+            yield UnresolvedProgram(at=at, subject=subject, reason=reason)
             return
         try:
-            find_executable(run, self._environment, at=node.at)
-        except PlanError as problem:
-            self._missing(node, "run.executable", subject, problem, is_ours=is_ours)
+            if run.command:
+                _find_command(run, environment)
+            else:
+                find_executable(run, environment, at=node.at)
+        except (NotThereError, PlanError) as problem:
+            yield _missing(node, part, subject, problem, ours=ours)
 
-    def _python(self, node: Node, *, is_ours: bool) -> None:
-        subject = f"class {node.run.python!r}"
-        at = _at(node, "run.python")
-        module, separator, name = node.run.python.partition(":")
-        if not separator or not module or not name.isidentifier():
-            message = f"cannot read {node.run.python!r}; write package.module:Class"
-            self.found.append(error(RULE, at, message))
-            return
-        found = self._class(node)
-        if isinstance(found, NotThereError):
-            # A module that is not here may be there; one that is here lacks the class there, too.
-            may_be_there = not is_ours and found.message.startswith("cannot find module")
-            self._missing(node, "run.python", subject, found, is_ours=not may_be_there)
-        elif isinstance(found, LifecycleError):
-            self._unresolved(at, subject, found.message)
-        elif found.is_node is False:
-            message = (
-                f"cannot use {name!r} of {module} ({found.file}) as a node: it is no node class"
-            )
-            hint = "derive it from lifecycle.LifecycleNode, or from rclpy.node.Node"
-            self.found.append(error(RULE, at, message, hint))
-        else:
-            self.found += _called(node, found, at)
-            if found.is_managed is not None and not found.is_ours and found.is_node:
-                self.found += _immovable(node, found, at, self._authority)
-            self.found += _without_health(node, found)
-            self._interface(node, found, at, subject)
 
-    def _class(self, node: Node) -> NodeClass | LifecycleError:
-        folders = _folders(node)
-        key = (folders, node.run.python)
-        if key not in self._classes:
-            sources = self._sources.setdefault(folders, Sources(folders))
-            module, _, name = node.run.python.partition(":")
-            try:
-                self._classes[key] = sources.read_class(module, name)
-            except (NotThereError, UnknownError) as problem:
-                self._classes[key] = problem
-        return self._classes[key]
+def _missing(node: Node, part: str, subject: str, problem: LifecycleError, *, ours: bool) -> _Found:
+    at = _at(node, part)
+    if ours:
+        return error(RULE, at, problem.message, problem.hint)
+    here = problem.message.replace("cannot find", "there is no", 1)
+    reason = f"it is for machine {node.machine!r}; here, {here}"
+    return UnresolvedProgram(at=at, subject=subject, reason=reason)
 
-    def _interface(self, node: Node, found: NodeClass, at: Position, subject: str) -> None:
-        """Compare what a class handles and asks for with what the node declares."""
-        problems = [*_pairs(node, found, at)] if found.is_ours else []
-        accesses = [*_undeclared(node, found, at)] if found.is_ours else []
-        if found.unknown:
-            of = "handlers" if found.is_ours else "node class"
-            self._unresolved(at, f"{of} of {subject}", found.unknown)
-            # What is there is there, whatever else may be.
-            problems = [each for each in problems if each.message.startswith("cannot use")]
-        if found.declares and (problems or accesses):
-            reason = "; ".join(
-                ["its code declares endpoints itself", *(each.message for each in problems[:1])]
-            )
-            self._unresolved(at, f"endpoints of {subject}", reason)
-            return
-        self.found += problems
-        self.found += accesses
+
+def _python(node: Node, read: _Read, *, authority: Authority, ours: bool) -> Iterator[_Found]:
+    subject = f"class {node.run.python!r}"
+    at = _at(node, "run.python")
+    module, separator, name = node.run.python.partition(":")
+    if not separator or not module or not name.isidentifier():
+        yield error(RULE, at, f"cannot read {node.run.python!r}; write package.module:Class")
+        return
+    try:
+        found = read(_folders(node), module, name)
+    except NotThereError as problem:
+        # A module that is not here may be there; one that is here lacks the class there, too.
+        is_missing_module = problem.message.startswith("cannot find module")
+        here = ours or not is_missing_module
+        yield _missing(node, "run.python", subject, problem, ours=here)
+        return
+    except UnknownError as problem:
+        yield UnresolvedProgram(at=at, subject=subject, reason=problem.message)
+        return
+    if found.is_node is False:
+        yield error(
+            RULE,
+            at,
+            f"cannot use {name!r} of {module} ({found.file}) as a node: it is no node class",
+            "derive it from lifecycle.LifecycleNode, or from rclpy.node.Node",
+        )
+        return
+    yield from _called(node, found, at)
+    if found.is_managed is not None and not found.is_ours and found.is_node:
+        yield from _immovable(node, found, at, authority)
+    yield from _without_health(node, found)
+    yield from _interface(node, found, at, subject)
+
+
+def _interface(node: Node, found: NodeClass, at: Position, subject: str) -> Iterator[_Found]:
+    """Compare what a class handles and asks for with what the node declares."""
+    problems = [*_pairs(node, found, at)] if found.is_ours else []
+    accesses = [*_undeclared(node, found, at)] if found.is_ours else []
+    if found.unknown:
+        of = "handlers" if found.is_ours else "node class"
+        yield UnresolvedProgram(at=at, subject=f"{of} of {subject}", reason=found.unknown)
+        # What is there is there, whatever else may be.
+        problems = [each for each in problems if each.message.startswith("cannot use")]
+    if found.declares and (problems or accesses):
+        first = f"; {problems[0].message}" if problems else ""
+        reason = f"its code declares endpoints itself{first}"
+        yield UnresolvedProgram(at=at, subject=f"endpoints of {subject}", reason=reason)
+        return
+    yield from (*problems, *accesses)
 
 
 def _folders(node: Node) -> tuple[str, ...]:
