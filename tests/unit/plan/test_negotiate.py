@@ -59,14 +59,20 @@ def urls(graph: DataLayerGraph) -> dict[str, tuple[str, ...]]:
     return {f"{each.node} {each.name}": each.urls for each in graph.connections}
 
 
-def problem(graph: DataLayerGraph) -> str:
-    """The only problem, with its hint."""
-    (only,) = graph.problems
-    return f"{only.message}; {only.hint}" if only.hint else only.message
+NO_SHM = tuple(each for each in CONNECTABLE if each != "shm")
+MULTICAST = Wish.MULTICAST
+GROUP = "udpm://239.255.1.1:8910?ttl=0&interface=127.0.0.1"
+FIRST, SECOND = (
+    f"udpm://239.255.9.{number}:{9999 + number}?ttl=0&interface=127.0.0.1" for number in (1, 2)
+)
+WATCHING = Contact(host=THERE, transport="tcpv4", peer=Peer(address=THERE, port=1))
+LISTENERS = "2 processes of the host listen, and not by shared memory"
+LARGE = "not lossy, and 40000 bytes are more than one datagram"
+SERVED = ("shm://", "tcpv4://?server=10.77.0.3:42100")
+TO_S = ("/t", "p", "s")
 
-
-def test_what_own_participants_do_anyway_needs_no_connection():
-    graph = negotiate(
+MADE = {
+    "what own participants do anyway needs no connection": (
         [
             party("p", pub()),
             party("inside", sub(), process="p"),
@@ -75,54 +81,40 @@ def test_what_own_participants_do_anyway_needs_no_connection():
         ],
         {},
         Terms(),
-    )
-    assert media(graph) == {
-        "inside": ("intraprocess", "same process"),
-        "near": ("shm", "same host"),
-        "far": ("udpv4", "other host"),
-    }
-    assert graph.connections == ()
-
-
-def test_a_publisher_can_ask_for_udp_on_its_own_host():
-    graph = negotiate([party("p", pub(transport=Wish.UDPV4)), party("s", sub())], {}, Terms())
-    assert media(graph) == {"s": ("udpv4", "the publisher asks for it")}
-    assert urls(graph) == {"p udpv4": ("udpv4://",)}
-
-
-def test_a_link_overrides_what_the_publisher_asks_for():
-    graph = negotiate(
+        {
+            "inside": ("intraprocess", "same process"),
+            "near": ("shm", "same host"),
+            "far": ("udpv4", "other host"),
+        },
+        {},
+    ),
+    "a publisher can ask for UDP on its own host": (
         [party("p", pub(transport=Wish.UDPV4)), party("s", sub())],
-        {("/t", "p", "s"): Wish.TCPV4},
+        {},
         Terms(),
-    )
-    assert media(graph) == {"s": ("tcpv4", "a link says so")}
-    assert urls(graph) == {
-        "p tcpv4": (f"tcpv4://{HERE}:7910",),
-        "s tcpv4": (f"tcpv4://{HERE}:7911?peer={HERE}:7910",),
-    }
-
-
-def test_a_subscription_can_ask_where_nobody_else_does():
-    graph = negotiate([party("p", pub()), party("s", sub(transport=Wish.NETWORK))], {}, Terms())
-    assert media(graph) == {"s": ("udpv4", "the subscription asks for it")}
-    assert urls(graph) == {"p udpv4": ("udpv4://",)}
-
-
-def test_both_ends_must_ask_for_the_same():
-    graph = negotiate(
-        [party("p", pub(transport=Wish.SHM)), party("s", sub(transport=Wish.TCPV4))], {}, Terms()
-    )
-    assert problem(graph) == (
-        "cannot carry '/t' from 'p' to 's': the publisher asks for shm, the subscription for tcpv4;"
-        " ask for the same at both ends, or let a link decide with 'transport:'"
-    )
-
-
-def test_one_datagram_goes_to_all_subscriptions_of_the_host_and_tcp_to_the_others():
-    graph = negotiate(
+        {"s": ("udpv4", "the publisher asks for it")},
+        {"p udpv4": ("udpv4://",)},
+    ),
+    "a link overrides what the publisher asks for": (
+        [party("p", pub(transport=Wish.UDPV4)), party("s", sub())],
+        {TO_S: Wish.TCPV4},
+        Terms(),
+        {"s": ("tcpv4", "a link says so")},
+        {
+            "p tcpv4": (f"tcpv4://{HERE}:7910",),
+            "s tcpv4": (f"tcpv4://{HERE}:7911?peer={HERE}:7910",),
+        },
+    ),
+    "a subscription can ask where nobody else does": (
+        [party("p", pub()), party("s", sub(transport=Wish.NETWORK))],
+        {},
+        Terms(),
+        {"s": ("udpv4", "the subscription asks for it")},
+        {"p udpv4": ("udpv4://",)},
+    ),
+    "one datagram goes to all of the host, and TCP to the others": (
         [
-            party("p", pub(transport=Wish.MULTICAST)),
+            party("p", pub(transport=MULTICAST)),
             party("near", sub()),
             party("near2", sub()),
             party("inside", sub(), process="p"),
@@ -132,67 +124,128 @@ def test_one_datagram_goes_to_all_subscriptions_of_the_host_and_tcp_to_the_other
         Terms(
             observers=(Contact(host=THERE, transport="tcpv4", peer=Peer(address=THERE, port=1)),)
         ),
-    )
-    assert media(graph) == {
-        "near": ("udpm", "the publisher asks for it"),
-        "near2": ("udpm", "the publisher asks for it"),
-        "inside": ("intraprocess", "same process"),
-        "far": ("tcpv4", "multicast stays on its host"),
-    }
-    group = "udpm://239.255.1.1:8910?ttl=0&interface=127.0.0.1"
-    assert urls(graph) == {
-        "p udpm_tcpv4_t": (group, f"tcpv4://{HERE}:7910?peer={THERE}:1"),
-        "near udpm_t": (group,),
-        "near2 udpm_t": (group,),
-        "far tcpv4": (f"tcpv4://{THERE}:7910?peer={HERE}:7910&peer={THERE}:1",),
-    }
-
-
-def test_each_topic_that_goes_by_multicast_has_a_group_and_a_port_of_its_own():
-    multicast = Wish.MULTICAST
-    graph = negotiate(
+        {
+            "near": ("udpm", "the publisher asks for it"),
+            "near2": ("udpm", "the publisher asks for it"),
+            "inside": ("intraprocess", "same process"),
+            "far": ("tcpv4", "multicast stays on its host"),
+        },
+        {
+            "p udpm_tcpv4_t": (GROUP, f"tcpv4://{HERE}:7910?peer={THERE}:1"),
+            "near udpm_t": (GROUP,),
+            "near2 udpm_t": (GROUP,),
+            "far tcpv4": (f"tcpv4://{THERE}:7910?peer={HERE}:7910&peer={THERE}:1",),
+        },
+    ),
+    "each topic that goes by multicast has a group and a port": (
         [
-            party("p", pub("/a", transport=multicast), pub("/b", transport=multicast)),
+            party("p", pub("/a", transport=MULTICAST), pub("/b", transport=MULTICAST)),
             party("s", sub("/a"), sub("/b")),
         ],
         {},
         Terms(multicast_group="239.255.9.1", first_port=9000),
-    )
-    first = "udpm://239.255.9.1:10000?ttl=0&interface=127.0.0.1"
-    second = "udpm://239.255.9.2:10001?ttl=0&interface=127.0.0.1"
-    assert urls(graph) == {
-        "p udpm_a": (first,),
-        "p udpm_b": (second,),
-        "s udpm_a": (first,),
-        "s udpm_b": (second,),
-    }
-
-
-def test_many_listeners_without_shared_memory_share_one_datagram():
-    none = tuple(each for each in CONNECTABLE if each != "shm")
-    graph = negotiate(
+        {"s": ("udpm", "the publisher asks for it")},
+        {"p udpm_a": (FIRST,), "p udpm_b": (SECOND,), "s udpm_a": (FIRST,), "s udpm_b": (SECOND,)},
+    ),
+    "many listeners without shared memory share one datagram": (
         [
             party("p", pub(), own=("udpv6",)),
-            party("a", sub(), own=("udpv4",), transports=none),
-            party("b", sub(), own=("udpv4",), transports=none),
+            party("a", sub(), own=("udpv4",), transports=NO_SHM),
+            party("b", sub(), own=("udpv4",), transports=NO_SHM),
         ],
         {},
         Terms(),
-    )
-    reason = "2 processes of the host listen, and not by shared memory"
-    assert media(graph) == {"a": ("udpm", reason), "b": ("udpm", reason)}
+        {"a": ("udpm", LISTENERS), "b": ("udpm", LISTENERS)},
+        None,
+    ),
+    "what must arrive and is large goes by TCP to other hosts": (
+        [
+            party("p", pub(lossy=False, size_bytes=40_000)),
+            party("near", sub()),
+            party("far", sub(), host=THERE),
+        ],
+        {},
+        Terms(),
+        {"near": ("shm", "same host"), "far": ("tcpv4", LARGE)},
+        None,
+    ),
+    "a subscription can deny that its data bear loss": (
+        [
+            party("p", pub(lossy=True, size_bytes=40_000)),
+            party("far", sub(lossy=False), host=THERE),
+        ],
+        {},
+        Terms(),
+        {"far": ("tcpv4", LARGE)},
+        None,
+    ),
+    "IPv6 hosts talk by IPv6": (
+        [
+            party("p", pub(), host="fd77::1", own=("shm",)),
+            party("s", sub(), host="fd77::2", own=("udpv6", "tcpv4")),
+        ],
+        {},
+        Terms(),
+        {"s": ("udpv6", "other host, and no UDP over IPv4 between")},
+        {"p udpv6": ("udpv6://[fd77::1]",)},
+    ),
+    "beside another transport Fast DDS announces nothing by shared memory": (
+        [party("p", pub()), party("near", sub()), party("far", sub())],
+        {("/t", "p", "far"): Wish.TCPV4},
+        Terms(),
+        {"near": ("shm", "same host"), "far": ("tcpv4", "a link says so")},
+        {
+            "far tcpv4": (f"tcpv4://{HERE}:7910?peer={HERE}:7911",),
+            "p shm_udpv4_tcpv4": ("shm://", "udpv4://", f"tcpv4://{HERE}:7911"),
+        },
+    ),
+    "shared memory alone is joined by shared memory alone": (
+        [party("p", pub(by=("shm",), fixed=True)), party("s", sub())],
+        {},
+        Terms(),
+        {"s": ("shm", "same host")},
+        {"s shm": ("shm://",)},
+    ),
+    "a node that makes its own participants is met by the other end": (
+        [party("p", pub(), connectable=False), party("s", sub(transport=Wish.NETWORK))],
+        {},
+        Terms(),
+        {"s": ("udpv4", "the subscription asks for it")},
+        {"s udpv4": ("udpv4://",)},
+    ),
+    "where ports are fixed connections have all of theirs": (
+        [party("p", pub(), own=("shm",)), party("s", sub(), own=("shm",))],
+        {TO_S: Wish.UDPV4},
+        Terms(fixed=True, taken=((HERE, (7911,)),)),
+        {"s": ("udpv4", "a link says so")},
+        {
+            "p udpv4": (
+                f"udpv4://{HERE}:7912?metatraffic_port=7910&output_port=7913&multicast=off",
+            ),
+            "s udpv4": (
+                (
+                    f"udpv4://{HERE}:7915?metatraffic_port=7914&output_port=7916&peer={HERE}:7910"
+                    "&multicast=off"
+                ),
+            ),
+        },
+    ),
+    "a connection is a client of the discovery server": (
+        [party("p", pub(), own=("tcpv4",)), party("s", sub(), own=("tcpv4",))],
+        {TO_S: Wish.SHM},
+        Terms(server=Peer(address="10.77.0.3", port=42100)),
+        {"s": ("shm", "a link says so")},
+        {"p shm": SERVED, "s shm": SERVED},
+    ),
+}
 
 
-def test_what_must_arrive_and_is_larger_than_a_datagram_goes_by_tcp_to_other_hosts():
-    parties = [
-        party("p", pub(lossy=False, size_bytes=40_000)),
-        party("near", sub()),
-        party("far", sub(), host=THERE),
-    ]
-    assert media(negotiate(parties, {}, Terms())) == {
-        "near": ("shm", "same host"),
-        "far": ("tcpv4", "not lossy, and 40000 bytes are more than one datagram"),
-    }
+@pytest.mark.parametrize("case", MADE)
+def test_each_pair_is_carried_by_what_was_asked_for_or_is_there(case: str):
+    parties, wishes, terms, carried, connections = MADE[case]
+    graph = negotiate(parties, wishes, terms)
+    assert media(graph) == carried
+    assert connections is None or urls(graph) == connections
 
 
 @pytest.mark.parametrize(
@@ -203,146 +256,64 @@ def test_otherwise_udp_does_for_other_hosts(lossy: bool | None, size: int | None
     assert media(negotiate(parties, {}, Terms())) == {"far": ("udpv4", "other host")}
 
 
-def test_a_subscription_can_deny_that_its_data_bear_loss():
-    parties = [
-        party("p", pub(lossy=True, size_bytes=40_000)),
-        party("far", sub(lossy=False), host=THERE),
-    ]
-    assert media(negotiate(parties, {}, Terms()))["far"][0] == "tcpv4"
-
-
-def test_ipv6_hosts_talk_by_ipv6():
-    v6 = ("udpv6", "tcpv4")
-    graph = negotiate(
-        [
-            party("p", pub(), host="fd77::1", own=("shm",)),
-            party("s", sub(), host="fd77::2", own=v6),
-        ],
+REFUSED = {
+    "both ends must ask for the same": (
+        [party("p", pub(transport=Wish.SHM)), party("s", sub(transport=Wish.TCPV4))],
         {},
-        Terms(),
-    )
-    assert media(graph) == {"s": ("udpv6", "other host, and no UDP over IPv4 between")}
-    assert urls(graph) == {"p udpv6": ("udpv6://[fd77::1]",)}
-
-
-def test_nothing_in_common_names_what_each_end_can():
-    graph = negotiate(
+        (
+            "cannot carry '/t' from 'p' to 's': the publisher asks for shm, the subscription for tcpv4;"
+            " ask for the same at both ends, or let a link decide with 'transport:'"
+        ),
+    ),
+    "nothing in common": (
         [
             party("p", pub(), own=("udpv4",), transports=("udpv4", "shm")),
             party("s", sub(), host=THERE, own=("tcpv4",), transports=("tcpv4",)),
         ],
         {},
-        Terms(),
-    )
-    assert problem(graph) == (
-        "cannot carry '/t' from 'p' to 's': 'p' can be connected by udpv4, shm; 's' by tcpv4; "
-        "they are on different hosts, where shared memory is none"
-    )
-    assert graph.flows == ()
-
-
-@pytest.mark.parametrize(
-    ("changes", "text"),
-    [
         (
-            {"serializations": ("xcdr2",)},
-            (
-                "cannot carry '/t' from 'p' to 's': no wire format is common; 'p' has cdr; 's' has "
-                "xcdr2"
-            ),
+            "cannot carry '/t' from 'p' to 's': 'p' can be connected by udpv4, shm; 's' by tcpv4; "
+            "they are on different hosts, where shared memory is none"
         ),
+    ),
+    "no wire format": (
+        [party("p", pub()), party("s", sub(), serializations=("xcdr2",))],
+        {TO_S: Wish.UDPV4},
+        "cannot carry '/t' from 'p' to 's': no wire format is common; 'p' has cdr; 's' has xcdr2",
+    ),
+    "no paradigm": (
+        [party("p", pub()), party("s", sub(), paradigms=("request-response",))],
+        {},
         (
-            {"paradigms": ("request-response",)},
-            (
-                "cannot carry '/t' from 'p' to 's': no communication paradigm is common; 'p' has "
-                "publish-subscribe, request-response; 's' has request-response"
-            ),
+            "cannot carry '/t' from 'p' to 's': no communication paradigm is common; 'p' has "
+            "publish-subscribe, request-response; 's' has request-response"
         ),
-    ],
-)
-def test_without_common_ground_no_transport_helps(changes: dict[str, tuple[str, ...]], text: str):
-    parties = [party("p", pub()), party("s", sub(), **changes)]
-    assert problem(negotiate(parties, {}, Terms())) == text
-    expected = problem(negotiate(parties, {("/t", "p", "s"): Wish.UDPV4}, Terms()))
-    assert expected == text
-
-
-def test_inside_a_process_nothing_can_be_chosen():
-    parties = [party("p", pub()), party("s", sub(), process="p")]
-    graph = negotiate(parties, {("/t", "p", "s"): Wish.UDPV4}, Terms())
-    assert problem(graph) == (
-        "cannot carry '/t' from 'p' to 's' by udpv4: both are in process 'p', and inside a process "
-        "no transport is used; give one of the two another 'process:'"
-    )
-
-
-def test_a_connection_has_by_what_those_on_their_own_participant_discover_it():
-    """Beside another transport, Fast DDS announces nothing by shared memory."""
-    parties = [party("p", pub()), party("near", sub()), party("far", sub())]
-    graph = negotiate(parties, {("/t", "p", "far"): Wish.TCPV4}, Terms())
-    assert {key: medium for key, (medium, _) in media(graph).items()} == {
-        "near": "shm",
-        "far": "tcpv4",
-    }
-    assert list(urls(graph)) == ["far tcpv4", "p shm_udpv4_tcpv4"]
-
-
-def test_shared_memory_alone_is_joined_by_shared_memory_alone():
-    parties = [party("p", pub(by=("shm",), fixed=True)), party("s", sub())]
-    assert urls(negotiate(parties, {}, Terms())) == {"s shm": ("shm://",)}
-
-
-def test_shared_memory_wins_against_what_one_link_asks_for():
-    graph = negotiate(
+    ),
+    "inside a process nothing can be chosen": (
+        [party("p", pub()), party("s", sub(), process="p")],
+        {TO_S: Wish.UDPV4},
+        (
+            "cannot carry '/t' from 'p' to 's' by udpv4: both are in process 'p', and inside a process "
+            "no transport is used; give one of the two another 'process:'"
+        ),
+    ),
+    "shared memory wins against what one link asks for": (
         [party("p", pub()), party("q", pub()), party("s", sub(fixed=True)), party("r", sub())],
-        {("/t", "p", "s"): Wish.TCPV4},
-        Terms(),
-    )
-    assert problem(graph) == (
-        "cannot carry '/t' from 'p' to 's' by tcpv4, as a link says so: the publisher's "
-        "participant has shm, tcpv4, udpv4, the subscription's shm, udpv4, so it would go by shm; "
-        "ask for one transport for all that these two endpoints talk to"
-    )
-
-
-def test_a_node_that_makes_its_own_participants_is_met_by_the_other_end():
-    graph = negotiate(
-        [party("p", pub(), connectable=False), party("s", sub(transport=Wish.NETWORK))], {}, Terms()
-    )
-    assert urls(graph) == {"s udpv4": ("udpv4://",)}
-
-
-def test_where_ports_are_fixed_connections_have_all_of_theirs_and_look_for_each_other():
-    graph = negotiate(
-        [
-            party("p", pub(), own=("shm",)),
-            party("s", sub(), own=("shm",)),
-        ],
-        {("/t", "p", "s"): Wish.UDPV4},
-        Terms(fixed=True, taken=((HERE, (7911,)),)),
-    )
-    assert urls(graph) == {
-        "p udpv4": (f"udpv4://{HERE}:7912?metatraffic_port=7910&output_port=7913&multicast=off",),
-        "s udpv4": (
-            (
-                f"udpv4://{HERE}:7915?metatraffic_port=7914&output_port=7916&peer={HERE}:7910"
-                "&multicast=off"
-            ),
+        {TO_S: Wish.TCPV4},
+        (
+            "cannot carry '/t' from 'p' to 's' by tcpv4, as a link says so: the publisher's "
+            "participant has shm, tcpv4, udpv4, the subscription's shm, udpv4, so it would go by shm; "
+            "ask for one transport for all that these two endpoints talk to"
         ),
-    }
+    ),
+}
 
 
-def test_a_connection_is_a_client_of_the_discovery_server():
-    server = Peer(address="10.77.0.3", port=42100)
-    graph = negotiate(
-        [party("p", pub(), own=("tcpv4",)), party("s", sub(), own=("tcpv4",))],
-        {("/t", "p", "s"): Wish.SHM},
-        Terms(server=server),
-    )
-    assert urls(graph) == {
-        "p shm": ("shm://", "tcpv4://?server=10.77.0.3:42100"),
-        "s shm": ("shm://", "tcpv4://?server=10.77.0.3:42100"),
-    }
+@pytest.mark.parametrize("case", REFUSED)
+def test_a_pair_that_nothing_can_carry_is_one_problem(case: str):
+    parties, wishes, text = REFUSED[case]
+    (only,) = negotiate(parties, wishes, Terms()).problems
+    assert f"{only.message}; {only.hint}".removesuffix("; ") == text
 
 
 def test_publishers_that_are_told_apart_stay_apart():
