@@ -1,7 +1,22 @@
 """Which transport carries a publisher → subscription pair: the rules of negotiation for one pair.
 
-Owns: `carried`, what Fast DDS does with two participants, and `choose`, which medium a pair gets
-and why. Pure.
+The first rule that applies decides; what both ends cannot have is a problem with its reason.
+
+1.  No common wire format or paradigm: a problem.
+2.  Asked for, by a link, else the publisher, else the subscription: that, if both ends can have it.
+    Inside a process only `shm` and `multicast` can be asked for, and are handed over directly.
+    `multicast` to another host is TCP; `network` is what is there if that is one IP transport, else
+    UDP before TCP, IPv6 first where a host has an IPv6 address.
+3.  One process: handed over inside it.
+4.  An end whose transports are not known: its RMW chooses.
+5.  One host: what is there anyway if that is one transport; shared memory; one datagram to a group
+    (TTL 0, loopback) where several processes listen; UDP, TCP.
+6.  Two hosts: TCP if the publisher sends to a group, which stays on its host, or if the data may
+    not be lost and are more than one datagram; else what is there anyway, UDP, TCP.
+
+An end that asked for something else than what was chosen, where no link decides, is a problem.
+
+Owns: `carried`, what Fast DDS does with two participants, and `choose`, these rules. Pure.
 """
 
 from __future__ import annotations
@@ -47,6 +62,15 @@ class Pair:
         return self.same_host and self.publisher.process == self.subscription.process
 
     @property
+    def present(self) -> list[Medium]:
+        """By what the data go if neither end leaves its participant, see `carried`."""
+        return carried(
+            self.writer.by or self.publisher.own,
+            self.reader.by or self.subscription.own,
+            same_host=self.same_host,
+        )
+
+    @property
     def lossy(self) -> bool | None:
         """Whether the data bear an unreliable transport: either end can deny it."""
         said = (self.writer.lossy, self.reader.lossy)
@@ -89,7 +113,7 @@ MEETING = Medium.SHM
 """By what participants of one process find each other, if they have nothing else in common."""
 
 
-def carried(writer: Collection[str], reader: Collection[str], *, same_host: bool) -> list[str]:
+def carried(writer: Collection[str], reader: Collection[str], *, same_host: bool) -> list[Medium]:
     """Return by what Fast DDS 2.14 sends from a participant with some transports to another.
 
     Shared memory wins on one host. Of IP transports all that are common carry every sample, so
@@ -241,11 +265,7 @@ def _common(pair: Pair) -> set[str]:
 def _asked(pair: Pair, wish: FlowTransport, who: str, *, by_multicast: bool) -> Choice:
     common = _common(pair)
     if wish is FlowTransport.NETWORK:
-        present = carried(
-            _by(pair.publisher, pair.writer),
-            _by(pair.subscription, pair.reader),
-            same_host=pair.same_host,
-        )
+        present = pair.present
         if len(present) == 1 and present[0] in wish.media:
             return Choice(medium=present[0], reason=who)
         order = _ip_order(pair)
@@ -267,10 +287,6 @@ def _asked(pair: Pair, wish: FlowTransport, who: str, *, by_multicast: bool) -> 
     return Choice(medium=medium, reason=who)
 
 
-def _by(party: Party, endpoint: PartyEndpoint) -> tuple[str, ...]:
-    return endpoint.by or party.own
-
-
 def _ip_order(pair: Pair) -> tuple[str, ...]:
     ipv6 = ":" in pair.publisher.host or ":" in pair.subscription.host
     ip = (each for each in CONNECTABLE if each.is_network and not each.is_group)
@@ -280,11 +296,7 @@ def _ip_order(pair: Pair) -> tuple[str, ...]:
 def _unasked(
     pair: Pair, by_multicast: bool, listeners: int, max_datagram_bytes: int | None
 ) -> Choice:
-    present = carried(
-        _by(pair.publisher, pair.writer),
-        _by(pair.subscription, pair.reader),
-        same_host=pair.same_host,
-    )
+    present = pair.present
     default = present[0] if len(present) == 1 else ""
     if pair.same_host:
         return _near(pair, default, listeners)
@@ -322,8 +334,7 @@ def _why_tcp(pair: Pair, *, by_multicast: bool, max_datagram_bytes: int | None) 
     if by_multicast:
         return "multicast stays on its host"
     size = pair.writer.size_bytes
-    ipv6 = ":" in pair.publisher.host
-    limit = max_datagram_bytes or max_unfragmented(ipv6=ipv6)
+    limit = max_datagram_bytes or max_unfragmented(ipv6=":" in pair.publisher.host)
     if pair.lossy is False and size is not None and is_fragmented(size, limit):
         return f"not lossy, and {size} bytes are more than one datagram"
     return ""

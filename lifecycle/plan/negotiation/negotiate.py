@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 
 from lifecycle.manifest.model import EndpointKind, FlowTransport
-from lifecycle.network.medium import CONNECTABLE, UDP_UNICAST, medium_of
+from lifecycle.network.medium import CONNECTABLE, UDP_UNICAST, Medium, medium_of
 from lifecycle.plan.negotiation.connecting import Moved, connections_of
 from lifecycle.plan.negotiation.data_layer import (
     DataLayerGraph,
@@ -237,7 +237,7 @@ class _Carriers:
         party, endpoint = self._parties[end]
         return self._moved.get(end) or {*(endpoint.by or party.own)}
 
-    def _present(self, pair: Pair) -> list[str]:
+    def _present(self, pair: Pair) -> list[Medium]:
         writer, reader = map(self._transports, pair.ends)
         return carried(writer, reader, same_host=pair.same_host)
 

@@ -261,8 +261,8 @@ REFUSED = {
         [party("p", pub(transport=Wish.SHM)), party("s", sub(transport=Wish.TCPV4))],
         {},
         (
-            "cannot carry '/t' from 'p' to 's': the publisher asks for shm, the subscription for tcpv4;"
-            " ask for the same at both ends, or let a link decide with 'transport:'"
+            "cannot carry '/t' from 'p' to 's': the publisher asks for shm, the subscription for "
+            "tcpv4; ask for the same at both ends, or let a link decide with 'transport:'"
         ),
     ),
     "nothing in common": (
@@ -293,8 +293,8 @@ REFUSED = {
         [party("p", pub()), party("s", sub(), process="p")],
         {TO_S: Wish.UDPV4},
         (
-            "cannot carry '/t' from 'p' to 's' by udpv4: both are in process 'p', and inside a process "
-            "no transport is used; give one of the two another 'process:'"
+            "cannot carry '/t' from 'p' to 's' by udpv4: both are in process 'p', and inside a "
+            "process no transport is used; give one of the two another 'process:'"
         ),
     ),
     "shared memory wins against what one link asks for": (
@@ -302,8 +302,8 @@ REFUSED = {
         {TO_S: Wish.TCPV4},
         (
             "cannot carry '/t' from 'p' to 's' by tcpv4, as a link says so: the publisher's "
-            "participant has shm, tcpv4, udpv4, the subscription's shm, udpv4, so it would go by shm; "
-            "ask for one transport for all that these two endpoints talk to"
+            "participant has shm, tcpv4, udpv4, the subscription's shm, udpv4, so it would go by "
+            "shm; ask for one transport for all that these two endpoints talk to"
         ),
     ),
 }
