@@ -150,9 +150,12 @@ def planned_processes(
     domain_id: int,
     discovery_range: DiscoveryRange,
     environment: Mapping[str, str],
+    connecting: Sequence[tuple[str, str]] = (),
     shared_memory: bool = False,
 ) -> tuple[PlannedProcess, ...]:
     """Group nodes by process, in the order in which the manifest first names each process.
+
+    That nodes can share a process is checked by `manifest.checks`.
 
     Args:
         nodes: in manifest order.
@@ -160,8 +163,9 @@ def planned_processes(
         discovery_range: given to every process in ROS_AUTOMATIC_DISCOVERY_RANGE, but to commands
             that have shared memory alone: rmw_fastrtps_cpp 8.4 would have them look for peers at
             127.0.0.1 only, where no peer is, and shared memory stays on this host anyway.
-        shared_memory: own participants have nothing else.
         environment: where AMENT_PREFIX_PATH is looked up.
+        connecting: variables that connect commands, whose participants are their own code's.
+        shared_memory: own participants have nothing else.
 
     Raises:
         PlanError: an executable cannot be found.
@@ -170,38 +174,28 @@ def planned_processes(
     for node in nodes:
         groups.setdefault(node.process_name, []).append(node)
 
-    def graph_variables(kind: RunKind) -> tuple[tuple[str, str], ...]:
-        near = discovery_range is DiscoveryRange.LOCALHOST and shared_memory
-        reach = (
-            DiscoveryRange.SYSTEM_DEFAULT if near and kind is RunKind.COMMAND else discovery_range
+    def process(name: str, group: Sequence[Node]) -> PlannedProcess:
+        run = group[0].run
+        is_command = run.kind is RunKind.COMMAND
+        near = is_command and shared_memory and discovery_range is DiscoveryRange.LOCALHOST
+        reach = DiscoveryRange.SYSTEM_DEFAULT if near else discovery_range
+        return PlannedProcess(
+            name=name,
+            machine=group[0].machine,
+            run=run,
+            nodes=tuple(node.key for node in group),
+            argv=(*run.prefix, *command_line(group, environment)) if is_command else (),
+            environment=tuple(
+                {
+                    **(dict(connecting) if is_command else {}),
+                    "ROS_DOMAIN_ID": str(domain_id),
+                    "ROS_AUTOMATIC_DISCOVERY_RANGE": reach.name,
+                    **dict(run.environment),
+                }.items()
+            ),
         )
-        return (("ROS_DOMAIN_ID", str(domain_id)), ("ROS_AUTOMATIC_DISCOVERY_RANGE", reach.name))
 
-    return tuple(
-        _process(name, group, graph_variables(group[0].run.kind), environment)
-        for name, group in groups.items()
-    )
-
-
-def _process(
-    name: str,
-    nodes: Sequence[Node],
-    graph_variables: tuple[tuple[str, str], ...],
-    environment: Mapping[str, str],
-) -> PlannedProcess:
-    """Plan one process; that its nodes can share it is checked by `manifest.checks`."""
-    first = nodes[0]
-    argv: tuple[str, ...] = ()
-    if first.run.kind is RunKind.COMMAND:
-        argv = command_line(nodes, environment)
-    return PlannedProcess(
-        name=name,
-        machine=first.machine,
-        run=first.run,
-        nodes=tuple(node.key for node in nodes),
-        argv=(*first.run.prefix, *argv) if argv else (),
-        environment=tuple({**dict(graph_variables), **dict(first.run.environment)}.items()),
-    )
+    return tuple(process(name, group) for name, group in groups.items())
 
 
 def build_plan(
@@ -242,6 +236,7 @@ def build_plan(
             domain_id=domain_id,
             discovery_range=discovery_range,
             environment=variables,
+            connecting=variables_of(manifest.discovery, wired.server),
             shared_memory=manifest.discovery.transport.in_memory,
         ),
         nodes=wired.nodes,
@@ -255,7 +250,7 @@ def build_plan(
         observers=wired.observers,
         settle_s=manifest.discovery.settle_s,
     )
-    return _told(in_mode(plan, plan.modes[0].name) if plan.modes else plan)
+    return in_mode(plan, plan.modes[0].name) if plan.modes else plan
 
 
 def with_files_of_now(plan: Plan) -> Plan:
@@ -416,22 +411,6 @@ def _wired(
             node.key: dict(node.run.environment).get("RMW_IMPLEMENTATION", "") or rmw
             for node in manifest.nodes
         },
-    )
-
-
-def _told(plan: Plan) -> Plan:
-    """Configure processes that make their own participants, by variables."""
-    variables = dict(variables_of(plan.discovery, plan.server))
-    return dataclasses.replace(
-        plan,
-        processes=tuple(
-            dataclasses.replace(
-                each, environment=tuple({**variables, **dict(each.environment)}.items())
-            )
-            if each.run.kind is RunKind.COMMAND
-            else each
-            for each in plan.processes
-        ),
     )
 
 
