@@ -78,8 +78,6 @@ class Launched:
 def evaluate(path: Path, arguments: Mapping[str, str]) -> Launched:
     """Evaluate a launch file, in Python, XML or YAML, without starting what it describes.
 
-    What the file prints and launch logs goes to standard error: standard output has the manifest.
-
     Args:
         path: the file.
         arguments: launch arguments by name.
@@ -87,11 +85,6 @@ def evaluate(path: Path, arguments: Mapping[str, str]) -> Launched:
     Raises:
         UsageError: `launch` is not installed, there is no such file, or it cannot be evaluated.
     """
-    with contextlib.redirect_stdout(sys.stderr):
-        return _evaluated(path, arguments)
-
-
-def _evaluated(path: Path, arguments: Mapping[str, str]) -> Launched:
     try:
         launch = importlib.import_module("launch")
     except ModuleNotFoundError as problem:
@@ -102,26 +95,16 @@ def _evaluated(path: Path, arguments: Mapping[str, str]) -> Launched:
             hint="install the ros-DISTRO-launch package of your ROS distribution and source its "
             "setup file; PyPI has none",
         ) from problem
-    sources = importlib.import_module("launch.launch_description_sources")
     if not os.path.isfile(path):
         raise UsageError(f"cannot import {str(path)!r}: there is no such file")
     before = dict(os.environ)
     # launch_ros looks nowhere without it; wheels of ROS packages are below sys.prefix.
     os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)
-    started = dict(os.environ)
+    walk = _Walk(
+        launch.LaunchContext(argv=[f"{name}:={value}" for name, value in arguments.items()])
+    )
     try:
-        description = sources.get_launch_description_from_any_launch_file(str(path.absolute()))
-        context = launch.LaunchContext(argv=[f"{n}:={v}" for n, v in arguments.items()])
-        context.extend_locals({"current_launch_file_path": str(path.resolve())})
-        context.launch_configurations.update(arguments)
-        context.extend_globals(
-            {
-                "current_launch_file_path": str(path.resolve()),
-                "current_launch_file_directory": str(path.resolve().parent),
-            }
-        )
-        walk = _Walk(context, started)
-        walk.visit(description)
+        walk.begin(path, arguments)
     except LifecycleError:
         raise
     except Exception as problem:
@@ -154,11 +137,23 @@ _NEVER = (
 class _Walk:
     """One walk over a launch description, depth first, in the order in which launch acts."""
 
-    def __init__(self, context: Any, environment: Mapping[str, str]) -> None:
+    def __init__(self, context: Any) -> None:
         self.found = Launched()
         self._context = context
-        self._environment = environment
+        self._environment = dict(os.environ)
         self._left = MAX_ENTITIES
+
+    def begin(self, path: Path, arguments: Mapping[str, str]) -> None:
+        """Evaluate a launch file, whatever its language."""
+        sources = importlib.import_module("launch.launch_description_sources")
+        place = {
+            "current_launch_file_path": str(path.resolve()),
+            "current_launch_file_directory": str(path.resolve().parent),
+        }
+        self._context.extend_locals(place)
+        self._context.extend_globals(place)
+        self._context.launch_configurations.update(arguments)
+        self.visit(sources.get_launch_description_from_any_launch_file(str(path.absolute())))
 
     def visit(self, entity: Any, notes: tuple[str, ...] = ()) -> None:
         """Carry out what sets something, read what would start something."""
@@ -303,28 +298,25 @@ class _Walk:
         return str(names.make_namespace_absolute(names.prefix_namespace(base, own)) or "/")
 
     def _settings(self, node: LaunchedNode, parameters: Any, remappings: Any) -> None:
-        for each in self._context.launch_configurations.get("global_params") or ():
+        given = [*(self._context.launch_configurations.get("global_params") or ())]
+        for each in given + (self._evaluated(parameters) if parameters else []):
             if isinstance(each, tuple):
-                self._parameter(node, each[0], each[1])
-            else:
+                self._parameter(node, *each)
+            elif isinstance(each, Mapping):
+                for name, value in each.items():
+                    self._parameter(node, name, value)
+            elif isinstance(each, (str, os.PathLike)):
                 self._file(node, str(each))
-        if parameters:
-            for each in self._evaluated(parameters):
-                if isinstance(each, Mapping):
-                    for name, value in each.items():
-                        self._parameter(node, name, value)
-                elif isinstance(each, os.PathLike):
-                    self._file(node, os.fspath(each))
-                else:
-                    self._parameter(node, *each.evaluate(self._context))
+            else:
+                self._parameter(node, *each.evaluate(self._context))
         rules = [*(self._context.launch_configurations.get("ros_remaps") or ())]
         rules += [(self._text(source), self._text(target)) for source, target in remappings or ()]
         for source, target in rules:
             node.remap.setdefault(source, target)  # rcl takes the first that matches
 
-    def _evaluated(self, parameters: Any) -> Iterable[Any]:
+    def _evaluated(self, parameters: Any) -> list[Any]:
         utilities = importlib.import_module("launch_ros.utilities")
-        return utilities.evaluate_parameters(self._context, parameters)  # type: ignore[no-any-return]
+        return list(utilities.evaluate_parameters(self._context, parameters))
 
     def _parameter(self, node: LaunchedNode, name: str, value: Any) -> None:
         if isinstance(value, (list, tuple)):
@@ -399,10 +391,8 @@ class _Walk:
         """Return text of what may be text, a substitution, or a list of these."""
         if value is None:
             return ""
-        if isinstance(value, (str, bool, int, float)):
+        if isinstance(value, (str, bool, int, float, os.PathLike)):
             return str(value)
-        if isinstance(value, os.PathLike):
-            return str(os.fspath(value))
         if isinstance(value, Iterable):
             return "".join(self._text(each) for each in value)
         return str(value.perform(self._context))

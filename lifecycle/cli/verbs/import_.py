@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
+import sys
 from pathlib import Path
 
 import click
@@ -33,7 +35,8 @@ def command(
     from lifecycle.cli.launch_files import evaluate, gaps_of, to_launched_manifest
     from lifecycle.cli.verbs.init import schema_reference
 
-    found = evaluate(launch_file, parse_assignments(assignments))
+    with contextlib.redirect_stdout(sys.stderr):  # what the file prints, and launch logs
+        found = evaluate(launch_file, parse_assignments(assignments))
     if not found.nodes:
         raise UsageError(
             f"cannot import {str(launch_file)!r}: it describes no node with these arguments",
