@@ -7,6 +7,7 @@ import dataclasses
 import io
 import json
 import re
+from types import SimpleNamespace
 
 import msgspec
 import pytest
@@ -24,6 +25,7 @@ from lifecycle.network.nfe import (
 )
 from lifecycle.node.host.control import Operation
 from lifecycle.supervisor.control.protocol import NodeStatus, ProcessState, Reach, SystemStatus
+from lifecycle.supervisor.control.status import node_status
 from lifecycle.supervisor.run.events import (
     Event,
     Failure,
@@ -42,7 +44,8 @@ from lifecycle.supervisor.run.options import UpResult
 from lifecycle.verify.outcome import ConnectionReport, Outcome
 from lifecycle.verify.report import to_json
 from lifecycle.verify.verdict import FlowReport, Stage
-from tests.builders import nfe
+from tests.builders import nfe, node, publisher
+from tests.builders import planned as planned_of
 from tests.unit.supervisor.fakes import verdict_of
 
 EVENTS: tuple[Event, ...] = (
@@ -451,6 +454,32 @@ def test_a_flow_shows_its_tuple_dscp_and_tos_requirement_and_verdict() -> None:
     assert (cells["dscp"], cells["dscp_name"], cells["tos"]) == ("46", "EF", "184")
     assert (cells["five_qi"], cells["effective_transport"]) == ("85", "shm")
     assert json.loads(render_flows([FLOW], "json"))[0]["topic"] == "/video"
+
+
+def test_a_command_is_shown_as_it_was_judged_and_matches_where_its_flows_are_ok() -> None:
+    planned = planned_of(node("camera", publisher("/video"), publisher("/audio"))).nodes[0]
+    command = SimpleNamespace(
+        name="/camera",
+        planned=planned,
+        process=None,
+        configuration=None,
+        pid=0,
+        reach=Reach.ACTIVE,
+        state="active",
+        doing="",
+        withheld="",
+        reports_changes=False,
+    )
+    wrong = dataclasses.replace(
+        verdict_of(Outcome.VIOLATED, "state.wrong-state").findings[0],
+        node="/camera",
+        observed="inactive",
+    )
+    verdict = dataclasses.replace(verdict_of(Outcome.OK), findings=(wrong,), flows=(FLOW,))
+    shown = node_status(command, verdict, "", elapsed_s=0.0, schedule=None)
+    assert (shown.state, shown.matched, shown.unreported, shown.endpoints) == ("inactive", 1, 1, 2)
+    hosted = SimpleNamespace(**{**vars(command), "reports_changes": True})
+    assert node_status(hosted, verdict, "", elapsed_s=0.0, schedule=None).state == "active"
 
 
 @pytest.mark.parametrize(
