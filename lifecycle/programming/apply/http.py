@@ -10,19 +10,20 @@ from __future__ import annotations
 
 import asyncio
 import email.utils
-import json
 import os
+import re
 import ssl
 import threading
 import time
-import zlib
-from collections.abc import Collection, Mapping
-from typing import Any, NoReturn
+from collections.abc import Mapping
+from typing import Any, TypeVar
 from urllib.parse import quote, unquote, urlsplit
 
-from lifecycle import dataclasses
+import msgspec
+
+from lifecycle.codec import from_json, to_json
 from lifecycle.network.nfe import is_loopback
-from lifecycle.programming.apply.settings import Token
+from lifecycle.programming.apply.settings import Token, readable
 from lifecycle.programming.apply.target import HttpError, MissingFeatureError, SettingsError
 from lifecycle.programming.apply.tool import Deadline
 
@@ -34,20 +35,24 @@ except ModuleNotFoundError:  # an extra: most systems program no network that is
 MERGE_PATCH = "application/merge-patch+json"
 """RFC 7396; what TS 29.122 wants of PATCH."""
 
+ID_PATTERN = r"^[!-~]{1,512}$"
+"""The id of a subscription or a session; CAMARA's are UUIDs."""
+
 _IDEMPOTENT = frozenset({"GET", "PUT", "DELETE", "PATCH"})
 """RFC 9110 §9.2.2, and PATCH: a merge patch that is applied twice gives the same."""
 
-_PASSING = frozenset({500, 502, 503, 504})
+_ALWAYS_AGAIN = frozenset({409, 429, 503})
+_PASSING = frozenset({500, 502, 504})
 _MAX_QUOTED = 300
 _LARGEST_ANSWER = 4 * 1024 * 1024
 """Bytes, unpacked: answers are a session or a subscription each, and a list of them all when one
 was lost."""
 
-_LONGEST_ID = 512
-"""Characters of the id of a subscription or a session; CAMARA's are UUIDs."""
+_CODINGS = ("", "identity", "gzip", "x-gzip", "deflate")
+"""Content codings that are unpacked, though none is asked for: one at most, as each multiplies the
+size by up to a thousand."""
 
-_GZIP_OR_ZLIB = 32 + zlib.MAX_WBITS
-"""zlib finds out by itself which of the two headers there is."""
+_T = TypeVar("_T")
 
 
 class Clock:
@@ -66,8 +71,7 @@ class Clock:
         woken.wait(seconds)
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Patience:
+class Patience(msgspec.Struct, frozen=True, kw_only=True):
     """How long to go on asking.
 
     Attributes:
@@ -84,107 +88,13 @@ class Patience:
     total_s: float = 60.0
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Fields:
-    """A JSON object of an answer; what is read of it is checked first.
-
-    Attributes:
-        reply: the answer.
-        values: the object.
-        where: of the object in the answer, "[2]."; empty for the whole.
-    """
-
-    reply: Reply
-    values: Mapping[str, Any]
-    where: str = ""
-
-    def text(self, key: str, *, required: bool = False) -> str:
-        """Return a string; empty if there is none.
-
-        Raises:
-            HttpError: it is something else, or is required and not there.
-        """
-        value = self.values.get(key)
-        if value is None and not required:
-            return ""
-        if not isinstance(value, str) or (required and not value):
-            self.refuse(key, "a string" if value is not None else "", value)
-        return value
-
-    def one_of(self, key: str, allowed: Collection[str]) -> str:
-        """Return a string that is one of a few.
-
-        Raises:
-            HttpError: it is not.
-        """
-        value = self.values.get(key)
-        if not isinstance(value, str) or value not in allowed:
-            self.refuse(key, f"one of {', '.join(allowed)}", value)
-        return value
-
-    def whole(self, key: str, least: int, most: int) -> int | None:
-        """Return a whole number; None if there is none.
-
-        Raises:
-            HttpError: it is something else, or less than `least`, or more than `most`.
-        """
-        value = self.values.get(key)
-        if value is None:
-            return None
-        if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
-            self.refuse(key, f"a whole number from {least} to {most}", value)
-        return value
-
-    def identifier(self, key: str) -> str:
-        """Return an id that can be a path segment of a URL; empty if there is none.
-
-        Raises:
-            HttpError: it cannot be one.
-        """
-        value = self.text(key)
-        if value and not _is_identifier(value):
-            self.refuse(key, _IDENTIFIER, value)
-        return value
-
-    def link(self, key: str) -> str:
-        """Return the id at the end of a URL, see `last_segment`; empty if there is none.
-
-        Raises:
-            HttpError: it is no URL, or its end cannot be an id.
-        """
-        value = self.text(key)
-        try:
-            found = last_segment(value)
-        except ValueError:
-            self.refuse(key, "a URL", value)
-        if found and not _is_identifier(found):
-            self.refuse(key, f"a URL that ends in {_IDENTIFIER}", value)
-        return found
-
-    def refuse(self, key: str, allowed: str, value: object = None) -> NoReturn:
-        """Raise for a field that cannot be used.
-
-        Args:
-            key: of the field.
-            allowed: what it must be, "a string".
-            value: what it is; None if it is missing.
-
-        Raises:
-            HttpError: always. The request may have taken effect.
-        """
-        is_there = f"{show(value)} is not {allowed}" if value is not None else "is missing"
-        raise self.reply.unusable(f"{self.where}{key}", is_there)
-
-
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Reply:
+class Reply(msgspec.Struct, frozen=True, kw_only=True):
     """An answer.
 
     Attributes:
         asked: the request, "GET http://nef.example.net/…".
         reason: beside the status.
-        body: decoded JSON object or array; None if there was none.
-        flaw: why there is no body that can be used; empty if there is one, or was none.
+        body: as far as it was read.
         location: of what was created; empty if there was none.
         retry_after: as it was sent; empty if it was not.
     """
@@ -192,8 +102,7 @@ class Reply:
     asked: str
     status: int
     reason: str
-    body: object
-    flaw: str
+    body: bytes
     location: str
     retry_after: str
 
@@ -207,85 +116,55 @@ class Reply:
         """Whether there is no such thing (any more)."""
         return self.status in (404, 410)
 
-    def object(self, *, may_be_empty: bool = False) -> Fields:
-        """Return the body, which must be a JSON object.
-
-        Args:
-            may_be_empty: an answer without a body is an object without fields.
+    def read(self, type_: type[_T]) -> _T:
+        """Return the body, which must be JSON that fits a type.
 
         Raises:
-            HttpError: it is something else.
+            HttpError: it does not. The request may have taken effect.
         """
-        body = self.body
-        if may_be_empty and body is None and not self.flaw:
-            body = {}
-        if self.flaw or not isinstance(body, dict):
-            raise self._no_body("a JSON object")
-        return Fields(reply=self, values=body)
+        try:
+            return from_json(self.body, type_, longest=_LARGEST_ANSWER)
+        except ValueError as error:
+            reason = readable(error)
+            at_field = reason != str(error)
+            raise self.unusable(reason if at_field else f"its body: {reason}") from error
 
-    def objects(self) -> tuple[Fields, ...]:
-        """Return the body, which must be an array of JSON objects; none of it if it is gone.
-
-        Raises:
-            HttpError: it is something else.
-        """
-        if self.gone:
-            return ()
-        if self.flaw or not isinstance(self.body, list):
-            raise self._no_body("a JSON array")
-        found = []
-        for index, each in enumerate(self.body):
-            if not isinstance(each, dict):
-                raise self.unusable(f"[{index}]", f"{show(each)} is not a JSON object")
-            found.append(Fields(reply=self, values=each, where=f"[{index}]."))
-        return tuple(found)
-
-    def created(self) -> str:
-        """Return the id at the end of Location; empty if there is no Location.
-
-        Raises:
-            HttpError: it is no URL, or its end cannot be an id.
-        """
-        return Fields(reply=self, values={"Location": self.location}).link("Location")
-
-    def _no_body(self, allowed: str) -> HttpError:
-        there = "" if self.body is None else f"{show(self.body)} "
-        return self.unusable("its body", self.flaw or f"{there}is not {allowed}")
-
-    def unusable(self, field: str, reason: str) -> HttpError:
-        """Return the error for an answer that was understood as far as `field`.
-
-        Args:
-            field: "duration", "[2].self", "Location".
-            reason: follows the field, "'x' is not a string".
-        """
+    def unusable(self, reason: str) -> HttpError:
+        """Return the error for an answer that is no use; `reason` names the field first."""
         return HttpError(
-            f"cannot use the answer {self.status} to {self.asked}: {field}: {reason}",
+            f"cannot use the answer {self.status} to {self.asked}: {text_of(reason)}",
             status=self.status,
             # Whatever the answer is worth, the server has taken the request.
             uncertain=True,
             hint="check that the url is that of such a server",
         )
 
+    def linked(self, url: str) -> str:
+        """Return the last path segment of an absolute or relative URL: the id of what it names.
 
-def show(value: object) -> str:
-    """Spell a value of an answer on one line, printable and short."""
-    if isinstance(value, dict):
-        return "a JSON object"
-    if isinstance(value, list):
-        return "a JSON array"
-    if value is None:
-        return "null"
-    spelled = str(value).lower() if isinstance(value, bool) else repr(value)
-    return spelled if len(spelled) <= _SHOWN else f"{spelled[: _SHOWN - 2]}…{spelled[-1]}"
+        Only the id is taken of a Location: behind a gateway its host is often one that cannot be
+        reached from here, and a token must not follow it.
+
+        Raises:
+            HttpError: it is no URL, or its end cannot be an id.
+        """
+        try:
+            segment = unquote(urlsplit(url).path.rstrip("/").rpartition("/")[2])
+        except ValueError:
+            segment = ""
+        if segment in (".", "..") or not re.match(ID_PATTERN, segment):
+            raise self.unusable(f"{url[:60]!r} is not a URL that ends in an id")
+        return segment
 
 
-_SHOWN = 60
-_IDENTIFIER = f"an id of 1 to {_LONGEST_ID} printable characters"
+class _Problem(msgspec.Struct, frozen=True):
+    """Problem+json (RFC 7807; `cause`: TS 29.122), and CAMARA's {status, code, message}."""
 
-
-def _is_identifier(text: str) -> bool:
-    return 0 < len(text) <= _LONGEST_ID and text.isprintable() and text not in (".", "..")
+    cause: Any = None
+    code: Any = None
+    detail: Any = None
+    message: Any = None
+    title: Any = None
 
 
 class Api:
@@ -327,7 +206,14 @@ class Api:
         self._timeout_s = timeout_s
         self._patience = patience or Patience()
         self._deadline = deadline or Deadline()
-        self._certificates = _certificates(ca_file)
+        try:
+            self._certificates = (
+                ssl.create_default_context(cafile=ca_file)
+                if ca_file
+                else httpx.create_ssl_context()
+            )
+        except OSError as error:
+            raise SettingsError(f"cannot use ca_file {ca_file!r}: {error}") from error
         self._client()  # so that a proxy that cannot be used is an error at once
 
     def _client(self) -> httpx.AsyncClient:
@@ -397,47 +283,49 @@ class Api:
             method,
             f"{self.url}{path}",
             headers=headers,
-            content=None if body is None else json.dumps(body).encode(),
+            content=None if body is None else to_json(body),
         )
         with self._deadline.within(self._patience.total_s):
             return self._patiently(request, may_be_gone=may_be_gone)
 
     def _patiently(self, request: httpx.Request, *, may_be_gone: bool) -> Reply:
-        method = request.method
-        waited_s = 0.0
+        idempotent = request.method in _IDEMPOTENT
         wait_s = self._patience.first_s
-        for attempt in range(1, self._patience.attempts + 1):
-            last = attempt == self._patience.attempts
+        attempt = 1
+        while True:
             asked_s = None
-            found = self._attempt(request)
-            if isinstance(found, HttpError):
-                failed = found
-                if last or (failed.uncertain and method not in _IDEMPOTENT):
-                    raise failed
+            try:
+                reply = self._attempt(request)
+            except HttpError as error:
+                failed, again = error, idempotent or not error.uncertain
             else:
-                if found.is_success or (may_be_gone and found.gone):
-                    return found
-                failed = self._refusal(found, method)
-                asked_s = _retry_after_s(found.retry_after, self.clock.now_s())
-                if last or not _again(found.status, method):
-                    raise failed
-                if waited_s + (asked_s or 0.0) > self._patience.total_s:
-                    raise _with_hint(failed, asked_s or 0.0, self._patience.total_s)
+                if reply.is_success or (may_be_gone and reply.gone):
+                    return reply
+                lost = reply.status in _PASSING
+                failed = self._refusal(reply, uncertain=lost and not idempotent)
+                again = reply.status in _ALWAYS_AGAIN or (lost and idempotent)
+                asked_s = _retry_after_s(reply.retry_after, self.clock.now_s())
+            if not again or attempt >= self._patience.attempts:
+                raise failed
             pause_s = min(wait_s, self._patience.longest_s) if asked_s is None else asked_s
             left_s = self._deadline.left_s()
             if pause_s >= left_s:
                 # What has failed says more than that there is no time to try again.
-                raise failed if asked_s is None else _with_hint(failed, asked_s, left_s)
+                if asked_s is not None:
+                    failed.hint = (
+                        f"the server asks to wait {asked_s:g} s, more than the {left_s:.0f} s that "
+                        "this waits for; try again then"
+                    )
+                raise failed
             self.pause(pause_s)
-            waited_s += pause_s
             wait_s *= 2
-        raise AssertionError("the last attempt returns or raises")
+            attempt += 1
 
-    def _attempt(self, request: httpx.Request) -> Reply | HttpError:
-        """Ask once; return the error if there was no answer, which may be worth another try.
+    def _attempt(self, request: httpx.Request) -> Reply:
+        """Ask once.
 
         Raises:
-            HttpError: there is no answer that another try could make better.
+            HttpError: there is no answer that can be read; `uncertain` if it was sent.
         """
         what = f"{request.method} {request.url}"
         limit_s = min(self._timeout_s, self._deadline.left_s())
@@ -461,23 +349,21 @@ class Api:
             with self._deadline.waking(lambda: loop.call_soon_threadsafe(asking.cancel)):
                 return loop.run_until_complete(asking)
         except (asyncio.TimeoutError, asyncio.CancelledError):
-            reason = self._why_late() if self._deadline.is_cancelled else ""
-            reason = reason or f"no {'whole answer' if sent else 'connection'} in time"
-            return HttpError(f"cannot {what}: {reason} ({limit_s:.3g} s)", uncertain=sent)
+            reason = f"no {'whole answer' if sent else 'connection'} in time"
+            if self._deadline.is_cancelled:
+                reason = self._why_late()
+            reason = f"{reason} ({limit_s:.3g} s)"
         except httpx.TransportError as error:
-            return HttpError(f"cannot {what}: {_why(error)}", uncertain=sent)
-        except Exception as error:  # noqa: BLE001 - whatever a library raises
-            # What a library makes of bytes that it did not expect; never its own message, which
-            # may quote the request.
-            raise HttpError(
-                f"cannot {what}: its answer is no HTTP that can be read ({type(error).__name__})",
-                uncertain=sent,
-                hint="check that the url is that of such a server",
-            ) from None
+            reason = _why(error)
+        except Exception as error:  # noqa: BLE001 - whatever a library makes of unexpected bytes
+            # Never its own message, which may quote the request.
+            reason = f"its answer is no HTTP that can be read ({type(error).__name__})"
         finally:
             if asking.cancel():  # whatever ended this, such as Ctrl-C, before it was done
                 loop.run_until_complete(asyncio.wait([asking]))
+            loop.run_until_complete(loop.shutdown_asyncgens())  # of an answer that is cut off
             loop.close()
+        raise HttpError(f"cannot {what}: {reason}", uncertain=sent)
 
     async def _ask(self, request: httpx.Request) -> Reply:
         """Send a request and read its answer, of which no more than can be of use.
@@ -485,27 +371,24 @@ class Api:
         Raises:
             httpx.HTTPError: there is none.
         """
-        packed = bytearray()
+        body = bytearray()
         async with self._client() as client:
             answer = await client.send(request, stream=True)
             try:
-                async for chunk in answer.aiter_raw():
-                    packed += chunk
-                    if len(packed) > _LARGEST_ANSWER:
+                coding = answer.headers.get("content-encoding", "").strip().lower()
+                if coding not in _CODINGS:
+                    raise httpx.DecodingError(f"packed as {coding!r}")
+                async for chunk in answer.aiter_bytes():
+                    body += chunk
+                    if len(body) > _LARGEST_ANSWER:
                         break
             finally:
                 await answer.aclose()
-        flaw = _TOO_LARGE if len(packed) > _LARGEST_ANSWER else ""
-        body = bytes(packed)
-        if not flaw:
-            body, flaw = _unpacked(body, answer.headers.get("content-encoding", ""))
-        decoded, flaw = _decoded(body) if body and not flaw else (None, flaw)
         return Reply(
             asked=f"{request.method} {request.url}",
             status=answer.status_code,
             reason=answer.reason_phrase,
-            body=decoded,
-            flaw=flaw,
+            body=bytes(body),
             location=answer.headers.get("location", ""),
             retry_after=answer.headers.get("retry-after", ""),
         )
@@ -513,104 +396,34 @@ class Api:
     def _why_late(self) -> str:
         return "it was ended before it was done" if self._deadline.is_cancelled else "no time left"
 
-    def _refusal(self, answer: Reply, method: str) -> HttpError:
-        """Read problem+json (RFC 7807; `cause`: TS 29.122) or CAMARA's {status, code, message}."""
-        found = answer.body if isinstance(answer.body, dict) else {}
+    def _refusal(self, answer: Reply, *, uncertain: bool) -> HttpError:
+        try:
+            found = from_json(answer.body, _Problem, longest=_LARGEST_ANSWER)
+        except ValueError:
+            found = _Problem()
         # Some servers quote the credentials that they refuse.
         secret = "" if self._token is None else self._token.reveal()
-        cause = text_of(found.get("cause"), secret) or text_of(found.get("code"), secret)
-        detail = next(
-            (
-                text
-                for key in ("detail", "message", "title")
-                if (text := text_of(found.get(key), secret))
-            ),
-            "",
-        )
-        reason = text_of(answer.reason, secret)
-        words = [f"{answer.status} {reason}".strip(), cause, detail]
-        hint = ""
-        if answer.status in (401, 403):
-            hint = "check the token and what it is allowed to do"
+
+        def first(*values: object) -> str:
+            return next(filter(None, (text_of(each, secret) for each in values)), "")
+
+        words = [
+            f"{answer.status} {text_of(answer.reason, secret)}".strip(),
+            first(found.cause, found.code),
+            first(found.detail, found.message, found.title),
+        ]
+        forbidden = answer.status in (401, 403)
         return HttpError(
-            f"cannot {answer.asked}: {': '.join(word for word in words if word)}",
+            f"cannot {answer.asked}: {': '.join(filter(None, words))}",
             status=answer.status,
-            uncertain=answer.status in _PASSING - {503} and method == "POST",
-            hint=hint,
+            uncertain=uncertain,
+            hint="check the token and what it is allowed to do" if forbidden else "",
         )
-
-
-_TOO_LARGE = f"is larger than {_LARGEST_ANSWER} bytes"
-
-
-def _unpacked(body: bytes, encoding: str) -> tuple[bytes, str]:
-    """Return a body unpacked, and what is wrong with it; some servers pack what was not to be."""
-    coding = encoding.strip().lower()
-    if not body or coding in ("", "identity"):
-        return body, ""
-    if coding not in ("gzip", "x-gzip", "deflate"):
-        return b"", f"is packed as {show(encoding)}, which was not asked for"
-    unpacking = zlib.decompressobj(_GZIP_OR_ZLIB)
-    try:
-        plain = unpacking.decompress(body, _LARGEST_ANSWER + 1)
-    except zlib.error:
-        return b"", f"is no {coding}, as its Content-Encoding says"
-    if len(plain) > _LARGEST_ANSWER:
-        return b"", _TOO_LARGE
-    return (plain, "") if unpacking.eof else (b"", f"is {coding} that ends in the middle")
-
-
-def last_segment(location: str) -> str:
-    """Return the last path segment of a URL, absolute or relative: the id of what was created.
-
-    Only the id is taken of a Location: behind a gateway its host is often one that cannot be
-    reached from here, and a token must not follow it.
-    """
-    segment = unquote(urlsplit(location).path.rstrip("/").rpartition("/")[2])
-    return "" if segment in (".", "..") else segment
 
 
 def as_segment(identifier: str) -> str:
     """Return an id as one path segment."""
     return quote(identifier, safe="")
-
-
-def _certificates(ca_file: str) -> ssl.SSLContext:
-    if not ca_file:
-        return httpx.create_ssl_context()
-    try:
-        return ssl.create_default_context(cafile=ca_file)
-    except (OSError, ssl.SSLError) as error:
-        raise SettingsError(f"cannot use ca_file {ca_file!r}: {error}") from error
-
-
-def _again(status: int, method: str) -> bool:
-    if status in (409, 429, 503):
-        return True
-    return status in _PASSING and method in _IDEMPOTENT
-
-
-def _decoded(body: bytes) -> tuple[object, str]:
-    """Return what JSON says, and what is wrong with it."""
-    try:
-        return json.loads(body, parse_constant=_no_number), ""
-    except RecursionError:
-        return None, "is JSON that is nested too deeply"
-    except ValueError:  # no JSON, no UTF-8, or a number of thousands of digits
-        return None, "is no JSON"
-
-
-def _no_number(text: str) -> NoReturn:
-    """NaN and Infinity, which are no JSON (RFC 8259 §6)."""
-    raise ValueError(text)
-
-
-def _with_hint(error: HttpError, asked_s: float, total_s: float) -> HttpError:
-    error.hint = (
-        f"the server asks to wait {asked_s:g} s, more than the {total_s:g} s that this waits for; "
-        "try again then"
-    )
-    return error
 
 
 def text_of(value: object, secret: str = "") -> str:

@@ -163,7 +163,7 @@ def load_settings(
         where = "" if mark is None else f" at line {mark.line + 1}, column {mark.column + 1}"
         raise SettingsError(f"cannot read settings {str(path)!r}: no YAML{where}") from None
     except msgspec.ValidationError as error:
-        raise SettingsError(f"cannot use settings {str(path)!r}: {_readable(error)}") from error
+        raise SettingsError(f"cannot use settings {str(path)!r}: {readable(error)}") from error
     except (ValueError, OverflowError, RecursionError):
         # Dates and numbers that are none, and what is nested deeper than Python goes.
         raise SettingsError(
@@ -185,13 +185,13 @@ def _beside(settings: ServerSettings, folder: Path) -> ServerSettings:
     return msgspec.structs.replace(settings, token=token, ca_file=ca_file)
 
 
-def _readable(error: msgspec.ValidationError) -> str:
-    """Rewrite the library's text in our way to write paths."""
+def readable(error: Exception) -> str:
+    """Return msgspec's message with the path of the value in front, as we write paths."""
     text, separator, where = str(error).rpartition(" - at `")
     if not separator:
         return str(error)
     whose, _, path = where.strip("`").rpartition("` in `")
-    return f"{'a key of ' if whose else ''}{path.removeprefix('$.')}: {text}"
+    return f"{'a key of ' if whose else ''}{path.lstrip('$.')}: {text}"
 
 
 def _check_url(url: str, *, token: Token | None) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ipaddress
 from collections.abc import Callable, Iterable, Mapping
+from typing import Any
 
 from lifecycle import dataclasses
 from lifecycle.codec import to_json
@@ -17,7 +18,7 @@ _ENDS = ("source", "destination")
 
 IpNetwork = ipaddress.IPv4Network | ipaddress.IPv6Network
 
-Body = dict[str, object]
+Body = dict[str, Any]
 """Of a request, JSON-able."""
 
 

@@ -9,11 +9,11 @@ from __future__ import annotations
 import datetime as dt
 import re
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
 import msgspec
 
-from lifecycle.programming.apply.http import Api, Fields, show, text_of
+from lifecycle.programming.apply.http import ID_PATTERN, Api, text_of
 from lifecycle.programming.apply.ledger import Entry, Ledger
 from lifecycle.programming.apply.remote import Made, RemoteTarget, ServerOptions
 from lifecycle.programming.apply.settings import ServerSettings
@@ -30,7 +30,12 @@ from lifecycle.programming.rules.rules import FlowRule
 
 KIND = "camara"
 
-_COMPARED = ("applicationServer", "devicePorts", "applicationServerPorts", "qosProfile")
+_COMPARED = {
+    "applicationServer": "application_server",
+    "devicePorts": "device_ports",
+    "applicationServerPorts": "application_server_ports",
+    "qosProfile": "qos_profile",
+}
 
 _MARGIN = 0.2
 """A session is prolonged when this part of what was asked for is left, …"""
@@ -39,11 +44,6 @@ _MARGIN_S = (5.0, 300.0)
 """… but at least and at most so many seconds before it expires."""
 
 _POLL_S = 0.25
-
-_STATUSES = ("REQUESTED", "AVAILABLE", "UNAVAILABLE")
-"""QosStatus of QualityOnDemand 1.1.0."""
-
-_Moment = Annotated[dt.datetime, msgspec.Meta(tz=True)]
 
 _LONGEST_S = 2**31 - 1
 """Largest `duration`, an int32."""
@@ -117,6 +117,25 @@ def session(rule: FlowRule, end: DeviceEnd, settings: CamaraSettings) -> Body:
     }
 
 
+class _Session(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
+    """SessionInfo of QualityOnDemand 1.1.0, as far as it is read; None is not shown."""
+
+    session_id: Annotated[str, msgspec.Meta(pattern=ID_PATTERN)]
+    qos_status: Literal["REQUESTED", "AVAILABLE", "UNAVAILABLE"]
+    status_info: str | None = None
+    duration: Annotated[int, msgspec.Meta(ge=1, le=_LONGEST_S)] | None = None
+    expires_at: Annotated[dt.datetime, msgspec.Meta(tz=True)] | None = None
+    application_server: Any = None
+    device_ports: Any = None
+    application_server_ports: Any = None
+    qos_profile: Any = None
+
+    @property
+    def why(self) -> str:
+        """Why it ended."""
+        return text_of(self.status_info) or "no reason given"
+
+
 class CamaraTarget(RemoteTarget[CamaraSettings]):
     """One QualityOnDemand interface."""
 
@@ -144,25 +163,18 @@ class CamaraTarget(RemoteTarget[CamaraSettings]):
             HttpError: refused, or the network cannot provide it.
         """
         reply = self._api.request("POST", self.collection, body)
-        session = reply.object()
-        id_ = session.identifier("sessionId")
-        if not id_:
-            raise HttpError(
-                f"cannot tell what {self._api.url}/sessions has made: its answer has no sessionId",
-                status=reply.status,
-                uncertain=True,
-            )
+        session = reply.read(_Session)
+        id_ = session.session_id
         try:
-            session = self._settled(id_, session)
-            if _status(session) != "UNAVAILABLE":
-                return self._made(id_, session, body)
-            why = _why(session)
+            session = self._settled(session)
+            if session.qos_status != "UNAVAILABLE":
+                return self._made(session, body)
             self.delete(id_)
         except HttpError as error:
             error.uncertain = True  # it was made, whatever became of asking for its state
             raise
         raise HttpError(
-            f"cannot get this QoS: the network made session {id_} unavailable ({why})",
+            f"cannot get this QoS: the network made session {id_} unavailable ({session.why})",
             status=reply.status,
         )
 
@@ -170,16 +182,15 @@ class CamaraTarget(RemoteTarget[CamaraSettings]):
         """Look through the device's sessions for one that asks for the same."""
         asked = {"device": body["device"]} if "device" in body else {}
         reply = self._api.request("POST", "/retrieve-sessions", asked, may_be_gone=True)
-        for each in reply.objects():
-            id_ = each.identifier("sessionId")
-            if id_ and not _differs(body, each, missing=True):
-                return self._made(id_, each, body)
+        for each in () if reply.gone else reply.read(tuple[_Session, ...]):
+            if not _differs(body, each, missing=True):
+                return self._made(each, body)
         return None
 
     def see(self, id_: str, body: Body) -> Made | None:
         """GET it; one that has ended counts as different, for it has to be deleted first."""
         reply = self._api.request("GET", self.path(id_), may_be_gone=True)
-        return None if reply.gone else self._made(id_, reply.object(), body)
+        return None if reply.gone else self._made(reply.read(_Session), body)
 
     def update(self, id_: str, before: Body, body: Body) -> Made:  # noqa: ARG002 - RemoteTarget
         """Delete and create: a session cannot be changed, and two for one flow are a conflict."""
@@ -204,7 +215,7 @@ class CamaraTarget(RemoteTarget[CamaraSettings]):
                 raise
         else:
             if not reply.gone:
-                made = self._made(entry.id, reply.object(), body)
+                made = self._made(reply.read(_Session), body)
                 if made.expires_s is not None and made.expires_s > (entry.expires_s or 0.0) + 1:
                     return made
         return self.update(entry.id, body, body)
@@ -223,59 +234,40 @@ class CamaraTarget(RemoteTarget[CamaraSettings]):
             known = self._expires[entry.key] = entry.expires_s, now_s + left_s
         return min(left_s, known[1] - now_s) - margin_s
 
-    def _settled(self, id_: str, session: Fields) -> Fields:
+    def _settled(self, session: _Session) -> _Session:
         """Ask until the session is more than requested, for `wait_s`."""
         wait_s = _POLL_S
         deadline_s = self._api.clock.steady_s() + self._settings.wait_s
-        while _status(session) == "REQUESTED":
+        path = self.path(session.session_id)
+        while session.qos_status == "REQUESTED":
             left_s = deadline_s - self._api.clock.steady_s()
             if left_s <= 0:
                 break
             self._api.pause(min(wait_s, left_s))
             wait_s *= 2
-            session = self._api.request("GET", self.path(id_)).object()
+            session = self._api.request("GET", path).read(_Session)
         return session
 
-    def _made(self, id_: str, session: Fields, body: Body) -> Made:
-        status = _status(session)
-        if status == "UNAVAILABLE":
-            return Made(id=id_, differs=f"it ended: {_why(session)}")
-        granted = session.whole("duration", 1, _LONGEST_S)
-        detail = "requested, not yet available" if status == "REQUESTED" else ""
+    def _made(self, session: _Session, body: Body) -> Made:
+        id_, granted = session.session_id, session.duration
+        if session.qos_status == "UNAVAILABLE":
+            return Made(id=id_, differs=f"it ended: {session.why}")
+        detail = "requested, not yet available" if session.qos_status == "REQUESTED" else ""
         if granted is not None and granted < self._settings.duration_s:
             detail = f"granted for {granted} s instead of {self._settings.duration_s} s"
-        return Made(
-            id=id_,
-            expires_s=self._expires_s(session, granted),
-            detail=detail,
-            differs=_differs(body, session),
-        )
-
-    def _expires_s(self, session: Fields, granted_s: int | None) -> float | None:
-        """When a session ends, seconds since the epoch; the latest it can, if nothing says when."""
-        text = session.text("expiresAt")
-        if text:
-            try:
-                return msgspec.convert(text, _Moment).timestamp()
-            except msgspec.ValidationError:
-                session.refuse("expiresAt", "a date and time with a time zone (RFC 3339)", text)
-        return None if granted_s is None else self._api.clock.now_s() + granted_s
+        # The latest that it can end, if nothing says when.
+        expires_s = None if granted is None else self._api.clock.now_s() + granted
+        if session.expires_at is not None:
+            expires_s = session.expires_at.timestamp()
+        return Made(id=id_, expires_s=expires_s, detail=detail, differs=_differs(body, session))
 
 
-def _status(session: Fields) -> str:
-    return session.one_of("qosStatus", _STATUSES)
-
-
-def _why(session: Fields) -> str:
-    return text_of(session.text("statusInfo")) or "no reason given"
-
-
-def _differs(asked: Body, seen: Fields, *, missing: bool = False) -> str:
+def _differs(asked: Body, seen: _Session, *, missing: bool = False) -> str:
     """Why what the server shows is not what was asked for; empty if it is."""
-    for key in _COMPARED:
-        found = seen.values.get(key)
-        if (key in seen.values or missing) and found != asked.get(key):
-            return f"the server has {key} {show(found)}"
+    for key, field in _COMPARED.items():
+        found = getattr(seen, field)
+        if (found is not None or missing) and found != asked.get(key):
+            return f"the server has {key} {text_of(str(found))!r}"
     return ""
 
 

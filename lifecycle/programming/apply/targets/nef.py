@@ -11,12 +11,11 @@ import contextlib
 import enum
 import ipaddress
 import re
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Iterable, Sequence
 
 import msgspec
 
-from lifecycle.programming.apply.http import MERGE_PATCH, Fields, as_segment, show, text_of
+from lifecycle.programming.apply.http import MERGE_PATCH, Reply, as_segment, text_of
 from lifecycle.programming.apply.remote import Made, RemoteTarget, ServerOptions
 from lifecycle.programming.apply.settings import ServerSettings
 from lifecycle.programming.apply.target import HttpError
@@ -35,7 +34,12 @@ KIND = "nef"
 _PATCHABLE = ("notificationDestination", "flowInfo", "qosReference")
 """What AsSessionWithQoSSubscriptionPatch may hold; a device's address is not among it."""
 
-_COMPARED = ("ueIpv4Addr", "ueIpv6Addr", "qosReference", "notificationDestination")
+_COMPARED = {
+    "ueIpv4Addr": "ue_ipv4_addr",
+    "ueIpv6Addr": "ue_ipv6_addr",
+    "qosReference": "qos_reference",
+    "notificationDestination": "notification_destination",
+}
 
 _PROTOCOLS = {name: str(number) for name, number in PROTOCOL_NUMBERS.items()}
 
@@ -127,6 +131,24 @@ def _filter(rule: FlowRule, end: DeviceEnd, settings: NefSettings) -> str:
     return f"permit {direction} {protocol} from {source} to {destination}"
 
 
+class _Flow(msgspec.Struct, frozen=True, rename="camel"):
+    """FlowInfo of TS 29.122 §5.2.1.2.14, as far as it is read."""
+
+    flow_descriptions: tuple[str, ...] = ()
+
+
+class _Subscription(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
+    """What a server shows of a subscription; None is not shown."""
+
+    link: str | None = msgspec.field(default=None, name="self")
+    applied_qos_ref: str | None = None
+    ue_ipv4_addr: str | None = None
+    ue_ipv6_addr: str | None = None
+    qos_reference: str | None = None
+    notification_destination: str | None = None
+    flow_info: tuple[_Flow, ...] | None = None
+
+
 class NefTarget(RemoteTarget[NefSettings]):
     """One NEF."""
 
@@ -149,32 +171,24 @@ class NefTarget(RemoteTarget[NefSettings]):
             HttpError: refused, or the answer does not say what was made.
         """
         reply = self._api.request("POST", self.collection, body)
-        subscription = reply.object(may_be_empty=True)
-        made = reply.created() or subscription.link("self")
+        shown = _shown(reply)
+        made = reply.location or shown.link
         if not made:
-            raise HttpError(
-                f"cannot tell what {self._api.url}{self.collection} has made: its answer has "
-                "neither a Location nor a self",
-                status=reply.status,
-                uncertain=True,
-            )
-        return Made(id=made, detail=_refused(subscription))
+            raise reply.unusable("it has neither a Location nor a self")
+        return Made(id=reply.linked(made), detail=_refused(shown))
 
     def find(self, body: Body) -> Made | None:
         """Look through our subscriptions for one that asks for the same."""
         reply = self._api.request("GET", self.collection, may_be_gone=True)
-        for each in reply.objects():
-            id_ = each.link("self")
-            if id_ and not _differs(body, each, missing=True):
-                return Made(id=id_)
+        for each in () if reply.gone else reply.read(tuple[_Subscription, ...]):
+            if each.link and not _differs(body, each, missing=True):
+                return Made(id=reply.linked(each.link))
         return None
 
     def see(self, id_: str, body: Body) -> Made | None:
         """GET it."""
         reply = self._api.request("GET", self.path(id_), may_be_gone=True)
-        if reply.gone:
-            return None
-        return Made(id=id_, differs=_differs(body, reply.object()))
+        return None if reply.gone else Made(id=id_, differs=_differs(body, _shown(reply)))
 
     def update(self, id_: str, before: Body, body: Body) -> Made:
         """PATCH what may be patched, PUT where there is no PATCH; else delete and create."""
@@ -191,60 +205,46 @@ class NefTarget(RemoteTarget[NefSettings]):
             reply = self._api.request("PUT", self.path(id_), body, may_be_gone=True)
         if reply.gone:
             return self.create(body)
-        return Made(id=id_, detail=_refused(reply.object(may_be_empty=True)))
+        return Made(id=id_, detail=_refused(_shown(reply)))
 
 
-def _refused(subscription: Fields) -> str:
+def _shown(reply: Reply) -> _Subscription:
+    """Return what an answer shows; it may be without a body.
+
+    Raises:
+        HttpError: a field is not what the interface has there.
+    """
+    return reply.read(_Subscription) if reply.body else _Subscription()
+
+
+def _refused(subscription: _Subscription) -> str:
     """Note it if the server granted another reference than was asked for."""
-    granted = text_of(subscription.text("appliedQosRef"))
+    granted = text_of(subscription.applied_qos_ref)
     return f"granted as {granted}" if granted else ""
 
 
-def _differs(asked: Body, seen: Fields, *, missing: bool = False) -> str:
+def _differs(asked: Body, seen: _Subscription, *, missing: bool = False) -> str:
     """Why what the server shows is not what was asked for; empty if it is.
 
     Args:
         asked: our body.
         seen: the server's; it may add to it.
         missing: something that the server does not show differs too.
-
-    Raises:
-        HttpError: a field is not what the interface has there.
     """
-    for key in _COMPARED:
-        found = seen.text(key)
-        if (key in seen.values or missing) and found != asked.get(key, ""):
-            return f"the server has {key} {show(found)}"
-    if ("flowInfo" in seen.values or missing) and _shown_filters(seen) != _filters(asked):
+    for key, field in _COMPARED.items():
+        found = getattr(seen, field)
+        if (found is not None or missing) and found != asked.get(key):
+            return f"the server has {key} {text_of(found)!r}"
+    wanted = _filters(text for flow in asked["flowInfo"] for text in flow["flowDescriptions"])
+    shown = _filters(text for flow in seen.flow_info or () for text in flow.flow_descriptions)
+    if (seen.flow_info is not None or missing) and shown != wanted:
         return "the server has other filters"
     return ""
 
 
-def _shown_filters(seen: Fields) -> list[str]:
-    """The filters that a server shows.
-
-    Raises:
-        HttpError: they are no list of objects that hold lists of strings.
-    """
-    flows = seen.values.get("flowInfo")
-    if flows is None:
-        return []
-    if not isinstance(flows, list):
-        seen.refuse("flowInfo", "a JSON array", flows)
-    for index, flow in enumerate(flows):
-        if not isinstance(flow, dict):
-            seen.refuse(f"flowInfo[{index}]", "a JSON object", flow)
-        texts = flow.get("flowDescriptions", [])
-        if not isinstance(texts, list) or not all(isinstance(each, str) for each in texts):
-            key = f"flowInfo[{index}].flowDescriptions"
-            seen.refuse(key, "a JSON array of strings", texts if texts is not None else "null")
-    return _filters(seen.values)
-
-
-def _filters(subscription: Mapping[str, Any]) -> list[str]:
+def _filters(texts: Iterable[str]) -> list[str]:
     """The filters in one spelling: servers write `17` and `udp`, and other spaces."""
-    flows = subscription.get("flowInfo", [])
-    return sorted(_spelled(text) for flow in flows for text in flow.get("flowDescriptions", []))
+    return sorted(map(_spelled, texts))
 
 
 def _spelled(text: str) -> str:
