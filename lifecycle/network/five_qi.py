@@ -131,49 +131,41 @@ def check_class(
         message_bytes: largest message, > 0, against the data burst volume.
     """
     found: list[ClassIssue] = []
+
+    def issue(field: str, message: str) -> None:
+        found.append(ClassIssue(field=field, message=message))
+
     budget_ms, burst = class_.packet_delay_budget_ms, class_.max_data_burst_bytes
     if max_delay_ms is not None and max_delay_ms < budget_ms:
-        found.append(
-            ClassIssue(
-                field="max_delay_ms",
-                message=f"cannot keep a delay of {max_delay_ms:g} ms with {class_}: "
-                f"its packet delay budget is {budget_ms} ms",
-            )
+        issue(
+            "max_delay_ms",
+            f"cannot keep a delay of {max_delay_ms:g} ms with {class_}: "
+            f"its packet delay budget is {budget_ms} ms",
         )
     if loss is not None and loss < class_.packet_error_rate:
-        found.append(
-            ClassIssue(
-                field="loss",
-                message=f"cannot keep a loss of {loss:g} with {class_}: "
-                f"its packet error rate is {class_.packet_error_rate:g}",
-            )
+        issue(
+            "loss",
+            f"cannot keep a loss of {loss:g} with {class_}: "
+            f"its packet error rate is {class_.packet_error_rate:g}",
         )
     if rate_bps is not None and not class_.resource_type.guarantees_rate:
-        found.append(
-            ClassIssue(
-                field="rate_bps",
-                message=f"cannot guarantee {rate_bps:g} bit/s with {class_}: "
-                f"only GBR classes guarantee a rate",
-            )
+        issue(
+            "rate_bps",
+            f"cannot guarantee {rate_bps:g} bit/s with {class_}: only GBR classes guarantee a rate",
         )
     if burst is None:
         return tuple(found)
+    served = f"with {class_}: by default it serves {burst} bytes in {budget_ms} ms"
     served_bps = _served_bps(class_)
     if rate_bps is not None and rate_bps > served_bps:
-        found.append(
-            ClassIssue(
-                field="rate_bps",
-                message=f"cannot keep the delay of {rate_bps:g} bit/s with {class_}: by default "
-                f"it serves {burst} bytes in {budget_ms} ms, {served_bps:g} bit/s",
-            )
+        issue(
+            "rate_bps",
+            f"cannot keep the delay of {rate_bps:g} bit/s {served}, {served_bps:g} bit/s",
         )
     if message_bytes is not None and message_bytes > burst:
-        found.append(
-            ClassIssue(
-                field="message_bytes",
-                message=f"cannot keep the delay of a message of {message_bytes} bytes with "
-                f"{class_}: by default it serves {burst} bytes in {budget_ms} ms",
-            )
+        issue(
+            "message_bytes",
+            f"cannot keep the delay of a message of {message_bytes} bytes {served}",
         )
     return tuple(found)
 
@@ -298,17 +290,19 @@ class DscpMapping:
 
     name: str
     source: str
-    status: str
-    notes: tuple[str, ...]
+    status: str = ""
+    notes: tuple[str, ...] = ()
     values: tuple[tuple[int, int], ...]
 
     def dscp_for(self, value: int) -> int | None:
         """Return the DSCP of a 5QI; None if the mapping has none."""
-        return next((dscp for each, dscp in self.values if each == value), None)
+        return dict(self.values).get(value)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class _File:
+    """A mapping as it is written, with names or numbers of DSCPs."""
+
     name: str
     source: str
     status: str = ""

@@ -32,108 +32,75 @@ LINUX = Platform.LINUX
 DOMAINS = st.integers(0, 232)
 
 
-def unicast(domain_id: int, participant_id: int) -> tuple[int, int]:
-    ports = participant_ports(domain_id, participant_id)
-    return ports.discovery_unicast, ports.user_unicast
+@pytest.mark.parametrize(
+    ("domain_id", "participant_id", "ports"),
+    [
+        (0, 0, (7400, 7401, 7410, 7411)),
+        (1, 0, (7650, 7651, 7660, 7661)),
+        (1, 119, (7650, 7651, 7898, 7899)),
+        (1, 120, (7650, 7651, 7900, 7901)),
+        (2, 0, (7900, 7901, 7910, 7911)),
+        (101, 0, (32650, 32651, 32660, 32661)),
+        (101, 1, (32650, 32651, 32662, 32663)),
+        (101, 2, (32650, 32651, 32664, 32665)),
+        (101, 53, (32650, 32651, 32766, 32767)),
+        (101, 54, (32650, 32651, 32768, 32769)),
+        (232, 62, (65400, 65401, 65534, 65535)),
+    ],
+)
+def test_the_articles_ports(
+    domain_id: int, participant_id: int, ports: tuple[int, int, int, int]
+) -> None:
+    names = ("discovery_multicast", "user_multicast", "discovery_unicast", "user_unicast")
+    expected = ParticipantPorts(**dict(zip(names, ports, strict=True)))
+    assert participant_ports(domain_id, participant_id) == expected
 
 
-def multicast(domain_id: int) -> tuple[int, int]:
-    ports = participant_ports(domain_id, 0)
-    return ports.discovery_multicast, ports.user_multicast
+@pytest.mark.parametrize("domain_id", [-1, 233])
+def test_the_highest_domain_is_232_because_ports_end_at_65535(domain_id: int) -> None:
+    with pytest.raises(ValueError, match=f"cannot use domain id {domain_id}: .*; use 0 to 232"):
+        participant_ports(domain_id, 0)
 
 
-class TestTheArticle:
-    def test_the_calculator_shows_7400_7401_7410_7411_for_domain_0_participant_0(self) -> None:
-        assert participant_ports(0, 0) == ParticipantPorts(
-            discovery_multicast=7400,
-            user_multicast=7401,
-            discovery_unicast=7410,
-            user_unicast=7411,
-        )
+@pytest.mark.parametrize(
+    ("platform", "ephemeral", "safe"),
+    [
+        (LINUX, (32768, 60999), (range(102), range(215, 233))),
+        (Platform.MACOS, (49152, 65535), (range(167),)),
+        (Platform.WINDOWS, (49152, 65535), (range(167),)),
+    ],
+)
+def test_the_articles_safe_domains(
+    platform: Platform, ephemeral: tuple[int, int], safe: tuple[range, ...]
+) -> None:
+    assert safe_domains(platform) == safe
+    assert safe_domains(EphemeralRange(first=ephemeral[0], last=ephemeral[1])) == safe
 
-    def test_the_lowest_domain_is_0_and_the_highest_232_because_ports_end_at_65535(self) -> None:
-        assert domain_base(0) == 7400
-        assert domain_base(232) == 65400
-        with pytest.raises(ValueError) as caught:
-            domain_base(233)
-        assert str(caught.value) == (
-            "cannot use domain id 233: its ports would lie outside 1 to 65535; use 0 to 232"
-        )
-        with pytest.raises(ValueError, match="cannot use domain id -1: "):
-            participant_ports(-1, 0)
 
-    def test_linux_hands_out_32768_to_60999_so_0_to_101_and_215_to_232_are_safe(self) -> None:
-        assert safe_domains(LINUX) == (range(102), range(215, 233))
-        assert safe_domains(EphemeralRange(first=32768, last=60999)) == safe_domains(LINUX)
+@pytest.mark.parametrize(
+    ("domain_id", "platform", "participants", "limit"),
+    [
+        (1, LINUX, 120, "the ports of domain 2, from 7900"),
+        (101, LINUX, 54, "the ephemeral ports 32768–60999"),
+        (214, LINUX, 0, "the ephemeral ports 32768–60999: they hold its multicast ports"),
+        (232, LINUX, 63, "the highest port, 65535"),
+        (232, EphemeralRange(first=1, last=1), 63, "the highest port, 65535"),
+        (166, Platform.MACOS, 120, "the ports of domain 167, from 49150"),
+        (166, Platform.WINDOWS, 120, "the ports of domain 167, from 49150"),
+    ],
+)
+def test_how_many_participants_fit(
+    domain_id: int, platform: Platform | EphemeralRange, participants: int, limit: str
+) -> None:
+    assert max_participants(domain_id, platform) == Capacity(participants=participants, limit=limit)
 
-    @pytest.mark.parametrize("platform", [Platform.MACOS, Platform.WINDOWS])
-    def test_macos_and_windows_hand_out_49152_to_65535_so_0_to_166_are_safe(
-        self, platform: Platform
-    ) -> None:
-        assert safe_domains(platform) == (range(167),)
-        assert safe_domains(EphemeralRange(first=49152, last=65535)) == safe_domains(platform)
 
-    def test_choosing_0_to_101_is_safe_everywhere(self) -> None:
-        for platform in Platform:
-            assert all(d in safe_domains(platform)[0] for d in range(102))
-
-    def test_domain_1_uses_7650_and_7651_for_multicast(self) -> None:
-        assert multicast(1) == (7650, 7651)
-
-    def test_domain_2_uses_7900_and_7901_for_multicast(self) -> None:
-        assert multicast(2) == (7900, 7901)
-
-    def test_the_first_process_in_domain_1_uses_7660_and_7661(self) -> None:
-        assert unicast(1, 0) == (7660, 7661)
-
-    def test_the_120th_process_in_domain_1_uses_7898_and_7899(self) -> None:
-        assert unicast(1, 119) == (7898, 7899)
-        assert overlaps(1, 119) == ()
-
-    def test_the_121st_process_in_domain_1_uses_7900_and_7901_which_overlaps_domain_2(self) -> None:
-        assert unicast(1, 120) == (7900, 7901)
-        assert overlaps(1, 120) == (
-            PortUse(domain_id=2, role="discovery_multicast", participant_id=None),
-            PortUse(domain_id=2, role="user_multicast", participant_id=None),
-        )
-
-    def test_one_host_may_run_120_processes_per_domain(self) -> None:
-        assert max_participants(1, LINUX) == Capacity(
-            participants=120, limit="the ports of domain 2, from 7900"
-        )
-
-    @pytest.mark.parametrize(
-        ("participant_id", "ports"),
-        [
-            (0, (32660, 32661)),
-            (1, (32662, 32663)),
-            (2, (32664, 32665)),
-            (53, (32766, 32767)),
-            (54, (32768, 32769)),
-        ],
+def test_the_121st_participant_of_domain_1_overlaps_domain_2() -> None:
+    assert overlaps(1, 119) == ()
+    assert overlaps(1, 120) == (
+        PortUse(domain_id=2, role="discovery_multicast", participant_id=None),
+        PortUse(domain_id=2, role="user_multicast", participant_id=None),
     )
-    def test_domain_101_uses_32650_32651_and_these_unicast_ports(
-        self, participant_id: int, ports: tuple[int, int]
-    ) -> None:
-        assert multicast(101) == (32650, 32651)
-        assert unicast(101, participant_id) == ports
-
-    def test_54_processes_fit_domain_101_on_linux(self) -> None:
-        assert max_participants(101, LINUX) == Capacity(
-            participants=54, limit="the ephemeral ports 32768–60999"
-        )
-
-    def test_63_processes_fit_domain_232_on_linux_because_the_highest_port_is_65535(self) -> None:
-        assert max_participants(232, LINUX) == Capacity(
-            participants=63, limit="the highest port, 65535"
-        )
-        assert unicast(232, 62) == (65534, 65535)
-
-    @pytest.mark.parametrize("platform", [Platform.MACOS, Platform.WINDOWS])
-    def test_120_processes_fit_domain_166_on_macos_and_windows(self, platform: Platform) -> None:
-        assert max_participants(166, platform) == Capacity(
-            participants=120, limit="the ports of domain 167, from 49150"
-        )
 
 
 def test_participant_63_of_domain_232_is_refused_where_fast_dds_wraps_to_port_1() -> None:
@@ -149,13 +116,6 @@ def test_a_negative_participant_is_refused() -> None:
     with pytest.raises(ValueError) as caught:
         participant_ports(0, -1)
     assert str(caught.value) == "cannot use participant id -1; use 0 or more"
-
-
-def test_no_participant_fits_a_domain_whose_multicast_ports_are_ephemeral() -> None:
-    assert max_participants(214, LINUX) == Capacity(
-        participants=0,
-        limit="the ephemeral ports 32768–60999: they hold its multicast ports",
-    )
 
 
 def test_the_machines_own_range_moves_the_safe_domains() -> None:
@@ -276,16 +236,9 @@ def test_an_ephemeral_range_begins_at_1() -> None:
         EphemeralRange(first=0, last=1)
 
 
-def test_participants_of_the_highest_domain_end_with_the_last_port() -> None:
-    out_of_the_way = EphemeralRange(first=1, last=1)
-    assert max_participants(232, out_of_the_way) == Capacity(
-        participants=63, limit="the highest port, 65535"
-    )
-    assert isinstance(max_participants(232, out_of_the_way).participants, int)
-    assert owner_of(65400) == PortUse(
-        domain_id=232, role="discovery_multicast", participant_id=None
-    )
+def test_the_last_ports_are_those_of_the_highest_domain() -> None:
     assert owner_of(65535) == PortUse(domain_id=232, role="user_unicast", participant_id=62)
+    assert owner_of(65536) is None
 
 
 @pytest.mark.parametrize("domain", [0, 77, 101, 231, 232])
