@@ -37,7 +37,14 @@ from lifecycle.programming.apply.targets.registry import (
     Targets,
     settings_types,
 )
-from lifecycle.programming.rules.mobile import Body, Requests, document
+from lifecycle.programming.rules.mobile import (
+    Body,
+    DeviceEnd,
+    Requests,
+    document,
+    parse_devices,
+    requests_of,
+)
 from lifecycle.programming.rules.rules import FlowRule, RuleSet
 
 
@@ -91,8 +98,18 @@ class RemoteTarget(abc.ABC, Generic[_S]):
 
     @staticmethod
     @abc.abstractmethod
-    def requests(settings: _S, rules: Sequence[FlowRule]) -> Requests:
+    def body(rule: FlowRule, end: DeviceEnd, settings: _S) -> Body:
+        """Return what is asked for one flow and one of its ends that is a device.
+
+        Raises:
+            ValueError: it cannot be asked for.
+        """
+
+    @classmethod
+    def requests(cls, settings: _S, rules: Sequence[FlowRule]) -> Requests:
         """Return one request per flow and device, and each flow that cannot be asked for."""
+        devices = parse_devices(settings.devices)
+        return requests_of(rules, devices, lambda rule, end: cls.body(rule, end, settings))
 
     @abc.abstractmethod
     def create(self, body: Body) -> Made:

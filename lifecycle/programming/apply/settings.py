@@ -34,6 +34,7 @@ import yaml
 
 from lifecycle.network.nfe import is_loopback
 from lifecycle.programming.apply.target import SettingsError
+from lifecycle.programming.rules.mobile import parse_devices
 
 _MAX_BYTES = 256 * 1024
 _MAX_TOKEN_BYTES = 64 * 1024
@@ -100,12 +101,15 @@ class ServerSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
 
     Attributes:
         url: of its interface.
+        devices: addresses or networks of the network's devices, `10.45.0.0/16`, or `source` or
+            `destination` for that end of every flow.
         token: None sends none.
         ca_file: certificates that the server is checked against; empty for the system's.
         timeout_s: of one request, > 0.
     """
 
     url: str
+    devices: tuple[str, ...]
     token: Token | None = None
     ca_file: str = ""
     timeout_s: float = 10.0
@@ -114,6 +118,7 @@ class ServerSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
         _check_url(self.url, token=self.token)
         if not 0 < self.timeout_s < float("inf"):
             raise ValueError(f"cannot use timeout_s {self.timeout_s:g}; use a number > 0")
+        parse_devices(self.devices)
         self.check()
 
     def check(self) -> None:

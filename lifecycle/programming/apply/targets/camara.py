@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import datetime as dt
 import re
-from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -21,10 +20,7 @@ from lifecycle.programming.apply.target import HttpError
 from lifecycle.programming.rules.mobile import (
     Body,
     DeviceEnd,
-    Requests,
     class_name,
-    parse_devices,
-    requests_of,
 )
 from lifecycle.programming.rules.rules import FlowRule
 
@@ -54,8 +50,6 @@ class CamaraSettings(ServerSettings, frozen=True, kw_only=True, forbid_unknown_f
 
     Attributes:
         url: everything before `/sessions`.
-        devices: addresses or networks of the network's devices, `10.45.0.0/16`, or `source` or
-            `destination` for that end of every flow.
         qos_profiles: the provider's names of profiles, by 5QI.
         default_qos_profile: for flows whose 5QI is not named; empty leaves them out.
         duration_s: 1–2147483647; sessions are renewed, or they expire.
@@ -66,7 +60,6 @@ class CamaraSettings(ServerSettings, frozen=True, kw_only=True, forbid_unknown_f
         wait_s: how long a session may take to become available; 0 does not wait.
     """
 
-    devices: tuple[str, ...]
     qos_profiles: dict[int, str] = msgspec.field(default_factory=dict)
     default_qos_profile: str = ""
     duration_s: int = 3600
@@ -77,7 +70,6 @@ class CamaraSettings(ServerSettings, frozen=True, kw_only=True, forbid_unknown_f
 
     def check(self) -> None:
         """Refuse what a server would refuse."""
-        parse_devices(self.devices)
         for profile in filter(None, (*self.qos_profiles.values(), self.default_qos_profile)):
             if not re.fullmatch(r"[a-zA-Z0-9_.-]{3,256}", profile):
                 raise ValueError(
@@ -91,30 +83,6 @@ class CamaraSettings(ServerSettings, frozen=True, kw_only=True, forbid_unknown_f
             raise ValueError(f"cannot use a duration of {self.duration_s} s; use 1 to {_LONGEST_S}")
         if self.sink and not re.fullmatch(r"https://[^\s/]+\S*", self.sink):
             raise ValueError(f"cannot use sink {self.sink!r}; use an https URL, or none")
-
-
-def session(rule: FlowRule, end: DeviceEnd, settings: CamaraSettings) -> Body:
-    """Return the body of a CreateSession (QualityOnDemand 1.1.0).
-
-    It has no protocol and no direction: it treats what goes between a device's ports and a
-    server's ports, both ways, UDP and TCP alike.
-    """
-    profile = class_name(
-        rule, settings.qos_profiles, settings.default_qos_profile, setting="qos_profiles"
-    )
-    public = settings.public_addresses.get(end.device, end.device)
-    device: Body = {"ipv4Address": {"publicAddress": public, "privateAddress": end.device}}
-    if end.is_ipv6:
-        device = {"ipv6Address": end.device}
-    return {
-        **({} if settings.device_by_token else {"device": device}),
-        "applicationServer": {"ipv6Address" if end.is_ipv6 else "ipv4Address": end.server},
-        "devicePorts": {"ports": [end.device_port]},
-        "applicationServerPorts": {"ports": [end.server_port]},
-        "qosProfile": profile,
-        **({"sink": settings.sink} if settings.sink else {}),
-        "duration": settings.duration_s,
-    }
 
 
 class _Session(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
@@ -148,13 +116,28 @@ class CamaraTarget(RemoteTarget[CamaraSettings]):
         """By key, when a session expires: since the epoch, and on the clock that goes forward."""
 
     @staticmethod
-    def requests(settings: CamaraSettings, rules: Sequence[FlowRule]) -> Requests:
-        """Return one session per flow and device."""
-        return requests_of(
-            rules,
-            parse_devices(settings.devices),
-            lambda rule, end: session(rule, end, settings),
+    def body(rule: FlowRule, end: DeviceEnd, settings: CamaraSettings) -> Body:
+        """Return the body of a CreateSession (QualityOnDemand 1.1.0).
+
+        It has no protocol and no direction: it treats what goes between a device's ports and a
+        server's ports, both ways, UDP and TCP alike.
+        """
+        profile = class_name(
+            rule, settings.qos_profiles, settings.default_qos_profile, setting="qos_profiles"
         )
+        public = settings.public_addresses.get(end.device, end.device)
+        device: Body = {"ipv4Address": {"publicAddress": public, "privateAddress": end.device}}
+        if end.is_ipv6:
+            device = {"ipv6Address": end.device}
+        return {
+            **({} if settings.device_by_token else {"device": device}),
+            "applicationServer": {"ipv6Address" if end.is_ipv6 else "ipv4Address": end.server},
+            "devicePorts": {"ports": [end.device_port]},
+            "applicationServerPorts": {"ports": [end.server_port]},
+            "qosProfile": profile,
+            **({"sink": settings.sink} if settings.sink else {}),
+            "duration": settings.duration_s,
+        }
 
     def create(self, body: Body) -> Made:
         """POST it and wait a little until it is available.

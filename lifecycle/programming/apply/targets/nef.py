@@ -11,7 +11,7 @@ import contextlib
 import enum
 import ipaddress
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 import msgspec
 
@@ -22,10 +22,7 @@ from lifecycle.programming.apply.target import HttpError
 from lifecycle.programming.rules.mobile import (
     Body,
     DeviceEnd,
-    Requests,
     class_name,
-    parse_devices,
-    requests_of,
 )
 from lifecycle.programming.rules.rules import PROTOCOL_NUMBERS, FlowRule
 
@@ -61,8 +58,6 @@ class NefSettings(ServerSettings, frozen=True, kw_only=True, forbid_unknown_fiel
         url: API root, before `/3gpp-as-session-with-qos/v1`.
         scs_as_id: who we are to the operator.
         notification_destination: http or https URL that the network reports to.
-        devices: addresses or networks of the network's devices, `10.45.0.0/16`, or `source` or
-            `destination` for that end of every flow.
         qos_references: the operator's names of classes, by 5QI.
         default_qos_reference: for flows whose 5QI is not named; empty leaves them out.
         supported_features: hexadecimal text (TS 29.571 SupportedFeatures), "0" for none.
@@ -72,7 +67,6 @@ class NefSettings(ServerSettings, frozen=True, kw_only=True, forbid_unknown_fiel
 
     scs_as_id: str
     notification_destination: str
-    devices: tuple[str, ...]
     qos_references: dict[int, str] = msgspec.field(default_factory=dict)
     default_qos_reference: str = ""
     supported_features: str = "0"
@@ -95,29 +89,11 @@ class NefSettings(ServerSettings, frozen=True, kw_only=True, forbid_unknown_fiel
                 f"cannot use supportedFeatures {self.supported_features!r}; "
                 "use hexadecimal digits, 0 for none"
             )
-        parse_devices(self.devices)
 
     @property
     def scope(self) -> str:
         """Our collection of subscriptions, without the last path segment."""
         return f"{self.url.rstrip('/')}/3gpp-as-session-with-qos/v1/{as_segment(self.scs_as_id)}"
-
-
-def subscription(rule: FlowRule, end: DeviceEnd, settings: NefSettings) -> Body:
-    """Return the body of an AsSessionWithQoSSubscription (3GPP TS 29.122 §5.14).
-
-    One flow each: a known open implementation passes on only the last of several.
-    """
-    reference = class_name(
-        rule, settings.qos_references, settings.default_qos_reference, setting="qos_references"
-    )
-    return {
-        "supportedFeatures": settings.supported_features,
-        "notificationDestination": settings.notification_destination,
-        "ueIpv6Addr" if end.is_ipv6 else "ueIpv4Addr": end.device,
-        "flowInfo": [{"flowId": 1, "flowDescriptions": [_filter(rule, end, settings)]}],
-        "qosReference": reference,
-    }
 
 
 def _filter(rule: FlowRule, end: DeviceEnd, settings: NefSettings) -> str:
@@ -156,13 +132,21 @@ class NefTarget(RemoteTarget[NefSettings]):
     collection = "/subscriptions"
 
     @staticmethod
-    def requests(settings: NefSettings, rules: Sequence[FlowRule]) -> Requests:
-        """Return one subscription per flow and device."""
-        return requests_of(
-            rules,
-            parse_devices(settings.devices),
-            lambda rule, end: subscription(rule, end, settings),
+    def body(rule: FlowRule, end: DeviceEnd, settings: NefSettings) -> Body:
+        """Return the body of an AsSessionWithQoSSubscription (3GPP TS 29.122 §5.14).
+
+        One flow each: a known open implementation passes on only the last of several.
+        """
+        reference = class_name(
+            rule, settings.qos_references, settings.default_qos_reference, setting="qos_references"
         )
+        return {
+            "supportedFeatures": settings.supported_features,
+            "notificationDestination": settings.notification_destination,
+            "ueIpv6Addr" if end.is_ipv6 else "ueIpv4Addr": end.device,
+            "flowInfo": [{"flowId": 1, "flowDescriptions": [_filter(rule, end, settings)]}],
+            "qosReference": reference,
+        }
 
     def create(self, body: Body) -> Made:
         """POST it.
