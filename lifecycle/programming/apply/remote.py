@@ -42,7 +42,6 @@ from lifecycle.programming.rules.mobile import (
     DeviceEnd,
     Requests,
     document,
-    parse_devices,
     requests_of,
 )
 from lifecycle.programming.rules.rules import FlowRule, RuleSet
@@ -108,8 +107,7 @@ class RemoteTarget(abc.ABC, Generic[_S]):
     @classmethod
     def requests(cls, settings: _S, rules: Sequence[FlowRule]) -> Requests:
         """Return one request per flow and device, and each flow that cannot be asked for."""
-        devices = parse_devices(settings.devices)
-        return requests_of(rules, devices, lambda rule, end: cls.body(rule, end, settings))
+        return requests_of(rules, settings.devices, lambda rule, end: cls.body(rule, end, settings))
 
     @abc.abstractmethod
     def create(self, body: Body) -> Made:

@@ -34,7 +34,7 @@ import yaml
 
 from lifecycle.network.nfe import is_loopback
 from lifecycle.programming.apply.target import SettingsError
-from lifecycle.programming.rules.mobile import parse_devices
+from lifecycle.programming.rules.mobile import device_networks
 
 _MAX_BYTES = 256 * 1024
 _MAX_TOKEN_BYTES = 64 * 1024
@@ -118,7 +118,7 @@ class ServerSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
         _check_url(self.url, token=self.token)
         if not 0 < self.timeout_s < float("inf"):
             raise ValueError(f"cannot use timeout_s {self.timeout_s:g}; use a number > 0")
-        parse_devices(self.devices)
+        device_networks(self.devices)
         self.check()
 
     def check(self) -> None:

@@ -7,7 +7,7 @@ devices, so a flow between two devices is asked for twice, once for each. Pure.
 from __future__ import annotations
 
 import ipaddress
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from lifecycle import dataclasses
@@ -68,51 +68,23 @@ class Requests:
     left_out: tuple[LeftOut, ...]
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Devices:
-    """Which ends of flows are devices.
-
-    Attributes:
-        networks: that devices have their addresses from.
-        source: the sender of every flow is one.
-        destination: the receiver of every flow is one.
-    """
-
-    networks: tuple[IpNetwork, ...]
-    source: bool = False
-    destination: bool = False
-
-    def __str__(self) -> str:
-        return ", ".join(map(str, self.networks))
-
-    def has(self, address: str) -> bool:
-        """Whether an address, known or not, is that of a device."""
-        return bool(address) and any(
-            ipaddress.ip_address(address) in network for network in self.networks
-        )
-
-
-def parse_devices(texts: Iterable[str]) -> Devices:
-    """Parse which ends of flows are devices.
+def device_networks(devices: Iterable[str]) -> tuple[IpNetwork, ...]:
+    """Return the networks among what says which ends of flows are devices.
 
     Args:
-        texts: `10.45.0.0/16`, `2001:db8:45::/48`, single addresses, or `source` and `destination`
-            for that end of every flow.
+        devices: `10.45.0.0/16`, `2001:db8:45::/48`, single addresses, or `source` and
+            `destination` for that end of every flow.
 
     Raises:
         ValueError: not a network, or none at all: without it no end is known to be a device.
     """
-    every = tuple(texts)
+    every = tuple(devices)
     if not every:
         raise ValueError(
             "cannot tell which ends of flows are devices: devices is empty; name the addresses or "
             "networks of the devices, such as 10.45.0.0/16, or 'source' or 'destination'"
         )
-    return Devices(
-        networks=tuple(_network(each) for each in every if each not in _ENDS),
-        source="source" in every,
-        destination="destination" in every,
-    )
+    return tuple(_network(each) for each in every if each not in _ENDS)
 
 
 def _network(text: str) -> IpNetwork:
@@ -126,13 +98,13 @@ def _network(text: str) -> IpNetwork:
 
 
 def requests_of(
-    rules: Iterable[FlowRule], devices: Devices, make: Callable[[FlowRule, DeviceEnd], Body]
+    rules: Iterable[FlowRule], devices: Sequence[str], make: Callable[[FlowRule, DeviceEnd], Body]
 ) -> Requests:
     """Return one request per flow and device, and the flows that none can be made for.
 
     Args:
         rules: of verified flows.
-        devices: which ends are devices.
+        devices: see `device_networks`.
         make: the body for one flow and one of its ends; a ValueError leaves the flow out.
     """
     requests: list[NetworkRequest] = []
@@ -158,42 +130,39 @@ def requests_of(
     return Requests(requests=tuple(requests), left_out=tuple(left))
 
 
-def device_ends(rule: FlowRule, devices: Devices) -> tuple[DeviceEnd, ...]:
+def device_ends(rule: FlowRule, devices: Sequence[str]) -> tuple[DeviceEnd, ...]:
     """Return the ends of a flow that are devices: one or both.
 
     Raises:
         ValueError: none is, or an end that has to be known is not.
     """
-    source, destination = rule.source_address, rule.destination_address
-    if ipaddress.ip_address(destination).is_loopback:
+    source = (rule.source_address, rule.source_port)
+    destination = (rule.destination_address, rule.destination_port)
+    if ipaddress.ip_address(rule.destination_address).is_loopback:
         raise ValueError("it never leaves its machine")
-    if not source:
+    if not rule.source_address:
         raise ValueError(
             "the address it is sent from is not known; give its machine an address in the manifest"
         )
+    networks = device_networks(devices)
     found: list[DeviceEnd] = []
-    if devices.destination or devices.has(destination):
-        found.append(
-            DeviceEnd(
-                sends=False,
-                device=destination,
-                device_port=rule.destination_port,
-                server=source,
-                server_port=rule.source_port,
+    for end, sends, device, server in (
+        ("destination", False, destination, source),
+        ("source", True, source, destination),
+    ):
+        if end in devices or any(ipaddress.ip_address(device[0]) in each for each in networks):
+            found.append(
+                DeviceEnd(
+                    sends=sends,
+                    device=device[0],
+                    device_port=device[1],
+                    server=server[0],
+                    server_port=server[1],
+                )
             )
-        )
-    if devices.source or devices.has(source):
-        found.append(
-            DeviceEnd(
-                sends=True,
-                device=source,
-                device_port=rule.source_port,
-                server=destination,
-                server_port=rule.destination_port,
-            )
-        )
     if not found:
-        raise ValueError(f"neither end is a device of the mobile network ({devices})")
+        text = ", ".join(map(str, networks))
+        raise ValueError(f"neither end is a device of the mobile network ({text})")
     return tuple(found)
 
 

@@ -10,7 +10,6 @@ for. Pure.
 from __future__ import annotations
 
 import hashlib
-import ipaddress
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from lifecycle import dataclasses
@@ -29,6 +28,7 @@ from lifecycle.network.nfe import (
     is_loopback,
     is_multicast,
     is_wildcard,
+    parse_address,
     socket_text,
 )
 from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedNode
@@ -135,20 +135,13 @@ def _address(text: str) -> IpAddress:
     Raises:
         ValueError: not one unicast address: a name, a zone, a wildcard or a group.
     """
-    try:
-        address = ipaddress.ip_address(text)
-    except ValueError:
+    address = parse_address(text)
+    # A zone means something on its own host only.
+    if address is None or "%" in text or address.is_unspecified or address.is_multicast:
         raise ValueError(
-            f"cannot use address {text!r}; use one IPv4 or IPv6 address, such as 10.77.0.1"
-        ) from None
-    if "%" in text:
-        raise ValueError(
-            f"cannot use address {text!r}: its zone means something on its own host only; "
-            f"use {text.partition('%')[0]}"
+            f"cannot use address {text!r}; use one unicast address without a zone, such as "
+            "10.77.0.1"
         )
-    if address.is_unspecified or address.is_multicast:
-        kind = "a group" if address.is_multicast else "every address of its host"
-        raise ValueError(f"cannot use address {text!r}: it is {kind}; use one unicast address")
     return address
 
 
