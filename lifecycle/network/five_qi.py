@@ -290,8 +290,8 @@ class DscpMapping:
 
     name: str
     source: str
-    status: str = ""
-    notes: tuple[str, ...] = ()
+    status: str
+    notes: tuple[str, ...]
     values: tuple[tuple[int, int], ...]
 
     def dscp_for(self, value: int) -> int | None:
