@@ -13,9 +13,7 @@ from lifecycle.plan.build import build_plan
 from lifecycle.plan.model import ParticipantConnections, Plan, PlannedParticipant
 from lifecycle.verify.judge import verify
 from lifecycle.verify.observation import Identity, NodeConfiguration, Observation
-from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.endpoints import differ
-from lifecycle.verify.rules.nodes import UNDECLARED_NODE
 from lifecycle.verify.verdict import Finding, Stage
 from tests.builders import (
     endpoint,
@@ -842,12 +840,3 @@ def test_findings_are_on_these_alone_where(case: str):
 )
 def test_hashes_differ_where_those_of_one_version_do(one: str, other: str, expected: bool):
     assert differ(one, other) is expected
-
-
-def test_a_rule_gives_no_outcome_that_it_is_not_documented_to_have():
-    with pytest.raises(
-        ValueError, match=r"^cannot give rule graph\.undeclared-node the outcome unverifiable$"
-    ):
-        UNDECLARED_NODE.finding(
-            Outcome.UNVERIFIABLE, subject="/spy", expected="", observed="", message=""
-        )

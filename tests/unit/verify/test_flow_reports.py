@@ -35,10 +35,6 @@ def flows_after(edit: Edit, plan: Plan = PLAN) -> tuple[FlowReport, ...]:
     return verify(plan, edit(perfect(plan)), stage=Stage.CONNECTED).flows
 
 
-def unchanged(seen):
-    return seen
-
-
 NET = planned(
     node("one", publisher("a"), machine="m"),
     node("two", subscription("a"), machine="n"),
@@ -95,14 +91,6 @@ def test_a_finding_concerns_a_flow_at_its_pair_its_nodes_and_its_endpoints(place
     assert outcome_with(finding(*place, rule="graph.qos-differs")) is Outcome.OK
 
 
-@pytest.mark.parametrize("places", [((SUBJECT,), (SUBJECT,)), ((SUBJECT,), ("/a", "/one", PUB))])
-def test_a_flow_is_violated_whichever_finding_comes_first(places):
-    one, other = places
-    violated = finding(*one, outcome=Outcome.VIOLATED)
-    assert outcome_with(violated, finding(*other)) is Outcome.VIOLATED
-    assert outcome_with(finding(*other), violated) is Outcome.VIOLATED
-
-
 def nfe(protocol: str, family: str = "ipv4", address: str = "10.0.0.1") -> NetworkFlowEndpoint:
     return NetworkFlowEndpoint(
         transport_protocol=TransportProtocol(protocol),
@@ -115,7 +103,6 @@ def nfe(protocol: str, family: str = "ipv4", address: str = "10.0.0.1") -> Netwo
 SHM = nfe("unknown", "unknown", "")
 UDP4, UDP6 = nfe("udp"), nfe("udp", "ipv6", "fd00::1")
 TCP4, TCP6 = nfe("tcp"), nfe("tcp", "ipv6", "fd00::1")
-GROUP = nfe("udp", address="239.255.1.9")
 
 
 def flow_between(source, destination, *, machines=("m", "n"), dscp: int | None = 46) -> FlowReport:
@@ -157,12 +144,6 @@ def test_what_can_carry_a_flow_is_what_both_ends_list(source, destination, machi
     assert flow_between(source, destination, machines=machines).transport == transport
 
 
-def test_a_flow_between_nodes_of_which_one_does_not_report_may_not_go_by_shared_memory():
-    plan = planned(node("one", publisher("a")), node("two", subscription("a")))
-    (flow,) = flows_after(drop_report("/one"), plan)
-    assert flow.transport == "unknown"
-
-
 @pytest.mark.parametrize(
     ("carried_by", "source", "destination", "used", "dscp"),
     [
@@ -186,56 +167,6 @@ def test_only_sockets_of_what_carries_a_flow_are_shown(carried_by, source, desti
     assert (flow.dscp, flow.reader_dscp) == (dscp, dscp)
 
 
-def test_of_a_flow_to_a_group_only_the_sockets_of_udp_are_shown():
-    flow = flow_between((UDP4, TCP4), (GROUP, TCP6), machines="mm")
-    assert flow.effective_transport == "udpm"
-    assert [each.transport_protocol for each in (*flow.source, *flow.destination)] == [
-        TransportProtocol.UDP,
-        TransportProtocol.UDP,
-    ]
-    assert flow.dscp == 46
-
-
-def test_of_ends_that_report_nothing_no_dscp_is_shown():
-    plan = planned(node("one", publisher("a")), node("two", subscription("a")))
-    (flow,) = flows_after(both(drop_report("/one"), drop_report("/two")), plan)
-    assert (flow.dscp, flow.reader_dscp, flow.unique) == (None, None, None)
-
-
-def reasoned(*reasons: str) -> Plan:
-    """A node whose publishers of one topic have a 5QI for these reasons."""
-    plan = planned(node("one", publisher("a"), publisher("/a")), node("two", subscription("a")))
-    ends = tuple(
-        dataclasses.replace(end, five_qi=85, five_qi_reason=reason)
-        for end, reason in zip(plan.nodes[0].endpoints, reasons, strict=True)
-    )
-    one = dataclasses.replace(plan.nodes[0], endpoints=ends)
-    return dataclasses.replace(plan, nodes=(one, plan.nodes[1]))
-
-
-@pytest.mark.parametrize(
-    ("reasons", "shown"),
-    [
-        (("fast", "small"), "fast; small"),
-        (("fast", "fast"), "fast"),
-        (("", "small"), "small"),
-        (("", ""), ""),
-    ],
-)
-def test_a_flow_says_once_each_why_its_publishers_have_their_5qi(reasons, shown):
-    (flow,) = flows_after(unchanged, reasoned(*reasons))
-    assert (flow.five_qi, flow.five_qi_reason) == (85, shown)
-
-
-def test_the_5qi_of_a_flow_is_the_planned_one():
-    assert [each.five_qi for each in flows_after(unchanged)] == [85, None, None]
-
-
-def test_a_finding_that_concerns_no_flow_hides_none_that_does():
-    other = finding(SUBJECT, rule="graph.qos-differs")
-    assert outcome_with(other, finding(SUBJECT)) is Outcome.UNVERIFIABLE
-
-
 @pytest.mark.parametrize(
     ("address", "unique"), [("10.0.0.1", UniqueHow.STRONGLY), ("", UniqueHow.WEAKLY)]
 )
@@ -257,3 +188,9 @@ def test_a_flow_is_as_unique_as_it_is_on_the_declared_address_of_its_machine(add
         plan,
     )
     assert flow.unique is unique
+
+
+def test_of_ends_that_report_nothing_no_dscp_is_shown():
+    plan = planned(node("one", publisher("a")), node("two", subscription("a")))
+    (flow,) = flows_after(both(drop_report("/one"), drop_report("/two")), plan)
+    assert (flow.dscp, flow.reader_dscp, flow.unique) == (None, None, None)

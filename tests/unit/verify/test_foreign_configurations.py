@@ -144,12 +144,6 @@ def test_of_every_number_what_it_can_be_is_read_and_all_else_refused_with_what_i
         assert str(caught.value) == f"{what} is '{value}'; allowed: {least}–{most}"
 
 
-def test_of_a_text_that_no_schema_allows_it_is_said_where_it_is_wrong() -> None:
-    with pytest.raises(ConfigurationError) as caught:
-        decode_configuration(edited(name=7), NAME)
-    assert str(caught.value) == "Expected `str`, got `int` - at `$.name`"
-
-
 def test_what_is_refused_is_quoted_no_longer_than_a_line() -> None:
     for text, message in (
         (
@@ -165,12 +159,6 @@ def test_what_is_refused_is_quoted_no_longer_than_a_line() -> None:
         with pytest.raises(ConfigurationError) as caught:
             decode_configuration(text, NAME)
         assert str(caught.value) == message
-
-
-def test_of_several_values_of_a_parameter_each_must_be_one_that_it_can_have() -> None:
-    assert decode_configuration(with_parameter([0, LARGEST]), NAME).name == NAME
-    with pytest.raises(ConfigurationError, match=str(LARGEST + 1)):
-        decode_configuration(with_parameter([0, LARGEST + 1]), NAME)
 
 
 def test_deep_text_is_refused_in_a_thread_with_little_stack_too() -> None:

@@ -13,7 +13,6 @@ from lifecycle.manifest.model import (
     RosInterfaceAccess,
 )
 from lifecycle.manifest.qos import Durability, Liveliness, QosProfile
-from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.plan.model import Plan
 from lifecycle.verify.judge import verify
 from lifecycle.verify.outcome import Outcome
@@ -85,17 +84,6 @@ def test_tools_are_listed_with_what_they_have_and_the_pattern_that_tolerates_the
     verdict = judged(plan_of(), LISTENERS)
     assert (verdict.verdict, verdict.findings) == (Outcome.OK, ())
     assert verdict.tolerated == TOOLS
-
-
-def test_observers_are_listed_only_where_they_do_more_than_observe() -> None:
-    name = "/_lifecycle_observer_1"
-    assert judged(plan_of(), add_node(name)).tolerated == ()
-    listens = add_endpoint(SUB, name, "/a", gid="1", qos=QosProfile())
-    assert judged(plan_of(), add_node(name), listens).tolerated == (
-        ToleratedNode(
-            node=name, because="tolerated_nodes: _lifecycle_*", endpoints=(has(SUB, name, "/a"),)
-        ),
-    )
 
 
 ARRAY, TRIGGER = "diagnostic_msgs/msg/DiagnosticArray", "std_srvs/srv/Trigger"
@@ -265,41 +253,6 @@ def test_a_supervisor_does_not_publish_diagnostics_where_it_would_disturb(
     assert takes_diagnostics(planned(node("one", end))) is publishes
 
 
-def test_a_supervisor_adds_nothing_to_a_flow_that_the_manifest_wants_for_itself() -> None:
-    unique = need(SUB, "/diagnostics", UniqueRequirement.OPTIONALLY_REQUIRED)
-    alone = node("one", subscription("/diagnostics", ARRAY), needs=(unique,))
-    plan = planned(alone)
-    assert not takes_diagnostics(plan)
-    assert rules(plan, supervisor(1))[0][:2] == (
-        "graph.undeclared-publisher",
-        "/_lifecycle_observer_1",
-    )
-
-
-def test_who_else_is_there_is_listed_in_an_open_system_and_nobody_else() -> None:
-    others = both(
-        add_node("/guest"),
-        add_endpoint(PUB, "/stranger", "/x", gid="3"),
-        add_endpoint(PUB, "", "/y", gid="4"),
-        add_endpoint(SUB, "/guest", "/a", gid="5", qos=QosProfile()),
-        LISTENERS,
-        add_node("/_lifecycle_observer_1"),
-        add_node("/quiet"),
-    )
-    opened = judged(plan_of(undeclared_nodes=EndpointPolicy.OPEN), others)
-    because = "undeclared_nodes: open"
-    assert opened.tolerated == (
-        ToleratedNode(node="", because=because, endpoints=(has(PUB, "", "/y"),)),
-        TOOLS[0],
-        ToleratedNode(node="/guest", because=because, endpoints=(has(SUB, "/guest", "/a"),)),
-        TOOLS[1],
-        ToleratedNode(node="/quiet", because=because),
-        TOOLS[2],
-        ToleratedNode(node="/stranger", because=because, endpoints=(has(PUB, "/stranger", "/x"),)),
-    )
-    assert judged(plan_of(), others).tolerated == TOOLS
-
-
 NOT_ENFORCED = need(PUB, "a", dscp=46, enforce=False)
 
 
@@ -328,9 +281,3 @@ def test_what_is_violated_blocks_and_what_is_unverifiable_where_rule_and_policy_
     )
     verdict = judged(plan, edit)
     assert (verdict.verdict, verdict.blocking) == (outcome, blocks)
-
-
-def test_a_verdict_of_what_was_seen_is_judged_and_of_no_run() -> None:
-    verdict = judged(plan_of())
-    assert (verdict.judged, verdict.run, verdict.open_endpoints) == (True, None, ())
-    assert [each.topic for each in verdict.flows] == ["/a"]

@@ -34,27 +34,6 @@ def line(edit: Edit, plan=PLAN) -> str:
     return missing(verify(plan, edit(perfect(plan)), stage=Stage.CONNECTED))
 
 
-def test_nothing_is_missing_in_a_perfect_system():
-    assert line(lambda seen: seen) == ""
-
-
-def test_missing_things_are_named_with_what_they_are():
-    edit = both(drop_node("/viewer"), drop_endpoint(PUB, "/robot/status"))
-    assert line(edit) == ("missing: /viewer (node), /robot/status (publisher of /robot/camera)")
-
-
-def test_what_is_there_but_wrong_comes_after_what_is_missing():
-    edit = both(
-        change_node("/viewer", state="unconfigured"),
-        change_report(PUB, "/robot/status", matched=0),
-        change_report(SUB, "/robot/status", matched=0),
-    )
-    assert line(edit) == (
-        "missing: /robot/status: /robot/camera → /viewer (match);"
-        " wrong: /viewer (state.wrong-state)"
-    )
-
-
 def test_everything_that_is_missing_wrong_or_unknown_is_named_once():
     edit = both(
         *(change_node(name, state="active", count=2) for name in ("/robot/camera", "/viewer")),
@@ -87,10 +66,6 @@ def test_an_unverifiable_finding_is_waited_for_only_where_it_blocks():
     assert line(edit, strict) == "unknown: /viewer (graph.qos-unverifiable)"
 
 
-def test_an_endpoint_of_an_unknown_node_is_unknown_and_not_wrong():
-    assert line(NOBODYS) == "unknown: /odometry (graph.unattributed-endpoint)"
-
-
 def test_an_endpoint_of_an_unknown_node_is_not_named_while_a_declared_node_is_missing():
     """Discovery tells of an endpoint first and of its node a moment later."""
     edit = both(drop_node("/viewer"), NOBODYS)
@@ -104,17 +79,6 @@ def test_what_keeps_a_verdict_from_being_ok_is_named_although_the_gate_may_open(
     assert not_ok(verify(PLAN, perfect(PLAN), stage=Stage.CONNECTED)) == ""
     missing_node = verify(PLAN, drop_node("/viewer")(perfect(PLAN)), stage=Stage.CONNECTED)
     assert not_ok(missing_node) == missing(missing_node) != ""
-
-
-def test_without_findings_that_close_the_gate_every_rule_that_keeps_it_from_ok_is_named():
-    edit = both(
-        change_report(SUB, "/robot/status", qos=None),
-        change_report(PUB, "/robot/battery", dscp=None),
-    )
-    verdict = verify(PLAN, edit(perfect(PLAN)), stage=Stage.CONNECTED)
-    assert not_ok(verdict) == (
-        "unknown: /viewer (graph.qos-unverifiable), /robot/battery (flow.dscp-unverifiable)"
-    )
 
 
 def unverifiable(rule: str, subject: str, expected: str = "") -> Finding:
@@ -131,15 +95,6 @@ def unverifiable(rule: str, subject: str, expected: str = "") -> Finding:
 def trusted(*findings: Finding) -> str:
     verdict = Outcome.UNVERIFIABLE if findings else Outcome.OK
     return taken_on_trust(Verdict(verdict=verdict, blocking=False, findings=findings, flows=()))
-
-
-def test_what_is_taken_on_trust_is_named_by_rule_two_of_each_at_most():
-    assert trusted() == ""
-    rates = [unverifiable("flow.not-measured", f"/t{n}", "rate_hz 5") for n in range(4)]
-    assert trusted(*rates, unverifiable("graph.qos-unverifiable", "/camera")) == (
-        "rate_hz 5 of /t0, rate_hz 5 of /t1 and 2 more (flow.not-measured);"
-        " /camera (graph.qos-unverifiable)"
-    )
 
 
 @pytest.mark.parametrize(

@@ -207,13 +207,6 @@ def test_that_there_are_no_parameters_is_proven_or_unverifiable(
     assert all("that there are no parameters" in each.message for each in found)
 
 
-def test_what_cannot_be_seen_is_unverifiable_and_not_equal(tmp_path: Path) -> None:
-    plan = _plan(tmp_path)
-    seen = change_announced_qos(PUB, PRIVATE, history=History.UNKNOWN, depth=0)(_seen(plan))
-    (only,) = verify(plan, seen, stage=Stage.ACTIVE).findings
-    assert (only.outcome, only.node) == (Outcome.UNVERIFIABLE, ARM)
-
-
 def test_a_captured_document_takes_the_place_of_the_one_that_was_fed_in(tmp_path: Path) -> None:
     plan = _plan(tmp_path)
     seen = _seen(plan)

@@ -14,7 +14,6 @@ from lifecycle.verify.tool_filter import (
     fold_actions,
     is_noise_endpoint,
     is_noise_node,
-    known_node,
     our_nodes,
     tolerating_pattern,
     without_noise,
@@ -138,10 +137,6 @@ def test_a_service_of_the_node_interface_is_noise_on_a_node_of_ours_alone(base: 
     assert not is_noise_endpoint(*service, ours=False)
 
 
-def test_whoever_uses_the_node_interface_of_another_declares_nothing():
-    assert is_noise_endpoint(CLIENT, "/b", "/a/map_to", SET_PARAMETERS, ours=False)
-
-
 def server(name: str, type_: str, node: str = "/a") -> ObservedEndpoint:
     return ObservedEndpoint(kind=SERVER, node=node, name=name, type=type_)
 
@@ -220,27 +215,6 @@ def test_parts_of_another_type_stay_beside_their_action():
     wrong = [dataclasses.replace(each, type="std_msgs/msg/String") for each in some[-2:]]
     action, *left = fold_actions([*some[:-2], *wrong])
     assert (action.type, left) == ("robot/action/Dock", wrong)
-
-
-def test_a_second_server_of_an_action_is_another_end():
-    folded = ObservedEndpoint(
-        kind=ACTION_SERVER, node="/base", name="/dock", type="robot/action/Dock"
-    )
-    assert fold_actions([folded, *parts()]) == (folded, folded)
-
-
-@pytest.mark.parametrize(
-    ("kind", "name", "type_"),
-    [
-        (PUB, "/rosout", "rcl_interfaces/msg/Log"),
-        (PUB, "/ns/a/transition_event", "lifecycle_msgs/msg/TransitionEvent"),
-        (SERVER, "/ns/a/get_state", "lifecycle_msgs/srv/GetState"),
-    ],
-)
-def test_an_endpoint_of_nobody_known_is_never_noise(
-    kind: EndpointKind, name: str, type_: str
-) -> None:
-    assert not is_noise_endpoint(kind, "", name, type_, ours=True)
 
 
 def test_observers_notice_each_other_by_topics_that_are_nobody_elses():
@@ -334,45 +308,3 @@ def test_what_feeds_the_system_is_left_in_although_it_looks_like_a_client_librar
 )
 def test_a_tool_is_tolerated_by_the_first_pattern_of_its_name(name, patterns, pattern) -> None:
     assert tolerating_pattern(name, patterns) == pattern
-
-
-def test_an_action_of_no_node_keeps_the_gid_and_the_address_of_its_first_part() -> None:
-    def at_some_place(node: str) -> list[ObservedEndpoint]:
-        return [
-            dataclasses.replace(each, gid=f"{number:02}", address=f"10.0.0.{number}")
-            for number, each in enumerate(parts(node))
-        ]
-
-    nameless, named = fold_actions([*at_some_place(""), *at_some_place("/base")])
-    assert (nameless.gid, nameless.address) == ("00", "10.0.0.0")
-    assert (named.gid, named.address) == ("00", "10.0.0.0")
-
-
-def test_several_actions_are_folded_each_by_itself() -> None:
-    lift = parts(action="/lift")
-    folded = dataclasses.replace(
-        parts()[0], kind=ACTION_SERVER, name="/dock", type="robot/action/Dock"
-    )
-    assert fold_actions([*parts(), *lift]) == (
-        folded,
-        dataclasses.replace(folded, name="/lift"),
-    )
-
-
-def test_the_type_of_an_action_is_that_of_its_goal_whatever_the_order() -> None:
-    for order in (parts(), parts()[::-1]):
-        assert [each.type for each in fold_actions(order)] == ["robot/action/Dock"]
-
-
-@pytest.mark.parametrize(
-    ("name", "known"),
-    [
-        ("/robot/camera", "/robot/camera"),
-        ("/robot/_NODE_NAME_UNKNOWN_", ""),
-        ("_CREATED_BY_BARE_DDS_APP_/_CREATED_BY_BARE_DDS_APP_", ""),
-        ("/_NODE_NAME_UNKNOWN_/camera", "/_NODE_NAME_UNKNOWN_/camera"),
-        ("", ""),
-    ],
-)
-def test_a_placeholder_is_no_name_of_a_node(name: str, known: str) -> None:
-    assert known_node(name) == known

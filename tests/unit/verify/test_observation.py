@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import hashlib
 
-import pytest
-
 from lifecycle import codec
-from lifecycle.verify.observation import LONGEST_VALUE, ParameterReport, digest_of
+from lifecycle.verify.observation import LONGEST_VALUE, ParameterReport
 
 _FITS = "x" * (LONGEST_VALUE - len('""'))
 _TOO_LONG = _FITS + "x"
@@ -28,8 +26,3 @@ def test_a_value_that_is_too_long_is_reported_by_its_digest_alone() -> None:
         name="map", type="string", value=None, digest=digest, read_only=True
     )
     assert ParameterReport.of("map", "string", _FITS, read_only=True).value == _FITS
-
-
-@pytest.mark.parametrize(("value", "has_digest"), [(_FITS, False), (_TOO_LONG, True), ("", False)])
-def test_only_a_value_that_is_too_long_has_a_digest(value: str, has_digest: bool) -> None:
-    assert bool(digest_of(value)) is has_digest

@@ -15,7 +15,6 @@ from lifecycle.manifest.qos import (
     Liveliness,
     QosProfile,
     Reliability,
-    not_written,
 )
 from lifecycle.plan.model import Plan
 from lifecycle.verify.judge import verify
@@ -29,8 +28,6 @@ from tests.unit.verify.edits import (
     both,
     change_announced_qos,
     change_endpoint,
-    change_report,
-    drop_endpoint,
 )
 from tests.unit.verify.perfect import perfect
 from tests.unit.verify.told import told
@@ -192,21 +189,6 @@ def test_values_that_leave_the_choice_to_the_middleware_are_not_compared():
     assert differing(edit, pair(free)) == ["publisher: lifespan_ns infinite, lifespan_ns 3 ns"]
 
 
-def test_a_policy_that_is_not_written_does_not_end_the_comparison():
-    plan = planned(
-        node(
-            "one",
-            dataclasses.replace(publisher("a"), qos_defaults=not_written(["durability"])),
-            run=ATTACH,
-            managed=False,
-        )
-    )
-    edit = change_announced_qos(
-        PUB, "/a", reliability=Reliability.BEST_EFFORT, durability=Durability.TRANSIENT_LOCAL
-    )
-    assert differing(edit, plan) == ["publisher: durability VOLATILE, durability TRANSIENT_LOCAL"]
-
-
 # --- what is not known
 
 
@@ -219,25 +201,6 @@ def test_of_an_endpoint_whose_qos_nobody_knows_every_written_policy_is_unverifia
             " infinite"
         )
     ]
-
-
-def test_the_qos_of_an_endpoint_that_is_missing_is_not_named_besides():
-    plan = planned(node("one", publisher("a"), run=ATTACH, managed=False))
-    assert [each.rule for each in findings(drop_endpoint(PUB, "/a"), plan)] == [
-        "graph.missing-endpoint"
-    ]
-
-
-def test_the_qos_of_an_endpoint_that_only_its_node_tells_of_is_judged():
-    plan = planned(node("one", publisher("a")))
-    edit = both(drop_endpoint(PUB, "/a"), change_report(PUB, "/a", qos=QosProfile(depth=4)))
-    assert differing(edit, plan) == ["publisher: depth 10, depth 4"]
-
-
-def test_an_endpoint_that_writes_no_qos_does_not_end_the_judgement_of_its_node():
-    plan = planned(node("one", publisher("a", qos=None), publisher("b"), run=ATTACH, managed=False))
-    edit = change_announced_qos(PUB, "/b", depth=4)
-    assert differing(edit, plan) == ["publisher: depth 10, depth 4"]
 
 
 # --- offered against requested
@@ -316,20 +279,6 @@ def test_a_pair_is_judged_where_one_end_at_least_is_of_a_declared_node(
         ends.append(LESS)
     found = of("graph.qos-incompatible", both(*ends), plan)
     assert [(each.subject, each.at) for each in found] == ([(subject, at)] if subject else [])
-
-
-def test_a_pair_of_strangers_or_of_two_types_does_not_end_the_judgement_of_a_topic():
-    plan = open_world(subscription("a", line=5), subscription("b"))
-    edit = both(
-        add_endpoint(PUB, "/A", "/a", gid="91", qos=BEST_EFFORT, type="std_msgs/msg/Int32"),
-        add_endpoint(PUB, "/B", "/a", gid="92", qos=BEST_EFFORT),
-        add_endpoint(SUB, "/A", "/a", gid="93", qos=QosProfile()),
-        add_endpoint(PUB, "/B", "/b", gid="94", qos=BEST_EFFORT),
-        add_endpoint(SUB, "/one", "/a", gid="96", qos=QosProfile(), type="std_msgs/msg/Bool"),
-        # A topic with subscriptions alone has no pair.
-        add_endpoint(SUB, "/one", "/c", gid="95", qos=QosProfile()),
-    )
-    assert [each[0] for each in incompatible(edit, plan)] == ["/a: /B → /one", "/b: /B → /one"]
 
 
 def test_an_end_whose_qos_nobody_knows_may_match_anything():

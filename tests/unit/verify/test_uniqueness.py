@@ -26,7 +26,6 @@ from lifecycle.verify.view import Actual
 from tests import builders
 from tests.builders import (
     configuration,
-    endpoint,
     node,
     planned,
     publisher,
@@ -38,7 +37,6 @@ from tests.unit.verify.edits import (
     both,
     change_configuration,
     change_report,
-    drop_report,
 )
 from tests.unit.verify.perfect import perfect
 
@@ -115,66 +113,6 @@ def on_machines(one: str, two: str, *, processes: tuple[int, int] = (1, 2)) -> E
 def test_an_endpoint_is_unique_if_none_of_its_sockets_is_anothers(kind, a, b, expected):
     found = unique(plan_of(kind), both(on_machines("m", "m"), lists(kind, a=a, b=b)))
     assert (found["/a"], found["/b"]) == expected
-
-
-@pytest.mark.parametrize("kind", [PUB, SUB])
-def test_unknown_sockets_make_an_answer_unknown_only_inside_their_process(kind):
-    edit = lists(kind, a=(nfe(1),), b=None)
-    assert unique(plan_of(kind, processes=1), edit) == {"/a": None, "/b": None}
-    assert unique(plan_of(kind), edit) == {"/a": True, "/b": None}
-
-
-@pytest.mark.parametrize(
-    ("machines", "processes", "expected"),
-    [
-        (("m", "m"), (7, 7), None),
-        (("m", "m"), (7, 8), True),
-        (("m", "n"), (7, 7), True),
-    ],
-)
-def test_a_process_is_known_by_its_machine_and_its_number(machines, processes, expected):
-    edit = both(on_machines(*machines, processes=processes), lists(SUB, a=(nfe(1),), b=None))
-    assert unique(plan_of(SUB), edit)["/a"] is expected
-
-
-def test_a_shared_socket_is_no_doubt_whatever_else_is_not_known():
-    make = publisher
-    plan = planned(node("one", make("a"), make("b"), make("c")))
-    edit = lists(PUB, a=(nfe(1),), b=(nfe(1),), c=None)
-    assert unique(plan, edit) == {"/a": False, "/b": False, "/c": None}
-
-
-def test_several_unknown_endpoints_of_a_process_leave_it_unknown():
-    plan = planned(node("one", *(publisher(name) for name in ("a", "b", "c"))))
-    assert unique(plan, lists(PUB, a=(nfe(1),), b=None, c=None))["/a"] is None
-
-
-def test_publishers_are_compared_with_publishers_and_subscriptions_with_subscriptions():
-    plan = planned(node("one", publisher("a"), subscription("b")))
-    same = both(lists(PUB, a=(nfe(1),)), lists(SUB, b=(nfe(1),)))
-    assert unique(plan, same) == {"/a": True, "/b": True}
-    assert unique(plan, both(lists(PUB, a=(nfe(1),)), lists(SUB, b=None)))["/a"] is True
-    assert unique(plan, both(lists(PUB, a=None), lists(SUB, b=(nfe(1),))))["/b"] is True
-
-
-def test_an_endpoint_that_was_not_made_shares_nothing():
-    refused = change_report(PUB, "/b", error="refused")
-    for nfes in ((nfe(1),), None):
-        edit = both(lists(PUB, a=(nfe(1),), b=nfes), refused)
-        assert unique(plan_of(PUB, processes=1), edit) == {"/a": True, "/b": None}
-
-
-def test_what_is_no_topic_is_not_compared():
-    service = endpoint(EndpointKind.SERVICE_SERVER, "ask", "std_srvs/srv/Trigger")
-    plan = planned(node("one", service, publisher("a")))
-    assert unique(plan, lists(PUB, a=(nfe(1),))) == {"/ask": None, "/a": True}
-
-
-def test_an_endpoint_that_nobody_reports_is_unknown_and_has_no_sockets():
-    edit = both(lists(PUB, a=(nfe(1),)), drop_report("/two"))
-    uniqueness, ends = laid_out(plan_of(PUB), edit)
-    assert uniqueness.is_unique(ends["/b"]) is None
-    assert uniqueness.nfes((ends["/b"], ends["/a"])) == (nfe(1),)
 
 
 @pytest.mark.parametrize(
@@ -268,21 +206,6 @@ def test_where_the_manifest_says_a_machines_address_only_that_one_counts(a, b, a
     edit = both(on_machines("m", "n"), lists(SUB, a=a, b=b))
     found = unique(plan_of(SUB), edit, addresses)
     assert found == {"/a": expected, "/b": expected}
-
-
-def test_a_wildcard_counts_beside_the_declared_address_of_a_machine():
-    edit = both(
-        on_machines("m", "m"),
-        lists(SUB, a=(nfe(2), nfe(1, "0.0.0.0")), b=(nfe(3), nfe(1, "0.0.0.0"))),
-    )
-    here = {"/one": "10.0.0.1", "/two": "10.0.0.1"}
-    assert unique(plan_of(SUB), edit, here) == {"/a": False, "/b": False}
-
-
-def test_what_does_not_count_is_named_all_the_same():
-    edit = both(on_machines("m", "n"), lists(SUB, a=(nfe(1), BRIDGE), b=(BRIDGE,)))
-    uniqueness, ends = laid_out(plan_of(SUB), edit, DECLARED)
-    assert uniqueness.nfes((ends["/a"],)) == (nfe(1), BRIDGE)
 
 
 NFES = st.one_of(

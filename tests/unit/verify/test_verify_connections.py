@@ -14,14 +14,11 @@ from lifecycle.manifest.model import (
     EndpointKind,
     EndpointPolicy,
     Machine,
-    Policy,
     Run,
     RunKind,
 )
-from lifecycle.network.nfe import TransportProtocol
 from lifecycle.plan.model import ParticipantConnections, Plan, PlannedNode, PlannedParticipant
 from lifecycle.verify.judge import verify
-from lifecycle.verify.observation import Observation
 from lifecycle.verify.outcome import ConnectionReport, Outcome
 from lifecycle.verify.report import render_text, to_json
 from lifecycle.verify.verdict import Finding, OpenEndpoint, Stage
@@ -168,29 +165,6 @@ def test_what_a_node_has_after_a_restart_is_as_planned(
     assert [each[0] for each in found] == (["connection.differs"] if differs else [])
 
 
-@pytest.mark.parametrize(
-    "fields", [{"mapped": False}, {"error": "refused"}, {"error": "refused", "mapped": False}]
-)
-def test_an_endpoint_that_was_not_made_is_not_judged_as_mapped_elsewhere(
-    fields: dict[str, object],
-) -> None:
-    found = findings(change_report(PUB, "/video", connection="", **fields))
-    assert "connection.wrong-mapping" not in {rule for rule, _, _ in found}
-
-
-def test_a_connection_of_a_node_that_is_not_there_is_not_named_besides() -> None:
-    def gone(seen: Observation) -> Observation:
-        rest = tuple(each for each in seen.endpoints if each.node != "/_camera_net")
-        return dataclasses.replace(seen, endpoints=rest)
-
-    absent = both(gone, HIDDEN, drop_node("/camera"), change_configuration("/camera", endpoints=()))
-    edit = both(absent, change_configuration("/camera", connections=()))
-    assert [each for each in findings(edit) if each[0].startswith("connection.")] == []
-    # The nodes after it are judged all the same.
-    late = both(edit, change_report(SUB, "/video", connection="late"))
-    assert told(late).subject == "/video"
-
-
 def test_every_connection_and_mapping_of_a_node_is_judged() -> None:
     plain = PlannedParticipant(name="_camera_flow_0", dscp=None, reason="")
     (net,) = PLAN.nodes[0].participants
@@ -324,11 +298,6 @@ def test_more_matches_than_the_graph_explains_are_found_beside_it() -> None:
     ]
 
 
-def test_who_else_is_matched_does_not_matter_in_an_open_system() -> None:
-    plan = dataclasses.replace(PLAN, policy=Policy(undeclared_nodes=EndpointPolicy.OPEN))
-    assert findings(both(HIDDEN, change_report(PUB, "/video", matched=2)), plan) == []
-
-
 def test_an_endpoint_on_a_participant_that_anybody_can_see_must_be_seen() -> None:
     assert findings(drop_endpoint(SUB, "/video")) != []
     plain = dataclasses.replace(
@@ -340,11 +309,6 @@ def test_an_endpoint_on_a_participant_that_anybody_can_see_must_be_seen() -> Non
     assert findings(drop_endpoint(PUB, "/video"), plan) == [
         ("graph.missing-endpoint", "violated", "/video")
     ]
-
-
-def test_a_hidden_endpoint_that_nobody_reports_is_unverifiable() -> None:
-    plan = plan_of(run=Run(kind=RunKind.ATTACH))
-    assert ("graph.unseen-endpoint", "unverifiable", "/video") in findings(HIDDEN, plan)
 
 
 BEYOND = dataclasses.replace(
@@ -409,18 +373,6 @@ def test_a_medium_that_nobody_asked_for_is_only_expected() -> None:
     assert verify(expected, perfect(expected), stage=Stage.CONNECTED).verdict is Outcome.OK
     asked = dataclasses.replace(expected, data_layer=DataLayer(at=at(5)))
     assert verify(asked, perfect(asked), stage=Stage.CONNECTED).verdict is Outcome.VIOLATED
-
-
-def test_an_endpoint_without_any_nfe_goes_by_what_it_was_connected_to() -> None:
-    plan = plan_of(medium="tcpv4")
-    camera = connected(plan.nodes[0], "tcpv4://10.77.0.1:5100")
-    plan = dataclasses.replace(plan, nodes=(camera, plan.nodes[1]))
-    tcp = nfe("10.77.0.2", 5101, TransportProtocol.TCP)
-    for listed in ((), (nfe("0.0.0.0", 40000),)):
-        dialling = both(
-            change_report(PUB, "/video", nfes=listed), change_report(SUB, "/video", nfes=(tcp,))
-        )
-        assert findings(dialling, plan) == []
 
 
 def test_an_endpoint_that_a_node_may_make_is_no_finding_but_listed() -> None:

@@ -283,11 +283,6 @@ def test_a_node_that_nobody_asked_is_unverifiable_and_one_that_is_not_there_is_o
     assert [each.rule for each in judged(plan, gone)] == ["graph.missing-node"]
 
 
-def test_nothing_is_asked_of_a_node_of_which_nothing_is_declared_or_given():
-    plan = plan_of()
-    assert judged(plan, perfect(plan, Stage.ACTIVE)) == ()
-
-
 def test_a_file_that_could_not_be_read_is_unverifiable():
     plan = plan_of(unread_parameter_files=("arm.yaml",))
     (finding,) = judged(plan, perfect(plan, Stage.ACTIVE))
@@ -368,29 +363,6 @@ def test_at_most_eight_parameters_are_named(count: int, listed: str):
     assert finding.message == (
         f"cannot verify parameters {listed} of node /arm: they were not read"
     )
-
-
-def several(*nodes: tuple[str, tuple[ExpectedParameter, ...]], run: Run = ATTACH) -> Plan:
-    plan = planned(*(node(key, run=run, managed=False) for key, _ in nodes))
-    return dataclasses.replace(
-        plan,
-        nodes=tuple(
-            dataclasses.replace(each, expected_parameters=parameters)
-            for each, (_, parameters) in zip(plan.nodes, nodes, strict=True)
-        ),
-    )
-
-
-def test_a_node_is_judged_although_those_before_it_are_absent_or_have_nothing_to_judge():
-    plan = several(("gone", (expected(),)), ("idle", ()), ("arm", (expected(),)))
-    seen = served(plan, has(2.0))
-    seen = dataclasses.replace(
-        seen, nodes=tuple(each for each in seen.nodes if each.full_name != "/gone")
-    )
-    assert [(each.rule, each.subject) for each in judged(plan, seen)] == [
-        ("graph.missing-node", "/gone"),
-        ("param.value-differs", "/arm: gain"),
-    ]
 
 
 OURS = Run(kind=RunKind.PYTHON, python="robot:Arm")

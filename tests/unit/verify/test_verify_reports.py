@@ -196,10 +196,6 @@ def test_an_ipv6_flow_shows_its_flow_label_or_that_the_sender_sets_none():
     assert text.splitlines()[-1] == "    udp [::]:7411 → [fd00::2]:7000 flow_label unset"
 
 
-def test_a_flow_that_shared_memory_carries_shows_no_tuple_that_does_not_carry_it():
-    assert render_text(with_first_flow(effective_transport="shm")).endswith("  shm  ok\n")
-
-
 BAD_TEXT = """\
 verdict: violated (1 violated, 1 unverifiable, 3 flows)
 
@@ -244,13 +240,6 @@ def test_colour_comes_only_when_asked_for():
     assert coloured == [in_colour.get(line, line) for line in plain]
 
 
-def test_names_and_addresses_stay_whole_where_lines_are_wrapped():
-    name = "/robot/" + "a-long-name" * 5
-    finding = dataclasses.replace(VIOLATED, message=f"cannot find {name} anywhere")
-    text = render_text(dataclasses.replace(WRITTEN, findings=(finding,)), width=40)
-    assert f"\n  {name}\n" in text
-
-
 def test_what_a_verdict_allows_and_how_its_run_ended_follow_what_it_finds():
     assert (
         render_text(WRITTEN)
@@ -293,11 +282,6 @@ def test_the_first_line_counts_the_findings_of_each_outcome_and_the_flows():
     assert render_text(verdict).splitlines()[0] == first
 
 
-def test_flows_are_left_out_where_nobody_asks_for_them():
-    assert "\nflows\n" not in render_text(WRITTEN, flows=False)
-    assert "\nflows\n" not in render_text(dataclasses.replace(WRITTEN, flows=()))
-
-
 # --- JSON
 
 
@@ -323,17 +307,6 @@ def test_the_json_of_a_verdict_on_one_line_is_spelled_so():
         '{"node":"","because":"undeclared_nodes: open","endpoints":[]}],'
         '"run":{"reason":"/one died","reached":"active","exit_code":3,"trusted":"1 depth"}}'
     )
-
-
-def test_the_json_of_an_unjudged_run_is_spelled_so():
-    assert to_json(UNJUDGED) == (
-        '{"verdict":"unverifiable","findings":[],"flows":[],"judged":false,"run":{"reason":'
-        '"interrupted; /talker is still configuring","reached":null,"exit_code":130}}'
-    )
-
-
-def test_json_can_be_indented_for_people():
-    assert to_json(after(perfectly), indent=2).startswith('{\n  "verdict": "ok",\n')
 
 
 @pytest.mark.parametrize(
@@ -568,13 +541,6 @@ def test_the_junit_of_a_run_that_did_what_was_asked_for_says_how_it_ended():
         "</testcase>",
         "</testsuite>",
     ]
-
-
-def test_the_junit_of_what_nobody_judged_says_where_to_look():
-    skipped = {
-        each.get("message") for each in ET.fromstring(to_junit(UNJUDGED, PLAN)).iter("skipped")
-    }
-    assert skipped == {"not judged; see the end of the run"}
 
 
 def test_the_junit_of_findings_and_flows_is_spelled_so():

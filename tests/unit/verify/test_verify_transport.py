@@ -6,7 +6,7 @@ import dataclasses
 
 import pytest
 
-from lifecycle.manifest.model import DataLayer, EndpointKind, FlowTransport, Machine, UniqueHow
+from lifecycle.manifest.model import DataLayer, EndpointKind, FlowTransport, Machine
 from lifecycle.network.nfe import (
     InternetProtocol,
     NetworkFlowEndpoint,
@@ -19,15 +19,12 @@ from lifecycle.verify.observation import Identity
 from lifecycle.verify.outcome import ConnectionReport, Outcome
 from lifecycle.verify.transport import carrier
 from lifecycle.verify.verdict import Finding, Stage
-from tests.builders import at, link, need, node, planned, publisher, subscription
+from tests.builders import at, need, node, planned, publisher, subscription
 from tests.unit.verify.edits import (
     Edit,
     both,
     change_configuration,
-    change_node,
     change_report,
-    drop_endpoint,
-    drop_endpoint_report,
 )
 from tests.unit.verify.perfect import perfect
 
@@ -102,10 +99,6 @@ def pair(publishing: FlowTransport, subscribing: FlowTransport, **rest: object) 
     )
 
 
-def unchanged(seen):
-    return seen
-
-
 def findings(plan: Plan, edit: Edit) -> list[tuple[str, str, str]]:
     verdict = verify(plan, edit(perfect(plan)), stage=Stage.CONNECTED)
     return [(each.rule, each.outcome.value, each.observed) for each in verdict.findings]
@@ -138,17 +131,6 @@ def test_a_flow_has_only_those_sockets_of_a_connection_that_carry_it(receives, s
     )
     (flow,) = verify(plan, edit(perfect(plan)), stage=Stage.CONNECTED).flows
     assert (flow.source, flow.destination) == (source, receives)
-
-
-@pytest.mark.parametrize(("receives", "dscp"), [((TCP4,), None), ((UDP4,), 46)])
-def test_the_mark_of_udp_sockets_is_not_told_of_a_flow_that_tcp_carries(receives, dscp):
-    plan = pair(NETWORK, FlowTransport.ANY)
-    edit = both(
-        change_report(PUB, "/a", nfes=(UDP4, TCP4), dscp=46),
-        change_report(SUB, "/a", nfes=receives),
-    )
-    (flow,) = verify(plan, edit(perfect(plan)), stage=Stage.CONNECTED).flows
-    assert flow.dscp == dscp
 
 
 LISTED = change_report(PUB, "/a", nfes=(SHM, nfe("udp", "ipv4", "0.0.0.0", 40000)))
@@ -227,71 +209,7 @@ def test_container_bridges_of_one_address_do_not_make_two_machines_share_a_flow(
     assert findings(on_two_machines(declared=True), BOTH_BRIDGED) == []
 
 
-def test_without_declared_addresses_equal_addresses_may_be_one():
-    assert [rule for rule, _, _ in findings(on_two_machines(declared=False), BOTH_BRIDGED)] == [
-        "flow.not-unique",
-        "flow.not-unique",
-    ]
-
-
-def test_an_endpoint_that_is_not_on_the_declared_address_is_judged_by_all_that_it_has():
-    edit = both(change_report(SUB, "/a", nfes=(BRIDGE,)), change_report(SUB, "/b", nfes=(BRIDGE,)))
-    assert [rule for rule, _, _ in findings(on_two_machines(declared=True), edit)] == [
-        "flow.not-unique",
-        "flow.not-unique",
-    ]
-
-
-def test_a_group_on_the_declared_address_still_counts():
-    group = nfe("udp", "ipv4", "239.255.0.1")
-    edit = both(
-        change_report(SUB, "/a", nfes=(nfe("udp", "ipv4", "10.0.0.1"), group)),
-        change_report(SUB, "/b", nfes=(nfe("udp", "ipv4", "10.0.0.2"), group)),
-    )
-    assert [rule for rule, _, _ in findings(on_two_machines(declared=True), edit)] == [
-        "flow.not-unique",
-        "flow.not-unique",
-    ]
-
-
 # --- nodes that another supervisor brings up
-
-ELSEWHERE = planned(
-    node("one", publisher("a"), machine="m1"),
-    node("two", subscription("a"), machine="m2"),
-    links=[link("/a", "one", "two", unique=UniqueHow.NOT)],
-)
-ACTIVE = both(change_node("/two", state="active"), change_configuration("/two", state="active"))
-
-
-def rules_with(machines: frozenset[str] | None, edit: Edit, stage: Stage = Stage.CONNECTED):
-    seen = edit(perfect(ELSEWHERE, stage))
-    verdict = verify(ELSEWHERE, seen, stage=stage, machines=machines)
-    return [(each.rule, each.expected) for each in verdict.findings]
-
-
-@pytest.mark.parametrize("edit", [unchanged, ACTIVE])
-def test_before_our_gate_a_node_of_another_machine_may_be_inactive_or_active(edit: Edit):
-    assert rules_with(frozenset({"m1"}), edit) == []
-
-
-@pytest.mark.parametrize("machines", [None, frozenset({"m1", "m2"})])
-def test_before_our_gate_a_node_that_we_bring_up_must_not_be_active(machines):
-    assert rules_with(machines, ACTIVE) == [("state.wrong-state", "inactive, connected")]
-
-
-def test_a_node_of_another_machine_must_be_connected_all_the_same():
-    edit = change_configuration("/two", connected=False)
-    assert rules_with(frozenset({"m1"}), edit) == [
-        ("state.wrong-state", "inactive, connected or active")
-    ]
-
-
-def test_after_our_gate_every_node_must_be_active_wherever_it_is():
-    edit = both(
-        change_node("/two", state="inactive"), change_configuration("/two", state="inactive")
-    )
-    assert rules_with(frozenset({"m1"}), edit, Stage.ACTIVE) == [("state.wrong-state", "active")]
 
 
 # --- what a connection carries where the RMW lists no NFE of it
@@ -388,25 +306,6 @@ def test_what_a_node_lists_wins_over_what_it_was_connected_to(urls, report, used
     assert seen_by(ANY, apart(edit)) == used
 
 
-def test_an_end_that_lists_nothing_does_not_hide_what_the_others_of_its_node_list():
-    plan = planned(node("one", publisher("a"), publisher("/a")), node("two", subscription("a")))
-
-    def first_silent(seen):
-        (one, two) = seen.configurations
-        first, second = one.endpoints
-        one = dataclasses.replace(
-            one,
-            endpoints=(
-                dataclasses.replace(first, nfes=None),
-                dataclasses.replace(second, nfes=(UDP6,)),
-            ),
-        )
-        return dataclasses.replace(seen, configurations=(one, two))
-
-    edit = both(first_silent, change_report(SUB, "/a", nfes=EVERYTHING))
-    assert seen_by(plan, edit) == "udpv6"
-
-
 def test_both_ends_of_a_flow_are_asked_which_process_they_are():
     edit = both(
         change_report(PUB, "/a", nfes=(UDP4,)),
@@ -438,74 +337,6 @@ def the_finding(plan: Plan, edit: Edit) -> Finding:
         if each.rule.startswith("flow.wrong-")
     )
     return finding
-
-
-NOBODY_TELLS = change_report(PUB, "/a", nfes=None)
-
-
-def test_a_flow_of_which_nobody_tells_that_the_network_carries_it_is_told_whole():
-    assert the_finding(pair(FlowTransport.ANY, NETWORK), NOBODY_TELLS) == Finding(
-        rule="flow.wrong-transport",
-        outcome=Outcome.UNVERIFIABLE,
-        subject="/a: /one → /two",
-        ends=("/one", "/two"),
-        expected="an IP transport",
-        observed="not known",
-        message="cannot verify the flow /one → /two on /a: it needs the network, and nobody tells"
-        " what carries it",
-        at="robot.lifecycle.yaml:10:9",
-        hint="run both ends in our host and in processes of their own, or drop"
-        " `transport: network`",
-    )
-
-
-MEDIUM_FIX = (
-    "compare the connections of both ends with `lifecycle plan`; see what each process was given"
-    " by its environment"
-)
-
-
-@pytest.mark.parametrize(
-    ("medium", "nfes", "planned_words", "used_words"),
-    [
-        ("udpv4", (SHM, UDP4), "udpv4", "shared memory"),
-        ("shm", (UDP4,), "shared memory", "udpv4"),
-        ("udpm", (UDP4,), "UDP multicast", "udpv4"),
-        ("udpv4", (UDP6,), "udpv4", "no transport that both have"),
-        ("intraprocess", (TCP4,), "handed over inside their process", "tcpv4"),
-        ("quic", (UDP4,), "quic", "udpv4"),  # of a plan that a later release has made
-    ],
-)
-def test_a_flow_that_another_medium_carries_is_told_whole(medium, nfes, planned_words, used_words):
-    listed = (SHM, UDP4, TCP4)
-    edit = both(change_report(PUB, "/a", nfes=listed), change_report(SUB, "/a", nfes=nfes))
-    assert the_finding(with_medium(medium), edit) == Finding(
-        rule="flow.wrong-medium",
-        outcome=Outcome.VIOLATED,
-        subject="/a: /one → /two",
-        ends=("/one", "/two"),
-        expected=planned_words,
-        observed=used_words,
-        message=f"cannot accept what carries /one → /two on /a: it must be {planned_words}, and it"
-        f" is {used_words}",
-        at="robot.lifecycle.yaml:10:9",
-        hint=MEDIUM_FIX,
-    )
-
-
-def test_a_flow_of_which_nobody_tells_the_medium_is_told_whole():
-    assert the_finding(with_medium("shm"), NOBODY_TELLS) == Finding(
-        rule="flow.wrong-medium",
-        outcome=Outcome.UNVERIFIABLE,
-        subject="/a: /one → /two",
-        ends=("/one", "/two"),
-        expected="shared memory",
-        observed="not known",
-        message="cannot verify what carries /one → /two on /a: it must be shared memory, and"
-        " nobody tells what it is",
-        at="robot.lifecycle.yaml:10:9",
-        hint=MEDIUM_FIX,
-    )
 
 
 def test_a_flow_that_the_network_must_carry_is_found_wrong_once():
@@ -558,47 +389,3 @@ def test_a_medium_is_held_to_where_either_end_was_told_what_to_use(index):
     assert held(with_node(plan, index, connections=ParticipantConnections(urls=("udpv4://",))))
     mapped = with_node(with_end(plan, index, participant="_net"), index, participants=(NET,))
     assert held(mapped)
-
-
-@pytest.mark.parametrize(
-    ("gone", "subjects"),
-    [
-        (unchanged, ["/a: /one → /two", "/b: /one → /two"]),
-        (both(drop_endpoint(PUB, "/a"), drop_endpoint_report(PUB, "/a")), ["/b: /one → /two"]),
-        (both(drop_endpoint(SUB, "/a"), drop_endpoint_report(SUB, "/a")), ["/b: /one → /two"]),
-        (drop_endpoint(SUB, "/a"), ["/a: /one → /two", "/b: /one → /two"]),
-        (drop_endpoint_report(SUB, "/a"), ["/a: /one → /two", "/b: /one → /two"]),
-    ],
-)
-def test_the_transport_of_a_flow_without_one_of_its_ends_is_not_named_besides(gone, subjects):
-    needs = [need(PUB, name, transport=NETWORK) for name in ("a", "b")]
-    plan = planned(
-        node("one", publisher("a"), publisher("b"), needs=needs),
-        node("two", subscription("a"), subscription("b")),
-    )
-    edit = both(change_report(PUB, "/a", nfes=(SHM,)), change_report(PUB, "/b", nfes=(SHM,)), gone)
-    verdict = verify(plan, edit(perfect(plan)), stage=Stage.CONNECTED)
-    found = [each.subject for each in verdict.findings if each.rule == "flow.wrong-transport"]
-    assert found == subjects
-
-
-@pytest.mark.parametrize(("publishers", "subscriptions"), [((), ("a",)), (("a",), ()), ((), ())])
-def test_the_transport_of_a_link_without_ends_is_not_judged_and_that_of_the_next_is(
-    publishers, subscriptions
-):
-    network = [need(PUB, "b", transport=NETWORK)]
-    plan = planned(
-        node("one", *map(publisher, publishers), publisher("b"), needs=network),
-        node("two", *map(subscription, subscriptions), subscription("b")),
-        links=[link("/a", "one", "two"), link("/b", "one", "two")],
-    )
-    plan = dataclasses.replace(
-        plan,
-        data_layer=DataLayer(at=at(5)),
-        flows=tuple(dataclasses.replace(each, medium="shm") for each in reversed(plan.flows)),
-    )
-    assert [each.topic for each in plan.flows] == ["/a", "/b"]
-    edit = both(change_report(PUB, "/b", nfes=(SHM,)), change_report(SUB, "/b", nfes=(SHM,)))
-    verdict = verify(plan, edit(perfect(plan)), stage=Stage.CONNECTED)
-    found = [each.subject for each in verdict.findings if each.rule.startswith("flow.wrong-")]
-    assert found == ["/b: /one → /two"]
