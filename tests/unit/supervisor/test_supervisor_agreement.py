@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 
 from lifecycle.manifest.model import DiscoveryRange, Machine, RunKind
-from lifecycle.middleware.process.control import machine_id
-from lifecycle.plan.comparison import decode, encode, notice_of, plan_checksum
+from lifecycle.plan.comparison import decode, encode, notice_of
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.health.agreement import ANNOUNCED_S, Agreement
 from lifecycle.supervisor.nodes.system import System
@@ -217,26 +216,6 @@ async def test_a_plan_is_announced_where_another_supervisor_may_be(tmp_path: Pat
         assert left.air.destroyed == announced
 
 
-async def test_what_is_announced_names_the_plan_this_run_this_host_and_its_machines_once(
-    tmp_path: Path,
-) -> None:
-    plan = two_machines()
-    unplaced = plan_of(*plan.nodes, planned_node("here"), planned_node("there"))
-    front = dataclasses.replace(planned_node("front"), machine="left")
-    plan = dataclasses.replace(
-        plan_of(front, *unplaced.nodes), discovery_range=plan.discovery_range
-    )
-    own = frozenset({"front", "camera", "here", "there"})
-    one, other = Left(tmp_path, plan, own), Left(tmp_path, plan, own)
-    said, of_other = decode(one.air.said[0]), decode(other.air.said[0])
-    assert said == notice_of(plan, run=said.run, host=machine_id(), machines=("left",))
-    assert len(said.run) == 16
-    assert said.run != of_other.run
-    one.agreement.leave("the operator\n  ended it")
-    left = decode(one.air.said[1])
-    assert left == dataclasses.replace(said, left=True, reason="the operator ended it")
-
-
 def test_after_it_was_closed_nothing_is_announced_taken_or_woken(tmp_path: Path) -> None:
     left: list[Left] = []
 
@@ -309,67 +288,6 @@ async def test_the_newest_64_supervisors_are_kept(tmp_path: Path) -> None:
     subjects = [each.subject for each in left.agreement.findings(NOBODY)]
     assert subjects[0].endswith("on machine 'machine_2'")
     assert subjects[-1].endswith("on machine 'machine_65'")
-
-
-async def test_a_difference_is_told_with_both_checksums_and_where_to_look(tmp_path: Path) -> None:
-    ours, theirs = two_machines(), two_machines(log_level="debug")
-
-    left = Left(tmp_path)
-    await left.hears(theirs)
-    (finding,) = left.agreement.findings(VIEWER)
-    assert (finding.expected, finding.observed) == (
-        f"plan {plan_checksum(ours)}",
-        f"plan {plan_checksum(theirs)}",
-    )
-    assert finding.message == (
-        "cannot rely on the supervisor of machine 'right': plans differ (checksums "
-        f"{plan_checksum(ours)} here, {plan_checksum(theirs)} there); "
-        "compare 'lifecycle plan MANIFEST' on both"
-    )
-    # What others say is bounded: no checksum of theirs is shown longer than ours.
-    await left.hears(theirs, checksum="f" * 1000)
-    (finding,) = left.agreement.findings(VIEWER)
-    assert finding.observed == f"plan {'f' * len(plan_checksum(ours))}"
-
-
-@pytest.mark.parametrize(
-    ("system", "machines", "who"),
-    [
-        ("robot", ("right", "far"), "the supervisor of machine 'right' and 'far'"),
-        ("robot", ("right", "b", "c", "d"), "the supervisor of machine 'right' and 'b' and 'c'"),
-        ("robot", ("right", "b" * 81), f"the supervisor of machine 'right' and {'b' * 80!r}"),
-        ("r" * 81, (), f"the supervisor of system {'r' * 80!r} on host {'h' * 40!r}"),
-    ],
-)
-async def test_who_planned_something_else_is_named_in_bounded_words(
-    tmp_path: Path, system: str, machines: tuple[str, ...], who: str
-) -> None:
-    left = Left(tmp_path)
-    await left.hears(two_machines(system, log_level="debug"), machines=machines, host="h" * 41)
-    (finding,) = left.agreement.findings(NOBODY)
-    assert finding.subject == who
-
-
-@pytest.mark.parametrize(
-    ("after_s", "observed", "why"),
-    [
-        (0.0, "not announced yet", "has not said so yet"),
-        (ANNOUNCED_S, "not announced", "has not said what it planned within 5 s"),
-    ],
-)
-async def test_a_plan_that_is_not_announced_is_told_with_what_is_waited_for_and_for_how_long(
-    tmp_path: Path, after_s: float, observed: str, why: str
-) -> None:
-    left = Left(tmp_path)
-    left.agreement.findings(VIEWER)
-    await asyncio.sleep(after_s)
-    (finding,) = left.agreement.findings(VIEWER)
-    assert (finding.subject, finding.expected, finding.observed, finding.message) == (
-        "the supervisor of machine 'right'",
-        f"plan {plan_checksum(left.plan)}",
-        observed,
-        f"cannot tell whether the supervisor of machine 'right' planned the same system: it {why}",
-    )
 
 
 async def test_we_look_when_the_first_of_several_machines_had_its_time_and_then_the_next(
@@ -449,24 +367,6 @@ async def test_every_machine_is_waited_for_by_itself_and_a_node_without_one_or_a
     assert sorted(waited_for()) == [f"{supervisor} {each!r}" for each in ("bench", "far")]
 
 
-async def test_another_system_that_plans_the_nodes_of_a_machine_has_said_what_it_planned(
-    tmp_path: Path,
-) -> None:
-    left = Left(tmp_path)
-    # A supervisor of our system is taken at the machines that it names, and at no others.
-    await left.hears(two_machines(), "left", host="h3")
-    assert WAITS in left.found(VIEWER)
-    await left.hears(two_machines("robbie"), "elsewhere")
-    assert left.found(VIEWER) == [DIFFER]
-    (finding,) = left.agreement.findings(VIEWER)
-    assert finding.subject == "the supervisor of system 'robbie' on machine 'elsewhere'"
-    # Only one with a node of the machine has said so.
-    left = Left(tmp_path)
-    ours = dataclasses.replace(two_machines("robbie"), nodes=two_machines().nodes[:1])
-    await left.hears(ours, "elsewhere")
-    assert left.found(VIEWER) == [DIFFER, WAITS]
-
-
 async def test_shut_down_are_the_machines_of_our_system_whose_supervisor_says_so(
     tmp_path: Path,
 ) -> None:
@@ -479,41 +379,6 @@ async def test_shut_down_are_the_machines_of_our_system_whose_supervisor_says_so
     await other.hears(two_machines("robbie"))
     await other.hears(two_machines("robbie"), left=True)
     assert other.agreement.shut_down == {}
-
-
-async def test_only_missing_nodes_of_a_machine_that_was_shut_down_are_explained(
-    tmp_path: Path,
-) -> None:
-    def finding(name: str) -> Finding:
-        return MISSING_NODE.finding(
-            Outcome.VIOLATED,
-            subject=name,
-            expected="node in the graph",
-            observed="no such node",
-            message=f"cannot find node {name}",
-            node=name,
-        )
-
-    viewer = finding("/viewer")
-    others = (
-        finding("/camera"),
-        finding("/unplanned"),
-        dataclasses.replace(viewer, rule="graph.unmatched-flow"),
-    )
-
-    left = Left(tmp_path)
-    await left.hears(two_machines())
-    # What others name is not ours to trust: no node without a machine is on the machine "".
-    await left.hears(two_machines(), left=True, machines=("right", ""))
-    explained = left.agreement.explained(_verdict(*others, viewer))
-    assert explained == _verdict(
-        *others,
-        dataclasses.replace(
-            viewer,
-            observed="machine 'right' was shut down",
-            message="cannot find node /viewer: machine 'right' was shut down by its supervisor",
-        ),
-    )
 
 
 def _missing(node: str) -> Finding:

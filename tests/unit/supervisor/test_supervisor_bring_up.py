@@ -19,11 +19,10 @@ from lifecycle.supervisor.nodes.bring_up import ALSO_S
 from lifecycle.supervisor.processes.control_channel import ControlChannel
 from lifecycle.supervisor.processes.process import ProcessExit, SpawnRequest
 from lifecycle.supervisor.run.events import Notice
-from lifecycle.supervisor.run.failure import StepFailedError, with_failure
+from lifecycle.supervisor.run.failure import StepFailedError
 from lifecycle.supervisor.run.shutdown import TakeDown
 from lifecycle.verify.outcome import Outcome
-from lifecycle.verify.rules import rule
-from lifecycle.verify.verdict import NOT_JUDGED, Stage, Verdict
+from lifecycle.verify.verdict import Stage, Verdict
 from tests.builders import plan_of, planned_node
 from tests.unit.supervisor.fakes import FakeGraph, FakeProcess, World, run, verdict_of
 
@@ -176,13 +175,6 @@ async def test_time_that_a_process_waits_for_a_processor_is_not_its_own(
     await _down(world)
 
 
-async def test_what_is_done_promptly_is_done_without_a_look_at_any_process(tmp_path: Path) -> None:
-    world = _world(tmp_path, planned_node("a"), planned_node("b"))
-    await world.bring_up.connect(LIMIT_S)
-    await _down(world)
-    assert world.spawner.looked_at == []
-
-
 @pytest.mark.parametrize(("starves", "after_s"), [(0.0, 2.0), (0.5, 4.0), (3.0, 20.0)])
 async def test_a_start_that_hangs_is_noticed_on_a_loaded_machine_too(
     tmp_path: Path, starves: float, after_s: float
@@ -304,18 +296,6 @@ async def test_a_process_is_blamed_once_for_each_node_that_it_cannot_host_and_fo
     await _down(world)
 
 
-async def test_a_command_that_does_not_appear_may_call_its_node_otherwise(tmp_path: Path) -> None:
-    world = _world(tmp_path, planned_node("a", kind=RunKind.COMMAND, timeouts=Timeouts()))
-    world.spawner.takes_s["a start"] = 60.0
-    with pytest.raises(StepFailedError) as caught:
-        await world.bring_up.connect(LIMIT_S)
-    assert caught.value.message == (
-        "cannot bring up '/a': it was still waiting to appear in the graph after 10 s; if its "
-        "code calls it otherwise, write 'name: a' at nodes.a"
-    )
-    await _down(world)
-
-
 async def test_every_process_that_died_by_then_is_named(tmp_path: Path) -> None:
     world = _world(
         tmp_path,
@@ -361,22 +341,3 @@ async def test_a_process_that_is_still_starting_is_ended_at_once_and_not_by_an_i
     assert [each for each in world.log if each.startswith("a SIG")] == ["a SIGTERM"]
     assert loop.time() - began < 0.1
     assert world.heard(Notice) == []
-
-
-def test_a_failure_is_one_finding_with_the_log_that_says_more() -> None:
-    failure = StepFailedError(
-        "cannot start '/a': no",
-        rule=rule("run.start-failed"),
-        subject="/a",
-        process="a",
-        log="/log/a.log",
-    )
-    again = StepFailedError(
-        "exit status 1", rule=rule("run.process-died"), subject="a", process="a"
-    )
-    verdict = with_failure(NOT_JUDGED, failure.joined([again, failure]))
-    (finding,) = verdict.findings
-    assert finding.message == "cannot start '/a': no"
-    assert finding.hint.endswith("the last lines of its log: /log/a.log")
-    assert with_failure(verdict, failure).findings == verdict.findings
-    assert not verdict.judged

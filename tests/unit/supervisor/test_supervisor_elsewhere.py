@@ -111,14 +111,6 @@ def test_a_step_that_a_remote_node_holds_goes_on_once_that_is_seen(tmp_path: Pat
     assert graph.asked == [("/camera",)] * 3
 
 
-def test_a_supervisor_of_the_whole_system_has_nobody_elsewhere(tmp_path: Path) -> None:
-    async def main() -> System:
-        return World(plan_of(planned_node("a"), planned_node("b")), tmp_path).system
-
-    system = run(main())
-    assert (system.machines, system.remote, system.awaited()) == (None, {}, ())
-
-
 def test_a_task_that_loses_a_cancellation_is_ended_all_the_same() -> None:
     lost: list[None] = []
 

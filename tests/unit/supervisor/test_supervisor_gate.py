@@ -60,12 +60,6 @@ async def test_a_foreign_node_gets_no_activate_request_without_a_permit_that_hol
     assert node.requests == ["activate"]
 
 
-def test_an_ok_verdict_opens_the_gate() -> None:
-    gate = Gate(strict=True)
-    permit = gate.judge(verdict_of(Outcome.OK))
-    permit.check()
-
-
 def test_a_violated_verdict_closes_it_with_exit_code_4_and_every_finding() -> None:
     verdict = verdict_of(Outcome.VIOLATED, "graph.missing-node", "graph.qos-differs")
     with pytest.raises(VerificationError) as caught:
@@ -113,20 +107,9 @@ def test_a_newer_verdict_replaces_the_permit_of_an_older_one() -> None:
         old.check()
 
 
-def test_a_permit_says_what_it_rests_on() -> None:
-    verdict = verdict_of(Outcome.UNVERIFIABLE, "state.unverifiable")
-    assert Gate(strict=False).judge(verdict).verdict is verdict
-
-
 def test_a_violated_verdict_closes_the_gate_even_if_it_says_that_nothing_blocks() -> None:
     with pytest.raises(VerificationError):
         Gate(strict=False).judge(verdict_of(Outcome.VIOLATED, "graph.missing-node", blocking=False))
-
-
-def test_a_permit_made_past_the_gate_is_worth_nothing() -> None:
-    forged = Permit(Gate(strict=False), verdict_of(Outcome.OK))
-    with pytest.raises(BringUpError):
-        forged.check()
 
 
 def test_no_permit_can_be_made_past_a_gate_that_would_refuse_it_or_has_given_one() -> None:
@@ -331,29 +314,6 @@ def test_a_judgement_that_fails_fails_whoever_waits_for_it_and_may_be_tried_agai
         await permit.use("/camera")
 
     run_quietly(main)
-
-
-def test_a_judgement_that_fails_when_nobody_waits_any_more_is_no_error_of_the_loop() -> None:
-    async def main() -> None:
-        system = Changing(verdict_of(Outcome.OK))
-        permit = system.gate().judge(system.latest)
-        system.changed = True
-        system.error = RuntimeError("cannot look")
-        waits = asyncio.ensure_future(permit.use("/camera"))
-        await system.begun.wait()
-        waits.cancel()
-        await asyncio.sleep(0.02)
-        del permit, waits
-
-    run_quietly(main)
-
-
-def test_to_close_a_gate_twice_changes_nothing() -> None:
-    gate = Gate(strict=False)
-    gate.judge(verdict_of(Outcome.OK))
-    gate.close()
-    gate.close()
-    assert gate.permit is None
 
 
 def test_a_gate_that_opens_in_the_last_moment_leaves_time_to_activate() -> None:

@@ -22,7 +22,6 @@ from lifecycle.supervisor.gate.verification_loop import (
     ChangeCounter,
     VerificationLoop,
     without,
-    without_nodes,
 )
 from lifecycle.supervisor.gate.violations import LASTS_S
 from lifecycle.supervisor.health.liveliness import Cause
@@ -169,16 +168,6 @@ async def test_how_long_a_verdict_is_waited_out(
         assert await bench.judge.until_clear(Stage.CONNECTED, 30.0) == verdict
         assert bench.now == pytest.approx(waits_s, abs=0.1 if waits_s > 1 else 0.05)
         assert looks in (None, len(bench.looks))
-
-
-async def test_what_is_missing_is_waited_for_and_each_change_of_the_verdict_is_told(
-    tmp_path: Path,
-) -> None:
-    async with judging(tmp_path, MISSING, OK) as bench:
-        bench.later(7.0, bench.grow)
-        assert await bench.judge.until_clear(Stage.CONNECTED, 30.0) == OK
-        assert bench.now == pytest.approx(7.0, abs=0.1)
-        assert bench.told() == [MISSING, OK]
 
 
 async def test_a_node_that_must_be_healthy_is_given_time_to_say_how_it_is_once(
@@ -340,12 +329,6 @@ async def test_nodes_that_are_silent_are_not_asked_for_and_judged_silent(tmp_pat
         assert bench.judged[-1]["plan"] is system.expected
         assert (verdict.verdict, verdict.blocking) == (Outcome.VIOLATED, True)
         assert verdict.findings == system.liveliness.findings()
-
-
-def test_of_a_plan_only_silent_nodes_are_left_out() -> None:
-    plan = plan_of(planned_node("camera"), planned_node("viewer"))
-    assert without_nodes(plan, {}) is plan
-    assert without_nodes(plan, {"/camera": "why"}).nodes == plan.nodes[1:]
 
 
 class _Looker:
@@ -784,12 +767,6 @@ async def test_while_held_violations_that_relieve_each_other_do_not_count(tmp_pa
         await bench.hold(6.0)
         assert not bench.judge.violations.counted
         assert "(graph.undeclared-publisher), " in bench.judge.violations.passed()
-
-
-async def test_while_held_a_violated_verdict_without_findings_counts_too(tmp_path: Path) -> None:
-    async with judging(tmp_path, verdict_of(Outcome.VIOLATED)) as bench:
-        await bench.hold(2.0)
-        assert bench.judge.violations.counted == "violated"
 
 
 async def test_while_held_a_newcomer_that_is_not_known_by_name_yet_is_not_told(

@@ -15,7 +15,7 @@ from lifecycle.manifest.model import DiscoveryRange, Machine, Run, RunKind, Time
 from lifecycle.middleware.process.busy_sign import BusySign, Overdue
 from lifecycle.node.host.control import HostSpec, Operation
 from lifecycle.plan.model import Plan
-from lifecycle.supervisor.health.liveliness import Cause, NodeArrivals, SilenceMonitor
+from lifecycle.supervisor.health.liveliness import Cause, SilenceMonitor
 from lifecycle.supervisor.health.peer_supervisors import Listener, PeerSupervisors
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.control_channel import ChannelClosedError, ControlChannel
@@ -24,12 +24,8 @@ from lifecycle.supervisor.run.events import (
     Event,
     MachineConnection,
     NodeAlive,
-    NodeJoined,
-    NodeLeft,
     NodeSilent,
 )
-from lifecycle.verify.observation import Observation, ObservedNode
-from lifecycle.verify.outcome import Outcome
 from tests.builders import HERE, plan_of, planned_node
 from tests.unit.supervisor.fakes import World
 
@@ -93,54 +89,12 @@ async def test_a_node_is_not_called_alive_that_has_not_started_or_is_not_in_the_
     await desk.peer_supervisors.close()
 
 
-def test_what_is_no_change_is_no_news() -> None:
-    ears = Ears()
-    ears.liveliness.came_back(["/camera"], Cause.HUNG)
-    assert (ears.kinds, ears.changes) == ([], 0)
-    for _ in range(2):
-        ears.liveliness.fell_silent(["/camera"], Cause.HUNG, "it hangs")
-        assert (ears.kinds, ears.changes) == (["silent"], 1)
-    # A dead process is not silent.
-    ears.liveliness.forget(["/camera"])
-    ears.liveliness.came_back(["/camera"], Cause.HUNG)
-    assert (ears.kinds, ears.liveliness.findings()) == (["silent"], ())
-
-
-def test_a_silent_node_violates_and_the_finding_says_why() -> None:
-    ears = Ears()
-    ears.liveliness.fell_silent(["/camera"], Cause.STOPPED, "it was stopped")
-    ears.liveliness.fell_silent(["/camera"], Cause.HUNG, "it hangs")
-    (finding,) = ears.liveliness.findings()
-    assert (finding.rule, finding.outcome, finding.node) == (
-        "run.silent-node",
-        Outcome.VIOLATED,
-        "/camera",
-    )
-    assert finding.message == "cannot rely on '/camera': it was stopped, and it hangs"
-    assert finding.observed == "stopped, hung"
-
-
 def test_who_hangs_may_come_back_and_who_is_stopped_or_lost_is_out_of_reach() -> None:
     ears = Ears()
     for node, cause in (("/a", Cause.HUNG), ("/b", Cause.STOPPED), ("/c", Cause.LOST)):
         ears.liveliness.fell_silent([node], cause, "it is")
     reached = {node: not ears.liveliness.is_out_of_reach(node) for node in ("/a", "/b", "/c", "/d")}
     assert reached == {"/a": True, "/b": False, "/c": False, "/d": True}
-
-
-def test_nodes_join_and_leave_between_two_looks() -> None:
-    ears = Ears()
-    emit = Emitter()
-    emit.listen(ears.events.append)
-    presence = NodeArrivals(emit)
-    for names in (("/a", "/b"), ("/a", "/b", "/_a_data"), ("/b", "/c", "/ns/_c_flow_0")):
-        presence.see(Observation(nodes=tuple(ObservedNode(full_name=each) for each in names)))
-    assert ears.events == [
-        NodeJoined(node="/a"),
-        NodeJoined(node="/b"),
-        NodeJoined(node="/c"),
-        NodeLeft(node="/a"),
-    ]
 
 
 class FakeEar:
@@ -402,30 +356,5 @@ def test_a_process_that_was_killed_while_it_was_busy_does_not_hang() -> None:
             await asyncio.wait_for(told.get(), 10 * sign.limit_s)
         sign.close()
         await channel.close()
-
-    asyncio.run(test())
-
-
-def open_descriptors() -> int:
-    return len(list(Path("/proc/self/fd").iterdir()))
-
-
-def test_closing_a_channel_closes_its_busy_sign(tmp_path: Path) -> None:
-    async def test() -> None:
-        world = World(plan_of(planned_node("camera")), tmp_path)
-        before = open_descriptors()
-        for _ in range(3):
-            spec = HostSpec(
-                system="robot",
-                process="camera",
-                domain_id=0,
-                discovery_range=world.system.plan.discovery_range,
-                nodes=world.system.plan.nodes,
-            )
-            channel = ControlChannel(spec, lambda _: None)
-            theirs = await channel.open()
-            theirs.close()
-            await channel.close()
-        assert open_descriptors() <= before
 
     asyncio.run(test())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import io
 import json
@@ -35,7 +34,6 @@ from lifecycle.supervisor.run.events import (
     ProcessChanged,
     RequestSent,
     RunStarted,
-    Stopping,
     SystemReached,
     VerdictChanged,
     to_record,
@@ -166,27 +164,6 @@ def test_a_stage_is_over_with_the_last_node_that_came_so_far() -> None:
         "stage verified      0.750 s  at   3.000 s",
         "stage active        1.000 s  at   4.000 s  last /camera",
         "stage total         4.000 s  at   4.000 s",
-    ]
-
-
-def test_stages_that_were_not_reached_are_left_out_and_later_ones_are_not_timed_again() -> None:
-    again = (3.0, SystemReached(reached="connected", elapsed_s=3.0))
-    lines = _timed(
-        "active",
-        (0.5, _RUN),
-        (1.0, _came("/camera", Reach.STARTED)),
-        # A node that was not discovered is started again; the stage is over with the last try.
-        (1.5, _came("/camera", Reach.WAITING)),
-        (2.0, _came("/camera", Reach.STARTED)),
-        (2.5, Stopping(reason="the process of /arm died")),
-        (2.6, _came("/camera", Reach.STOPPED)),
-        again,
-    )
-    assert lines == [
-        "stage supervisor    0.500 s  at   0.500 s",
-        "stage processes     1.500 s  at   2.000 s  last /camera",
-        "stage total         2.500 s  at   2.500 s",
-        "system connected after 3.00 s",
     ]
 
 
@@ -480,40 +457,3 @@ def test_a_command_is_shown_as_it_was_judged_and_matches_where_its_flows_are_ok(
     assert (shown.state, shown.matched, shown.unreported, shown.endpoints) == ("inactive", 1, 1, 2)
     hosted = SimpleNamespace(**{**vars(command), "reports_changes": True})
     assert node_status(hosted, verdict, "", elapsed_s=0.0, schedule=None).state == "active"
-
-
-@pytest.mark.parametrize(
-    ("label", "word"), [(0x12345, "0x12345"), (0xABC, "0x00abc"), (0, "unset")]
-)
-def test_an_ipv6_flow_shows_its_3_tuple_alike_in_every_format(label: int, word: str) -> None:
-    flow = dataclasses.replace(
-        FLOW,
-        source=(nfe("fd00::1", 7411, flow_label=label),),
-        destination=(nfe("fd00::2", 7000), nfe("fd00::3", 7000)),
-        effective_transport="udpv6",
-    )
-    head, *rows = render_flows([flow], "text").splitlines()
-    at = {name: head.index(name) for name in ("source", "destination", "flow_label")}
-    shown = [[row[start:].split()[0] for start in at.values()] for row in rows]
-    assert shown == [
-        ["[fd00::1]:7411", "[fd00::2]:7000", word],
-        ["[fd00::1]:7411", "[fd00::3]:7000", word],
-    ]
-    cells = list(csv.DictReader(io.StringIO(render_flows([flow], "csv"))))
-    names = ("source_address", "destination_address", "flow_label")
-    assert [[each[name] for name in names] for each in cells] == [
-        ["fd00::1", "fd00::2", word],
-        ["fd00::1", "fd00::3", word],
-    ]
-    tuples = json.loads(render_flows([flow], "json"))[0]["tuples"]
-    assert [[each[name] for name in names] for each in tuples] == [
-        ["fd00::1", "fd00::2", label],
-        ["fd00::1", "fd00::3", label],
-    ]
-
-
-def test_ends_that_form_no_ip_flow_are_shown_as_what_they_tell() -> None:
-    memory = nfe("10.0.0.1", 7000, TransportProtocol.UNKNOWN)
-    flow = dataclasses.replace(FLOW, source=(memory,), destination=())
-    (_, row) = render_flows([flow], "text").splitlines()
-    assert " ".join(row.split()).startswith("/video /camera /viewer shm unknown – – EF = DSCP 46")

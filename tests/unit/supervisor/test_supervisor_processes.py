@@ -17,7 +17,7 @@ from typing import Any
 import psutil
 import pytest
 
-from lifecycle.errors import BringUpError, UsageError
+from lifecycle.errors import BringUpError
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import Resources, Run, RunKind
 from lifecycle.node.host.control import HostSpec
@@ -34,10 +34,9 @@ from lifecycle.supervisor.processes.logs import (
     LogDirectory,
     ProcessLog,
     Traceback,
-    check_log_root,
     ros_log_root,
 )
-from lifecycle.supervisor.processes.orphans import Lineage, descendants, end_run
+from lifecycle.supervisor.processes.orphans import end_run
 from lifecycle.supervisor.processes.process import (
     COMMAND_ESCALATION,
     ManagedProcess,
@@ -124,18 +123,6 @@ async def test_a_command_gets_its_arguments_environment_and_session_and_its_end_
         assert process.log.path.read_text() == "red True\n"
 
 
-async def test_a_process_is_read_together_with_what_it_started(tmp_path: Path) -> None:
-    started = "import subprocess; subprocess.run(['sleep', '60'])"
-    async with _bench(tmp_path) as bench:
-        process = await bench.start(PYTHON, "-c", started)
-        for _ in range(500):
-            if len(found := Lineage().of(process.pid)) > 1:
-                break
-            await asyncio.sleep(0.02)
-        assert found == {process.pid, *descendants(process.pid)}
-        assert len(found) == 2
-
-
 async def test_a_killed_process_is_noticed_within_a_tenth_of_a_second(tmp_path: Path) -> None:
     took_s = []
     async with _bench(tmp_path) as bench:
@@ -146,24 +133,6 @@ async def test_a_killed_process_is_noticed_within_a_tenth_of_a_second(tmp_path: 
             assert await process.ended == ProcessExit(signal=signal.SIGKILL)
             took_s.append(time.monotonic() - began)
     assert min(took_s) < 0.1  # the others may have had to wait for a processor
-
-
-async def test_how_a_process_ended_may_be_reported_later_than_it_is_waited_for(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("lifecycle.supervisor.processes.fork_server._STATUS_WAIT_S", 0.01)
-
-    wrong: list[object] = []
-    asyncio.get_running_loop().set_exception_handler(lambda _, context: wrong.append(context))
-    async with _bench(tmp_path) as bench:
-        process = await bench.start("sleep", "60")
-        os.kill(bench.fork_server.pid, signal.SIGSTOP)  # it has no processor
-        os.kill(process.pid, signal.SIGKILL)
-        assert await process.ended == ProcessExit()
-        os.kill(bench.fork_server.pid, signal.SIGCONT)
-        another = await bench.start("true")
-        await another.ended
-    assert wrong == []
 
 
 async def test_a_program_that_does_not_exist_says_so_in_its_output(tmp_path: Path) -> None:
@@ -209,15 +178,6 @@ async def test_a_fork_server_that_is_killed_starts_nothing_more_and_its_children
         assert not first.ended.done()
         await first.end(COMMAND_ESCALATION, asyncio.Event())
         assert first.ended.done()
-
-
-def test_a_python_that_does_not_exist_cannot_be_a_fork_server(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(sys, "executable", "/no/such/python")
-    expected = "cannot start the fork server: No such file or directory"
-    with pytest.raises(BringUpError, match=expected):
-        ForkServerProcess(preload=False)
 
 
 async def test_when_the_supervisor_vanishes_the_fork_server_ends_what_it_forked(
@@ -276,15 +236,6 @@ async def test_whoever_writes_faster_than_we_read_does_not_keep_a_pipe_from_bein
             left_behind.kill()
 
 
-async def test_a_command_that_nobody_reads_any_more_ends_as_in_a_shell(tmp_path: Path) -> None:
-    async with _bench(tmp_path) as bench:
-        process = await bench.start("grep", "SigIgn", "/proc/self/status")
-        await process.ended
-        await process.end(COMMAND_ESCALATION, asyncio.Event())
-        (line,) = bench.lines
-        assert not int(line.split()[1], 16) & 1 << signal.SIGPIPE - 1
-
-
 async def test_a_host_that_reads_nothing_any_more_does_not_keep_its_channel_from_closing() -> None:
     plan = build_plan(teleop())
     spec = HostSpec(
@@ -317,51 +268,6 @@ def test_a_log_that_is_full_is_rotated_and_keeps_one_older(
     assert said == []
 
 
-def test_what_a_log_misses_is_said_once_counted_and_written_where_it_is_missing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(logs, "_TRIED_AGAIN_S", 0.0)
-    said: list[str] = []
-    directory = LogDirectory(tmp_path, said.append)
-    log, other = (ProcessLog(directory, name) for name in ("it", "other"))
-    full = os.open("/dev/full", os.O_WRONLY)
-    for each in (log, other):
-        each.open()
-        each.add("before")
-    files = [(each, os.dup(each._file.open())) for each in (log, other)]
-    for each, _ in files:
-        os.dup2(full, each._file.open())
-        each.add("lost")
-        each.add("lost")
-    (line,) = said
-    assert line == (
-        f"cannot write the log of process 'it' in {str(tmp_path)!r}: No space left on device; the "
-        "run goes on, and what is lost is counted"
-    )
-    for each, file in files:
-        os.dup2(file, each._file.open())
-        each.add("after")
-        each.close()
-        os.close(file)
-        assert each.path.read_text() == (
-            "before\n2 log lines are missing here: No space left on device\nafter\n"
-        )
-    os.close(full)
-    directory.report_lost()
-    assert said[1:] == [f"4 log lines are missing in {str(tmp_path)!r}: No space left on device"]
-
-
-def test_a_log_directory_that_cannot_be_made_is_said_and_fails_nothing(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    said: list[str] = []
-    log = ProcessLog(LogDirectory(tmp_path / "file", said.append), "it")
-    log.open()
-    log.add("nowhere to be written")
-    log.close()
-    (line,) = said
-    assert "File exists" in line or "Not a directory" in line
-
-
 @pytest.mark.parametrize(
     ("environment", "expected"),
     [
@@ -373,38 +279,6 @@ def test_a_log_directory_that_cannot_be_made_is_said_and_fails_nothing(tmp_path:
 )
 def test_logs_go_where_ros_puts_them(environment: dict[str, str], expected: Path) -> None:
     assert ros_log_root(environment) == expected
-
-
-def test_a_user_without_a_home_is_asked_for_a_log_directory(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(pwd, "getpwuid", lambda _: {}["robot"])
-    with pytest.raises(UsageError) as refused:
-        check_log_root({})
-    assert str(refused.value) == (
-        "cannot find a home directory for ROS's logs: HOME is not set, and this user has none; set "
-        "ROS_LOG_DIR to a directory"
-    )
-
-
-@pytest.mark.parametrize(
-    ("access", "home", "why"),
-    [
-        (True, "/proc/nowhere", "No such file or directory"),
-        (False, "/tmp", "it cannot be written"),
-    ],
-)
-def test_a_log_directory_that_cannot_be_used_is_said(
-    access: bool, home: str, why: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    home = str(tmp_path) if home == "/tmp" else home
-    monkeypatch.setattr(os, "access", lambda *_, **__: access)
-    with pytest.raises(UsageError) as refused:
-        check_log_root({"HOME": home})
-    assert str(refused.value) == (
-        f"cannot use '{home}/.ros/log' as ROS log directory: {why}; set ROS_LOG_DIR to a directory "
-        "that can be made and written"
-    )
 
 
 @pytest.fixture

@@ -46,12 +46,6 @@ def test_it_reads_only_by_default_and_off_leaves_nothing(tmp_path: Path) -> None
     assert run(main(None, 3.0)).services == ("get_status",)
 
 
-async def test_who_only_tries_a_system_pays_nothing_for_it(tmp_path: Path) -> None:
-    world = SessionWorld(CHAIN, tmp_path, stop_after_s=0.1)
-    await world.run()
-    assert world.graph.ros is None
-
-
 async def test_a_bring_up_that_is_held_up_says_why_before_it_is_active(tmp_path: Path) -> None:
     world = SessionWorld(CHAIN, tmp_path, stop_after_s=1.0)
     world.graph.unseen.add("/camera")

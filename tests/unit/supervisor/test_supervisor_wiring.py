@@ -9,14 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.errors import BringUpError
 from lifecycle.manifest.model import (
     Authority,
     Condition,
     DataLayer,
     DataLayerSource,
     EndpointKind,
-    RunKind,
 )
 from lifecycle.node.host.control import Event as HostEvent
 from lifecycle.node.host.control import Operation
@@ -34,8 +32,6 @@ from lifecycle.supervisor.connections.authority import (
 from lifecycle.supervisor.connections.desired_state import (
     ActualState,
     Instructions,
-    Step,
-    planned_instructions,
     steps,
     wired,
 )
@@ -177,18 +173,6 @@ async def test_a_node_is_connected_and_mapped_between_configure_and_connect(tmp_
     await wiring.down()
 
 
-async def test_take_down_disconnects_before_the_node_is_disconnected(tmp_path: Path) -> None:
-    wiring = Wiring(wired_plan(wired_node("a")), tmp_path)
-    await wiring.world.bring_up.connect(LIMIT_S)
-    await wiring.down()
-    assert wiring.told("/a")[-4:] == [
-        "disconnect_from net",
-        "disconnect",
-        "cleanup",
-        "shutdown",
-    ]
-
-
 @pytest.mark.parametrize(
     ("what", "message"),
     [
@@ -240,26 +224,6 @@ async def test_a_negotiation_does_not_wait_for_what_waits_for_a_connection(tmp_p
     log = wiring.world.log
     assert log.index("/a connect") < log.index("plain start") < log.index("/late configure")
     assert "/late connect" in log
-    await wiring.down()
-
-
-async def test_capabilities_that_do_not_fit_end_bring_up(tmp_path: Path) -> None:
-    wiring = Wiring(wired_plan(wired_node("a")), tmp_path)
-    wiring.source.next = ("cannot link /a → /b on /out: /a has shm; /b has udpv4",)
-    with pytest.raises(StepFailedError) as caught:
-        await wiring.world.bring_up.connect(LIMIT_S)
-    assert caught.value.message == wiring.source.next[0]
-    await wiring.down()
-
-
-async def test_without_events_nobody_is_watched(tmp_path: Path) -> None:
-    wiring = Wiring(wired_plan(wired_node("a"), events=False), tmp_path)
-    await wiring.world.bring_up.connect(LIMIT_S)
-    before = len(wiring.told("/a"))
-    wiring.lose("/a", "net")
-    wiring.look()
-    await settle()
-    assert len(wiring.told("/a")) == before
     await wiring.down()
 
 
@@ -362,27 +326,6 @@ async def test_a_negotiation_that_fails_while_running_is_a_finding_until_it_succ
     await wiring.down()
 
 
-async def test_a_foreign_node_without_a_node_interface_cannot_be_connected(tmp_path: Path) -> None:
-    class Foreign:
-        async def interface(self) -> None:
-            return None
-
-        async def wire(self, step: Step) -> None:
-            raise AssertionError(step)
-
-    attached = dataclasses.replace(
-        wired_node("a"), run=dataclasses.replace(wired_node("a").run, kind=RunKind.ATTACH)
-    )
-    wiring = Wiring(wired_plan(attached), tmp_path)
-    node = wiring.world.system.nodes["a"]
-    node.driver = Foreign()  # type: ignore[assignment]
-    with pytest.raises(BringUpError) as caught:
-        await wiring.authority.wire(node)
-    assert caught.value.message == (
-        f"cannot connect '/a' to 'net' ({URL}): it offers no ~/connect_to"
-    )
-
-
 def test_steps_make_before_they_break_and_spare_what_is_not_ours() -> None:
     wanted = Instructions(
         node="/a",
@@ -402,21 +345,3 @@ def test_steps_make_before_they_break_and_spare_what_is_not_ours() -> None:
     for step in made:
         has = has.after(step)
     assert steps(wanted, has, ours=("new",)) == ()
-
-
-def test_a_connection_whose_urls_changed_is_made_anew_with_all_that_is_on_it() -> None:
-    wanted = Instructions(
-        node="/a", connections=(("net", NET),), mappings=(("publishers/out", "net"),)
-    )
-    has = ActualState(
-        connections=(("net", ("udpv4://127.0.0.1:9",)),), mappings=(("publishers/out", "net"),)
-    )
-    assert [each.operation for each in steps(wanted, has)] == [DISCONNECT, CONNECT, MAP]
-
-
-def test_a_participant_that_only_tells_a_flow_apart_is_no_connection() -> None:
-    node = wired_node("a")
-    flow = dataclasses.replace(node.participants[0], connection="")
-    told = planned_instructions(dataclasses.replace(node, participants=(flow,)))
-    assert told.connections == ()
-    assert told.mappings == (("publishers/out", ""), ("subscriptions/in", ""))

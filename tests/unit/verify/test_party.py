@@ -78,11 +78,6 @@ def test_a_node_that_no_manifest_declares_takes_part_with_all_that_it_says():
     )
 
 
-def test_what_a_node_says_that_it_can_speak_is_what_it_takes_part_with():
-    party = party_of(camera(serializations=("xcdr2",), paradigms=("request-response",)), "h")
-    assert (party.serializations, party.paradigms) == (("xcdr2",), ("request-response",))
-
-
 def test_a_node_that_names_no_transports_can_be_connected_by_all():
     assert party_of(camera(transports=()), "h").transports == CONNECTABLE
 
@@ -90,10 +85,6 @@ def test_a_node_that_names_no_transports_can_be_connected_by_all():
 def test_a_node_of_an_rmw_that_we_cannot_connect_has_no_transports_at_all():
     party = party_of(camera(rmw="rmw_cyclonedds_cpp"), "h")
     assert (party.transports, party.own, party.connectable) == ((), (), False)
-
-
-def test_an_endpoint_made_in_code_takes_part_under_its_resolved_name():
-    assert own_endpoint(video(name="")).label == "publishers//video"
 
 
 @pytest.mark.parametrize(
@@ -121,12 +112,6 @@ def test_the_own_participant_is_reached_where_the_node_says_that_it_is():
     other = ConnectionReport(name="net", urls=("shm://",))
     party = party_of(camera(connections=(other, OWN)), "h")
     assert (party.own, party.contacts) == (("tcpv4",), (CONTACT,))
-
-
-def test_a_contact_without_an_address_is_on_the_host_of_the_node():
-    own = ConnectionReport(name="", urls=("tcpv4://:5100",))
-    (contact,) = party_of(camera(connections=(own,)), "10.0.0.9").contacts
-    assert (contact.host, contact.peer.address) == ("10.0.0.9", "10.0.0.9")
 
 
 def declared(**changes: object) -> PlannedNode:
@@ -163,11 +148,6 @@ def test_planned_urls_of_the_own_participant_hold_until_the_node_reports_its_own
     assert party.own == own
 
 
-@pytest.mark.parametrize(("transports", "own"), [(("udpv6",), ("udpv6",)), ((), RMW_DEFAULT)])
-def test_without_urls_the_own_participant_has_what_the_plan_gives_it_or_the_rmw(transports, own):
-    assert party_of(CAMERA, "h", planned=declared(transports=transports)).own == own
-
-
 # --- what the manifest says wins
 
 
@@ -189,19 +169,6 @@ def test_a_declared_node_takes_part_under_its_key_and_with_what_is_declared_of_i
     )
 
 
-def test_an_endpoint_that_the_manifest_of_its_node_does_not_declare_takes_part_by_its_report():
-    assert own_endpoint(video(name="news", resolved="/news"), with_endpoint()) == PartyEndpoint(
-        kind=PUB,
-        name="news",
-        resolved="/news",
-        type=STRING,
-        qos=QosProfile(depth=3),
-        alone=True,
-        lossy=True,
-        size_bytes=70_000,
-    )
-
-
 @pytest.mark.parametrize(
     ("reported", "resolved"), [("/stage/video", "/stage/video"), ("", "/video")]
 )
@@ -218,12 +185,6 @@ def test_that_data_bear_loss_is_the_nodes_hint_only_where_the_manifest_says_noth
     assert own_endpoint(video(lossy=hint), with_endpoint(lossy=written)).lossy is lossy
 
 
-@pytest.mark.parametrize(("written", "hint", "size"), [(None, 9, 9), (5, 9, 5), (5, None, 5)])
-def test_a_size_is_the_nodes_hint_only_where_the_manifest_says_nothing(written, hint, size):
-    found = own_endpoint(video(size_bytes=hint), with_endpoint(max_message_size=written))
-    assert found.size_bytes == size
-
-
 # --- connections that are there already
 
 NET = ConnectionReport(name="net", urls=(URL,))
@@ -238,21 +199,10 @@ def test_connections_that_somebody_else_made_are_taken_and_what_is_on_them_stays
     assert (found.by, found.fixed, found.name) == (("tcpv4",), True, "video")
 
 
-def test_a_connection_without_urls_is_what_the_rmw_makes():
-    seen = camera(connections=(BARE,), endpoints=(dataclasses.replace(MAPPED, connection="bare"),))
-    found = own_endpoint(seen)
-    assert (found.by, found.fixed) == (RMW_DEFAULT, True)
-
-
 def test_what_a_negotiation_made_before_it_may_unmake():
     seen = camera(connections=(NET, BARE), endpoints=(MAPPED,))
     assert party_of(seen, "h", negotiated={"net"}).connections == ("bare",)
     found = own_endpoint(seen, negotiated={"net"})
-    assert (found.by, found.fixed) == ((), False)
-
-
-def test_what_is_on_the_own_participant_may_be_mapped_elsewhere():
-    found = own_endpoint(camera(connections=(OWN, NET), endpoints=(VIDEO,)))
     assert (found.by, found.fixed) == ((), False)
 
 
