@@ -348,3 +348,17 @@ def test_what_is_equal_of_other_topics_or_nodes_is_a_finding_of_its_own():
         "/b: /one → /three",
         "/b: /one → /two",
     ]
+
+
+def test_a_pair_of_strangers_or_of_two_types_does_not_end_the_judgement_of_a_topic():
+    plan = open_world(subscription("a", line=5), subscription("b"))
+    edit = both(
+        add_endpoint(PUB, "/A", "/a", gid="91", qos=BEST_EFFORT, type="std_msgs/msg/Int32"),
+        add_endpoint(PUB, "/B", "/a", gid="92", qos=BEST_EFFORT),
+        add_endpoint(SUB, "/A", "/a", gid="93", qos=QosProfile()),
+        add_endpoint(PUB, "/B", "/b", gid="94", qos=BEST_EFFORT),
+        add_endpoint(SUB, "/one", "/a", gid="96", qos=QosProfile(), type="std_msgs/msg/Bool"),
+        # A topic with subscriptions alone has no pair.
+        add_endpoint(SUB, "/one", "/c", gid="95", qos=QosProfile()),
+    )
+    assert [each[0] for each in incompatible(edit, plan)] == ["/a: /B → /one", "/b: /B → /one"]
