@@ -402,6 +402,10 @@ def test_a_node_that_has_ended_as_it_may_is_unverifiable_and_not_missing():
     assert [each.message for each in from_outside.findings if each.node == "/viewer"] == [
         "cannot verify node /viewer: it may have ended by itself, or not have started"
     ]
+    both_gone = both(drop_node("/robot/camera"), drop_node("/viewer"))(perfect(PLAN))
+    verdict = verify(PLAN, both_gone, stage=Stage.CONNECTED, over={"/robot/camera": ""})
+    missing = [each.node for each in verdict.findings if each.rule == "graph.missing-node"]
+    assert missing == ["/viewer"], "what has ended hides nobody who is missing"
 
 
 # --- policies
