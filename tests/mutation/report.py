@@ -1,7 +1,8 @@
 """Say what `make mutate` found: the score, and every mutant that survived and is not justified.
 
 A mutant is one small change of the code that judges. It is killed when a test fails with it. One
-that no test needs to notice is listed in justified/ beside this file, with the reason.
+that no test needs to notice is listed in justified/ beside this file, with the reason; one that
+changes words for people alone does not count.
 
 Usage: python -m tests.mutation.report [--at-least PERCENT]
 Exit code 1 if the score is lower, or a survivor is not justified.
@@ -19,6 +20,7 @@ import functools
 import json
 import re
 import sys
+import textwrap
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -79,6 +81,16 @@ class Mutant:
         changed = [line for line in lines if not line.startswith(("---", "+++", "@@"))]
         return "\n".join(f"{line[0]} {line[1:].strip()}" for line in changed)
 
+    @property
+    def is_wording(self) -> bool:
+        """Whether it changes words for people alone: a text with a blank in it decides nothing."""
+        functions = _functions(self.module)
+        name = self.key.rpartition(".")[2]
+        original = re.sub(r"_\d+$", "_orig", name)
+        return _without_words(functions[original]) == _without_words(
+            functions[name].replace(name, original)
+        )
+
     def reasons(self, allowed: Mapping[str, Sequence[str]]) -> list[str]:
         """Return which entries of `justified` are of the lines that it adds, or else removes."""
         change = self.change().splitlines()
@@ -87,6 +99,15 @@ class Mutant:
             if lines:
                 return [each for each in allowed.get(self.place, ()) if each in " ".join(lines)]
         return []
+
+
+def _without_words(function: str) -> str:
+    """Return a function's syntax tree as text, without the texts that have a blank in them."""
+    tree = ast.parse(textwrap.dedent(function))
+    for each in ast.walk(tree):
+        if isinstance(each, ast.Constant) and isinstance(each.value, str) and " " in each.value:
+            each.value = ""
+    return ast.dump(tree)
 
 
 @functools.cache
@@ -148,6 +169,9 @@ def main() -> int:
             counts["not tried"] += 1
             unsure.add(mutant.place)
             continue
+        if not mutant.killed and mutant.is_wording:
+            counts["wording"] += 1
+            continue
         counts["tried"] += 1
         if mutant.killed:
             counts["killed"] += 1
@@ -172,7 +196,8 @@ def main() -> int:
         if counts["tried"]:
             print(
                 f"{name}: {counts['killed'] / counts['tried']:.1%} of {counts['tried']} killed,"
-                f" {counts['timed out']} of them by time; {counts['justified']} justified"
+                f" {counts['timed out']} of them by time; {counts['justified']} justified,"
+                f" {counts['wording']} of wording survived and do not count"
                 + (f"; {counts['not tried']} not tried" if counts["not tried"] else "")
             )
     score = 100 * total["killed"] / total["tried"]

@@ -133,15 +133,22 @@ TWO_TYPES = planned(
 
 
 SAYS: dict[str, tuple[Case, list[str]]] = {
+    "a node asks a service that it does not declare": (
+        Case(
+            "graph.undeclared-service-client",
+            add_endpoint(CLIENT, "/viewer", "/other", type=TRIGGER),
+        ),
+        ["violated graph.undeclared-service-client: /other, /viewer (service client) at 3:3"],
+    ),
     "a node is missing": (
         Case("graph.missing-node", drop_node("/viewer")),
-        ["violated graph.missing-node: /viewer"],
+        ["violated graph.missing-node: /viewer, /viewer at 3:3"],
     ),
     "nodes are missing that others start": (
         Case("graph.missing-node", lambda seen: dataclasses.replace(seen, nodes=()), FOREIGN),
         [
-            "violated graph.missing-node: /talker",
-            "violated graph.missing-node: /listener",
+            "violated graph.missing-node: /talker, /talker at 3:3",
+            "violated graph.missing-node: /listener, /listener at 3:3",
         ],
     ),
     "a node is out of reach": (
@@ -151,7 +158,7 @@ SAYS: dict[str, tuple[Case, list[str]]] = {
             FAR_CAMERA,
             machines=frozenset({"operator"}),
         ),
-        ["unverifiable graph.missing-node: /robot/camera"],
+        ["unverifiable graph.missing-node: /robot/camera, /robot/camera at 3:3"],
     ),
     "one name is that of two nodes, and of three reports": (
         Case(
@@ -162,11 +169,11 @@ SAYS: dict[str, tuple[Case, list[str]]] = {
                 add_configuration(twin(2)),
             ),
         ),
-        ["violated graph.duplicate-node: /robot/camera"],
+        ["violated graph.duplicate-node: /robot/camera, /robot/camera at 3:3"],
     ),
     "one name is that of two nodes that nobody declared": (
         Case("graph.duplicate-node", add_node("/spy", count=2), OPEN),
-        ["violated graph.duplicate-node: /spy"],
+        ["violated graph.duplicate-node: /spy, /spy"],
     ),
     "nodes that nobody declared": (
         Case(
@@ -178,8 +185,8 @@ SAYS: dict[str, tuple[Case, list[str]]] = {
             ),
         ),
         [
-            "violated graph.undeclared-node: /nosy",
-            "violated graph.undeclared-node: /spy",
+            "violated graph.undeclared-node: /nosy, /nosy",
+            "violated graph.undeclared-node: /spy, /spy",
         ],
     ),
     "an endpoint is missing of which its node does not report": (
@@ -187,22 +194,22 @@ SAYS: dict[str, tuple[Case, list[str]]] = {
             "graph.missing-endpoint",
             both(drop_endpoint(ACTION_SERVER, DOCK), drop_endpoint_report(ACTION_SERVER, DOCK)),
         ),
-        ["violated graph.missing-endpoint: /robot/dock"],
+        ["violated graph.missing-endpoint: /robot/dock, /robot/camera (action server) at 15:9"],
     ),
     "an endpoint is missing although its node reports it": (
         Case("graph.missing-endpoint", drop_endpoint(SUB, STATUS)),
-        ["violated graph.missing-endpoint: /robot/status"],
+        ["violated graph.missing-endpoint: /robot/status, /viewer (subscription) at 18:9"],
     ),
     "an endpoint has another type": (
         Case("graph.type-mismatch", change_endpoint(PUB, STATUS, type="std_msgs/msg/Int32")),
-        ["violated graph.type-mismatch: /robot/status"],
+        ["violated graph.type-mismatch: /robot/status, /robot/camera (publisher) at 13:9"],
     ),
     "an endpoint has another type of which only its node tells": (
         Case(
             "graph.type-mismatch",
             both(drop_endpoint(PUB, STATUS), change_report(PUB, STATUS, type="std_msgs/msg/Int32")),
         ),
-        ["violated graph.type-mismatch: /robot/status"],
+        ["violated graph.type-mismatch: /robot/status, /robot/camera (publisher) at 13:9"],
     ),
     "undeclared ends of a declared service have other types": (
         Case(
@@ -214,8 +221,8 @@ SAYS: dict[str, tuple[Case, list[str]]] = {
             OPEN,
         ),
         [
-            "violated graph.type-mismatch: /robot/camera/calibrate",
-            "violated graph.type-mismatch: /robot/camera/calibrate",
+            "violated graph.type-mismatch: /robot/camera/calibrate, /other (service client)",
+            "violated graph.type-mismatch: /robot/camera/calibrate, no node (service client)",
         ],
     ),
     "an undeclared publisher has a type that no declaration of its topic has": (
@@ -226,7 +233,7 @@ SAYS: dict[str, tuple[Case, list[str]]] = {
             ),
             TWO_TYPES,
         ),
-        ["violated graph.type-mismatch: /chatter"],
+        ["violated graph.type-mismatch: /chatter, /other (publisher)"],
     ),
     "a node could not make an endpoint": (
         Case(
@@ -236,7 +243,7 @@ SAYS: dict[str, tuple[Case, list[str]]] = {
                 change_report(PUB, STATUS, gid="", nfes=None, matched=None, error="not feasible"),
             ),
         ),
-        ["violated endpoint.error: /robot/status"],
+        ["violated endpoint.error: /robot/status, /robot/camera (publisher) at 13:9"],
     ),
     "a hidden endpoint is not reported": (
         Case(
@@ -244,11 +251,16 @@ SAYS: dict[str, tuple[Case, list[str]]] = {
             both(drop_endpoint(PUB, "/chatter"), drop_endpoint(SUB, "/chatter")),
             wired(FOREIGN, "talker"),
         ),
-        ["unverifiable graph.unseen-endpoint: /chatter"],
+        ["unverifiable graph.unseen-endpoint: /chatter, /talker (publisher) at 10:9"],
     ),
     "nobody counts whom a hidden service is matched with": (
         Case("graph.unseen-endpoint", drop_endpoint(SERVER, CALIBRATE), wired(PLAN, "camera")),
-        ["unverifiable graph.unseen-endpoint: /robot/camera/calibrate"],
+        [
+            (
+                "unverifiable graph.unseen-endpoint: /robot/camera/calibrate, "
+                "/robot/camera (service server) at 14:9"
+            )
+        ],
     ),
     "a hidden endpoint is matched with more than are known": (
         Case(
@@ -261,7 +273,7 @@ SAYS: dict[str, tuple[Case, list[str]]] = {
             ),
             wired(PLAN, "camera"),
         ),
-        ["unverifiable graph.unseen-endpoint: /robot/status"],
+        ["unverifiable graph.unseen-endpoint: /robot/status, /robot/camera (publisher) at 13:9"],
     ),
     "parts of a declared action have other types": (
         Case(
@@ -272,20 +284,20 @@ SAYS: dict[str, tuple[Case, list[str]]] = {
             ),
         ),
         [
-            "violated graph.type-mismatch: /robot/dock",
-            "violated graph.type-mismatch: /robot/dock",
+            "violated graph.type-mismatch: /robot/dock, /robot/camera (action server) at 15:9",
+            "violated graph.type-mismatch: /robot/dock, /robot/camera (action server) at 15:9",
         ],
     ),
     "an undeclared publisher": (
         Case("graph.undeclared-publisher", add_endpoint(PUB, "/robot/camera", "/extra", gid="99")),
-        ["violated graph.undeclared-publisher: /extra"],
+        ["violated graph.undeclared-publisher: /extra, /robot/camera (publisher) at 3:3"],
     ),
     "a tool publishes on a declared topic": (
         Case(
             "graph.undeclared-publisher",
             add_endpoint(PUB, "/rviz2", STATUS, gid="99", qos=QosProfile()),
         ),
-        ["violated graph.undeclared-publisher: /robot/status"],
+        ["violated graph.undeclared-publisher: /robot/status, /rviz2 (publisher)"],
     ),
     "a tool serves a declared service": (
         Case(
@@ -295,7 +307,12 @@ SAYS: dict[str, tuple[Case, list[str]]] = {
                 add_endpoint(SERVER, "/rviz2", CALIBRATE, type=""),
             ),
         ),
-        ["violated graph.undeclared-service-server: /robot/camera/calibrate"],
+        [
+            (
+                "violated graph.undeclared-service-server: /robot/camera/calibrate, "
+                "/rviz2 (service server)"
+            )
+        ],
     ),
     "endpoints whose node is not known": (
         Case(
@@ -308,10 +325,10 @@ SAYS: dict[str, tuple[Case, list[str]]] = {
             ),
         ),
         [
-            "violated graph.unattributed-endpoint: /a",
-            "violated graph.unattributed-endpoint: /b",
-            "violated graph.unattributed-endpoint: /c",
-            "violated graph.unattributed-endpoint: /d",
+            "violated graph.unattributed-endpoint: /a, no node (subscription)",
+            "violated graph.unattributed-endpoint: /b, no node (publisher)",
+            "violated graph.unattributed-endpoint: /c, no node (publisher)",
+            "violated graph.unattributed-endpoint: /d, no node (publisher)",
         ],
     ),
     "endpoints whose node is not known, of which one feeds nothing, after the gate": (
@@ -321,8 +338,8 @@ SAYS: dict[str, tuple[Case, list[str]]] = {
             stage=Stage.ACTIVE,
         ),
         [
-            "violated graph.unattributed-endpoint: /robot/status",
-            "unverifiable graph.unattributed-endpoint: /robot/status",
+            "violated graph.unattributed-endpoint: /robot/status, no node (publisher)",
+            "unverifiable graph.unattributed-endpoint: /robot/status, no node (subscription)",
         ],
     ),
     "a type has another definition than is installed": (
@@ -331,7 +348,7 @@ SAYS: dict[str, tuple[Case, list[str]]] = {
             change_endpoint(SUB, "/chatter", type_hash=OTHER),
             defined(FOREIGN, HERE),
         ),
-        ["violated graph.type-definition-differs: /chatter"],
+        ["violated graph.type-definition-differs: /chatter, /listener (subscription) at 10:9"],
     ),
     "types of services have other definitions": (
         Case(
@@ -350,11 +367,23 @@ SAYS: dict[str, tuple[Case, list[str]]] = {
             defined(OPEN, ""),
         ),
         [
-            "violated graph.type-definition-differs: /robot/camera/calibrate",
-            "violated graph.type-definition-differs: /robot/camera/calibrate",
-            "violated graph.type-definition-differs: /robot/camera/calibrate",
-            "violated graph.type-definition-differs: /robot/camera/calibrate",
-            "violated graph.type-definition-differs: /robot/dock",
+            (
+                "violated graph.type-definition-differs: /robot/camera/calibrate, "
+                "/viewer (service client) at 19:9"
+            ),
+            (
+                "violated graph.type-definition-differs: /robot/camera/calibrate, "
+                "/other (service client)"
+            ),
+            (
+                "violated graph.type-definition-differs: /robot/camera/calibrate, "
+                "/rviz2 (service client)"
+            ),
+            (
+                "violated graph.type-definition-differs: /robot/camera/calibrate, "
+                "no node (service client)"
+            ),
+            "violated graph.type-definition-differs: /robot/dock, /robot/camera (action client)",
         ],
     ),
     "nodes announce no hashes": (
@@ -370,18 +399,29 @@ SAYS: dict[str, tuple[Case, list[str]]] = {
             defined(OPEN, HERE),
         ),
         [
-            "unverifiable graph.type-definition-differs: an unknown node",
-            "unverifiable graph.type-definition-differs: /robot/camera",
-            "unverifiable graph.type-definition-differs: /viewer",
+            "unverifiable graph.type-definition-differs: an unknown node, no node",
+            "unverifiable graph.type-definition-differs: /robot/camera, /robot/camera at 13:9",
+            "unverifiable graph.type-definition-differs: /viewer, /viewer at 18:9",
         ],
     ),
     "a client counts no server": (
         Case("graph.unmatched-client", change_report(ACTION_CLIENT, DOCK, server_matched=False)),
-        ["violated graph.unmatched-client: /robot/dock: /viewer → /robot/camera"],
+        [
+            (
+                "violated graph.unmatched-client: /robot/dock: /viewer → /robot/camera, "
+                "/viewer (action client) at 20:9"
+            )
+        ],
     ),
     "a client does not say whether it has a server": (
         Case("graph.unmatched-client", change_report(CLIENT, CALIBRATE, server_matched=None)),
-        ["unverifiable graph.unmatched-client: /robot/camera/calibrate: /viewer → /robot/camera"],
+        [
+            (
+                "unverifiable graph.unmatched-client: /robot/camera/calibrate: "
+                "/viewer → /robot/camera, "
+                "/viewer (service client) at 19:9"
+            )
+        ],
     ),
     "a client has one of three servers": (
         Case(
@@ -392,11 +432,17 @@ SAYS: dict[str, tuple[Case, list[str]]] = {
             ),
             OPEN,
         ),
-        ["unverifiable graph.unmatched-client: /robot/camera/calibrate: /viewer → /robot/camera"],
+        [
+            (
+                "unverifiable graph.unmatched-client: /robot/camera/calibrate: "
+                "/viewer → /robot/camera, "
+                "/viewer (service client) at 19:9"
+            )
+        ],
     ),
     "a node is in another state": (
         Case("state.wrong-state", change_node("/viewer", state="unconfigured")),
-        ["violated state.wrong-state: /viewer"],
+        ["violated state.wrong-state: /viewer, /viewer at 3:3"],
     ),
     "a node is in another state after the gate": (
         Case(
@@ -404,7 +450,7 @@ SAYS: dict[str, tuple[Case, list[str]]] = {
             change_configuration("/viewer", state="inactive"),
             stage=Stage.ACTIVE,
         ),
-        ["violated state.wrong-state: /viewer"],
+        ["violated state.wrong-state: /viewer, /viewer at 3:3"],
     ),
     "a node of another machine is in another state": (
         Case(
@@ -413,15 +459,15 @@ SAYS: dict[str, tuple[Case, list[str]]] = {
             FOREIGN,
             machines=frozenset({"far"}),
         ),
-        ["violated state.wrong-state: /talker"],
+        ["violated state.wrong-state: /talker, /talker at 3:3"],
     ),
     "a node has not connected": (
         Case("state.wrong-state", change_configuration("/viewer", connected=False)),
-        ["violated state.wrong-state: /viewer"],
+        ["violated state.wrong-state: /viewer, /viewer at 3:3"],
     ),
     "a node is no managed node": (
         Case("state.wrong-state", change_node("/talker", state=None, managed=False), FOREIGN),
-        ["violated state.wrong-state: /talker"],
+        ["violated state.wrong-state: /talker, /talker at 3:3"],
     ),
     "a node of ours is no managed node and reports nothing": (
         Case(
@@ -429,15 +475,15 @@ SAYS: dict[str, tuple[Case, list[str]]] = {
             both(drop_report("/viewer"), change_node("/viewer", state=None, managed=False)),
             stage=Stage.ACTIVE,
         ),
-        ["violated state.wrong-state: /viewer"],
+        ["violated state.wrong-state: /viewer, /viewer at 3:3"],
     ),
     "a state is not known": (
         Case("state.unverifiable", change_node("/talker", state=None, managed=None), FOREIGN),
-        ["unverifiable state.unverifiable: /talker"],
+        ["unverifiable state.unverifiable: /talker, /talker at 3:3"],
     ),
     "a node of ours does not report": (
         Case("config.missing-report", drop_report("/viewer")),
-        ["violated config.missing-report: /viewer"],
+        ["violated config.missing-report: /viewer, /viewer at 3:3"],
     ),
     "a node of ours leaves endpoints out of its report": (
         Case(
@@ -445,8 +491,11 @@ SAYS: dict[str, tuple[Case, list[str]]] = {
             both(drop_endpoint_report(SUB, STATUS), drop_endpoint_report(CLIENT, CALIBRATE)),
         ),
         [
-            "violated config.incomplete-report: /robot/status",
-            "violated config.incomplete-report: /robot/camera/calibrate",
+            "violated config.incomplete-report: /robot/status, /viewer (subscription) at 18:9",
+            (
+                "violated config.incomplete-report: /robot/camera/calibrate, "
+                "/viewer (service client) at 19:9"
+            ),
         ],
     ),
     "a second publisher where one is declared": (
@@ -454,7 +503,7 @@ SAYS: dict[str, tuple[Case, list[str]]] = {
             "graph.undeclared-publisher",
             add_endpoint(PUB, "/robot/camera", STATUS, gid="99", qos=QosProfile()),
         ),
-        ["violated graph.undeclared-publisher: /robot/status"],
+        ["violated graph.undeclared-publisher: /robot/status, /robot/camera (publisher) at 3:3"],
     ),
     "a publisher of nobody known has another definition than the declared end": (
         Case(
@@ -465,7 +514,7 @@ SAYS: dict[str, tuple[Case, list[str]]] = {
             ),
             defined(OPEN, ""),
         ),
-        ["violated graph.type-definition-differs: /robot/status"],
+        ["violated graph.type-definition-differs: /robot/status, no node (publisher)"],
     ),
 }
 

@@ -12,7 +12,8 @@ import lifecycle
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import RULES, About, Heals, Rule
 
-PAGE = Path(__file__).parents[3] / "docs" / "rules.md"
+TESTS = Path(__file__).parents[2]
+PAGE = TESTS.parent / "docs" / "rules.md"
 
 
 def sections() -> dict[str, str]:
@@ -22,6 +23,12 @@ def sections() -> dict[str, str]:
 
 def test_the_page_documents_exactly_the_registered_rules():
     assert sorted(sections()) == sorted(rule.id for rule in RULES)
+
+
+@pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.id)
+def test_every_rule_is_tried_somewhere(rule: Rule):
+    tests = (each for each in TESTS.rglob("*.py") if each != Path(__file__))
+    assert any(rule.id in each.read_text(encoding="utf-8") for each in tests)
 
 
 def test_no_rule_is_registered_twice():

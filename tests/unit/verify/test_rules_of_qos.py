@@ -220,22 +220,22 @@ SAYS: dict[str, tuple[Edit, Plan, list[str]]] = {
     "a policy differs": (
         change_announced_qos(PUB, "/a", deadline_ns=NS),
         pair(QosProfile()),
-        ["violated graph.qos-differs: /a"],
+        ["violated graph.qos-differs: /a, /one (publisher) at 11:9"],
     ),
     "nobody announces a policy": (
         change_announced_qos(PUB, "/a", history=History.UNKNOWN, depth=0),
         pair(QosProfile()),
-        ["unverifiable graph.qos-unverifiable: /one"],
+        ["unverifiable graph.qos-unverifiable: /one, /one at 11:9"],
     ),
     "a pair is incompatible": (
         LESS,
         pair(QosProfile(), QosProfile()),
-        ["violated graph.qos-incompatible: /a: /one → /two"],
+        ["violated graph.qos-incompatible: /a: /one → /two, no node at 11:9"],
     ),
     "a pair may be incompatible": (
         change_announced_qos(PUB, "/a", reliability=Reliability.UNKNOWN),
         pair(QosProfile(), QosProfile()),
-        ["unverifiable graph.qos-incompatible: /a: /one → /two"],
+        ["unverifiable graph.qos-incompatible: /a: /one → /two, no node at 11:9"],
     ),
 }
 

@@ -199,47 +199,47 @@ SAYS: dict[str, tuple[Edit, Plan, list[str]]] = {
     "a node has no connection": (
         change_configuration("/camera", connections=()),
         PLAN,
-        ["violated connection.missing: /camera"],
+        ["violated connection.missing: /camera, /camera at 3:3"],
     ),
     "a node has other connections": (
         change_configuration("/camera", connections=OTHERS),
         PLAN,
-        ["violated connection.missing: /camera"],
+        ["violated connection.missing: /camera, /camera at 3:3"],
     ),
     "a node does not report its connections": (
         unchanged,
         plan_of(run=Run(kind=RunKind.ATTACH)),
-        ["unverifiable connection.missing: /camera"],
+        ["unverifiable connection.missing: /camera, /camera at 3:3"],
     ),
     "a connection failed": (
         reported("shm://", URL, error="port 7911 is taken"),
         PLAN,
-        ["violated connection.failed: /camera"],
+        ["violated connection.failed: /camera, /camera at 3:3"],
     ),
     "a connection is to other URLs": (
         reported("udpv4://", "udpv6://"),
         with_urls("shm://", URL),
-        ["violated connection.differs: /camera"],
+        ["violated connection.differs: /camera, /camera at 3:3"],
     ),
     "an own participant was connected otherwise": (
         change_configuration("/viewer", connections=OWN),
         own_urls("shm://"),
-        ["violated connection.differs: /viewer"],
+        ["violated connection.differs: /viewer, /viewer at 3:3"],
     ),
     "a publisher is mapped onto another connection": (
         change_report(PUB, "/video", connection="late"),
         PLAN,
-        ["violated connection.wrong-mapping: /video"],
+        ["violated connection.wrong-mapping: /video, /camera (publisher) at 10:9"],
     ),
     "a publisher is mapped onto the own participant": (
         change_report(PUB, "/video", connection=""),
         PLAN,
-        ["violated connection.wrong-mapping: /video"],
+        ["violated connection.wrong-mapping: /video, /camera (publisher) at 10:9"],
     ),
     "a subscription is mapped onto a connection": (
         change_report(SUB, "/video", connection="late"),
         PLAN,
-        ["violated connection.wrong-mapping: /video"],
+        ["violated connection.wrong-mapping: /video, /viewer (subscription) at 10:9"],
     ),
 }
 

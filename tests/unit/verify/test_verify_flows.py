@@ -238,70 +238,70 @@ SAYS: dict[str, tuple[Edit, Plan, list[str]]] = {
     "a strict endpoint shares its flow": (
         SHARED,
         strict(),
-        ["violated flow.not-unique: /a"],
+        ["violated flow.not-unique: /a, /one (publisher) at 11:9"],
     ),
     "the RMW of a strict endpoint reports no network flow endpoints": (
         change_report(PUB, "/a", nfes=None),
         strict(),
-        ["violated flow.unverifiable: /a"],
+        ["violated flow.unverifiable: /a, /one (publisher) at 11:9"],
     ),
     "an endpoint beside a strict one reports none": (
         change_report(PUB, "/b", nfes=None),
         strict(),
-        ["violated flow.unverifiable: /a"],
+        ["violated flow.unverifiable: /a, /one (publisher) at 11:9"],
     ),
     "the node of a strict endpoint reports it by its participant alone": (
         both(carried("/one", "/a"), drop_endpoint_report(PUB, "/a")),
         strict(),
-        ["violated flow.unverifiable: /a"],
+        ["violated flow.unverifiable: /a, /one (publisher) at 11:9"],
     ),
     "nothing can reach a subscription": (
         change_report(SUB, "/a", nfes=()),
         strict(),
-        ["violated flow.broken-endpoint: /a"],
+        ["violated flow.broken-endpoint: /a, /two (subscription) at 13:9"],
     ),
     "a link that demands a weakly unique flow has none": (
         unchanged,
         unlinked_ends(UniqueHow.WEAKLY),
-        ["violated flow.not-unique: /a: /one → /two"],
+        ["violated flow.not-unique: /a: /one → /two, no node at 10:9"],
     ),
     "a link that demands a strongly unique flow has none": (
         unchanged,
         unlinked_ends(UniqueHow.STRONGLY),
-        ["violated flow.not-unique: /a: /one → /two"],
+        ["violated flow.not-unique: /a: /one → /two, no node at 10:9"],
     ),
     "the demand of a link cannot be proven": (
         change_report(SUB, "/a", nfes=None),
         strict(linked=UniqueHow.STRONGLY),
-        ["violated flow.unverifiable: /a: /one → /two"],
+        ["violated flow.unverifiable: /a: /one → /two, no node at 13:9"],
     ),
     "nobody measures numbers": (
         unchanged,
         NUMBERS,
         [
-            "unverifiable flow.not-measured: /a",
-            "unverifiable flow.not-measured: /a: /one → /two",
+            "unverifiable flow.not-measured: /a, /one (publisher) at 22:3",
+            "unverifiable flow.not-measured: /a: /one → /two, no node at 40:7",
         ],
     ),
     "sockets carry another DSCP": (
         change_report(PUB, "/a", dscp=8),
         marked(),
-        ["violated flow.dscp-not-applied: /a"],
+        ["violated flow.dscp-not-applied: /a, /one (publisher) at 10:9"],
     ),
     "sockets carry another DSCP, which is not enforced": (
         change_report(PUB, "/a", dscp=8),
         marked(enforce=False),
-        ["unverifiable flow.dscp-not-applied: /a"],
+        ["unverifiable flow.dscp-not-applied: /a, /one (publisher) at 10:9"],
     ),
     "nobody read a DSCP back": (
         change_report(PUB, "/a", dscp=None),
         marked(),
-        ["unverifiable flow.dscp-unverifiable: /a"],
+        ["unverifiable flow.dscp-unverifiable: /a, /one (publisher) at 10:9"],
     ),
     "a DSCP is that of a participant alone": (
         both(carried("/one", "/a"), drop_endpoint_report(PUB, "/a")),
         marked(),
-        ["unverifiable flow.dscp-unverifiable: /a"],
+        ["unverifiable flow.dscp-unverifiable: /a, /one (publisher) at 10:9"],
     ),
 }
 

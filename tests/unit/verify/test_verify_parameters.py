@@ -188,62 +188,62 @@ SAYS: dict[str, tuple[ExpectedParameter, ParameterReport | None, list[str]]] = {
     "a value that is given is not there": (
         expected((1, 2), "int_array"),
         ABSENT,
-        ["violated param.missing: /arm: gain"],
+        ["violated param.missing: /arm: gain, /arm at 60:7"],
     ),
     "no number is given, and nothing is there": (
         expected(".nan"),
         ABSENT,
-        ["violated param.missing: /arm: gain"],
+        ["violated param.missing: /arm: gain, /arm at 60:7"],
     ),
     "a type that is declared is not there": (
         expected(None),
         ABSENT,
-        ["violated param.missing: /arm: gain"],
+        ["violated param.missing: /arm: gain, /arm at 60:7"],
     ),
     "a value that the command gives is not there": (
         expected(source="command"),
         ABSENT,
-        ["violated param.missing: /arm: gain"],
+        ["violated param.missing: /arm: gain, /arm at 60:7"],
     ),
     "another type": (
         expected(2.0),
         has(2, "int"),
-        ["violated param.type-differs: /arm: gain"],
+        ["violated param.type-differs: /arm: gain, /arm at 60:7"],
     ),
     "another type, too long to show": (
         expected(2.0),
         has("x" * LONGEST_VALUE, "string"),
-        ["violated param.type-differs: /arm: gain"],
+        ["violated param.type-differs: /arm: gain, /arm at 60:7"],
     ),
     "an array of another type": (
         expected(None, "string"),
         has((True, False), "bool_array"),
-        ["violated param.type-differs: /arm: gain"],
+        ["violated param.type-differs: /arm: gain, /arm at 60:7"],
     ),
     "not set, of any type": (
         expected(None),
         has(None, ""),
-        ["violated param.type-differs: /arm: gain"],
+        ["violated param.type-differs: /arm: gain, /arm at 60:7"],
     ),
     "not set, of the type": (
         expected(),
         has(None),
-        ["violated param.value-differs: /arm: gain"],
+        ["violated param.value-differs: /arm: gain, /arm at 60:7"],
     ),
     "another value than the default": (
         expected(source="default_value"),
         has(2.0),
-        ["violated param.value-differs: /arm: gain"],
+        ["violated param.value-differs: /arm: gain, /arm at 60:7"],
     ),
     "another value than is given, too long to show": (
         expected(LONG, "double_array", source="cfg/arm.yaml"),
         has((*LONG[:-1], 0.0), "double_array"),
-        ["violated param.value-differs: /arm: gain"],
+        ["violated param.value-differs: /arm: gain, /arm at 60:7"],
     ),
     "read_only, and can be set": (
         expected(read_only=True),
         has(1.5),
-        ["violated param.read-only-differs: /arm: gain"],
+        ["violated param.read-only-differs: /arm: gain, /arm at 60:7"],
     ),
 }
 
@@ -341,11 +341,11 @@ def test_what_a_node_says_is_shown_short_and_without_control_characters(
     assert spell(value, type_) == text
 
 
-def test_what_cannot_be_read_is_told_whole():
+def test_what_cannot_be_read_is_unverifiable():
     plan = plan_of(expected(), unread_parameter_files=("arm.yaml",))
     assert told(judged(plan, perfect(plan, Stage.ACTIVE))) == [
-        "unverifiable param.unverifiable: /arm: arm.yaml",
-        "unverifiable param.unverifiable: /arm",
+        "unverifiable param.unverifiable: /arm: arm.yaml, /arm at 3:3",
+        "unverifiable param.unverifiable: /arm, /arm at 3:3",
     ]
 
 
