@@ -29,6 +29,18 @@ def test_networks_are_programmed_without_ros_and_loaded_without_httpx() -> None:
     assert result.returncode == 0, result.stderr
 
 
+def test_the_core_of_a_supervisor_is_loaded_without_a_loop() -> None:
+    code = (
+        "import sys\n"
+        "sys.modules['asyncio'] = sys.modules['rclpy'] = None\n"
+        "import lifecycle.supervisor.core.reduce\n"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert result.returncode == 0, result.stderr
+
+
 def test_the_api_page_lists_what_the_graph_offers() -> None:
     listed = re.search(r"members: \[(.*)\]", (ROOT / "docs" / "api.md").read_text())
     assert listed is not None

@@ -1,0 +1,460 @@
+"""What is to be done now: `wanted` says how far a node is to be, `advance` what brings it there.
+
+Level-triggered, as a kubelet: from the state alone, whatever happened before. Going down is the
+same ladder as going up. A request that is made is noted in the state, so that it is made once.
+Pure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from lifecycle.manifest.model import Condition, RunKind, Supervision
+from lifecycle.supervisor.control.protocol import ControlRequest, ProcessState
+from lifecycle.supervisor.core import effects, gate
+from lifecycle.supervisor.core.state import (
+    DOWNWARDS,
+    HOLDS,
+    NEVER_S,
+    UP,
+    Level,
+    Node,
+    Process,
+    Request,
+    Run,
+    Step,
+)
+from lifecycle.verify.verdict import Stage
+
+SIGINT, SIGTERM, SIGKILL = 2, 15, 9
+
+OWN_S = 0.5
+"""Our hosts keep the limits of transitions themselves and know more: they speak first."""
+
+GLANCE_S = 1.0
+"""For so long a system that is to be no more than connected is judged; it gates nothing."""
+
+Escalation = tuple[tuple[int, float], ...]
+"""Steps to end a process: (signal number, 0 to close its channel; seconds until the next)."""
+
+HOST: Escalation = ((0, 2.0), (SIGINT, 2.0), (SIGTERM, 1.0), (SIGKILL, NEVER_S))
+"""Destroying a participant may hang for good."""
+STUCK: Escalation = ((0, 1.0), (SIGTERM, 0.5), (SIGKILL, NEVER_S))
+"""For a host with a callback in progress: asked politely, it would first have to finish it."""
+STARTING: Escalation = ((SIGTERM, 1.5), (SIGKILL, NEVER_S))
+"""Not SIGINT: Python answers that with a traceback from the middle of an import."""
+COMMAND: Escalation = HOST[1:]
+"""rclpy and rclcpp end on SIGINT."""
+AT_ONCE: Escalation = ((SIGKILL, NEVER_S),)
+
+
+def wanted(run: Run, node: Node) -> Level:
+    """Return how far a node is to be: every order, policy and fault is a field read here."""
+    process = run.process_of(node)
+    change = run.change
+    if (
+        run.ending is not None
+        or node.renew
+        or node.due_s > run.now_s
+        or (process is not None and process.stays_down)
+        or (change is not None and not change.taken and node.key in change.down)
+    ):
+        return Level.DOWN
+    top = node.levels[-1]
+    if top is Level.ACTIVE and is_kept_inactive(run, node):
+        return node.gate
+    return top
+
+
+def is_kept_inactive(run: Run, node: Node) -> bool:
+    """Return whether a node is not to be active although the manifest has it so."""
+    if node.base is Level.ACTIVE:
+        return False  # it is adopted as it was found
+    asked = run.attempt is not None and run.attempt.asks_for(node.key)
+    if run.options.until < Level.ACTIVE:
+        return True
+    if not asked and (run.paused or node.withheld or node.refused):
+        return True
+    if node.level is Level.ACTIVE:
+        return not node.let_through
+    needs = (
+        run.nodes[after.node]
+        for after in node.planned.after
+        if HOLDS[after.condition] is Level.ACTIVE and after.node in run.nodes
+    )
+    # One that is away comes again; one that is kept inactive does not.
+    return any(
+        each.levels[-1] is Level.ACTIVE
+        and each.level is not Level.ACTIVE
+        and is_kept_inactive(run, each)
+        for each in needs
+    )
+
+
+def has_reached(run: Run, key: str, condition: Condition) -> bool:
+    """Return whether a node is as far as another waits for: a plain one has to be started."""
+    node = run.nodes.get(key)
+    if node is None:
+        return condition in run.elsewhere.get(key, ())
+    process = run.process_of(node)
+    if process is not None and process.is_over:
+        return condition is not Condition.HEALTHY
+    if condition is Condition.HEALTHY and not node.healthy:
+        return False
+    level = HOLDS[condition] if node.planned.managed else Level.STARTED
+    return node.level >= level
+
+
+def holds_up(run: Run, node: Node, target: Level) -> str:
+    """Return what a step to this level waits for, `/a is active`; empty if nothing holds it."""
+    for after in node.planned.after:
+        step = HOLDS[after.condition] if node.planned.managed else Level.STARTED
+        if step <= target and not has_reached(run, after.node, after.condition):
+            other = run.plan.node(after.node).full_name
+            return f"{other} is {after.condition.value}"
+    container = run.nodes.get(node.planned.run.container)
+    if node.planned.run.component and container is not None and container.level < Level.STARTED:
+        return f"{container.name} is started"
+    return ""
+
+
+def goal_of(run: Run, node: Node) -> Level:
+    """Return where a node goes from here: as wanted, and never below what it was found in."""
+    return max(wanted(run, node), node.base)
+
+
+def is_walking(run: Run, node: Node) -> bool:
+    """Return whether a node is on its way to its gate, or down, and will be there by itself."""
+    goal = goal_of(run, node)
+    if node.guarded > gate.GUARD_TRIES and goal > Level.DOWN:
+        return False  # it is left to the verdict
+    if node.planned.run.kind is RunKind.COMMAND and not node.planned.managed and goal:
+        process = run.processes.get(node.process)
+        return process is None or not process.is_alive  # it reports nothing: a verdict says it
+    return min(goal, node.gate) > node.level or goal < node.may_be_at or node.renew
+
+
+def is_at_gate(run: Run) -> bool:
+    """Return whether all nodes but those in backoff are where they can be without the gate."""
+    return not any(
+        is_walking(run, each) for each in run.nodes.values() if each.due_s <= run.now_s
+    ) and not any(each.is_alive and _is_to_end(run, each) for each in run.processes.values())
+
+
+def waiting(run: Run) -> tuple[str, ...]:
+    """Return the keys of the nodes that wait for the gate to open."""
+    return tuple(
+        key
+        for key, each in run.nodes.items()
+        if wanted(run, each) is Level.ACTIVE and each.level is each.gate
+    )
+
+
+def stage_of(run: Run) -> Stage:
+    """Return what the system is judged as now."""
+    passed = run.furthest == "active" or run.passage is not None
+    return Stage.ACTIVE if passed and not run.paused and _is_whole(run) else Stage.CONNECTED
+
+
+def away(run: Run) -> frozenset[str]:
+    """Return the full names of the nodes that are not as far as their manifest has them."""
+    return frozenset(
+        each.name
+        for each in run.nodes.values()
+        if each.level < each.levels[-1] or each.renew or each.due_s > run.now_s
+    )
+
+
+def advance(run: Run) -> list[effects.Effect]:
+    """Return what is to be done now, and note it in the state."""
+    found: list[effects.Effect] = [
+        effects.Answer(order=number, code=code, error=error) for number, code, error in run.outbox
+    ]
+    run.outbox = []
+    if run.order is not None and run.ready is None and run.ending is None:
+        run.ready = False
+        found.append(effects.Prepare())
+    for process in run.processes.values():
+        found += _process(run, process)
+    for node in run.nodes.values():
+        if (step := _next(run, node)) is not None:
+            found.append(_ask(run, node, step))
+    found += _parameters(run)
+    found += _gate(run)
+    if (at_s := wakes_at_s(run)) < NEVER_S:
+        found.append(effects.Wake(at_s=at_s))
+    return found
+
+
+# Nodes
+
+
+def _next(run: Run, node: Node) -> Step | None:
+    if node.request is not None:
+        return None
+    goal = goal_of(run, node)
+    if node.level > goal:
+        return _step_down(run, node, goal)
+    if node.level < goal and run.fails_s == NEVER_S:
+        return _step_up(run, node)
+    return None
+
+
+def _step_up(run: Run, node: Node) -> Step | None:
+    target = next(each for each in node.levels if each > node.level)
+    if node.stuck or (node.silent and target is not Level.STARTED):
+        return None
+    process = run.processes.get(node.process)
+    if node.process and (process is None or not process.pid or process.asked >= 0):
+        return None
+    if holds_up(run, node, target):
+        return None
+    if target is Level.ACTIVE:
+        passage = run.passage
+        passes = passage is not None and passage.opened and node.key in passage.waiting
+        change = run.change is not None and not run.change.taken
+        if not passes or change or run.switch is not None or not gate.is_open(run):
+            return None
+    if target is Level.CONNECTED and run.options.wires and not node.wired:
+        return Step.WIRE if node.wirable else None
+    return UP[target]
+
+
+def _step_down(run: Run, node: Node, goal: Level) -> Step | None:
+    process = run.processes.get(node.process)
+    if not can_be_asked(run, node) or _waits_for_dependents(run, node, wanted(run, node)):
+        return None
+    if process is not None and (not process.is_alive or process.asked >= 0):
+        return None
+    if node.guarded > gate.GUARD_TRIES and goal > Level.DOWN:
+        return None
+    if node.level is not Level.STARTED:
+        return DOWNWARDS[node.level]
+    if node.planned.run.component:
+        return None if _goes_with_container(run, node) else Step.UNLOAD
+    return Step.SHUTDOWN if node.process and node.planned.holds else None
+
+
+def can_be_asked(run: Run, node: Node) -> bool:
+    """Return whether a node is asked politely on its way down."""
+    return not (node.stuck or node.silent or run.hurry)
+
+
+def _waits_for_dependents(run: Run, node: Node, goal: Level) -> bool:
+    """Return whether another goes down first: what stays is not waited for."""
+    return not run.hurry and any(
+        goal_of(run, each) < each.may_be_at
+        and each.may_be_at > max(goal, each.base)
+        and (can_be_asked(run, each) or not each.planned.holds)
+        and not (each.level is Level.STARTED and _goes_with_container(run, each))
+        for each in run.dependents(node.key)
+    )
+
+
+def _goes_with_container(run: Run, node: Node) -> bool:
+    """Return whether a node is a component whose container's process ends, too."""
+    container = run.nodes.get(node.planned.run.container)
+    loaded = node.planned.run.component and container is not None and container.process
+    return bool(loaded) and container is not None and wanted(run, container) is Level.DOWN
+
+
+def _ask(run: Run, node: Node, step: Step) -> effects.Ask:
+    limits = node.planned.timeouts
+    limit_s = {
+        Step.START: limits.start_s,
+        Step.CONFIGURE: limits.configure_s + OWN_S,
+        Step.WIRE: limits.connect_s,
+        Step.CONNECT: limits.connect_s + OWN_S,
+        Step.ACTIVATE: limits.activate_s + OWN_S,
+        Step.DEACTIVATE: limits.deactivate_s + OWN_S,
+        Step.SHUTDOWN: limits.shutdown_s,
+    }.get(step, limits.cleanup_s)
+    appears = step is Step.START and not node.planned.managed and not node.planned.holds
+    run.requests += 1
+    node.request = Request(
+        number=run.requests,
+        step=step,
+        since_s=run.now_s,
+        limit_s=NEVER_S if appears else limit_s,
+    )
+    if step is not Step.ACTIVATE:
+        return effects.Ask(node=node.key, step=step, number=run.requests)
+    assert run.passage is not None
+    run.passage.sent.add(node.key)
+    node.let_through = True
+    return effects.Ask(node=node.key, step=step, number=run.requests, mark=run.mark)
+
+
+# Processes
+
+
+def _is_to_end(run: Run, process: Process) -> bool:
+    members = [*run.nodes_of(process.name)]
+    return not any(wanted(run, each) for each in members)
+
+
+def _process(run: Run, process: Process) -> Iterator[effects.Effect]:
+    if process.state is ProcessState.EXITED:
+        if not process.sweeping:
+            process.sweeping = True
+            yield effects.Sweep(process=process.name)
+    elif process.state is None:
+        if _may_be_spawned(run, process):
+            process.state, process.end = ProcessState.STARTING, None
+            process.started(run.now_s)
+            yield effects.Spawn(process=process.name)
+    elif process.barks and SIGKILL not in process.sent:
+        process.sent = [*process.sent, SIGKILL]
+        yield effects.Signal(process=process.name, number=SIGKILL)
+    elif process.pid and _is_to_end(run, process):
+        yield from _end(run, process)
+
+
+def _may_be_spawned(run: Run, process: Process) -> bool:
+    members = [*run.nodes_of(process.name)]
+    if run.fails_s < NEVER_S or _is_to_end(run, process):
+        return False
+    return not any(holds_up(run, each, Level.STARTED) for each in members)
+
+
+def _end(run: Run, process: Process) -> Iterator[effects.Signal]:
+    """End a process once nothing is left to undo in it, by ever stronger means."""
+    members = [*run.nodes_of(process.name)]
+    escalation = _escalation(run, process, members)
+    if process.asked < 0:
+        asked = [each for each in members if each.planned.holds and can_be_asked(run, each)]
+        busy = any(each.level or each.request is not None for each in asked)
+        if busy or any(_waits_for_dependents(run, each, Level.DOWN) for each in members):
+            return
+    hurried = run.hurry and SIGKILL not in process.sent
+    if process.asked >= 0 and run.now_s < process.asked_until_s and not hurried:
+        return
+    process.asked = min(process.asked + 1, len(escalation) - 1)
+    if hurried:
+        process.asked = len(escalation) - 1
+    process.state = ProcessState.STOPPING
+    number, wait_s = escalation[process.asked]
+    process.asked_until_s = run.now_s + wait_s
+    process.sent = [*process.sent, number]
+    yield effects.Signal(process=process.name, number=number)
+
+
+def _escalation(run: Run, process: Process, members: list[Node]) -> Escalation:
+    if run.hurry:
+        return AT_ONCE
+    if process.state is ProcessState.STARTING or process.sent[:1] == [SIGTERM]:
+        return STARTING
+    if process.planned.run.kind is RunKind.COMMAND:
+        return COMMAND
+    return STUCK if any(each.stuck or each.silent for each in members) else HOST
+
+
+# The gate, networks, parameters
+
+
+def _parameters(run: Run) -> Iterator[effects.Give]:
+    if run.ending is not None:
+        return
+    switch, change = run.switch, run.change
+    if switch is not None and is_settled_down(run):
+        for key in sorted(switch.to_ask):
+            switch.asked.add(key)
+            yield effects.Give(node=key)
+        switch.to_ask = set()
+    if change is not None and not change.taken:
+        for key, values in change.to_give.items():
+            change.giving.add(key)
+            change.given[key] = values
+            yield effects.Give(node=key, values=values)
+        change.to_give = {}
+
+
+def is_settled_down(run: Run) -> bool:
+    """Return whether nothing has still to be deactivated."""
+    return not any(goal_of(run, each) < each.may_be_at for each in run.nodes.values())
+
+
+def _gate(run: Run) -> Iterator[effects.Effect]:
+    if run.ending is not None:
+        return
+    judged, passage = run.judged, run.passage
+    programs = passage is not None and not (passage.programmed or passage.programming)
+    if programs and gate.is_open(run) and passage and judged.verdict:
+        passage.programming, passage.flows = True, judged.verdict.flows
+        yield effects.Program(verdict=judged.verdict)
+    # A loop that looks while its nodes are on their way would look at each step of each.
+    active = frozenset(each.name for each in run.nodes.values() if each.level is Level.ACTIVE)
+    due = judged.mark != run.mark or judged.again_s <= run.now_s
+    if due and not judged.looking and (active or is_at_gate(run)):
+        stage = stage_of(run)
+        judged.looking, judged.again_s = True, NEVER_S
+        yield effects.Look(
+            mark=run.mark,
+            stage=stage,
+            ahead=frozenset() if stage is Stage.ACTIVE else active,
+        )
+
+
+# Time
+
+
+def late_at_s(request: Request) -> float:
+    """Return when a request is late: its process's time without a processor does not count."""
+    waited_s = min(request.waited_s, 9 * request.limit_s)
+    return request.since_s + request.limit_s + waited_s
+
+
+def barks_at_s(process: Process) -> float:
+    """Return when the watchdog of a process ends it; NEVER_S while it does not hang."""
+    how: Supervision = process.supervision
+    watched = how.watchdog_sec and how.restart.value != "no" and process.is_alive
+    if process.hangs_s is None or not watched or process.barks:
+        return NEVER_S
+    return process.hangs_s + how.watchdog_sec
+
+
+def wakes_at_s(run: Run) -> float:
+    """Return when something is to be done although nothing happens; NEVER_S if nothing is."""
+    now_s = run.now_s
+    times = [late_at_s(each.request) for each in run.nodes.values() if each.request is not None]
+    times += [each.due_s for each in run.nodes.values()]
+    times += [each.asked_until_s for each in run.processes.values() if each.is_alive]
+    times += map(barks_at_s, run.processes.values())
+    if run.ending is None:
+        times += [run.judged.again_s, run.fails_s, gate.counts_at_s(run.judged, now_s)]
+        times += (since_s + gate.SETTLED_S for since_s in run.judged.asked.values())
+        for each in (run.attempt, run.passage):
+            if each is not None:
+                times += [each.until_s, gate.refuses_at_s(run, each.until_s)]
+        if run.passage is not None:
+            times.append(run.passage.late_s)
+        if run.change is not None:
+            times.append(run.change.until_s)
+        if run.held_s is not None and run.options.hold_s is not None:
+            times += [run.held_s + run.options.hold_s, run.held_s + run.options.hold_s + GLANCE_S]
+    return min((each for each in times if each > now_s), default=NEVER_S)
+
+
+def phase_of(run: Run) -> str:
+    """Return what the run is doing, as `lifecycle status` shows it."""
+    pausing = run.order is not None and run.order.ask is ControlRequest.PAUSE
+    coming = not is_at_gate(run)
+    up = run.held_s is not None
+    found = (
+        (run.ending is not None, "stopping"),
+        (run.change is not None and run.change.back, "rolling back"),
+        (run.change is not None, "applying"),
+        (run.switch is not None, "switching"),
+        (run.passage is not None, "activating"),
+        (run.paused and pausing, "pausing"),
+        (coming, "restarting" if up else "connecting"),
+        (run.attempt is not None, "verifying"),
+        (run.paused, "paused"),
+        (_is_whole(run), "active"),
+    )
+    return next((name for holds, name in found if holds), "held")
+
+
+def _is_whole(run: Run) -> bool:
+    gated = [each for each in run.nodes.values() if each.is_gated and wanted(run, each)]
+    return all(each.level is Level.ACTIVE for each in gated)

@@ -1,0 +1,405 @@
+"""What fails, and what follows: a restart, the way back from a change, or the end of the run.
+
+Owns: `fail`, which every failure of a node or process goes through in every phase, the sentences
+for people, and how a run ends: `end` and the exit code. Pure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from lifecycle import dataclasses
+from lifecycle.errors import ExitCode
+from lifecycle.supervisor.control.protocol import ControlRequest, Failed
+from lifecycle.supervisor.core import gate
+from lifecycle.supervisor.core.advance import holds_up, phase_of, wanted
+from lifecycle.supervisor.core.change import go_back
+from lifecycle.supervisor.core.inputs import Exited
+from lifecycle.supervisor.core.state import (
+    NEVER_S,
+    UP,
+    Ending,
+    Level,
+    Node,
+    Process,
+    Run,
+    Step,
+)
+from lifecycle.supervisor.policy.restart import RestartPolicy, group_of
+from lifecycle.supervisor.run.events import (
+    Event,
+    Failure,
+    GaveUp,
+    RestartScheduled,
+    Stopping,
+)
+from lifecycle.verify.judge import missing, not_ok
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.rules import Rule, rule
+from lifecycle.verify.rules.run import DEADLINE, GAVE_UP, PROCESS_DIED, START_FAILED
+from lifecycle.verify.verdict import Verdict
+
+ALSO_S = 0.5
+"""For steps in progress to fail, too, once one has failed: one run names all causes."""
+
+_REMEMBERED = 20
+"""Failures of one process; a limit on what a report repeats, not on what is counted."""
+
+_ING = {
+    Step.START: "starting",
+    Step.CONFIGURE: "configuring",
+    Step.WIRE: "being wired",
+    Step.CONNECT: "connecting",
+    Step.ACTIVATE: "activating",
+    Step.DEACTIVATE: "deactivating",
+}
+
+
+def doing(run: Run, node: Node) -> str:
+    """Return what a node does, or waits for, as in messages; empty when nothing."""
+    if node.request is not None:
+        return _ING.get(node.request.step, "being taken down")
+    higher = [each for each in node.levels if each > node.level]
+    if not higher or wanted(run, node) <= node.level:
+        return ""
+    held = holds_up(run, node, higher[0])
+    return f"waits to {UP[higher[0]].value} until {held}" if held else ""
+
+
+def unfinished(run: Run) -> str:
+    """Say what every node is doing, or waits for, that is in a step; empty if none is."""
+    found = ((each.name, doing(run, each)) for each in run.nodes.values())
+    said = (
+        (name, text if text.startswith("waits") else f"is still {text}") for name, text in found
+    )
+    return "; ".join(f"{name} {text}" for name, text in said if not text.endswith("still "))
+
+
+def death(run: Run, process: Process, given: Exited) -> list[Failure]:
+    """Return the failures that an unexpected end is: what it said that it fails of, if it did."""
+    members = [*run.nodes_of(process.name)]
+    node = members[0] if len(members) == 1 else None
+    name = process.name if node is None else node.name
+    if given.reports:
+        return [
+            _failure(START_FAILED, subject or name, _start_failed(subject or name, text), process)
+            for subject, text in given.reports
+        ]
+    while_ = doing(run, node) if node is not None else ""
+    what = f"process {name!r}" if node is None else repr(name)
+    while_ = f" while {while_}" if while_ else ""
+    why = f": {process.why}" if process.why else ""
+    words = f": {given.words}" if given.words else ""
+    text = f"cannot keep {what} running: pid {process.pid} died{while_}: {given.text}{words}{why}"
+    return [_failure(PROCESS_DIED, name, text, process)]
+
+
+def _start_failed(name: str, text: str) -> str:
+    return text if text.startswith("cannot") else f"cannot start {name!r}: {text}"
+
+
+def of_step(run: Run, node: Node, what: Rule, message: str) -> Failure:
+    """Return the failure of a step of one node: a component's is its container's."""
+    process = run.process_of(node)
+    text = _start_failed(node.name, message) if what is START_FAILED else message
+    return _failure(what, node.name, text, process)
+
+
+def too_late(run: Run, node: Node, limit_s: float) -> Failure:
+    """Return the failure of a node whose step takes longer than it may."""
+    text = f"cannot bring up {node.name!r}: it was still {doing(run, node)} after {limit_s:g} s"
+    return _failure(DEADLINE, node.name, text, run.process_of(node))
+
+
+def _failure(what: Rule, subject: str, message: str, process: Process | None) -> Failure:
+    name = "" if process is None else process.name
+    log = "" if process is None or process.end is None else process.end.log
+    return Failure(rule=what.id, subject=subject, message=message, process=name, log=log)
+
+
+# What follows
+
+
+def fail(run: Run, failure: Failure, end: Exited | None = None) -> list[Event]:
+    """Take one failure of a run that is not ending.
+
+    Args:
+        run: see above.
+        failure: as people read it.
+        end: of its process, if that has ended.
+    """
+    process = run.processes.get(failure.process)
+    run.changed()
+    change = run.change
+    if change is not None and not change.back:
+        return _fails_in_change(run, failure, end)
+    if process is not None and process.failed:
+        return []  # it is to be started again for another failure already
+    if _is_covered(process, end):
+        assert process is not None
+        _cut_short(run, failure)
+        return _back_off(run, process, failure, end)
+    if run.options.keep_going and run.held_s is not None and end is not None and process:
+        process.stays_down = True
+        run.judged.counted = run.judged.counted or _named([failure])
+        run.deaths.append(failure)
+        return [goes_on(failure)]
+    if not run.failures:
+        run.fails_s = run.now_s + ALSO_S
+    is_said = any(
+        each.rule == failure.rule and each.subject == failure.subject for each in run.failures
+    )
+    died = failure.rule == PROCESS_DIED.id and any(
+        each.process and each.process == failure.process for each in run.failures
+    )
+    if not is_said and not died:  # one that says why it cannot go on, and ends, has failed once
+        run.failures.append(failure)
+    return []
+
+
+def _fails_in_change(run: Run, failure: Failure, end: Exited | None) -> list[Event]:
+    """Have the system go back; what failed of others counts as ever."""
+    change, process = run.change, run.processes.get(failure.process)
+    assert change is not None
+    node = run.node_named(failure.subject)
+    keys = {each.key for each in run.nodes_of(process.name)} if process is not None else set()
+    keys |= set() if node is None else {node.key}
+    touched = bool(keys & (change.touched | change.down))
+    died = end is not None or failure.rule == PROCESS_DIED.id
+    events = go_back(run, failure.message, ExitCode.BRING_UP_FAILED)
+    if touched or not died:
+        change.down |= keys
+        change.touched |= keys
+    elif _is_covered(process, end) and process is not None:
+        events += _back_off(run, process, failure, end)
+    else:
+        change.ends = [*change.ends, failure]
+        if process is not None:
+            process.stays_down = True
+    return events
+
+
+def _is_covered(process: Process | None, end: Exited | None) -> bool:
+    if process is None or process.stays_down:
+        return False
+    policy = RestartPolicy(process.supervision, 0.0)
+    return policy.takes(exit_status=None if end is None else end.status)
+
+
+def goes_on(failure: Failure) -> Failure:
+    """Return a failure as one that does not end the run."""
+    return dataclasses.replace(failure, ends_run=False)
+
+
+def _cut_short(run: Run, failure: Failure) -> None:
+    """Answer the order that a failure cuts short; a pause goes on. All wait for the gate again."""
+    order = run.order
+    run.passage = None
+    if order is None:
+        if run.attempt is not None:
+            run.attempt.at_gate = False
+            run.attempt.until_s = run.now_s + run.options.timeout_s
+    elif order.ask is not ControlRequest.PAUSE:
+        run.attempt = run.switch = None
+        run.answer(ExitCode.BRING_UP_FAILED, failure.message)
+
+
+def _back_off(run: Run, process: Process, failure: Failure, end: Exited | None) -> list[Event]:
+    """Have a process, and what goes down with it, started again later; or give it up."""
+    process.failures = [*process.failures, _remembered(run, failure, end)][-_REMEMBERED:]
+    process.why = ""
+    was_up = run.held_s is not None
+    policy = process.policy = process.policy or RestartPolicy(process.supervision, run.now_s)
+    due_s = policy.failed(run.now_s, was_up=was_up)
+    events: list[Event] = [goes_on(failure)]
+    if due_s is None:
+        history = tuple(process.failures)
+        events.append(GaveUp(process=process.name, restarts=process.restarts, history=history))
+        run.failures = [*run.failures, _given_up(process, failure, was_up=was_up)]
+        run.fails_s = run.now_s
+        return events
+    keys = group_of((each.planned for each in run.nodes.values()), process.name)
+    for key in keys:
+        node = run.nodes[key]
+        node.renew, node.due_s = True, max(node.due_s, due_s)
+    process.failed = True
+    process.away_s = run.now_s if process.away_s is None else process.away_s
+    if run.attempt is not None and run.held_s is None:
+        run.attempt.until_s = due_s + run.options.timeout_s
+    events.append(
+        RestartScheduled(
+            process=process.name,
+            nodes=tuple(run.nodes[key].name for key in keys),
+            reason=failure.message,
+            stderr="",
+            restarts=process.restarts,
+            in_s=due_s - run.now_s,
+        )
+    )
+    return events
+
+
+def _remembered(run: Run, failure: Failure, end: Exited | None) -> Failed:
+    return Failed(
+        rule=failure.rule,
+        subject=failure.subject,
+        message=failure.message,
+        exit_status=None if end is None else end.status,
+        elapsed_s=run.now_s,
+    )
+
+
+def _given_up(process: Process, failure: Failure, *, was_up: bool) -> Failure:
+    how = process.supervision
+    burst = how.start_limit_burst
+    lines = "".join(
+        f"\n  at {each.elapsed_s:.1f} s: {each.message}" for each in process.failures[-burst:]
+    )
+    within = f"within {how.start_limit_interval_sec:g} s" if was_up else "during bring-up"
+    text = (
+        f"cannot keep {process.name!r} running: it was started {burst} time{'s' * (burst != 1)} "
+        f"{within} (start_limit_burst, start_limit_interval_sec) and failed again:{lines}"
+    )
+    return Failure(
+        rule=GAVE_UP.id,
+        subject=failure.subject,
+        message=text,
+        process=process.name,
+        log=failure.log,
+    )
+
+
+# The end
+
+
+def end(run: Run, ending: Ending) -> list[Event]:
+    """End the run: from now on everything is to be down. Whatever is open is answered."""
+    if run.ending is not None:
+        return []
+    run.ending = ending
+    run.attempt = run.passage = run.switch = run.change = None
+    open_ = [*([run.order] if run.order is not None else []), *run.orders]
+    text = f"cannot go on: {run.plan.system!r} is being taken down"
+    said = "; ".join(each.message for each in ending.failures) or text
+    for order in open_:
+        own = order is run.order and bool(ending.failures)
+        run.outbox = [*run.outbox, (order.id, ExitCode.BRING_UP_FAILED, said if own else text)]
+    run.order, run.ready = None, None
+    run.orders.clear()
+    return [*ending.failures, Stopping(reason=ending.stopping)]
+
+
+def end_failed(run: Run) -> list[Event]:
+    """End the run for what failed."""
+    gave_up = any(each.rule == GAVE_UP.id for each in run.failures)
+    code = ExitCode.SUPERVISION_GAVE_UP if gave_up else ExitCode.BRING_UP_FAILED
+    reason = _also(run, _named(run.failures))
+    failures = tuple(run.failures)
+    return end(run, Ending(code=code, stopping="rolling back", reason=reason, failures=failures))
+
+
+def end_refused(run: Run, verdict: Verdict, stopping: str) -> list[Event]:
+    """End the run because the gate stays closed."""
+    reason = _also(run, f"{stopping}; {not_ok(verdict) or verdict.verdict.value}")
+    return end(run, Ending(code=gate.exit_code(verdict), stopping=stopping, reason=reason))
+
+
+def end_done(run: Run) -> list[Event]:
+    """End a run that was held for as long as was asked."""
+    code, why = _outcome(run, run.judged.counted)
+    reason = f"done, but {why}" if why else "done"
+    return end(run, Ending(code=code, stopping="done", reason=_also(run, reason)))
+
+
+def stop(run: Run, reason: str, code: ExitCode) -> list[Event]:
+    """End a run that is asked to end.
+
+    It is a success only if the system was verified, is what was asked for, and nothing bound it to
+    stay; an interrupt (Ctrl-C) never is, nor what a violation ends.
+    """
+    if run.held_s is None:
+        latest, phase = run.judged.verdict, phase_of(run)
+        why = unfinished(run) or (missing(latest) if latest and phase == "verifying" else "")
+    else:
+        asked = code
+        code, why = _outcome(run, "")
+        if asked in (ExitCode.INTERRUPTED, ExitCode.VIOLATED):
+            code = asked
+        elif code is ExitCode.OK and run.options.hold_s is not None:
+            code, why = asked, f"it did not hold for the {run.options.hold_s:g} s of --stop-after"
+        elif code is ExitCode.OK and run.options.until is Level.ACTIVE and not _is_kept(run):
+            code, why = asked, f"the system was {phase_of(run)}, not active"
+        elif code is ExitCode.OK and run.judged.counted:
+            why = f"violated meanwhile, {run.judged.counted}"
+    text = f"{reason}; {why}" if why else reason
+    return end(run, Ending(code=code, stopping=reason, reason=_also(run, text)))
+
+
+def _is_kept(run: Run) -> bool:
+    return phase_of(run) in ("active", "paused", "pausing")
+
+
+def _outcome(run: Run, meanwhile: str) -> tuple[ExitCode, str]:
+    """Return the exit code of a system that was held until now, and why it is no success."""
+    verdict = run.judged.verdict
+    if run.deaths:
+        return ExitCode.BRING_UP_FAILED, _named(run.deaths)
+    if (run.options.until < Level.ACTIVE and not run.options.verifies) or verdict is None:
+        return ExitCode.OK, ""
+    left = follows_from_shut_down(run, verdict)
+    held = phase_of(run) == "held" and run.options.until is Level.ACTIVE
+    closed = gate.closes(verdict, strict=run.options.strict) and not left
+    found = (
+        (closed and verdict.verdict is Outcome.VIOLATED, f"violated; {not_ok(verdict)}"),
+        (bool(meanwhile), f"violated meanwhile, {meanwhile}"),
+        (closed, f"unverifiable; {not_ok(verdict)}"),
+        (held, "held at the gate, and not active"),
+    )
+    why = next((text for holds, text in found if holds), "")
+    unverifiable = ExitCode.UNVERIFIABLE if why.startswith("unver") else ExitCode.VIOLATED
+    return (unverifiable if why else ExitCode.OK), why
+
+
+def _named(failures: Iterable[Failure]) -> str:
+    return f"failed: {', '.join(f'{each.subject} ({each.rule})' for each in failures)}"
+
+
+def follows_from_shut_down(run: Run, verdict: Verdict) -> bool:
+    """Return whether nothing is violated but the absence of hosts that were shut down properly."""
+    violated = [each for each in verdict.findings if each.outcome is Outcome.VIOLATED]
+    return bool(violated) and all(
+        rule(each.rule).about is not None and not run.left.isdisjoint(each.nodes)
+        for each in violated
+    )
+
+
+def _also(run: Run, reason: str) -> str:
+    restarts = [(each.name, each.restarts) for each in run.processes.values()]
+    said = [f"{name!r} {n} time{'s' * (n != 1)}" for name, n in restarts if n]
+    summary = f"restarted: {', '.join(said)}" if said else ""
+    return "; ".join(each for each in (reason, summary, gate.passed(run.judged)) if each)
+
+
+def exit_code_of(run: Run) -> ExitCode:
+    """Return the exit code of a run that is over: a death on the way down counts, too."""
+    assert run.ending is not None
+    code = run.ending.code
+    well = (ExitCode.OK, ExitCode.VIOLATED, ExitCode.UNVERIFIABLE)
+    if run.deaths and code in well:
+        return ExitCode.BRING_UP_FAILED
+    return ExitCode.INTERRUPTED if run.hurry and code is ExitCode.OK else code
+
+
+def fail_late(run: Run, limit_s: float) -> list[Event]:
+    """Fail a bring-up, or an order, that takes too long: say what every node was doing."""
+    busy = [each for each in run.nodes.values() if each.request is not None]
+    culprit = busy[0] if busy else None
+    subject = run.plan.system if culprit is None else culprit.name
+    text = f"cannot bring up {run.plan.system!r} within {limit_s:.3g} s: {unfinished(run)}"
+    for node in busy:
+        node.stuck = bool(node.process)
+    process = None if culprit is None else run.process_of(culprit)
+    if run.attempt is not None:
+        run.attempt.until_s = NEVER_S
+    run.passage = None
+    return fail(run, _failure(DEADLINE, subject, text, process))

@@ -1,0 +1,217 @@
+"""The gate: open while the verdict is of this very mark and allows it.
+
+Owns: `is_open`, for how long a verdict that closes the gate is waited out, which violations last
+and count, and for how long. A mark counts what may change a verdict, so a verdict of an earlier one
+opens nothing: whatever changed is looked at first. Pure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+from lifecycle import dataclasses
+from lifecycle.errors import ExitCode
+from lifecycle.supervisor.core.inputs import Verified
+from lifecycle.supervisor.core.state import NEVER_S, Judged, Level, Node, Run
+from lifecycle.supervisor.run.events import Event, VerdictChanged
+from lifecycle.verify.judge import not_ok, with_findings, with_only
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.rules import rule
+from lifecycle.verify.rules.catalogue import Heals
+from lifecycle.verify.rules.state import ACTIVATED_AT_CLOSED_GATE, MISSING_REPORT
+from lifecycle.verify.verdict import Finding, Stage, Verdict
+
+SETTLED_S = 0.5
+"""A finding that time does not heal counts once it is unchanged for so long."""
+
+UNVERIFIABLE_S = 3.5
+"""What cannot be verified may be unseen yet; Fast DDS announces a late participant every 3 s."""
+
+AGAIN_S = 5.0
+"""For what changed behind an open gate to be judged clear, where nobody is kept waiting."""
+
+LEAST_S = 2.0
+"""For what comes behind an open gate, however late it opened."""
+
+LASTS_S = 1.0
+"""A violation that lasts for longer is in the exit code."""
+
+GUARD_TRIES = 5
+"""A node that others activate again and again is not deactivated for ever."""
+
+_MOST = 1000
+"""A graph that churns for days has ever new findings: so many are remembered."""
+
+_NAMED = 3
+
+Key = tuple[str, str, str, str]
+
+
+def closes(verdict: Verdict, *, strict: bool) -> bool:
+    """Return whether a verdict keeps the gate closed; `strict` refuses what is unverifiable."""
+    if verdict.verdict is Outcome.VIOLATED or verdict.blocking:
+        return True
+    return strict and verdict.verdict is Outcome.UNVERIFIABLE
+
+
+def allows(run: Run) -> bool:
+    """Return whether the latest verdict allows to activate, whatever changed since."""
+    verdict = run.judged.verdict
+    return verdict is not None and not closes(verdict, strict=run.options.strict)
+
+
+def is_open(run: Run) -> bool:
+    """Return whether an activate request may be sent now."""
+    return run.judged.mark == run.mark and allows(run)
+
+
+def exit_code(verdict: Verdict) -> ExitCode:
+    """Return the exit code of a run or an order that this verdict ends."""
+    violated = verdict.verdict is Outcome.VIOLATED
+    return ExitCode.VIOLATED if violated else ExitCode.UNVERIFIABLE
+
+
+def refusal(verdict: Verdict, *, again: bool = False) -> str:
+    """Return why the gate stays closed, or closed again, in whole sentences."""
+    named = "\n".join(f"  {each.rule}: {each.message}" for each in verdict.findings)
+    what = "the verdict is"
+    if again:
+        what = "the system changed before every node was activated, and its verdict now is"
+    return f"cannot activate: {what} {verdict.verdict.value}\n{named}"
+
+
+def patience_s(verdict: Verdict) -> float:
+    """Return for how long the findings of a verdict may stay unchanged; for ever if time heals."""
+    violated = [rule(each.rule) for each in verdict.findings if each.outcome is Outcome.VIOLATED]
+    if any(each.heals is not Heals.WITH_TIME for each in violated):
+        return SETTLED_S
+    if all(each.awaits is MISSING_REPORT for each in violated):
+        stays = any(rule(each.rule).heals is Heals.NEVER for each in verdict.findings)
+        return SETTLED_S if stays and not violated else UNVERIFIABLE_S
+    return NEVER_S
+
+
+def refuses_at_s(run: Run, until_s: float) -> float:
+    """Return when the gate has stayed closed for long enough; NEVER_S while it may open.
+
+    Args:
+        run: with a verdict.
+        until_s: when the time of who waits for the gate is over.
+    """
+    judged = run.judged
+    if judged.verdict is None or allows(run):
+        return NEVER_S
+    if any(each.guarded > GUARD_TRIES for each in run.nodes.values()):
+        return run.now_s
+    if any(each.due_s > run.now_s for each in run.nodes.values()):
+        return until_s  # what comes again may mend it
+    return min(until_s, judged.since_s + patience_s(judged.verdict))
+
+
+def take_verdict(run: Run, given: Verified, away: Collection[str], stage: Stage) -> list[Event]:
+    """Take the verdict of a look.
+
+    Args:
+        run: see above.
+        given: the result of the look.
+        away: full names of nodes that are not as far as they are to be: they violate nothing.
+        stage: that was looked at.
+    """
+    judged = run.judged
+    guarded = tuple(_guarded(each) for each in run.nodes.values() if is_foreign_activation(each))
+    verdict = with_findings(given.verdict, guarded, run.plan.policy)
+    judged.looking = False
+    judged.mark = given.mark
+    judged.again_s = NEVER_S if given.again_s is None else run.now_s + given.again_s
+    found = frozenset((each.rule, each.subject) for each in verdict.findings)
+    if found != judged.found or judged.verdict is None:
+        judged.found, judged.since_s = found, run.now_s
+    is_new, judged.verdict = verdict != judged.verdict, verdict
+    see_violations(run, away)
+    return [VerdictChanged(stage=stage, verdict=verdict)] if is_new else []
+
+
+def is_foreign_activation(node: Node) -> bool:
+    """Return whether a node is active that the gate has not let through."""
+    found = node.level is Level.ACTIVE and node.base < Level.ACTIVE
+    return found and node.planned.managed and not node.let_through
+
+
+def _guarded(node: Node) -> Finding:
+    given_up = node.guarded > GUARD_TRIES
+    what = f"it was deactivated {GUARD_TRIES} times" if given_up else "it is being deactivated"
+    return ACTIVATED_AT_CLOSED_GATE.on_node(
+        Outcome.VIOLATED,
+        node.planned,
+        expected="inactive",
+        observed="activated by its own code or another client",
+        message=f"cannot accept node {node.name}: it was activated by its own code or another "
+        f"client while the gate is closed; {what}",
+    )
+
+
+# Violations
+
+
+def without(run: Run, verdict: Verdict, names: Collection[str]) -> Verdict:
+    """Return a verdict without what is found of these nodes, by their full names."""
+    findings = tuple(
+        each
+        for each in verdict.findings
+        if not any(name in names for name in (*each.nodes, each.subject))
+    )
+    return with_only(verdict, findings, run.plan.policy) if names else verdict
+
+
+def key_of(finding: Finding) -> Key:
+    """Return what makes a finding the same one in a later verdict."""
+    kind = "" if finding.endpoint is None else finding.endpoint.value
+    return finding.rule, finding.subject, finding.node, kind
+
+
+def see_violations(run: Run, away: Collection[str]) -> None:
+    """Note what is violated of the nodes that are to be as planned, and what of it counts.
+
+    It is asked at each verdict and at each moment in which something begins to count.
+    """
+    judged = run.judged
+    if judged.verdict is None:
+        return
+    if run.held_s is None or not any(each.level is Level.ACTIVE for each in run.nodes.values()):
+        judged.violated = {}
+        return
+    verdict = without(run, judged.verdict, {*away, *run.left})
+    found = {key_of(each): each for each in verdict.findings if each.outcome is Outcome.VIOLATED}
+    keys = [*found]
+    if verdict.verdict is Outcome.VIOLATED and not found:
+        keys = [("", verdict.verdict.value, "", "")]
+    judged.violated = {key: judged.violated.get(key, run.now_s) for key in keys}
+    lasting = [key for key, since_s in judged.violated.items() if run.now_s - since_s >= LASTS_S]
+    if lasting:
+        findings = tuple(found[key] for key in lasting if key in found)
+        text = not_ok(dataclasses.replace(verdict, findings=findings)) or _named(keys[0])
+        judged.counted = judged.counted or text
+    for key in keys:
+        name = _named(key)
+        if key in lasting or len(judged.passed) < _MOST:
+            judged.passed[name] = judged.passed.get(name, False) or key in lasting
+
+
+def counts_at_s(judged: Judged, now_s: float) -> float:
+    """Return when the next violation begins to count; NEVER_S if none would."""
+    ends_s = (since_s + LASTS_S for since_s in judged.violated.values())
+    return min((each for each in ends_s if each > now_s), default=NEVER_S)
+
+
+def passed(judged: Judged) -> str:
+    """Say what was violated and did not count; empty if nothing was."""
+    found = [text for text, lasted in judged.passed.items() if not lasted]
+    if not found:
+        return ""
+    more = f" and {len(found) - _NAMED} more" if len(found) > _NAMED else ""
+    named = f"{', '.join(found[:_NAMED])}{more}"
+    return f"violated for no longer than {LASTS_S:g} s, and not counted: {named}"
+
+
+def _named(key: Key) -> str:
+    return f"{key[1]} ({key[0]})" if key[0] else key[1]

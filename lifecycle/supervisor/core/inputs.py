@@ -1,0 +1,178 @@
+"""What happens to a run: the inputs of `take`. Each is one fact, said once, by one port. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from lifecycle.manifest.model import Condition
+from lifecycle.verify.verdict import Verdict
+
+if TYPE_CHECKING:
+    from lifecycle.supervisor.core.state import Level, Order
+
+
+class Tick(msgspec.Struct, frozen=True, kw_only=True):
+    """Time has passed; by process, seconds of it in which it was ready to run, and had no CPU."""
+
+    waited_s: Mapping[str, float] = {}
+
+
+class Spawned(msgspec.Struct, frozen=True, kw_only=True):
+    """A process was started, or cannot be: `error`."""
+
+    process: str
+    pid: int = 0
+    error: str = ""
+
+
+class Exited(msgspec.Struct, frozen=True, kw_only=True):
+    """A process has ended, by whatever cause; in whatever phase.
+
+    Attributes:
+        status: its exit status; None if a signal ended it, or it is not known.
+        signal: number of the signal that ended it; 0 if none did.
+        text: both for people, `exit status 1`.
+        words: what it said of it; empty if nothing.
+        clean: it is an end that somebody asked for, as systemd.service(5) has it.
+        crash: the program broke.
+        reports: why it cannot host nodes, as it said: full name (or empty) and message.
+        log: file with its output.
+    """
+
+    process: str
+    status: int | None = None
+    signal: int = 0
+    text: str = ""
+    words: str = ""
+    clean: bool = False
+    crash: bool = False
+    reports: tuple[tuple[str, str], ...] = ()
+    log: str = ""
+
+
+class Swept(msgspec.Struct, frozen=True, kw_only=True):
+    """Nothing is left of a process that ended: what it started has ended, the graph forgot it."""
+
+    process: str
+
+
+class Replied(msgspec.Struct, frozen=True, kw_only=True):
+    """The request with this number was answered: the node is at `level`, or the step failed.
+
+    Attributes:
+        changed: it is not as it was verified, and was not activated: the gate is asked again.
+    """
+
+    node: str
+    number: int
+    level: Level
+    error: str = ""
+    changed: bool = False
+
+
+class Saw(msgspec.Struct, frozen=True, kw_only=True):
+    """What the graph, or a host unasked, shows of nodes; all by key.
+
+    Attributes:
+        levels: of nodes of ours whose state others may change.
+        health: whether nodes are healthy, as far as that is known.
+        elsewhere: conditions that nodes of other supervisors have reached.
+        wirable: the authority knows how these nodes are to be connected.
+    """
+
+    levels: Mapping[str, Level] = {}
+    health: Mapping[str, bool] = {}
+    elsewhere: Mapping[str, frozenset[Condition]] = {}
+    wirable: frozenset[str] = frozenset()
+
+
+class Changed(msgspec.Struct, frozen=True, kw_only=True):
+    """Something that a verdict looks at may have changed."""
+
+
+class Verified(msgspec.Struct, frozen=True, kw_only=True):
+    """A look is over.
+
+    Attributes:
+        mark: of the moment at which it began.
+        again_s: look again after so long, as nobody says when what is missing is there.
+        undiscovered: key of a node that others do not discover over TCP although it runs.
+    """
+
+    mark: int
+    verdict: Verdict
+    again_s: float | None = None
+    undiscovered: str = ""
+
+
+class Programmed(msgspec.Struct, frozen=True, kw_only=True):
+    """Networks have the flows of the verdict, or cannot be programmed."""
+
+    error: str = ""
+
+
+class Given(msgspec.Struct, frozen=True, kw_only=True):
+    """A running node has taken parameters, or refuses them."""
+
+    node: str
+    error: str = ""
+
+
+class Ready(msgspec.Struct, frozen=True, kw_only=True):
+    """Processes can be started, or cannot."""
+
+    error: str = ""
+
+
+class Ordered(msgspec.Struct, frozen=True, kw_only=True):
+    """Somebody ordered something; what does not fit the manifest was refused before."""
+
+    order: Order
+
+
+class Stop(msgspec.Struct, frozen=True, kw_only=True):
+    """The run is to end: `lifecycle down`, a signal.
+
+    Attributes:
+        code: of a run that is cut short by it.
+        hurries: said again while the system is taken down, nothing is asked politely any more.
+    """
+
+    reason: str
+    code: int
+    hurries: bool = False
+
+
+class Silent(msgspec.Struct, frozen=True, kw_only=True):
+    """A node cannot be reached, or can be again: `why` is empty.
+
+    Attributes:
+        hangs: it is stopped or hangs, for which its process's watchdog ends it.
+    """
+
+    node: str
+    why: str = ""
+    hangs: bool = False
+
+
+class Left(msgspec.Struct, frozen=True, kw_only=True):
+    """Supervisors of other hosts were shut down: full names of their nodes, all of them."""
+
+    nodes: frozenset[str]
+
+
+class Broken(msgspec.Struct, frozen=True, kw_only=True):
+    """Something failed that is no node's: the discovery server died, the fork server died."""
+
+    subject: str
+    message: str
+    rule: str = "run.process-died"
+
+
+Input = (
+    Tick | Spawned | Exited | Swept | Replied | Saw | Changed | Verified | Programmed | Given
+    | Ready | Ordered | Stop | Silent | Left | Broken
+)  # fmt: skip

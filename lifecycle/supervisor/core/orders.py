@@ -1,0 +1,176 @@
+"""Orders: which fit what the system is doing, what each is in the state, and when it is done.
+
+One is carried out at a time; one that comes meanwhile waits for its end. Each is answered once.
+Pure.
+"""
+
+from __future__ import annotations
+
+from lifecycle.errors import ExitCode, did_you_mean
+from lifecycle.supervisor.control.protocol import ControlRequest
+from lifecycle.supervisor.core import advance
+from lifecycle.supervisor.core.change import apply, enter_mode
+from lifecycle.supervisor.core.passing import reached
+from lifecycle.supervisor.core.state import Attempt, Level, Node, Order, Run
+from lifecycle.supervisor.policy.restart import group_of
+from lifecycle.supervisor.run.events import Event
+
+_SAID = {
+    ControlRequest.MODE: "switch the mode of",
+    ControlRequest.APPLY: "apply another manifest to",
+}
+
+FITS = {
+    ControlRequest.PAUSE: (("active", "held"), "only an active system can be paused"),
+    ControlRequest.RESUME: (("paused", "held"), "only a paused system can be resumed"),
+    ControlRequest.RESTART: (
+        ("active", "paused", "held"),
+        "only a system that is active or paused can be restarted",
+    ),
+    ControlRequest.MODE: (
+        ("active", "paused", "held"),
+        "only a system that is active or paused can enter another mode",
+    ),
+    ControlRequest.APPLY: (
+        ("active", "paused", "held"),
+        "only a system that is active or paused can take another manifest",
+    ),
+}
+"""In which phases an order can begin, and what is said in any other."""
+
+_STARTS = (ControlRequest.RESTART, ControlRequest.APPLY)
+
+
+def settled_phase(run: Run) -> str:
+    """Return the phase without what policy does meanwhile, which is nobody's order."""
+    if run.held_s is None or run.ending is not None or run.change is not None:
+        return advance.phase_of(run)
+    if run.paused:
+        return "paused"
+    kept = any(each.withheld or each.refused for each in run.nodes.values())
+    return "held" if kept or advance.waiting(run) else "active"
+
+
+def refusal(run: Run, order: Order) -> str:
+    """Return why an order cannot be carried out now; empty if it can."""
+    what = f"cannot {_SAID.get(order.ask, order.ask.value)} {run.plan.system!r}"
+    phases, hint = FITS[order.ask]
+    phase = settled_phase(run)
+    if phase not in phases:
+        return f"{what}: it is {phase}; {hint}"
+    if order.node and named(run, order.node) is None:
+        return f"cannot restart {order.node!r}: this supervisor runs no such node"
+    if order.ask is ControlRequest.MODE:
+        modes = [each.name for each in run.plan.modes]
+        if order.mode not in modes:
+            known = f"the modes {', '.join(modes)}" if modes else "no modes"
+            hint = did_you_mean(order.mode, modes) if modes else "declare them under 'modes:'"
+            text = f"cannot enter mode {order.mode!r} of {run.plan.system!r}: it has {known}"
+            return f"{text}; {hint}" if hint else text
+        if run.elsewhere:
+            return f"{what}: nodes on other machines run in it, too"
+    return ""
+
+
+def named(run: Run, name: str) -> Node | None:
+    """Return the node that an order names, if it is ours to restart."""
+    node = run.nodes.get(name) or run.node_named(name)
+    return None if node is None or run.process_of(node) is None else node
+
+
+def take_order(run: Run, order: Order) -> list[Event]:
+    """Take an order: it is refused at once, carried out, or waits for the one under way."""
+    applies = run.order is not None and run.order.ask is ControlRequest.APPLY
+    if run.ending is not None:
+        text = f"cannot go on: {run.plan.system!r} is being taken down"
+        run.outbox = [*run.outbox, (order.id, ExitCode.BRING_UP_FAILED, text)]
+    elif applies or run.held_s is None:
+        why = refusal(run, order)
+        if applies:
+            why = (
+                f"cannot {order.ask.value} {run.plan.system!r}: it is {advance.phase_of(run)}, "
+                "another manifest is being applied to it; ask again once 'lifecycle apply' has "
+                "ended; 'lifecycle down' is taken at once"
+            )
+        run.outbox = [*run.outbox, (order.id, ExitCode.USAGE, why)]
+    else:
+        run.orders.append(order)
+    return []
+
+
+def settle_orders(run: Run) -> list[Event]:
+    """Be done with the order that is carried out, and begin the next."""
+    events: list[Event] = []
+    if run.order is not None and run.ready and _is_done(run):
+        if run.paused and run.order.ask in (ControlRequest.PAUSE, ControlRequest.RESTART):
+            events.append(reached(run, "paused"))
+        run.answer(ExitCode.OK)
+    while run.order is None and run.orders and _is_free(run):
+        order = run.orders.popleft()
+        if why := refusal(run, order):
+            run.outbox = [*run.outbox, (order.id, ExitCode.USAGE, why)]
+            continue
+        run.order = order
+        if order.ask not in _STARTS:
+            run.ready = True
+            events += begin(run)
+    return events
+
+
+def _is_free(run: Run) -> bool:
+    """Return whether nothing else is under way that an order would have to wait for."""
+    return run.switch is None and run.change is None and run.attempt is None and not run.failures
+
+
+def _is_done(run: Run) -> bool:
+    return _is_free(run) and run.passage is None and advance.is_settled_down(run)
+
+
+def begin(run: Run) -> list[Event]:
+    """Note an order in the state, by which it is carried out."""
+    order = run.order
+    assert order is not None
+    if order.ask is ControlRequest.APPLY:
+        return apply(run, order)
+    run.passage = None
+    if order.ask is ControlRequest.PAUSE:
+        run.paused = True
+    elif order.ask is ControlRequest.MODE:
+        return enter_mode(run, order.mode)
+    else:
+        if order.ask is ControlRequest.RESTART:
+            _restart(run, order)
+        opens = order.ask is ControlRequest.RESUME or not run.paused
+        until_s = run.now_s + run.options.timeout_s
+        run.attempt = Attempt(until_s=until_s, activates=opens, judges=opens)
+    run.changed()
+    return []
+
+
+def _restart(run: Run, order: Order) -> None:
+    """Have nodes go down once, with all that comes and goes with them; failures are forgotten."""
+    node = named(run, order.node) if order.node else None
+    keys = set(run.nodes)
+    if node is not None:
+        keys = set(run.whole({node.key}))
+        keys |= _gone_with(run, keys)
+    for key in keys:
+        each = run.nodes[key]
+        each.due_s = 0.0
+        each.renew = each.level > Level.DOWN or bool(each.process)
+        process = run.processes.get(each.process)
+        if process is not None:
+            process.by_hand, process.failed = True, False
+            process.away_s, process.stays_down = None, False
+
+
+def _gone_with(run: Run, keys: set[str]) -> set[str]:
+    """Return the keys of the nodes that wait in the same backoff, and for no failure of theirs."""
+    names = {run.nodes[key].process for key in keys}
+    found = set[str]()
+    for name in names:
+        process = run.processes.get(name)
+        if process is not None and process.failed:
+            found.update(group_of((each.planned for each in run.nodes.values()), name))
+    others = {each.name for each in run.processes.values() if each.failed} - names
+    return {key for key in found if run.nodes[key].process not in others}

@@ -1,0 +1,221 @@
+"""Nodes pass the gate: who asks, when it opens or stays closed, and what they became.
+
+Owns: attempts (a bring-up or an order asks for the gate) and passages (nodes are let through).
+Nodes that policy started again need no attempt: they are let through whenever the gate is open.
+Pure.
+"""
+
+from __future__ import annotations
+
+from lifecycle.errors import ExitCode
+from lifecycle.supervisor.core import advance, failure, gate
+from lifecycle.supervisor.core.change import go_back, leave_mode
+from lifecycle.supervisor.core.state import Level, Passage, Run
+from lifecycle.supervisor.run.events import Event, Failure, GateOpened, Notice, SystemReached
+from lifecycle.verify.judge import not_ok, taken_on_trust
+from lifecycle.verify.rules.run import NOT_PROGRAMMED, TRANSITION_FAILED
+from lifecycle.verify.verdict import Verdict
+
+
+def settle(run: Run) -> list[Event]:
+    """Take attempt and passage as far as the state allows."""
+    if run.ending is not None or run.failures:
+        return []
+    events = _arrive(run)
+    if run.passage is not None:
+        return [*events, *_go_on(run)]
+    return [*events, *_open(run)]
+
+
+def _arrive(run: Run) -> list[Event]:
+    """Note that all who are on their way are at the gate; from now on its time counts."""
+    attempt = run.attempt
+    if attempt is None or attempt.at_gate:
+        return []
+    change = run.change is not None and not run.change.taken
+    coming = run.held_s is None and any(each.due_s > run.now_s for each in run.nodes.values())
+    if change or run.switch is not None or coming or not advance.is_at_gate(run):
+        late = run.now_s >= attempt.until_s
+        if late and run.change is not None and not run.change.back:
+            text = f"cannot bring up {run.plan.system!r} in time: {failure.unfinished(run)}"
+            return go_back(run, text, ExitCode.BRING_UP_FAILED)
+        return failure.fail_late(run, run.options.timeout_s) if late else []
+    left_s = attempt.until_s - run.now_s
+    fresh_s = run.options.timeout_s if run.held_s is not None else min(left_s, run.options.gate_s)
+    if run.change is None:
+        attempt.until_s = run.now_s + fresh_s
+    attempt.at_gate = True
+    run.changed()
+    attempt.mark = run.mark
+    run.judged.found, run.judged.since_s = frozenset(), run.now_s
+    if not attempt.judges:
+        run.attempt = None
+    return [reached(run, "connected")]
+
+
+def _open_for_returned(run: Run) -> list[Event]:
+    """Let through what was started again by policy, and nobody waits for."""
+    busy = run.switch is not None or run.change is not None or run.held_s is None
+    keys = () if busy else advance.waiting(run)
+    if not keys or not gate.is_open(run):
+        return []
+    return [reached(run, "verified"), *_begin(run, keys, run.now_s + gate.AGAIN_S)]
+
+
+def _open(run: Run) -> list[Event]:
+    attempt = run.attempt
+    if attempt is None:
+        return _open_for_returned(run)
+    if not attempt.at_gate or run.judged.mark < attempt.mark:
+        return []
+    if gate.is_open(run):
+        events = [reached(run, "verified")]
+        if attempt.activates:
+            return [*events, *_begin(run, advance.waiting(run), attempt.until_s)]
+        run.attempt = None
+        return events
+    if run.now_s >= gate.refuses_at_s(run, attempt.until_s):
+        return _refused(run, again=False)
+    return []
+
+
+def _begin(run: Run, keys: tuple[str, ...], until_s: float) -> list[Event]:
+    run.judged.violated = {}
+    run.passage = Passage(
+        waiting=keys,
+        until_s=max(until_s, run.now_s + gate.LEAST_S),
+        late_s=max(until_s, run.now_s + run.options.timeout_s),
+        paused=run.paused,
+    )
+    return []
+
+
+def programmed(run: Run, error: str) -> list[Event]:
+    """Take it that networks are programmed: the gate opens for those that wait at it."""
+    passage, verdict = run.passage, run.judged.verdict
+    if passage is None or not passage.programming or verdict is None:
+        return []
+    passage.programming = False
+    if error:
+        run.passage = None
+        name = run.plan.system
+        return failure.fail(run, Failure(rule=NOT_PROGRAMMED.id, subject=name, message=error))
+    passage.programmed = True
+    return []
+
+
+def _go_on(run: Run) -> list[Event]:
+    passage, verdict = run.passage, run.judged.verdict
+    assert passage is not None
+    assert verdict is not None
+    nodes = [run.nodes[key] for key in passage.waiting if key in run.nodes]
+    behind = [each for each in nodes if advance.wanted(run, each) is Level.ACTIVE]
+    done = passage.programmed and all(each.level is Level.ACTIVE for each in behind)
+    if gate.is_open(run) and passage.programmed:
+        if not passage.sent and verdict.flows != passage.flows:
+            passage.programmed = False  # other flows are verified than were programmed
+            return []
+        events = [] if passage.opened else _let_through(run, passage, verdict)
+        return [*events, *(_passed(run) if done else [])]
+    if run.now_s >= gate.refuses_at_s(run, passage.until_s):
+        return _became_another(run) if done and passage.sent else _refused(run, again=True)
+    if run.now_s >= passage.late_s:
+        return failure.fail_late(run, run.options.timeout_s)
+    return []
+
+
+def _let_through(run: Run, passage: Passage, verdict: Verdict) -> list[Event]:
+    passage.opened = True
+    run.trusted = taken_on_trust(verdict)
+    if run.attempt is not None:
+        run.paused = False
+    for key in passage.waiting:
+        run.nodes[key].withheld, run.nodes[key].refused = "", False
+    names = tuple(run.nodes[key].name for key in passage.waiting)
+    return [GateOpened(outcome=verdict.verdict.value, nodes=names, trusted=run.trusted)]
+
+
+def _passed(run: Run) -> list[Event]:
+    run.attempt = run.passage = None
+    for node in run.nodes.values():
+        if node.level is Level.ACTIVE:
+            node.guarded = 0
+    gated = [each for each in run.nodes.values() if each.is_gated]
+    whole = all(each.level is Level.ACTIVE for each in gated)
+    return [reached(run, "active")] if whole else []
+
+
+def reached(run: Run, what: str) -> Event:
+    """Note, and say, how far the system has come."""
+    order = ("", "connected", "verified", "active")
+    if what in order and order.index(what) > order.index(run.furthest):
+        run.furthest = what
+    return SystemReached(reached=what, elapsed_s=run.now_s)
+
+
+def _withdraw(run: Run) -> None:
+    """Have those be inactive again that were let through since the gate opened."""
+    passage = run.passage
+    for key in () if passage is None else passage.sent:
+        if key in run.nodes:
+            run.nodes[key].let_through = False
+    if passage is not None and passage.paused:
+        run.paused = True
+
+
+def _refused(run: Run, *, again: bool) -> list[Event]:
+    """The gate stays closed, or closed again, for who asked."""
+    verdict, attempt = run.judged.verdict, run.attempt
+    assert verdict is not None
+    text, code = gate.refusal(verdict, again=again), gate.exit_code(verdict)
+    keys = advance.waiting(run)
+    if run.held_s is None:
+        stopping = "the verdict keeps the gate closed"
+        if again:
+            stopping = "the system changed before every node was activated"
+        if attempt is not None and run.now_s >= attempt.until_s:
+            over = f"the {run.options.timeout_s:g} s of the bring-up are over (--timeout)"
+            stopping = f"{stopping}, and {over}"
+        return failure.end_refused(run, verdict, stopping)
+    sent = () if run.passage is None else tuple(run.passage.sent)
+    _withdraw(run)
+    run.attempt = run.passage = None
+    change = run.change
+    if change is not None and not change.back:
+        return go_back(run, text, code)
+    if attempt is None:
+        return [Notice(message=text)]
+    for key in (*keys, *sent):
+        run.nodes[key].refused = True
+    if change is not None:
+        change.state = f"its verdict is {verdict.verdict.value}: {not_ok(verdict)}"
+    elif attempt.mode:
+        return [Notice(message=text), *leave_mode(run, attempt.mode, text, code)]
+    elif run.order is not None:
+        run.answer(code, text)
+    return [Notice(message=text)]
+
+
+def _became_another(run: Run) -> list[Event]:
+    """What became active is not what was verified."""
+    verdict, passage, attempt = run.judged.verdict, run.passage, run.attempt
+    assert verdict is not None
+    assert passage is not None
+    if run.change is not None and not run.change.back:
+        _withdraw(run)
+        run.attempt = run.passage = None
+        return go_back(run, gate.refusal(verdict), gate.exit_code(verdict))
+    if attempt is not None:
+        if run.order is not None:
+            run.answer(gate.exit_code(verdict), gate.refusal(verdict))
+        return failure.end_refused(run, verdict, "what became active is not what was verified")
+    run.passage = None
+    events: list[Event] = []
+    for key in sorted(passage.sent & run.nodes.keys()):
+        node = run.nodes[key]
+        text = (
+            f"cannot keep {node.name!r} active: what became active is not what was verified; "
+            f"{not_ok(verdict)}"
+        )
+        events += failure.fail(run, failure.of_step(run, node, TRANSITION_FAILED, text))
+    return events

@@ -1,0 +1,450 @@
+"""`take`: one input changes the state, and something is said of it.
+
+Owns: what each input means. Nothing is asked of anybody here; what is to be done follows from the
+state (advance.py). An end is an end in every phase: what dies, what it leaves and what is late are
+inputs that the same lines handle in bring-up, restart, apply and take-down. Pure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from lifecycle.errors import ExitCode
+from lifecycle.manifest.model import RunKind
+from lifecycle.plan.model import PlanError
+from lifecycle.plan.restart import restarted
+from lifecycle.supervisor.control.protocol import ProcessState
+from lifecycle.supervisor.core import advance, consequences, failure, gate, inputs, orders, passing
+from lifecycle.supervisor.core.change import (
+    leave_mode,
+    refused_parameters,
+    settle_change,
+    settle_mode,
+)
+from lifecycle.supervisor.core.state import (
+    NEVER_S,
+    REACHES,
+    UP,
+    Level,
+    Node,
+    Process,
+    Request,
+    Run,
+    Step,
+)
+from lifecycle.supervisor.run.events import Event, Failure, Notice, Restarted
+from lifecycle.verify.rules.run import NOT_WIRED, START_FAILED, TRANSITION_FAILED
+
+_UPWARDS = (*UP.values(), Step.WIRE)
+_PASSES = 3
+"""An order that ends, the next that begins, and the gate that it asks: no more follow silently."""
+
+
+def take(run: Run, now_s: float, given: inputs.Input) -> list[Event]:
+    """Apply one input to the state; return what is said of it.
+
+    Args:
+        run: changed in place.
+        now_s: of the input, on the run's clock, which begins at 0 and only goes forward.
+        given: what happened.
+    """
+    passed_s, run.now_s = max(0.0, now_s - run.now_s), max(run.now_s, now_s)
+    if isinstance(given, inputs.Tick):
+        _waited(run, given, passed_s)
+    events = [*_HANDLERS[type(given)](run, given), *_due(run)]
+    quiet = 0
+    while quiet < _PASSES:  # what moved without a word is looked at once more
+        more = _settle(run)
+        quiet = 0 if more else quiet + 1
+        events += more
+    return events
+
+
+def _settle(run: Run) -> list[Event]:
+    """Take what follows from the state alone one step further."""
+    events: list[Event] = []
+    if run.ending is None and run.failures and _has_failed(run):
+        events += failure.end_failed(run)
+    _give_up_steps(run)
+    _begin_anew(run)
+    if run.ending is None:
+        events += settle_mode(run)
+        events += settle_change(run)
+        events += passing.settle(run)
+        events += orders.settle_orders(run)
+        events += consequences.settle_consequences(run)
+        events += _hold(run)
+    return [*events, *_returned(run)]
+
+
+# Processes
+
+
+def _spawned(run: Run, given: inputs.Spawned) -> list[Event]:
+    process = run.processes.get(given.process)
+    if process is None or process.state is not ProcessState.STARTING:
+        return []
+    if not given.error:
+        process.pid = given.pid or -1
+        return []
+    process.state = None
+    node = next(run.nodes_of(process.name))
+    return (
+        []
+        if run.ending
+        else failure.fail(run, failure.of_step(run, node, START_FAILED, given.error))
+    )
+
+
+def _exited(run: Run, given: inputs.Exited) -> list[Event]:
+    process = run.processes.get(given.process)
+    if process is None or not process.is_alive:
+        return []
+    failures = failure.death(run, process, given)
+    members = [*run.nodes_of(process.name)]
+    loaded = [each for each in run.nodes.values() if run.process_of(each) is process]
+    shut_down = all(each.level is Level.DOWN for each in members if each.planned.managed)
+    to_end = not any(advance.wanted(run, each) for each in members)
+    process.state, process.end = ProcessState.EXITED, given
+    for node in {each.key: each for each in (*members, *loaded)}.values():
+        _is_down(node)
+    run.changed()
+    if process.asked >= 0:
+        return _died_when_asked(run, process, given, failures)
+    if process.is_over:
+        process.stays_down = True
+        return []
+    if run.ending is not None or to_end:
+        hosted = process.planned.run.kind is RunKind.PYTHON
+        in_order = given.clean and (shut_down or not hosted)
+        if in_order:
+            return []
+        if run.ending is not None:
+            run.deaths += failures
+        return [failure.goes_on(each) for each in failures]
+    return [event for each in failures for event in failure.fail(run, each, given)]
+
+
+def _died_when_asked(
+    run: Run, process: Process, given: inputs.Exited, failures: list[Failure]
+) -> list[Event]:
+    """Take the end of a process that was asked to end, and may have died instead."""
+    if given.signal:
+        crashed = given.signal not in process.sent and not given.clean
+    else:
+        hosted = process.planned.run.kind is RunKind.PYTHON
+        crashed = given.crash or (hosted and (given.status or 0) > 1)
+    if not crashed:
+        return []
+    if run.ending is not None:
+        run.deaths += failures
+    return [failure.goes_on(each) for each in failures]
+
+
+def _is_down(node: Node) -> None:
+    node.level = node.base = Level.DOWN
+    node.request = None
+    node.stuck = node.wired = node.healthy = node.let_through = False
+    node.silent, node.guarded = "", 0
+
+
+def _swept(run: Run, given: inputs.Swept) -> list[Event]:
+    process = run.processes.get(given.process)
+    if process is None or process.state is not ProcessState.EXITED:
+        return []
+    process.state, process.pid, process.asked, process.sent = None, 0, -1, []
+    process.asked_until_s, process.hangs_s, process.sweeping = NEVER_S, None, False
+    process.barks, process.why = False, ""
+    run.changed()
+    if run.ending is not None or run.change is not None:
+        return []
+    keys = [key for key, each in run.nodes.items() if run.process_of(each) is process]
+    try:
+        plan = restarted(run.plan, keys, first=run.first)
+    except PlanError as error:
+        found = Failure(rule=START_FAILED.id, subject=run.plan.system, message=error.message)
+        return failure.fail(run, found)
+    run.plan = plan
+    for key, node in run.nodes.items():
+        node.planned = plan.node(key)
+    return []
+
+
+def _silent(run: Run, given: inputs.Silent) -> list[Event]:
+    node = run.nodes.get(given.node)
+    if node is None:
+        return []
+    node.silent = given.why
+    run.changed()
+    process = run.process_of(node)
+    if process is not None:
+        hangs = bool(given.why) and given.hangs
+        since_s = run.now_s if process.hangs_s is None else process.hangs_s
+        process.hangs_s = since_s if hangs else None
+        how = process.supervision
+        process.why = (
+            f"its watchdog ended it after {how.watchdog_sec:g} s, because {given.why}"
+            if hangs
+            else ""
+        )
+    return []
+
+
+# Nodes
+
+
+def _replied(run: Run, given: inputs.Replied) -> list[Event]:
+    node = run.nodes.get(given.node)
+    if node is None or node.request is None or node.request.number != given.number:
+        return []  # it was given up
+    step, node.request = node.request.step, None
+    goal = advance.goal_of(run, node)
+    run.changed()
+    if given.changed:
+        node.let_through = False
+        if run.passage is not None:
+            run.passage.sent.discard(node.key)
+        return []
+    if given.error:
+        return _step_failed(run, node, step, given, goal)
+    node.level = given.level
+    if step in UP.values():
+        node.level = max(given.level, REACHES[step])
+    if step is Step.START:
+        _is_there(run, node)
+    elif step is Step.WIRE:
+        node.wired = True
+    elif step is Step.DISCONNECT:
+        node.wired = False
+    if step is Step.DEACTIVATE and node.level < Level.ACTIVE:
+        node.let_through = False
+    return []
+
+
+def _is_there(run: Run, node: Node) -> None:
+    process = run.processes.get(node.process)
+    if process is None:
+        node.base = Level.DOWN if node.planned.run.component else node.level
+    elif process.state is ProcessState.STARTING:
+        process.state = ProcessState.RUNNING
+
+
+def _step_failed(
+    run: Run, node: Node, step: Step, given: inputs.Replied, goal: Level
+) -> list[Event]:
+    node.level = given.level
+    is_up = step in _UPWARDS or (step is Step.DEACTIVATE and goal > Level.DOWN)
+    if not is_up or run.ending is not None:
+        if not is_up:
+            node.level = REACHES[step]  # the next step is tried all the same
+        return [Notice(message=given.error)]
+    rules = {Step.START: START_FAILED, Step.WIRE: NOT_WIRED}
+    what = rules.get(step, TRANSITION_FAILED)
+    return failure.fail(run, failure.of_step(run, node, what, given.error))
+
+
+def _saw(run: Run, given: inputs.Saw) -> list[Event]:
+    events: list[Event] = []
+    for key, level in given.levels.items():
+        node = run.nodes.get(key)
+        if node is None:
+            continue
+        run.changed()
+        idle = node.request is None and node.level in (Level.CONFIGURED, Level.CONNECTED)
+        if level is Level.ACTIVE and idle and not node.let_through:
+            node.level, node.guarded = Level.ACTIVE, node.guarded + 1
+            text = f"{node.name!r} was activated by its own code or another client while the "
+            events.append(Notice(message=f"{text}gate is closed"))
+    for key, healthy in given.health.items():
+        if key in run.nodes and run.nodes[key].healthy != healthy:
+            run.nodes[key].healthy = healthy
+            run.changed()
+    for key, conditions in given.elsewhere.items():
+        if run.elsewhere.get(key) != conditions:
+            run.elsewhere = {**run.elsewhere, key: conditions}
+            run.changed()
+    for node in run.nodes.values():
+        node.wirable = not run.options.wires or node.wirable or node.key in given.wirable
+    return events
+
+
+# Everything else
+
+
+def _verified(run: Run, given: inputs.Verified) -> list[Event]:
+    events = gate.take_verdict(run, given, advance.away(run), advance.stage_of(run))
+    node = run.nodes.get(given.undiscovered)
+    if node is not None and run.passage is None:
+        for each in run.nodes_of(node.process):
+            each.renew = True
+    return events
+
+
+def _given(run: Run, given: inputs.Given) -> list[Event]:
+    run.changed()
+    switch, change = run.switch, run.change
+    if switch is not None and given.node in switch.asked:
+        switch.asked.discard(given.node)
+        if given.error and not switch.back:
+            text = f"cannot enter mode {switch.mode!r}: {given.error}"
+            return leave_mode(run, switch.before, text, ExitCode.BRING_UP_FAILED)
+    elif change is not None and given.node in change.giving:
+        change.giving.discard(given.node)
+        if given.error:
+            return refused_parameters(run, given.node, given.error)
+    return []
+
+
+def _ready(run: Run, given: inputs.Ready) -> list[Event]:
+    if run.order is None or run.ready is not False:
+        return []
+    if given.error:
+        what = run.order.node or run.plan.system
+        text = f"cannot {run.order.ask.value} {what!r}: {given.error}; everything stays as it is"
+        run.answer(ExitCode.BRING_UP_FAILED, text)
+        return []
+    run.ready = True
+    return orders.begin(run)
+
+
+def _stop(run: Run, given: inputs.Stop) -> list[Event]:
+    if run.ending is None:
+        return failure.stop(run, given.reason, ExitCode(given.code))
+    run.hurry = run.hurry or given.hurries
+    return []
+
+
+def _left(run: Run, given: inputs.Left) -> list[Event]:
+    run.left = given.nodes
+    run.changed()
+    return []
+
+
+def _broken(run: Run, given: inputs.Broken) -> list[Event]:
+    found = Failure(rule=given.rule, subject=given.subject, message=given.message)
+    return [] if run.ending else failure.fail(run, found)
+
+
+def _changed(run: Run, _: inputs.Changed) -> list[Event]:
+    run.changed()
+    return []
+
+
+_HANDLERS: dict[type, Callable[[Run, Any], list[Event]]] = {
+    inputs.Tick: lambda _run, _given: [],
+    inputs.Spawned: _spawned,
+    inputs.Exited: _exited,
+    inputs.Swept: _swept,
+    inputs.Replied: _replied,
+    inputs.Saw: _saw,
+    inputs.Changed: _changed,
+    inputs.Verified: _verified,
+    inputs.Programmed: lambda run, given: passing.programmed(run, given.error),
+    inputs.Given: _given,
+    inputs.Ready: _ready,
+    inputs.Ordered: lambda run, given: orders.take_order(run, given.order),
+    inputs.Stop: _stop,
+    inputs.Silent: _silent,
+    inputs.Left: _left,
+    inputs.Broken: _broken,
+}
+
+
+# Time
+
+
+def _waited(run: Run, given: inputs.Tick, passed_s: float) -> None:
+    for node in run.nodes.values():
+        if node.request is not None:
+            waited_s = given.waited_s.get(node.process, 0.0)
+            node.request.waited_s += min(max(waited_s, 0.0), passed_s)
+
+
+def _due(run: Run) -> list[Event]:
+    events: list[Event] = []
+    for node in [*run.nodes.values()]:
+        if node.request is not None and run.now_s >= advance.late_at_s(node.request):
+            events += _late(run, node, node.request)
+    for process in run.processes.values():
+        if run.now_s >= advance.barks_at_s(process):
+            process.barks = True
+    gate.see_violations(run, advance.away(run))
+    return events
+
+
+def _late(run: Run, node: Node, request: Request) -> list[Event]:
+    goal = advance.goal_of(run, node)
+    late = failure.too_late(run, node, request.limit_s)
+    node.request, node.stuck = None, True
+    run.changed()
+    if run.ending is not None or goal is Level.DOWN or request.step is Step.UNLOAD:
+        what = f"{request.step.value} {node.name!r} within {request.limit_s:g} s"
+        return [Notice(message=f"cannot {what}; its process is ended all the same")]
+    return failure.fail(run, late)
+
+
+# What follows from the state alone
+
+
+def _has_failed(run: Run) -> bool:
+    """Return whether the run ends now: nothing is in a step, or a moment is over."""
+    busy = any(each.request is not None for each in run.nodes.values())
+    return not busy or run.now_s >= run.fails_s
+
+
+def _give_up_steps(run: Run) -> None:
+    """Give up steps upwards of nodes that are to be down: their processes end."""
+    for node in run.nodes.values():
+        request = node.request
+        if request is None or advance.wanted(run, node) is not Level.DOWN:
+            continue
+        if run.hurry or (request.step in _UPWARDS and node.process):
+            node.request, node.stuck = None, True
+
+
+def _begin_anew(run: Run) -> None:
+    """Let nodes come up again that went down once, with all of their process."""
+    for node in run.nodes.values():
+        process = run.processes.get(node.process)
+        if node.renew and node.is_down and (process is None or process.state is None):
+            node.renew = node.stuck = False
+
+
+def _hold(run: Run) -> list[Event]:
+    """Hold the system once it is up, and end the run once it was held for as long as asked."""
+    if run.held_s is None:
+        if run.attempt is None and run.passage is None and not run.failures and run.furthest:
+            run.held_s = run.now_s
+        return []
+    hold_s = run.options.hold_s
+    if hold_s is None or run.now_s < run.held_s + hold_s or run.order is not None or run.failures:
+        return []
+    judged = run.judged
+    waits = judged.mark != run.mark and any(
+        each.level is Level.ACTIVE for each in run.nodes.values()
+    )
+    if run.options.until < Level.ACTIVE and not run.options.verifies:
+        waits = not (gate.allows(run) and judged.mark == run.mark)
+    waits = waits and run.now_s < run.held_s + hold_s + advance.GLANCE_S
+    return [] if waits else failure.end_done(run)
+
+
+def _returned(run: Run) -> list[Event]:
+    """Say of processes that failed that they are as far again as they are to be."""
+    events: list[Event] = []
+    for process in run.processes.values():
+        if process.away_s is None or process.failed or process.state is not ProcessState.RUNNING:
+            continue
+        members = [*run.nodes_of(process.name)]
+        if all(each.level >= max(advance.wanted(run, each), Level.STARTED) for each in members):
+            events.append(
+                Restarted(
+                    process=process.name,
+                    nodes=tuple(each.name for each in members),
+                    restarts=process.restarts,
+                    took_s=run.now_s - process.away_s,
+                )
+            )
+            process.away_s = None
+    return events

@@ -1,0 +1,574 @@
+"""What is true of one run now: `Run`, its nodes, processes and orders.
+
+Owns: the types that `take` changes and `advance` reads, and the words for how far a node is. All of
+a run is here: nothing is kept in a coroutine, a timer or a callback. Pure.
+
+    node     DOWN ─start▶ STARTED ─configure▶ CONFIGURED ─connect▶ CONNECTED ─activate▶ ACTIVE
+                  ◀shutdown       ◀cleanup             ◀disconnect         ◀deactivate
+    process  none ─spawn▶ STARTING ─nodes are there▶ RUNNING ─▶ STOPPING ─▶ EXITED ─swept▶ none
+"""
+
+from __future__ import annotations
+
+import enum
+from collections import deque
+from collections.abc import Iterable, Iterator
+
+import msgspec
+
+from lifecycle.errors import ExitCode
+from lifecycle.manifest.model import Condition, RunKind, Supervision, TargetState
+from lifecycle.plan.change import GivenParameters, PlanChange
+from lifecycle.plan.model import Plan, PlannedNode, PlannedProcess
+from lifecycle.supervisor.control.protocol import ControlRequest, Failed, ProcessState
+from lifecycle.supervisor.core.inputs import Exited
+from lifecycle.supervisor.policy.restart import RestartPolicy
+from lifecycle.supervisor.run.events import Failure
+from lifecycle.verify.verdict import Verdict
+
+NEVER_S = float("inf")
+
+
+class Level(enum.IntEnum):
+    """How far a node is, or is to be."""
+
+    DOWN = 0
+    STARTED = 1
+    CONFIGURED = 2
+    CONNECTED = 3
+    ACTIVE = 4
+
+
+class Step(enum.Enum):
+    """What is asked of one node; answered by one `Replied`."""
+
+    START = "start"  # be there: its host is ready, it appears, its container has loaded it
+    CONFIGURE = "configure"
+    WIRE = "wire"  # the authority's connections and mappings
+    CONNECT = "connect"
+    ACTIVATE = "activate"
+    DEACTIVATE = "deactivate"
+    DISCONNECT = "disconnect"
+    CLEANUP = "cleanup"
+    SHUTDOWN = "shutdown"
+    UNLOAD = "unload"
+
+
+UP = {
+    Level.STARTED: Step.START,
+    Level.CONFIGURED: Step.CONFIGURE,
+    Level.CONNECTED: Step.CONNECT,
+    Level.ACTIVE: Step.ACTIVATE,
+}
+"""The step that reaches a level from the one below it."""
+
+DOWNWARDS = {
+    Level.ACTIVE: Step.DEACTIVATE,
+    Level.CONNECTED: Step.DISCONNECT,
+    Level.CONFIGURED: Step.CLEANUP,
+    Level.STARTED: Step.SHUTDOWN,
+}
+"""The step that leaves a level."""
+
+REACHES = {
+    **{step: level for level, step in UP.items()},
+    Step.WIRE: Level.CONFIGURED,
+    Step.DEACTIVATE: Level.CONNECTED,
+    Step.DISCONNECT: Level.CONFIGURED,
+    Step.CLEANUP: Level.STARTED,
+    Step.SHUTDOWN: Level.DOWN,
+    Step.UNLOAD: Level.DOWN,
+}
+"""Where a managed node is after a step."""
+
+HOLDS = {
+    Condition.STARTED: Level.STARTED,
+    Condition.CONFIGURED: Level.CONFIGURED,
+    Condition.CONNECTED: Level.CONNECTED,
+    Condition.ACTIVE: Level.ACTIVE,
+    Condition.HEALTHY: Level.ACTIVE,
+}
+"""The level that a condition of `after` stands for, in both nodes."""
+
+
+class Request(msgspec.Struct, kw_only=True):
+    """The one request to a node that is not answered yet; what it waited without CPU is free."""
+
+    number: int
+    step: Step
+    since_s: float
+    limit_s: float
+    waited_s: float = 0.0
+
+
+class Node(msgspec.Struct, kw_only=True):
+    """One node that this supervisor brings up.
+
+    Attributes:
+        process: name of its process; empty for one that this supervisor does not start.
+        base: how far it was found; it is not taken further down. DOWN for one that we start.
+        wirable: the authority knows how it is to be connected; `wired`: it is.
+        stuck: a request to it was given up; a further one would wait behind it.
+        silent: why it cannot be reached; empty while it can.
+        renew: it is to go down once, whatever it is wanted to be.
+        due_s: it is not started before.
+        withheld: why a consequence keeps it inactive until a person lets it through the gate.
+        refused: its gate stayed closed for an order; it is let through by the next one.
+        let_through: it was sent its activate request, and may be active.
+        guarded: how often it was deactivated because others activated it.
+    """
+
+    planned: PlannedNode
+    process: str = ""
+    level: Level = Level.DOWN
+    base: Level = Level.DOWN
+    request: Request | None = None
+    wirable: bool = True
+    wired: bool = False
+    healthy: bool = False
+    stuck: bool = False
+    silent: str = ""
+    renew: bool = False
+    due_s: float = 0.0
+    withheld: str = ""
+    refused: bool = False
+    let_through: bool = False
+    guarded: int = 0
+
+    @property
+    def key(self) -> str:
+        """Its key in the manifest."""
+        return self.planned.key
+
+    @property
+    def name(self) -> str:
+        """Fully qualified node name."""
+        return self.planned.full_name
+
+    @property
+    def levels(self) -> tuple[Level, ...]:
+        """The levels that it has, in order: a plain node is neither configured nor connected."""
+        if self.planned.managed:
+            top = {TargetState.UNCONFIGURED: Level.STARTED, TargetState.INACTIVE: Level.CONNECTED}
+            last = top.get(self.planned.state, Level.ACTIVE)
+            return tuple(each for each in Level if each <= last)
+        held = self.planned.holds and self.planned.state is TargetState.ACTIVE
+        return (Level.DOWN, Level.STARTED, *((Level.ACTIVE,) if held else ()))
+
+    @property
+    def gate(self) -> Level:
+        """The level at which it waits for the gate, or is left without one."""
+        return max(each for each in self.levels if each < Level.ACTIVE)
+
+    @property
+    def is_gated(self) -> bool:
+        """Whether the manifest has it active, by leave of the gate."""
+        return self.planned.holds and self.planned.state is TargetState.ACTIVE
+
+    @property
+    def is_down(self) -> bool:
+        """Whether nothing is left to undo; what others run and does not answer is left to them."""
+        given_up = self.stuck and not self.process
+        return self.request is None and (self.level <= self.base or given_up)
+
+    @property
+    def may_be_at(self) -> Level:
+        """The highest level that it may have: a request that is not answered may be carried out."""
+        asked = Level.DOWN if self.request is None else REACHES[self.request.step]
+        return max(self.level, asked)
+
+
+class Process(msgspec.Struct, kw_only=True):
+    """One process that this supervisor starts.
+
+    Attributes:
+        state: None before it is started, and once nothing is left of it.
+        end: how it ended; None while it has not.
+        sweeping: what it left is being ended, and forgotten by the graph.
+        policy: when it is started again, over all of its lives; None before the first.
+        by_hand: it is started next by a person, and its failures are forgotten.
+        failed: it is started next because it failed.
+        away_s: when it failed; None once it is as far again as it is to be.
+        asked: index of the step of its escalation that was taken last; -1 before.
+        asked_until_s: then the next one is taken.
+        sent: signals that it was sent.
+        stays_down: it is not started again: it ended as it may, or the run goes on without it.
+        hangs_s: since when it is stopped or hangs; None while it does not.
+        barks: its watchdog ends it.
+        why: said of its end: why its watchdog ended it.
+    """
+
+    planned: PlannedProcess
+    supervision: Supervision
+    may_end: bool = False
+    state: ProcessState | None = None
+    pid: int = 0
+    end: Exited | None = None
+    sweeping: bool = False
+    policy: RestartPolicy | None = None
+    by_hand: bool = False
+    failures: list[Failed] = []
+    failed: bool = False
+    away_s: float | None = None
+    asked: int = -1
+    asked_until_s: float = NEVER_S
+    sent: list[int] = []
+    stays_down: bool = False
+    hangs_s: float | None = None
+    barks: bool = False
+    why: str = ""
+
+    @property
+    def name(self) -> str:
+        """The planned name."""
+        return self.planned.name
+
+    @property
+    def restarts(self) -> int:
+        """How often it was started again after a failure."""
+        return 0 if self.policy is None else self.policy.restarts
+
+    def started(self, now_s: float) -> None:
+        """Count a start: StartLimitBurst= applies to all kinds of them (systemd.unit(5))."""
+        if self.policy is None or self.policy.how != self.supervision:
+            self.policy = RestartPolicy(self.supervision, now_s)
+        elif self.by_hand:
+            self.policy.reset(now_s)
+        else:
+            self.policy.started(now_s, after_failure=self.failed)
+        self.failed = self.by_hand = False
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether it was started and has not ended."""
+        return self.state in (ProcessState.STARTING, ProcessState.RUNNING, ProcessState.STOPPING)
+
+    @property
+    def is_over(self) -> bool:
+        """Whether it ended by itself as all of its nodes may: with exit status 0."""
+        return self.may_end and self.end is not None and self.end.status == 0
+
+
+class Order(msgspec.Struct, kw_only=True, frozen=True):
+    """What a person, or a ROS client, has ordered.
+
+    Attributes:
+        id: by which it is answered, once.
+        node: for RESTART, key or full name; empty for the whole system.
+        timeout_s: for APPLY; 0 is as long as a bring-up may take.
+    """
+
+    id: int
+    ask: ControlRequest
+    node: str = ""
+    mode: str = ""
+    plan: Plan | None = None
+    timeout_s: float = 0.0
+
+
+class Passage(msgspec.Struct, kw_only=True):
+    """Nodes that pass the gate: from the verdict that opens it to the one on what they became.
+
+    Attributes:
+        waiting: keys of the nodes; `sent`: of those that were sent their requests.
+        programming: networks are being programmed with `flows`; `programmed`: they have them.
+        opened: the gate is open for the nodes, as far as nothing changes.
+        until_s: for so long what changes meanwhile may heal.
+        late_s: then they must be active.
+        paused: the system was paused before.
+    """
+
+    waiting: tuple[str, ...]
+    until_s: float
+    late_s: float
+    flows: object = None
+    paused: bool = False
+    sent: set[str] = msgspec.field(default_factory=set)
+    programming: bool = False
+    programmed: bool = False
+    opened: bool = False
+
+
+class Attempt(msgspec.Struct, kw_only=True):
+    """Somebody waits for the gate: a bring-up, or an order.
+
+    Attributes:
+        until_s: when its time is over; it begins anew when all are at the gate.
+        at_gate: the nodes have come as far.
+        mark: of the moment at which they had.
+        judges: the gate is to open; else they are only to come to it.
+        activates: nodes are let through; else the system is only verified.
+        keys: of those that are, also where an order or a consequence kept them; None for all.
+        mode: to go back to where the gate stays closed; empty for an attempt of another kind.
+    """
+
+    until_s: float
+    at_gate: bool = False
+    mark: int = 0
+    judges: bool = True
+    activates: bool = True
+    keys: frozenset[str] | None = None
+    mode: str = ""
+
+    def asks_for(self, key: str) -> bool:
+        """Return whether a node is to be let through that was kept inactive until now."""
+        return self.activates and (self.keys is None or key in self.keys)
+
+
+class Switch(msgspec.Struct, kw_only=True):
+    """Another mode is being entered.
+
+    Attributes:
+        active: keys of the nodes that were to be active before.
+        to_ask: keys of those that are to be given parameters; `asked`: that have not answered.
+        back: the system goes back to the mode before.
+    """
+
+    mode: str
+    before: str
+    active: frozenset[str]
+    to_ask: set[str]
+    asked: set[str] = msgspec.field(default_factory=set)
+    back: bool = False
+
+
+class Change(msgspec.Struct, kw_only=True):
+    """Another manifest is being applied, or taken back.
+
+    Attributes:
+        before: the manifest that was in force; likewise revision and mode.
+        active: keys of the nodes that were active, or had failed and were to be again.
+        touched: keys of the nodes that were taken down, or are new.
+        down: keys of the nodes that go down before the manifest is taken.
+        to_give: parameters of running nodes that are to be set first; `giving`: who has to answer.
+        given: what nodes were asked to take; who did not answer may have taken it.
+        taken: the manifest is in force.
+        back: the system goes back to the manifest before.
+        ends: what failed of others meanwhile, and ends the run.
+    """
+
+    plan: Plan
+    change: PlanChange
+    before: Plan
+    revision: int
+    mode: str
+    active: frozenset[str]
+    until_s: float
+    touched: set[str] = msgspec.field(default_factory=set)
+    down: set[str] = msgspec.field(default_factory=set)
+    to_give: dict[str, GivenParameters] = {}
+    giving: set[str] = msgspec.field(default_factory=set)
+    given: dict[str, GivenParameters] = {}
+    taken: bool = False
+    back: bool = False
+    reason: str = ""
+    code: ExitCode = ExitCode.OK
+    state: str = ""
+    ends: list[Failure] = []
+
+
+class Judged(msgspec.Struct, kw_only=True):
+    """What is known by verdicts; see gate.py.
+
+    Attributes:
+        verdict: the latest; None before the first.
+        mark: of the moment that it is of.
+        again_s: look again then, although nothing is known to have changed.
+        since_s: since when its findings are the same, `found`.
+        violated: since when each violation lasts.
+        counted: the first that lasted, as text; it is in the exit code.
+        passed: what was violated, and whether it lasted.
+        asked: violations that a consequence is asked for, and since when.
+        tried: those for which a mode was entered.
+    """
+
+    verdict: Verdict | None = None
+    mark: int = -1
+    looking: bool = False
+    again_s: float = NEVER_S
+    since_s: float = 0.0
+    found: frozenset[tuple[str, str]] = frozenset()
+    violated: dict[tuple[str, str, str, str], float] = {}
+    counted: str = ""
+    passed: dict[str, bool] = {}
+    asked: dict[tuple[str, str, str, str], float] = {}
+    tried: set[tuple[str, str, str, str]] = msgspec.field(default_factory=set)
+
+
+class Ending(msgspec.Struct, kw_only=True):
+    """Why the run ends: in short, and as the report has it."""
+
+    code: ExitCode
+    stopping: str
+    reason: str
+    failures: tuple[Failure, ...] = ()
+
+
+class Options(msgspec.Struct, kw_only=True, frozen=True):
+    """What a person asked of the run.
+
+    Attributes:
+        until: how far the system is brought: CONNECTED; CONFIGURED stands for nothing.
+        verifies: with `until` CONNECTED: the gate is judged, and nothing let through.
+        hold_s: the system is held for so long; None until it is asked to end.
+        timeout_s: for a bring-up, and for each order.
+        gate_s: of these at the gate at most.
+        wires: an authority connects nodes between their configure and their connect.
+    """
+
+    until: Level = Level.ACTIVE
+    verifies: bool = False
+    hold_s: float | None = None
+    timeout_s: float = 30.0
+    gate_s: float = 30.0
+    strict: bool = False
+    keep_going: bool = False
+    wires: bool = False
+
+
+class Run(msgspec.Struct, kw_only=True):
+    """One run of one system: all that its supervisor decides by.
+
+    Attributes:
+        plan: as it must be now: in its mode, with the ports of what was started again.
+        first: as it was made from the manifest in force.
+        elsewhere: conditions that nodes of other supervisors have reached, by key.
+        left: full names of nodes whose supervisor was shut down, and said so.
+        mark: counts what may change a verdict.
+        requests: counts what nodes were asked.
+        furthest: "connected", "verified" or "active", as far as it came; empty before.
+        held_s: since when it is held; None before it was up.
+        ready: None: it has still to be known whether processes can be started; False: it is asked.
+        failures: that end the run, as soon as what is in a step has failed, too, or not.
+        fails_s: then it ends all the same.
+        deaths: of processes that died while they were taken down, or that the run went on without.
+        outbox: answers to orders that have not been sent.
+    """
+
+    options: Options
+    plan: Plan
+    first: Plan
+    nodes: dict[str, Node]
+    processes: dict[str, Process]
+    elsewhere: dict[str, frozenset[Condition]] = {}
+    left: frozenset[str] = frozenset()
+    revision: int = 1
+    revisions: int = 1
+    mode: str = ""
+    now_s: float = 0.0
+    mark: int = 0
+    requests: int = 0
+    judged: Judged = msgspec.field(default_factory=Judged)
+    furthest: str = ""
+    held_s: float | None = None
+    paused: bool = False
+    attempt: Attempt | None = None
+    passage: Passage | None = None
+    orders: deque[Order] = msgspec.field(default_factory=deque)
+    order: Order | None = None
+    ready: bool | None = None
+    switch: Switch | None = None
+    change: Change | None = None
+    failures: list[Failure] = []
+    fails_s: float = NEVER_S
+    ending: Ending | None = None
+    deaths: list[Failure] = []
+    hurry: bool = False
+    outbox: list[tuple[int, ExitCode, str]] = []
+    trusted: str = ""
+
+    @property
+    def is_over(self) -> bool:
+        """Whether it has ended and nothing of it runs."""
+        return (
+            self.ending is not None
+            and all(each.state is None and not each.sweeping for each in self.processes.values())
+            and all(
+                each.level <= each.base or each.stuck or each.silent or self.hurry
+                for each in self.nodes.values()
+            )
+        )
+
+    def node_named(self, name: str) -> Node | None:
+        """Return the node with this fully qualified name; None if it is not ours."""
+        return next((each for each in self.nodes.values() if each.name == name), None)
+
+    def nodes_of(self, process: str) -> Iterator[Node]:
+        """Yield the nodes in a process."""
+        return (each for each in self.nodes.values() if each.process == process)
+
+    def process_of(self, node: Node) -> Process | None:
+        """Return the process that a node is in: a component's is its container's."""
+        container = self.nodes.get(node.planned.run.container)
+        name = container.process if container is not None and not node.process else node.process
+        return self.processes.get(name)
+
+    def dependents(self, key: str) -> Iterator[Node]:
+        """Yield the nodes that depend on one: those that go down before it."""
+        return (
+            each
+            for each in self.nodes.values()
+            if each.planned.run.container == key
+            or any(after.node == key for after in each.planned.after)
+        )
+
+    def answer(self, code: ExitCode, error: str = "") -> None:
+        """Answer the order that is carried out, and be done with it."""
+        if self.order is not None:
+            self.outbox = [*self.outbox, (self.order.id, code, error)]
+        self.order, self.ready = None, None
+
+    def whole(self, keys: Iterable[str]) -> tuple[str, ...]:
+        """Return the keys with those of all that comes and goes with these nodes."""
+        found, more = set[str](), set(keys)
+        while more != found:
+            found, processes = set(more), {self.nodes[key].process for key in more} - {""}
+            for key, node in self.nodes.items():
+                if node.process in processes or node.planned.run.container in found:
+                    more.add(key)
+        return tuple(key for key in self.nodes if key in found)
+
+    def changed(self) -> None:
+        """Note that something may be other than the last verdict saw it."""
+        self.mark += 1
+
+
+def new_run(plan: Plan, options: Options, *, own: frozenset[str] | None = None) -> Run:
+    """Return a run that begins now, with nothing started.
+
+    Args:
+        plan: in its first mode.
+        options: of the person.
+        own: names of the processes that are this supervisor's; None for all.
+    """
+    run = Run(options=options, plan=plan, first=plan, nodes={}, processes={})
+    run.mode = plan.modes[0].name if plan.modes else ""
+    install(run, plan, own=own)
+    run.elsewhere = {each.key: frozenset() for each in plan.nodes if each.key not in run.nodes}
+    active = options.until is Level.ACTIVE
+    judges = active or options.verifies
+    run.attempt = Attempt(until_s=options.timeout_s, activates=active, judges=judges)
+    return run
+
+
+def install(run: Run, plan: Plan, *, own: frozenset[str] | None = None) -> None:
+    """Give a run the nodes and processes of a plan; those that it has keep what is true of them."""
+    nodes, processes = run.nodes, run.processes
+    run.plan, run.nodes, run.processes = plan, {}, {}
+    for planned in plan.processes:
+        if own is not None and planned.name not in own:
+            continue
+        members = [plan.node(key) for key in planned.nodes]
+        started = planned.run.kind is not RunKind.ATTACH
+        if started:
+            supervision = members[0].supervision if members else Supervision()
+            process = processes.get(planned.name) or Process(
+                planned=planned, supervision=supervision
+            )
+            process.planned, process.supervision = planned, supervision
+            process.may_end = bool(members) and all(each.may_end for each in members)
+            run.processes[planned.name] = process
+        for each in members:
+            node = run.nodes[each.key] = nodes.get(each.key) or Node(planned=each)
+            node.planned = each
+            node.process = planned.name if started else ""

@@ -1,0 +1,159 @@
+"""A story as a script: an input, and what the reducer wants done then, in words.
+
+`Play` answers each effect at once and well, unless `ways` says otherwise, and keeps what was asked:
+`spawn camera`, `camera configure`, `look`, `program`, `signal camera 15`, `sweep camera`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from lifecycle.errors import ExitCode
+from lifecycle.plan.model import Plan
+from lifecycle.supervisor.control.protocol import ControlRequest
+from lifecycle.supervisor.core import effects, inputs
+from lifecycle.supervisor.core.advance import advance, phase_of
+from lifecycle.supervisor.core.failure import exit_code_of
+from lifecycle.supervisor.core.reduce import take
+from lifecycle.supervisor.core.state import REACHES, Level, Options, Order, Step, new_run
+from lifecycle.verify.verdict import Verdict
+from tests.unit.supervisor.core.world import verdict
+
+
+class Play:
+    """One run; `ways`: what is asked → an error, "hang", "die" or "changed", for as long as so.
+
+    Attributes:
+        asked: since `said` was last called.
+        events: all that was said.
+        answers: to orders, by their number.
+        found: the verdict of each look.
+    """
+
+    def __init__(self, plan: Plan, ways: Mapping[str, str] = {}, **options: Any) -> None:
+        self.run = new_run(plan, Options(**options))
+        self.ways = dict(ways)
+        self.asked: list[str] = []
+        self.events: list[Any] = []
+        self.answers: dict[int, tuple[ExitCode, str]] = {}
+        self.found: Verdict = verdict()
+        self.wake_s = float("inf")
+        self.now_s = 0.0
+        self.held: list[Any] = []
+        self.give(inputs.Tick())
+
+    def give(self, given: Any) -> list[str]:
+        """Have something happen; return what is asked until all is quiet."""
+        todo = self._step(given)
+        while todo:
+            answer = self._answer(todo.pop(0))
+            if answer is not None:
+                todo += self._step(answer)
+        return self.said()
+
+    def said(self) -> list[str]:
+        """Return what was asked, looks left out, and forget it."""
+        asked, self.asked = self.asked, []
+        return [each for each in asked if each != "look"]
+
+    def wait(self, seconds: float) -> list[str]:
+        """Let time pass, with a tick whenever one was asked for."""
+        until_s = self.now_s + seconds
+        found: list[str] = []
+        while self.wake_s <= until_s:
+            self.now_s = self.wake_s
+            found += self.give(inputs.Tick())
+        self.now_s = until_s
+        return [*found, *self.give(inputs.Tick())]
+
+    def order(self, ask: ControlRequest, **what: Any) -> list[str]:
+        """Order something; its number is that of the orders before it."""
+        number = len(self.answers) + len(self.run.orders) + (self.run.order is not None)
+        return self.give(inputs.Ordered(order=Order(id=number, ask=ask, **what)))
+
+    def down(self) -> list[str]:
+        return self.give(inputs.Stop(reason="lifecycle down", code=ExitCode.BRING_UP_FAILED))
+
+    def die(self, process: str, status: int | None = None) -> list[str]:
+        number = 11 if status is None else 0
+        return self.give(inputs.Exited(process=process, status=status, signal=number, text="gone"))
+
+    def see(self, *found: tuple[str, str]) -> list[str]:
+        """Have the next looks find this."""
+        self.found = verdict(*found)
+        return self.give(inputs.Changed())
+
+    @property
+    def phase(self) -> str:
+        return phase_of(self.run)
+
+    @property
+    def code(self) -> int:
+        """The exit code of the run, which is over."""
+        assert self.run.is_over
+        return int(exit_code_of(self.run))
+
+    @property
+    def levels(self) -> str:
+        """How far all nodes are, `4 3`."""
+        return " ".join(str(int(each.level)) for each in self.run.nodes.values())
+
+    def _step(self, given: Any) -> list[Any]:
+        self.events += take(self.run, self.now_s, given)
+        self.wake_s = float("inf")
+        todo = []
+        for each in advance(self.run):
+            if isinstance(each, effects.Wake):
+                self.wake_s = each.at_s
+            elif isinstance(each, effects.Answer):
+                self.answers[each.order] = (each.code, each.error)
+            else:
+                self.asked.append(_words(each))
+                todo.append(each)
+        return todo
+
+    def _answer(self, effect: Any) -> Any:
+        way = self.ways.get(_words(effect), "")
+        if way == "hang":
+            self.held.append(effect)
+            return None
+        if isinstance(effect, effects.Ask):
+            node = self.run.nodes[effect.node]
+            if way == "die":
+                return inputs.Exited(process=node.process, signal=11, text="gone")
+            level = node.level if way else REACHES[effect.step]
+            if not node.planned.managed and effect.step is Step.DEACTIVATE:
+                level = Level.STARTED
+            changed, error = way == "changed", "" if way == "changed" else way
+            return inputs.Replied(
+                node=effect.node, number=effect.number, level=level, error=error, changed=changed
+            )
+        if isinstance(effect, effects.Signal):
+            number = effect.number
+            return inputs.Exited(
+                process=effect.process,
+                status=None if number else 0,
+                signal=number,
+                text="gone",
+                clean=number != 9,
+            )
+        return {
+            effects.Spawn: lambda: inputs.Spawned(process=effect.process, pid=1, error=way),
+            effects.Sweep: lambda: inputs.Swept(process=effect.process),
+            effects.Look: lambda: inputs.Verified(mark=effect.mark, verdict=self.found),
+            effects.Program: lambda: inputs.Programmed(error=way),
+            effects.Give: lambda: inputs.Given(node=effect.node, error=way),
+            effects.Prepare: lambda: inputs.Ready(error=way),
+        }[type(effect)]()
+
+
+def _words(effect: Any) -> str:
+    name = type(effect).__name__.lower()
+    if isinstance(effect, effects.Ask):
+        return f"{effect.node} {effect.step.value}"
+    if isinstance(effect, effects.Signal):
+        return f"signal {effect.process} {effect.number}"
+    if isinstance(effect, effects.Spawn | effects.Sweep):
+        return f"{name} {effect.process}"
+    return f"give {effect.node}" if isinstance(effect, effects.Give) else name
