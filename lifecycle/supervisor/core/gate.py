@@ -134,7 +134,7 @@ def take_verdict(run: Run, given: Verified, away: Collection[str], stage: Stage)
 def is_foreign_activation(node: Node) -> bool:
     """Return whether a node is active that the gate has not let through."""
     found = node.level is Level.ACTIVE and node.base < Level.ACTIVE
-    return found and node.planned.managed and not node.let_through
+    return found and node.planned.managed and node.guarded > 0 and not node.let_through
 
 
 def _guarded(node: Node) -> Finding:
