@@ -24,7 +24,6 @@ from lifecycle.supervisor.core.change import (
 )
 from lifecycle.supervisor.core.state import (
     NEVER_S,
-    REACHES,
     UP,
     Level,
     Node,
@@ -210,7 +209,7 @@ def _replied(run: Run, given: inputs.Replied) -> list[Event]:
         return _step_failed(run, node, step, given, goal)
     node.level = given.level
     if step in UP.values():
-        node.level = max(given.level, REACHES[step])
+        node.level = max(given.level, node.after(step))
     if step is Step.START:
         _is_there(run, node)
     elif step is Step.WIRE:
@@ -237,7 +236,7 @@ def _step_failed(
     is_up = step in _UPWARDS or (step is Step.DEACTIVATE and goal > Level.DOWN)
     if not is_up or run.ending is not None:
         if not is_up:
-            node.level = REACHES[step]  # the next step is tried all the same
+            node.level = node.after(step)  # the next step is tried all the same
         return [Notice(message=given.error)]
     rules = {Step.START: START_FAILED, Step.WIRE: NOT_WIRED}
     what = rules.get(step, TRANSITION_FAILED)

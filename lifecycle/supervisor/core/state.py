@@ -174,8 +174,13 @@ class Node(msgspec.Struct, kw_only=True):
     @property
     def may_be_at(self) -> Level:
         """The highest level that it may have: a request that is not answered may be carried out."""
-        asked = Level.DOWN if self.request is None else REACHES[self.request.step]
+        asked = Level.DOWN if self.request is None else self.after(self.request.step)
         return max(self.level, asked)
+
+    def after(self, step: Step) -> Level:
+        """Return the level that it has after a step; a plain node has none between."""
+        is_plain = step is Step.DEACTIVATE and not self.planned.managed
+        return Level.STARTED if is_plain else REACHES[step]
 
 
 class Process(msgspec.Struct, kw_only=True):

@@ -58,15 +58,23 @@ def test_a_system_comes_up_along_its_order_and_goes_down_in_reverse() -> None:
     play = Play(CHAIN)
     assert play.levels == "4 4"
     assert play.phase == "active"
-    assert (
-        play.down()
-        == [
-            *(*down("viewer"), "signal viewer 0"),
-            *(*down("camera"), "sweep viewer", "signal camera 0", "sweep camera"),
-        ]
-        or play.run.is_over
-    )
+    assert play.down() == [
+        *(*down("viewer"), "signal viewer 0"),
+        *("camera deactivate", "sweep viewer", *down("camera", active=False)),
+        *("signal camera 0", "sweep camera"),
+    ]
     assert play.code == 0
+
+
+def test_a_plain_node_that_will_not_deactivate_is_started_and_no_more() -> None:
+    plain = planned_node("camera", kind=RunKind.PYTHON, managed=False, supervision=AGAIN)
+    play = Play(plan_of(plain), ways={"camera deactivate": "it failed"})
+    assert play.levels == "4"
+    play.order(ControlRequest.PAUSE)
+    assert play.levels == "4", "nobody knows it to be inactive"
+    play.ways.clear()
+    play.order(ControlRequest.RESUME)
+    assert (play.levels, play.phase) == ("4", "active")
 
 
 @pytest.mark.parametrize(

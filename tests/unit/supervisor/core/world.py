@@ -155,6 +155,7 @@ class World:
         self.answers: dict[int, int] = {}
         self.calm = False
         self.faults = r.randint(0, 10)
+        self.broke_s = 0.0
         self.stubborn = {each.name for each in self.plan.processes if r.random() < 0.2}
         connected = core.state.Level.CONNECTED
         until = r.choice([*6 * [core.state.Level.ACTIVE], connected])
@@ -202,7 +203,7 @@ class World:
                 self.break_something()
             elif self.pending:
                 self.carry_out(self.pending.pop(self.r.randrange(len(self.pending))))
-            elif self.wake_s < float("inf") and self.wake_s - self.now_s < 3600:
+            elif self.wake_s < float("inf") and not self.lasts_on(calm_since):
                 self.check_idle()
                 self.pass_time(self.wake_s)
             elif self.faults:
@@ -217,6 +218,12 @@ class World:
                 self.check_up()
                 self.stop()
         raise AssertionError(f"ends: the story never ends {self}")
+
+    def lasts_on(self, calm_since: float | None) -> bool:
+        """Whether only the end of what is broken can change anything: a hang may last for ever."""
+        wakes_late = self.wake_s - self.now_s >= 3600
+        is_broken = calm_since is None and not self.faults and self.run.ending is None
+        return wakes_late or (is_broken and self.now_s - self.broke_s > 600)
 
     def pass_time(self, to_s: float) -> None:
         self.now_s = to_s
@@ -285,6 +292,8 @@ class World:
                 )
             return
         level = self.core.state.REACHES[effect.step]
+        if effect.step.value == "deactivate" and not node.planned.managed:
+            level = self.core.state.Level.STARTED  # it has no state between
         self.level_of[effect.node] = int(level)
         if effect.step.value == "deactivate":
             self.let.discard(effect.node)
@@ -336,6 +345,7 @@ class World:
 
     def break_something(self) -> None:
         r, inputs = self.r, self.core.inputs
+        self.broke_s = self.now_s
         what = r.choice([*2 * ["die"], *3 * ["order"], *_FAULTS])
         living = [name for name, lives in self.alive.items() if lives]
         if what == "die" and living:
