@@ -66,13 +66,17 @@ def test_a_system_comes_up_along_its_order_and_goes_down_in_reverse() -> None:
     assert play.code == 0
 
 
-def test_a_plain_node_that_will_not_deactivate_is_started_and_no_more() -> None:
+def test_a_plain_node_that_will_not_deactivate_is_started_anew_and_has_no_level_between() -> None:
     plain = planned_node("camera", kind=RunKind.PYTHON, managed=False, supervision=AGAIN)
     play = Play(plan_of(plain), ways={"camera deactivate": "it failed"})
-    assert play.levels == "4"
     play.order(ControlRequest.PAUSE)
-    assert play.levels == "4", "nobody knows it to be inactive"
+    play.wait(5.0)
+    assert play.levels == "1"
+    play.order(ControlRequest.RESUME)
+    assert (play.levels, play.phase) == ("4", "active")
     play.ways.clear()
+    play.order(ControlRequest.PAUSE)
+    assert play.levels == "1"
     play.order(ControlRequest.RESUME)
     assert (play.levels, play.phase) == ("4", "active")
 
