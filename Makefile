@@ -41,12 +41,12 @@ demo: $(STAMP)
 	$(BIN)/lifecycle up manifests/teleop.lifecycle.yaml --stop-after 5
 
 test: $(STAMP)
-	$(PYTEST) -n $(WORKERS) --dist worksteal tests/unit
+	$(PYTEST) -n $(WORKERS) --dist worksteal -m "not thorough" tests/unit
 	$(PYTEST) -n $(WORKERS) --dist worksteal -m "not thorough and not alone" tests/ros tests/outside
 
 # What `test` leaves out: first side by side as well, then one after the other.
 test-thorough: $(STAMP)
-	$(PYTEST) -n $(WORKERS) --dist worksteal -m "thorough and not alone" tests/ros tests/net tests/outside
+	$(PYTEST) -n $(WORKERS) --dist worksteal -m "thorough and not alone" tests/unit tests/ros tests/net tests/outside
 	$(PYTEST) -m alone tests/ros tests/net
 
 # The same tests on the other distribution: what is asked, and what asks, run on it.
