@@ -44,9 +44,11 @@ test: $(STAMP)
 	$(PYTEST) -n $(WORKERS) --dist worksteal -m "not thorough" tests/unit
 	$(PYTEST) -n $(WORKERS) --dist worksteal -m "not thorough and not alone" tests/ros tests/outside
 
-# What `test` leaves out: first side by side as well, then one after the other.
+# What `test` leaves out: first side by side as well (what only computes by itself: it takes the time of others), then one
+# after the other.
 test-thorough: $(STAMP)
-	$(PYTEST) -n $(WORKERS) --dist worksteal -m "thorough and not alone" tests/unit tests/ros tests/net tests/outside
+	$(PYTEST) -n $(WORKERS) --dist worksteal -m thorough tests/unit
+	$(PYTEST) -n $(WORKERS) --dist worksteal -m "thorough and not alone" tests/ros tests/net tests/outside
 	$(PYTEST) -m alone tests/ros tests/net
 
 # The same tests on the other distribution: what is asked, and what asks, run on it.
