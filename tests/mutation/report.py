@@ -71,12 +71,17 @@ class Mutant:
             return "timed out" if self.exit_code in _TIMED_OUT else "killed"
         return "survived" if self.survived else f"undecided ({self.exit_code})"
 
-    def change(self) -> str:
-        """Return the lines that it removes and adds, each with `-` or `+`, stripped."""
+    @property
+    def texts(self) -> tuple[str, str]:
+        """The function before and after the change, both under its name before."""
         functions = _functions(self.module)
         name = self.key.rpartition(".")[2]
-        before = functions[re.sub(r"_\d+$", "_orig", name)]
-        after = functions[name].replace(name, re.sub(r"_\d+$", "_orig", name))
+        original = re.sub(r"_\d+$", "_orig", name)
+        return functions[original], functions[name].replace(name, original)
+
+    def change(self) -> str:
+        """Return the lines that it removes and adds, each with `-` or `+`, stripped."""
+        before, after = self.texts
         lines = difflib.unified_diff(before.splitlines(), after.splitlines(), n=0, lineterm="")
         changed = [line for line in lines if not line.startswith(("---", "+++", "@@"))]
         return "\n".join(f"{line[0]} {line[1:].strip()}" for line in changed)
@@ -84,12 +89,8 @@ class Mutant:
     @property
     def is_wording(self) -> bool:
         """Whether it changes words for people alone: a text with a blank in it decides nothing."""
-        functions = _functions(self.module)
-        name = self.key.rpartition(".")[2]
-        original = re.sub(r"_\d+$", "_orig", name)
-        return _without_words(functions[original]) == _without_words(
-            functions[name].replace(name, original)
-        )
+        before, after = map(_without_words, self.texts)
+        return before == after
 
     def reasons(self, allowed: Mapping[str, Sequence[str]]) -> list[str]:
         """Return which entries of `justified` are of the lines that it adds, or else removes."""

@@ -38,8 +38,8 @@ from tests.unit.verify.edits import (
     drop_node,
     drop_report,
 )
+from tests.unit.verify.lines import lines
 from tests.unit.verify.perfect import perfect
-from tests.unit.verify.told import told
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
 SERVER, CLIENT = EndpointKind.SERVICE_SERVER, EndpointKind.SERVICE_CLIENT
@@ -522,7 +522,7 @@ SAYS: dict[str, tuple[Case, list[str]]] = {
 @pytest.mark.parametrize("case", SAYS)
 def test_what_is_found_where(case: str):
     how, expected = SAYS[case]
-    assert told(findings_of(how)) == expected
+    assert lines(findings_of(how)) == expected
 
 
 WRONG = "std_srvs/srv/Empty"

@@ -29,8 +29,8 @@ from tests.unit.verify.edits import (
     change_announced_qos,
     change_endpoint,
 )
+from tests.unit.verify.lines import lines
 from tests.unit.verify.perfect import perfect
-from tests.unit.verify.told import told
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
 ATTACH = Run(kind=RunKind.ATTACH)
@@ -243,7 +243,7 @@ SAYS: dict[str, tuple[Edit, Plan, list[str]]] = {
 @pytest.mark.parametrize("case", SAYS)
 def test_what_is_found_of_qos_where(case: str):
     edit, plan, text = SAYS[case]
-    assert told(of(text[0].split()[1][:-1], edit, plan)) == text
+    assert lines(of(text[0].split()[1][:-1], edit, plan)) == text
 
 
 def open_world(*endpoints: object) -> Plan:

@@ -34,8 +34,8 @@ from tests.unit.verify.edits import (
     drop_node,
     drop_report,
 )
+from tests.unit.verify.lines import lines
 from tests.unit.verify.perfect import perfect
-from tests.unit.verify.told import told as all_told
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
 URL = "udpv4://10.77.0.1:7911?multicast=off&peer=10.77.0.2:7910"
@@ -247,7 +247,7 @@ SAYS: dict[str, tuple[Edit, Plan, list[str]]] = {
 @pytest.mark.parametrize("case", SAYS)
 def test_what_is_found_of_a_connection_where(case: str) -> None:
     edit, plan, text = SAYS[case]
-    assert all_told([told(edit, plan)]) == text
+    assert lines([told(edit, plan)]) == text
 
 
 @pytest.mark.parametrize(

@@ -35,8 +35,8 @@ from tests.unit.verify.edits import (
     drop_endpoint_report,
     drop_report,
 )
+from tests.unit.verify.lines import lines
 from tests.unit.verify.perfect import perfect
-from tests.unit.verify.told import told
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
 PLAN = build_plan(teleop(), environment={})
@@ -309,7 +309,7 @@ SAYS: dict[str, tuple[Edit, Plan, list[str]]] = {
 @pytest.mark.parametrize("case", SAYS)
 def test_what_is_found_of_a_flow_where(case: str):
     edit, plan, text = SAYS[case]
-    assert told(of_flows(edit, plan)) == text
+    assert lines(of_flows(edit, plan)) == text
 
 
 @pytest.mark.parametrize(

@@ -22,8 +22,8 @@ from lifecycle.verify.rules import RULES
 from lifecycle.verify.rules.parameters import spell
 from lifecycle.verify.verdict import Finding, Stage
 from tests.builders import at, node, planned
+from tests.unit.verify.lines import lines
 from tests.unit.verify.perfect import perfect
-from tests.unit.verify.told import told
 
 ATTACH = Run(kind=RunKind.ATTACH)
 NAN = float("nan")
@@ -252,7 +252,7 @@ SAYS: dict[str, tuple[ExpectedParameter, ParameterReport | None, list[str]]] = {
 def test_what_is_found_of_a_parameter_that_is(case: str):
     wanted, actual, text = SAYS[case]
     plan = plan_of(wanted)
-    assert told(judged(plan, served(plan, *(() if actual is None else (actual,))))) == text
+    assert lines(judged(plan, served(plan, *(() if actual is None else (actual,))))) == text
 
 
 @pytest.mark.parametrize(
@@ -343,7 +343,7 @@ def test_what_a_node_says_is_shown_short_and_without_control_characters(
 
 def test_what_cannot_be_read_is_unverifiable():
     plan = plan_of(expected(), unread_parameter_files=("arm.yaml",))
-    assert told(judged(plan, perfect(plan, Stage.ACTIVE))) == [
+    assert lines(judged(plan, perfect(plan, Stage.ACTIVE))) == [
         "unverifiable param.unverifiable: /arm: arm.yaml, /arm at 3:3",
         "unverifiable param.unverifiable: /arm, /arm at 3:3",
     ]

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from lifecycle.verify.verdict import Finding
 
 
-def told(findings: Iterable[Finding]) -> list[str]:
+def lines(findings: Iterable[Finding]) -> list[str]:
     """Return outcome, rule, subject, node and place (line:column) of each finding."""
     return [_line(each) for each in findings]
 
