@@ -17,7 +17,7 @@ import os
 import re
 import stat
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from lifecycle.errors import MiddlewareError
@@ -142,30 +142,51 @@ def _unused(*, remove: bool) -> tuple[tuple[str, ...], bool]:
         if group := _group(path.name):
             with contextlib.suppress(FileNotFoundError):
                 groups.setdefault(group, {})[path] = path.lstat()
-    found: list[str] = []
-    mapped: frozenset[str] | None = None
     in_use = False
+    unowned: dict[str, dict[Path, os.stat_result]] = {}
     for group, files in groups.items():
         if not all(_is_own(each) for each in files.values()):
             continue
         if remove and any(_is_new(each) for each in files.values()):
             in_use = True
-            continue
-        with contextlib.suppress(OSError), contextlib.ExitStack() as locks:
+        else:
             # One that is locked is owned by a process.
-            owned = [locks.enter_context(_lock(each)) for each in files if _is_lock(each)]
-            if not owned or "_port" in group:
-                if mapped is None:
-                    processes = filter(str.isdigit, os.listdir("/proc"))  # noqa: PTH208 - names
-                    mapped = frozenset().union(*map(_mapped, processes))
-                if group in mapped:
-                    in_use = True
-                    continue
+            with contextlib.suppress(OSError), _locked(files):
+                unowned[group] = files
+    # Reading what all processes map takes milliseconds, in which a participant that is made would
+    # be refused its port for a lock of ours: none is held meanwhile.
+    shared = {name for name, files in unowned.items() if "_port" in name or not _locks(files)}
+    if in_others := shared and shared & _mapped_by_any():
+        in_use = True
+    found: list[str] = []
+    for group, files in unowned.items():
+        if group in in_others:
+            continue
+        with contextlib.suppress(OSError), _locked(files) if remove else contextlib.nullcontext():
             for path in files:
                 if remove:
                     path.unlink(missing_ok=True)
                 found.append(path.name)
     return tuple(sorted(found)), in_use
+
+
+def _locks(files: Iterable[Path]) -> list[Path]:
+    return [each for each in files if each.name.endswith(_LOCKS)]
+
+
+@contextlib.contextmanager
+def _locked(files: Iterable[Path]) -> Iterator[None]:
+    """Hold the locks of a group; raises OSError where a process has one."""
+    with contextlib.ExitStack() as locks:
+        for each in _locks(files):
+            locks.enter_context(_lock(each))
+        yield
+
+
+def _mapped_by_any() -> set[str]:
+    """Return the groups of which any process has a file mapped."""
+    processes = filter(str.isdigit, os.listdir("/proc"))  # noqa: PTH208 - names
+    return set().union(*map(_mapped, processes))
 
 
 @contextlib.contextmanager
@@ -193,10 +214,6 @@ def _files() -> list[Path]:
     with contextlib.suppress(FileNotFoundError):
         return list(_DIRECTORY.iterdir())
     return []
-
-
-def _is_lock(path: Path) -> bool:
-    return path.name.endswith(_LOCKS)
 
 
 def _is_own(status: os.stat_result) -> bool:

@@ -150,6 +150,24 @@ def test_all_that_is_unused_goes_but_for_what_was_made_just_now(
     assert names(directory) == ("other",)
 
 
+def test_a_port_can_be_locked_while_a_sweep_looks_who_uses_it(
+    directory: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A participant that is refused the lock of a port does without shared memory there."""
+    make(directory, *GROUP)
+    had: list[str] = []
+
+    def look(process: str) -> frozenset[str]:
+        with (directory / f"{PORT}_el").open("rb") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            had.append(process)
+        return frozenset()
+
+    monkeypatch.setattr(shared_memory, "_mapped", look)
+    assert sweep() == tuple(sorted(GROUP))
+    assert had
+
+
 def test_what_a_process_owns_is_not_waited_for(directory: Path) -> None:
     make(directory, *GROUP)
     began_s = time.monotonic()
