@@ -13,7 +13,7 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 from lifecycle.codec import from_json, to_json
@@ -36,7 +36,7 @@ from lifecycle.supervisor.processes.orphans import (
     end_left,
     end_strays,
 )
-from lifecycle.supervisor.processes.process import ProcessExit, SpawnRequest, run_delay_s
+from lifecycle.supervisor.processes.process import ManagedProcess, ProcessExit, run_delay_s
 from lifecycle.supervisor.processes.scope import scope
 
 _STATUS_WAIT_S = 1.0
@@ -55,21 +55,15 @@ class ForkServerChild:
     """A process forked by the fork server.
 
     Args:
-        on_stop: see SpawnRequest.
+        process: what it is.
         lineage: which processes descend from it.
     """
 
-    def __init__(
-        self,
-        pid: int,
-        pidfd: int,
-        on_stop: Callable[[bool], None],
-        lineage: Lineage,
-    ) -> None:
+    def __init__(self, process: ManagedProcess, pid: int, pidfd: int, lineage: Lineage) -> None:
+        self.process = process
         self.pid = pid
         self._lineage = lineage
         self.exited: asyncio.Future[ProcessExit] = asyncio.get_running_loop().create_future()
-        self.on_stop = on_stop
         self._pidfd: int | None = pidfd
         self._has_ended = False
         self._is_ours = False
@@ -130,7 +124,7 @@ class _Pending(NamedTuple):
     """A process that the fork server was asked for."""
 
     born: asyncio.Future[ForkServerChild]
-    request: SpawnRequest
+    process: ManagedProcess
 
 
 class ForkServer:
@@ -208,47 +202,55 @@ class ForkServer:
         if not self._alive:
             raise BringUpError(self.died.result() if self.died.done() else "the fork server ended")
 
-    async def spawn(self, request: SpawnRequest) -> ForkServerChild:
-        """Fork one process.
+    async def spawn(
+        self, process: ManagedProcess, streams: Sequence[int], control: int | None
+    ) -> ForkServerChild:
+        """Fork one process, in a session of its own.
+
+        Args:
+            process: what to start.
+            streams: descriptors for its standard output and error; not closed here.
+            control: descriptor of the host's end of the control channel; None for a foreign
+                command.
 
         Raises:
             BringUpError: the fork server is gone, or the system is out of processes.
         """
         try:
-            return await self._forked(request)
+            return await self._forked(process, streams, control)
         except (BringUpError, OSError) as error:
             message = error.message if isinstance(error, BringUpError) else str(error)
-            raise BringUpError(
-                f"cannot start process {request.planned.name!r}: {message}"
-            ) from error
+            raise BringUpError(f"cannot start process {process.name!r}: {message}") from error
 
-    async def _forked(self, request: SpawnRequest) -> ForkServerChild:
+    async def _forked(
+        self, process: ManagedProcess, streams: Sequence[int], control: int | None
+    ) -> ForkServerChild:
         """Have it fork; raises BringUpError if it cannot."""
         self._next += 1
-        planned, run = request.planned, request.planned.run
-        descriptors = [request.stdout, request.stderr]
+        planned, run = process.planned, process.planned.run
+        descriptors = [*streams]
         scoped = scope(run.resources)
         argv = (*scoped, *planned.argv)
-        if request.control is not None:
-            descriptors.append(request.control)
-            fresh = any(name.startswith(_FRESH_INTERPRETER) for name, _ in request.environment)
+        if control is not None:
+            descriptors.append(control)
+            fresh = any(name.startswith(_FRESH_INTERPRETER) for name, _ in process.environment)
             if fresh or run.prefix or scoped:
                 host = (sys.executable, "-m", _HOST, "--control-fd", "{control}")
                 argv = (*scoped, *run.prefix, *host)
         message = ForkRequest(
             id=self._next,
             argv=argv,
-            environment=(*request.environment, (PROCESS_VARIABLE, planned.name)),
+            environment=(*process.environment, (PROCESS_VARIABLE, planned.name)),
             working_directory=run.working_directory,
-            control=request.control is not None,
+            control=control is not None,
             limits=() if run.limits is None else run.limits.resources(),
             no_new_privileges=run.no_new_privileges,
-            grace_s=request.grace_s,
+            grace_s=process.grace_s,
         )
         born: asyncio.Future[ForkServerChild] = self._loop.create_future()
         with self._asking():
             socket.send_fds(self._process.socket, [to_json(message)], descriptors)
-        self._pending[message.id] = _Pending(born, request)
+        self._pending[message.id] = _Pending(born, process)
         return await born
 
     def belonging(self, processes: Mapping[int, str]) -> frozenset[int]:
@@ -296,7 +298,7 @@ class ForkServer:
             self._serves.set()
         elif report.stopped is not None:
             if report.id in self._children:
-                self._children[report.id].on_stop(report.stopped)
+                self._children[report.id].process.on_stop(report.stopped)
         elif report.status is not None:
             # On a loaded machine it may come later than we waited for it.
             if report.id in self._children:
@@ -306,12 +308,12 @@ class ForkServer:
         return True
 
     def _born(self, report: ChildReport, descriptors: list[int]) -> None:
-        born, request = self._pending.pop(report.id)
+        born, process = self._pending.pop(report.id)
         if report.error:
             if not born.done():
                 born.set_exception(BringUpError(report.error))
             return
-        child = ForkServerChild(report.pid, descriptors[0], request.on_stop, self._lineage)
+        child = ForkServerChild(process, report.pid, descriptors[0], self._lineage)
         self._children[report.id] = child
         child.exited.add_done_callback(lambda _: self._children.pop(report.id, None))
         if born.cancelled():

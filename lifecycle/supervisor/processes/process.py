@@ -98,30 +98,6 @@ _CRASHES = (
 )
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class SpawnRequest:
-    """One process to start, in a session of its own.
-
-    Attributes:
-        planned: what the plan declares of it.
-        environment: (name, value) on top of the spawner's own environment.
-        stdout: descriptor; the spawner does not close it.
-        stderr: descriptor.
-        control: descriptor of the host's end of the control channel; None for a foreign command.
-        on_stop: called with True when a signal stopped the process (signal(7), Stop), False when it
-            continues.
-        grace_s: seconds that it gets to end by itself should the supervisor be killed.
-    """
-
-    planned: PlannedProcess
-    environment: tuple[tuple[str, str], ...]
-    stdout: int
-    stderr: int
-    control: int | None
-    on_stop: Callable[[bool], None]
-    grace_s: float
-
-
 Escalation = Sequence[tuple[int, float]]
 """Steps to end a process: (signal number, 0 for none; seconds to wait for its end after it)."""
 
@@ -161,10 +137,12 @@ class ManagedProcess:
     Args:
         nodes: keys of its nodes by their full names; of several, each has a log file of its own
             beside the process's, with the lines of its logger.
-        grace_s: see SpawnRequest.
+        variables: (name, value) that it gets beside its own.
+        grace_s: seconds that it gets to end by itself should the supervisor be killed.
 
     Attributes:
         planned: what the plan declares of it.
+        environment: (name, value) on top of the supervisor's own environment.
         carries: full names of the nodes that are gone with it, loaded components included.
         state: in the order of ProcessState; from any but the last it may be EXITED next.
         channel: to our host; None for a foreign command.
@@ -194,9 +172,9 @@ class ManagedProcess:
     ) -> None:
         self.planned = planned
         self.carries = tuple(carries)
-        self._grace_s = grace_s
+        self.grace_s = grace_s
         self.may_end = may_end
-        self._variables = variables
+        self.environment = tuple({**dict(variables), **dict(planned.environment)}.items())
         self.state = ProcessState.STARTING
         self.channel: ControlChannel | None = None
         self.child: ForkServerChild | None = None
@@ -253,7 +231,6 @@ class ManagedProcess:
         self._emit(ProcessChanged(process=self.name, state=self.state))
         ends: list[int] = []
         control = None
-        own = dict(self.planned.environment)
         try:
             for stream in ("stdout", "stderr"):
                 read, write = os.pipe()
@@ -263,15 +240,7 @@ class ManagedProcess:
                 self.channel = channel
                 control = await channel.open()
             self.child = await spawner.spawn(
-                SpawnRequest(
-                    planned=self.planned,
-                    environment=tuple({**dict(self._variables), **own}.items()),
-                    stdout=ends[0],
-                    stderr=ends[1],
-                    control=None if control is None else control.fileno(),
-                    on_stop=self.on_stop,
-                    grace_s=self._grace_s,
-                )
+                self, ends, None if control is None else control.fileno()
             )
         finally:
             for descriptor in ends:

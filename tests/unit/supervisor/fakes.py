@@ -13,7 +13,7 @@ import os
 import selectors
 import signal
 import socket
-from collections.abc import Callable, Collection, Coroutine, Mapping
+from collections.abc import Callable, Collection, Coroutine, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -23,7 +23,7 @@ from lifecycle.node.host.control import Command, Event, HostSpec, Operation
 from lifecycle.plan.model import Plan, PlannedNode
 from lifecycle.supervisor.nodes.bring_up import BringUp
 from lifecycle.supervisor.nodes.system import System
-from lifecycle.supervisor.processes.process import ProcessExit, SpawnRequest
+from lifecycle.supervisor.processes.process import ManagedProcess, ProcessExit
 from lifecycle.supervisor.run.events import Emitter
 from lifecycle.supervisor.run.events import Event as SupervisorEvent
 from lifecycle.verify.observation import NodeConfiguration, Observation
@@ -150,17 +150,19 @@ _FIRST_PID = 5_000_000
 class FakeProcess:
     """A host that lives in the loop; see FakeSpawner for what it can be told to do."""
 
-    def __init__(self, spawner: FakeSpawner, request: SpawnRequest) -> None:
+    def __init__(
+        self, spawner: FakeSpawner, process: ManagedProcess, stdout: int, control: int | None
+    ) -> None:
         self.pid = spawner.next_pid()
         self.exited: asyncio.Future[ProcessExit] = asyncio.get_running_loop().create_future()
         self.signals: list[int] = []
         self._spawner = spawner
-        self._name = request.planned.name
-        self._stdout = os.dup(request.stdout)
+        self._name = process.name
+        self._stdout = os.dup(stdout)
         self._task: asyncio.Task[None] | None = None
-        if request.control is not None:
-            control = socket.socket(fileno=os.dup(request.control))
-            self._task = asyncio.ensure_future(self._serve(control))
+        if control is not None:
+            host = socket.socket(fileno=os.dup(control))
+            self._task = asyncio.ensure_future(self._serve(host))
         else:
             self._task = asyncio.ensure_future(self._appear())
 
@@ -356,9 +358,11 @@ class FakeSpawner:
     async def ready(self) -> None:
         """Always."""
 
-    async def spawn(self, request: SpawnRequest) -> FakeProcess:
-        process = self.processes[request.planned.name] = FakeProcess(self, request)
-        return process
+    async def spawn(
+        self, process: ManagedProcess, streams: Sequence[int], control: int | None
+    ) -> FakeProcess:
+        child = self.processes[process.name] = FakeProcess(self, process, streams[0], control)
+        return child
 
     def belonging(self, processes: Mapping[int, str]) -> frozenset[int]:
         """They have started nothing."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import signal
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -17,7 +18,7 @@ from lifecycle.supervisor.gate.verification_loop import ChangeCounter, Verificat
 from lifecycle.supervisor.health.process_monitor import ProcessMonitor
 from lifecycle.supervisor.nodes.bring_up import ALSO_S
 from lifecycle.supervisor.processes.control_channel import ControlChannel
-from lifecycle.supervisor.processes.process import ProcessExit, SpawnRequest
+from lifecycle.supervisor.processes.process import ManagedProcess, ProcessExit
 from lifecycle.supervisor.run.events import Notice
 from lifecycle.supervisor.run.failure import StepFailedError
 from lifecycle.supervisor.run.shutdown import TakeDown
@@ -56,10 +57,10 @@ async def test_a_bring_up_that_was_cancelled_twice_starts_everything_anew_the_ne
     world = _world(tmp_path, planned_node("a"), planned_node("b"))
     spawn, asked = world.spawner.spawn, []
 
-    async def slow(request: SpawnRequest) -> FakeProcess:
-        asked.append(request.planned.name)
+    async def slow(process: ManagedProcess, *descriptors: Any) -> FakeProcess:
+        asked.append(process.name)
         if len(asked) > 2:
-            return await spawn(request)
+            return await spawn(process, *descriptors)
         try:
             return await asyncio.get_running_loop().create_future()
         except asyncio.CancelledError:

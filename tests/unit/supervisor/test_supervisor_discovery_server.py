@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import socket
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -14,11 +14,11 @@ from lifecycle.network.connection_url import parse
 from lifecycle.plan.model import ParticipantConnections, Plan, PlannedServer
 from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.nodes.system import System
-from lifecycle.supervisor.processes.process import ProcessExit
+from lifecycle.supervisor.processes.process import ManagedProcess, ProcessExit
 from lifecycle.supervisor.run.failure import StepFailedError
 from lifecycle.supervisor.run.options import observer_connections, onlooker_connections
 from tests.builders import plan_of, planned_node
-from tests.unit.supervisor.fakes import FakeSpawner, World
+from tests.unit.supervisor.fakes import FakeProcess, FakeSpawner, World
 
 PREFIX = "44.53.00.5f.45.50.52.4f.53.49.4d.41"
 
@@ -49,10 +49,12 @@ def world(plan: Plan, directory: Path) -> tuple[System, FakeSpawner]:
 
 
 class _EndsAtOnce(FakeSpawner):
-    async def spawn(self, request):  # type: ignore[no-untyped-def]
-        process = await super().spawn(request)
-        process.end(ProcessExit(status=1))
-        return process
+    async def spawn(
+        self, process: ManagedProcess, streams: Sequence[int], control: int | None
+    ) -> FakeProcess:
+        child = await super().spawn(process, streams, control)
+        child.end(ProcessExit(status=1))
+        return child
 
 
 def test_a_port_that_somebody_has_is_refused_before_the_server_seems_to_run(
