@@ -13,7 +13,6 @@ simulated discovery shows is observed, and the observation is judged. What DDS c
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 import functools
 import os
 import statistics
@@ -25,6 +24,8 @@ from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # as a script, only its own directory is there
+
+from msgspec.structs import replace
 
 from benchmarks import scale
 from lifecycle.graph.loop import GraphLoop
@@ -109,9 +110,9 @@ def change_configuration(system: System, name: str, turn: int) -> None:
     assert before is not None
     assert before.configuration is not None
     one_more = len(before.endpoints) == PER_NODE
-    extra = dataclasses.replace(before.endpoints[0], name="extra", resolved="/extra")
+    extra = replace(before.endpoints[0], name="extra", resolved="/extra")
     system.state.learn(
-        dataclasses.replace(
+        replace(
             before.configuration,
             endpoints=(*before.endpoints, extra) if one_more else before.endpoints[:PER_NODE],
             checksum=str(turn + 1),

@@ -1,6 +1,6 @@
-"""JSON encoding and decoding of the package's frozen dataclasses, and ranges for their schemas.
+"""JSON encoding and decoding of the package's types (msgspec.Struct), and ranges for their schemas.
 
-Owns: the one way a dataclass becomes JSON (control channel, reports, files) and becomes typed
+Owns: the one way a value becomes JSON (control channel, reports, files) and becomes typed
 again. Enums travel as their values, tuples as arrays, None as null. Owns also the ranges in the
 schemas of results (`make schemas`); reading enforces none of them, because each reader reports what
 is out of range in its own message; and reading the tables that ship inside the package:
@@ -35,7 +35,7 @@ PortOrNone = Annotated[int, says(minimum=0, maximum=65535)]
 
 
 def to_json(value: object) -> bytes:
-    """Encode a dataclass (or a container of them) as compact UTF-8 JSON."""
+    """Encode a value (or a container of them) as compact UTF-8 JSON."""
     return msgspec.json.encode(value)
 
 

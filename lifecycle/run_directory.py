@@ -22,7 +22,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.errors import UsageError
 
 if TYPE_CHECKING:
@@ -52,8 +53,7 @@ OWN_CHILD = threading.Lock()
 its exit code would be lost, and `subprocess` takes a lost one for success."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class ChildRecord:
+class ChildRecord(msgspec.Struct, frozen=True, kw_only=True):
     """One process of ours.
 
     Attributes:
@@ -66,8 +66,7 @@ class ChildRecord:
     start_ticks: int
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class RunRecord:
+class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     """What a supervisor writes down of its run.
 
     Attributes:

@@ -7,8 +7,9 @@ and `reported`, what a node says of itself. Needs neither YAML nor ROS.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterable, Mapping
+
+from msgspec.structs import replace
 
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import (
@@ -161,7 +162,7 @@ def teleop() -> Manifest:
         after=(("camera", Condition.CONFIGURED),),
         machine="operator",
     )
-    return dataclasses.replace(
+    return replace(
         manifest(
             camera,
             viewer,
@@ -264,7 +265,7 @@ def configuration(
         paradigms=("publish-subscribe",),
         endpoints=endpoints,
     )
-    return dataclasses.replace(made, **changes)
+    return replace(made, **changes)
 
 
 def nfe(

@@ -156,9 +156,7 @@ def _parts(hint: Any, seen: set[Any]) -> Iterator[Any]:
 
 
 def _is_section(hint: Any) -> bool:
-    return isinstance(hint, type) and (
-        dataclasses.is_dataclass(hint) or issubclass(hint, msgspec.Struct)
-    )
+    return isinstance(hint, type) and issubclass(hint, msgspec.Struct)
 
 
 def _described(type_: type, schema: _Schema, result: Result) -> _Schema:

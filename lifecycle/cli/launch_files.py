@@ -19,7 +19,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.errors import LifecycleError, UsageError
 from lifecycle.export.manifest_yaml import Noted, Tree, comment, literal, to_yaml
 from lifecycle.export.programs import LOG_LEVELS
@@ -30,8 +31,7 @@ MAX_ENTITIES = 10_000
 """Actions of one launch description, those of files that it includes with them."""
 
 
-@dataclasses.dataclass(slots=True, kw_only=True)
-class LaunchedNode:
+class LaunchedNode(msgspec.Struct, kw_only=True):
     """What a launch file says of one node.
 
     Attributes:
@@ -47,13 +47,13 @@ class LaunchedNode:
     namespace: str
     run: dict[str, Tree]
     managed: bool
-    restart: dict[str, Tree] = dataclasses.field(default_factory=dict)
-    parameter_files: list[str] = dataclasses.field(default_factory=list)
-    parameters: dict[str, ParameterValue] = dataclasses.field(default_factory=dict)
-    remap: dict[str, str] = dataclasses.field(default_factory=dict)
+    restart: dict[str, Tree] = msgspec.field(default_factory=dict)
+    parameter_files: list[str] = msgspec.field(default_factory=list)
+    parameters: dict[str, ParameterValue] = msgspec.field(default_factory=dict)
+    remap: dict[str, str] = msgspec.field(default_factory=dict)
     log_level: str = ""
     container: str = ""
-    gaps: list[str] = dataclasses.field(default_factory=list)
+    gaps: list[str] = msgspec.field(default_factory=list)
 
     @property
     def full_name(self) -> str:
@@ -61,8 +61,7 @@ class LaunchedNode:
         return f"{self.namespace.rstrip('/')}/{self.name}"
 
 
-@dataclasses.dataclass(slots=True, kw_only=True)
-class Launched:
+class Launched(msgspec.Struct, kw_only=True):
     """What evaluating a launch file has shown.
 
     Attributes:
@@ -70,9 +69,9 @@ class Launched:
         gaps: what concerns no single node.
     """
 
-    nodes: list[LaunchedNode] = dataclasses.field(default_factory=list)
-    arguments: dict[str, str] = dataclasses.field(default_factory=dict)
-    gaps: list[str] = dataclasses.field(default_factory=list)
+    nodes: list[LaunchedNode] = msgspec.field(default_factory=list)
+    arguments: dict[str, str] = msgspec.field(default_factory=dict)
+    gaps: list[str] = msgspec.field(default_factory=list)
 
 
 def evaluate(path: Path, arguments: Mapping[str, str]) -> Launched:

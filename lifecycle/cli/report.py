@@ -15,8 +15,8 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
+from msgspec.structs import replace
 
-from lifecycle import dataclasses
 from lifecycle.errors import ExitCode, LifecycleError, UsageError, exhausted
 from lifecycle.printable import count, lines
 
@@ -275,7 +275,7 @@ def _verdict_of(error: BaseException) -> Verdict:
     if isinstance(error, ManifestError):
         found = [each for each in error.diagnostics if each.severity is Severity.ERROR]
         reason = f"the manifest is invalid: {count(len(found), 'error')}"
-        return dataclasses.replace(
+        return replace(
             _unjudged(reason, error.exit_code),
             verdict=Outcome.VIOLATED,
             findings=tuple(
@@ -309,7 +309,7 @@ def _unjudged(reason: str, code: ExitCode) -> Verdict:
     from lifecycle.verify.verdict import NOT_JUDGED, RunEnd
 
     run = RunEnd(reason=reason, reached=None, exit_code=code)
-    return dataclasses.replace(NOT_JUDGED, run=run)
+    return replace(NOT_JUDGED, run=run)
 
 
 def _is_file(path: Path) -> bool:

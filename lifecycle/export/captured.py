@@ -10,7 +10,9 @@ import math
 import re
 from collections.abc import Iterable, Mapping
 
-from lifecycle import dataclasses
+import msgspec
+from msgspec.structs import replace
+
 from lifecycle.export.programs import (
     CapturedProgram,
     CapturedRun,
@@ -41,8 +43,7 @@ from lifecycle.verify.tool_filter import is_noise_endpoint, is_noise_node, known
 _TYPE = re.compile(r"[a-zA-Z][a-zA-Z0-9_]*/(msg|srv|action)/[a-zA-Z][a-zA-Z0-9_]*")
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class CapturedParameter:
+class CapturedParameter(msgspec.Struct, frozen=True, kw_only=True):
     """A parameter as its node describes it.
 
     Attributes:
@@ -57,8 +58,7 @@ class CapturedParameter:
     read_only: bool = False
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class CapturedEndpoint:
+class CapturedEndpoint(msgspec.Struct, frozen=True, kw_only=True):
     """An endpoint as the graph and its node report it.
 
     Attributes:
@@ -78,8 +78,7 @@ class CapturedEndpoint:
     dscp: int | None = None
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class CapturedNode:
+class CapturedNode(msgspec.Struct, frozen=True, kw_only=True):
     """One node.
 
     Attributes:
@@ -115,8 +114,7 @@ class CapturedNode:
         return f"{self.namespace.rstrip('/')}/{self.name}"
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class CapturedMachine:
+class CapturedMachine(msgspec.Struct, frozen=True, kw_only=True):
     """A machine that nodes of ours named; `address` is empty if none of them reported one."""
 
     name: str
@@ -124,8 +122,7 @@ class CapturedMachine:
     address: str
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class CapturedSystem:
+class CapturedSystem(msgspec.Struct, frozen=True, kw_only=True):
     """A whole running system.
 
     Attributes:
@@ -234,8 +231,7 @@ _ALIKE = "they cannot be told apart"
 _PREFIX_DIGITS = 24
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class _Instance:
+class _Instance(msgspec.Struct, frozen=True, kw_only=True):
     """A node of the graph, or one of several of a name.
 
     Attributes:
@@ -288,7 +284,7 @@ def _restartable(instance: _Instance) -> _Instance:
     if instance.program is None or not instance.program.is_of_a_supervisor:
         return instance
     gap = "lifecycle up runs it: its own manifest says how it is started"
-    return dataclasses.replace(instance, program=None, gap=gap)
+    return replace(instance, program=None, gap=gap)
 
 
 def _shared(instances: Iterable[_Instance], keys: Mapping[str, str]) -> dict[int, str]:
@@ -320,7 +316,7 @@ def _counted(nodes: Iterable[ObservedNode], owners: Mapping[str, str]) -> dict[s
             continue
         other = found.get(name)
         count = node.count + (other.count if other else 0)
-        found[name] = dataclasses.replace(node, count=count)
+        found[name] = replace(node, count=count)
     return found
 
 
@@ -442,7 +438,7 @@ def _node(
         )
         gaps += run.gaps
         taken = {
-            key: dataclasses.replace(each, declared=declared_name(run, node.full_name, *key))
+            key: replace(each, declared=declared_name(run, node.full_name, *key))
             if each.declared == each.name
             else each
             for key, each in taken.items()
@@ -504,7 +500,7 @@ def _endpoint(endpoint: ObservedEndpoint, reports: Iterable[EndpointReport]) -> 
     qos = endpoint.qos
     reported = report.qos if report else None
     if qos is not None and reported is not None and qos.history is History.UNKNOWN:
-        qos = dataclasses.replace(qos, history=reported.history, depth=reported.depth)
+        qos = replace(qos, history=reported.history, depth=reported.depth)
     return CapturedEndpoint(
         kind=endpoint.kind,
         name=endpoint.name,

@@ -14,9 +14,9 @@ import math
 import re
 from collections.abc import Callable, Iterator, Mapping
 
+import msgspec
 import yaml
 
-from lifecycle import dataclasses
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest.loading import THIS_HOST
 from lifecycle.manifest.model import Restart, Timeouts
@@ -50,8 +50,7 @@ _USELESS = (
 """Exit codes after which the same command would end the same way, or that say so themselves."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Deployment:
+class Deployment(msgspec.Struct, frozen=True, kw_only=True):
     """What is to be started, and with what.
 
     Attributes:

@@ -13,7 +13,8 @@ import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Union
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.export.captured import (
     TARGETS,
     CapturedEndpoint,
@@ -39,8 +40,7 @@ Scalar = Union[bool, int, float, str]  # noqa: UP007 - a run-time alias on Pytho
 Tree = Union[Scalar, "Noted", Sequence["Tree"], Mapping[str, "Tree"]]
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Noted:
+class Noted(msgspec.Struct, frozen=True, kw_only=True):
     """A value with a comment on its line."""
 
     value: Tree

@@ -13,7 +13,9 @@ import tempfile
 from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 
-from lifecycle import dataclasses
+import msgspec
+from msgspec.structs import replace
+
 from lifecycle.manifest.model import EndpointKind, RosArguments
 from lifecycle.manifest.names import free_name, name_problem, node_name_problem, resolve
 
@@ -24,8 +26,7 @@ LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
 _WORD = re.compile(r"[^A-Za-z0-9_]+")
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class CapturedProgram:
+class CapturedProgram(msgspec.Struct, frozen=True, kw_only=True):
     """How a process was started.
 
     Attributes:
@@ -54,8 +55,7 @@ class CapturedProgram:
         return any(each == str(self.process_id) or len(each) > 5 for each in numbers)
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class CapturedRun:
+class CapturedRun(msgspec.Struct, frozen=True, kw_only=True):
     """The keys of a manifest that start a process again.
 
     Attributes:
@@ -103,11 +103,11 @@ def run_of(
         return run
     made_up = renamed or program.names(node.rpartition("/")[2])
     if "--ros-args" not in program.argv:
-        return dataclasses.replace(run, ros_args=RosArguments.AUTO, names=True) if made_up else run
+        return replace(run, ros_args=RosArguments.AUTO, names=True) if made_up else run
     taken = _taken_apart(run, node, parameters)
     if taken is None or not _resolves(taken, node, endpoints):
         return run
-    return dataclasses.replace(taken, names=taken.names or made_up)
+    return replace(taken, names=taken.names or made_up)
 
 
 def _taken_apart(run: CapturedRun, node: str, parameters: Collection[str]) -> CapturedRun | None:
@@ -131,11 +131,11 @@ def _taken_apart(run: CapturedRun, node: str, parameters: Collection[str]) -> Ca
         elif option == "--params-file" and words:
             run = _with_file(run, words.pop(0))
         elif option == "--log-level" and words and words[0].lower() in LOG_LEVELS:
-            run = dataclasses.replace(run, log_level=words.pop(0).lower())
+            run = replace(run, log_level=words.pop(0).lower())
         else:
             rest.append(option)
     command = (*own, *(["--ros-args", *rest] if rest else []))
-    return dataclasses.replace(run, command=command, ros_args=RosArguments.AUTO)
+    return replace(run, command=command, ros_args=RosArguments.AUTO)
 
 
 def _remapped(run: CapturedRun, node: str, rule: str) -> CapturedRun | None:
@@ -143,12 +143,12 @@ def _remapped(run: CapturedRun, node: str, rule: str) -> CapturedRun | None:
     namespace, _, name = node.rpartition("/")
     left, separator, right = rule.partition(":=")
     if left in ("__node", "__name") and right == name:
-        return dataclasses.replace(run, names=True)
+        return replace(run, names=True)
     if left == "__ns" and right.rstrip("/") == namespace:
         return run  # the manifest has the namespace of every node
     if not separator or left.startswith("__") or ":" in left or left in dict(run.remap):
         return None
-    return dataclasses.replace(run, remap=(*run.remap, (left, right)))
+    return replace(run, remap=(*run.remap, (left, right)))
 
 
 def _with_file(run: CapturedRun, word: str) -> CapturedRun:
@@ -157,9 +157,9 @@ def _with_file(run: CapturedRun, word: str) -> CapturedRun:
     is_temporary = file.startswith(f"{tempfile.gettempdir()}/")
     of_launch = is_temporary and Path(file).name.startswith("launch_params_")
     if os.path.isfile(file) and not of_launch:
-        return dataclasses.replace(run, parameter_files=(*run.parameter_files, file))
+        return replace(run, parameter_files=(*run.parameter_files, file))
     gap = f"it was given the parameter file {word}, which does not stay"
-    return dataclasses.replace(run, gaps=(*run.gaps, gap))
+    return replace(run, gaps=(*run.gaps, gap))
 
 
 def _resolves(run: CapturedRun, node: str, endpoints: Iterable[tuple[EndpointKind, str]]) -> bool:

@@ -14,7 +14,8 @@ import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.manifest.model import EndpointKind, RunKind
 from lifecycle.manifest.names import (
     ALIVE_PULSE,
@@ -45,8 +46,7 @@ _GRANTS = {
 """What a policy calls an endpoint, and what the endpoint does with it."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Profile:
+class Profile(msgspec.Struct, frozen=True, kw_only=True):
     """What one node may do.
 
     Attributes:
@@ -60,8 +60,7 @@ class Profile:
     allowed: frozenset[tuple[EndpointKind, str]]
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Enclave:
+class Enclave(msgspec.Struct, frozen=True, kw_only=True):
     """What the holder of one key may do: rcl has one for each context, we for each process.
 
     Attributes:

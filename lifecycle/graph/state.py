@@ -17,8 +17,8 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import msgspec
+from msgspec.structs import replace
 
-from lifecycle import dataclasses
 from lifecycle.graph.model import (
     End,
     GraphChange,
@@ -298,7 +298,7 @@ class GraphState:
         reported = [ObservedNode(full_name=each.name, managed=bool(each.state)) for each in bare]
         return Observation(
             nodes=tuple(
-                dataclasses.replace(
+                replace(
                     each,
                     state=states.get(each.full_name),
                     health=look.health.get(each.full_name),

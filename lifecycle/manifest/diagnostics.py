@@ -10,7 +10,8 @@ import enum
 from collections.abc import Iterable
 from typing import Annotated
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.codec import Positive, says
 from lifecycle.errors import ExitCode, LifecycleError
 
@@ -27,8 +28,7 @@ BY_POLICY = frozenset({"check.unheard", "check.unpublished", "check.no-server"})
 """Rules whose severity `policy:` decides: a warning of them is what was asked for."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Position:
+class Position(msgspec.Struct, frozen=True, kw_only=True):
     """A place in a document.
 
     Attributes:
@@ -49,8 +49,7 @@ class Position:
         return f"{self.file}:{self.line}:{self.column}"
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Diagnostic:
+class Diagnostic(msgspec.Struct, frozen=True, kw_only=True):
     """One finding of a static check.
 
     Attributes:

@@ -12,7 +12,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
-from lifecycle import dataclasses
+import msgspec
+from msgspec.structs import replace
+
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.installed_types import bounded_size
 from lifecycle.manifest.model import (
@@ -49,8 +51,7 @@ _OPERATOR_SPECIFIC = range(128, 255)  # TS 24.501 §9.11.4.12
 _ANY_LOSS = 1.0
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class FlowClass:
+class FlowClass(msgspec.Struct, frozen=True, kw_only=True):
     """A 5QI with its reason and problems.
 
     Attributes:
@@ -125,8 +126,7 @@ DIRECT = TransportPriorityMapping(mask=0xFF)
 """Takes the priority as the TOS byte: Connext Micro's mapping "as-is"."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Marking:
+class Marking(msgspec.Struct, frozen=True, kw_only=True):
     """A DSCP and its source.
 
     Attributes:
@@ -209,8 +209,7 @@ def identifiers(taken: Iterable[int]) -> tuple[int, ...]:
     )
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class ResolvedNeed:
+class ResolvedNeed(msgspec.Struct, frozen=True, kw_only=True):
     """One endpoint's need, resolved.
 
     Attributes:
@@ -255,8 +254,7 @@ class ResolvedNeed:
         return self.unique or self.dscp is not None or self.five_qi is not None
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class ParticipantGroup:
+class ParticipantGroup(msgspec.Struct, frozen=True, kw_only=True):
     """Endpoints of one kind and node that share an extra participant.
 
     Attributes:
@@ -420,7 +418,7 @@ class FlowNeeds:
         small = declared is None if size is None else not is_fragmented(size, limit)
         if small:
             return each
-        return dataclasses.replace(each, max_datagram_bytes=declared or SAFE_DATAGRAM_BYTES)
+        return replace(each, max_datagram_bytes=declared or SAFE_DATAGRAM_BYTES)
 
 
 def _add_subscription(
@@ -497,5 +495,5 @@ def _with_identifiers(
             marking = Marking(problem=(message, hint))
         else:
             marking = Marking(dscp=dscp, reason="its identifier")
-        found[key] = dataclasses.replace(each, marking=marking)
+        found[key] = replace(each, marking=marking)
     return found

@@ -23,7 +23,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.errors import nearest
 
 _INDEX = Path("share", "ament_index", "resource_index")
@@ -67,8 +68,7 @@ class TypeStatus(enum.Enum):
     NOT_INSTALLED = "package not installed"
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class TypeLookup:
+class TypeLookup(msgspec.Struct, frozen=True, kw_only=True):
     """The answer for one type.
 
     Attributes:
@@ -212,8 +212,7 @@ def bounded_size(type_: str, prefixes: Sequence[Path]) -> int | None:
     return _ENCAPSULATION + layout.offset
 
 
-@dataclasses.dataclass(slots=True)
-class _Layout:
+class _Layout(msgspec.Struct):
     """Bytes so far; `exact` while every message of the type has this very offset here."""
 
     offset: int = 0

@@ -16,8 +16,8 @@ from pathlib import Path
 from types import MappingProxyType
 
 import msgspec
+from msgspec.structs import replace
 
-from lifecycle import dataclasses
 from lifecycle.manifest.building import (
     build_data_layer,
     build_discovery,
@@ -203,8 +203,7 @@ def _link(cursor: Cursor) -> Link:
 _NONE: Mapping[str, str] = MappingProxyType({})
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Loaded:
+class Loaded(msgspec.Struct, frozen=True, kw_only=True):
     """A manifest without errors.
 
     Attributes:
@@ -264,11 +263,10 @@ def load(
         raise ManifestError(every())
     warnings = every()
     unproven = tuple(each for each in warnings if each.is_unproven)
-    return Loaded(manifest=dataclasses.replace(manifest, unproven=unproven), warnings=warnings)
+    return Loaded(manifest=replace(manifest, unproven=unproven), warnings=warnings)
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class ArgumentDeclaration:
+class ArgumentDeclaration(msgspec.Struct, frozen=True, kw_only=True):
     """An argument that a manifest takes: `rate:=5.0` on the command line.
 
     Attributes:
@@ -317,9 +315,7 @@ def _without_left_out(manifest: Manifest) -> Manifest:
     if not manifest.left_out:
         return manifest
     nodes = tuple(
-        dataclasses.replace(
-            node, after=tuple(each for each in node.after if not is_left_out(each.node))
-        )
+        replace(node, after=tuple(each for each in node.after if not is_left_out(each.node)))
         for node in manifest.nodes
     )
     links = tuple(
@@ -328,22 +324,21 @@ def _without_left_out(manifest: Manifest) -> Manifest:
         if not is_left_out(link.from_node) and not is_left_out(link.to_node)
     )
     modes = tuple(
-        dataclasses.replace(
+        replace(
             mode,
             inactive=tuple(key for key in mode.inactive if not is_left_out(key)),
             parameters=tuple(each for each in mode.parameters if not is_left_out(each.node)),
         )
         for mode in manifest.modes
     )
-    return dataclasses.replace(manifest, nodes=nodes, links=links, modes=modes)
+    return replace(manifest, nodes=nodes, links=links, modes=modes)
 
 
 SUFFIX = ".lifecycle.yaml"
 """What a manifest's name ends in; plain `.yaml` belongs to ROS launch files."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class _Reading:
+class _Reading(msgspec.Struct, frozen=True, kw_only=True):
     """One file while it is read: places in it are counted from its root.
 
     Attributes:
@@ -465,7 +460,7 @@ class _Loading:
     ) -> Manifest:
         """Give the nodes of a document or group what they share, and add groups and includes."""
         shared = shared.inner(root, self.found)
-        manifest = dataclasses.replace(
+        manifest = replace(
             manifest,
             nodes=tuple(shared.given_to(node) for node in manifest.nodes),
             left_out=tuple(
@@ -478,13 +473,13 @@ class _Loading:
             if reading.leaves_out(each):
                 key = each.text("prefix")
                 here = (f"{key}/",) if key and "$(" not in key else ()
-                manifest = dataclasses.replace(manifest, left_out=(*manifest.left_out, *here))
+                manifest = replace(manifest, left_out=(*manifest.left_out, *here))
             else:
                 manifest = self._include(manifest, each, reading.chain, shared)
         for each in root.items("groups"):
             if reading.leaves_out(each):
                 keys = tuple(_keys_of(each.value))
-                manifest = dataclasses.replace(manifest, left_out=(*manifest.left_out, *keys))
+                manifest = replace(manifest, left_out=(*manifest.left_out, *keys))
             else:
                 manifest = self._group(reading, manifest, each, shared)
         return manifest
@@ -564,7 +559,7 @@ class _Loading:
         for key in ("discovery", "network", "data_layer", "policy", "on_violation", "modes"):
             mine, holds = getattr(manifest, key), getattr(outer, key)
             if key == "network":
-                mine = dataclasses.replace(mine, at=holds.at)
+                mine = replace(mine, at=holds.at)
             elif key in ("discovery", "data_layer"):
                 mine = msgspec.structs.replace(mine, at=holds.at)
             if key in root and mine != holds:

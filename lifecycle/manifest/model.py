@@ -13,7 +13,6 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from lifecycle import dataclasses
 from lifecycle.codec import Positive, says
 from lifecycle.manifest.diagnostics import Diagnostic, Position, Severity
 from lifecycle.manifest.qos import POLICIES, QosProfile
@@ -280,8 +279,7 @@ class Resources(ResourceLimits, frozen=True, kw_only=True):
         return hash(self.properties())
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Run:
+class Run(msgspec.Struct, frozen=True, kw_only=True):
     """How to start a node. Exactly one of the forms is set, as `kind` says.
 
     Attributes:
@@ -325,8 +323,7 @@ class Run:
     resources: Resources | None = None
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class After:
+class After(msgspec.Struct, frozen=True, kw_only=True):
     """The step of this node that `condition` names begins once `node` (a key) has reached it."""
 
     node: str
@@ -426,8 +423,7 @@ BY_DEFAULT = "default"
 """Key of `on_violation` for every rule that it does not name."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Reaction:
+class Reaction(msgspec.Struct, frozen=True, kw_only=True):
     """What is done about violations of some rules.
 
     Attributes:
@@ -444,8 +440,7 @@ OnViolation = tuple[Reaction, ...]
 """Each rule, family or BY_DEFAULT once; may be empty."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Endpoint:
+class Endpoint(msgspec.Struct, frozen=True, kw_only=True):
     """One declared endpoint.
 
     Attributes:
@@ -464,8 +459,7 @@ class Endpoint:
     at: Position
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class ParameterDeclaration:
+class ParameterDeclaration(msgspec.Struct, frozen=True, kw_only=True):
     """A parameter of an interface.
 
     Attributes:
@@ -481,8 +475,7 @@ class ParameterDeclaration:
     at: Position
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Interface:
+class Interface(msgspec.Struct, frozen=True, kw_only=True):
     """What a node offers and needs, in NoDL v2 terms.
 
     Attributes:
@@ -497,8 +490,7 @@ class Interface:
     has_all_parameters: bool = False
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Quantity:
+class Quantity(msgspec.Struct, frozen=True, kw_only=True):
     """A number that a manifest promises or asks for, and where it is written.
 
     Attributes:
@@ -514,8 +506,7 @@ class Quantity:
         return f"{self.name} {self.value:g}" if self.value < 1e6 else f"{self.name} {self.value}"
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)  # no slots: it is extended beside another type
-class FlowTerms:
+class FlowTerms(msgspec.Struct, frozen=True, kw_only=True):
     """What an endpoint asks of its flow that its plan takes over as it is.
 
     Attributes:
@@ -536,8 +527,7 @@ class FlowTerms:
     quantities: tuple[Quantity, ...] = ()
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class FlowNeed(FlowTerms):
+class FlowNeed(FlowTerms, frozen=True, kw_only=True):
     """What one endpoint asks of its network flow.
 
     Attributes:
@@ -568,8 +558,7 @@ class FlowNeed(FlowTerms):
     at: Position
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class ConnectionDeclaration:
+class ConnectionDeclaration(msgspec.Struct, frozen=True, kw_only=True):
     """A connection that the manifest spells out for a node: `connections: {name: {…}}`.
 
     Attributes:
@@ -601,8 +590,7 @@ class Health(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     timeout_s: Seconds = 1.0
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class NodeDeclaration:
+class NodeDeclaration(msgspec.Struct, frozen=True, kw_only=True):
     """What a manifest declares of one node that its plan takes over as it is.
 
     Attributes:
@@ -649,8 +637,7 @@ class NodeDeclaration:
         return self.managed or self.run.kind is RunKind.PYTHON
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Node(NodeDeclaration):
+class Node(NodeDeclaration, frozen=True, kw_only=True):
     """One node instance.
 
     Attributes:
@@ -685,15 +672,14 @@ class Node(NodeDeclaration):
 
     def __post_init__(self) -> None:
         """Sort `positions`: a node may have thousands of parameters, each looked up once."""
-        object.__setattr__(self, "positions", tuple(sorted(self.positions, key=_path)))
+        msgspec.structs.force_setattr(self, "positions", tuple(sorted(self.positions, key=_path)))
 
 
 def _path(entry: tuple[str, Position]) -> str:
     return entry[0]
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Machine:
+class Machine(msgspec.Struct, frozen=True, kw_only=True):
     """A host. `address` is an IPv4 or IPv6 address, or empty for this host."""
 
     name: str
@@ -776,8 +762,7 @@ class DataLayer(DataLayerKeys, frozen=True, kw_only=True):
     at: Position | None = None
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Network:
+class Network(msgspec.Struct, frozen=True, kw_only=True):
     """How flow needs become network resources; for the whole system.
 
     Attributes:
@@ -809,8 +794,7 @@ TOLERATED_NODES = (
 """Names of nodes that tools make, as the tools choose them: the default of `tolerated_nodes`."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Policy:
+class Policy(msgspec.Struct, frozen=True, kw_only=True):
     """How strict checks and verification are.
 
     Attributes:
@@ -838,8 +822,7 @@ class Policy:
     ros_interface_required: bool = False
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Link:
+class Link(msgspec.Struct, frozen=True, kw_only=True):
     """What must hold between one publisher's and one subscription's node.
 
     Attributes:
@@ -861,8 +844,7 @@ class Link:
     at: Position
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class ModeParameter:
+class ModeParameter(msgspec.Struct, frozen=True, kw_only=True):
     """The value that a parameter of a node has in a mode.
 
     Attributes:
@@ -875,8 +857,7 @@ class ModeParameter:
     at: Position
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Mode:
+class Mode(msgspec.Struct, frozen=True, kw_only=True):
     """A named set of nodes that are active, all that are to be so but these, and of parameters.
 
     Attributes:
@@ -890,8 +871,7 @@ class Mode:
     at: Position
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class SystemDeclaration:
+class SystemDeclaration(msgspec.Struct, frozen=True, kw_only=True):
     """What a manifest declares of its system that the plan takes over as it is.
 
     Attributes:
@@ -915,8 +895,7 @@ class SystemDeclaration:
         return next((each.address for each in self.machines if each.name == machine), "")
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Manifest(SystemDeclaration):
+class Manifest(SystemDeclaration, frozen=True, kw_only=True):
     """One system, valid on its own; the input of `lifecycle.plan`.
 
     Attributes:

@@ -15,7 +15,8 @@ import functools
 import re
 from collections.abc import Container, Iterable, Mapping, Sequence
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.errors import ExitCode, LifecycleError
 from lifecycle.manifest.model import EndpointKind, RosInterfaceAccess
 from lifecycle.manifest.yaml.yaml_parser import quote
@@ -43,8 +44,7 @@ class RemapRuleError(LifecycleError):
     exit_code = ExitCode.MANIFEST_INVALID
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class RemapRule:
+class RemapRule(msgspec.Struct, frozen=True, kw_only=True):
     """One rule.
 
     Attributes:

@@ -15,7 +15,8 @@ import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from lifecycle import dataclasses
+from msgspec.structs import replace
+
 from lifecycle.errors import did_you_mean, nearest
 from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position, Severity
 from lifecycle.manifest.installed_types import find_resource, list_resources, search_prefixes
@@ -63,22 +64,20 @@ class _Reader:
             if (each := entries.get(kind.value)) and isinstance(each.data, tuple):
                 items = enumerate(each.data)
                 data = tuple(self._endpoint(kind, (kind.value, i), item) for i, item in items)
-                entries[kind.value] = dataclasses.replace(each, data=data)
+                entries[kind.value] = replace(each, data=data)
         if (each := entries.get("parameters")) and isinstance(each.data, Mapping):
             parameters = {
                 name: self._parameter(name, ("parameters", name), value)
                 for name, value in each.data.items()
             }
             known = {name: value for name, value in parameters.items() if value is not None}
-            entries["parameters"] = dataclasses.replace(each, data=known)
-        inline = dataclasses.replace(document, root=dataclasses.replace(root, data=entries))
+            entries["parameters"] = replace(each, data=known)
+        inline = replace(document, root=replace(root, data=entries))
         found = [each for _, each in validate(inline, definition="Interface")]
         if not found:
             self.interface = build_inline(Cursor.root(inline), found)
         rules = {"manifest.duplicate-name": "nodl.duplicate"}
-        self.found += [
-            dataclasses.replace(each, rule=rules.get(each.rule, "nodl.invalid")) for each in found
-        ]
+        self.found += [replace(each, rule=rules.get(each.rule, "nodl.invalid")) for each in found]
         if any(each.severity is Severity.ERROR for each in self.found):
             self.interface = Interface()
 
@@ -96,14 +95,14 @@ class _Reader:
         if qos and not isinstance(qos.data, Mapping):
             self._error(at, f"cannot use {quote(qos.plain())} as a QoS profile; write a mapping")
         elif qos and isinstance(qos.data, Mapping):
-            entries["qos"] = dataclasses.replace(qos, data=self._entries(at, qos, POLICIES))
+            entries["qos"] = replace(qos, data=self._entries(at, qos, POLICIES))
             for name in ("history", "reliability"):
                 if name not in qos.data:
                     self._error(at, f"cannot do without the key {name!r} in a QoS profile")
             history = qos.data.get("history")
             if history and history.data == "KEEP_LAST" and "depth" not in qos.data:
                 self._error(at, "cannot do without 'depth' under KEEP_LAST", "add 'depth: 10'")
-        return dataclasses.replace(value, data=entries)
+        return replace(value, data=entries)
 
     def _parameter(self, name: str, place: Place, value: Value) -> Value | None:
         """Return a declaration as a manifest has it; None for what declares no parameter."""
@@ -122,7 +121,7 @@ class _Reader:
             return None
         if type_ and type_.text == "none":
             return None
-        return dataclasses.replace(value, data=entries)
+        return replace(value, data=entries)
 
     def _entries(self, place: Place, value: Value, known: Iterable[str]) -> _Entries:
         """Return the entries of a mapping that NoDL knows, and warn of the others."""
@@ -150,7 +149,7 @@ def _key(kind: EndpointKind) -> str:
 
 
 def _text(value: Value, text: str) -> Value:
-    return dataclasses.replace(value, data=text, text=text)
+    return replace(value, data=text, text=text)
 
 
 MAX_DOCUMENTS = 100

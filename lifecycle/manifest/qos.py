@@ -10,7 +10,8 @@ import types
 from collections.abc import Collection, Mapping
 from typing import TypeVar
 
-from lifecycle import dataclasses
+import msgspec
+from msgspec.structs import replace
 
 
 class History(enum.Enum):
@@ -52,8 +53,7 @@ class Liveliness(enum.Enum):
     UNKNOWN = "UNKNOWN"
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class QosProfile:
+class QosProfile(msgspec.Struct, frozen=True, kw_only=True):
     """One rmw QoS profile; field names are NoDL v2's.
 
     Durations are nanoseconds, 0 to 2**63-1; None is rmw's default, which means infinite. `depth`
@@ -106,11 +106,9 @@ _SYSTEM_LIVELINESS = QosProfile(liveliness=Liveliness.SYSTEM_DEFAULT)
 PRESETS: Mapping[str, QosProfile] = types.MappingProxyType(
     {
         "default": _SYSTEM_LIVELINESS,
-        "sensor_data": dataclasses.replace(
-            _SYSTEM_LIVELINESS, depth=5, reliability=Reliability.BEST_EFFORT
-        ),
-        "parameters": dataclasses.replace(_SYSTEM_LIVELINESS, depth=1000),
-        "parameter_events": dataclasses.replace(_SYSTEM_LIVELINESS, depth=1000),
+        "sensor_data": replace(_SYSTEM_LIVELINESS, depth=5, reliability=Reliability.BEST_EFFORT),
+        "parameters": replace(_SYSTEM_LIVELINESS, depth=1000),
+        "parameter_events": replace(_SYSTEM_LIVELINESS, depth=1000),
         "services_default": _SYSTEM_LIVELINESS,
         "system_default": QosProfile(
             history=History.SYSTEM_DEFAULT,
@@ -126,16 +124,14 @@ PRESETS: Mapping[str, QosProfile] = types.MappingProxyType(
             liveliness=Liveliness.BEST_AVAILABLE,
             liveliness_lease_duration_ns=BEST_AVAILABLE_NS,
         ),
-        "rosout_default": dataclasses.replace(
+        "rosout_default": replace(
             _SYSTEM_LIVELINESS,
             depth=1000,
             durability=Durability.TRANSIENT_LOCAL,
             lifespan_ns=10 * 10**9,
         ),
-        "clock": dataclasses.replace(
-            _SYSTEM_LIVELINESS, depth=1, reliability=Reliability.BEST_EFFORT
-        ),
-        "action_status_default": dataclasses.replace(
+        "clock": replace(_SYSTEM_LIVELINESS, depth=1, reliability=Reliability.BEST_EFFORT),
+        "action_status_default": replace(
             _SYSTEM_LIVELINESS, depth=1, durability=Durability.TRANSIENT_LOCAL
         ),
     }
@@ -154,8 +150,7 @@ class Certainty(enum.Enum):
     POSSIBLE = "possible"
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Incompatibility:
+class Incompatibility(msgspec.Struct, frozen=True, kw_only=True):
     """One policy by which a publisher and a subscription do not, or may not, match.
 
     Attributes:

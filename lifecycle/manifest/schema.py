@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from lifecycle import dataclasses
 from lifecycle.errors import did_you_mean, nearest
 from lifecycle.manifest import written
 from lifecycle.manifest.diagnostics import Diagnostic
@@ -35,8 +34,7 @@ if TYPE_CHECKING:  # it costs 60 ms, and who only asks for a similar name needs 
     from jsonschema.exceptions import ValidationError
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Violation:
+class Violation(msgspec.Struct, frozen=True, kw_only=True):
     """A value that breaks one keyword.
 
     Attributes:

@@ -12,8 +12,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 
 import msgspec
+from msgspec.structs import replace
 
-from lifecycle import dataclasses
 from lifecycle.manifest.building import build_parameters
 from lifecycle.manifest.checks.parameters import is_implicit, read_sections, shown_path
 from lifecycle.manifest.diagnostics import Diagnostic, Position
@@ -31,8 +31,7 @@ from lifecycle.manifest.yaml.document import Cursor, error, warning
 SIM_TIME = "use_sim_time"
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Shared:
+class Shared(msgspec.Struct, frozen=True, kw_only=True):
     """What all nodes of a document or group get that have nothing nearer.
 
     Attributes:
@@ -43,11 +42,9 @@ class Shared:
     """
 
     machine: str
-    parameters: Mapping[str, tuple[ParameterValue, Position]] = dataclasses.field(
-        default_factory=dict
-    )
-    remap: Mapping[str, tuple[str, Position]] = dataclasses.field(default_factory=dict)
-    supervision: Mapping[str, tuple[object, Position]] = dataclasses.field(default_factory=dict)
+    parameters: Mapping[str, tuple[ParameterValue, Position]] = msgspec.field(default_factory=dict)
+    remap: Mapping[str, tuple[str, Position]] = msgspec.field(default_factory=dict)
+    supervision: Mapping[str, tuple[object, Position]] = msgspec.field(default_factory=dict)
 
     def inner(self, cursor: Cursor, found: Findings) -> Shared:
         """Return what holds inside a document or group.
@@ -92,7 +89,7 @@ class Shared:
             **{f"parameters.{name}": at for name, (_, at) in parameters.items()},
             **{f"remap.{name}": at for name, (_, at) in remap.items()},
         }
-        return dataclasses.replace(
+        return replace(
             node,
             parameters=(
                 *((name, value) for name, (value, _) in parameters.items()),
@@ -111,7 +108,7 @@ class Shared:
         if not given or node.run.kind is RunKind.ATTACH:
             return node
         values = {key: value for key, (value, _) in given.items()}
-        return dataclasses.replace(
+        return replace(
             node,
             supervision=msgspec.structs.replace(node.supervision, **values),
             shared=node.shared | given.keys(),
@@ -138,7 +135,7 @@ def settle(manifest: Manifest, found: Findings) -> Manifest:
         _settled(_as_its_process(node, own.get(node.process, {})), manifest.path)
         for node in manifest.nodes
     )
-    return dataclasses.replace(manifest, nodes=nodes)
+    return replace(manifest, nodes=nodes)
 
 
 def _for_no_node(nodes: Iterable[Node]) -> Iterator[Diagnostic]:
@@ -168,7 +165,7 @@ def _own_supervision(node: Node) -> dict[str, object]:
 def _as_its_process(node: Node, process: Mapping[str, object]) -> Node:
     values = {**process, **_own_supervision(node)}
     supervision = msgspec.structs.replace(node.supervision, **values)
-    return dataclasses.replace(node, supervision=supervision) if process else node
+    return replace(node, supervision=supervision) if process else node
 
 
 def _settled(node: Node, manifest: str) -> Node:
@@ -186,7 +183,7 @@ def _settled(node: Node, manifest: str) -> Node:
             if section.matches(node.full_name):
                 kept -= {name for name, _, _ in section.parameters}
     gone = shared - kept
-    return dataclasses.replace(
+    return replace(
         node,
         parameters=tuple(each for each in node.parameters if each[0] not in gone),
         shared=node.shared - {f"parameters.{name}" for name in gone},

@@ -23,7 +23,8 @@ from collections.abc import Callable
 from typing import Any
 from urllib.parse import parse_qsl, urlencode, urlsplit
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.errors import LifecycleError, did_you_mean
 from lifecycle.network.medium import SCHEMES, Medium
 
@@ -36,8 +37,7 @@ class ConnectionUrlError(LifecycleError):
     """A text that is no connection URL, or one that contradicts itself."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True, order=True)
-class Peer:
+class Peer(msgspec.Struct, frozen=True, kw_only=True, order=True):
     """Where another participant's discovery listens. `port` None: its well-known ports."""
 
     address: str
@@ -94,8 +94,7 @@ _UDP = frozenset(each for each in SCHEMES if each.is_udp)
 _IP = frozenset(each for each in SCHEMES if each.is_network)
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Option:
+class Option(msgspec.Struct, frozen=True, kw_only=True):
     """One option.
 
     Attributes:
@@ -167,8 +166,7 @@ def read_options(transport: Medium, query: str) -> dict[str, Any]:
 _HOW = "write TRANSPORT://[ADDRESS][:PORT][?OPTION=VALUE&…], udpv4://10.77.0.1:7911"
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class ConnectionUrl:
+class ConnectionUrl(msgspec.Struct, frozen=True, kw_only=True):
     """One transport of one connection.
 
     Attributes:

@@ -15,7 +15,8 @@ import functools
 import re
 from typing import Annotated
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.codec import Octet, read_table, says
 
 MAX_DSCP = 63
@@ -25,8 +26,7 @@ ECN_MASK = 0b11
 """The two lower bits of the TOS byte; Linux sends them as given to IP_TOS."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class CodePoint:
+class CodePoint(msgspec.Struct, frozen=True, kw_only=True):
     """One named code point.
 
     Attributes:
@@ -46,8 +46,7 @@ class CodePoint:
     nft: str
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class _DscpTable:
+class _DscpTable(msgspec.Struct, frozen=True, kw_only=True):
     code_points: tuple[CodePoint, ...]
 
 
@@ -159,8 +158,7 @@ def describe(dscp: int) -> str:
 _BITS_32 = 0xFFFFFFFF
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class TransportPriorityMapping:
+class TransportPriorityMapping(msgspec.Struct, frozen=True, kw_only=True):
     """UDPInterfaceFactoryProperty's three transport priority fields.
 
     Attributes:
@@ -182,8 +180,7 @@ class TransportPriorityMapping:
             )
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class MappedPriority:
+class MappedPriority(msgspec.Struct, frozen=True, kw_only=True):
     """What becomes of one TRANSPORT_PRIORITY value.
 
     Attributes:

@@ -11,7 +11,8 @@ from __future__ import annotations
 import enum
 import functools
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.codec import from_json, read_table
 from lifecycle.network.dscp import parse_dscp
 
@@ -29,8 +30,7 @@ class ResourceType(enum.Enum):
         return self is not ResourceType.NON_GBR
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class FiveQi:
+class FiveQi(msgspec.Struct, frozen=True, kw_only=True):
     """One standardized 5QI and its characteristics.
 
     Attributes:
@@ -63,8 +63,7 @@ class FiveQi:
         return f"5QI {self.value} ({self.resource_type.value})"
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class ClassIssue:
+class ClassIssue(msgspec.Struct, frozen=True, kw_only=True):
     """A declared need that a class does not keep.
 
     Attributes:
@@ -76,8 +75,7 @@ class ClassIssue:
     message: str
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Proposal:
+class Proposal(msgspec.Struct, frozen=True, kw_only=True):
     """The answer to `five_qi: auto`.
 
     Attributes:
@@ -89,8 +87,7 @@ class Proposal:
     why: str
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class _FiveQiTable:
+class _FiveQiTable(msgspec.Struct, frozen=True, kw_only=True):
     values: tuple[FiveQi, ...]
 
 
@@ -278,8 +275,7 @@ def _served_bps(each: FiveQi) -> float:
     return (each.max_data_burst_bytes or 0) * 8000 / each.packet_delay_budget_ms
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class DscpMapping:
+class DscpMapping(msgspec.Struct, frozen=True, kw_only=True):
     """One mapping and its source.
 
     Attributes:
@@ -299,8 +295,7 @@ class DscpMapping:
         return dict(self.values).get(value)
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class _File:
+class _File(msgspec.Struct, frozen=True, kw_only=True):
     """A mapping as it is written, with names or numbers of DSCPs."""
 
     name: str
@@ -310,8 +305,7 @@ class _File:
     values: dict[int, int | str]
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class _MappingTable:
+class _MappingTable(msgspec.Struct, frozen=True, kw_only=True):
     mappings: tuple[_File, ...]
 
 

@@ -17,11 +17,10 @@ from __future__ import annotations
 import enum
 import socket
 
-from lifecycle import dataclasses
+import msgspec
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class _Traits:
+class _Traits(msgspec.Struct, frozen=True, kw_only=True):
     """What a medium is besides UDP or TCP over the version of IP that its value ends with.
 
     Attributes:

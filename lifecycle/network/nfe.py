@@ -22,7 +22,9 @@ import functools
 import ipaddress
 from collections.abc import Iterable, Sequence
 
-from lifecycle import dataclasses
+import msgspec
+from msgspec.structs import replace
+
 from lifecycle.codec import DscpValue, FlowLabel, PortOrNone
 from lifecycle.network.medium import Medium
 
@@ -147,8 +149,7 @@ class UniqueRequirement(enum.Enum):
         return list(UniqueRequirement).index(self)
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class NetworkFlowEndpoint:
+class NetworkFlowEndpoint(msgspec.Struct, frozen=True, kw_only=True):
     """The part of a network flow that belongs to one publisher or subscription.
 
     Field names are those of rmw_network_flow_endpoint_t. Equality is the article's "not
@@ -183,8 +184,7 @@ class NetworkFlowEndpoint:
         return f"{self.transport_protocol.value}{_VERSIONS.get(self.internet_protocol, '')}"
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class LocatedNfe:
+class LocatedNfe(msgspec.Struct, frozen=True, kw_only=True):
     """An NFE and the machine it is on, which defines what `0.0.0.0` and `127.0.0.1` mean.
 
     Attributes:
@@ -215,7 +215,7 @@ def located(
     return tuple(
         LocatedNfe(
             machine_id=machine_id,
-            nfe=each if dscp is None else dataclasses.replace(each, dscp=dscp),
+            nfe=each if dscp is None else replace(each, dscp=dscp),
         )
         for each in nfes
     )
@@ -266,8 +266,7 @@ def _exact_resources(nfe: NetworkFlowEndpoint) -> tuple[object, ...]:
     return (*protocols, nfe.transport_port, nfe.dscp, nfe.flow_label)
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class FlowTuple:
+class FlowTuple(msgspec.Struct, frozen=True, kw_only=True):
     """One network flow.
 
     Attributes:

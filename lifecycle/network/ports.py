@@ -13,7 +13,8 @@ from __future__ import annotations
 import enum
 from collections.abc import Callable
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.printable import count
 
 PB = 7400
@@ -64,8 +65,7 @@ class Platform(enum.Enum):
     WINDOWS = "windows"
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class EphemeralRange:
+class EphemeralRange(msgspec.Struct, frozen=True, kw_only=True):
     """Ports that an operating system gives to sockets bound to no port; both ends belong to it."""
 
     first: int
@@ -92,8 +92,7 @@ DEFAULT_EPHEMERAL_RANGE: dict[Platform, EphemeralRange] = {
 """Each platform's default, as the article gives it; all three can be configured."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class ParticipantPorts:
+class ParticipantPorts(msgspec.Struct, frozen=True, kw_only=True):
     """The four UDP ports of one participant; the multicast ones are shared by the whole domain."""
 
     discovery_multicast: int
@@ -102,8 +101,7 @@ class ParticipantPorts:
     user_unicast: int
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Capacity:
+class Capacity(msgspec.Struct, frozen=True, kw_only=True):
     """How many participants of one domain fit on one host.
 
     Attributes:
@@ -115,8 +113,7 @@ class Capacity:
     limit: str
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class PortUse:
+class PortUse(msgspec.Struct, frozen=True, kw_only=True):
     """What the formula assigns a port to.
 
     Attributes:

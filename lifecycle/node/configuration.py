@@ -22,12 +22,13 @@ import weakref
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
+from msgspec.structs import replace
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 from rclpy.utilities import get_rmw_implementation_identifier
 from std_srvs.srv import Trigger
 
-from lifecycle import codec, dataclasses
+from lifecycle import codec
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import QosProfile
@@ -103,18 +104,15 @@ def checksum(configuration: NodeConfiguration) -> str:
     State, matches and what follows from them (whether a connection is established) change
     all the time and are reported by events, so they do not count.
     """
-    stable = dataclasses.replace(
+    stable = replace(
         configuration,
         state="",
         connected=False,
         checksum="",
         endpoints=tuple(
-            dataclasses.replace(each, matched=None, server_matched=None)
-            for each in configuration.endpoints
+            replace(each, matched=None, server_matched=None) for each in configuration.endpoints
         ),
-        connections=tuple(
-            dataclasses.replace(each, established=False) for each in configuration.connections
-        ),
+        connections=tuple(replace(each, established=False) for each in configuration.connections),
     )
     return hashlib.sha256(codec.to_json(stable)).hexdigest()[:_DIGITS]
 
@@ -178,7 +176,7 @@ def _named(
     report: EndpointReport, planned: PlannedEndpoint, connection: Connection
 ) -> EndpointReport:
     error = connection.warning if planned.enforce_dscp else ""
-    return dataclasses.replace(report, name=planned.name, unique=planned.unique, error=error)
+    return replace(report, name=planned.name, unique=planned.unique, error=error)
 
 
 def _foreign_connection(
@@ -235,7 +233,7 @@ def collect(
         parameters=parameters.reports(node),
         health=health,
     )
-    return dataclasses.replace(configuration, checksum=checksum(configuration))
+    return replace(configuration, checksum=checksum(configuration))
 
 
 def connection_reports(
@@ -296,14 +294,14 @@ def _report(node: Node, mapping: Mapping) -> EndpointReport:
     if entity is None:
         return report
     if endpoint.kind in CLIENTS:
-        return dataclasses.replace(report, server_matched=is_server_matched(entity))
+        return replace(report, server_matched=is_server_matched(entity))
     if not endpoint.kind.is_topic:
         return report
     # A participant knows its own endpoints; the node's own need not know those of another.
     hidden = connection.participant if connection is not None else None
     witness = node if hidden is None else hidden.node
     report = _with_matches(report, witness, entity)
-    return dataclasses.replace(
+    return replace(
         report, nfes=_nfes(witness, endpoint.kind, entity, connection), dscp=_dscp(connection)
     )
 
@@ -320,13 +318,13 @@ def _undeclared_report(
     if connection is None:
         connection = Connection(name="")
     elif kind in CLIENTS:
-        return dataclasses.replace(report, server_matched=is_server_matched(entity))
+        return replace(report, server_matched=is_server_matched(entity))
     if not kind.is_topic:
         return report
     hidden = connection.participant
     witness = node if hidden is None else hidden.node
     report = _with_matches(report, witness, entity)
-    return dataclasses.replace(
+    return replace(
         report,
         nfes=_nfes(witness, kind, entity, connection),
         dscp=_dscp(connection),
@@ -344,7 +342,7 @@ def _with_matches(report: EndpointReport, witness: Node, entity: Any) -> Endpoin
         entity: its rclpy object.
     """
     info = _own_endpoint(witness, report.resolved, report.kind)
-    return dataclasses.replace(
+    return replace(
         report,
         qos=_actual_qos(entity, info),
         gid=info.gid if info is not None else "",
@@ -432,7 +430,7 @@ def _actual_qos(entity: Any, info: ObservedEndpoint | None) -> QosProfile:
     asked = from_rclpy(entity.qos_profile)
     if info is None or info.qos is None:
         return asked
-    return dataclasses.replace(info.qos, history=asked.history, depth=asked.depth)
+    return replace(info.qos, history=asked.history, depth=asked.depth)
 
 
 def _transports(endpoints: tuple[EndpointReport, ...]) -> tuple[str, ...]:

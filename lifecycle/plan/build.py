@@ -16,8 +16,8 @@ import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 
 import msgspec
+from msgspec.structs import replace
 
-from lifecycle import dataclasses
 from lifecycle.errors import UsageError
 from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position
 from lifecycle.manifest.flows import FlowNeeds, ParticipantGroup, ResolvedNeed
@@ -221,7 +221,7 @@ def build_plan(
     variables = os.environ if environment is None else environment
     if domain_id is not None:
         discovery = msgspec.structs.replace(manifest.discovery, domain_id=domain_id)
-        manifest = dataclasses.replace(manifest, discovery=discovery)
+        manifest = replace(manifest, discovery=discovery)
     domain_id = effective_domain(manifest.discovery, variables)
     discovery_range = effective_range(manifest.discovery, variables)
     rmw = variables.get("RMW_IMPLEMENTATION", "") or DEFAULT_RMW
@@ -257,7 +257,7 @@ def with_files_of_now(plan: Plan) -> Plan:
     """Return a plan with the digests that its parameter files have now."""
     digest_of = functools.cache(_digest)
     nodes = tuple(
-        dataclasses.replace(
+        replace(
             node,
             files=tuple(
                 _planned_file(node.parameter_files, each.place, each.written, digest_of)
@@ -266,7 +266,7 @@ def with_files_of_now(plan: Plan) -> Plan:
         )
         for node in plan.nodes
     )
-    return dataclasses.replace(plan, nodes=nodes)
+    return replace(plan, nodes=nodes)
 
 
 def started_by_others(plan: Plan, names: Collection[str]) -> Plan:
@@ -318,14 +318,14 @@ def attached_to(plan: Plan, keys: Collection[str]) -> Plan:
         keys: of nodes.
     """
     chosen = frozenset(keys)
-    return dataclasses.replace(
+    return replace(
         plan,
         nodes=tuple(
-            dataclasses.replace(each, run=_attached(each.run)) if each.key in chosen else each
+            replace(each, run=_attached(each.run)) if each.key in chosen else each
             for each in plan.nodes
         ),
         processes=tuple(
-            dataclasses.replace(each, run=_attached(each.run), argv=())
+            replace(each, run=_attached(each.run), argv=())
             if chosen.issuperset(each.nodes)
             else each
             for each in plan.processes
@@ -484,9 +484,7 @@ def _planned_node(
         held_by=_held_by(node),
         endpoints=endpoints,
         declared_parameters=tuple(
-            each
-            if each.default is None
-            else dataclasses.replace(each, default=portable(each.default))
+            each if each.default is None else replace(each, default=portable(each.default))
             for each in node.interface.parameters
         ),
         expected_parameters=expected,
@@ -505,10 +503,8 @@ def _planned_node(
 
 
 def _portable(mode: Mode) -> Mode:
-    parameters = tuple(
-        dataclasses.replace(each, value=portable(each.value)) for each in mode.parameters
-    )
-    return dataclasses.replace(mode, parameters=parameters)
+    parameters = tuple(replace(each, value=portable(each.value)) for each in mode.parameters)
+    return replace(mode, parameters=parameters)
 
 
 def _held_by(node: Node) -> HeldBy:
@@ -558,7 +554,7 @@ def _planned_endpoint(
     message, hint = need.marking.problem
     if message:
         raise PlanError(message, hint=hint, at=need.need.at)
-    return dataclasses.replace(
+    return replace(
         planned,
         **declared(FlowTerms, need.need),
         dscp=need.dscp,

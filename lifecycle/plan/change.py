@@ -10,7 +10,9 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Any
 
-from lifecycle import dataclasses
+import msgspec
+from msgspec.structs import replace
+
 from lifecycle.codec import to_plain
 from lifecycle.manifest.model import ParameterValue, RunKind, Supervision, TargetState, Timeouts
 from lifecycle.plan.comparison import PlanDifference, changes
@@ -25,7 +27,7 @@ _JUDGED_BY = (
 
 _ENDPOINT: dict[str, Any] = {
     each.name: each.default
-    for each in dataclasses.fields(PlannedEndpoint)
+    for each in msgspec.structs.fields(PlannedEndpoint)
     if each.name in _JUDGED_BY
 }
 
@@ -37,8 +39,7 @@ _PARAMETER_WORDS = ("-p", "--params-file")
 Values = Mapping[str, ParameterValue]
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class GivenParameters:
+class GivenParameters(msgspec.Struct, frozen=True, kw_only=True):
     """Parameters of a node that may be set while it runs: their values before and from now on.
 
     Attributes:
@@ -50,8 +51,7 @@ class GivenParameters:
     types: Mapping[str, str]
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class PlanChange:
+class PlanChange(msgspec.Struct, frozen=True, kw_only=True):
     """What becomes of the nodes of a running system with another plan; all else stays as it is.
 
     Attributes:
@@ -66,7 +66,7 @@ class PlanChange:
     added: tuple[str, ...] = ()
     removed: tuple[str, ...] = ()
     restarted: tuple[str, ...] = ()
-    parameters: Mapping[str, GivenParameters] = dataclasses.field(default_factory=dict)
+    parameters: Mapping[str, GivenParameters] = msgspec.field(default_factory=dict)
 
     @property
     def ends_or_starts(self) -> bool:
@@ -123,10 +123,10 @@ def _as_run(node: PlannedNode) -> object:
     """Return what of a node its process depends on, but for parameters."""
     hosted = node.run.kind is RunKind.PYTHON
     unmanaged = node.state is TargetState.UNCONFIGURED
-    bare = dataclasses.replace(
+    bare = replace(
         node,
-        endpoints=tuple(dataclasses.replace(each, **_ENDPOINT) for each in node.endpoints),
-        participants=tuple(dataclasses.replace(each, reason="") for each in node.participants),
+        endpoints=tuple(replace(each, **_ENDPOINT) for each in node.endpoints),
+        participants=tuple(replace(each, reason="") for each in node.participants),
         parameters=(),
         mode_parameters=(),
         parameter_files=(),

@@ -17,7 +17,8 @@ import hashlib
 import json
 from collections.abc import Iterator, Mapping
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.codec import from_json, to_json, to_plain
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import OnViolation, RunKind
@@ -54,8 +55,7 @@ _ENDPOINT_DERIVED = (
 )
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class PlanDifference:
+class PlanDifference(msgspec.Struct, frozen=True, kw_only=True):
     """One difference between two plans.
 
     Attributes:
@@ -203,7 +203,7 @@ def _flows(node: PlannedNode) -> _Tree:
     """Return what each endpoint asks of its flow, without what it does not ask."""
     found: dict[str, dict[str, object]] = {}
     waiting = {each.name for each in node.participants if each.non_blocking_send}
-    defaults = {field.name: field.default for field in dataclasses.fields(PlannedEndpoint)}
+    defaults = {field.name: field.default for field in msgspec.structs.fields(PlannedEndpoint)}
     for each in node.endpoints:
         skipped = list(_ENDPOINT_DERIVED)
         asked: dict[str, object] = {}
@@ -224,7 +224,7 @@ def _flows(node: PlannedNode) -> _Tree:
 
 
 def _fields(value: object, *without: str) -> dict[str, object]:
-    """Return the fields of a dataclass by the names that the manifest has for them."""
+    """Return the fields of a Struct by the names that the manifest has for them."""
     plain = to_plain(value)
     assert isinstance(plain, dict)
     return {
@@ -287,8 +287,7 @@ class PlanNoticeError(ValueError):
     """A text that is no notice."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class PlanNotice:
+class PlanNotice(msgspec.Struct, frozen=True, kw_only=True):
     """What one supervisor announces of its plan.
 
     Attributes:

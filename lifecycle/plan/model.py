@@ -10,7 +10,9 @@ from __future__ import annotations
 import enum
 from typing import Annotated, Any
 
-from lifecycle import dataclasses
+import msgspec
+from msgspec.structs import replace
+
 from lifecycle.codec import DomainId, DscpValue, Port, Positive, says
 from lifecycle.errors import ExitCode, LifecycleError
 from lifecycle.manifest.diagnostics import Diagnostic, Position
@@ -21,7 +23,6 @@ from lifecycle.manifest.model import (
     Endpoint,
     EndpointPolicy,
     FlowIdentification,
-    FlowTerms,
     FlowTransport,
     NodeDeclaration,
     ParameterDeclaration,
@@ -34,6 +35,7 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.manifest.shared import SIM_TIME
 from lifecycle.network.medium import UDP_UNICAST, Medium
+from lifecycle.network.nfe import UniqueRequirement
 
 _UdpUnicast = Annotated[Medium, says(enum=[each.value for each in UDP_UNICAST])]
 
@@ -48,7 +50,7 @@ def declared(as_: type, by: object) -> dict[str, Any]:
         as_: the manifest's type.
         by: a value of it, or of a type that extends it.
     """
-    return {each.name: getattr(by, each.name) for each in dataclasses.fields(as_)}
+    return {each.name: getattr(by, each.name) for each in msgspec.structs.fields(as_)}
 
 
 MAX_USER_ID = 32767
@@ -60,8 +62,7 @@ GRAPH_TOPIC = "ros_discovery_info"
 GRAPH_TYPE = "rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_"
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class StaticEndpoint:
+class StaticEndpoint(msgspec.Struct, frozen=True, kw_only=True):
     """One line of the table of static endpoint discovery (Fast DDS, STATIC EDP).
 
     Attributes:
@@ -81,16 +82,14 @@ class StaticEndpoint:
     transient_local: bool = False
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class StaticParticipant:
+class StaticParticipant(msgspec.Struct, frozen=True, kw_only=True):
     """A participant that others know without announcement. `name` is its enclave, `/camera_net`."""
 
     name: str
     endpoints: tuple[StaticEndpoint, ...]
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class ParticipantConnections:
+class ParticipantConnections(msgspec.Struct, frozen=True, kw_only=True):
     """How one participant is connected: the arguments of `connect_to`.
 
     Attributes:
@@ -107,8 +106,7 @@ class ParticipantConnections:
     super_client: bool = False
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class PlannedParticipant:
+class PlannedParticipant(msgspec.Struct, frozen=True, kw_only=True):
     """An extra DDS participant that carries endpoints which need their own flow or mark.
 
     A publisher becomes unique only in its own participant, so the planner groups publishers of one
@@ -141,12 +139,18 @@ class PlannedParticipant:
     declared: bool = False
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class PlannedEndpoint(Endpoint, FlowTerms):
+class PlannedEndpoint(Endpoint, frozen=True, kw_only=True):
     """One endpoint as it must exist at run time.
 
     Attributes:
         resolved: fully qualified topic, service or action name after namespace and remap.
+        loss: highest share of messages lost or late that it bears, > 0 and <= 1; None if not
+            declared.
+        rate_hz: messages per second, > 0; likewise.
+        transport: NETWORK must not go by shared memory.
+        lossy: the data bear an unreliable transport (True), or do not (False); None leaves that to
+            the QoS and to the node's own hint, which this overrides.
+        quantities: each of its numbers that only a measurement could prove, as it is written.
         dscp: 0–63 of what it sends: a publisher's data, a subscription's acknowledgements.
         dscp_reason: source of a DSCP that is not written as such; empty if it is.
         five_qi_reason: why it is this 5QI, or none, where the manifest has `auto`; else empty.
@@ -160,6 +164,12 @@ class PlannedEndpoint(Endpoint, FlowTerms):
     """
 
     resolved: str
+    unique: UniqueRequirement = UniqueRequirement.NOT_REQUIRED
+    loss: float | None = None
+    rate_hz: float | None = None
+    transport: FlowTransport = FlowTransport.ANY
+    lossy: bool | None = None
+    quantities: tuple[Quantity, ...] = ()
     dscp: DscpValue | None = None
     enforce_dscp: bool = True
     dscp_reason: str = ""
@@ -172,8 +182,7 @@ class PlannedEndpoint(Endpoint, FlowTerms):
     type_hash: str = ""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class PlannedFile:
+class PlannedFile(msgspec.Struct, frozen=True, kw_only=True):
     """A path that the manifest gives a node, as it was when the plan was made.
 
     Attributes:
@@ -189,8 +198,7 @@ class PlannedFile:
     digest: Annotated[str, says(pattern="^([0-9a-f]{16})?$")] = ""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class ExpectedParameter:
+class ExpectedParameter(msgspec.Struct, frozen=True, kw_only=True):
     """A parameter that a node must have, and what of it must be so.
 
     Attributes:
@@ -227,8 +235,7 @@ def raw_value(value: Any, type_: str) -> Any:
     return float(value.replace(".", "")) if isinstance(value, str) else value
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class ModeParameters:
+class ModeParameters(msgspec.Struct, frozen=True, kw_only=True):
     """What those parameters of a node are in one mode that some mode sets.
 
     Attributes:
@@ -249,8 +256,7 @@ class HeldBy(enum.Enum):
     NOTHING = "nothing"  # it works as soon as it is started
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class PlannedNode(NodeDeclaration):
+class PlannedNode(NodeDeclaration, frozen=True, kw_only=True):
     """One node as it must exist at run time.
 
     Attributes:
@@ -298,8 +304,7 @@ class PlannedNode(NodeDeclaration):
         return next(found, ())
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class PlannedProcess:
+class PlannedProcess(msgspec.Struct, frozen=True, kw_only=True):
     """One operating system process.
 
     Attributes:
@@ -317,8 +322,7 @@ class PlannedProcess:
     environment: tuple[tuple[str, str], ...] = ()
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class PlannedFlow:
+class PlannedFlow(msgspec.Struct, frozen=True, kw_only=True):
     """One publisher → subscription pair that must match and what its flow must be.
 
     Attributes:
@@ -345,8 +349,7 @@ class PlannedFlow:
     quantities: tuple[Quantity, ...] = ()
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class PlannedServer:
+class PlannedServer(msgspec.Struct, frozen=True, kw_only=True):
     """The discovery server that a supervisor starts, watches and ends.
 
     Attributes:
@@ -364,8 +367,7 @@ class PlannedServer:
     prefix: str
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Plan(SystemDeclaration):
+class Plan(SystemDeclaration, frozen=True, kw_only=True):
     """A system, planned.
 
     Attributes:
@@ -425,16 +427,16 @@ def in_mode(plan: Plan, name: str) -> Plan:
         if node.key not in switched:
             return node
         state = TargetState.INACTIVE if node.key in mode.inactive else TargetState.ACTIVE
-        return node if node.state is state else dataclasses.replace(node, state=state)
+        return node if node.state is state else replace(node, state=state)
 
-    return dataclasses.replace(plan, nodes=tuple(map(as_in_mode, plan.nodes)))
+    return replace(plan, nodes=tuple(map(as_in_mode, plan.nodes)))
 
 
 def _with_parameters(node: PlannedNode, given: tuple[ExpectedParameter, ...]) -> PlannedNode:
     """Return a node that is started with other values, and must have them."""
     values = {each.name: each for each in given}
     known = {each.name for each in node.expected_parameters}
-    return dataclasses.replace(
+    return replace(
         node,
         expected_parameters=(
             *(values.get(each.name, each) for each in node.expected_parameters),

@@ -15,7 +15,8 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, NamedTuple
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import Mode, ModeParameter, Node, ParameterDeclaration, ParameterValue
 from lifecycle.plan.model import ExpectedParameter, ModeParameters
@@ -39,8 +40,7 @@ class _Given(NamedTuple):
     at: Position
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class _GivenFile:
+class _GivenFile(msgspec.Struct, frozen=True, kw_only=True):
     shown: str
     sections: tuple[Section, ...]
     is_read: bool

@@ -16,7 +16,8 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from lifecycle import dataclasses
+from msgspec.structs import replace
+
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.flows import ParticipantGroup
 from lifecycle.manifest.model import Node, ParameterValue, RosArguments, Run
@@ -46,7 +47,7 @@ def place_flows(
         for name in group.names
     }
     placed = tuple(
-        dataclasses.replace(each, participant=names[each.kind, each.name])
+        replace(each, participant=names[each.kind, each.name])
         if (each.kind, each.name) in names
         else each
         for each in endpoints

@@ -15,7 +15,9 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
-from lifecycle import dataclasses
+import msgspec
+from msgspec.structs import replace
+
 from lifecycle.errors import LifecycleError, did_you_mean
 from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.model import Authority, EndpointKind, Manifest, Node, Run, RunKind
@@ -44,8 +46,7 @@ _WORDS = {
 _PYTHON = re.compile(r"python(3(\.\d+)?)?")
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class UnresolvedProgram:
+class UnresolvedProgram(msgspec.Struct, frozen=True, kw_only=True):
     """Something of a node that could not be looked for here.
 
     Attributes:
@@ -63,8 +64,7 @@ class UnresolvedProgram:
         return f"{place}could not resolve {self.subject}: {self.reason}"
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Resolution:
+class Resolution(msgspec.Struct, frozen=True, kw_only=True):
     """The result of looking for everything that a manifest runs.
 
     Attributes:
@@ -412,4 +412,4 @@ def _at(node: Node, part: str) -> Position:
     at = node.where(part)
     at = node.where("run") if at == node.at else at
     known = at.path.endswith(part)
-    return at if known else dataclasses.replace(at, path=f"nodes.{node.key}.{part}")
+    return at if known else replace(at, path=f"nodes.{node.key}.{part}")

@@ -17,7 +17,8 @@ import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.errors import LifecycleError, did_you_mean
 from lifecycle.manifest.model import EndpointKind
 
@@ -56,8 +57,7 @@ class UnknownError(LifecycleError):
     """Only running it can show that; the message is the reason, half a sentence."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Handler:
+class Handler(msgspec.Struct, frozen=True, kw_only=True):
     """A decorated method.
 
     Attributes:
@@ -75,8 +75,7 @@ class Handler:
     place: str
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Access:
+class Access(msgspec.Struct, frozen=True, kw_only=True):
     """An endpoint that code asks for by a literal name: `self.publisher("chatter")`."""
 
     kind: EndpointKind
@@ -85,8 +84,7 @@ class Access:
     place: str
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class NodeClass:
+class NodeClass(msgspec.Struct, frozen=True, kw_only=True):
     """What the source of a class shows.
 
     Attributes:
@@ -118,8 +116,7 @@ class NodeClass:
     has_health: bool = False
 
 
-@dataclasses.dataclass(slots=True)
-class _Module:
+class _Module(msgspec.Struct):
     """A module's source; `bound` holds the top statements that bind a name, anywhere inside."""
 
     name: str
@@ -133,8 +130,7 @@ _Function = (ast.FunctionDef, ast.AsyncFunctionDef)
 _AnyFunction = ast.FunctionDef | ast.AsyncFunctionDef
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class _Definition:
+class _Definition(msgspec.Struct, frozen=True):
     """A class or function, and the module that defines it."""
 
     module: _Module

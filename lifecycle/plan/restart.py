@@ -14,7 +14,8 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping
 from types import MappingProxyType
 
-from lifecycle import dataclasses
+from msgspec.structs import replace
+
 from lifecycle.network.connection_url import ConnectionUrl, Peer, parse
 from lifecycle.plan.connections.hosts import PortPool, contacts_of
 from lifecycle.plan.model import ParticipantConnections, Plan, PlanError
@@ -79,24 +80,22 @@ def restarted(
     urls = {}
     for place, (_, url) in again.items():
         peers = _peers(place, original, reached, again)
-        urls[place] = str(dataclasses.replace(url, peers=peers))
+        urls[place] = str(replace(url, peers=peers))
 
     def moved(connections: ParticipantConnections, place: _Place) -> ParticipantConnections:
         if place not in urls:
             return connections
         texts = tuple(urls[place] if _has_port(parse(each)) else each for each in connections.urls)
-        return dataclasses.replace(connections, urls=texts)
+        return replace(connections, urls=texts)
 
-    return dataclasses.replace(
+    return replace(
         plan,
         nodes=tuple(
-            dataclasses.replace(
+            replace(
                 node,
                 connections=moved(node.connections, (node.process, "")),
                 participants=tuple(
-                    dataclasses.replace(
-                        each, connections=moved(each.connections, (node.key, each.name))
-                    )
+                    replace(each, connections=moved(each.connections, (node.key, each.name)))
                     for each in node.participants
                 ),
             )
@@ -129,10 +128,10 @@ def moved_observer(
             hint="lower 'discovery.first_port'",
         )
     urls = tuple(
-        str(dataclasses.replace(url, port=port) if _has_port(url) else url)
+        str(replace(url, port=port) if _has_port(url) else url)
         for url in map(parse, connections.urls)
     )
-    return dataclasses.replace(connections, urls=urls)
+    return replace(connections, urls=urls)
 
 
 def moving_nodes(plan: Plan) -> frozenset[str]:
@@ -165,7 +164,7 @@ def is_restarted_url(planned: str, reported: str, *, first_port: int) -> bool:
         return False
     if was.port is None or now.port is None or now.port < first_port + RESTART_PORTS_FROM:
         return False
-    return dataclasses.replace(now, port=was.port, peers=was.peers) == was
+    return replace(now, port=was.port, peers=was.peers) == was
 
 
 def _has_port(url: ConnectionUrl) -> bool:
@@ -211,7 +210,7 @@ def _on_next_port(
     if had != original[place][1].port:
         while port <= had:
             port = pool.take(host, len(listeners))[mine]
-    return dataclasses.replace(url, port=port)
+    return replace(url, port=port)
 
 
 def _peers(

@@ -9,7 +9,8 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 
-from lifecycle import dataclasses
+from msgspec.structs import replace
+
 from lifecycle.plan.model import Plan
 
 REDACTED = "(redacted)"
@@ -34,19 +35,19 @@ def shown(variable: str, value: str) -> str:
 def without_secrets(plan: Plan) -> Plan:
     """Return `plan` without values of environment variables whose names say they are secret."""
     nodes = tuple(
-        dataclasses.replace(
+        replace(
             node,
-            run=dataclasses.replace(node.run, environment=_redacted(node.run.environment)),
+            run=replace(node.run, environment=_redacted(node.run.environment)),
         )
         if _has_secrets(node.run.environment)
         else node
         for node in plan.nodes
     )
     processes = tuple(
-        dataclasses.replace(
+        replace(
             process,
             environment=_redacted(process.environment),
-            run=dataclasses.replace(process.run, environment=_redacted(process.run.environment)),
+            run=replace(process.run, environment=_redacted(process.run.environment)),
         )
         if _has_secrets((*process.environment, *process.run.environment))
         else process
@@ -54,7 +55,7 @@ def without_secrets(plan: Plan) -> Plan:
     )
     if nodes == plan.nodes and processes == plan.processes:
         return plan
-    return dataclasses.replace(plan, nodes=nodes, processes=processes)
+    return replace(plan, nodes=nodes, processes=processes)
 
 
 def _has_secrets(variables: Iterable[tuple[str, str]]) -> bool:

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
-from lifecycle import dataclasses
+from msgspec.structs import replace
+
 from lifecycle.manifest.model import EndpointKind, EndpointPolicy, Policy, UniqueHow
 from lifecycle.network.medium import Medium
 from lifecycle.network.nfe import NetworkFlowEndpoint, TransportProtocol, is_ip
@@ -193,7 +194,7 @@ def verify(
 
 def with_only(verdict: Verdict, findings: tuple[Finding, ...], policy: Policy) -> Verdict:
     """Return `verdict` with these of its findings, and what follows from them."""
-    return dataclasses.replace(
+    return replace(
         verdict,
         verdict=Outcome.worst(each.outcome for each in findings if not is_trusted(each, policy)),
         blocking=_blocks(findings, policy),
@@ -209,7 +210,7 @@ def with_findings(verdict: Verdict, findings: tuple[Finding, ...], policy: Polic
     if not findings:
         return verdict
     added = with_only(verdict, findings, policy)
-    return dataclasses.replace(
+    return replace(
         added,
         verdict=Outcome.worst((verdict.verdict, added.verdict)),
         blocking=verdict.blocking or added.blocking,

@@ -9,7 +9,8 @@ from __future__ import annotations
 import itertools
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
-from lifecycle import dataclasses
+from msgspec.structs import replace
+
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedNode
 from lifecycle.verify.observation import (
@@ -202,7 +203,7 @@ def _unknown(
         if _counts(endpoint, node, names, ours=node in configurations):
             # Half of a service may be seen before its node is: it is no second one.
             known = node and not endpoint.kind.is_topic
-            yield _as_of(dataclasses.replace(endpoint, gid="") if known else endpoint, node)
+            yield _as_of(replace(endpoint, gid="") if known else endpoint, node)
 
 
 def _counts(endpoint: ObservedEndpoint, node: str, names: DeclaredNames, *, ours: bool) -> bool:
@@ -219,7 +220,7 @@ def _counts(endpoint: ObservedEndpoint, node: str, names: DeclaredNames, *, ours
 def _as_of(endpoint: ObservedEndpoint, node: str) -> ObservedEndpoint:
     if node == endpoint.node:
         return endpoint
-    return dataclasses.replace(endpoint, node=node)
+    return replace(endpoint, node=node)
 
 
 def _place(endpoint: ObservedEndpoint) -> tuple[EndpointKind, str]:
@@ -433,9 +434,7 @@ def _graph_nodes(
         if name not in planned and (name in tools or name in hidden):
             continue
         known = merged.get(name)
-        merged[name] = (
-            node if known is None else dataclasses.replace(known, count=known.count + node.count)
-        )
+        merged[name] = node if known is None else replace(known, count=known.count + node.count)
     return merged
 
 

@@ -11,7 +11,9 @@ import ipaddress
 import re
 from collections.abc import Iterable
 
-from lifecycle import codec, dataclasses
+import msgspec
+
+from lifecycle import codec
 from lifecycle.codec import Count, DscpValue
 from lifecycle.manifest.model import EndpointKind, ParameterValue
 from lifecycle.manifest.qos import QosProfile
@@ -30,8 +32,7 @@ LONGEST_VALUE = 4096
 """Bytes of JSON; of a longer parameter value only the digest is passed on."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Identity:
+class Identity(msgspec.Struct, frozen=True, kw_only=True):
     """What distinguishes one node instance from every other.
 
     Attributes:
@@ -45,8 +46,7 @@ class Identity:
     node_id: str
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class EndpointReport:
+class EndpointReport(msgspec.Struct, frozen=True, kw_only=True):
     """What a node reports of one of its endpoints.
 
     Attributes:
@@ -89,8 +89,7 @@ class EndpointReport:
     type_hash: str | None = None
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class ParameterReport:
+class ParameterReport(msgspec.Struct, frozen=True, kw_only=True):
     """What a node reports of one of its parameters.
 
     Attributes:
@@ -134,8 +133,7 @@ def digest_of(value: ParameterValue) -> str:
     return hashlib.sha256(document).hexdigest() if len(document) > LONGEST_VALUE else ""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class HealthReport:
+class HealthReport(msgspec.Struct, frozen=True, kw_only=True):
     """What a node says of its own health, or /diagnostics of it.
 
     Attributes:
@@ -147,8 +145,7 @@ class HealthReport:
     message: str = ""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class NodeConfiguration:
+class NodeConfiguration(msgspec.Struct, frozen=True, kw_only=True):
     """The node configuration interface's document.
 
     Attributes:
@@ -261,8 +258,7 @@ SERVES_NONE = "serves no parameters"
 """Why nothing is known of the parameters of a node that has no parameter services."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class NodeParameters:
+class NodeParameters(msgspec.Struct, frozen=True, kw_only=True):
     """What a node's parameter services returned for the parameters that its plan names.
 
     Attributes:
@@ -276,8 +272,7 @@ class NodeParameters:
     error: str = ""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class ObservedNode:
+class ObservedNode(msgspec.Struct, frozen=True, kw_only=True):
     """A node name in the graph.
 
     Attributes:
@@ -294,8 +289,7 @@ class ObservedNode:
     health: HealthReport | None = None
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class ObservedEndpoint:
+class ObservedEndpoint(msgspec.Struct, frozen=True, kw_only=True):
     """An endpoint as discovery shows it.
 
     Attributes:
@@ -322,8 +316,7 @@ class ObservedEndpoint:
     silent: bool = False
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Observation:
+class Observation(msgspec.Struct, frozen=True, kw_only=True):
     """Everything seen of a system at one moment, tools and what they use included.
 
     Attributes:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import enum
 from collections.abc import Iterable
 
-from lifecycle import dataclasses
+import msgspec
 
 
 class Outcome(enum.Enum):
@@ -26,8 +26,7 @@ class Outcome(enum.Enum):
         return next((each for each in (cls.VIOLATED, cls.UNVERIFIABLE) if each in outcomes), cls.OK)
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class ConnectionReport:
+class ConnectionReport(msgspec.Struct, frozen=True, kw_only=True):
     """What a node reports of one of its connections.
 
     Attributes:

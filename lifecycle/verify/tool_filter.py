@@ -15,7 +15,8 @@ import functools
 import re
 from collections.abc import Collection, Iterable, Mapping
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.manifest.installed_types import join
 from lifecycle.manifest.model import TOLERATED_NODES, EndpointKind, RosInterfaceAccess
 from lifecycle.manifest.names import (
@@ -170,8 +171,7 @@ def _offering(kind: EndpointKind) -> EndpointKind:
     return kind if kind.offers else kind.other_end
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class DeclaredNames:
+class DeclaredNames(msgspec.Struct, frozen=True):
     """The topics, services and actions that a plan declares.
 
     Attributes:
@@ -652,8 +652,7 @@ def _action_hash(parts: Iterable[ObservedEndpoint]) -> str | None:
     return join(known) if len(known) == len(found) else None
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class Owner:
+class Owner(msgspec.Struct, frozen=True):
     """Whose a hidden node is, as that node itself reports.
 
     Attributes:

@@ -13,7 +13,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.manifest.model import EndpointKind, UniqueHow
 from lifecycle.network.nfe import (
     InternetProtocol,
@@ -38,8 +39,7 @@ _SEVERAL = -1
 _Bucket = tuple[EndpointKind, InternetProtocol, TransportProtocol, int]
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class _Entry:
+class _Entry(msgspec.Struct, frozen=True, kw_only=True):
     """One endpoint.
 
     Attributes:

@@ -8,7 +8,8 @@ from __future__ import annotations
 import enum
 from typing import Annotated
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.codec import DscpValue, Octet, says
 from lifecycle.manifest.model import EndpointKind, UniqueHow
 from lifecycle.network.medium import Medium
@@ -25,8 +26,7 @@ class Stage(enum.Enum):
     ACTIVE = "active"  # after the gate, and for `lifecycle verify`
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Finding:
+class Finding(msgspec.Struct, frozen=True, kw_only=True):
     """One rule's result on one subject; only violated and unverifiable ones are kept.
 
     Attributes:
@@ -59,8 +59,7 @@ class Finding:
         return (self.node,) if self.node else self.ends
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class FlowReport:
+class FlowReport(msgspec.Struct, frozen=True, kw_only=True):
     """One publisher → subscription pair as it runs.
 
     Attributes:
@@ -101,14 +100,13 @@ class FlowReport:
     five_qi_reason: str = ""
     effective_transport: _Carrier = "unknown"
     reader_dscp: DscpValue | None = None
-    tuples: tuple[FlowTuple, ...] = dataclasses.field(init=False)
+    tuples: tuple[FlowTuple, ...] = ()
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "tuples", flow_tuples(self.source, self.destination))
+        msgspec.structs.force_setattr(self, "tuples", flow_tuples(self.source, self.destination))
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class OpenEndpoint:
+class OpenEndpoint(msgspec.Struct, frozen=True, kw_only=True):
     """An endpoint that no manifest declares, of a node that may have such: `endpoints: open`.
 
     Attributes:
@@ -122,8 +120,7 @@ class OpenEndpoint:
     type: str
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class ToleratedNode:
+class ToleratedNode(msgspec.Struct, frozen=True, kw_only=True):
     """A node that no manifest declares and that the policy lets be there.
 
     Attributes:
@@ -151,8 +148,7 @@ _ENDED = {
 }
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class RunEnd:
+class RunEnd(msgspec.Struct, frozen=True, kw_only=True):
     """How a run of a supervisor ended.
 
     Attributes:
@@ -175,8 +171,7 @@ class RunEnd:
         return f"ended {_ENDED[self.reached]}, exit code {self.exit_code}: {self.reason}{trusted}"
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Verdict:
+class Verdict(msgspec.Struct, frozen=True, kw_only=True):
     """The result of `verify`.
 
     Attributes:

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import EndpointKind, RunKind
 from lifecycle.manifest.qos import Durability, History, Liveliness, QosProfile, Reliability
@@ -49,8 +50,7 @@ _BY_STRENGTH = (
 )
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Actual:
+class Actual(msgspec.Struct, frozen=True, kw_only=True):
     """A declared endpoint and what was seen of it.
 
     Attributes:
@@ -69,8 +69,7 @@ class Actual:
     beyond: bool = False
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class SeenEndpoint:
+class SeenEndpoint(msgspec.Struct, frozen=True, kw_only=True):
     """An endpoint of the graph, declared or not, with all that is known of it.
 
     Attributes:
@@ -95,8 +94,7 @@ class SeenEndpoint:
     expected: bool = True
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class NodeFacts:
+class NodeFacts(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     """A declared node and all that is known of it.
 
     Attributes:
@@ -127,8 +125,7 @@ class NodeFacts:
         return self.node.run.kind is RunKind.PYTHON
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FlowView:
+class FlowView(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     """A planned flow and what was seen of its two ends.
 
     Attributes:
@@ -175,8 +172,7 @@ def _strongest(ends: Iterable[Actual]) -> UniqueRequirement:
     return next(each for each in _BY_STRENGTH if each in asked)
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class View:
+class View(msgspec.Struct, frozen=True, kw_only=True):
     """The input of every rule.
 
     Attributes:

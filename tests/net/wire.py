@@ -18,6 +18,8 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 
+from msgspec.structs import replace
+
 from tests.net.fragments import IPV6_FRAGMENT, Fragments
 from tests.net.hosts import Host
 
@@ -246,7 +248,7 @@ class Capture:
             return
         if packet is None:
             return
-        packet = dataclasses.replace(packet, interface=interface)
+        packet = replace(packet, interface=interface)
         message = self._fragments.add(octets)[_UDP_HEADER:]
         if message[:4] == b"RTPS":
             self._learn_all(message)
@@ -257,7 +259,7 @@ class Capture:
             writers += [prefix + writer for writer, _ in _data(message)]
             readers += [prefix + reader for reader in _acknowledging(message)]
             self._learn_all(message)
-            packet = dataclasses.replace(
+            packet = replace(
                 packet,
                 participant=prefix,
                 discovers=any(each[12:] == _PARTICIPANT_WRITER for each in writers),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -11,6 +10,7 @@ import pytest
 import rclpy
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 from rclpy.duration import Duration
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.expand_topic_name import expand_topic_name
@@ -121,8 +121,8 @@ def worst(offered: QosProfile, requested: QosProfile) -> QoSCompatibility:
 def test_two_profiles_that_differ_in_up_to_two_policies_match_as_rmw_says() -> None:
     wrong = []
     for offer, request in itertools.product(VALUES, VALUES):
-        offered = dataclasses.replace(QosProfile(), **offer)  # type: ignore[arg-type]
-        requested = dataclasses.replace(QosProfile(), **request)  # type: ignore[arg-type]
+        offered = replace(QosProfile(), **offer)  # type: ignore[arg-type]
+        requested = replace(QosProfile(), **request)  # type: ignore[arg-type]
         real, reason = qos_check_compatible(theirs(offered), theirs(requested))
         if worst(offered, requested) != real:
             wrong.append((offer, request, reason))

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import click
+import msgspec
 
-from lifecycle import dataclasses
 from lifecycle.cli.common import (
     assignments_argument,
     format_option,
@@ -38,8 +38,7 @@ _SPARE_S = 30.0
 _OUTCOMES = ("applied", "unchanged", "would_apply", "refused", "rolled_back")
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class ApplyReport:
+class ApplyReport(msgspec.Struct, frozen=True, kw_only=True):
     """What became of a manifest that was applied (schemas/apply.v1.schema.json).
 
     Attributes:

@@ -11,8 +11,8 @@ import os
 from pathlib import Path
 
 import click
+import msgspec
 
-from lifecycle import dataclasses
 from lifecycle.ci_formats import Case, Result, Suite, junit, sarif
 from lifecycle.cli.common import (
     format_option,
@@ -47,8 +47,7 @@ TESTS = {
 """Test → beginnings of the rules that it covers; any other rule is of the system."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class CheckReport:
+class CheckReport(msgspec.Struct, frozen=True, kw_only=True):
     """What was found in one manifest and everything it includes (schemas/check.v1.schema.json).
 
     Attributes:

@@ -9,8 +9,8 @@ import os
 from pathlib import Path
 
 import click
+import msgspec
 
-from lifecycle import dataclasses
 from lifecycle.cli.common import (
     format_option,
 )
@@ -38,8 +38,7 @@ from lifecycle.plan.build import effective_domain
 THIS = "this"
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class PortsReport:
+class PortsReport(msgspec.Struct, frozen=True, kw_only=True):
     """All that the verb says; the JSON document has these keys.
 
     Attributes:

@@ -8,7 +8,8 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Mapping
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.export.picture.model import (
     DASHES,
     LineKind,
@@ -42,8 +43,7 @@ _WORST_FIRST = (Presence.MISSING, Presence.UNDECLARED, Presence.PRESENT, Presenc
 _WORST_OUTCOME = (Outcome.VIOLATED, Outcome.UNVERIFIABLE, Outcome.OK)
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Supervised:
+class Supervised(msgspec.Struct, frozen=True, kw_only=True):
     """What only a supervisor knows of a node.
 
     Attributes:

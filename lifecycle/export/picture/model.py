@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import enum
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.codec import DomainId, Positive
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import Finding
@@ -48,8 +49,7 @@ class PicturedNodeState(enum.Enum):
     MANAGED = "managed"  # in the picture of a plan, where no node has a state yet
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class PicturedNode:
+class PicturedNode(msgspec.Struct, frozen=True, kw_only=True):
     """One node.
 
     Attributes:
@@ -71,8 +71,7 @@ class PicturedNode:
     findings: tuple[Positive, ...]
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class PicturedEnd:
+class PicturedEnd(msgspec.Struct, frozen=True, kw_only=True):
     """A node's end of a topic, service or action."""
 
     node: str
@@ -81,8 +80,7 @@ class PicturedEnd:
     findings: tuple[Positive, ...]
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class PicturedFlow:
+class PicturedFlow(msgspec.Struct, frozen=True, kw_only=True):
     """Two nodes' ends that belong together.
 
     Attributes:
@@ -101,8 +99,7 @@ class PicturedFlow:
     unique: bool
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class PicturedLine:
+class PicturedLine(msgspec.Struct, frozen=True, kw_only=True):
     """One topic, service or action: a row.
 
     Attributes:
@@ -119,8 +116,7 @@ class PicturedLine:
     flows: tuple[PicturedFlow, ...]
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Picture:
+class Picture(msgspec.Struct, frozen=True, kw_only=True):
     """A whole picture.
 
     Attributes:
@@ -147,8 +143,7 @@ class Picture:
         return f"system {self.system}, domain {self.domain_id}{phase}{verdict}"
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Appearance:
+class Appearance(msgspec.Struct, frozen=True, kw_only=True):
     """How one state looks; `ink` is readable on `fill`."""
 
     symbol: str

@@ -12,7 +12,8 @@ import os
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.manifest.checks.connection_urls import check_urls
 from lifecycle.manifest.checks.connections import (
     check_connections,
@@ -50,8 +51,7 @@ from lifecycle.manifest.installed_types import search_prefixes
 from lifecycle.manifest.model import Manifest
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Scope:
+class Scope(msgspec.Struct, frozen=True, kw_only=True, dict=True):
     """What a check may read.
 
     Attributes:

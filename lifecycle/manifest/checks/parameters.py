@@ -21,7 +21,9 @@ from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from lifecycle import dataclasses
+import msgspec
+from msgspec.structs import replace
+
 from lifecycle.errors import did_you_mean
 from lifecycle.manifest.checks.system import DeclaredSystem
 from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position, Severity
@@ -352,8 +354,7 @@ PARAMETERS_KEY = "ros__parameters"
 _LAYOUT = f"write 'NODE: {{{PARAMETERS_KEY}: {{NAME: VALUE}}}}'"
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Section:
+class Section(msgspec.Struct, frozen=True, kw_only=True):
     """What a file sets for the nodes that match one name or pattern.
 
     Attributes:
@@ -421,9 +422,9 @@ def _reworded(each: Diagnostic) -> Diagnostic:
     if each.rule == "yaml.tag":
         # rcl reads `!!str`; the reader that is shared with manifests reads no tags at all.
         message = "cannot check the parameters of this file: it holds a YAML tag"
-        return dataclasses.replace(each, severity=Severity.WARNING, message=message, hint="")
+        return replace(each, severity=Severity.WARNING, message=message, hint="")
     hint = _LAYOUT if "manifest_version" in each.hint else each.hint
-    return dataclasses.replace(each, hint=hint, message=each.message.replace("a manifest", "text"))
+    return replace(each, hint=hint, message=each.message.replace("a manifest", "text"))
 
 
 class _Reading:
@@ -518,13 +519,12 @@ def _has_section(value: Value) -> bool:
     return PARAMETERS_KEY in data or any(map(_has_section, data.values()))
 
 
-@dataclasses.dataclass(slots=True, kw_only=True)
-class _ParameterFile:
+class _ParameterFile(msgspec.Struct, kw_only=True):
     """A file, read once for all nodes that name it."""
 
     shown: str
     sections: tuple[Section, ...] = ()
-    readers: list[Node] = dataclasses.field(default_factory=list)
+    readers: list[Node] = msgspec.field(default_factory=list)
     readable: bool = True
 
 

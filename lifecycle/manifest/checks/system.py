@@ -12,7 +12,8 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterator, Mapping
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import (
@@ -41,8 +42,7 @@ from lifecycle.network.medium import DEFAULT_RMW
 _RMW_VARIABLE = "RMW_IMPLEMENTATION"
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Resolved:
+class Resolved(msgspec.Struct, frozen=True, kw_only=True):
     """One endpoint of one node, with the name it will have in the graph."""
 
     node: Node
@@ -59,8 +59,7 @@ class Resolved:
         return f"{noun} {self.endpoint.name!r} of node {self.node.key!r} ({self.at.spelled})"
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class UnresolvedEndpoint:
+class UnresolvedEndpoint(msgspec.Struct, frozen=True, kw_only=True):
     """An endpoint whose name cannot be resolved, and why."""
 
     node: Node
@@ -68,8 +67,7 @@ class UnresolvedEndpoint:
     problem: LifecycleError
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class DeclaredSystem:
+class DeclaredSystem(msgspec.Struct, frozen=True, kw_only=True, dict=True):
     """A manifest and what follows from it alone.
 
     Attributes:

@@ -12,7 +12,9 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 
-from lifecycle import dataclasses
+import msgspec
+from msgspec.structs import replace
+
 from lifecycle.errors import LifecycleError, did_you_mean
 from lifecycle.manifest.diagnostics import Diagnostic
 from lifecycle.manifest.yaml.document import Cursor, Document, Place, Scalar, Value, error, warning
@@ -37,8 +39,7 @@ _ARGV = ("command", "prefix")
 """Lists that are kept although a program that is not run would write one of their words."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Substituted:
+class Substituted(msgspec.Struct, frozen=True, kw_only=True):
     """A document without substitutions.
 
     Attributes:
@@ -75,7 +76,7 @@ def substitute(
     work = _Substitution(document, surroundings, include)
     work.resolve_arguments(given)
     return Substituted(
-        document=dataclasses.replace(document, root=work.system(document.root)),
+        document=replace(document, root=work.system(document.root)),
         arguments=tuple(work.values.items()),
         diagnostics=tuple(work.found),
         broken=tuple(work.broken),
@@ -179,10 +180,10 @@ class _Substitution:
                 items = tuple(
                     self._item(item, (*inside, index)) for index, item in enumerate(each.data)
                 )
-                data[key] = dataclasses.replace(each, data=items)
+                data[key] = replace(each, data=items)
             elif key not in CONDITIONS and (place or key != "arguments"):
                 data[key] = self.value(each, inside)
-        return dataclasses.replace(value, data=self._known(data, place))
+        return replace(value, data=self._known(data, place))
 
     def _known(self, entries: Mapping[str, Value], place: Place) -> Mapping[str, Value]:
         """Return the entries of a mapping whose values do not depend on programs."""
@@ -208,7 +209,7 @@ class _Substitution:
             if known is None:
                 continue
             kept[key] = node if inside in self.broken else self.value(known, inside)
-        return dataclasses.replace(value, data=kept)
+        return replace(value, data=kept)
 
     def _item(self, value: Value, place: Place) -> Value:
         known = self._conditions(value, place)
@@ -237,7 +238,7 @@ class _Substitution:
                 hint = "write $(equals A B), $(not A), $(and A B) or $(or A B)"
                 self._break(inside, place, message, hint)
                 return value
-            known[key] = dataclasses.replace(each, data=holds)
+            known[key] = replace(each, data=holds)
         if len(written) > 1:
             message = "cannot use if and unless together"
             hint = "write if: $(and A $(not B))"
@@ -246,7 +247,7 @@ class _Substitution:
         if known and known[written[0]].data is not (written[0] == "if"):
             self.left_out.append(place)
             return None
-        return dataclasses.replace(value, data={**value.data, **known}) if known else value
+        return replace(value, data={**value.data, **known}) if known else value
 
     def _break(self, at: Place, place: Place, message: str, hint: str) -> None:
         self._report("manifest.condition", at, message, hint)
@@ -260,10 +261,10 @@ class _Substitution:
             )
             if place[-1] not in _ARGV and any((*place, i) in self.open for i in range(len(items))):
                 self.open.add(place)
-            return dataclasses.replace(value, data=items)
+            return replace(value, data=items)
         if isinstance(value.data, Mapping):
             entries = {key: self.value(each, (*place, key)) for key, each in value.data.items()}
-            return dataclasses.replace(value, data=self._known(entries, place))
+            return replace(value, data=self._known(entries, place))
         if "$" not in value.text:
             return value
         if len(self.found) > MAX_FINDINGS:
@@ -292,7 +293,7 @@ class _Substitution:
         except ValueError as problem:
             self._report("yaml.number", place, f"cannot use {quote(text)}: {problem}")
         else:
-            return dataclasses.replace(value, data=data, text=text)
+            return replace(value, data=data, text=text)
         self.broken.append(place)
         return value
 

@@ -16,7 +16,6 @@ from typing import Any, TypeVar, get_type_hints
 
 import msgspec
 
-from lifecycle import dataclasses
 from lifecycle.manifest.diagnostics import Diagnostic, Position, Severity
 
 Scalar = bool | int | float | str | None
@@ -44,8 +43,7 @@ def spell_place(place: Sequence[str | int]) -> str:
     return spelled
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Value:
+class Value(msgspec.Struct, frozen=True, kw_only=True):
     """One value of a document.
 
     Attributes:
@@ -75,8 +73,7 @@ class Value:
         return null if self.data is None else self.data
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Document:
+class Document(msgspec.Struct, frozen=True, kw_only=True):
     """One file's content.
 
     Attributes:
@@ -147,8 +144,7 @@ _EXACT = 2**53
 """Above, a float cannot represent every integer."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Cursor:
+class Cursor(msgspec.Struct, frozen=True, kw_only=True):
     """A place in a document, and the value there."""
 
     document: Document
@@ -209,7 +205,7 @@ class Cursor:
         return default if cursor is None else cursor.value.text
 
     def build(self, type_: type[T], /, **computed: Any) -> T:
-        """Return a dataclass whose fields are keys of this mapping.
+        """Return a Struct whose fields are keys of this mapping.
 
         Args:
             type_: its fields have the keys' names; what is not written keeps its default. A text is

@@ -10,7 +10,9 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from lifecycle import dataclasses
+import msgspec
+from msgspec.structs import replace
+
 from lifecycle.errors import LifecycleError, did_you_mean
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.interface import Findings
@@ -26,8 +28,7 @@ MAX_DOCUMENTS = 256
 """Manifests of one system; included twice counts twice."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Origin:
+class Origin(msgspec.Struct, frozen=True, kw_only=True):
     """A manifest file in the chain of includes.
 
     Attributes:
@@ -100,7 +101,7 @@ def move(manifest: Manifest, *, prefix: str, namespace: str) -> Manifest:
     old = {node.key: node for node in manifest.nodes}
     new = {node.key: _move_node(node, prefix, namespace) for node in manifest.nodes}
     links = tuple(
-        dataclasses.replace(
+        replace(
             link,
             topic=_moved_topic(link, old, new),
             from_node=join_key(prefix, link.from_node),
@@ -108,7 +109,7 @@ def move(manifest: Manifest, *, prefix: str, namespace: str) -> Manifest:
         )
         for link in manifest.links
     )
-    return dataclasses.replace(
+    return replace(
         manifest,
         nodes=tuple(new.values()),
         links=links,
@@ -118,15 +119,13 @@ def move(manifest: Manifest, *, prefix: str, namespace: str) -> Manifest:
 
 def _move_node(node: Node, prefix: str, namespace: str) -> Node:
     outer, inner = namespace.strip("/"), node.namespace.strip("/")
-    return dataclasses.replace(
+    return replace(
         node,
         key=join_key(prefix, node.key),
         namespace="/" + "/".join(part for part in (outer, inner) if part),
         process=join_key(prefix, node.process) if node.process else "",
         run=_moved_run(node.run, prefix),
-        after=tuple(
-            dataclasses.replace(each, node=join_key(prefix, each.node)) for each in node.after
-        ),
+        after=tuple(replace(each, node=join_key(prefix, each.node)) for each in node.after),
     )
 
 
@@ -134,7 +133,7 @@ def _moved_run(run: Run, prefix: str) -> Run:
     """Return how a node comes to run; a container that the manifest itself has moves with it."""
     if not run.container or run.container.startswith("/"):
         return run
-    return dataclasses.replace(run, container=join_key(prefix, run.container))
+    return replace(run, container=join_key(prefix, run.container))
 
 
 def join_key(prefix: str, key: str) -> str:
@@ -188,7 +187,7 @@ def join(
     machines = {machine.name: machine for machine in outer.machines}
     for machine in inner.machines:
         _join_machine(machines.setdefault(machine.name, machine), machine, found)
-    return dataclasses.replace(
+    return replace(
         outer,
         nodes=tuple(nodes.values()),
         machines=tuple(machines.values()),

@@ -22,7 +22,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import IO
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.errors import LifecycleError, did_you_mean
 from lifecycle.manifest.diagnostics import ManifestError
 from lifecycle.manifest.installed_types import find_resource, list_resources, search_prefixes
@@ -65,8 +66,7 @@ Text = tuple["str | Substitution", ...]
 """Text of a value in its parts."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Substitution:
+class Substitution(msgspec.Struct, frozen=True, kw_only=True):
     """One `$(…)`.
 
     Attributes:
@@ -343,8 +343,7 @@ def _without_last_break(text: str) -> str:
     return text.removesuffix("\n").removesuffix("\r")
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Surroundings:
+class Surroundings(msgspec.Struct, frozen=True, kw_only=True):
     """What substitutions of one document read from outside.
 
     Attributes:

@@ -21,7 +21,9 @@ import re
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, NoReturn
 
-from lifecycle import dataclasses
+import msgspec
+from msgspec.structs import replace
+
 from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position
 from lifecycle.manifest.yaml.document import Document, Place, Scalar, Value, error, spell_place
 
@@ -155,8 +157,7 @@ MAX_FINDINGS = 200
 _SHOWN_DEPTH = 8  # steps of a document path in a message that ends the reading
 
 
-@dataclasses.dataclass(slots=True)
-class _Frame:
+class _Frame(msgspec.Struct):
     """A collection that is still open."""
 
     place: Place
@@ -172,8 +173,7 @@ class _Frame:
     height: int = 1
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class _Anchored:
+class _Anchored(msgspec.Struct, frozen=True):
     value: Value
     values: int
     height: int
@@ -309,7 +309,7 @@ class _Composer:
         self._count(anchored.values, mark)
         if len(self._stack) + anchored.height > MAX_DEPTH:
             self._stop(mark, f"cannot read values nested deeper than {MAX_DEPTH} levels")
-        value = dataclasses.replace(anchored.value, line=mark[0], column=mark[1], alias=True)
+        value = replace(anchored.value, line=mark[0], column=mark[1], alias=True)
         self._finish(value, None, anchored.values, anchored.height)
 
     def _key(self, data: Scalar, event: yaml.ScalarEvent, mark: tuple[int, int]) -> None:
@@ -356,7 +356,7 @@ class _Composer:
             return
         assert frame.key is not None
         if not frame.skip:
-            frame.mapping[frame.key] = dataclasses.replace(value, key=frame.key_mark)
+            frame.mapping[frame.key] = replace(value, key=frame.key_mark)
         frame.key = None
 
     def _wants_key(self) -> bool:

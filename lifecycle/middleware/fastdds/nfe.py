@@ -18,6 +18,7 @@ import weakref
 from collections.abc import Callable, Iterator
 from typing import Any
 
+from msgspec.structs import replace
 from rclpy.context import Context
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.impl.implementation_singleton import rclpy_implementation
@@ -28,7 +29,6 @@ from rclpy.subscription import Subscription
 from rclpy.type_support import check_is_valid_msg_type
 from rclpy.validate_topic_name import validate_topic_name
 
-from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.fastdds.sockets import udp_sockets
@@ -156,7 +156,7 @@ def _convert(nfe: abi.Nfe) -> NetworkFlowEndpoint:
     if not nfe.internet_address:
         # Shared memory, of which Kilted's RMW says that it is UDPv4: it looks at single bits of the
         # kind, and LOCATOR_KIND_SHM of Fast DDS 3 is 19, which has that of LOCATOR_KIND_UDPv4.
-        return dataclasses.replace(SHARED_MEMORY, transport_port=nfe.transport_port)
+        return replace(SHARED_MEMORY, transport_port=nfe.transport_port)
     return NetworkFlowEndpoint(
         transport_protocol=_TRANSPORTS[nfe.transport_protocol],
         internet_protocol=_INTERNETS[nfe.internet_protocol],

@@ -14,7 +14,8 @@ import os
 from collections.abc import Mapping
 from xml.etree import ElementTree as ET
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds.profiles import DefaultProfile, child, drop, text
 from lifecycle.middleware.fastdds.static_edp import endpoint_table
@@ -43,8 +44,7 @@ dials again only when there is something to send: what gets lost so comes with t
 announcement, or with the one after it."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class ParticipantSettings:
+class ParticipantSettings(msgspec.Struct, frozen=True, kw_only=True):
     """What a participant needs that the process's default does not give it.
 
     Attributes:

@@ -16,7 +16,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.versions import DISTRIBUTIONS, installed
 from lifecycle.network.medium import udp_to
@@ -122,8 +123,7 @@ def discovery_environment(
     return {version.profiles_variable: str(path)}
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class DefaultProfile:
+class DefaultProfile(msgspec.Struct, frozen=True, kw_only=True):
     """A participant profile that every participant of the process gets.
 
     Attributes:

@@ -18,11 +18,11 @@ import os
 import weakref
 from collections.abc import Iterator
 
+from msgspec.structs import replace
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.utilities import get_rmw_implementation_identifier
 
-from lifecycle import dataclasses
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds.factory import (
     RMW,
@@ -63,11 +63,11 @@ def observer_settings(settings: ParticipantSettings, *, super_client: bool) -> P
     if get_rmw_implementation_identifier() != RMW or fast_dds_refusal():
         return settings
     if settings or super_client:
-        return dataclasses.replace(settings, super_client=super_client)
+        return replace(settings, super_client=super_client)
     with contextlib.suppress(MiddlewareError):  # Fast DDS ignores such a profile
         base = default_profile()
         if not (os.environ.get(TRANSPORTS_VARIABLE) or (base and base.chosen_transports)):
-            return dataclasses.replace(settings, transports=(RMW_DISCOVERY,), announces_often=True)
+            return replace(settings, transports=(RMW_DISCOVERY,), announces_often=True)
     return settings
 
 

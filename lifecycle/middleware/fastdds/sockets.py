@@ -22,7 +22,8 @@ import struct
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.process.control import interface_addresses
 from lifecycle.middleware.process.shared_memory import open_files
@@ -44,8 +45,7 @@ _DSCP_OPTION = {
 _DISCOVERY_BYTES = 1 << 22
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class OpenSocket:
+class OpenSocket(msgspec.Struct, frozen=True, kw_only=True):
     """A bound UDP or listening TCP socket of a process.
 
     Attributes:

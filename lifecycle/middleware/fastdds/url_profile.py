@@ -14,7 +14,8 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from xml.etree import ElementTree as ET
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds.profiles import child, drop, text
 from lifecycle.middleware.versions import installed
@@ -40,8 +41,7 @@ _DISCOVERY_UNICAST, _DISCOVERY_GROUPS, _SEARCHED = _DISCOVERY = (
 )
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class UrlTransport:
+class UrlTransport(msgspec.Struct, frozen=True, kw_only=True):
     """One transport of a participant: all URLs that it serves.
 
     Attributes:

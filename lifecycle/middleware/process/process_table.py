@@ -12,7 +12,8 @@ import shutil
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from lifecycle import dataclasses
+from msgspec.structs import replace
+
 from lifecycle.export.programs import CapturedProgram
 from lifecycle.middleware.discovery.prefixes import is_of_process
 from lifecycle.plan.secrets import shown
@@ -106,7 +107,7 @@ def note_ended(
     """Return what `GraphObserver.programs` did, with those noted that have ended since."""
     return {
         name: {
-            prefix: dataclasses.replace(each, has_ended=not _speaks_ros(each.process_id))
+            prefix: replace(each, has_ended=not _speaks_ros(each.process_id))
             for prefix, each in found.items()
         }
         for name, found in programs.items()

@@ -21,11 +21,11 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import rclpy
+from msgspec.structs import replace
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 from rclpy.subscription import Subscription
 
-from lifecycle import dataclasses
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.middleware.discovery.environment import is_served, reach, settle_s
 from lifecycle.middleware.discovery.prefixes import PROCESS_DIGITS, is_of_host, is_of_process
@@ -419,7 +419,7 @@ class GraphObserver:
         """Say of who publishes /clock that no time came from it, while that is so."""
         publishes = (endpoint.kind, endpoint.name) == (EndpointKind.PUBLISHER, CLOCK[0])
         if publishes and self._clock is not None and not self._time_came:
-            return dataclasses.replace(endpoint, silent=True)
+            return replace(endpoint, silent=True)
         return endpoint
 
     def _services_by_node(
@@ -470,7 +470,7 @@ class GraphObserver:
                 if each.node not in listed and owner not in shown and not self._is_dead(each):
                     shown.add(owner)
                     gid = "" if each.node else each.gid
-                    yield dataclasses.replace(each, qos=None, type_hash=None, gid=gid)
+                    yield replace(each, qos=None, type_hash=None, gid=gid)
 
     def _hashed(
         self, name: str, endpoints: Iterable[ObservedEndpoint], ends: Callable[..., Ends]
@@ -495,7 +495,7 @@ class GraphObserver:
                 } or {""}
             type_hash = service_hash(both, name)
             for gid in sorted(gids):
-                yield dataclasses.replace(each, type_hash=type_hash, gid=gid)
+                yield replace(each, type_hash=type_hash, gid=gid)
 
     def _located(self, endpoints: Iterable[ObservedEndpoint]) -> Iterator[ObservedEndpoint]:
         """Add their participants' addresses to endpoints of no known node.
@@ -514,7 +514,7 @@ class GraphObserver:
             if prefix not in known and prefix not in self._asked_for and not is_coming:
                 self._asked_for.add(prefix)
                 self.settling.ask()
-            yield dataclasses.replace(endpoint, address=known.get(prefix, ""))
+            yield replace(endpoint, address=known.get(prefix, ""))
 
 
 def _observing_node(domain_id: int, settings: ParticipantSettings) -> tuple[rclpy.Context, Node]:

@@ -10,10 +10,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from msgspec.structs import replace
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
-from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import EndpointKind, EndpointPolicy
 from lifecycle.manifest.qos import QosProfile
@@ -109,9 +109,7 @@ class DeclaredInCode:
         key, is_new = (endpoint.kind, endpoint.name), self._is_new(endpoint)
         if self._state() is NodeState.UNCONFIGURED:
             if is_new:
-                self.spec = dataclasses.replace(
-                    self.spec, endpoints=(*self.spec.endpoints, endpoint)
-                )
+                self.spec = replace(self.spec, endpoints=(*self.spec.endpoints, endpoint))
             if callback is not None:
                 self._callbacks[key] = callback
             self._hints[key] = hints

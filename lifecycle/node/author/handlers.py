@@ -10,7 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TypeVar
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.errors import LifecycleError, nearest
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.plan.model import PlannedEndpoint
@@ -25,8 +26,7 @@ _WORDS = {
 }
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class _Mark:
+class _Mark(msgspec.Struct, frozen=True, kw_only=True):
     """What a decorator leaves on a function."""
 
     kind: EndpointKind | None  # None for a timer
@@ -35,16 +35,14 @@ class _Mark:
     decides: bool = False  # on an action's goals, instead of executing them
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class TimerHandler:
+class TimerHandler(msgspec.Struct, frozen=True, kw_only=True):
     """A method to be called every `period_s` seconds while the node is active."""
 
     method: str
     period_s: float
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class ActionHandler:
+class ActionHandler(msgspec.Struct, frozen=True, kw_only=True):
     """What an action server gives its goals to.
 
     Attributes:
@@ -60,8 +58,7 @@ class ActionHandler:
         return self.execute(goal_handle)
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Handlers:
+class Handlers(msgspec.Struct, frozen=True, kw_only=True):
     """The handlers of one node: (kind, declared name) → method name, and its timers.
 
     Attributes:

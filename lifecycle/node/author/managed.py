@@ -12,13 +12,13 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 from rclpy.exceptions import InvalidHandle
 from rclpy.lifecycle import LifecycleState
 from rclpy.node import Node
 from rclpy.task import Future
 from rclpy.timer import Timer
 
-from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import EndpointKind, Health
 from lifecycle.node import configuration
@@ -92,8 +92,7 @@ _WITHOUT_DATA_LAYER = (NodeState.INACTIVE_DISCONNECTED, NodeState.UNCONFIGURED, 
 """A node that enters one of these is not the one that was verified any more."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class HostedState:
+class HostedState(msgspec.Struct, frozen=True, kw_only=True):
     """The state of a hosted node.
 
     Attributes:

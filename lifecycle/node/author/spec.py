@@ -20,7 +20,8 @@ import sys
 from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.errors import BringUpError, LifecycleError, nearest
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import EndpointPolicy, Run, RunKind
@@ -39,8 +40,7 @@ class Mode(enum.Enum):
     AUTO = "auto"  # it configures, connects and activates itself
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Construction:
+class Construction(msgspec.Struct, frozen=True, kw_only=True):
     """What a host says to the node that it is about to construct.
 
     Attributes:

@@ -16,7 +16,8 @@ from collections.abc import Callable
 from collections.abc import Mapping as AbstractMapping
 from typing import TYPE_CHECKING, Any
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.node.connections.connections import Connection, Connections
 from lifecycle.node.endpoints.mapping import Key, Mapping, count_peers
 
@@ -33,8 +34,7 @@ class ConnectionEventKind(enum.Enum):
     MAPPING_LOST = "mapping_lost"
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class ConnectionEvent:
+class ConnectionEvent(msgspec.Struct, frozen=True, kw_only=True):
     """One thing that became of a connection or of a mapping.
 
     A connection is *established* when it was made, and again when every topic endpoint on it has a

@@ -12,7 +12,8 @@ import re
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.errors import LifecycleError, MiddlewareError, nearest
 from lifecycle.middleware.fastdds.nfe import senders_of
 from lifecycle.middleware.fastdds.participant import FlowParticipant
@@ -35,8 +36,7 @@ class ConnectError(LifecycleError):
     """A connection or an endpoint could not be made as asked; none was left."""
 
 
-@dataclasses.dataclass(slots=True, kw_only=True, eq=False)
-class Connection:
+class Connection(msgspec.Struct, kw_only=True, eq=False):
     """One participant that endpoints are mapped onto; what `connect_to` returns.
 
     Attributes:

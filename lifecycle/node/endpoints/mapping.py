@@ -13,6 +13,7 @@ import typing
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 from rclpy.event_handler import (
     EventHandler,
     QoSPublisherEventType,
@@ -21,7 +22,6 @@ from rclpy.event_handler import (
 )
 from rclpy.publisher import Publisher
 
-from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError, nearest
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.node.connections.connections import Connection
@@ -139,8 +139,7 @@ class MatchWatch:
             self._handler = None
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class EndpointOptions:
+class EndpointOptions(msgspec.Struct, frozen=True, kw_only=True):
     """What only code can say of how an endpoint is made; as in rclpy's factories.
 
     Attributes:
@@ -189,8 +188,7 @@ def wire_name(entity: Any) -> str:
     return ""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Placement:
+class Placement(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     """The rclpy object of an endpoint on one connection.
 
     Attributes:
@@ -202,8 +200,7 @@ class Placement:
     watch: MatchWatch | ServerWatch | None = None
 
 
-@dataclasses.dataclass(slots=True, kw_only=True, eq=False)
-class Mapping:
+class Mapping(msgspec.Struct, kw_only=True, eq=False):
     """One declared endpoint and where it is now.
 
     Attributes:

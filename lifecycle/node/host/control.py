@@ -25,7 +25,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import NoReturn
 
-from lifecycle import codec, dataclasses
+import msgspec
+
+from lifecycle import codec
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import DiscoveryRange
 from lifecycle.plan.model import ParticipantConnections, PlannedNode
@@ -55,8 +57,7 @@ class Operation(enum.Enum):
     END = "end"
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class HostSpec:
+class HostSpec(msgspec.Struct, frozen=True, kw_only=True):
     """First line from the supervisor: what this process hosts.
 
     Attributes:
@@ -73,8 +74,7 @@ class HostSpec:
     log: str = ""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Command:
+class Command(msgspec.Struct, frozen=True, kw_only=True):
     """Supervisor → host.
 
     Attributes:
@@ -92,8 +92,7 @@ class Command:
     endpoint: str = ""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Event:
+class Event(msgspec.Struct, frozen=True, kw_only=True):
     """Host → supervisor; exactly one of the groups below is set.
 
     Attributes:

@@ -15,7 +15,7 @@ import socket
 from collections.abc import Iterable
 from typing import NoReturn
 
-from lifecycle import codec, dataclasses
+from lifecycle import codec
 from lifecycle.manifest.model import DiscoveryRange
 from lifecycle.node.host.control import HostChannel, HostSpec, give_up
 
@@ -65,14 +65,6 @@ def preload(types: Iterable[str] = ()) -> None:
     for interface in _INTERFACES:
         load_type_support(interface)
     unknown_versions()  # it loads the libraries of the RMW, which hosts then share
-    # Of the types that a node uses; else each host would make them anew.
-    dataclasses.make_constructors(
-        "lifecycle.node",
-        "lifecycle.middleware",
-        "lifecycle.verify.observation",
-        "lifecycle.verify.outcome",
-        "lifecycle.network.ports",
-    )
     for interface in types:
         with contextlib.suppress(Exception):
             load_type_support(interface)

@@ -15,7 +15,8 @@ import traceback
 from collections.abc import Callable, Coroutine, Generator
 from typing import Any
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.errors import LifecycleError
 from lifecycle.node.lifecycle.machine import CallbackOutcome
 
@@ -28,8 +29,7 @@ class CancelledError(LifecycleError):
     """A running transition was cancelled because its process must end."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Result:
+class Result(msgspec.Struct, frozen=True, kw_only=True):
     """The result of a step.
 
     Attributes:

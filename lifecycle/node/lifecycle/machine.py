@@ -14,14 +14,13 @@ from __future__ import annotations
 import enum
 from collections.abc import Callable
 
+import msgspec
 import transitions
 
-from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class State:
+class State(msgspec.Struct, frozen=True, kw_only=True):
     """A state as other tools see it (lifecycle_msgs/State)."""
 
     id: int
@@ -133,8 +132,7 @@ class TransitionRequest(enum.Enum):
     SHUTDOWN = "shutdown"
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Transition:
+class Transition(msgspec.Struct, frozen=True, kw_only=True):
     """One edge of the transition graph (lifecycle_msgs/TransitionDescription)."""
 
     id: int
@@ -229,8 +227,7 @@ _OUTCOMES: tuple[tuple[NodeState, NodeState, NodeState, NodeState], ...] = (
 )
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class StateChange:
+class StateChange(msgspec.Struct, frozen=True, kw_only=True):
     """One change of the machine.
 
     Attributes:

@@ -13,7 +13,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from lifecycle import dataclasses
+import msgspec
+from msgspec.structs import replace
+
 from lifecycle.manifest.model import Discovery, DiscoveryMode, FlowTransport, RunKind
 from lifecycle.network.connection_url import ConnectionUrl, Peer, parse
 from lifecycle.network.medium import DEFAULT_TCP, LOOPBACK, RMW_DEFAULT, UDP_UNICAST, Medium, udp_to
@@ -35,8 +37,7 @@ DEFAULT_PREFIX = ConnectionUrl(transport=DEFAULT_TCP).server_prefix
 _FIXED = (DiscoveryMode.STATIC, DiscoveryMode.STATIC_ENDPOINTS)
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Control:
+class Control(msgspec.Struct, frozen=True, kw_only=True):
     """The control plane of a system.
 
     Attributes:
@@ -139,10 +140,10 @@ def connect_control(
         slot = ("extra", node.key, each.name)
         if slot not in slots:
             return each
-        return dataclasses.replace(each, transports=(), connections=connected(slot))
+        return replace(each, transports=(), connections=connected(slot))
 
     return tuple(
-        dataclasses.replace(
+        replace(
             node,
             transports=(),  # the URLs say so
             connections=connected(("process", node.process, "")),
@@ -185,10 +186,7 @@ def _urls(
     }
     if server is not None:
         at = (Peer(address=server.address, port=server.port),)
-        return {
-            key: str(dataclasses.replace(url, server=at, multicast=True))
-            for key, url in alone.items()
-        }
+        return {key: str(replace(url, server=at, multicast=True)) for key, url in alone.items()}
     contacts = {key: contacts_of(slots[key][0], (str(url),))[0] for key, url in alone.items()}
     order = {key: index for index, key in enumerate(alone)}
 
@@ -199,7 +197,7 @@ def _urls(
 
     return {
         key: str(
-            dataclasses.replace(
+            replace(
                 url,
                 peers=tuple(
                     sorted(each.peer for other, each in contacts.items() if looks_for(key, other))
@@ -213,7 +211,7 @@ def _urls(
 def with_tcp(control: Control, hosts: Hosts) -> dict[str, ParticipantConnections]:
     """Return the observers as they are if they must also be found by TCP, by host."""
     return {
-        host: dataclasses.replace(each, urls=tuple(map(str, _with_tcp(each, control, host, hosts))))
+        host: replace(each, urls=tuple(map(str, _with_tcp(each, control, host, hosts))))
         for host, each in control.observers.items()
     }
 
@@ -276,10 +274,10 @@ def connect_observers(
         new = [{*peers_by(url.transport, wanted, host=host)} - {*url.peers} for url in found]
         if not needed and not any(new):
             return base
-        return dataclasses.replace(
+        return replace(
             base,
             urls=tuple(
-                str(dataclasses.replace(url, peers=(*url.peers, *sorted(peers))))
+                str(replace(url, peers=(*url.peers, *sorted(peers))))
                 for url, peers in zip(found, new, strict=True)
             ),
         )

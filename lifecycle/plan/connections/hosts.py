@@ -11,7 +11,8 @@ from __future__ import annotations
 import ipaddress
 from collections.abc import Collection, Iterable, Mapping, Sequence
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.manifest.model import DiscoveryMode, DiscoveryRange, Machine
 from lifecycle.network.connection_url import ConnectionUrl, Peer, parse
 from lifecycle.network.medium import LOOPBACK, LOOPBACK6, RMW_DISCOVERY, Medium
@@ -19,8 +20,7 @@ from lifecycle.network.ports import MAX_PORT
 from lifecycle.plan.model import Plan, PlanError
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Hosts:
+class Hosts(msgspec.Struct, frozen=True, kw_only=True):
     """The hosts of a system. A host is known by its address; this host's is empty if not declared.
 
     Attributes:
@@ -142,8 +142,7 @@ _SPARE = 4
 """Participants of other systems and tools on a host, which take ports before or between ours."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True, order=True)
-class Contact:
+class Contact(msgspec.Struct, frozen=True, kw_only=True, order=True):
     """Where one participant's discovery is reached.
 
     Attributes:

@@ -16,7 +16,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
-from lifecycle import dataclasses
+import msgspec
+from msgspec.structs import replace
+
 from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.flows import ParticipantGroup
 from lifecycle.manifest.model import (
@@ -161,8 +163,7 @@ def _without_udp(
         yield error("plan.unique-without-udp", _at(node, each), message, hint)
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class WiredSystem:
+class WiredSystem(msgspec.Struct, frozen=True, kw_only=True):
     """Nodes and flows with their data layer.
 
     Attributes:
@@ -212,7 +213,7 @@ def wire(
         discovery.mode is DiscoveryMode.DYNAMIC and data_layer.source is DataLayerSource.DYNAMIC
     )
     nodes = tuple(
-        dataclasses.replace(
+        replace(
             node,
             authority=data_layer.authority,
             events=data_layer.events,
@@ -268,7 +269,7 @@ def with_graph(plan: Plan, graph: DataLayerGraph) -> Plan:
         graph: what was negotiated; what it gives to nodes that the plan does not know is left out.
     """
     nodes, flows = _with_graph(plan.nodes, plan.flows, graph)
-    return dataclasses.replace(plan, nodes=nodes, flows=flows)
+    return replace(plan, nodes=nodes, flows=flows)
 
 
 def _with_graph(
@@ -359,7 +360,7 @@ def _with_medium(flow: PlannedFlow, found: Sequence[NegotiatedFlow]) -> PlannedF
         return flow
     media = dict.fromkeys(each.medium for each in found)
     reasons = dict.fromkeys(each.reason for each in found)
-    return dataclasses.replace(flow, medium=" and ".join(media), medium_reason=", ".join(reasons))
+    return replace(flow, medium=" and ".join(media), medium_reason=", ".join(reasons))
 
 
 def place_declared(
@@ -388,13 +389,13 @@ def place_declared(
         for entry in connection.map
     }
     placed = tuple(
-        dataclasses.replace(each, participant=places[each.kind, each.name])
+        replace(each, participant=places[each.kind, each.name])
         if (each.kind, each.name) in places
         else each
         for each in endpoints
     )
     left = tuple(
-        dataclasses.replace(group, names=remaining)
+        replace(group, names=remaining)
         for group in groups
         if (remaining := tuple(name for name in group.names if (group.kind, name) not in places))
     )
@@ -458,16 +459,14 @@ def place_static(
             return each
         peers = tuple(sorted(contact.peer for key, contact in contacts.items() if key != own))
         connections = ParticipantConnections(
-            urls=(str(dataclasses.replace(bare[own], peers=peers)),),
+            urls=(str(replace(bare[own], peers=peers)),),
             static_name=_enclave(node, each),
             static_participants=table,
         )
-        return dataclasses.replace(each, connections=connections)
+        return replace(each, connections=connections)
 
     return tuple(
-        dataclasses.replace(
-            node, participants=tuple(connected(node, each) for each in node.participants)
-        )
+        replace(node, participants=tuple(connected(node, each) for each in node.participants))
         for node in placed
     )
 
@@ -483,15 +482,12 @@ def _place(node: PlannedNode) -> PlannedNode:
     name = participant_name(node.name, DATA)
     moved = [each for each in node.endpoints if each.kind.is_topic and not each.participant]
     endpoints = tuple(
-        dataclasses.replace(each, participant=name) if each in moved else each
-        for each in node.endpoints
+        replace(each, participant=name) if each in moved else each for each in node.endpoints
     )
     extra = tuple(
         each
         if each.connection
-        else dataclasses.replace(
-            each, transports=(), connection=each.name.removeprefix(f"_{node.name}_")
-        )
+        else replace(each, transports=(), connection=each.name.removeprefix(f"_{node.name}_"))
         for each in node.participants
     )
     data = PlannedParticipant(
@@ -505,9 +501,7 @@ def _place(node: PlannedNode) -> PlannedNode:
         ),
         connection=DATA,
     )
-    return dataclasses.replace(
-        node, endpoints=endpoints, participants=(*extra, *((data,) if moved else ()))
-    )
+    return replace(node, endpoints=endpoints, participants=(*extra, *((data,) if moved else ())))
 
 
 def _enclave(node: PlannedNode, participant: PlannedParticipant) -> str:
@@ -531,7 +525,7 @@ def _table(nodes: Sequence[PlannedNode]) -> Iterator[StaticParticipant]:
                         hint="use 'discovery: {mode: static}'",
                         at=node.at,
                     )
-                lines.append(dataclasses.replace(entry, user_id=number))
+                lines.append(replace(entry, user_id=number))
             yield StaticParticipant(name=_enclave(node, participant), endpoints=tuple(lines))
 
 

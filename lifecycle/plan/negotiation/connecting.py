@@ -11,7 +11,9 @@ import ipaddress
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-from lifecycle import dataclasses
+import msgspec
+from msgspec.structs import replace
+
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.names import free_name
 from lifecycle.network.connection_url import ConnectionUrl, parse
@@ -40,8 +42,7 @@ GROUP_PORTS_FROM = 1000
 _NOT_WORD = re.compile(r"[^A-Za-z0-9]+")
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Moved:
+class Moved(msgspec.Struct, frozen=True, kw_only=True):
     """One endpoint that must leave its node's own participant.
 
     Attributes:
@@ -57,8 +58,7 @@ class Moved:
     partners: frozenset[End]
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class _Draft:
+class _Draft(msgspec.Struct, frozen=True, kw_only=True):
     """A connection that has no URLs yet; `topic` is that of its group, empty without."""
 
     party: Party
@@ -145,7 +145,7 @@ def _drafts(moved: Sequence[Moved]) -> list[_Draft]:
         names = taken.setdefault(key, set(party.connections))
         name = free_name("_".join(words), names)
         names.add(name)
-        drafts.append(dataclasses.replace(draft, name=name))
+        drafts.append(replace(draft, name=name))
     return sorted(drafts, key=lambda each: each.key)
 
 
@@ -205,10 +205,10 @@ def _bare(
         elif transport.is_group:
             assert group is not None
             if not terms.fixed:
-                yield dataclasses.replace(group, metatraffic_port=None, peers=(), multicast=True)
+                yield replace(group, metatraffic_port=None, peers=(), multicast=True)
                 continue
             (port,) = pool.take(host)
-            yield dataclasses.replace(group, metatraffic_port=port, peers=(), multicast=False)
+            yield replace(group, metatraffic_port=port, peers=(), multicast=False)
         elif transport.is_tcp or terms.fixed:
             yield fixed_url(transport, address, pool.take(host, transport.ports))
         else:
@@ -245,10 +245,10 @@ def _with_peers(
     def looking(url: ConnectionUrl, found: Iterable[Contact], host: str) -> ConnectionUrl:
         if terms.server is not None:
             served = url.transport is terms.server_medium
-            return dataclasses.replace(url, server=(terms.server,) if served else ())
+            return replace(url, server=(terms.server,) if served else ())
         if url.transport.is_network and (terms.fixed or url.transport.is_tcp):
             peers = peers_by(url.transport, found, host=host)
-            return dataclasses.replace(url, peers=peers)
+            return replace(url, peers=peers)
         return url
 
     for draft in drafts:

@@ -6,7 +6,8 @@ Pure.
 
 from __future__ import annotations
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.manifest.model import EndpointKind, FlowTransport
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.network.connection_url import Peer
@@ -24,8 +25,7 @@ End = tuple[str, EndpointKind, str]
 """An endpoint that takes part: key of its party, kind, declared name."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class PartyEndpoint:
+class PartyEndpoint(msgspec.Struct, frozen=True, kw_only=True):
     """One publisher or subscription that takes part.
 
     Attributes:
@@ -61,8 +61,7 @@ class PartyEndpoint:
         return f"{self.kind.value}/{self.name}"
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Party:
+class Party(msgspec.Struct, frozen=True, kw_only=True):
     """One node, as negotiation sees it.
 
     Attributes:
@@ -91,8 +90,7 @@ class Party:
     contacts: tuple[Contact, ...] = ()
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Terms:
+class Terms(msgspec.Struct, frozen=True, kw_only=True):
     """What a system's data layer is made under.
 
     Attributes:
@@ -116,8 +114,7 @@ class Terms:
     observers: tuple[Contact, ...] = ()
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True, order=True)
-class NegotiatedFlow:
+class NegotiatedFlow(msgspec.Struct, frozen=True, kw_only=True, order=True):
     """What carries one topic from one node to another.
 
     Attributes:
@@ -134,8 +131,7 @@ class NegotiatedFlow:
     reason: str
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class NegotiatedConnection:
+class NegotiatedConnection(msgspec.Struct, frozen=True, kw_only=True):
     """One connection that a node must have because its own participant does not do it.
 
     Attributes:
@@ -153,8 +149,7 @@ class NegotiatedConnection:
     reason: str
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True, order=True)
-class NegotiationProblem:
+class NegotiationProblem(msgspec.Struct, frozen=True, kw_only=True, order=True):
     """A pair that cannot be connected.
 
     Attributes:
@@ -168,8 +163,7 @@ class NegotiationProblem:
     hint: str = ""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class DataLayerGraph:
+class DataLayerGraph(msgspec.Struct, frozen=True, kw_only=True):
     """Everything that was negotiated; sorted throughout."""
 
     flows: tuple[NegotiatedFlow, ...] = ()

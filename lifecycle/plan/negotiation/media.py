@@ -23,14 +23,14 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.manifest.model import EndpointKind, FlowTransport
 from lifecycle.network.medium import CONNECTABLE, Medium, is_fragmented, max_unfragmented
 from lifecycle.plan.negotiation.data_layer import End, Party, PartyEndpoint
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Pair:
+class Pair(msgspec.Struct, frozen=True, kw_only=True):
     """A publisher and a subscription of one topic.
 
     Attributes:
@@ -82,8 +82,7 @@ class Pair:
         return f"{self.writer.resolved!r} from {self.publisher.key!r} to {self.subscription.key!r}"
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Choice:
+class Choice(msgspec.Struct, frozen=True, kw_only=True):
     """What a pair gets.
 
     Attributes:

@@ -10,7 +10,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 
-from lifecycle import dataclasses
+from msgspec.structs import replace
+
 from lifecycle.manifest.model import (
     DataLayer,
     Discovery,
@@ -154,11 +155,11 @@ def place_negotiated(node: PlannedNode, connections: Sequence[NegotiatedConnecti
         if each.participant in carriers:
             takes.setdefault(connection.name, []).append(carriers[each.participant])
         name = participant_name(node.name, connection.name)
-        endpoints.append(dataclasses.replace(each, participant=name))
+        endpoints.append(replace(each, participant=name))
     used = {each.participant for each in endpoints}
     kept = [each for each in node.participants if each.connection or each.name in used]
     made = [_participant(node.name, each, takes.get(each.name, ())) for each in connections]
-    return dataclasses.replace(node, endpoints=tuple(endpoints), participants=(*kept, *made))
+    return replace(node, endpoints=tuple(endpoints), participants=(*kept, *made))
 
 
 def _participant(

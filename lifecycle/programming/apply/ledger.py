@@ -16,7 +16,8 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import UsageError
 from lifecycle.programming.apply.target import ProgrammingError
@@ -36,8 +37,7 @@ _LOCK_CHECK_S = 0.05
 """A lock cannot be waited for with a deadline."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Entry:
+class Entry(msgspec.Struct, frozen=True, kw_only=True):
     """One thing of ours at a server, for one flow.
 
     Attributes:
@@ -56,8 +56,7 @@ class Entry:
     body: str = ""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class TargetRecord:
+class TargetRecord(msgspec.Struct, frozen=True, kw_only=True):
     """Everything of ours in one network.
 
     Attributes:
@@ -72,8 +71,7 @@ class TargetRecord:
     entries: tuple[Entry, ...] = ()
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class LedgerFile:
+class LedgerFile(msgspec.Struct, frozen=True, kw_only=True):
     """The file.
 
     Attributes:

@@ -15,9 +15,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
+import msgspec
 import psutil
 
-from lifecycle import dataclasses
 from lifecycle.errors import LifecycleError, UsageError
 from lifecycle.network.five_qi import DscpMapping, dscp_mapping, parse_mapping
 from lifecycle.network.nfe import canonical, is_loopback
@@ -34,8 +34,7 @@ _DISCARD_PORT = 9
 """RFC 863; connecting a UDP socket sends nothing."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Treatment:
+class Treatment(msgspec.Struct, frozen=True, kw_only=True):
     """What flows get beyond what the manifest says.
 
     Attributes:

@@ -13,7 +13,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
-from lifecycle import dataclasses
+import msgspec
+from msgspec.structs import replace
+
 from lifecycle.errors import LifecycleError, UsageError
 from lifecycle.programming.apply.http import Api, as_segment
 from lifecycle.programming.apply.ledger import (
@@ -47,8 +49,7 @@ from lifecycle.programming.rules.mobile import (
 from lifecycle.programming.rules.rules import FlowRule, RuleSet
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Made:
+class Made(msgspec.Struct, frozen=True, kw_only=True):
     """One thing as the server has it.
 
     Attributes:
@@ -179,10 +180,10 @@ class RemoteTarget(abc.ABC, Generic[_S]):
             except LifecycleError as error:  # noqa: PERF203 - the other flows go on
                 errors.append((change.key, error))
             else:
-                done.append(dataclasses.replace(change, detail=detail or change.detail))
-        made = dataclasses.replace(planned, changes=tuple(done))
+                done.append(replace(change, detail=detail or change.detail))
+        made = replace(planned, changes=tuple(done))
         if errors:
-            text = [dataclasses.replace(made, left_out=()).render(done=True)]
+            text = [replace(made, left_out=()).render(done=True)]
             raise PartlyError(
                 self.name, len(planned.changes), errors, done=text if made.pending else ()
             )
@@ -221,7 +222,7 @@ class RemoteTarget(abc.ABC, Generic[_S]):
                 errors.append((entry.key, error))
             else:
                 if made is not None:
-                    self._note(dataclasses.replace(entry, id=made.id, expires_s=made.expires_s))
+                    self._note(replace(entry, id=made.id, expires_s=made.expires_s))
         if errors:
             raise PartlyError(self.name, len(self._entries()), errors)
         due = [self.due_in_s(each) for each in self._entries().values()]
@@ -235,13 +236,13 @@ class RemoteTarget(abc.ABC, Generic[_S]):
             found = self.find(asked)
             if found is None:
                 return ChangeKind.CREATE, "asked for before, but never made"
-            entry = dataclasses.replace(entry, id=found.id)
+            entry = replace(entry, id=found.id)
             self._note(entry)
         seen = self.see(entry.id, asked)
         if seen is None:
             return ChangeKind.CREATE, "gone from the server"
         if seen.expires_s != entry.expires_s:
-            self._note(dataclasses.replace(entry, expires_s=seen.expires_s))
+            self._note(replace(entry, expires_s=seen.expires_s))
         if asked != body:
             return ChangeKind.UPDATE, ""
         if seen.differs:

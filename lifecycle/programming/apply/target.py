@@ -10,7 +10,8 @@ import enum
 from collections.abc import Iterable, Sequence
 from typing import Protocol
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.errors import ExitCode, LifecycleError, UsageError
 from lifecycle.programming.rules.rules import FlowRule, asks
 
@@ -32,8 +33,7 @@ _SIGNS = {
 }
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class FlowChange:
+class FlowChange(msgspec.Struct, frozen=True, kw_only=True):
     """One flow in one target.
 
     Attributes:
@@ -48,8 +48,7 @@ class FlowChange:
     detail: str = ""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class TargetChanges:
+class TargetChanges(msgspec.Struct, frozen=True, kw_only=True):
     """What one target has to do, or did.
 
     Attributes:

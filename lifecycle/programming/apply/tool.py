@@ -18,7 +18,8 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.codec import from_json
 from lifecycle.programming.apply.target import (
     MissingFeatureError,
@@ -46,8 +47,7 @@ _NO_FEATURE = re.compile(
 )
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class ToolOutput:
+class ToolOutput(msgspec.Struct, frozen=True, kw_only=True):
     """What a program left."""
 
     returncode: int
@@ -122,8 +122,7 @@ def demand(tool: HostTool, argv: Sequence[str], *, doing: str, stdin: str = "") 
     raise failure(output, argv, doing=doing)
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Qdisc:
+class Qdisc(msgspec.Struct, frozen=True, kw_only=True):
     """What is read of a queueing discipline in the list of `tc -j qdisc show`."""
 
     kind: str

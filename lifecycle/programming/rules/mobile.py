@@ -10,7 +10,8 @@ import ipaddress
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.codec import to_json
 from lifecycle.programming.rules.rules import FlowRule, LeftOut, asks
 
@@ -22,8 +23,7 @@ Body = dict[str, Any]
 """Of a request, JSON-able."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class DeviceEnd:
+class DeviceEnd(msgspec.Struct, frozen=True, kw_only=True):
     """One end of a flow that is a device of the mobile network, and the other end.
 
     Attributes:
@@ -46,8 +46,7 @@ class DeviceEnd:
         return ":" in self.device
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class NetworkRequest:
+class NetworkRequest(msgspec.Struct, frozen=True, kw_only=True):
     """What to ask the network for one flow and one of its ends.
 
     Attributes:
@@ -60,8 +59,7 @@ class NetworkRequest:
     body: Body
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Requests:
+class Requests(msgspec.Struct, frozen=True, kw_only=True):
     """Everything to ask the network for, and what cannot be asked."""
 
     requests: tuple[NetworkRequest, ...]

@@ -14,7 +14,8 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.network.dscp import code_points, describe, dscp_name
 from lifecycle.network.nfe import InternetProtocol
 from lifecycle.programming.rules.rules import FlowRule, LeftOut, named, remarks
@@ -43,8 +44,7 @@ class Action(NamedTuple):
     comment: str
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class _Group:
+class _Group(msgspec.Struct, frozen=True, kw_only=True):
     """Flows that one nft rule treats: their set, what selects them and what is set on them."""
 
     name: str

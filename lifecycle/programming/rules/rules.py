@@ -12,7 +12,9 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
-from lifecycle import dataclasses
+import msgspec
+from msgspec.structs import replace
+
 from lifecycle.codec import to_json
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.network.dscp import describe, parse_dscp
@@ -53,8 +55,7 @@ SourceAddress = Callable[[PlannedNode, str], str]
 """Observes the address that a node's machine sends from to a destination; empty if unknown."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class FlowRule:
+class FlowRule(msgspec.Struct, frozen=True, kw_only=True):
     """One verified flow as a network can match it, and what it is to get.
 
     Attributes:
@@ -145,8 +146,7 @@ def _address(text: str) -> IpAddress:
     return address
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class LeftOut:
+class LeftOut(msgspec.Struct, frozen=True, kw_only=True):
     """Something of a flow that makes no rule.
 
     Attributes:
@@ -162,16 +162,14 @@ class LeftOut:
         return f"{self.topic} {self.publisher} → {self.subscription}: {self.reason}"
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class RuleSet:
+class RuleSet(msgspec.Struct, frozen=True, kw_only=True):
     """What may be programmed, and what may not."""
 
     rules: tuple[FlowRule, ...]
     left_out: tuple[LeftOut, ...]
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class _Candidate:
+class _Candidate(msgspec.Struct, frozen=True, kw_only=True):
     """One tuple of one pair; `ask` is (DSCP, 5QI), both None where nothing is asked."""
 
     report: FlowReport
@@ -260,7 +258,7 @@ def _candidates(
         left_out.append(_left(report, "its two ends have no IP transport in common"))
     for each in report.tuples:
         # A zone (`fe80::1%eth0`) names an interface of its own host and is not in the packet.
-        flow = dataclasses.replace(
+        flow = replace(
             each,
             source_address=each.source_address.partition("%")[0],
             destination_address=each.destination_address.partition("%")[0],
@@ -342,12 +340,12 @@ def _rule(sharing: Sequence[_Candidate]) -> FlowRule:
 def _treated(rule: FlowRule, mapping: DscpMapping | None, *, label_flows: bool) -> FlowRule:
     """The rule with what follows from its 5QI and its 5-tuple."""
     if mapping is not None and rule.dscp is None and rule.five_qi is not None:
-        rule = dataclasses.replace(rule, dscp=mapping.dscp_for(rule.five_qi))
+        rule = replace(rule, dscp=mapping.dscp_for(rule.five_qi))
     if label_flows and rule.internet_protocol is InternetProtocol.IPV6 and not rule.flow_label:
         # Equal for equal 5-tuples and evenly spread, as RFC 6437 §3 asks; never 0, which is none.
         digest = hashlib.sha256(rule.describe().encode()).digest()
         label = 1 + int.from_bytes(digest[:8], "big") % MAX_FLOW_LABEL
-        rule = dataclasses.replace(rule, flow_label=label)
+        rule = replace(rule, flow_label=label)
     return rule
 
 
@@ -358,9 +356,7 @@ def _distinct(rules: Sequence[FlowRule]) -> tuple[FlowRule, ...]:
     for rule in sorted(rules, key=lambda each: (each.key, each.source_port, each.destination_port)):
         seen[rule.key] = seen.get(rule.key, 0) + 1
         number = seen[rule.key]
-        distinct.append(
-            rule if number == 1 else dataclasses.replace(rule, key=f"{rule.key} #{number}")
-        )
+        distinct.append(rule if number == 1 else replace(rule, key=f"{rule.key} #{number}"))
     return tuple(distinct)
 
 

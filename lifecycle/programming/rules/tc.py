@@ -23,7 +23,8 @@ import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.network.dscp import describe, dscp_name, parse_dscp
 from lifecycle.network.five_qi import five_qi_of
 from lifecycle.programming.rules.nftables import (
@@ -44,8 +45,7 @@ _LOWEST = tuple(map(parse_dscp, ("LE", "CS1")))
 """Less than best effort (RFC 8622, RFC 4594 §4.10)."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True, order=True)
-class TrafficClass:
+class TrafficClass(msgspec.Struct, frozen=True, kw_only=True, order=True):
     """One class of a link.
 
     Attributes:
@@ -180,8 +180,7 @@ class TcMatch(enum.Enum):
     MARK = "mark"  # the DSCP: one rule per class, also for what others have marked
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class TcSettings:
+class TcSettings(msgspec.Struct, frozen=True, kw_only=True):
     """How a device is to treat the flows.
 
     Attributes:
@@ -195,7 +194,7 @@ class TcSettings:
 
     device: str
     link_kbit: int
-    guaranteed_kbit: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    guaranteed_kbit: Mapping[str, int] = msgspec.field(default_factory=dict)
     match: TcMatch = TcMatch.FLOW
     queue_ms: float = DEFAULT_QUEUE_MS
 
@@ -226,8 +225,7 @@ _QUANTUM_BYTES = 3028
 _CLASSES = re.compile(r"managed-by=lifecycle digest=[0-9a-f]+ classes=(?P<digest>[0-9a-f]+)")
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Queues:
+class Queues(msgspec.Struct, frozen=True, kw_only=True):
     """What makes a device queue by class.
 
     Attributes:

@@ -15,7 +15,9 @@ import asyncio
 from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import TYPE_CHECKING
 
-from lifecycle import dataclasses
+import msgspec
+from msgspec.structs import replace
+
 from lifecycle.errors import BringUpError
 from lifecycle.graph.loop import set_within
 from lifecycle.manifest.model import Authority, Condition, DataLayerSource
@@ -125,12 +127,11 @@ class PlannedSource:
         return self._instructions
 
 
-@dataclasses.dataclass(slots=True)
-class _Wiring:
+class _Wiring(msgspec.Struct):
     """What the authority knows of one node that it wires."""
 
-    actual: ActualState = dataclasses.field(default_factory=ActualState)
-    ours: list[str] = dataclasses.field(default_factory=list)
+    actual: ActualState = msgspec.field(default_factory=ActualState)
+    ours: list[str] = msgspec.field(default_factory=list)
     settled: tuple[Instructions, str] | None = None  # with this configuration nothing was missing
     rounds: int = 0
     last_s: float = float("-inf")
@@ -412,7 +413,7 @@ class ConnectionAuthority:
             try:
                 configuration = await interface.wire(step)
             except BringUpError as error:
-                self._emit(dataclasses.replace(event, error=error.message))
+                self._emit(replace(event, error=error.message))
                 raise
             finally:
                 self._making -= 1

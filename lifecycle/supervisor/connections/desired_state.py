@@ -10,7 +10,8 @@ from __future__ import annotations
 import functools
 from collections.abc import Collection, Mapping
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.node.host.control import Operation
 from lifecycle.plan.model import ParticipantConnections, PlannedNode
 from lifecycle.verify.observation import NodeConfiguration
@@ -19,8 +20,7 @@ from lifecycle.verify.rules.run import NOT_WIRED, node_of
 from lifecycle.verify.verdict import Finding
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Instructions:
+class Instructions(msgspec.Struct, frozen=True, kw_only=True):
     """What one node must have.
 
     Attributes:
@@ -35,8 +35,7 @@ class Instructions:
     mappings: tuple[tuple[str, str], ...] = ()
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class ActualState:
+class ActualState(msgspec.Struct, frozen=True, kw_only=True):
     """What one node has.
 
     Attributes:
@@ -60,8 +59,7 @@ class ActualState:
         return ActualState(connections=tuple(connections.items()), mappings=tuple(mappings.items()))
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Step:
+class Step(msgspec.Struct, frozen=True, kw_only=True):
     """One request to one node: CONNECT_TO, MAP_TO or DISCONNECT_FROM."""
 
     node: str

@@ -14,7 +14,9 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
 
-from lifecycle import dataclasses
+import msgspec
+from msgspec.structs import replace
+
 from lifecycle.manifest.model import Authority, DataLayerSource, EndpointKind, EndpointPolicy
 from lifecycle.network.connection_url import parse
 from lifecycle.network.medium import CONNECTABLE, FAST_DDS, RMW_DEFAULT
@@ -117,7 +119,7 @@ def _endpoint(
     carrier = next((each for each in others if each.name == report.connection), None)
     if declared is not None and planned is not None:
         endpoint = endpoint_of(planned, declared)
-        endpoint = dataclasses.replace(
+        endpoint = replace(
             endpoint,
             resolved=report.resolved or endpoint.resolved,
             lossy=report.lossy if endpoint.lossy is None else endpoint.lossy,
@@ -136,7 +138,7 @@ def _endpoint(
         )
     if carrier is None:
         return endpoint
-    return dataclasses.replace(endpoint, by=transports_of(carrier.urls) or RMW_DEFAULT, fixed=True)
+    return replace(endpoint, by=transports_of(carrier.urls) or RMW_DEFAULT, fixed=True)
 
 
 _RMW = "RMW_IMPLEMENTATION"
@@ -231,11 +233,11 @@ class NegotiatedSource:
                 taken.setdefault(hosts[each.node], set()).update(ports_of(tcp))
         for host, ports in terms_of(plan).taken:
             taken.setdefault(host, set()).update(ports)
-        self._terms = dataclasses.replace(
+        self._terms = replace(
             self._terms,
             taken=tuple((host, tuple(sorted(ports))) for host, ports in sorted(taken.items())),
         )
-        self.graph = dataclasses.replace(
+        self.graph = replace(
             self.graph,
             connections=tuple(each for each in self.graph.connections if each.node not in keys),
         )
@@ -268,7 +270,7 @@ class NegotiatedSource:
 
     def _grown(self, known: Mapping[str, NodeConfiguration]) -> Plan:
         """The plan with the endpoints that its nodes made in code, where they may."""
-        return dataclasses.replace(
+        return replace(
             self._plan,
             nodes=tuple(
                 _with_made(node, known[node.full_name])
@@ -297,7 +299,7 @@ def _with_made(node: PlannedNode, configuration: NodeConfiguration) -> PlannedNo
         if (each.kind, each.name) not in declared
         and (each.name or (each.kind, each.resolved) not in resolved)
     )
-    return dataclasses.replace(node, endpoints=(*node.endpoints, *made))
+    return replace(node, endpoints=(*node.endpoints, *made))
 
 
 def _with_flows(plan: Plan, graph: DataLayerGraph) -> Plan:
@@ -316,7 +318,7 @@ def _with_flows(plan: Plan, graph: DataLayerGraph) -> Plan:
         if (place := (each.topic, each.publisher, each.subscription)) not in there
         and {each.publisher, each.subscription} <= keys
     }
-    return dataclasses.replace(plan, flows=(*plan.flows, *more.values()))
+    return replace(plan, flows=(*plan.flows, *more.values()))
 
 
 def _unplanned_instructions(
@@ -346,8 +348,7 @@ def is_negotiated(plan: Plan) -> bool:
     return layer.authority is Authority.SUPERVISOR and layer.source is DataLayerSource.DYNAMIC
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Expectation:
+class Expectation(msgspec.Struct, frozen=True, kw_only=True):
     """Desired state, as far as an outside observer can know it.
 
     Attributes:

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from lifecycle import dataclasses
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import UsageError
 from lifecycle.plan.model import Plan
@@ -41,8 +40,7 @@ _LARGEST_QUESTION = 64 * 2**20
 """Bytes of a line; a question may hold a whole plan."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class SupervisorSnapshot:
+class SupervisorSnapshot(msgspec.Struct, frozen=True, kw_only=True):
     """All that a supervisor knows at one moment.
 
     Attributes:

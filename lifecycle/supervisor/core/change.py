@@ -7,7 +7,8 @@ Pure.
 
 from __future__ import annotations
 
-from lifecycle import dataclasses
+from msgspec.structs import replace
+
 from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import TargetState
 from lifecycle.plan.change import change_between
@@ -128,7 +129,7 @@ def go_back(run: Run, reason: str, code: ExitCode) -> list[Event]:
     change.touched |= change.down
     change.giving = set()
     change.to_give = {
-        key: dataclasses.replace(each, before=each.now, now=each.before)
+        key: replace(each, before=each.now, now=each.before)
         for key, each in change.given.items()
         if key not in change.down and key in run.nodes
     }
@@ -205,9 +206,9 @@ def _connected_as(plan: Plan, stays: dict[str, PlannedNode], before: Plan) -> Pl
             return node
         if (was.connections, was.participants) != (node.connections, node.participants):
             return node
-        return dataclasses.replace(node, connections=now.connections, participants=now.participants)
+        return replace(node, connections=now.connections, participants=now.participants)
 
-    return dataclasses.replace(plan, nodes=tuple(map(connected, plan.nodes)))
+    return replace(plan, nodes=tuple(map(connected, plan.nodes)))
 
 
 def _finish(run: Run, change: Change) -> list[Event]:
@@ -243,7 +244,7 @@ def _said(run: Run, stage: str, reason: str = "") -> Event:
         return tuple(names[key] for key in keys)  # type: ignore[attr-defined]
 
     what = change.change
-    return dataclasses.replace(
+    return replace(
         event,
         added=named(what.added),
         removed=named(what.removed),

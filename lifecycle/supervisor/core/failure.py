@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from lifecycle import dataclasses
+from msgspec.structs import replace
+
 from lifecycle.errors import ExitCode
 from lifecycle.supervisor.control.protocol import ControlRequest, Failed
 from lifecycle.supervisor.core import gate
@@ -188,7 +189,7 @@ def _is_covered(process: Process | None, end: Exited | None) -> bool:
 
 def goes_on(failure: Failure) -> Failure:
     """Return a failure as one that does not end the run."""
-    return dataclasses.replace(failure, ends_run=False)
+    return replace(failure, ends_run=False)
 
 
 def _cut_short(run: Run, failure: Failure) -> None:

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-from lifecycle import dataclasses
+from msgspec.structs import replace
+
 from lifecycle.errors import ExitCode
 from lifecycle.supervisor.core.inputs import Verified
 from lifecycle.supervisor.core.state import NEVER_S, Judged, Level, Node, Run
@@ -189,7 +190,7 @@ def see_violations(run: Run, away: Collection[str]) -> None:
     lasting = [key for key, since_s in judged.violated.items() if run.now_s - since_s >= LASTS_S]
     if lasting:
         findings = tuple(found[key] for key in lasting if key in found)
-        text = not_ok(dataclasses.replace(verdict, findings=findings)) or _named(keys[0])
+        text = not_ok(replace(verdict, findings=findings)) or _named(keys[0])
         judged.counted = judged.counted or text
     for key in keys:
         name = _named(key)

@@ -11,7 +11,8 @@ import asyncio
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from lifecycle import dataclasses
+from msgspec.structs import replace
+
 from lifecycle.errors import BringUpError
 from lifecycle.manifest.model import RunKind
 from lifecycle.node.host.control import Operation
@@ -147,4 +148,4 @@ def _foreign(plan: Plan, nodes: Iterable[NodeRun]) -> Plan | None:
         # Not by its control channel: a process of ours has none before it is started.
         and (each.process is None or each.process.planned.run.kind is not RunKind.PYTHON)
     )
-    return dataclasses.replace(plan, nodes=found) if found else None
+    return replace(plan, nodes=found) if found else None

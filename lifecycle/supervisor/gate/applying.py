@@ -13,7 +13,9 @@ import asyncio
 from collections.abc import Callable, Collection, Coroutine, Mapping
 from typing import TYPE_CHECKING, Any
 
-from lifecycle import dataclasses
+import msgspec
+from msgspec.structs import replace
+
 from lifecycle.errors import BringUpError, MiddlewareError, UsageError
 from lifecycle.manifest.model import Condition
 from lifecycle.plan.change import GivenParameters, PlanChange
@@ -50,8 +52,7 @@ Alive = Callable[[Coroutine[Any, Any, object]], Coroutine[Any, Any, None]]
 _LEAST_S = 1.0
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class _Before:
+class _Before(msgspec.Struct, frozen=True, kw_only=True):
     """What a system was before another manifest was applied.
 
     Attributes:
@@ -67,8 +68,7 @@ class _Before:
     active: frozenset[str]
 
 
-@dataclasses.dataclass(slots=True)
-class _Done:
+class _Done(msgspec.Struct):
     """What was done of a change so far.
 
     Attributes:
@@ -77,9 +77,9 @@ class _Done:
         asked: likewise that it was asked to take; who did not answer may have taken them.
     """
 
-    touched: set[str] = dataclasses.field(default_factory=set)
-    given: dict[str, GivenParameters] = dataclasses.field(default_factory=dict)
-    asked: dict[str, GivenParameters] = dataclasses.field(default_factory=dict)
+    touched: set[str] = msgspec.field(default_factory=set)
+    given: dict[str, GivenParameters] = msgspec.field(default_factory=dict)
+    asked: dict[str, GivenParameters] = msgspec.field(default_factory=dict)
 
 
 class Applying:
@@ -279,7 +279,7 @@ class Applying:
         system, sequence = self._system, self._sequence
         deadline = asyncio.get_running_loop().time() + self._timeout_s
         given = {
-            key: dataclasses.replace(each, before=each.now, now=each.before)
+            key: replace(each, before=each.now, now=each.before)
             for key, each in done.asked.items()
             if key not in done.touched and not system.nodes[key].is_gone
         }
@@ -439,7 +439,7 @@ class Applying:
         )
         if change is not None:
             words = said(change, before.first, plan, revision)
-            event = dataclasses.replace(
+            event = replace(
                 event,
                 differences=words.differences,
                 added=words.added,
@@ -457,7 +457,7 @@ _BACK = "rolling back"
 def _with_restarted(change: PlanChange, keys: Collection[str], system: System) -> PlanChange:
     """Return a change in which nodes are started again that have failed and are down."""
     restarted = {*change.restarted, *keys}
-    return dataclasses.replace(
+    return replace(
         change,
         restarted=tuple(key for key in system.nodes if key in restarted),
         parameters={key: each for key, each in change.parameters.items() if key not in restarted},

@@ -14,7 +14,8 @@ import asyncio
 from collections.abc import Callable, Collection, Iterator
 from typing import TYPE_CHECKING
 
-from lifecycle import dataclasses
+from msgspec.structs import replace
+
 from lifecycle.graph.loop import set_within
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.middleware.fastdds.profiles import DEFAULT_LEASE_S
@@ -656,7 +657,7 @@ def without(observation: Observation, dead: frozenset[str]) -> Observation:
     gone = dead - alive
     return Observation(
         nodes=tuple(
-            dataclasses.replace(node, count=node.count - 1) if node.full_name in alive else node
+            replace(node, count=node.count - 1) if node.full_name in alive else node
             for node in observation.nodes
             if node.full_name not in gone
         ),
@@ -671,7 +672,7 @@ def without_nodes(plan: Plan, silent: Collection[str]) -> Plan:
     if not silent:
         return plan
     nodes = tuple(each for each in plan.nodes if each.full_name not in silent)
-    return dataclasses.replace(plan, nodes=nodes)
+    return replace(plan, nodes=nodes)
 
 
 def _patience(verdict: Verdict) -> float | None:

@@ -6,7 +6,8 @@ changes meanwhile; a shorter one does not, and is named when the run ends. Pure.
 
 from __future__ import annotations
 
-from lifecycle import dataclasses
+from msgspec.structs import replace
+
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.verify.judge import not_ok
 from lifecycle.verify.outcome import Outcome
@@ -52,7 +53,7 @@ class Violations:
         lasting = [key for key in keys if now_s - self._since[key] >= LASTS_S]
         if lasting:
             findings = tuple(found[key] for key in lasting if key in found)
-            self.count(not_ok(dataclasses.replace(verdict, findings=findings)) or _named(keys[0]))
+            self.count(not_ok(replace(verdict, findings=findings)) or _named(keys[0]))
         for key in keys:
             if key in lasting or len(self._seen) < _MOST:
                 self._seen[_named(key)] = self._seen.get(_named(key), False) or key in lasting

@@ -14,7 +14,8 @@ import os
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from lifecycle import dataclasses
+from msgspec.structs import replace
+
 from lifecycle.manifest.model import DiscoveryRange, RunKind
 from lifecycle.middleware.process.control import machine_id
 from lifecycle.plan.comparison import (
@@ -100,7 +101,7 @@ class Agreement:
     def leave(self, reason: str) -> None:
         """Say that what comes is an orderly end, and why; begins with FAILED where a run failed."""
         if self._notices is not None and self._said is not None:
-            notice = dataclasses.replace(self._said, left=True, reason=" ".join(reason.split()))
+            notice = replace(self._said, left=True, reason=" ".join(reason.split()))
             self._notices.announce(encode(notice))
 
     def close(self) -> None:
@@ -149,7 +150,7 @@ class Agreement:
             if finding.rule != MISSING_NODE.id or machine not in gone:
                 return finding
             why = f" ({gone[machine]})" if gone[machine] else ""
-            return dataclasses.replace(
+            return replace(
                 finding,
                 observed=f"machine {machine!r} was shut down",
                 message=f"{finding.message}: machine {machine!r} was shut down by its supervisor"
@@ -158,7 +159,7 @@ class Agreement:
 
         if not gone:
             return verdict
-        return dataclasses.replace(verdict, findings=tuple(map(explain, verdict.findings)))
+        return replace(verdict, findings=tuple(map(explain, verdict.findings)))
 
     def _arrived(self, text: str) -> None:
         with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile

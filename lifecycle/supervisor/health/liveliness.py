@@ -12,7 +12,9 @@ import enum
 from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import TYPE_CHECKING
 
-from lifecycle import dataclasses
+import msgspec
+from msgspec.structs import replace
+
 from lifecycle.middleware.process.busy_sign import Overdue
 from lifecycle.supervisor.run.events import (
     Emitter,
@@ -42,8 +44,7 @@ class Cause(enum.Enum):
     REPORTED = "told"
 
 
-@dataclasses.dataclass(slots=True)
-class _Silence:
+class _Silence(msgspec.Struct):
     since_s: float
     causes: dict[Cause, str]
     hangs_since_s: float = 0.0
@@ -229,9 +230,9 @@ class SilenceMonitor:
             if each.rule == SILENT_NODE.id and silence and Cause.HUNG in silence.causes:
                 busy_s = self._emit.elapsed_s - silence.hangs_since_s
                 message = f"{_message(each.subject, _why(silence))}; {busy_s:.1f} s by now"
-                each = dataclasses.replace(each, message=message)  # noqa: PLW2901
+                each = replace(each, message=message)  # noqa: PLW2901
             found.append(each)
-        return dataclasses.replace(verdict, findings=tuple(found))
+        return replace(verdict, findings=tuple(found))
 
 
 class NodeArrivals:

@@ -11,7 +11,8 @@ import contextlib
 from collections.abc import Callable, Coroutine, Mapping
 from typing import TYPE_CHECKING, Any
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.errors import BringUpError
 from lifecycle.manifest.model import RunKind
 from lifecycle.node.host.control import Operation
@@ -29,8 +30,7 @@ SAID_AGAIN_S = (0.1, 0.3)
 """Fast DDS repeats what was lost after up to 3 s: too late for a silence."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Listener:
+class Listener(msgspec.Struct, frozen=True, kw_only=True):
     """What an AliveSubscription calls, from any thread.
 
     Attributes:
@@ -44,8 +44,7 @@ class Listener:
     silent: Callable[[Mapping[str, str]], None]
 
 
-@dataclasses.dataclass(slots=True)
-class _PeerSupervisor:
+class _PeerSupervisor(msgspec.Struct):
     """One peer that should be alive.
 
     Attributes:

@@ -15,7 +15,8 @@ from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from lifecycle import dataclasses
+from msgspec.structs import replace
+
 from lifecycle.errors import BringUpError, MiddlewareError
 from lifecycle.manifest.model import Condition, RosArguments, RunKind, TargetState
 from lifecycle.node.host.control import HostSpec, Operation
@@ -183,11 +184,11 @@ class BringUp:
         if gives is None:
             return
         plans = [
-            dataclasses.replace(
+            replace(
                 node.planned,
                 # All of them, also those that it has by default.
                 expected_parameters=tuple(
-                    dataclasses.replace(each, source=GIVEN) for each in node.planned.in_mode(mode)
+                    replace(each, source=GIVEN) for each in node.planned.in_mode(mode)
                 ),
             )
             for node in nodes

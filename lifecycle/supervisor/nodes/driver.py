@@ -11,7 +11,8 @@ import functools
 from collections.abc import Awaitable
 from typing import TYPE_CHECKING
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.errors import BringUpError, MiddlewareError
 from lifecycle.node.host.control import Operation
 from lifecycle.plan.model import PlannedNode
@@ -35,8 +36,7 @@ _PASSING_S = 0.1
 """Who drives a node that is in the middle of a transition is somebody else: it is asked again."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class NodeCondition:
+class NodeCondition(msgspec.Struct, frozen=True, kw_only=True):
     """State of a node after an operation.
 
     Attributes:

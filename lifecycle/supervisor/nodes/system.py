@@ -13,7 +13,8 @@ from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lifecycle import dataclasses
+from msgspec.structs import replace
+
 from lifecycle.errors import BringUpError
 from lifecycle.manifest.model import Condition, RunKind, TargetState
 from lifecycle.node.host.control import Event as HostEvent
@@ -77,7 +78,7 @@ async def follow_remote(system: System, observer: Graph, changes: ChangeCounter)
     """Look at every change, until the remote nodes that others wait for have reached everything."""
     nodes = system.awaited()
     # Ours report by themselves: only these have to be asked.
-    plan = dataclasses.replace(system.plan, nodes=tuple(each.planned for each in nodes))
+    plan = replace(system.plan, nodes=tuple(each.planned for each in nodes))
     while not all(each.has_reached(each.awaited) for each in nodes):
         count = changes.count
         observation = await observer.observe(plan)
@@ -103,7 +104,7 @@ async def follow_health(system: System, observer: Graph, changes: ChangeCounter)
     awaited = [each for each in awaited if not each.reports_health]
     if not awaited:
         return
-    plan = dataclasses.replace(system.plan, nodes=tuple(each.planned for each in awaited))
+    plan = replace(system.plan, nodes=tuple(each.planned for each in awaited))
     while True:
         count = changes.count
         observation = await observer.observe(plan)
@@ -326,9 +327,7 @@ class NodeRun:
             # What it said of itself in another state is no answer; its host reports the new one.
             stale = known.health is not None and known.state != state
             health = _NOT_ANSWERED if stale else known.health
-            self.configuration = dataclasses.replace(
-                known, state=state, connected=connected, health=health
-            )
+            self.configuration = replace(known, state=state, connected=connected, health=health)
 
     def _tell(self) -> None:
         self._emit(
@@ -679,6 +678,6 @@ def _connected_as(plan: Plan, running: Mapping[str, NodeRun], before: Plan) -> P
         if (was.connections, was.participants) != (node.connections, node.participants):
             return node
         now = run.planned
-        return dataclasses.replace(node, connections=now.connections, participants=now.participants)
+        return replace(node, connections=now.connections, participants=now.participants)
 
-    return dataclasses.replace(plan, nodes=tuple(map(connected, plan.nodes)))
+    return replace(plan, nodes=tuple(map(connected, plan.nodes)))

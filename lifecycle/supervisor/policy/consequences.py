@@ -10,7 +10,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from lifecycle import dataclasses
+import msgspec
+from msgspec.structs import replace
+
 from lifecycle.manifest.model import (
     BY_DEFAULT,
     Consequence,
@@ -58,8 +60,7 @@ def _strongest(finding: Finding, said: Iterable[OnViolation]) -> Reaction | None
     return max(found, key=lambda one: _ORDER.index(one.what), default=None)
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Due:
+class Due(msgspec.Struct, frozen=True, kw_only=True):
     """A consequence that is to be carried out now.
 
     Attributes:
@@ -124,7 +125,7 @@ class Consequences:
             # A mode that its gate refuses is left again, and not entered for the same reason twice.
             self._tried |= {key for key, due in asked.items() if due.mode == worst.mode}
         ordered = tuple(key for key in self._system.nodes if key in keys)
-        return dataclasses.replace(worst, keys=ordered), None
+        return replace(worst, keys=ordered), None
 
     def _asked(self, finding: Finding) -> Due | None:
         """Return what would still have an effect."""

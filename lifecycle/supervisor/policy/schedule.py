@@ -13,8 +13,8 @@ import signal
 from collections.abc import Collection, Iterable
 
 import msgspec
+from msgspec.structs import replace
 
-from lifecycle import dataclasses
 from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import Restart
 from lifecycle.supervisor.control.protocol import Failed, ProcessState
@@ -44,8 +44,7 @@ class GaveUpError(StepFailedError):
     exit_code = ExitCode.SUPERVISION_GAVE_UP
 
 
-@dataclasses.dataclass(slots=True)
-class _Record:
+class _Record(msgspec.Struct):
     """One process over all of its lives.
 
     Attributes:
@@ -59,8 +58,7 @@ class _Record:
     since_s: float | None = None
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class _Entry:
+class _Entry(msgspec.Struct, frozen=True):
     """Nodes that are to be started again at a time.
 
     Attributes:
@@ -224,7 +222,7 @@ class RestartSchedule:
                 failed.add(entry.process)
             if entry.keys - keys:
                 process = "" if begins else entry.process
-                left.append(dataclasses.replace(entry, process=process, keys=entry.keys - keys))
+                left.append(replace(entry, process=process, keys=entry.keys - keys))
         begun = {self._system.nodes[key].process for key in keys}
         for again in (each for each in begun if each is not None):
             policy = self._record(again).policy
@@ -243,7 +241,7 @@ class RestartSchedule:
     def by_hand(self, keys: Collection[str]) -> None:
         """Note that a person starts nodes again: whose process is among them begins anew."""
         self._entries = [
-            dataclasses.replace(entry, keys=entry.keys - set(keys))
+            replace(entry, keys=entry.keys - set(keys))
             for entry in self._entries
             if entry.keys - set(keys)
         ]

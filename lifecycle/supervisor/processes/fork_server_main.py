@@ -23,7 +23,8 @@ import warnings
 from collections.abc import Iterable
 from typing import NoReturn
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.process.control import limit_resources
@@ -44,8 +45,7 @@ GRACE_S = 4.0
 """How long orphans get to end by themselves once the supervisor is gone."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class ForkRequest:
+class ForkRequest(msgspec.Struct, frozen=True, kw_only=True):
     """Supervisor → fork server, with descriptors stdout, stderr and, if `control`, the channel.
 
     Attributes:
@@ -68,8 +68,7 @@ class ForkRequest:
     grace_s: float = GRACE_S
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class ChildReport:
+class ChildReport(msgspec.Struct, frozen=True, kw_only=True):
     """Fork server → supervisor: a child was forked (with its pidfd), stopped, continued or ended.
 
     Attributes:
@@ -96,8 +95,7 @@ _STOPS = os.WSTOPPED | os.WCONTINUED | os.WNOHANG
 _WAKEUP_BYTES = 4096
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class _Child:
+class _Child(msgspec.Struct, frozen=True, kw_only=True):
     request: ForkRequest
     pidfd: int
 

@@ -17,7 +17,8 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.manifest.model import Output
 from lifecycle.middleware.process.stacks import brief
 from lifecycle.plan.model import PlannedProcess
@@ -39,8 +40,7 @@ if TYPE_CHECKING:
     from lifecycle.supervisor.processes.fork_server import ForkServer, ForkServerChild
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class ProcessExit:
+class ProcessExit(msgspec.Struct, frozen=True, kw_only=True):
     """How a process ended.
 
     Attributes:

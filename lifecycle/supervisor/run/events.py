@@ -12,15 +12,13 @@ from typing import Any, ClassVar, Union, get_args
 
 import msgspec
 
-from lifecycle import dataclasses
 from lifecycle.codec import to_plain
 from lifecycle.node.host.control import Operation
 from lifecycle.supervisor.control.protocol import Failed, ProcessState, Reach
 from lifecycle.verify.verdict import Stage, Verdict
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class RunStarted:
+class RunStarted(msgspec.Struct, frozen=True, kw_only=True):
     """A supervisor took charge of a system.
 
     Attributes:
@@ -37,8 +35,7 @@ class RunStarted:
     log_directory: str
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class ProcessChanged:
+class ProcessChanged(msgspec.Struct, frozen=True, kw_only=True):
     """A process changed its state.
 
     Attributes:
@@ -53,8 +50,7 @@ class ProcessChanged:
     detail: str = ""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class RequestSent:
+class RequestSent(msgspec.Struct, frozen=True, kw_only=True):
     """A request to one node is about to be sent; what the gate's promise is checked against."""
 
     kind: ClassVar[str] = "request"
@@ -62,8 +58,7 @@ class RequestSent:
     operation: Operation
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class NodeChanged:
+class NodeChanged(msgspec.Struct, frozen=True, kw_only=True):
     """A node came a step further, or its state changed.
 
     Attributes:
@@ -78,8 +73,7 @@ class NodeChanged:
     connected: bool = False
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class WiringChanged:
+class WiringChanged(msgspec.Struct, frozen=True, kw_only=True):
     """The authority made a connection or a mapping, unmade one, or failed to.
 
     Attributes:
@@ -101,8 +95,7 @@ class WiringChanged:
     error: str = ""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class WiringLost:
+class WiringLost(msgspec.Struct, frozen=True, kw_only=True):
     """A connection or a mapping that the authority had made is no more.
 
     Attributes:
@@ -116,8 +109,7 @@ class WiringLost:
     endpoint: str = ""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class NodeSilent:
+class NodeSilent(msgspec.Struct, frozen=True, kw_only=True):
     """Nothing can be expected of a node any more, though it has not left.
 
     Attributes:
@@ -131,8 +123,7 @@ class NodeSilent:
     message: str
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class NodeAlive:
+class NodeAlive(msgspec.Struct, frozen=True, kw_only=True):
     """A node is not silent any more.
 
     Attributes:
@@ -147,24 +138,21 @@ class NodeAlive:
     there: bool = True
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class NodeJoined:
+class NodeJoined(msgspec.Struct, frozen=True, kw_only=True):
     """A node is in the graph that was not there when it was last looked at."""
 
     kind: ClassVar[str] = "joined"
     node: str
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class NodeLeft:
+class NodeLeft(msgspec.Struct, frozen=True, kw_only=True):
     """A node is not in the graph any more; what is silent leaves it when its DDS lease is over."""
 
     kind: ClassVar[str] = "left"
     node: str
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class MachineConnection:
+class MachineConnection(msgspec.Struct, frozen=True, kw_only=True):
     """The supervisor of another machine is connected, or not any more.
 
     Attributes:
@@ -181,8 +169,7 @@ class MachineConnection:
     left: bool = False
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class LogLine:
+class LogLine(msgspec.Struct, frozen=True, kw_only=True):
     """One line that a process wrote.
 
     Attributes:
@@ -195,8 +182,7 @@ class LogLine:
     line: str
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class VerdictChanged:
+class VerdictChanged(msgspec.Struct, frozen=True, kw_only=True):
     """The running system was judged and the result differs from the one before."""
 
     kind: ClassVar[str] = "verdict"
@@ -204,8 +190,7 @@ class VerdictChanged:
     verdict: Verdict
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class GateOpened:
+class GateOpened(msgspec.Struct, frozen=True, kw_only=True):
     """The verdict lets the system activate.
 
     Attributes:
@@ -218,8 +203,7 @@ class GateOpened:
     trusted: str = ""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class SystemReached:
+class SystemReached(msgspec.Struct, frozen=True, kw_only=True):
     """The whole system is connected, verified or active.
 
     Attributes:
@@ -232,8 +216,7 @@ class SystemReached:
     elapsed_s: float
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class StageTimed:
+class StageTimed(msgspec.Struct, frozen=True, kw_only=True):
     """How long a stage of bring-up took; `up --timings` has one of each once bring-up is over.
 
     Attributes:
@@ -251,8 +234,7 @@ class StageTimed:
     last: str = ""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Failure:
+class Failure(msgspec.Struct, frozen=True, kw_only=True):
     """A step that failed, or a process that ended unasked; the last verdict has it as a finding.
 
     Attributes:
@@ -272,8 +254,7 @@ class Failure:
     ends_run: bool = True
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class RestartScheduled:
+class RestartScheduled(msgspec.Struct, frozen=True, kw_only=True):
     """A process failed that is to be started again; until then it is in backoff.
 
     Attributes:
@@ -293,8 +274,7 @@ class RestartScheduled:
     in_s: float
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Restarted:
+class Restarted(msgspec.Struct, frozen=True, kw_only=True):
     """A process that failed is as far again as the system is: active and verified, or paused.
 
     Attributes:
@@ -310,8 +290,7 @@ class Restarted:
     took_s: float
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class GaveUp:
+class GaveUp(msgspec.Struct, frozen=True, kw_only=True):
     """A process failed too often to be started again; the run ends for it.
 
     Attributes:
@@ -324,8 +303,7 @@ class GaveUp:
     history: tuple[Failed, ...]
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class ConsequenceTaken:
+class ConsequenceTaken(msgspec.Struct, frozen=True, kw_only=True):
     """A violation of an active system lasts, and what the manifest asks for is done about it.
 
     Attributes:
@@ -343,8 +321,7 @@ class ConsequenceTaken:
     message: str
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class ModeEntered:
+class ModeEntered(msgspec.Struct, frozen=True, kw_only=True):
     """The system is in another mode.
 
     Attributes:
@@ -361,8 +338,7 @@ class ModeEntered:
     parameters: tuple[str, ...] = ()
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class ManifestApplied:
+class ManifestApplied(msgspec.Struct, frozen=True, kw_only=True):
     """A running system is to run by another manifest, does so, or goes back to the one before.
 
     Attributes:
@@ -387,24 +363,21 @@ class ManifestApplied:
     reason: str = ""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Notice:
+class Notice(msgspec.Struct, frozen=True, kw_only=True):
     """Something a person should know that changes nothing: orphans swept, a step forced."""
 
     kind: ClassVar[str] = "notice"
     message: str
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Stopping:
+class Stopping(msgspec.Struct, frozen=True, kw_only=True):
     """The system is being taken down."""
 
     kind: ClassVar[str] = "stopping"
     reason: str
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Stopped:
+class Stopped(msgspec.Struct, frozen=True, kw_only=True):
     """Nothing of the system runs any more.
 
     Attributes:

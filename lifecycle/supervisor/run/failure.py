@@ -12,7 +12,8 @@ from collections.abc import Callable, Coroutine, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
-from lifecycle import dataclasses
+from msgspec.structs import replace
+
 from lifecycle.errors import BringUpError, ExitCode
 from lifecycle.middleware.process.control import no_room_for_threads
 from lifecycle.supervisor.run.events import Failure
@@ -101,7 +102,7 @@ def ended_early(reason: str, exit_code: ExitCode) -> UpResult:
 def never_connected(verdict: Verdict, reason: str, exit_code: ExitCode) -> Verdict:
     """Return `verdict` as the last one of a run that ended before its system was connected."""
     run = RunEnd(reason=reason, reached=None, exit_code=exit_code)
-    return dataclasses.replace(verdict, run=run)
+    return replace(verdict, run=run)
 
 
 def with_failure(verdict: Verdict, failure: StepFailedError) -> Verdict:
@@ -119,9 +120,7 @@ def with_failure(verdict: Verdict, failure: StepFailedError) -> Verdict:
         if (each.rule, each.subject) not in named
         and (rule(each.rule).about is None or gone.isdisjoint((each.subject, *each.nodes)))
     )
-    return dataclasses.replace(
-        verdict, verdict=Outcome.VIOLATED, blocking=True, findings=(*findings, *rest)
-    )
+    return replace(verdict, verdict=Outcome.VIOLATED, blocking=True, findings=(*findings, *rest))
 
 
 T = TypeVar("T")

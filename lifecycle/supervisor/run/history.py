@@ -6,7 +6,9 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
-from lifecycle import codec, dataclasses
+import msgspec
+
+from lifecycle import codec
 from lifecycle.errors import UsageError
 from lifecycle.supervisor.processes.logs import JOURNAL_NAME
 from lifecycle.supervisor.run.events import Event, from_record
@@ -16,8 +18,7 @@ LONGEST_LINE = 64 * 2**20
 """Bytes of a line that is read at all."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Moment:
+class Moment(msgspec.Struct, frozen=True, kw_only=True):
     """One line of a journal.
 
     Attributes:
@@ -31,8 +32,7 @@ class Moment:
     text: str
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class RecordedRun:
+class RecordedRun(msgspec.Struct, frozen=True, kw_only=True):
     """A journal that was read.
 
     Attributes:

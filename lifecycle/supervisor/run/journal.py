@@ -14,7 +14,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
-from lifecycle import codec, dataclasses
+import msgspec
+from msgspec.structs import replace
+
+from lifecycle import codec
 from lifecycle.codec import Count, says
 from lifecycle.supervisor.processes.logs import JOURNAL_NAME, RotatedFile
 from lifecycle.supervisor.run.events import Event, LogLine, VerdictChanged
@@ -26,8 +29,7 @@ _TRIED_AGAIN_S = 1.0
 """How often a journal is tried that could not be written."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class JournaledRun:
+class JournaledRun(msgspec.Struct, frozen=True, kw_only=True):
     """Which run a journal is of; the first line of each file.
 
     Attributes:
@@ -42,8 +44,7 @@ class JournaledRun:
     supervisor: Count
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class JournalLine:
+class JournalLine(msgspec.Struct, frozen=True, kw_only=True):
     """One line of a journal: the run, or an event.
 
     Attributes:
@@ -110,8 +111,8 @@ class Journal:
         if isinstance(event, LogLine):
             return
         if isinstance(event, VerdictChanged):
-            verdict = dataclasses.replace(event.verdict, flows=(), open_endpoints=())
-            event = dataclasses.replace(event, verdict=verdict)
+            verdict = replace(event.verdict, flows=(), open_endpoints=())
+            event = replace(event, verdict=verdict)
         plain = codec.to_plain(event)
         assert isinstance(plain, dict)
         line = self._line(event={"event": event.kind, **plain})

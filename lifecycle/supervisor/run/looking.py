@@ -17,7 +17,9 @@ from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from lifecycle import dataclasses
+import msgspec
+from msgspec.structs import replace
+
 from lifecycle.errors import MiddlewareError, UsageError
 from lifecycle.export.captured import CapturedParameter, CapturedSystem, Programs, capture
 from lifecycle.export.picture.build import Supervised, build_picture
@@ -64,8 +66,7 @@ _ASK_AT_MOST_S = 8.0
 not notified that a node hangs or was reconfigured."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class JudgedSystem:
+class JudgedSystem(msgspec.Struct, frozen=True, kw_only=True):
     """What was seen of a running system, and how it was judged.
 
     Attributes:
@@ -151,7 +152,7 @@ async def _following(
             if now != last or again_s is not None:
                 pause_s = _ASK_AGAIN_S
             last = now
-            said = of(dataclasses.replace(seen, verdict=last))
+            said = of(replace(seen, verdict=last))
             if said != told:
                 told = said
                 on_change(said)

@@ -12,7 +12,9 @@ import socket
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from lifecycle import dataclasses
+import msgspec
+from msgspec.structs import replace
+
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest.model import Machine, Manifest
 from lifecycle.network.connection_url import Peer, parse
@@ -44,8 +46,7 @@ class Until(enum.Enum):
     ACTIVE = "active"
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class UpOptions:
+class UpOptions(msgspec.Struct, frozen=True, kw_only=True):
     """How to bring a system up.
 
     Attributes:
@@ -84,8 +85,7 @@ class UpOptions:
         return min(left_s, TIMEOUT_S) if self.timeout_s is None else left_s
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class UpResult:
+class UpResult(msgspec.Struct, frozen=True, kw_only=True):
     """How a run ended.
 
     Attributes:
@@ -183,7 +183,7 @@ def observer_connections(plan: Plan, machine: str = "") -> ParticipantConnection
     shared = tuple(
         url for url in found.urls if only_shared_memory(ParticipantConnections(urls=(url,)))
     )
-    return dataclasses.replace(found, urls=shared or found.urls)
+    return replace(found, urls=shared or found.urls)
 
 
 def onlooker_connections(
@@ -210,11 +210,11 @@ def onlooker_connections(
     for text in connections.urls:
         url = parse(text)
         if not url.transport.is_group:
-            url = dataclasses.replace(url, port=None, metatraffic_port=None, output_port=None)
+            url = replace(url, port=None, metatraffic_port=None, output_port=None)
         if url.transport.is_tcp and not url.server:
-            url = dataclasses.replace(url, peers=tuple(sorted({*url.peers, *listening})))
+            url = replace(url, peers=tuple(sorted({*url.peers, *listening})))
         urls.append(str(url))
-    return dataclasses.replace(connections, urls=tuple(urls))
+    return replace(connections, urls=tuple(urls))
 
 
 def _own_addresses() -> set[str]:

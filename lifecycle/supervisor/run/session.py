@@ -19,7 +19,9 @@ from collections.abc import (
 )
 from typing import TYPE_CHECKING, Any
 
-from lifecycle import dataclasses
+import msgspec
+from msgspec.structs import replace
+
 from lifecycle.errors import ExitCode
 from lifecycle.run_directory import RunDirectory, start_ticks
 from lifecycle.supervisor.connections import discovery_server
@@ -102,8 +104,7 @@ class _Stop(Exception):  # noqa: N818 - not an error: it was asked for
         self.exit_code = exit_code
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class _RunEnd:
+class _RunEnd(msgspec.Struct, frozen=True, kw_only=True):
     """Result of a run, beside its reason: nothing to add, if it is as it was asked for."""
 
     exit_code: ExitCode = ExitCode.OK
@@ -395,7 +396,7 @@ class Session:
             trusted=self._gate_sequence.trusted,
         )
         verdict = self._system.liveliness.by_now(
-            dataclasses.replace(end.verdict or self._judge.latest or NOT_JUDGED, run=run)
+            replace(end.verdict or self._judge.latest or NOT_JUDGED, run=run)
         )
         return UpResult(exit_code=end.exit_code, verdict=verdict, plan=self._system.first)
 
@@ -413,7 +414,7 @@ class Session:
             return _RunEnd(exit_code=exit_code, why=self._waits())
         end = self._outcome()
         if exit_code in (ExitCode.INTERRUPTED, ExitCode.VIOLATED):
-            end = dataclasses.replace(end, exit_code=exit_code)
+            end = replace(end, exit_code=exit_code)
         if end.exit_code != ExitCode.OK:
             return end
         if self._options.stop_after_s is not None:
@@ -423,7 +424,7 @@ class Session:
             why = f"the system was {self._gate_sequence.phase}, not active"
             return _RunEnd(exit_code=exit_code, why=why)
         if meanwhile := self._judge.violations.counted:
-            return dataclasses.replace(end, why=f"violated meanwhile, {meanwhile}")
+            return replace(end, why=f"violated meanwhile, {meanwhile}")
         return end
 
     def _hosts_left(self) -> bool:
@@ -646,10 +647,8 @@ def _died_on_the_way_down(result: UpResult, deaths: list[StepFailedError]) -> Up
     verdict = with_failure(result.verdict, failure)
     assert verdict.run is not None
     reason = f"{verdict.run.reason}, but {failure.reason} while it was taken down"
-    run = dataclasses.replace(verdict.run, reason=reason, exit_code=code)
-    return dataclasses.replace(
-        result, exit_code=code, verdict=dataclasses.replace(verdict, run=run)
-    )
+    run = replace(verdict.run, reason=reason, exit_code=code)
+    return replace(result, exit_code=code, verdict=replace(verdict, run=run))
 
 
 def _hurried(result: UpResult) -> UpResult:
@@ -657,6 +656,6 @@ def _hurried(result: UpResult) -> UpResult:
     run = result.verdict.run
     assert run is not None
     reason = f"{run.reason}; interrupted while it was taken down"
-    run = dataclasses.replace(run, reason=reason, exit_code=ExitCode.INTERRUPTED)
-    verdict = dataclasses.replace(result.verdict, run=run)
-    return dataclasses.replace(result, exit_code=ExitCode.INTERRUPTED, verdict=verdict)
+    run = replace(run, reason=reason, exit_code=ExitCode.INTERRUPTED)
+    verdict = replace(result.verdict, run=run)
+    return replace(result, exit_code=ExitCode.INTERRUPTED, verdict=verdict)

@@ -17,7 +17,8 @@ import traceback
 from collections.abc import Awaitable, Callable, Iterable, Iterator
 from pathlib import Path
 
-from lifecycle import dataclasses
+from msgspec.structs import replace
+
 from lifecycle.errors import ExitCode, MiddlewareError
 from lifecycle.manifest.model import Authority, DataLayerSource, EndpointPolicy, RunKind
 from lifecycle.middleware.discovery.environment import (
@@ -278,7 +279,7 @@ async def _leaving_last(
     try:
         result = await run(leaving)
         exit_code = conclude(result)
-        return dataclasses.replace(result, exit_code=exit_code)
+        return replace(result, exit_code=exit_code)
     finally:
         with _ends_within(LEAVE_S, exit_code):
             await leaving.aclose()

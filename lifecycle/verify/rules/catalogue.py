@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import enum
 
-from lifecycle import dataclasses
+import msgspec
+
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.plan.model import PlannedNode
@@ -34,8 +35,7 @@ class About(enum.Enum):
     CONNECTION = "connection"  # a node's connections, and what is mapped onto them
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Rule:
+class Rule(msgspec.Struct, frozen=True, kw_only=True):
     """One thing that verification judges.
 
     Attributes:

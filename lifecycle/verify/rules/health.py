@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import msgspec
+from msgspec.structs import replace
 
-from lifecycle import dataclasses
 from lifecycle.plan.model import PlannedNode
 from lifecycle.verify.observation import HealthReport
 from lifecycle.verify.outcome import Outcome
@@ -91,7 +91,7 @@ def _judge(view: View, facts: NodeFacts) -> Iterator[Finding]:
         diagnostics=node.health.diagnostics if works else (),
     )
     health = health_of(
-        dataclasses.replace(node, health=asked),
+        replace(node, health=asked),
         None if report is None else report.health,
         None if facts.observed is None else facts.observed.health,
     )

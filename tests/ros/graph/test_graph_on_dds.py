@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import os
 import signal
 import subprocess
@@ -15,6 +14,7 @@ from pathlib import Path
 import pytest
 import rclpy
 from managed_node import ManagedNode
+from msgspec.structs import replace
 from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.node import Node
 from reporting_node import ReportingNode
@@ -117,7 +117,7 @@ def test_a_node_joins_tells_its_changes_and_leaves(
         teller.reporter.report(state="active")
         until(graph, lambda state: (seen := state.node("/teller")) and seen.state == "active")
         asked = teller.asked
-        teller.configuration = dataclasses.replace(
+        teller.configuration = replace(
             teller.configuration, endpoints=(), state="active", checksum="2"
         )
         teller.reporter.report(checksum="2")

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 from collections.abc import Iterator
 from typing import Any
 
 import rclpy
+from msgspec.structs import replace
 
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import EndpointKind
@@ -39,7 +39,7 @@ def planned(name: str, *endpoints: PlannedEndpoint, **changes: Any) -> PlannedNo
     """Return the plan of one node."""
     blank = plan_without_manifest(LifecycleNode, name=name, namespace="/")
     # Few tests are about what the graph is told; the others need no heartbeats.
-    return dataclasses.replace(blank, endpoints=endpoints, **{"events": False, **changes})
+    return replace(blank, endpoints=endpoints, **{"events": False, **changes})
 
 
 @contextlib.contextmanager

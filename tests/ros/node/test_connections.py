@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import subprocess
 import sys
 from collections.abc import Callable
@@ -12,6 +11,7 @@ from typing import Any
 import pytest
 import rclpy
 from lifecycle_driver import Driver
+from msgspec.structs import replace
 from planning import built_with, client, planned, publisher, server, subscription
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import String
@@ -72,7 +72,7 @@ def configuration(driver: Driver) -> NodeConfiguration:
 
 def reliable(endpoint: Callable[..., Any], name: str, **changes: Any) -> Any:
     made = endpoint(name, **changes)
-    return dataclasses.replace(made, qos=dataclasses.replace(made.qos, depth=1000))
+    return replace(made, qos=replace(made.qos, depth=1000))
 
 
 def numbers(first: int, count: int) -> list[str]:
@@ -184,8 +184,8 @@ def test_a_publisher_is_handed_over_under_traffic_and_its_handle_stays(
 
 def latched(name: str, depth: int = 2) -> Any:
     made = publisher(name)
-    qos = dataclasses.replace(made.qos, durability=Durability.TRANSIENT_LOCAL, depth=depth)
-    return dataclasses.replace(made, qos=qos)
+    qos = replace(made.qos, durability=Durability.TRANSIENT_LOCAL, depth=depth)
+    return replace(made, qos=qos)
 
 
 def latecomer(driver: Driver, topic: str) -> list[str]:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections.abc import Callable
 from typing import Any
 
 import pytest
 from lifecycle_driver import Driver
+from msgspec.structs import replace
 from planning import publisher, server, subscription
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -138,7 +138,7 @@ class Reporting(LifecycleNode):
 
 
 def test_the_configuration_tells_each_endpoint_as_it_is(driver: Driver, active: Active) -> None:
-    qos = dataclasses.replace(publisher("x").qos, depth=3)  # type: ignore[type-var]
+    qos = replace(publisher("x").qos, depth=3)  # type: ignore[type-var]
     active(Reporting, publisher("out", qos=qos), subscription("in"), server("reset"), to="")
     document = json.loads(driver.configuration("/it"))
     assert (document["name"], document["state"], document["connected"]) == (

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import os
 import signal
 import socket
@@ -15,6 +14,7 @@ from pathlib import Path
 import psutil
 import pytest
 from host_process import HostProcess, driver_in, hosted
+from msgspec.structs import replace
 from planning import publisher, subscription
 from std_msgs.msg import String
 
@@ -163,8 +163,8 @@ def test_a_node_that_cannot_be_constructed_ends_the_process_with_the_reason(
 
 def test_a_module_that_does_not_exist_is_named(start: Start) -> None:
     spec = hosted("one", "Good")
-    run = dataclasses.replace(spec.run, python="nowhere.nodes:Camera")
-    host = start(dataclasses.replace(spec, run=run))
+    run = replace(spec.run, python="nowhere.nodes:Camera")
+    host = start(replace(spec, run=run))
     assert host.read().error == (
         "cannot import 'nowhere.nodes:Camera': no module 'nowhere'; "
         f"it is looked for in {HERE} and in what is installed"
@@ -240,7 +240,7 @@ def test_an_exception_in_a_message_handler_ends_the_process_with_its_traceback(
 
 def test_a_plain_node_gets_its_planned_name_when_alone(start: Start, fresh_domain: int) -> None:
     plain = hosted("one", "Plain", managed=False, namespace="/robot", remap=(("out", "there"),))
-    host = start(dataclasses.replace(plain, parameters=(("label", "1: left"),)))
+    host = start(replace(plain, parameters=(("label", "1: left"),)))
     host.until("ready")
     with driver_in(fresh_domain) as driver:
         driver.spin_until(lambda: driver.node.count_publishers("/robot/there") == 1)
@@ -362,7 +362,7 @@ def test_a_node_that_shuts_rclpy_down_ends_its_process_well(start: Start) -> Non
 
 
 def test_a_node_that_another_makes_is_hosted_where_it_is_declared(start: Start) -> None:
-    out = dataclasses.replace(publisher("out"), resolved="/there/out")
+    out = replace(publisher("out"), resolved="/there/out")
     host = start(
         hosted("main", "WithHelper", managed=False),
         hosted("helper", "WithHelper", out, managed=False, namespace="/there"),

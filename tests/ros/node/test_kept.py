@@ -6,10 +6,10 @@ import time
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 from rclpy.serialization import deserialize_message
 from std_msgs.msg import Header, String
 
-from lifecycle import dataclasses
 from lifecycle.manifest.qos import Durability, History, QosProfile
 from lifecycle.node.endpoints.publisher import Kept
 
@@ -68,7 +68,7 @@ def test_a_message_is_kept_as_it_was_when_it_was_sent() -> None:
 def test_what_has_outlived_its_lifespan_is_not_sent_again(monkeypatch: pytest.MonkeyPatch) -> None:
     now_ns = [1_000]
     monkeypatch.setattr(time, "monotonic_ns", lambda: now_ns[0])
-    keeps = kept(dataclasses.replace(LATCHED, lifespan_ns=50))
+    keeps = kept(replace(LATCHED, lifespan_ns=50))
     for each in ("dead", "alive"):
         say(keeps, String(data=each))
         now_ns[0] += 30

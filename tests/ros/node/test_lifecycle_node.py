@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -12,6 +11,7 @@ from builtin_interfaces.msg import Time
 from lifecycle_driver import Driver
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
+from msgspec.structs import replace
 from planning import AT, built_with, client, planned, publisher, server, subscription
 from rcl_interfaces.msg import ParameterEvent
 from rclpy.node import Node
@@ -239,16 +239,14 @@ def test_a_client_before_connect_is_an_error_that_says_when(driver: Driver, chat
             ),
         ),
         (
-            dataclasses.replace(CHATTY, endpoints=(*CHATTY.endpoints, subscription("inn"))),
+            replace(CHATTY, endpoints=(*CHATTY.endpoints, subscription("inn"))),
             (
                 "cannot serve subscription 'inn' of /chatty: no method of Chatty is decorated with "
                 "@on_message('inn')"
             ),
         ),
         (
-            dataclasses.replace(
-                CHATTY, endpoints=(*CHATTY.endpoints, publisher("x", "std_msgs/msg/Strong"))
-            ),
+            replace(CHATTY, endpoints=(*CHATTY.endpoints, publisher("x", "std_msgs/msg/Strong"))),
             (
                 "publisher 'x': cannot find interface type 'std_msgs/msg/Strong': package "
                 "'std_msgs' has no msg 'Strong'; did you mean std_msgs/msg/String?"

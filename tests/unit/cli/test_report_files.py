@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import errno
 import json
 import os
@@ -13,6 +12,7 @@ from xml.etree import ElementTree as ET
 
 import click
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.cli.report import ReportFile, open_report
 from lifecycle.cli.up_output import output
@@ -239,20 +239,18 @@ def test_a_report_that_cannot_be_written_in_the_end_is_no_success(tmp_path: Path
 
 def test_a_run_that_took_another_manifest_is_reported_by_that_one(tmp_path: Path) -> None:
     """Whether what is unverifiable is a failure in JUnit is the policy's to say."""
-    found = [
-        dataclasses.replace(each, outcome=Outcome.UNVERIFIABLE) for each in violated().findings
-    ]
-    verdict = dataclasses.replace(
+    found = [replace(each, outcome=Outcome.UNVERIFIABLE) for each in violated().findings]
+    verdict = replace(
         violated(), verdict=Outcome.UNVERIFIABLE, findings=tuple(found), blocking=False
     )
-    policy = dataclasses.replace(PLAN.policy, unverifiable_blocks=True)
+    policy = replace(PLAN.policy, unverifiable_blocks=True)
     result = UpResult(
         exit_code=ExitCode.UNVERIFIABLE,
         verdict=verdict,
-        plan=dataclasses.replace(PLAN, policy=policy),
+        plan=replace(PLAN, policy=policy),
     )
     failed = []
-    for taken in (dataclasses.replace(result, plan=None), result):
+    for taken in (replace(result, plan=None), result):
         path = tmp_path / "report.xml"
         open_report(path)
         with ReportFile(path) as report, output("json") as listener:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import importlib.util
 import json
 import os
@@ -13,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_args
 
+import msgspec
 import pytest
 import yaml
 
@@ -242,7 +242,7 @@ def test_the_node_of_its_page_fits_its_manifest(tmp_path: Path) -> None:
 def test_the_page_of_events_has_every_event_with_its_fields() -> None:
     table = re.findall(r"^\| `(\w+)` \| ([^|]+) \|", read(ROOT / "docs/events.md"), re.MULTILINE)
     assert [(name, re.findall(r"`(\w+)`", fields)) for name, fields in table] == [
-        (event.kind, [each.name for each in dataclasses.fields(event)])
+        (event.kind, [each.name for each in msgspec.structs.fields(event)])
         for event in get_args(events.Event)
     ]
 

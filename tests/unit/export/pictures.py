@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
+from msgspec.structs import replace
 
 from lifecycle.export.picture.build import Supervised, build_picture
 from lifecycle.export.picture.model import Picture
@@ -131,7 +131,7 @@ def large() -> Picture:
     observation = Observation(
         nodes=(
             *(
-                dataclasses.replace(each, state=states.get(each.full_name, each.state))
+                replace(each, state=states.get(each.full_name, each.state))
                 for each in seen.nodes
                 if each.full_name not in missing
             ),
@@ -144,7 +144,7 @@ def large() -> Picture:
             ),
         ),
         configurations=tuple(
-            dataclasses.replace(each, state=states.get(each.name, each.state))
+            replace(each, state=states.get(each.name, each.state))
             for each in seen.configurations
             if each.name not in missing
         ),

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import random
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.export.captured import CapturedParameter, CapturedSystem, capture
 from lifecycle.export.manifest_yaml import to_manifest, to_nodl
@@ -30,9 +30,7 @@ from tests.builders import configuration, reported
 PUBLISHER, SUBSCRIPTION = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
 SERVER, CLIENT = EndpointKind.SERVICE_SERVER, EndpointKind.SERVICE_CLIENT
 ANNOUNCED = QosProfile(history=History.UNKNOWN, depth=0)
-LATCHED = dataclasses.replace(
-    ANNOUNCED, durability=Durability.TRANSIENT_LOCAL, deadline_ns=500_000_000
-)
+LATCHED = replace(ANNOUNCED, durability=Durability.TRANSIENT_LOCAL, deadline_ns=500_000_000)
 
 
 def endpoint(
@@ -82,7 +80,7 @@ PARAMETERS = {
     "/left/base": (),
 }
 
-ASKED = dataclasses.replace(
+ASKED = replace(
     FOREIGN,
     parameters=tuple(
         NodeParameters(
@@ -193,7 +191,7 @@ def test_the_same_graph_in_any_order_gives_the_same_text() -> None:
 
 def _without_depth(qos: QosProfile | None) -> object:
     """A profile without its depth: KEEP_LAST's presets differ, and nothing here keeps a depth."""
-    return None if qos is None else dataclasses.replace(qos, depth=0)
+    return None if qos is None else replace(qos, depth=0)
 
 
 def test_nodl_documents_stand_in_for_interfaces(tmp_path: Path) -> None:
@@ -341,7 +339,7 @@ def test_a_node_that_serves_no_parameters_and_reports_only_those_that_each_has_h
         reports = tuple(
             ParameterReport.of(name, "bool", value=True, read_only=False) for name in names
         )
-        silent = dataclasses.replace(configuration("/silent", state="active"), parameters=reports)
+        silent = replace(configuration("/silent", state="active"), parameters=reports)
         observation = Observation(
             nodes=(ObservedNode(full_name="/silent", managed=True, state="active"),),
             configurations=(silent,),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import json
 import re
@@ -17,6 +16,7 @@ import jsonschema
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.export.picture import (
@@ -153,12 +153,10 @@ def test_every_state_of_a_node_is_drawn(
     plan = planned(node("a", publisher("x")))
     seen = perfect(plan, Stage.ACTIVE)
     configurations = tuple(
-        dataclasses.replace(each, state=told, connected=True)
-        for each in seen.configurations
-        if told
+        replace(each, state=told, connected=True) for each in seen.configurations if told
     )
     nodes = (ObservedNode(full_name="/a", state=told, managed=managed),)
-    picture = drawn(plan, dataclasses.replace(seen, nodes=nodes, configurations=configurations))
+    picture = drawn(plan, replace(seen, nodes=nodes, configurations=configurations))
     assert picture.nodes[0].state is state
     assert f"{STATES[state].symbol} {state.value}" in picture_to_svg(picture)
 
@@ -241,8 +239,8 @@ def test_nothing_of_a_graph_is_taken_for_markup(
 @given(st.text(max_size=20), st.text(max_size=20))
 def test_mermaid_quotes_what_it_is_given(system: str, name: str) -> None:
     picture = build_picture(article())
-    nodes = (dataclasses.replace(picture.nodes[0], notes=(name,)), *picture.nodes[1:])
-    text = picture_to_mermaid(dataclasses.replace(picture, system=system, nodes=nodes))
+    nodes = (replace(picture.nodes[0], notes=(name,)), *picture.nodes[1:])
+    text = picture_to_mermaid(replace(picture, system=system, nodes=nodes))
     outside = re.sub(r'"[^"\n]*"', "", text.split("---\n", maxsplit=2)[2])
     assert '"' not in outside
     assert outside.count("subgraph") == len(re.findall(r"^ *end$", outside, re.MULTILINE))

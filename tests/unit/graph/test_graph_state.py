@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.graph.model import End, GraphChange, NodeView, link, match_ends
 from lifecycle.graph.state import GraphState, Look
@@ -62,8 +62,8 @@ def test_a_change_says_exactly_what_is_different(
     one, two, twin = endpoint("/one"), endpoint("/two"), endpoint("/two", gid="2")
     net = ConnectionReport(name="net", established=True)
     state.put_configuration(configuration("/a", one, two, connections=(net,)))
-    lost = dataclasses.replace(net, established=False)
-    now = configuration("/a", dataclasses.replace(two, matched=1), twin, connections=(lost,))
+    lost = replace(net, established=False)
+    now = configuration("/a", replace(two, matched=1), twin, connections=(lost,))
     state.put_configuration(now)
     change = changes[-1]
     assert change.endpoints.removed == (one,)
@@ -151,7 +151,7 @@ def test_who_asks_for_what_is_known_gets_each_node_and_then_its_changes(state: G
 
 
 UDP = nfe("10.0.0.2", 7411)
-TCP = dataclasses.replace(UDP, transport_protocol=TransportProtocol.TCP)
+TCP = replace(UDP, transport_protocol=TransportProtocol.TCP)
 
 
 def end(
@@ -172,7 +172,7 @@ def end(
             **options,
         }
     )
-    described = dataclasses.replace(
+    described = replace(
         configuration(name, report),
         identity=Identity(machine_id=name, process_id=1, node_id=name),
     )

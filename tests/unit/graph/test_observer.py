@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 import logging
 from collections.abc import Awaitable, Callable, Collection, Iterable, Sequence
 from typing import Any, TypeVar
 
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.graph.diagnostics import Diagnostic, DiagnosticReadings
@@ -233,7 +233,7 @@ def test_a_node_is_believed_of_itself_in_a_host_of_ours_only(
     graph.elsewhere = {"/a"} if where == "elsewhere" else set()
     node = planned_node("a", kind=kind)
     if kind is not RunKind.PYTHON:
-        node = dataclasses.replace(node, run=Run(kind=kind))
+        node = replace(node, run=Run(kind=kind))
     observation = run(observer.observe(plan_of(node)))
     assert observation.nodes[0].state == "active"
     assert bool(observation.configurations) is believed
@@ -362,18 +362,18 @@ def with_parameter(made: Plan, *names: str) -> Plan:
     """Expect the parameter gain of some nodes."""
     gain = ExpectedParameter(name="gain", type="double", at=made.nodes[0].at)
     nodes = tuple(
-        dataclasses.replace(each, expected_parameters=(gain,)) if each.name in names else each
+        replace(each, expected_parameters=(gain,)) if each.name in names else each
         for each in made.nodes
     )
-    return dataclasses.replace(made, nodes=nodes)
+    return replace(made, nodes=nodes)
 
 
 def test_only_nodes_that_report_no_parameters_are_asked_for_those_that_are_planned(
     observer: Observer, graph: FakeGraph, clients: FakeClients
 ) -> None:
     graph.nodes = managed("/foreign", "/ours", "/asked", "/unplanned")
-    observer.state.put_configuration(dataclasses.replace(configuration("/ours"), parameters=()))
-    clients.configurations["/asked"] = dataclasses.replace(configuration("/asked"), parameters=())
+    observer.state.put_configuration(replace(configuration("/ours"), parameters=()))
+    clients.configurations["/asked"] = replace(configuration("/asked"), parameters=())
     named = with_parameter(plan("foreign", "ours", "asked", "gone"), "foreign", "ours", "asked")
     seen = run(observer.observe(named))
     gain = ParameterReport(name="gain", type="double", value=1.5)
@@ -386,7 +386,7 @@ def test_without_a_planned_parameter_of_others_nobody_listens_for_changes(
     observer: Observer, graph: FakeGraph, clients: FakeClients
 ) -> None:
     graph.nodes = managed("/foreign", "/ours")
-    observer.state.put_configuration(dataclasses.replace(configuration("/ours"), parameters=()))
+    observer.state.put_configuration(replace(configuration("/ours"), parameters=()))
     seen = run(observer.observe(with_parameter(plan("foreign", "ours"), "ours")))
     assert (seen.parameters, clients.read, clients.listening) == ((), [], False)
 

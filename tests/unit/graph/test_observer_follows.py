@@ -6,11 +6,11 @@ And one state for all: what a program is shown of a node is what the verificatio
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 from collections.abc import Awaitable, Callable
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.graph.loop import GraphLoop
 from lifecycle.graph.observer import FORGET_AFTER_S, Observer
@@ -25,7 +25,7 @@ from tests.unit.supervisor.fakes import run
 OUT = EndpointReport(
     kind=EndpointKind.PUBLISHER, name="out", resolved="/out", type="std_msgs/msg/String"
 )
-ITS_OWN = dataclasses.replace(configuration("/it"), endpoints=(OUT,), checksum="1")
+ITS_OWN = replace(configuration("/it"), endpoints=(OUT,), checksum="1")
 
 
 class LoopOfItsOwn(GraphLoop):
@@ -87,7 +87,7 @@ def test_a_node_is_read_again_when_it_says_something_new_and_else_never() -> Non
         await world.show("/it")
         await asyncio.sleep(100)
         assert world.clients.read_configurations == ["/it"]
-        changed = dataclasses.replace(ITS_OWN, endpoints=(), checksum="2")
+        changed = replace(ITS_OWN, endpoints=(), checksum="2")
         world.clients.configurations["/it"] = changed
         await world.say(checksum="2")
         assert world.clients.read_configurations == ["/it"] * 2
@@ -136,7 +136,7 @@ def test_a_node_that_does_not_answer_is_read_again_later() -> None:
 
 def test_a_plain_node_has_what_discovery_shows_of_it() -> None:
     async def main(world: World) -> None:
-        world.graph.endpoints = (dataclasses.replace(VIDEO, node="/it"),)
+        world.graph.endpoints = (replace(VIDEO, node="/it"),)
         await world.show("/it", "/_it_net", "/_ros2cli_1", "/other")
         assert [each.name for each in world.state.nodes()] == ["/it", "/other"]
         (end,) = world.state.publishers_of("/video")

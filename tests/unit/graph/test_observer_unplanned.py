@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 from typing import Any
+
+from msgspec.structs import replace
 
 from lifecycle.graph.observer import Observer
 from lifecycle.graph.status import NodeStatus
@@ -21,7 +22,7 @@ def world(*, unplanned: bool) -> tuple[FakeGraph, FakeClients, Observer]:
         ObservedNode(full_name="/plain", managed=False),
     )
     clients.configurations = {
-        "/guest": dataclasses.replace(configuration("/guest"), checksum="1"),
+        "/guest": replace(configuration("/guest"), checksum="1"),
         "/plain": configuration("/plain"),
     }
     return graph, clients, observing(graph, clients, unplanned=unplanned)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from lifecycle.manifest.yaml.arguments import MAX_TEXT, Substituted, substitute
 from lifecycle.manifest.yaml.source import parse
@@ -18,7 +17,7 @@ NONE: dict[str, str] = {}
 def _substitute(
     text: str, given: dict[str, str] = NONE, environment: dict[str, str] = NONE
 ) -> Substituted:
-    around = dataclasses.replace(NOWHERE, environment=environment)
+    around = replace(NOWHERE, environment=environment)
     return substitute(parse(text, file="f"), given, around)
 
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from lifecycle.manifest.qos import (
     BEST_AVAILABLE_NS,
@@ -72,8 +72,8 @@ def test_every_pair_of_values_is_judged_as_rmw_dds_common_judges_it(
     _, weak, strong = POLICIES[policy]
     found = severity(
         policy,
-        dataclasses.replace(QosProfile(), **{policy: offered}),
-        dataclasses.replace(QosProfile(), **{policy: requested}),
+        replace(QosProfile(), **{policy: offered}),
+        replace(QosProfile(), **{policy: requested}),
     )
     assert found is rmw_rule(offered.value, requested.value, weak, strong)
 
@@ -81,20 +81,17 @@ def test_every_pair_of_values_is_judged_as_rmw_dds_common_judges_it(
 @pytest.mark.parametrize("policy", ["reliability", "durability"])
 def test_a_best_available_publisher_offers_the_stronger_value_for_certain(policy: str) -> None:
     kind, _, _ = POLICIES[policy]
-    offered = dataclasses.replace(QosProfile(), **{policy: kind("BEST_AVAILABLE")})
+    offered = replace(QosProfile(), **{policy: kind("BEST_AVAILABLE")})
     for requested in kind:
-        assert (
-            incompatibilities(offered, dataclasses.replace(QosProfile(), **{policy: requested}))
-            == ()
-        )
+        assert incompatibilities(offered, replace(QosProfile(), **{policy: requested})) == ()
 
 
 @pytest.mark.parametrize("policy", POLICIES)
 def test_a_best_available_subscription_may_fail_to_match_a_weak_publisher(policy: str) -> None:
     kind, weak, strong = POLICIES[policy]
-    requested = dataclasses.replace(QosProfile(), **{policy: kind("BEST_AVAILABLE")})
-    weakly = dataclasses.replace(QosProfile(), **{policy: kind(weak)})
-    strongly = dataclasses.replace(QosProfile(), **{policy: kind(strong)})
+    requested = replace(QosProfile(), **{policy: kind("BEST_AVAILABLE")})
+    weakly = replace(QosProfile(), **{policy: kind(weak)})
+    strongly = replace(QosProfile(), **{policy: kind(strong)})
     assert severity(policy, weakly, requested) is POSSIBLE
     assert severity(policy, strongly, requested) is None
 
@@ -128,8 +125,8 @@ def test_an_offered_duration_may_not_exceed_the_requested_one(
     field = f"{policy}_ns"
     found = severity(
         policy,
-        dataclasses.replace(QosProfile(), **{field: offered}),
-        dataclasses.replace(QosProfile(), **{field: requested}),
+        replace(QosProfile(), **{field: offered}),
+        replace(QosProfile(), **{field: requested}),
     )
     assert found is verdict
 
@@ -234,6 +231,6 @@ def test_a_negative_depth_is_refused() -> None:
 @pytest.mark.parametrize("field", ["deadline_ns", "lifespan_ns", "liveliness_lease_duration_ns"])
 @pytest.mark.parametrize("value", [-1, 2**63])
 def test_a_duration_outside_of_int64_is_refused(field: str, value: int) -> None:
-    profile = dataclasses.replace(QosProfile(), **{field: value})
+    profile = replace(QosProfile(), **{field: value})
     assert problems(profile) == (f"use {field} {value}: a duration is 0 to 2**63-1 nanoseconds",)
-    assert problems(dataclasses.replace(QosProfile(), **{field: 2**63 - 1})) == ()
+    assert problems(replace(QosProfile(), **{field: 2**63 - 1})) == ()

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.manifest.checks import check
 from lifecycle.manifest.model import (
@@ -91,7 +91,7 @@ def streams(count: int, *, need: FlowNeed) -> Manifest:
         node(
             f"n{index}",
             publisher(name, EMPTY),
-            needs=(dataclasses.replace(need, name=name, dscp=index % 64, at=at(index + 1)),),
+            needs=(replace(need, name=name, dscp=index % 64, at=at(index + 1)),),
             machine=f"n{index}",
         )
         for index, name in enumerate(names)
@@ -119,14 +119,14 @@ def test_sixty_four_publishers_can_be_told_apart_by_dscp_alone() -> None:
 
 
 def test_publishers_that_ask_to_be_unique_do_not_rely_on_their_dscp() -> None:
-    need = dataclasses.replace(MARKED, unique=UniqueRequirement.OPTIONALLY_REQUIRED)
+    need = replace(MARKED, unique=UniqueRequirement.OPTIONALLY_REQUIRED)
     assert check(streams(70, need=need)) == ()
 
 
 def test_a_dscp_that_no_link_needs_as_identifier_may_be_shared() -> None:
     made = streams(70, need=MARKED)
-    links = tuple(dataclasses.replace(link, unique=UniqueHow.NOT) for link in made.links)
-    assert check(dataclasses.replace(made, links=links)) == ()
+    links = tuple(replace(link, unique=UniqueHow.NOT) for link in made.links)
+    assert check(replace(made, links=links)) == ()
 
 
 @pytest.mark.parametrize(
@@ -141,11 +141,11 @@ def test_a_dscp_that_no_link_needs_as_identifier_may_be_shared() -> None:
 def test_numbers_out_of_range_are_refused_even_from_a_program(
     field: str, value: int, message: str
 ) -> None:
-    made = streams(1, need=dataclasses.replace(MARKED, dscp=None))
+    made = streams(1, need=replace(MARKED, dscp=None))
     source = made.nodes[0]
-    flows = (dataclasses.replace(source.flows[0], **{field: value}),)
-    nodes = (dataclasses.replace(source, flows=flows), *made.nodes[1:])
-    found = check(dataclasses.replace(made, nodes=nodes, links=()))
+    flows = (replace(source.flows[0], **{field: value}),)
+    nodes = (replace(source, flows=flows), *made.nodes[1:])
+    found = check(replace(made, nodes=nodes, links=()))
     assert [each.message for each in found] == [message]
 
 
@@ -153,15 +153,13 @@ def acknowledging(reliability: Reliability, **marks: int | None) -> Manifest:
     """A stream whose subscription is marked."""
     made = streams(1, need=MARKED)
     given = {"dscp": 48, **marks}
-    need = dataclasses.replace(MARKED, kind=EndpointKind.SUBSCRIPTION, name="s0", **given)
+    need = replace(MARKED, kind=EndpointKind.SUBSCRIPTION, name="s0", **given)
     sink = made.nodes[1]
     (endpoint,) = sink.interface.endpoints
-    qos = dataclasses.replace(endpoint.qos or QosProfile(), reliability=reliability)
-    interface = dataclasses.replace(
-        sink.interface, endpoints=(dataclasses.replace(endpoint, qos=qos),)
-    )
-    sink = dataclasses.replace(sink, interface=interface, flows=(need,))
-    return dataclasses.replace(made, nodes=(made.nodes[0], sink))
+    qos = replace(endpoint.qos or QosProfile(), reliability=reliability)
+    interface = replace(sink.interface, endpoints=(replace(endpoint, qos=qos),))
+    sink = replace(sink, interface=interface, flows=(need,))
+    return replace(made, nodes=(made.nodes[0], sink))
 
 
 def test_a_reliable_subscription_can_be_marked_as_it_acknowledges() -> None:
@@ -188,7 +186,7 @@ def test_a_subscription_has_one_mark_too() -> None:
 def test_a_subscription_may_not_acknowledge_with_what_identifies_a_publisher() -> None:
     network = Network(flow_identification=FlowIdentification.DSCP)
     made = acknowledging(Reliability.RELIABLE, dscp=MARKED.dscp)
-    found = check(dataclasses.replace(made, network=network))
+    found = check(replace(made, network=network))
     assert [each.rule for each in found if each.severity.value == "error"] == [
         "check.dscp-not-unique"
     ]
@@ -197,14 +195,14 @@ def test_a_subscription_may_not_acknowledge_with_what_identifies_a_publisher() -
 
 def test_the_mark_of_a_subscription_makes_no_flow_unique() -> None:
     made = acknowledging(Reliability.RELIABLE)
-    source = dataclasses.replace(made.nodes[0], flows=())
-    found = check(dataclasses.replace(made, nodes=(source, made.nodes[1])))
+    source = replace(made.nodes[0], flows=())
+    found = check(replace(made, nodes=(source, made.nodes[1])))
     assert [each.rule for each in found] == ["check.link-not-unique"]
 
 
 def test_a_link_that_relies_on_a_dscp_counts_as_an_identifier_too() -> None:
     network = Network(flow_identification=FlowIdentification.DSCP)
-    found = check(dataclasses.replace(streams(65, need=MARKED), network=network))
+    found = check(replace(streams(65, need=MARKED), network=network))
     assert [str(each) for each in found] == [
         (
             f"{FILE}:65:1: cannot give publisher '/s64' of 'n64' DF = DSCP 0 = TOS 0 (0x00): it "

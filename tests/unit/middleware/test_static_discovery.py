@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 from xml.etree import ElementTree as ET
 
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds.static_edp import (
@@ -92,7 +92,7 @@ def test_profiles_are_named_as_rmw_looks_for_them_and_give_the_id() -> None:
 def test_an_endpoint_is_found_by_direction_name_and_type_together() -> None:
     lines = [
         line("/x", 1, writer=False),
-        dataclasses.replace(line("/x", 2), type="std_msgs::msg::dds_::Int32_"),
+        replace(line("/x", 2), type="std_msgs::msg::dds_::Int32_"),
         line("/y", 3),
         line("/x", 4),
     ]

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from lifecycle.network.nfe import (
     InternetProtocol,
@@ -43,9 +42,9 @@ BASE = nfe("fd09::1", 7411, dscp=0, flow_label=0)
     ids=lambda change: next(iter(change)),
 )
 def test_a_difference_in_one_resource_makes_two_nfes_dissimilar(change: dict[str, object]) -> None:
-    changed = dataclasses.replace(BASE, **change)  # type: ignore[arg-type]
+    changed = replace(BASE, **change)  # type: ignore[arg-type]
     assert dissimilar(BASE, changed)
-    assert not dissimilar(BASE, dataclasses.replace(BASE))
+    assert not dissimilar(BASE, replace(BASE))
 
 
 def test_shared_memory_is_no_ip_flow() -> None:
@@ -138,4 +137,4 @@ def test_an_endpoint_is_described_as_its_socket_or_as_shared_memory() -> None:
 )
 def test_an_nfe_that_lacks_protocol_or_address_is_no_ip_nfe(change: dict[str, object]) -> None:
     assert is_ip(BASE)
-    assert not is_ip(dataclasses.replace(BASE, **change))  # type: ignore[arg-type]
+    assert not is_ip(replace(BASE, **change))  # type: ignore[arg-type]

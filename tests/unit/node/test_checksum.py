@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.node.configuration import checksum
@@ -34,7 +33,7 @@ CAMERA = configuration("/camera", VIDEO, state="active", connections=(NET,))
 def _with(
     endpoint: EndpointReport = VIDEO, connection: ConnectionReport = NET
 ) -> NodeConfiguration:
-    return dataclasses.replace(CAMERA, endpoints=(endpoint,), connections=(connection,))
+    return replace(CAMERA, endpoints=(endpoint,), connections=(connection,))
 
 
 def test_a_checksum_is_sixteen_hex_digits() -> None:
@@ -45,13 +44,13 @@ def test_a_checksum_is_sixteen_hex_digits() -> None:
 @pytest.mark.parametrize(
     "changed",
     [
-        dataclasses.replace(CAMERA, state="inactive"),
-        dataclasses.replace(CAMERA, connected=False),
-        dataclasses.replace(CAMERA, checksum="0123456789abcdef"),
-        _with(endpoint=dataclasses.replace(VIDEO, matched=2)),
-        _with(endpoint=dataclasses.replace(VIDEO, matched=None)),
-        _with(endpoint=dataclasses.replace(VIDEO, server_matched=True)),
-        _with(connection=dataclasses.replace(NET, established=False)),
+        replace(CAMERA, state="inactive"),
+        replace(CAMERA, connected=False),
+        replace(CAMERA, checksum="0123456789abcdef"),
+        _with(endpoint=replace(VIDEO, matched=2)),
+        _with(endpoint=replace(VIDEO, matched=None)),
+        _with(endpoint=replace(VIDEO, server_matched=True)),
+        _with(connection=replace(NET, established=False)),
     ],
     ids=["state", "connected", "checksum", "matched", "not counted", "server", "established"],
 )
@@ -63,16 +62,16 @@ def test_what_events_tell_makes_nobody_read_again(changed: NodeConfiguration) ->
 @pytest.mark.parametrize(
     "changed",
     [
-        dataclasses.replace(CAMERA, identity=dataclasses.replace(CAMERA.identity, process_id=2)),
-        dataclasses.replace(CAMERA, transports=("shm", "udpv4")),
-        _with(endpoint=dataclasses.replace(VIDEO, mapped=False)),
-        _with(endpoint=dataclasses.replace(VIDEO, connection="")),
-        _with(endpoint=dataclasses.replace(VIDEO, error="cannot make it")),
-        _with(connection=dataclasses.replace(NET, urls=("shm://",))),
-        _with(connection=dataclasses.replace(NET, error="cannot open it")),
-        _with(connection=dataclasses.replace(NET, mappings=())),
-        dataclasses.replace(CAMERA, connections=()),
-        dataclasses.replace(CAMERA, endpoints=()),
+        replace(CAMERA, identity=replace(CAMERA.identity, process_id=2)),
+        replace(CAMERA, transports=("shm", "udpv4")),
+        _with(endpoint=replace(VIDEO, mapped=False)),
+        _with(endpoint=replace(VIDEO, connection="")),
+        _with(endpoint=replace(VIDEO, error="cannot make it")),
+        _with(connection=replace(NET, urls=("shm://",))),
+        _with(connection=replace(NET, error="cannot open it")),
+        _with(connection=replace(NET, mappings=())),
+        replace(CAMERA, connections=()),
+        replace(CAMERA, endpoints=()),
     ],
     ids=[
         "process",

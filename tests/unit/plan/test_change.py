@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.manifest.model import (
     Condition,
@@ -47,7 +47,7 @@ def _change(old: tuple[Node, ...], new: tuple[Node, ...], **rest: Any) -> PlanCh
 
 
 def _talker(**changes: Any) -> tuple[Node, ...]:
-    return (dataclasses.replace(TALKER, **changes), LISTENER)
+    return (replace(TALKER, **changes), LISTENER)
 
 
 BEFORE = (TALKER, LISTENER)
@@ -64,7 +64,7 @@ def test_nodes_of_one_manifest_alone_come_and_go_and_all_else_stays() -> None:
     "changes",
     [
         {"run": Run(kind=RunKind.PYTHON, python="robot:Other")},
-        {"run": dataclasses.replace(TALKER.run, environment=(("RATE", "1"),))},
+        {"run": replace(TALKER.run, environment=(("RATE", "1"),))},
         {"run": COMMAND},
         {"run": ATTACH},
         {"remap": (("chatter", "noise"),)},
@@ -137,7 +137,7 @@ def _with(run: Run | None = None, **values: Any) -> tuple[Node, ...]:
         ParameterDeclaration(name="label", type="string", at=at(5)),
     )
     arm = node("arm", run=run or COMMAND, parameters=tuple(values.items()))
-    return (dataclasses.replace(arm, interface=Interface(parameters=declared)), LISTENER)
+    return (replace(arm, interface=Interface(parameters=declared)), LISTENER)
 
 
 def test_values_of_parameters_are_set_while_the_node_runs() -> None:
@@ -163,11 +163,11 @@ def test_parameters_that_cannot_be_set_restart_their_node(
 
 
 def test_a_process_is_restarted_as_a_whole_and_so_is_who_moves_into_it() -> None:
-    pair = tuple(dataclasses.replace(each, process="both") for each in BEFORE)
-    louder = (dataclasses.replace(pair[0], log_level="debug"), pair[1], node("arm"))
+    pair = tuple(replace(each, process="both") for each in BEFORE)
+    louder = (replace(pair[0], log_level="debug"), pair[1], node("arm"))
     change = _change((*pair, node("arm")), louder)
     assert change.restarted == ("talker", "listener")
-    more = dataclasses.replace(node("arm"), process="both")
+    more = replace(node("arm"), process="both")
     assert _change((*pair,), (*pair, more)).restarted == ("talker", "listener")
     assert _change((*pair, node("arm")), (*pair, more)).restarted == ("talker", "listener", "arm")
     assert _change((*pair, more), pair).restarted == ("talker", "listener")
@@ -176,10 +176,10 @@ def test_a_process_is_restarted_as_a_whole_and_so_is_who_moves_into_it() -> None
 def test_a_component_goes_with_its_container() -> None:
     loaded = Run(kind=RunKind.ATTACH, component="demo/Arm", container="box")
     box = node("box", run=COMMAND)
-    other = node("box", run=dataclasses.replace(COMMAND, command=("arm", "--slow")))
+    other = node("box", run=replace(COMMAND, command=("arm", "--slow")))
     arm = node("arm", run=loaded)
     assert _change((box, arm), (other, arm)).restarted == ("box", "arm")
-    moved = dataclasses.replace(arm, remap=(("a", "b"),))
+    moved = replace(arm, remap=(("a", "b"),))
     assert _change((box, arm), (box, moved)).restarted == ("arm",)
 
 

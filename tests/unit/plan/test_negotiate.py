@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 import random
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from lifecycle.manifest.model import EndpointKind, FlowTransport
 from lifecycle.network.connection_url import Peer, parse
@@ -403,9 +403,7 @@ def test_any_order_of_parties_gives_the_same_graph(system: tuple, order: random.
     parties, wishes, terms = system
     graph = negotiate(parties, wishes, terms)
     shuffled = [
-        dataclasses.replace(
-            each, endpoints=tuple(order.sample(each.endpoints, len(each.endpoints)))
-        )
+        replace(each, endpoints=tuple(order.sample(each.endpoints, len(each.endpoints))))
         for each in order.sample(parties, len(parties))
     ]
     assert negotiate(shuffled, wishes, terms) == graph

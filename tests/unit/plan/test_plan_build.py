@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from pathlib import Path
 
 import jsonschema
 import pytest
+from msgspec.structs import replace
 
 from lifecycle import codec
 from lifecycle.errors import ExitCode, UsageError
@@ -71,8 +71,8 @@ def test_needs_go_to_the_endpoint_that_they_name():
 @pytest.mark.parametrize("kind", [RunKind.COMMAND, RunKind.ATTACH])
 def test_a_node_that_others_make_is_given_no_participants(kind: RunKind):
     sample = teleop()
-    camera = dataclasses.replace(sample.nodes[0], run=Run(kind=kind, command=("camera",)))
-    plan = build_plan(dataclasses.replace(sample, nodes=(camera, sample.nodes[1])), environment={})
+    camera = replace(sample.nodes[0], run=Run(kind=kind, command=("camera",)))
+    plan = build_plan(replace(sample, nodes=(camera, sample.nodes[1])), environment={})
     assert plan.nodes[0].participants == ()
     assert {each.participant for each in plan.nodes[0].endpoints} == {""}
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from lifecycle import codec
 from lifecycle.cli.verbs.plan import command as plan_command
@@ -138,7 +138,7 @@ def test_every_change_is_said_by_its_place_in_the_manifest(
 
 def test_a_node_that_came_or_went_is_one_line(tmp_path: Path):
     old = plan_of(tmp_path)
-    new = dataclasses.replace(old, nodes=old.nodes[:1])
+    new = replace(old, nodes=old.nodes[:1])
     assert differences(old, new) == ("nodes.listener: was declared, is not declared",)
 
 
@@ -152,22 +152,20 @@ def test_two_hosts_with_one_manifest_plan_the_same_wherever_they_keep_it(tmp_pat
 def test_the_checksum_does_not_depend_on_which_types_are_installed(tmp_path: Path):
     here = plan_of(tmp_path / "here", MANIFEST.replace("msg/String", "msg/Int32"))
     assert here.node("talker").endpoints[0].max_message_size_reason
-    unknown = dataclasses.replace(
+    unknown = replace(
         here.nodes[0],
         endpoints=tuple(
-            dataclasses.replace(
-                each, max_message_size=None, max_message_size_reason="", five_qi=1, dscp=2
-            )
+            replace(each, max_message_size=None, max_message_size_reason="", five_qi=1, dscp=2)
             for each in here.nodes[0].endpoints
         ),
     )
-    there = dataclasses.replace(here, nodes=(unknown, *here.nodes[1:]))
+    there = replace(here, nodes=(unknown, *here.nodes[1:]))
     assert plan_checksum(here) == plan_checksum(there)
 
 
 def test_the_order_of_nodes_does_not_count(tmp_path: Path):
     plan = plan_of(tmp_path)
-    turned = dataclasses.replace(plan, nodes=plan.nodes[::-1], machines=plan.machines[::-1])
+    turned = replace(plan, nodes=plan.nodes[::-1], machines=plan.machines[::-1])
     assert plan_checksum(plan) == plan_checksum(turned)
 
 
@@ -197,9 +195,7 @@ def test_a_plan_that_crossed_the_control_socket_is_the_same(tmp_path: Path):
 def test_long_differences_are_cut(tmp_path: Path):
     old = plan_of(tmp_path)
     rates = tuple((f"rate_{number:02}", "x" * 1000) for number in range(30))
-    new = dataclasses.replace(
-        old, nodes=(dataclasses.replace(old.nodes[0], parameters=rates), *old.nodes[1:])
-    )
+    new = replace(old, nodes=(replace(old.nodes[0], parameters=rates), *old.nodes[1:]))
     assert max(map(len, differences(old, new))) < 200
 
 

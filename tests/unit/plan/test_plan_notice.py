@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.manifest.model import Machine
 from lifecycle.plan import comparison as notices
@@ -23,11 +22,11 @@ from tests.builders import HERE, plan_of, planned_node
 
 def plan(system: str = "robot", *names: str) -> Plan:
     nodes = [
-        dataclasses.replace(planned_node(name), machine=machine)
+        replace(planned_node(name), machine=machine)
         for name, machine in zip(names or ("camera", "viewer"), ("left", "right"), strict=False)
     ]
     machines = tuple(Machine(name=each, address="", at=HERE) for each in ("left", "right"))
-    return dataclasses.replace(plan_of(*nodes), system=system, machines=machines)
+    return replace(plan_of(*nodes), system=system, machines=machines)
 
 
 def said(of: Plan, machine: str = "right", run: str = "1", host: str = "h2") -> PlanNotice:
@@ -62,7 +61,7 @@ def test_a_notice_is_replaced_by_what_comes_in_its_place() -> None:
     # Started again under another name, on the same host.
     assert said(plan("other"), run="2").replaces(first)
     assert not said(plan("other"), run="2", host="h3").replaces(first)
-    gone = dataclasses.replace(first, left=True)
+    gone = replace(first, left=True)
     assert said(plan("other"), run="2", host="h3").replaces(gone)
 
 
@@ -71,11 +70,11 @@ def test_a_notice_replaces_none_of_another_machine_of_its_system(host: str) -> N
     beside = said(plan(), "left", run="2", host=host)
     first = said(plan())
     assert not beside.replaces(first)
-    assert not beside.replaces(dataclasses.replace(first, left=True))
+    assert not beside.replaces(replace(first, left=True))
 
 
 def test_what_is_no_notice_is_refused() -> None:
-    shown_badly = encode(dataclasses.replace(said(plan()), reason="\x1b[2J"))
+    shown_badly = encode(replace(said(plan()), reason="\x1b[2J"))
     for text in ("", "{}", '{"run": 1}', shown_badly, "x" * (notices.MAX_TEXT + 1)):
         with pytest.raises(PlanNoticeError, match=r"^cannot read"):
             decode(text)

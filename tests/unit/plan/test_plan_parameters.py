@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from pathlib import Path
 
 import jsonschema
 import pytest
+from msgspec.structs import replace
 
 from lifecycle import codec
 from lifecycle.manifest.model import (
@@ -34,7 +34,7 @@ def declared(name: str, type_: str, default: ParameterValue | None = None, **res
 
 def camera(*parameters: ParameterDeclaration, **rest: object) -> Node:
     made = node("camera", namespace="/robot", **rest)
-    return dataclasses.replace(made, interface=Interface(parameters=parameters))
+    return replace(made, interface=Interface(parameters=parameters))
 
 
 def plan_of(made: Node) -> Plan:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import shlex
 from pathlib import Path
 
 import pytest
 import yaml
+from msgspec.structs import replace
 
 from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import (
@@ -208,7 +208,7 @@ def test_a_process_of_several_nodes_gives_each_its_own_and_a_plain_one_gets_noth
         "pair --ros-args -r left:scan:=/scan -p right:rate:=2.0"
     )
     assert command_line([node("left", run=run)], {}) == ("pair",)
-    quiet = dataclasses.replace(run, ros_args=RosArguments.NONE)
+    quiet = replace(run, ros_args=RosArguments.NONE)
     assert command_line([node("right", run=quiet, parameters=(("rate", 2.0),))], {}) == ("pair",)
 
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.manifest.model import DiscoveryMode, DiscoveryRange, Machine
 from lifecycle.middleware.discovery.environment import discovery_peers, peers_environment
@@ -18,12 +17,12 @@ ADDRESSES = {"left": "10.0.1.1", "right": "10.0.2.1", "idle": "10.0.3.1", "near"
 
 def system(**fields: object) -> Plan:
     nodes = [
-        dataclasses.replace(planned_node(key), machine=machine)
+        replace(planned_node(key), machine=machine)
         for key, machine in (("a", "left"), ("b", "right"), ("c", "right"), ("d", "near"))
     ]
     machines = tuple(Machine(name=n, address=a, at=HERE) for n, a in ADDRESSES.items())
     subnet = {"machines": machines, "discovery_range": DiscoveryRange.SUBNET, **fields}
-    return dataclasses.replace(plan_of(*nodes), **subnet)  # type: ignore[arg-type]
+    return replace(plan_of(*nodes), **subnet)  # type: ignore[arg-type]
 
 
 def test_hosts_with_nodes_are_looked_for_by_address_and_nobody_else() -> None:

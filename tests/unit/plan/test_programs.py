@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import sys
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.manifest.model import (
     Authority,
@@ -345,10 +345,8 @@ def test_connections_that_a_class_of_rclpy_cannot_be_given_are_refused(folder: P
     mapped = ((EndpointKind.PUBLISHER, "a"), (EndpointKind.SERVICE_SERVER, "reset"))
     net = ConnectionDeclaration(name="net", urls=(url,), map=mapped, at=at(1))
     run = Run(kind=RunKind.PYTHON, python="them:Managed")
-    made = dataclasses.replace(node("talker", run=run), connections=(net,))
-    system = dataclasses.replace(
-        manifest(made), data_layer=DataLayer(authority=Authority.SUPERVISOR, at=at(1))
-    )
+    made = replace(node("talker", run=run), connections=(net,))
+    system = replace(manifest(made), data_layer=DataLayer(authority=Authority.SUPERVISOR, at=at(1)))
     assert said(resolve_programs(system, environment={})) == [
         (
             "cannot leave the connections of 'talker' to the supervisor: Managed (them.py) is not "
@@ -369,10 +367,10 @@ def test_modules_are_found_beside_the_manifest_and_on_pythonpath(folder: Path) -
     environment = (("PYTHONPATH", str(folder / "src")),)
     run = Run(kind=RunKind.PYTHON, python="them:Managed")
     assert said(resolve_programs(manifest(node("talker", run=run)), environment={})) != []
-    given = dataclasses.replace(run, environment=environment)
+    given = replace(run, environment=environment)
     assert said(resolve_programs(manifest(node("talker", run=given)), environment={})) == []
     at = Position(file=str(folder / "src" / "them.lifecycle.yaml"), line=1, column=1)
-    beside = dataclasses.replace(node("talker", run=run), at=at)
+    beside = replace(node("talker", run=run), at=at)
     assert said(resolve_programs(manifest(beside), environment={})) == []
 
 

@@ -7,11 +7,11 @@ proven where their code is.
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.manifest.loading import load
 from lifecycle.manifest.model import (
@@ -274,8 +274,8 @@ def negotiated(plan: Plan, *configurations: NodeConfiguration) -> str:
 def hinting(plan: Plan, *, lossy: bool, size_bytes: int) -> NodeConfiguration:
     configuration = configured(plan, "p")
     (endpoint,) = configuration.endpoints
-    hinted = dataclasses.replace(endpoint, lossy=lossy, size_bytes=size_bytes)
-    return dataclasses.replace(configuration, endpoints=(hinted,))
+    hinted = replace(endpoint, lossy=lossy, size_bytes=size_bytes)
+    return replace(configuration, endpoints=(hinted,))
 
 
 def test_a_node_hints_that_its_data_do_not_bear_unreliable_transport():
@@ -326,7 +326,7 @@ def test_what_transports_do_you_support_is_answered_and_decides():
 def test_configurations_captured_statically_and_read_while_running_negotiate_the_same():
     plan = pair(needs=[need(PUB, "t", transport=FlowTransport.TCPV4)])
     hosts = hosts_of(plan)
-    bare = {key: dataclasses.replace(plan.node(key), participants=()) for key in ("p", "s")}
+    bare = {key: replace(plan.node(key), participants=()) for key in ("p", "s")}
     statically = [party_of_node(each, hosts, rmw=plan.rmw) for each in bare.values()]
     dynamically = [
         party_of(configured(plan, key), hosts.host(each.machine), planned=each)

@@ -6,9 +6,8 @@ of 5QIs in test_five_qi.py; docs/flows.md lists every part of the article with i
 
 from __future__ import annotations
 
-import dataclasses
-
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.manifest.checks import check
 from lifecycle.manifest.model import (
@@ -56,7 +55,7 @@ def verdict_of(system: Manifest, *edits):
 
 def devices(*, unique: UniqueRequirement, links: list[Link]) -> Manifest:
     """N1 on D1 publishes video (P1) and battery status (P2); N2 on D2 subscribes to both."""
-    return dataclasses.replace(
+    return replace(
         manifest(
             node(
                 "n1",

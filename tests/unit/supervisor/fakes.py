@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import dataclasses
 import os
 import selectors
 import signal
@@ -16,6 +15,8 @@ import socket
 from collections.abc import Callable, Collection, Coroutine, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
+
+from msgspec.structs import replace
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.manifest.model import EndpointKind
@@ -117,21 +118,21 @@ def rewired(
     elif operation is Operation.MAP_TO:
         connections = list(interface.connections)
         endpoints = tuple(
-            dataclasses.replace(each, mapped=True, connection=connection)
+            replace(each, mapped=True, connection=connection)
             if f"{each.kind.value}/{each.name}" == endpoint
             else each
             for each in endpoints
         )
     elif operation is Operation.DISCONNECT_FROM:
         endpoints = tuple(
-            dataclasses.replace(each, mapped=False, connection="")
+            replace(each, mapped=False, connection="")
             if each.mapped and each.connection == connection
             else each
             for each in endpoints
         )
     else:
         return interface
-    return dataclasses.replace(
+    return replace(
         interface,
         connections=tuple(connections),
         endpoints=endpoints,
@@ -267,9 +268,9 @@ class FakeProcess:
         else:
             self._spawner.came(self._name, *nodes)
         if command is not None:
-            answer = dataclasses.replace(answer, configuration=self._carry_out(command, answer))
+            answer = replace(answer, configuration=self._carry_out(command, answer))
         if self._spawner.reports_changes and answer.configuration is not None:
-            told = dataclasses.replace(answer, kind="configuration", id=0, ok=True, error="")
+            told = replace(answer, kind="configuration", id=0, ok=True, error="")
             writer.write(to_json(told) + b"\n")
         writer.write(to_json(answer) + b"\n")
         return True
@@ -321,7 +322,7 @@ class FakeSpawner:
         """Construct nodes anew."""
         for name in nodes:
             if (report := self.interfaces.get(name)) is not None:
-                fresh = dataclasses.replace(report, state="unconfigured", connected=False)
+                fresh = replace(report, state="unconfigured", connected=False)
                 self.interfaces[name] = fresh
 
     def came(self, process: str, *nodes: str) -> None:
@@ -343,7 +344,7 @@ class FakeSpawner:
         if interface is None:
             return None
         if command.operation in _STATES:
-            interface = dataclasses.replace(interface, state=state, connected=connected)
+            interface = replace(interface, state=state, connected=connected)
         elif f"{command.node} {command.operation.value} {_what(command)}" not in self.ways:
             interface = rewired(
                 interface,

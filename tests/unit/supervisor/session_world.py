@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import dataclasses
 import signal
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
+
+from msgspec.structs import replace
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import MiddlewareError
@@ -705,10 +706,8 @@ def connected_by(*urls: str) -> ParticipantConnections:
 CHAIN = plan_of(planned_node("camera"), planned_node("viewer", after={"camera": Condition.ACTIVE}))
 
 DIALLING = plan_of(
-    dataclasses.replace(CHAIN.nodes[0], connections=connected_by("tcpv4://127.0.0.1:7911")),
-    dataclasses.replace(
-        CHAIN.nodes[1], connections=connected_by("tcpv4://127.0.0.1:7912?peer=127.0.0.1:7911")
-    ),
+    replace(CHAIN.nodes[0], connections=connected_by("tcpv4://127.0.0.1:7911")),
+    replace(CHAIN.nodes[1], connections=connected_by("tcpv4://127.0.0.1:7912?peer=127.0.0.1:7911")),
 )
 """The same by TCP alone: `viewer` gets another port when it is started again."""
 

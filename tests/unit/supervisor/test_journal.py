@@ -6,7 +6,6 @@ That a journal tells the story of a run is checked at the end of every session i
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import Any
 import jsonschema
 import pytest
 from click.testing import CliRunner
+from msgspec.structs import replace
 
 from lifecycle.cli.verbs import history
 from lifecycle.errors import UsageError
@@ -163,7 +163,7 @@ def test_the_verbs_tell_a_run_whose_supervisor_was_killed(kept: Kept) -> None:
         processes=("camera", "viewer"),
         log_directory="here",
     )
-    kept.journal._run = dataclasses.replace(kept.journal._run, supervisor=2**22 + 1)
+    kept.journal._run = replace(kept.journal._run, supervisor=2**22 + 1)
     kept.journal.on_event(started)
     kept.journal.on_event(VERDICT)
     kept.journal.on_event(Notice(message="about /camera\x1b[2J"))
@@ -186,8 +186,8 @@ def test_the_verbs_tell_a_run_whose_supervisor_was_killed(kept: Kept) -> None:
 
 
 def test_below_a_verdict_are_the_findings_that_came_and_went(kept: Kept) -> None:
-    ok = dataclasses.replace(VERDICT.verdict, findings=(), verdict=Outcome.OK)
-    for each in (VERDICT, VERDICT, dataclasses.replace(VERDICT, verdict=ok)):
+    ok = replace(VERDICT.verdict, findings=(), verdict=Outcome.OK)
+    for each in (VERDICT, VERDICT, replace(VERDICT, verdict=ok)):
         kept.journal.on_event(each)
     text = _verb(history.command, str(kept.directory))[1]
     assert [line for line in text.splitlines() if line.startswith("    ")] == [

@@ -7,10 +7,10 @@ What must hold in every run is checked by `SessionWorld.run` each time.
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import Condition, RunKind, TargetState
@@ -135,7 +135,7 @@ async def test_a_node_in_a_transition_is_adopted_as_what_it_becomes(tmp_path: Pa
 async def test_what_is_found_active_and_must_not_be_is_violated_and_left_active(
     tmp_path: Path,
 ) -> None:
-    lidar = dataclasses.replace(planned_node("lidar"), state=TargetState.INACTIVE)
+    lidar = replace(planned_node("lidar"), state=TargetState.INACTIVE)
     world = world_of(tmp_path, plan_of(lidar))
     await world.run()
     assert "[verdict] connected violated state.wrong-state /lidar" in world.outline

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 import logging
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.manifest.model import DiscoveryRange, Machine, RunKind
 from lifecycle.plan.comparison import decode, encode, notice_of
@@ -30,11 +30,11 @@ NOBODY = Observation()
 
 def two_machines(system: str = "robot", *, log_level: str = "") -> Plan:
     nodes = [
-        dataclasses.replace(planned_node(key), machine=machine, log_level=log_level)
+        replace(planned_node(key), machine=machine, log_level=log_level)
         for key, machine in (("camera", "left"), ("viewer", "right"))
     ]
     machines = tuple(Machine(name=each, address="", at=HERE) for each in ("left", "right"))
-    return dataclasses.replace(
+    return replace(
         plan_of(*nodes), system=system, machines=machines, discovery_range=DiscoveryRange.SUBNET
     )
 
@@ -76,7 +76,7 @@ class Left:
     async def hears(self, of: Plan, machine: str = "right", **changed: object) -> None:
         """Receive the notice of a supervisor on another host."""
         notice = notice_of(of, run="2", host="h2", machines=(machine,))
-        await self.receives(encode(dataclasses.replace(notice, **changed)))  # type: ignore[arg-type]
+        await self.receives(encode(replace(notice, **changed)))  # type: ignore[arg-type]
 
     async def receives(self, text: str) -> None:
         self.air.arrives(text)
@@ -205,7 +205,7 @@ async def test_a_plan_is_announced_where_another_supervisor_may_be(tmp_path: Pat
         (DiscoveryRange.OFF, both, 0),
         (DiscoveryRange.LOCALHOST, frozenset({"camera"}), 1),
     ):
-        plan = dataclasses.replace(two_machines(), discovery_range=where)
+        plan = replace(two_machines(), discovery_range=where)
         left = Left(tmp_path, plan, own)
         assert (left.air.taken_part, len(left.air.said)) == (announced, announced)
         # A change or an end of the plan is no reason to announce it either.
@@ -263,7 +263,7 @@ async def test_what_does_not_concern_us_was_received_before_or_left_before_wakes
         await left.hears(of, **changed)  # type: ignore[arg-type]
         return touched.is_set()
 
-    other = dataclasses.replace(plan_of(planned_node("rover")), system="rover")
+    other = replace(plan_of(planned_node("rover")), system="rover")
     assert not await woken_by(other)
     assert not await woken_by(two_machines(), left=True)
     assert not await woken_by(two_machines(), machine="left", run=decode(left.air.said[0]).run)
@@ -294,8 +294,8 @@ async def test_we_look_when_the_first_of_several_machines_had_its_time_and_then_
     tmp_path: Path,
 ) -> None:
     plan = two_machines()
-    far = dataclasses.replace(planned_node("arm"), machine="far")
-    plan = dataclasses.replace(plan_of(*plan.nodes, far), discovery_range=DiscoveryRange.SUBNET)
+    far = replace(planned_node("arm"), machine="far")
+    plan = replace(plan_of(*plan.nodes, far), discovery_range=DiscoveryRange.SUBNET)
     left = Left(tmp_path, plan)
     loop = asyncio.get_running_loop()
     left.machines = frozenset({"right"})
@@ -343,11 +343,11 @@ async def test_a_machine_that_comes_has_its_time_to_announce_and_we_look_when_it
 async def test_every_machine_is_waited_for_by_itself_and_a_node_without_one_or_attached_is_none(
     tmp_path: Path,
 ) -> None:
-    far = dataclasses.replace(planned_node("arm"), machine="far")
+    far = replace(planned_node("arm"), machine="far")
     attached = planned_node("lidar", kind=RunKind.ATTACH)
-    attached = dataclasses.replace(attached, machine="bench")
+    attached = replace(attached, machine="bench")
     plan = two_machines()
-    plan = dataclasses.replace(
+    plan = replace(
         plan_of(planned_node("nowhere"), *plan.nodes, attached, far),
         discovery_range=DiscoveryRange.SUBNET,
     )

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import dataclasses
 import random
 from collections.abc import AsyncIterator
 from pathlib import Path
 
 import msgspec
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.manifest.model import Condition, EndpointPolicy, Mode, Policy, Restart, Supervision
 from lifecycle.plan.model import ExpectedParameter, ModeParameters, Plan, PlannedNode
@@ -28,14 +28,14 @@ from tests.unit.supervisor.session_world import (
 CAMERA, VIEWER = CHAIN.nodes
 ARM = planned_node("arm", after={"camera": Condition.CONFIGURED})
 MORE = plan_of(CAMERA, VIEWER, ARM)
-LOUD = dataclasses.replace(VIEWER, log_level="debug")
+LOUD = replace(VIEWER, log_level="debug")
 BACK = "robot.lifecycle.yaml is in force again, revision 1, active and verified"
 AGAIN = Supervision(restart=Restart.ON_FAILURE, restart_sec=1.0)
 
 
 def _rate(node: PlannedNode, value: float) -> PlannedNode:
     rate = ExpectedParameter(name="rate", type="double", value=value, source="parameters", at=HERE)
-    return dataclasses.replace(node, parameters=(("rate", value),), expected_parameters=(rate,))
+    return replace(node, parameters=(("rate", value),), expected_parameters=(rate,))
 
 
 @contextlib.asynccontextmanager
@@ -151,7 +151,7 @@ async def test_a_parameter_is_set_while_its_node_runs_and_else_by_a_restart(
 async def test_rules_alone_are_only_judged_by_and_given_up_where_they_are_violated(
     tmp_path: Path,
 ) -> None:
-    open_ = dataclasses.replace(CHAIN, policy=Policy(undeclared_nodes=EndpointPolicy.OPEN))
+    open_ = replace(CHAIN, policy=Policy(undeclared_nodes=EndpointPolicy.OPEN))
     async with active(tmp_path, CHAIN) as world:
         world.intrude()
         await world.story.until("[verdict] active violated")
@@ -237,7 +237,7 @@ async def test_parameters_that_were_set_are_set_back(tmp_path: Path) -> None:
 async def test_parameters_that_a_death_kept_us_from_hearing_of_are_set_back_too(
     tmp_path: Path,
 ) -> None:
-    camera = dataclasses.replace(CAMERA, supervision=AGAIN)
+    camera = replace(CAMERA, supervision=AGAIN)
     plans = [plan_of(camera, _rate(VIEWER, rate)) for rate in (1.0, 2.0)]
     async with active(tmp_path, plans[0]) as world:
         world.hosts.takes_s["/viewer set"] = 1.0  # it takes them at once, and answers late
@@ -266,7 +266,7 @@ async def test_one_that_takes_too_long_is_rolled_back(tmp_path: Path) -> None:
 async def test_the_death_of_another_rolls_back_and_then_counts_as_ever(
     tmp_path: Path, stage: str, policy: Restart
 ) -> None:
-    camera = dataclasses.replace(CAMERA, supervision=msgspec.structs.replace(AGAIN, restart=policy))
+    camera = replace(CAMERA, supervision=msgspec.structs.replace(AGAIN, restart=policy))
     plan, other = plan_of(camera, VIEWER), plan_of(camera, LOUD, ARM)
     ends = policy is Restart.NO
 
@@ -292,7 +292,7 @@ async def test_the_death_of_another_rolls_back_and_then_counts_as_ever(
 async def test_a_node_at_the_gate_again_as_another_dies_is_activated_with_that_one(
     tmp_path: Path,
 ) -> None:
-    camera = dataclasses.replace(CAMERA, supervision=AGAIN)
+    camera = replace(CAMERA, supervision=AGAIN)
     plan, other = plan_of(camera, VIEWER), plan_of(camera, LOUD, ARM)
     async with active(tmp_path, plan) as world:
         world.hosts.takes_s["/arm configure"] = 4.0
@@ -329,8 +329,8 @@ async def test_a_failing_node_is_started_at_once_by_a_manifest_that_mends_it(
     tmp_path: Path,
 ) -> None:
     slow = msgspec.structs.replace(AGAIN, restart_sec=1000.0, restart_max_delay_sec=1000.0)
-    plan = plan_of(CAMERA, dataclasses.replace(VIEWER, supervision=slow))
-    mended = plan_of(CAMERA, dataclasses.replace(LOUD, supervision=slow))
+    plan = plan_of(CAMERA, replace(VIEWER, supervision=slow))
+    mended = plan_of(CAMERA, replace(LOUD, supervision=slow))
     async with active(tmp_path, plan) as world:
         world.kill("viewer")
         await world.story.until("[backoff] viewer")
@@ -441,8 +441,8 @@ async def test_a_paused_system_takes_a_manifest_and_stays_paused(tmp_path: Path)
 
 
 async def test_modes_may_change_and_the_nodes_follow(tmp_path: Path) -> None:
-    quiet = dataclasses.replace(CHAIN, modes=(Mode(name="quiet", inactive=("viewer",), at=HERE),))
-    loud = dataclasses.replace(CHAIN, modes=(Mode(name="loud", at=HERE),))
+    quiet = replace(CHAIN, modes=(Mode(name="quiet", inactive=("viewer",), at=HERE),))
+    loud = replace(CHAIN, modes=(Mode(name="loud", at=HERE),))
     async with active(tmp_path, CHAIN) as world:
         assert _told(await world.apply(quiet)) == "0"
         assert [each.state for each in world.status().nodes] == ["active", "inactive"]
@@ -459,16 +459,14 @@ async def test_parameters_of_the_mode_that_the_system_is_in_are_set(tmp_path: Pa
         given = tuple(
             ModeParameters(
                 mode=mode,
-                parameters=tuple(
-                    dataclasses.replace(each, value=value) for each in camera.expected_parameters
-                ),
+                parameters=tuple(replace(each, value=value) for each in camera.expected_parameters),
             )
             for mode, value in rates.items()
         )
-        camera = dataclasses.replace(camera, mode_parameters=given)
+        camera = replace(camera, mode_parameters=given)
         modes = tuple(Mode(name=each, at=HERE) for each in rates)
         policy = Policy(undeclared_nodes=EndpointPolicy.OPEN) if rate > 2.0 else Policy()
-        return dataclasses.replace(plan_of(camera, VIEWER), modes=modes, policy=policy)
+        return replace(plan_of(camera, VIEWER), modes=modes, policy=policy)
 
     async with active(tmp_path, plan(2.0)) as world:
         assert await world.order(ControlRequest.MODE, mode="night") == "0"
@@ -485,11 +483,9 @@ async def test_what_a_running_supervisor_cannot_change_is_refused_before_anythin
     tmp_path: Path,
 ) -> None:
     others = {
-        'system: was "robot", is "other"': dataclasses.replace(CHAIN, system="other"),
-        "ROS_DOMAIN_ID: was 30, is 31": dataclasses.replace(CHAIN, domain_id=31),
-        "RMW_IMPLEMENTATION: was , is rmw_zenoh_cpp": dataclasses.replace(
-            CHAIN, rmw="rmw_zenoh_cpp"
-        ),
+        'system: was "robot", is "other"': replace(CHAIN, system="other"),
+        "ROS_DOMAIN_ID: was 30, is 31": replace(CHAIN, domain_id=31),
+        "RMW_IMPLEMENTATION: was , is rmw_zenoh_cpp": replace(CHAIN, rmw="rmw_zenoh_cpp"),
     }
     async with active(tmp_path, CHAIN) as world:
         for line, plan in others.items():
@@ -504,14 +500,14 @@ async def test_what_a_running_supervisor_cannot_change_is_refused_before_anythin
 
 
 async def test_a_plan_that_does_not_hold_together_is_refused(tmp_path: Path) -> None:
-    nobody = dataclasses.replace(MORE.processes[0], nodes=("nobody",))
+    nobody = replace(MORE.processes[0], nodes=("nobody",))
     broken = [
-        dataclasses.replace(MORE, nodes=()),
-        dataclasses.replace(MORE, nodes=MORE.nodes * 2),
-        dataclasses.replace(MORE, nodes=MORE.nodes[1:]),
-        dataclasses.replace(MORE, processes=(nobody, *MORE.processes[1:])),
-        dataclasses.replace(MORE, levels=(("nobody",),)),
-        dataclasses.replace(MORE, modes=(Mode(name="m", inactive=("nobody",), at=HERE),)),
+        replace(MORE, nodes=()),
+        replace(MORE, nodes=MORE.nodes * 2),
+        replace(MORE, nodes=MORE.nodes[1:]),
+        replace(MORE, processes=(nobody, *MORE.processes[1:])),
+        replace(MORE, levels=(("nobody",),)),
+        replace(MORE, modes=(Mode(name="m", inactive=("nobody",), at=HERE),)),
     ]
     async with active(tmp_path, CHAIN) as world:
         for plan in broken:
@@ -540,7 +536,7 @@ async def test_what_was_adopted_is_judged_by_another_manifest_and_never_taken_do
 
 
 async def test_over_tcp_only_what_restarts_nothing_is_applied(tmp_path: Path) -> None:
-    rules = dataclasses.replace(DIALLING, policy=Policy(undeclared_nodes=EndpointPolicy.OPEN))
+    rules = replace(DIALLING, policy=Policy(undeclared_nodes=EndpointPolicy.OPEN))
     async with active(tmp_path, DIALLING) as world:
         assert await world.order(ControlRequest.RESTART, "viewer") == "0"
         urls = world.system.plan.node("viewer").connections
@@ -557,14 +553,12 @@ POOL = (
     MORE,
     plan_of(CAMERA),
     plan_of(CAMERA, LOUD, ARM),
-    plan_of(dataclasses.replace(CAMERA, log_level="warn"), VIEWER),
-    plan_of(*(dataclasses.replace(each, process="both") for each in CHAIN.nodes), ARM),
+    plan_of(replace(CAMERA, log_level="warn"), VIEWER),
+    plan_of(*(replace(each, process="both") for each in CHAIN.nodes), ARM),
     plan_of(CAMERA, _rate(VIEWER, 1.0)),
     plan_of(CAMERA, _rate(VIEWER, 2.0), ARM),
-    dataclasses.replace(MORE, policy=Policy(undeclared_nodes=EndpointPolicy.OPEN)),
-    dataclasses.replace(
-        MORE, modes=(Mode(name="a", inactive=("arm",), at=HERE), Mode(name="b", at=HERE))
-    ),
+    replace(MORE, policy=Policy(undeclared_nodes=EndpointPolicy.OPEN)),
+    replace(MORE, modes=(Mode(name="a", inactive=("arm",), at=HERE), Mode(name="b", at=HERE))),
 )
 FAULTS = (
     *("/arm configure", "/arm connect", "/arm activate", "arm start", "/viewer configure"),
@@ -578,9 +572,7 @@ async def test_whatever_fails_one_of_two_manifests_is_in_force_as_a_whole(
 ) -> None:
     chance = random.Random(seed)
     pool = [
-        dataclasses.replace(
-            each, nodes=tuple(dataclasses.replace(one, supervision=AGAIN) for one in each.nodes)
-        )
+        replace(each, nodes=tuple(replace(one, supervision=AGAIN) for one in each.nodes))
         for each in POOL
     ]
 

@@ -6,10 +6,10 @@ As in test_supervisor_session.py outlines of runs are compared.
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.manifest.model import (
     Condition,
@@ -43,12 +43,10 @@ TWICE = "graph.duplicate-node"
 def _plan(system: Said = (), camera: Said = (), restart: RestartWhen = RestartWhen.NO) -> Plan:
     supervision = Supervision(restart=restart, restart_sec=1.0)
     plan = plan_of(
-        dataclasses.replace(
-            planned_node("camera", supervision=supervision), on_violation=_said(camera)
-        ),
+        replace(planned_node("camera", supervision=supervision), on_violation=_said(camera)),
         planned_node("viewer", after={"camera": Condition.ACTIVE}),
     )
-    return dataclasses.replace(plan, on_violation=_said(system))
+    return replace(plan, on_violation=_said(system))
 
 
 def _said(pairs: Said) -> OnViolation:
@@ -201,7 +199,7 @@ async def test_who_comes_again_passes_its_gate_while_another_is_held_behind_it(
     tmp_path: Path,
 ) -> None:
     plan = plan_of(
-        dataclasses.replace(planned_node("camera"), on_violation=_said(((TWICE, DEACTIVATE),))),
+        replace(planned_node("camera"), on_violation=_said(((TWICE, DEACTIVATE),))),
         planned_node("viewer", supervision=Supervision(restart=RestartWhen.ON_FAILURE)),
     )
     world = SessionWorld(plan, tmp_path, stop_after_s=60.0)
@@ -225,7 +223,7 @@ async def test_a_violation_enters_a_mode_once_and_one_that_its_gate_refuses_is_l
     tmp_path: Path,
 ) -> None:
     plan = plan_of(planned_node("camera"), planned_node("viewer"))
-    plan = dataclasses.replace(
+    plan = replace(
         plan,
         modes=(
             Mode(name="normal", inactive=("viewer",), at=HERE),
@@ -257,7 +255,7 @@ async def test_a_violation_enters_a_mode_once_and_one_that_its_gate_refuses_is_l
 
 
 def test_what_a_node_said_of_its_health_while_it_was_inactive_lets_nobody_through() -> None:
-    camera = dataclasses.replace(planned_node("camera"), health=Health(check=True))
+    camera = replace(planned_node("camera"), health=Health(check=True))
     node = NodeRun(camera, Emitter())
     well = configuration("/camera", health=HealthReport(ok=True))
     node.advance(
@@ -267,7 +265,7 @@ def test_what_a_node_said_of_its_health_while_it_was_inactive_lets_nobody_throug
     assert node.has_reached(Condition.ACTIVE)
     assert not node.has_reached(Condition.HEALTHY)
     assert node.unhealthy_reason == ": it has not answered since its state changed"
-    node.learn(dataclasses.replace(well, state="active"))
+    node.learn(replace(well, state="active"))
     assert node.has_reached(Condition.HEALTHY)
 
 
@@ -275,17 +273,17 @@ async def test_a_node_waits_until_another_is_healthy_and_one_that_no_longer_is_h
     tmp_path: Path,
 ) -> None:
     camera, viewer = (planned_node(each) for each in ("camera", "viewer"))
-    camera = dataclasses.replace(camera, health=Health(check=True))
+    camera = replace(camera, health=Health(check=True))
     viewer = planned_node("viewer", after={"camera": Condition.HEALTHY})
     plan = plan_of(camera, viewer)
-    plan = dataclasses.replace(plan, on_violation=_said((("node", DEACTIVATE),)))
+    plan = replace(plan, on_violation=_said((("node", DEACTIVATE),)))
     world = SessionWorld(plan, tmp_path, stop_after_s=10.0)
     interfaces = world.hosts.interfaces
     unsaid = HealthReport(ok=None, message="it has not answered")
-    interfaces["/camera"] = dataclasses.replace(interfaces["/camera"], health=unsaid)
+    interfaces["/camera"] = replace(interfaces["/camera"], health=unsaid)
 
     def report(health: HealthReport) -> None:
-        interfaces["/camera"] = dataclasses.replace(interfaces["/camera"], health=health)
+        interfaces["/camera"] = replace(interfaces["/camera"], health=health)
         world.system.on_host_event(
             HostEvent(
                 kind="configuration",

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 import socket
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.network.connection_url import parse
 from lifecycle.plan.model import ParticipantConnections, Plan, PlannedServer
@@ -40,7 +40,7 @@ def nobody() -> int:
 
 def served(port: int, machine: str = "") -> Plan:
     server = PlannedServer(machine=machine, address="127.0.0.1", port=port, prefix=PREFIX)
-    return dataclasses.replace(plan_of(planned_node("a")), server=server)
+    return replace(plan_of(planned_node("a")), server=server)
 
 
 def world(plan: Plan, directory: Path) -> tuple[System, FakeSpawner]:
@@ -127,10 +127,8 @@ def test_the_server_of_another_machine_may_come_later(
 
 def observed(*urls: str, nodes: tuple[str, ...] = ()) -> Plan:
     plan = plan_of(planned_node("a"))
-    node = dataclasses.replace(plan.nodes[0], connections=ParticipantConnections(urls=nodes))
-    return dataclasses.replace(
-        plan, nodes=(node,), observers=(("", ParticipantConnections(urls=urls)),)
-    )
+    node = replace(plan.nodes[0], connections=ParticipantConnections(urls=nodes))
+    return replace(plan, nodes=(node,), observers=(("", ParticipantConnections(urls=urls)),))
 
 
 def test_an_onlooker_is_connected_like_the_supervisor_but_on_free_ports() -> None:

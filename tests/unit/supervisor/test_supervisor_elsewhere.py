@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import dataclasses
 import socket
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.manifest.model import Condition, Machine
 from lifecycle.plan.model import Plan
@@ -146,14 +146,14 @@ def test_a_machine_waits_for_the_interface_with_its_address_where_others_are_to_
     monkeypatch.setattr("psutil.net_if_addrs", lambda: {"e0": [address]})
     monkeypatch.setattr("psutil.net_if_stats", lambda: {"e0": SimpleNamespace(isup=is_up)})
     nodes = [
-        dataclasses.replace(planned_node(key), machine=of)
+        replace(planned_node(key), machine=of)
         for key, of in (("camera", "left"), ("viewer", "right"))
     ]
     machines = tuple(
         Machine(name=each, address=f"192.0.2.{number}", at=HERE)
         for number, each in enumerate(("left", "right"), 1)
     )
-    plan = dataclasses.replace(plan_of(*nodes), machines=machines)
+    plan = replace(plan_of(*nodes), machines=machines)
     assert address_that_is_down(plan, machine) == expected
-    alone = dataclasses.replace(plan, nodes=plan.nodes[:1])
+    alone = replace(plan, nodes=plan.nodes[:1])
     assert address_that_is_down(alone, "left") == ""

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.supervisor.gate.sequence import undiscovered
 from lifecycle.verify.outcome import Outcome
@@ -66,14 +65,10 @@ def test_who_lacks_most_is_started_again_and_nobody_where_more_is_wrong(
 def test_who_waits_for_a_node_that_is_on_its_way_is_not_started_again(rule: str) -> None:
     on_its_way = verdict(TO_AWAITED, (rule, "what is said of it"))
     waiting, late = on_its_way.findings
-    of = dataclasses.replace(
-        on_its_way, findings=(waiting, dataclasses.replace(late, node="/elsewhere"))
-    )
+    of = replace(on_its_way, findings=(waiting, replace(late, node="/elsewhere")))
     assert undiscovered(of, OURS, {}) is None
     # The same of a node that nobody lacks: then the match is what is missing.
-    of = dataclasses.replace(
-        on_its_way, findings=(waiting, dataclasses.replace(late, node="/other"))
-    )
+    of = replace(on_its_way, findings=(waiting, replace(late, node="/other")))
     assert undiscovered(of, OURS, {}) == "/talker"
 
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import dataclasses
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.manifest.model import EndpointKind, Policy
 from lifecycle.node.host.control import Event
@@ -141,7 +141,7 @@ async def judging(tmp_path: Path, *of: Verdict, **options: Any) -> AsyncIterator
 
 
 def _both(one: Verdict, other: Verdict) -> Verdict:
-    return dataclasses.replace(one, findings=(*one.findings, *other.findings))
+    return replace(one, findings=(*one.findings, *other.findings))
 
 
 @pytest.mark.parametrize(
@@ -210,8 +210,8 @@ async def test_an_unmatched_pair_is_asked_again_because_its_match_changes_no_gra
 
 
 async def test_a_node_that_tells_of_its_matches_is_not_asked_for_them(tmp_path: Path) -> None:
-    finding = dataclasses.replace(UNMATCHED.findings[0], ends=("/camera", "/viewer"))
-    unmatched = dataclasses.replace(UNMATCHED, findings=(finding,))
+    finding = replace(UNMATCHED.findings[0], ends=("/camera", "/viewer"))
+    unmatched = replace(UNMATCHED, findings=(finding,))
     async with judging(tmp_path, unmatched) as bench:
         bench.world.system.nodes["camera"].reports_changes = True
 
@@ -230,8 +230,8 @@ async def test_a_reply_does_not_undo_what_was_told_after_it(tmp_path: Path) -> N
     def of(*, matched: bool) -> NodeConfiguration:
         told = interface_of("/camera", "service_clients/ask")
         (end,) = told.endpoints
-        end = dataclasses.replace(end, server_matched=matched)
-        return dataclasses.replace(told, endpoints=(end,))
+        end = replace(end, server_matched=matched)
+        return replace(told, endpoints=(end,))
 
     async with judging(tmp_path, OK) as bench:
         system = bench.world.system
@@ -240,7 +240,7 @@ async def test_a_reply_does_not_undo_what_was_told_after_it(tmp_path: Path) -> N
         reply = Event(kind="reply", node="/camera", state="inactive", configuration=before)
         system.on_host_event(reply)
         assert node.configuration == before
-        system.on_host_event(dataclasses.replace(reply, kind="configuration", configuration=after))
+        system.on_host_event(replace(reply, kind="configuration", configuration=after))
         # Who awaited the reply goes on only now.
         node.advance(Reach.CONNECTED, NodeCondition(state="inactive", configuration=before))
         assert node.configuration is not None
@@ -258,7 +258,7 @@ async def test_a_reply_in_the_place_of_a_report_has_the_system_judged_again(tmp_
         reply = Event(kind="reply", node="/camera", state="inactive", configuration=told)
         system.on_host_event(reply)
         assert (node.reports_changes, system.touched.is_set()) == (False, False)
-        system.on_host_event(dataclasses.replace(reply, reports=True))
+        system.on_host_event(replace(reply, reports=True))
         assert (node.reports_changes, system.touched.is_set()) == (True, True)
 
 
@@ -266,13 +266,13 @@ async def test_a_reply_in_the_place_of_a_report_has_the_system_judged_again(tmp_
 async def test_of_a_server_that_is_matched_only_its_client_tells(
     tmp_path: Path, client: str, server: str
 ) -> None:
-    finding = dataclasses.replace(
+    finding = replace(
         UNMATCHED.findings[0],
         rule="graph.unmatched-client",
         subject=f"/calibrate: {client} → {server}",
         node=client,
     )
-    async with judging(tmp_path, dataclasses.replace(UNMATCHED, findings=(finding,))) as bench:
+    async with judging(tmp_path, replace(UNMATCHED, findings=(finding,))) as bench:
         bench.world.system.nodes["camera"].reports_changes = True
 
         def tell() -> None:
@@ -301,19 +301,19 @@ def test_a_dead_node_is_gone_although_discovery_shows_it_for_the_whole_lease() -
     endpoint = ObservedEndpoint(
         kind=EndpointKind.PUBLISHER, node="/dead", name="/topic", type="std_msgs/msg/String"
     )
-    kept = dataclasses.replace(endpoint, node="/twice")
+    kept = replace(endpoint, node="/twice")
     parameter = NodeParameters(node="/dead")
     seen = Observation(
         nodes=(of("/dead"), of("/other"), of("/twice", 2)),
         endpoints=(endpoint, kept),
         configurations=(interface_of("/dead"), interface_of("/other")),
-        parameters=(parameter, dataclasses.replace(parameter, node="/twice")),
+        parameters=(parameter, replace(parameter, node="/twice")),
     )
     assert without(seen, frozenset({"/dead", "/twice"})) == Observation(
         nodes=(of("/other"), of("/twice")),
         endpoints=(kept,),
         configurations=(interface_of("/other"),),
-        parameters=(dataclasses.replace(parameter, node="/twice"),),
+        parameters=(replace(parameter, node="/twice"),),
     )
     assert without(seen, frozenset()) is seen
 
@@ -325,7 +325,7 @@ async def test_nodes_that_are_silent_are_not_asked_for_and_judged_silent(tmp_pat
         assert bench.graph.asked is system.plan
         system.liveliness.fell_silent(("/camera",), Cause.HUNG, "a callback has been running")
         verdict = await bench.judge.once(Stage.CONNECTED)
-        assert bench.graph.asked == dataclasses.replace(system.plan, nodes=())
+        assert bench.graph.asked == replace(system.plan, nodes=())
         assert bench.judged[-1]["plan"] is system.expected
         assert (verdict.verdict, verdict.blocking) == (Outcome.VIOLATED, True)
         assert verdict.findings == system.liveliness.findings()
@@ -353,11 +353,9 @@ class _Agreement:
         self.unknown = verdict_of(Outcome.UNVERIFIABLE, "run.plan-unknown").findings
 
     def explained(self, verdict: Verdict) -> Verdict:
-        return dataclasses.replace(
+        return replace(
             verdict,
-            findings=tuple(
-                dataclasses.replace(each, observed="explained") for each in verdict.findings
-            ),
+            findings=tuple(replace(each, observed="explained") for each in verdict.findings),
         )
 
     def findings(self, observation: Observation) -> tuple[Finding, ...]:
@@ -394,7 +392,7 @@ async def test_what_is_seen_is_judged_against_what_is_expected_with_what_others_
         assert system.present == frozenset({"/camera"})
         assert [each.node for each in bench.world.heard(NodeJoined)] == ["/camera"]
         told = tuple(
-            dataclasses.replace(each, observed="explained")
+            replace(each, observed="explained")
             for each in (*guard.wrong, *looker.wrong, *UNATTRIBUTED.findings)
         )
         assert verdict == Verdict(
@@ -408,7 +406,7 @@ async def test_what_is_seen_is_judged_against_what_is_expected_with_what_others_
 def test_what_the_supervisor_finds_comes_first_and_makes_a_verdict_worse_never_better() -> None:
     for outcome, blocking in ((Outcome.VIOLATED, True), (Outcome.UNVERIFIABLE, False)):
         (finding,) = verdict_of(outcome, "run.plan-unknown").findings
-        assert with_findings(UNATTRIBUTED, (finding,), Policy()) == dataclasses.replace(
+        assert with_findings(UNATTRIBUTED, (finding,), Policy()) == replace(
             UNATTRIBUTED,
             verdict=outcome,
             blocking=blocking,
@@ -443,7 +441,7 @@ async def test_of_a_process_that_ended_the_nodes_are_left_out_and_of_the_server_
         assert bench.judge.seen == Observation(nodes=(ObservedNode(full_name="/viewer"),))
         assert system.present == frozenset({"/viewer"})
         system.server = system.make_process(
-            dataclasses.replace(system.plan.processes[0], name="discovery_server", nodes=())
+            replace(system.plan.processes[0], name="discovery_server", nodes=())
         )
         _end(system.server)
         verdict = await bench.judge.once(Stage.ACTIVE)
@@ -485,18 +483,16 @@ async def test_what_is_held_is_judged_at_its_stage_against_what_is_expected(tmp_
 
 
 def _with_publisher(plan: Plan, topic: str) -> Plan:
-    node = dataclasses.replace(plan.nodes[0], endpoints=negotiated_plan().nodes[0].endpoints[:1])
+    node = replace(plan.nodes[0], endpoints=negotiated_plan().nodes[0].endpoints[:1])
     (end,) = node.endpoints
-    end = dataclasses.replace(end, kind=EndpointKind.PUBLISHER, resolved=topic)
-    return dataclasses.replace(plan, nodes=(dataclasses.replace(node, endpoints=(end,)),))
+    end = replace(end, kind=EndpointKind.PUBLISHER, resolved=topic)
+    return replace(plan, nodes=(replace(node, endpoints=(end,)),))
 
 
 def _missing_endpoint(topic: str, node: str) -> Verdict:
     (finding,) = verdict_of(Outcome.VIOLATED, "graph.missing-endpoint").findings
-    finding = dataclasses.replace(
-        finding, subject=topic, node=node, endpoint=EndpointKind.PUBLISHER
-    )
-    return dataclasses.replace(MISSING, findings=(finding,))
+    finding = replace(finding, subject=topic, node=node, endpoint=EndpointKind.PUBLISHER)
+    return replace(MISSING, findings=(finding,))
 
 
 async def test_changes_are_counted_and_waited_for_within_a_time(tmp_path: Path) -> None:
@@ -522,7 +518,7 @@ async def test_a_verdict_is_current_until_something_is_noticed_after_its_look_be
         assert not judge.is_current(OK)
         verdict = await judge.once(Stage.CONNECTED)
         assert judge.is_current(verdict)
-        assert not judge.is_current(dataclasses.replace(verdict))
+        assert not judge.is_current(replace(verdict))
         for notice in 2 * (bench.graph.changed.set, bench.world.system.touched.set):
             notice()
             noticed = bench.changes.mark
@@ -626,8 +622,8 @@ async def test_nodes_are_asked_for_a_match_at_growing_intervals_up_to_half_a_sec
 async def test_while_held_a_match_with_a_node_of_another_machine_is_asked_for_until_it_is_there(
     tmp_path: Path,
 ) -> None:
-    finding = dataclasses.replace(UNMATCHED.findings[0], ends=("/camera", "/viewer"))
-    unmatched = dataclasses.replace(UNMATCHED, findings=(finding,))
+    finding = replace(UNMATCHED.findings[0], ends=("/camera", "/viewer"))
+    unmatched = replace(UNMATCHED, findings=(finding,))
     async with judging(tmp_path, unmatched) as bench:
         bench.world.system.remote = {"viewer": RemoteNode(planned_node("viewer"))}
         bench.world.system.nodes["camera"].reports_changes = True
@@ -655,7 +651,7 @@ async def test_a_node_of_another_supervisor_that_has_a_step_to_go_is_asked_again
     tmp_path: Path, rule: str, node: str, asked: bool
 ) -> None:
     (finding,) = verdict_of(Outcome.VIOLATED, rule).findings
-    late = dataclasses.replace(MISSING, findings=(dataclasses.replace(finding, node=node),))
+    late = replace(MISSING, findings=(replace(finding, node=node),))
     async with judging(tmp_path, late) as bench:
         bench.world.system.remote = {"viewer": RemoteNode(planned_node("viewer"))}
         await bench.judge.until_clear(Stage.CONNECTED, 1.0)
@@ -666,7 +662,7 @@ async def test_a_node_of_another_supervisor_that_is_missing_announces_itself(
     tmp_path: Path,
 ) -> None:
     (finding,) = MISSING.findings
-    missing = dataclasses.replace(MISSING, findings=(dataclasses.replace(finding, node="/viewer"),))
+    missing = replace(MISSING, findings=(replace(finding, node="/viewer"),))
     async with judging(tmp_path, missing) as bench:
         bench.world.system.remote = {"viewer": RemoteNode(planned_node("viewer"))}
         await bench.judge.until_clear(Stage.CONNECTED, 1.0)
@@ -691,7 +687,7 @@ async def test_a_burst_that_does_not_end_is_looked_at_every_50_ms(tmp_path: Path
 def _system(tmp_path: Path) -> System:
     system = World(plan_of(planned_node("camera"), planned_node("viewer")), tmp_path).system
     system.server = system.make_process(
-        dataclasses.replace(system.plan.processes[0], name="discovery_server", nodes=())
+        replace(system.plan.processes[0], name="discovery_server", nodes=())
     )
     return system
 

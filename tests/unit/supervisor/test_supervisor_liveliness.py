@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 import socket
 from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.cli.up_output import describe
 from lifecycle.manifest.model import DiscoveryRange, Machine, Run, RunKind, Timeouts
@@ -81,7 +81,7 @@ async def test_a_node_is_not_called_alive_that_has_not_started_or_is_not_in_the_
         "/viewer": False,
         "/lamp": True,
     }
-    assert [describe(dataclasses.replace(each, silent_s=2.0)) for each in alive] == [
+    assert [describe(replace(each, silent_s=2.0)) for each in alive] == [
         "/camera: not silent any more after 2.0 s, but not there yet",
         "/viewer: not silent any more after 2.0 s, but not there yet",
         "/lamp: alive again after 2.0 s",
@@ -144,7 +144,7 @@ class FakeAir:
 
 def two_machines() -> Plan:
     nodes = [
-        dataclasses.replace(planned_node(key), machine=machine)
+        replace(planned_node(key), machine=machine)
         for key, machine in (("camera", "robot"), ("viewer", "desk"), ("lamp", "desk"))
     ]
     plan = plan_of(*nodes)
@@ -152,7 +152,7 @@ def two_machines() -> Plan:
         Machine(name="robot", address="10.0.0.1", at=HERE),
         Machine(name="desk", address="10.0.0.2", at=HERE),
     )
-    return dataclasses.replace(plan, machines=machines)
+    return replace(plan, machines=machines)
 
 
 class Desk:
@@ -253,15 +253,13 @@ async def test_a_system_of_one_machine_neither_speaks_nor_listens(tmp_path: Path
 
 def attached(*keys: str) -> Plan:
     """A camera of ours, and nodes that others run."""
-    others = [
-        dataclasses.replace(planned_node(each), run=Run(kind=RunKind.ATTACH)) for each in keys
-    ]
+    others = [replace(planned_node(each), run=Run(kind=RunKind.ATTACH)) for each in keys]
     plan = plan_of(planned_node("camera"), *others)
     processes = tuple(
-        dataclasses.replace(each, run=Run(kind=RunKind.ATTACH)) if each.name in keys else each
+        replace(each, run=Run(kind=RunKind.ATTACH)) if each.name in keys else each
         for each in plan.processes
     )
-    return dataclasses.replace(plan, processes=processes)
+    return replace(plan, processes=processes)
 
 
 async def test_a_reloaded_plan_has_its_own_attached_nodes_followed_and_no_others(

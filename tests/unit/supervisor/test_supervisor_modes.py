@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 from pathlib import Path
+
+from msgspec.structs import replace
 
 from lifecycle.manifest.model import (
     Consequence,
@@ -34,7 +35,7 @@ def _plan(restart: Restart = Restart.NO) -> Plan:
         Mode(name="degraded", inactive=("camera",), at=HERE),
         Mode(name="blind", inactive=("base",), at=HERE),
     )
-    return in_mode(dataclasses.replace(plan, modes=modes), "normal")
+    return in_mode(replace(plan, modes=modes), "normal")
 
 
 def test_a_mode_keeps_its_nodes_inactive_and_the_next_has_them_active_again() -> None:
@@ -134,9 +135,7 @@ def _with_speeds() -> Plan:
     """Two nodes with a speed, another one in mode `slow`, which keeps the camera inactive."""
     speed = ParameterDeclaration(name="speed", type="double", default=1.0, at=HERE)
     nodes = [node(each) for each in ("base", "camera")]
-    nodes[0] = dataclasses.replace(
-        nodes[0], interface=dataclasses.replace(nodes[0].interface, parameters=(speed,))
-    )
+    nodes[0] = replace(nodes[0], interface=replace(nodes[0].interface, parameters=(speed,)))
     slow = ModeParameter(node="base", name="speed", value=0.2, at=HERE)
     modes = (
         Mode(name="normal", at=HERE),
@@ -157,7 +156,7 @@ def test_a_mode_has_parameters_and_the_next_has_them_as_they_are_declared() -> N
 async def test_parameters_are_set_before_what_comes_in_is_activated_and_set_back_if_one_is_refused(
     tmp_path: Path,
 ) -> None:
-    plan = dataclasses.replace(_with_speeds(), policy=Policy(ros_interface=RosInterfaceAccess.FULL))
+    plan = replace(_with_speeds(), policy=Policy(ros_interface=RosInterfaceAccess.FULL))
     world = SessionWorld(plan, tmp_path, stop_after_s=10.0)
     async with world.running("[system] active"):
         await asyncio.sleep(0.3)
@@ -196,9 +195,7 @@ async def test_a_consequence_that_a_node_refuses_is_reported_and_the_system_goes
     tmp_path: Path,
 ) -> None:
     what = Reaction(rule="graph", what=Consequence.MODE, mode="slow")
-    world = SessionWorld(
-        dataclasses.replace(_with_speeds(), on_violation=(what,)), tmp_path, stop_after_s=10.0
-    )
+    world = SessionWorld(replace(_with_speeds(), on_violation=(what,)), tmp_path, stop_after_s=10.0)
     world.graph.refuses = "speed=0.2"
     async with world.running("[system] active"):
         world.intrude()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
+from msgspec.structs import replace
 
 from lifecycle.manifest.model import (
     Authority,
@@ -91,19 +91,15 @@ def test_a_wish_for_another_medium_becomes_a_connection_of_the_plan_and_of_the_n
 def test_the_same_reports_are_not_negotiated_again() -> None:
     source = NegotiatedSource(plan_of())
     first = source.instructions(known(TALKER, LISTENER))
-    matched = dataclasses.replace(TALKER, state="active")
+    matched = replace(TALKER, state="active")
     assert source.instructions(known(matched, LISTENER)) is first
 
 
 def test_an_endpoint_made_in_code_is_expected_told_and_flows() -> None:
     source = NegotiatedSource(plan_of(transport=FlowTransport.UDPV4))
     before = source.instructions(known(TALKER, LISTENER))
-    grown = dataclasses.replace(
-        TALKER, checksum="1", endpoints=(*TALKER.endpoints, _made(PUB, "/news"))
-    )
-    heard = dataclasses.replace(
-        LISTENER, checksum="1", endpoints=(*LISTENER.endpoints, _made(SUB, "/news"))
-    )
+    grown = replace(TALKER, checksum="1", endpoints=(*TALKER.endpoints, _made(PUB, "/news")))
+    heard = replace(LISTENER, checksum="1", endpoints=(*LISTENER.endpoints, _made(SUB, "/news")))
     after = source.instructions(known(grown, heard))
     assert after["/talker"].connections == before["/talker"].connections
     assert after["/talker"].mappings == (

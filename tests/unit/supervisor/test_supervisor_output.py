@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import io
 import json
 import re
@@ -10,6 +9,7 @@ from types import SimpleNamespace
 
 import msgspec
 import pytest
+from msgspec.structs import replace
 from rich.console import Console
 
 from lifecycle.cli.live_view import Live
@@ -228,8 +228,8 @@ def test_what_the_others_print_while_a_failed_run_is_rolled_back_does_not_bury_t
 
 def test_an_event_writes_findings_as_every_report_does() -> None:
     unmatched = verdict_of(Outcome.VIOLATED, "graph.unmatched-link")
-    pair = dataclasses.replace(unmatched.findings[0], ends=("/camera", "/viewer"))
-    verdict = dataclasses.replace(unmatched, findings=(pair,))
+    pair = replace(unmatched.findings[0], ends=("/camera", "/viewer"))
+    verdict = replace(unmatched, findings=(pair,))
     record = to_record(VerdictChanged(stage=Stage.ACTIVE, verdict=verdict))
     written = json.loads(json.dumps(record))["verdict"]["findings"]
     assert written == json.loads(to_json(verdict))["findings"]
@@ -242,7 +242,7 @@ def test_a_verdict_that_reads_as_the_last_one_did_is_not_told_again() -> None:
     ok = VerdictChanged(stage=Stage.ACTIVE, verdict=RESULT.verdict)
     wrong = VerdictChanged(
         stage=Stage.ACTIVE,
-        verdict=dataclasses.replace(RESULT.verdict, verdict=Outcome.VIOLATED),
+        verdict=replace(RESULT.verdict, verdict=Outcome.VIOLATED),
     )
     for event in (ok, ok, EVENTS[0], ok, wrong, wrong, ok):
         output(event)
@@ -422,7 +422,7 @@ def test_a_flow_shows_its_tuple_dscp_and_tos_requirement_and_verdict() -> None:
         "weakly",
     ):
         assert cell in row
-    marked = dataclasses.replace(FLOW, reader_dscp=48)
+    marked = replace(FLOW, reader_dscp=48)
     _, row = render_flows([marked], "text").splitlines()
     assert "EF = DSCP 46 = TOS 184 (0xb8); back CS6 = DSCP 48 = TOS 192 (0xc0)" in row
     assert render_flows([], "text") == "no flow"
@@ -447,12 +447,12 @@ def test_a_command_is_shown_as_it_was_judged_and_matches_where_its_flows_are_ok(
         withheld="",
         reports_changes=False,
     )
-    wrong = dataclasses.replace(
+    wrong = replace(
         verdict_of(Outcome.VIOLATED, "state.wrong-state").findings[0],
         node="/camera",
         observed="inactive",
     )
-    verdict = dataclasses.replace(verdict_of(Outcome.OK), findings=(wrong,), flows=(FLOW,))
+    verdict = replace(verdict_of(Outcome.OK), findings=(wrong,), flows=(FLOW,))
     shown = node_status(command, verdict, "", elapsed_s=0.0, schedule=None)
     assert (shown.state, shown.matched, shown.unreported, shown.endpoints) == ("inactive", 1, 1, 2)
     hosted = SimpleNamespace(**{**vars(command), "reports_changes": True})

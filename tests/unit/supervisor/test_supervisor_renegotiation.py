@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.manifest.model import DataLayer, EndpointKind, FlowTransport
 from lifecycle.node.host.control import Operation
@@ -81,10 +80,10 @@ def test_what_somebody_else_connected_is_not_expected() -> None:
 
 def test_an_endpoint_made_in_code_is_expected_with_its_flow() -> None:
     plan = plan_of()
-    news = dataclasses.replace(TALKER.endpoints[0], name="news", resolved="/news")
-    heard = dataclasses.replace(LISTENER.endpoints[0], name="news", resolved="/news")
-    talker = dataclasses.replace(TALKER, endpoints=(*TALKER.endpoints, news))
-    listener = dataclasses.replace(LISTENER, endpoints=(*LISTENER.endpoints, heard))
+    news = replace(TALKER.endpoints[0], name="news", resolved="/news")
+    heard = replace(LISTENER.endpoints[0], name="news", resolved="/news")
+    talker = replace(TALKER, endpoints=(*TALKER.endpoints, news))
+    listener = replace(LISTENER, endpoints=(*LISTENER.endpoints, heard))
     expected = Expectation.of(plan, seen(known(talker, listener)))
     assert media(expected.plan) == {
         ("/chatter", "talker", "listener"): "shm",
@@ -94,12 +93,12 @@ def test_an_endpoint_made_in_code_is_expected_with_its_flow() -> None:
 
 def test_what_cannot_be_connected_is_a_finding() -> None:
     plan = plan_of(transport=FlowTransport.TCPV4)
-    poor = dataclasses.replace(LISTENER, transports=("udpv4", "shm"))
+    poor = replace(LISTENER, transports=("udpv4", "shm"))
     (finding,) = Expectation.of(plan, seen(known(TALKER, poor))).findings
     assert (finding.rule, finding.subject) == ("run.not-wired", plan.system)
     assert finding.message.startswith("cannot carry '/chatter' from 'talker' to 'listener' by tcp")
 
 
 def test_where_nothing_is_negotiated_the_plan_is_what_must_be() -> None:
-    plan: Plan = dataclasses.replace(plan_of(), data_layer=DataLayer(at=at(4)))
+    plan: Plan = replace(plan_of(), data_layer=DataLayer(at=at(4)))
     assert Expectation.of(plan, seen(known(TALKER, LISTENER))) == Expectation(plan=plan)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import dataclasses
 from collections.abc import Iterator
 from concurrent.futures import Future
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import Any, cast
 
 import msgspec
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.manifest.model import Condition, OnFailure, Restart, RunKind, Supervision
 from lifecycle.plan.model import Plan, PlannedNode
@@ -134,8 +134,8 @@ def test_who_goes_down_with_a_process(how: OnFailure, group: str) -> None:
 
 def _component(key: str, *, of: str) -> PlannedNode:
     node = planned_node(key, kind=RunKind.ATTACH)
-    run_ = dataclasses.replace(node.run, component="parts/Part", container=of)
-    return dataclasses.replace(node, run=run_)
+    run_ = replace(node.run, component="parts/Part", container=of)
+    return replace(node, run=run_)
 
 
 # Sessions

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import dataclasses
 import json
 import sys
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.errors import ExitCode, MiddlewareError
 from lifecycle.manifest.model import Policy, RosInterfaceAccess
@@ -30,7 +30,7 @@ OFF, FULL = RosInterfaceAccess.OFF, RosInterfaceAccess.FULL
 
 
 def offering(access: RosInterfaceAccess, plan: Plan = CHAIN) -> Plan:
-    return dataclasses.replace(plan, policy=Policy(ros_interface=access))
+    return replace(plan, policy=Policy(ros_interface=access))
 
 
 def test_it_reads_only_by_default_and_off_leaves_nothing(tmp_path: Path) -> None:
@@ -97,7 +97,7 @@ def test_what_a_manifest_asks_for_must_be_installed(
     refused = pytest.raises(MiddlewareError) if required else contextlib.nullcontext()
     with refused as error:
         check_installed(policy)
-    check_installed(dataclasses.replace(policy, ros_interface=OFF))
+    check_installed(replace(policy, ros_interface=OFF))
     if error is not None:
         assert str(error.value) == (
             "cannot offer 'policy: {ros_interface: full}': no Python package diagnostic_msgs is "

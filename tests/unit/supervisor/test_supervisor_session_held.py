@@ -6,11 +6,11 @@ As in test_supervisor_session.py whole outlines of whole runs are compared.
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 import signal
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.manifest.model import Discovery
 from lifecycle.supervisor.control.protocol import ControlRequest
@@ -279,7 +279,7 @@ async def test_a_restarted_node_stays_inactive_while_the_system_is_wrong_and_can
 
 
 async def test_a_restart_for_which_no_port_is_left_ends_the_run(tmp_path: Path) -> None:
-    full = dataclasses.replace(DIALLING, discovery=Discovery(first_port=65535))
+    full = replace(DIALLING, discovery=Discovery(first_port=65535))
     full_up = "cannot give out 2 more ports: they would begin at 67535, and the highest is 65535"
 
     world = SessionWorld(full, tmp_path)

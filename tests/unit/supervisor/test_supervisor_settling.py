@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.manifest.model import EndpointKind, FlowTransport
 from lifecycle.plan.model import Plan
@@ -29,12 +28,12 @@ def grown() -> tuple[Plan, Plan]:
     source.instructions(known(TALKER, LISTENER))
     before = source.expected
     more = [
-        dataclasses.replace(
+        replace(
             each,
             checksum="1",
             endpoints=(
                 *each.endpoints,
-                dataclasses.replace(each.endpoints[0], name="news", resolved="/news"),
+                replace(each.endpoints[0], name="news", resolved="/news"),
             ),
         )
         for each in (TALKER, LISTENER)
@@ -145,16 +144,14 @@ def test_the_first_verdict_of_all_is_told_whatever_it_is() -> None:
 def test_a_client_that_has_only_just_become_expected_may_be_unmatched_for_a_moment() -> None:
     grace_period = GracePeriod()
     grace_period.after(None, OK, BEFORE, 10.0)
-    asks = dataclasses.replace(
-        AFTER.nodes[0].endpoints[0], kind=EndpointKind.SERVICE_CLIENT, resolved="/ask"
-    )
-    answers = dataclasses.replace(asks, kind=EndpointKind.SERVICE_SERVER)
+    asks = replace(AFTER.nodes[0].endpoints[0], kind=EndpointKind.SERVICE_CLIENT, resolved="/ask")
+    answers = replace(asks, kind=EndpointKind.SERVICE_SERVER)
     client, server = AFTER.nodes[:2]
-    plan = dataclasses.replace(
+    plan = replace(
         AFTER,
         nodes=(
-            dataclasses.replace(client, endpoints=(*client.endpoints, asks)),
-            dataclasses.replace(server, endpoints=(*server.endpoints, answers)),
+            replace(client, endpoints=(*client.endpoints, asks)),
+            replace(server, endpoints=(*server.endpoints, answers)),
         ),
     )
     names = client.full_name, server.full_name
@@ -172,12 +169,10 @@ def with_client(plan: Plan, *hashes: str) -> Verdict:
     That is so while the tool comes and while it goes.
     """
     seen = perfect(plan, Stage.ACTIVE)
-    server = dataclasses.replace(seen.endpoints[0], type_hash="RIHS01_a RIHS01_a")
-    client = dataclasses.replace(
-        server, kind=EndpointKind.SERVICE_CLIENT, node="", gid="010f78fd" + 24 * "0"
-    )
-    clients = (dataclasses.replace(client, type_hash=each) for each in hashes)
-    observation = dataclasses.replace(seen, endpoints=(server, *clients))
+    server = replace(seen.endpoints[0], type_hash="RIHS01_a RIHS01_a")
+    client = replace(server, kind=EndpointKind.SERVICE_CLIENT, node="", gid="010f78fd" + 24 * "0")
+    clients = (replace(client, type_hash=each) for each in hashes)
+    observation = replace(seen, endpoints=(server, *clients))
     return verify(plan, observation, stage=Stage.ACTIVE)
 
 

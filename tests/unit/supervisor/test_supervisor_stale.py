@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterable
 from types import SimpleNamespace
 from typing import Any
+
+from msgspec.structs import replace
 
 from lifecycle.supervisor.control.protocol import ProcessState
 from lifecycle.supervisor.health.process_monitor import EndedProcesses
@@ -30,9 +31,9 @@ def test_only_a_process_of_the_system_that_has_ended_counts_no_more() -> None:
     participant: Any = SimpleNamespace(discovery=SimpleNamespace(ended=take))
     processes = EndedProcesses(system, participant)
     for event in (
-        dataclasses.replace(ENDED, state=ProcessState.RUNNING),
-        dataclasses.replace(ENDED, pid=6),
-        dataclasses.replace(ENDED, process="discovery_server"),
+        replace(ENDED, state=ProcessState.RUNNING),
+        replace(ENDED, pid=6),
+        replace(ENDED, process="discovery_server"),
     ):
         processes.on_event(event)
     assert ended == []

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.manifest.model import (
     Authority,
@@ -58,7 +58,7 @@ def wired_node(key: str, *, after: Mapping[str, Condition] = {}) -> PlannedNode:
             (EndpointKind.SUBSCRIPTION, "in", ""),
         )
     )
-    return dataclasses.replace(
+    return replace(
         planned_node(key, after=after),
         authority=Authority.SUPERVISOR,
         endpoints=endpoints,
@@ -71,7 +71,7 @@ def wired_node(key: str, *, after: Mapping[str, Condition] = {}) -> PlannedNode:
 
 
 def wired_plan(*nodes: PlannedNode, **layer: object) -> Plan:
-    return dataclasses.replace(
+    return replace(
         plan_of(*nodes),
         data_layer=DataLayer(authority=Authority.SUPERVISOR, **layer),  # type: ignore[arg-type]
     )
@@ -215,9 +215,7 @@ async def test_a_negotiation_waits_until_everybody_is_configured(tmp_path: Path)
 
 async def test_a_negotiation_does_not_wait_for_what_waits_for_a_connection(tmp_path: Path) -> None:
     late = wired_node("late", after={"plain": Condition.STARTED})
-    plain = dataclasses.replace(
-        planned_node("plain", after={"a": Condition.CONNECTED}), managed=False
-    )
+    plain = replace(planned_node("plain", after={"a": Condition.CONNECTED}), managed=False)
     plan = wired_plan(wired_node("a"), plain, late, source=DataLayerSource.DYNAMIC)
     wiring = Wiring(plan, tmp_path)
     await wiring.world.bring_up.connect(LIMIT_S)
@@ -266,7 +264,7 @@ async def test_only_the_difference_is_wired_when_the_negotiation_changes(tmp_pat
     wiring.look()
     await settle()
     before = {node: len(wiring.told(node)) for node in ("/a", "/b")}
-    wiring.source.now["/b"] = dataclasses.replace(
+    wiring.source.now["/b"] = replace(
         wiring.source.now["/b"],
         connections=(("group", ParticipantConnections(urls=("udpm://239.255.1.1:7900",))),),
         mappings=(("publishers/out", "group"), ("subscriptions/in", "")),
@@ -290,7 +288,7 @@ async def test_it_is_at_work_until_what_a_node_reports_already_is_done(tmp_path:
     wiring.look()
     await settle()
     assert not wiring.authority.is_at_work()
-    wiring.source.now["/a"] = dataclasses.replace(
+    wiring.source.now["/a"] = replace(
         wiring.source.now["/a"], mappings=(("publishers/out", ""), ("subscriptions/in", ""))
     )
     wiring.world.spawner.takes_s["/a map_to publishers/out"] = 2.0

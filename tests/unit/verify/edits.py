@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
+
+from msgspec.structs import replace
 
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.verify.observation import (
@@ -19,32 +20,29 @@ Edit = Callable[[Observation], Observation]
 
 def drop_node(name: str) -> Edit:
     """The node is not in the graph."""
-    return lambda seen: dataclasses.replace(
+    return lambda seen: replace(
         seen, nodes=tuple(each for each in seen.nodes if each.full_name != name)
     )
 
 
 def change_node(name: str, /, **fields: object) -> Edit:
     """The graph shows the node otherwise."""
-    return lambda seen: dataclasses.replace(
+    return lambda seen: replace(
         seen,
         nodes=tuple(
-            dataclasses.replace(each, **fields) if each.full_name == name else each
-            for each in seen.nodes
+            replace(each, **fields) if each.full_name == name else each for each in seen.nodes
         ),
     )
 
 
 def add_node(name: str, /, **fields: object) -> Edit:
     """The graph shows one more node."""
-    return lambda seen: dataclasses.replace(
-        seen, nodes=(*seen.nodes, ObservedNode(full_name=name, **fields))
-    )
+    return lambda seen: replace(seen, nodes=(*seen.nodes, ObservedNode(full_name=name, **fields)))
 
 
 def drop_endpoint(kind: EndpointKind, name: str) -> Edit:
     """Discovery does not show the endpoint."""
-    return lambda seen: dataclasses.replace(
+    return lambda seen: replace(
         seen,
         endpoints=tuple(each for each in seen.endpoints if (each.kind, each.name) != (kind, name)),
     )
@@ -52,10 +50,10 @@ def drop_endpoint(kind: EndpointKind, name: str) -> Edit:
 
 def change_endpoint(kind: EndpointKind, name: str, /, **fields: object) -> Edit:
     """Discovery shows the endpoint otherwise."""
-    return lambda seen: dataclasses.replace(
+    return lambda seen: replace(
         seen,
         endpoints=tuple(
-            dataclasses.replace(each, **fields) if (each.kind, each.name) == (kind, name) else each
+            replace(each, **fields) if (each.kind, each.name) == (kind, name) else each
             for each in seen.endpoints
         ),
     )
@@ -63,10 +61,10 @@ def change_endpoint(kind: EndpointKind, name: str, /, **fields: object) -> Edit:
 
 def change_announced_qos(kind: EndpointKind, name: str, /, **policies: object) -> Edit:
     """Discovery announces other policies."""
-    return lambda seen: dataclasses.replace(
+    return lambda seen: replace(
         seen,
         endpoints=tuple(
-            dataclasses.replace(each, qos=dataclasses.replace(each.qos, **policies))
+            replace(each, qos=replace(each.qos, **policies))
             if (each.kind, each.name) == (kind, name) and each.qos
             else each
             for each in seen.endpoints
@@ -77,7 +75,7 @@ def change_announced_qos(kind: EndpointKind, name: str, /, **policies: object) -
 def add_endpoint(kind: EndpointKind, node: str, name: str, /, **fields: object) -> Edit:
     """Discovery shows one more endpoint."""
     fields = {"type": "std_msgs/msg/String", **fields}
-    return lambda seen: dataclasses.replace(
+    return lambda seen: replace(
         seen,
         endpoints=(
             *seen.endpoints,
@@ -88,27 +86,24 @@ def add_endpoint(kind: EndpointKind, node: str, name: str, /, **fields: object) 
 
 def drop_report(name: str) -> Edit:
     """The node does not report."""
-    return lambda seen: dataclasses.replace(
+    return lambda seen: replace(
         seen, configurations=tuple(each for each in seen.configurations if each.name != name)
     )
 
 
 def change_configuration(name: str, /, **fields: object) -> Edit:
     """The node reports otherwise."""
-    return lambda seen: dataclasses.replace(
+    return lambda seen: replace(
         seen,
         configurations=tuple(
-            dataclasses.replace(each, **fields) if each.name == name else each
-            for each in seen.configurations
+            replace(each, **fields) if each.name == name else each for each in seen.configurations
         ),
     )
 
 
 def add_configuration(configuration: NodeConfiguration) -> Edit:
     """One more report."""
-    return lambda seen: dataclasses.replace(
-        seen, configurations=(*seen.configurations, configuration)
-    )
+    return lambda seen: replace(seen, configurations=(*seen.configurations, configuration))
 
 
 def _change_reports(
@@ -117,10 +112,10 @@ def _change_reports(
     change: Callable[[EndpointReport], tuple[EndpointReport, ...]],
 ) -> Edit:
     def edit(seen: Observation) -> Observation:
-        return dataclasses.replace(
+        return replace(
             seen,
             configurations=tuple(
-                dataclasses.replace(
+                replace(
                     each,
                     endpoints=tuple(
                         changed
@@ -141,7 +136,7 @@ def _change_reports(
 
 def change_report(kind: EndpointKind, resolved: str, /, **fields: object) -> Edit:
     """The node reports the endpoint otherwise."""
-    return _change_reports(kind, resolved, lambda report: (dataclasses.replace(report, **fields),))
+    return _change_reports(kind, resolved, lambda report: (replace(report, **fields),))
 
 
 def change_reported_qos(kind: EndpointKind, resolved: str, /, **policies: object) -> Edit:
@@ -149,9 +144,7 @@ def change_reported_qos(kind: EndpointKind, resolved: str, /, **policies: object
     return _change_reports(
         kind,
         resolved,
-        lambda report: (
-            dataclasses.replace(report, qos=dataclasses.replace(report.qos, **policies)),
-        ),
+        lambda report: (replace(report, qos=replace(report.qos, **policies)),),
     )
 
 

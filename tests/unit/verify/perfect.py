@@ -6,8 +6,9 @@ without history and depth, hidden nodes for extra participants, and a report fro
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
+
+from msgspec.structs import replace
 
 from lifecycle.manifest.model import EndpointKind, RunKind
 from lifecycle.manifest.qos import (
@@ -93,7 +94,7 @@ def settled(qos: QosProfile, kind: EndpointKind) -> QosProfile:
     }
     free = (Liveliness.SYSTEM_DEFAULT, Liveliness.BEST_AVAILABLE)
     deadline, lease = qos.deadline_ns, qos.liveliness_lease_duration_ns
-    return dataclasses.replace(
+    return replace(
         qos,
         history=History.KEEP_LAST if qos.history is History.SYSTEM_DEFAULT else qos.history,
         depth=qos.depth or 1,
@@ -107,7 +108,7 @@ def settled(qos: QosProfile, kind: EndpointKind) -> QosProfile:
 
 def announced(qos: QosProfile) -> QosProfile:
     """What Fast DDS's discovery tells of a profile: no history, no depth."""
-    return dataclasses.replace(qos, history=History.UNKNOWN, depth=0)
+    return replace(qos, history=History.UNKNOWN, depth=0)
 
 
 def _gid(node: PlannedNode, index: int) -> str:

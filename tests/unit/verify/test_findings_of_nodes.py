@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import NamedTuple
 
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.manifest.model import EndpointKind, EndpointPolicy, Policy, Run, RunKind
 from lifecycle.manifest.qos import QosProfile
@@ -49,7 +49,7 @@ TRIGGER = "std_srvs/srv/Trigger"
 HERE, OTHER = "RIHS01_" + "a" * 8, "RIHS01_" + "b" * 8
 
 PLAN = build_plan(teleop(), environment={})
-OPEN = dataclasses.replace(PLAN, policy=Policy(undeclared_nodes=EndpointPolicy.OPEN))
+OPEN = replace(PLAN, policy=Policy(undeclared_nodes=EndpointPolicy.OPEN))
 FOREIGN = planned(
     node("talker", publisher("chatter"), run=Run(kind=RunKind.ATTACH)),
     node("listener", subscription("chatter"), run=Run(kind=RunKind.ATTACH), managed=False),
@@ -72,15 +72,13 @@ def wired(plan: Plan, key: str, *urls: str) -> Plan:
                 connection="net",
                 connections=ParticipantConnections(urls=urls or ("udpv4://10.77.0.1:7911",)),
             )
-            each = dataclasses.replace(  # noqa: PLW2901
+            each = replace(  # noqa: PLW2901
                 each,
-                endpoints=tuple(
-                    dataclasses.replace(end, participant=net.name) for end in each.endpoints
-                ),
+                endpoints=tuple(replace(end, participant=net.name) for end in each.endpoints),
                 participants=(net,),
             )
         nodes.append(each)
-    return dataclasses.replace(plan, nodes=tuple(nodes))
+    return replace(plan, nodes=tuple(nodes))
 
 
 class Case(NamedTuple):
@@ -102,27 +100,25 @@ def findings_of(case: Case) -> list[Finding]:
 def defined(plan: Plan, installed: str) -> Plan:
     """The plan with this definition of every type installed here."""
     nodes = tuple(
-        dataclasses.replace(
+        replace(
             each,
-            endpoints=tuple(
-                dataclasses.replace(end, type_hash=installed) for end in each.endpoints
-            ),
+            endpoints=tuple(replace(end, type_hash=installed) for end in each.endpoints),
         )
         for each in plan.nodes
     )
-    return dataclasses.replace(plan, nodes=nodes)
+    return replace(plan, nodes=nodes)
 
 
 def twin(number: int) -> NodeConfiguration:
     """The report of a second node of the camera's name."""
     identity = Identity(machine_id="other", process_id=number, node_id=f"/robot/camera@{number}")
-    return dataclasses.replace(perfect(PLAN).configurations[0], identity=identity)
+    return replace(perfect(PLAN).configurations[0], identity=identity)
 
 
-FAR_CAMERA = dataclasses.replace(
+FAR_CAMERA = replace(
     PLAN,
     nodes=(
-        dataclasses.replace(PLAN.nodes[0], connections=ParticipantConnections(urls=("shm://",))),
+        replace(PLAN.nodes[0], connections=ParticipantConnections(urls=("shm://",))),
         PLAN.nodes[1],
     ),
 )
@@ -145,7 +141,7 @@ SAYS: dict[str, tuple[Case, list[str]]] = {
         ["violated graph.missing-node: /viewer, /viewer at 3:3"],
     ),
     "nodes are missing that others start": (
-        Case("graph.missing-node", lambda seen: dataclasses.replace(seen, nodes=()), FOREIGN),
+        Case("graph.missing-node", lambda seen: replace(seen, nodes=()), FOREIGN),
         [
             "violated graph.missing-node: /talker, /talker at 3:3",
             "violated graph.missing-node: /listener, /listener at 3:3",
@@ -543,7 +539,7 @@ def gone(name: str) -> Edit:
     return both(
         drop_node(name),
         drop_report(name),
-        lambda seen: dataclasses.replace(
+        lambda seen: replace(
             seen, endpoints=tuple(each for each in seen.endpoints if each.node != name)
         ),
     )
@@ -552,7 +548,7 @@ def gone(name: str) -> Edit:
 def reporting_itself(name: str, state: str) -> Edit:
     """A node that another program runs reports as ours do."""
     return add_configuration(
-        dataclasses.replace(perfect(PLAN).configurations[0], name=name, state=state, endpoints=())
+        replace(perfect(PLAN).configurations[0], name=name, state=state, endpoints=())
     )
 
 
@@ -632,12 +628,12 @@ SUBJECTS: dict[str, tuple[Case, list[str]]] = {
             "graph.type-definition-differs",
             both(
                 change_endpoint(PUB, STATUS, type_hash=OTHER),
-                lambda seen: dataclasses.replace(
+                lambda seen: replace(
                     seen,
                     endpoints=(
                         *seen.endpoints,
                         *(
-                            dataclasses.replace(each, node="/aa", gid=gid)
+                            replace(each, node="/aa", gid=gid)
                             for each in seen.endpoints
                             if (each.kind, each.name) == (PUB, STATUS)
                             for gid in ("98", "99")

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.manifest.model import EndpointKind, Machine, UniqueHow
 from lifecycle.network.nfe import (
@@ -159,8 +158,7 @@ def test_only_sockets_of_what_carries_a_flow_are_shown(carried_by, source, desti
     assert flow.effective_transport == carried_by
     assert (
         tuple(
-            tuple(dataclasses.replace(each, dscp=0) for each in end)
-            for end in (flow.source, flow.destination)
+            tuple(replace(each, dscp=0) for each in end) for end in (flow.source, flow.destination)
         )
         == used
     )

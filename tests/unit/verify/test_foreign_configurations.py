@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import threading
 from collections.abc import Callable
@@ -11,6 +10,7 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from lifecycle import codec
 from lifecycle.graph.status import NodeStatusError
@@ -226,7 +226,7 @@ def test_whatever_is_read_can_be_judged_and_written(data: st.DataObject) -> None
         found = decode_configuration(json.dumps(document), NAME)
     except ConfigurationError:
         return
-    seen = dataclasses.replace(SEEN, configurations=(found, *SEEN.configurations[1:]))
+    seen = replace(SEEN, configurations=(found, *SEEN.configurations[1:]))
     for stage in Stage:
         verdict = verify(PLAN, seen, stage=stage)
         for text in (render_text(verdict), to_junit(verdict, PLAN)):

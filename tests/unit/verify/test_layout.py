@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.plan.build import build_plan
@@ -85,8 +84,8 @@ def test_a_part_of_an_action_of_no_node_is_that_of_the_node_that_declares_the_ac
 def test_a_nameless_report_of_the_declared_type_is_chosen_where_discovery_shows_none() -> None:
     plan = connected("udpv4://10.0.0.1:7911")
     report = perfect(plan).configurations[0].endpoints[0]
-    right = dataclasses.replace(report, name="")
-    wrong = dataclasses.replace(right, type="std_msgs/msg/Int32", gid="99")
+    right = replace(report, name="")
+    wrong = replace(right, type="std_msgs/msg/Int32", gid="99")
     edit = both(drop_endpoint(PUB, "/a"), change_configuration("/one", endpoints=(wrong, right)))
     view = view_after(edit, plan)
     assert actual(view, PUB, "/a").report == right
@@ -104,9 +103,7 @@ def connected(url: str) -> Plan:
         node("two", subscription("a"), subscription("b"), machine="m2"),
     )
     connections = ParticipantConnections(urls=(url,))
-    return dataclasses.replace(
-        plan, nodes=tuple(dataclasses.replace(each, connections=connections) for each in plan.nodes)
-    )
+    return replace(plan, nodes=tuple(replace(each, connections=connections) for each in plan.nodes))
 
 
 # --- what is seen of topics

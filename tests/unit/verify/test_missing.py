@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.manifest.model import EndpointKind, Policy
 from lifecycle.plan.build import build_plan
@@ -62,7 +61,7 @@ def test_a_report_is_waited_for_but_not_what_only_the_report_could_prove():
 def test_an_unverifiable_finding_is_waited_for_only_where_it_blocks():
     edit = change_report(SUB, "/robot/status", qos=None)
     assert line(edit) == ""
-    strict = dataclasses.replace(PLAN, policy=Policy(unverifiable_blocks=True))
+    strict = replace(PLAN, policy=Policy(unverifiable_blocks=True))
     assert line(edit, strict) == "unknown: /viewer (graph.qos-unverifiable)"
 
 

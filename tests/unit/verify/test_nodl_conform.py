@@ -8,10 +8,10 @@ is `unverifiable` here.
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.export.captured import CapturedParameter, capture
 from lifecycle.export.manifest_yaml import to_nodl
@@ -80,7 +80,7 @@ def _plan(folder: Path, document: str = DOCUMENT) -> Plan:
 def _seen(plan: Plan, parameters: tuple[ParameterReport, ...] = HAS) -> Observation:
     """What runs: a node that has everything, and whose history is known as well."""
     seen = perfect(plan, Stage.ACTIVE)
-    seen = dataclasses.replace(seen, parameters=(NodeParameters(node=ARM, parameters=parameters),))
+    seen = replace(seen, parameters=(NodeParameters(node=ARM, parameters=parameters),))
     for kind, name, depth in ((PUB, PRIVATE, 5), (SUB, COMMAND, 1)):
         seen = change_announced_qos(kind, name, history=History.KEEP_LAST, depth=depth)(seen)
     return seen
@@ -201,7 +201,7 @@ def test_that_there_are_no_parameters_is_proven_or_unverifiable(
     tmp_path: Path, known: NodeParameters, outcomes: list[Outcome]
 ) -> None:
     plan = _plan(tmp_path, LESS)
-    seen = dataclasses.replace(_seen(plan), parameters=(known,))
+    seen = replace(_seen(plan), parameters=(known,))
     found = verify(plan, seen, stage=Stage.ACTIVE).findings
     assert [each.outcome for each in found] == outcomes
     assert all("that there are no parameters" in each.message for each in found)

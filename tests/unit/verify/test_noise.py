@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.verify.observation import ObservedEndpoint
@@ -188,14 +187,13 @@ def test_the_five_parts_of_an_action_server_fold_into_one_endpoint():
 def test_an_action_has_the_hashes_of_its_goal_result_and_feedback():
     told = {"send_goal": "g1 g2", "get_result": "r1 r2", "feedback": "f", "status": "s"}
     some = [
-        dataclasses.replace(part, type_hash=told.get(part.name.rpartition("/")[2], "c1 c2"))
-        for part in parts()
+        replace(part, type_hash=told.get(part.name.rpartition("/")[2], "c1 c2")) for part in parts()
     ]
     (action,) = fold_actions(some)
     assert action.type_hash == "g1 g2 r1 r2 f"
-    unseen = [dataclasses.replace(some[0], type_hash=None), *some[1:]]
+    unseen = [replace(some[0], type_hash=None), *some[1:]]
     assert fold_actions(unseen)[0].type_hash is None
-    unannounced = [dataclasses.replace(some[0], type_hash=""), *some[1:]]
+    unannounced = [replace(some[0], type_hash=""), *some[1:]]
     assert fold_actions(unannounced)[0].type_hash == ""
 
 
@@ -212,7 +210,7 @@ def test_parts_of_two_nodes_do_not_make_one_action():
 
 def test_parts_of_another_type_stay_beside_their_action():
     some = parts()
-    wrong = [dataclasses.replace(each, type="std_msgs/msg/String") for each in some[-2:]]
+    wrong = [replace(each, type="std_msgs/msg/String") for each in some[-2:]]
     action, *left = fold_actions([*some[:-2], *wrong])
     assert (action.type, left) == ("robot/action/Dock", wrong)
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.manifest.model import EndpointKind, FlowTransport
 from lifecycle.manifest.qos import QosProfile
@@ -38,7 +37,7 @@ CAMERA = configuration(
 
 
 def camera(**changes: object) -> NodeConfiguration:
-    return dataclasses.replace(CAMERA, **changes)
+    return replace(CAMERA, **changes)
 
 
 def own_endpoint(
@@ -49,7 +48,7 @@ def own_endpoint(
 
 
 def video(**changes: object) -> NodeConfiguration:
-    return camera(endpoints=(dataclasses.replace(VIDEO, **changes),))
+    return camera(endpoints=(replace(VIDEO, **changes),))
 
 
 def test_a_node_that_no_manifest_declares_takes_part_with_all_that_it_says():
@@ -126,16 +125,14 @@ def declared(**changes: object) -> PlannedNode:
         )
     )
     (only,) = plan.nodes
-    return dataclasses.replace(only, **{"participants": (), **changes})
+    return replace(only, **{"participants": (), **changes})
 
 
 def with_endpoint(**changes: object) -> PlannedNode:
     """The camera with its publisher declared otherwise."""
     only = declared()
     first, last = only.endpoints
-    return dataclasses.replace(
-        only, endpoints=(first, dataclasses.replace(last, participant="", **changes))
-    )
+    return replace(only, endpoints=(first, replace(last, participant="", **changes)))
 
 
 @pytest.mark.parametrize(
@@ -189,7 +186,7 @@ def test_that_data_bear_loss_is_the_nodes_hint_only_where_the_manifest_says_noth
 
 NET = ConnectionReport(name="net", urls=(URL,))
 BARE = ConnectionReport(name="bare")
-MAPPED = dataclasses.replace(VIDEO, connection="net", mapped=True)
+MAPPED = replace(VIDEO, connection="net", mapped=True)
 
 
 def test_connections_that_somebody_else_made_are_taken_and_what_is_on_them_stays():

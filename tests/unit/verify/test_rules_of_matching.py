@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.manifest.model import EndpointKind, EndpointPolicy, Policy
 from lifecycle.manifest.qos import QosProfile, Reliability
@@ -161,7 +160,7 @@ def second(node_name: str, **fields: object) -> Edit:
         first, other = next(
             each.endpoints for each in seen.configurations if each.name == node_name
         )
-        endpoints = (first, dataclasses.replace(other, **fields))
+        endpoints = (first, replace(other, **fields))
         return change_configuration(node_name, endpoints=endpoints)(seen)
 
     return edit
@@ -195,11 +194,10 @@ def test_one_endpoint_of_several_that_cannot_match_spoils_a_link():
     def edit(seen: Observation) -> Observation:
         last = [each for each in seen.endpoints if each.kind is PUB][-1]
         qos = QosProfile(reliability=Reliability.BEST_EFFORT)
-        return dataclasses.replace(
+        return replace(
             seen,
             endpoints=tuple(
-                dataclasses.replace(each, qos=qos) if each is last else each
-                for each in seen.endpoints
+                replace(each, qos=qos) if each is last else each for each in seen.endpoints
             ),
         )
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.manifest.model import EndpointKind, EndpointPolicy, Policy, Run, RunKind
 from lifecycle.manifest.qos import (
@@ -160,7 +159,7 @@ def test_rmws_system_default_leaves_the_durations_to_the_middleware_too():
 def test_a_profile_that_writes_one_policy_beside_defaults_is_compared(
     written: dict[str, object], found: list[str]
 ):
-    plan = pair(dataclasses.replace(SYSTEM, **written))
+    plan = pair(replace(SYSTEM, **written))
     lifespan = f"lifespan_ns {written.get('lifespan_ns', 'infinite')}"
     lifespan += " ns" if "lifespan_ns" in written else ""
     assert differing(OTHERWISE, plan) == [
@@ -316,7 +315,7 @@ def deadline(after_ns: int) -> QosProfile:
         ((BEST_EFFORT, BEST_EFFORT), (QosProfile(),), ["reliability BEST_EFFORT"]),
         ((BEST_EFFORT,), (QosProfile(), QosProfile()), ["reliability BEST_EFFORT"]),
         (
-            (dataclasses.replace(BEST_EFFORT, deadline_ns=9),),
+            (replace(BEST_EFFORT, deadline_ns=9),),
             (deadline(3),),
             ["reliability BEST_EFFORT", "deadline 9 ns"],
         ),

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.plan.model import ExpectedParameter, Plan
@@ -22,8 +21,8 @@ PUB = EndpointKind.PUBLISHER
 def simulated(plan: Plan) -> Plan:
     given = ExpectedParameter(name="use_sim_time", type="bool", value=True, optional=True, at=at(3))
     first, *rest = plan.nodes
-    user = dataclasses.replace(first, expected_parameters=(given,))
-    return dataclasses.replace(plan, nodes=(user, *rest))
+    user = replace(first, expected_parameters=(given,))
+    return replace(plan, nodes=(user, *rest))
 
 
 ALONE = planned(node("user", publisher("a")))

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from lifecycle.manifest.model import EndpointKind, UniqueHow
 from lifecycle.network.nfe import (
@@ -254,7 +254,7 @@ def test_answers_are_those_of_comparing_every_endpoint_with_every_other(ends):
             # What is not known hides no equal one but in its own process.
             if other != index and side is kind and (each is not None or place == process)
         ]
-        end = dataclasses.replace(END, report=reports[index])
+        end = replace(END, report=reports[index])
         assert uniqueness.is_unique(end) is by_comparing(located(nfes, process[0]), others)
 
 

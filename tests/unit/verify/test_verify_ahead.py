@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
+from msgspec.structs import replace
 
 from lifecycle.verify.judge import verify
 from lifecycle.verify.outcome import Outcome
@@ -15,14 +15,13 @@ PLAN = planned(node("one", publisher("a")), node("two", subscription("a")))
 
 def _with_active(name: str, state: str = "active", stage: Stage = Stage.CONNECTED):
     seen = perfect(PLAN, stage)
-    return dataclasses.replace(
+    return replace(
         seen,
         nodes=tuple(
-            dataclasses.replace(each, state=state) if each.full_name == name else each
-            for each in seen.nodes
+            replace(each, state=state) if each.full_name == name else each for each in seen.nodes
         ),
         configurations=tuple(
-            dataclasses.replace(each, state=state) if each.name == name else each
+            replace(each, state=state) if each.name == name else each
             for each in seen.configurations
         ),
     )

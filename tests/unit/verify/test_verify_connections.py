@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 
 import msgspec
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.manifest.model import (
     DataLayer,
@@ -45,10 +45,10 @@ FLOW = "/video: /camera → /viewer"
 def connected(each: PlannedNode, *urls: str) -> PlannedNode:
     """The node with its first endpoint on a connection `net`."""
     name = f"_{each.name}_net"
-    return dataclasses.replace(
+    return replace(
         each,
         endpoints=(
-            dataclasses.replace(each.endpoints[0], participant=name),
+            replace(each.endpoints[0], participant=name),
             *each.endpoints[1:],
         ),
         participants=(
@@ -75,10 +75,10 @@ def plan_of(*, medium: str = "", linked: bool = False, run: Run | None = None) -
             Machine(name="operator", address="10.77.0.2", at=at(2)),
         ),
     )
-    return dataclasses.replace(
+    return replace(
         plan,
         nodes=(connected(plan.nodes[0]), plan.nodes[1]),
-        flows=tuple(dataclasses.replace(each, medium=medium) for each in plan.flows),
+        flows=tuple(replace(each, medium=medium) for each in plan.flows),
     )
 
 
@@ -125,7 +125,7 @@ def told(edit: Edit, plan: Plan = PLAN) -> Finding:
 
 def with_urls(*urls: str, first_port: int = 7910) -> Plan:
     """The plan with these URLs of the connection."""
-    return dataclasses.replace(
+    return replace(
         PLAN,
         nodes=(connected(PLAN.nodes[0], *urls), PLAN.nodes[1]),
         discovery=msgspec.structs.replace(PLAN.discovery, first_port=first_port),
@@ -169,9 +169,9 @@ def test_what_a_node_has_after_a_restart_is_as_planned(
 def test_every_connection_and_mapping_of_a_node_is_judged() -> None:
     plain = PlannedParticipant(name="_camera_flow_0", dscp=None, reason="")
     (net,) = PLAN.nodes[0].participants
-    late = dataclasses.replace(net, name="_camera_late", connection="late")
-    camera = dataclasses.replace(PLAN.nodes[0], participants=(plain, net, late))
-    plan = dataclasses.replace(PLAN, nodes=(camera, PLAN.nodes[1]))
+    late = replace(net, name="_camera_late", connection="late")
+    camera = replace(PLAN.nodes[0], participants=(plain, net, late))
+    plan = replace(PLAN, nodes=(camera, PLAN.nodes[1]))
     edit = both(
         change_configuration("/camera", connections=()),
         change_report(PUB, "/video", connection="other"),
@@ -186,8 +186,8 @@ def test_every_connection_and_mapping_of_a_node_is_judged() -> None:
 
 def own_urls(*urls: str) -> Plan:
     """The plan with these URLs of the viewer's own participant."""
-    viewer = dataclasses.replace(PLAN.nodes[1], connections=ParticipantConnections(urls=urls))
-    return dataclasses.replace(PLAN, nodes=(PLAN.nodes[0], viewer))
+    viewer = replace(PLAN.nodes[1], connections=ParticipantConnections(urls=urls))
+    return replace(PLAN, nodes=(PLAN.nodes[0], viewer))
 
 
 OTHERS = tuple(ConnectionReport(name=name) for name in ("", "b", "a"))
@@ -301,23 +301,22 @@ def test_more_matches_than_the_graph_explains_are_found_beside_it() -> None:
 
 def test_an_endpoint_on_a_participant_that_anybody_can_see_must_be_seen() -> None:
     assert findings(drop_endpoint(SUB, "/video")) != []
-    plain = dataclasses.replace(
+    plain = replace(
         PLAN.nodes[0],
         participants=(),
-        endpoints=(dataclasses.replace(PLAN.nodes[0].endpoints[0], participant=""),),
+        endpoints=(replace(PLAN.nodes[0].endpoints[0], participant=""),),
     )
-    plan = dataclasses.replace(PLAN, nodes=(plain, PLAN.nodes[1]))
+    plan = replace(PLAN, nodes=(plain, PLAN.nodes[1]))
     assert findings(drop_endpoint(PUB, "/video"), plan) == [
         ("graph.missing-endpoint", "violated", "/video")
     ]
 
 
-BEYOND = dataclasses.replace(
+BEYOND = replace(
     PLAN,
     discovery_mode=DiscoveryMode.STATIC,
     nodes=tuple(
-        dataclasses.replace(each, connections=ParticipantConnections(urls=("shm://",)))
-        for each in PLAN.nodes
+        replace(each, connections=ParticipantConnections(urls=("shm://",))) for each in PLAN.nodes
     ),
 )
 NOTHING_OF_THE_CAMERA = both(HIDDEN, drop_node("/camera"), drop_report("/camera"))
@@ -368,17 +367,15 @@ def test_the_message_says_both_media() -> None:
 
 def test_a_medium_that_nobody_asked_for_is_only_expected() -> None:
     plan = planned(node("camera", publisher("video")), node("viewer", subscription("video")))
-    expected = dataclasses.replace(
-        plan, flows=tuple(dataclasses.replace(each, medium="udpv4") for each in plan.flows)
-    )
+    expected = replace(plan, flows=tuple(replace(each, medium="udpv4") for each in plan.flows))
     assert verify(expected, perfect(expected), stage=Stage.CONNECTED).verdict is Outcome.OK
-    asked = dataclasses.replace(expected, data_layer=DataLayer(at=at(5)))
+    asked = replace(expected, data_layer=DataLayer(at=at(5)))
     assert verify(asked, perfect(asked), stage=Stage.CONNECTED).verdict is Outcome.VIOLATED
 
 
 def test_an_endpoint_that_a_node_may_make_is_no_finding_but_listed() -> None:
-    camera = dataclasses.replace(PLAN.nodes[0], endpoint_policy=EndpointPolicy.OPEN)
-    plan = dataclasses.replace(PLAN, nodes=(camera, PLAN.nodes[1]))
+    camera = replace(PLAN.nodes[0], endpoint_policy=EndpointPolicy.OPEN)
+    plan = replace(PLAN, nodes=(camera, PLAN.nodes[1]))
     seen = add_endpoint(PUB, "/camera", "/news")(perfect(plan))
     verdict = verify(plan, seen, stage=Stage.CONNECTED)
     assert (verdict.verdict, verdict.findings) == (Outcome.OK, ())
@@ -417,7 +414,7 @@ def test_a_publisher_that_was_remapped_is_missing_whether_or_not_discovery_shows
 def test_a_connection_of_a_node_that_is_not_there_is_not_named_besides() -> None:
     def gone(seen: Observation) -> Observation:
         rest = tuple(each for each in seen.endpoints if each.node != "/_camera_net")
-        return dataclasses.replace(seen, endpoints=rest)
+        return replace(seen, endpoints=rest)
 
     absent = both(gone, HIDDEN, drop_node("/camera"), change_configuration("/camera", endpoints=()))
     edit = both(absent, change_configuration("/camera", connections=()))

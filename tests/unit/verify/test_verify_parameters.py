@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.manifest.diagnostics import Diagnostic, Position, Severity
 from lifecycle.manifest.model import ParameterValue, Run, RunKind
@@ -46,14 +45,14 @@ def has(value: ParameterValue | None, type_: str = "double", *, read_only: bool 
 def plan_of(*parameters: ExpectedParameter, run: Run = ATTACH, **rest: object) -> Plan:
     plan = planned(node("arm", run=run, managed=run is not ATTACH))
     (only,) = plan.nodes
-    only = dataclasses.replace(only, expected_parameters=parameters, **rest)
-    return dataclasses.replace(plan, nodes=(only,))
+    only = replace(only, expected_parameters=parameters, **rest)
+    return replace(plan, nodes=(only,))
 
 
 def served(plan: Plan, *reports: ParameterReport) -> Observation:
     """What is seen of a foreign node that answers."""
     seen = perfect(plan, Stage.ACTIVE)
-    return dataclasses.replace(seen, parameters=(NodeParameters(node="/arm", parameters=reports),))
+    return replace(seen, parameters=(NodeParameters(node="/arm", parameters=reports),))
 
 
 def judged(plan: Plan, seen: Observation) -> tuple[Finding, ...]:
@@ -147,7 +146,7 @@ def test_a_warning_of_check_is_a_finding_unless_the_graph_settles_it():
         Diagnostic(rule=rule, severity=Severity.WARNING, at=at, message="cannot")
         for rule in ("check.parameter-file-unmatched", "check.remap-unused", "check.qos-doubtful")
     ]
-    plan = dataclasses.replace(plan_of(), unproven=tuple(warnings))
+    plan = replace(plan_of(), unproven=tuple(warnings))
     found = judged(plan, served(plan))
     assert [each.rule for each in found] == ["param.reached-none", "declaration.unproven"]
     assert {(each.outcome, each.at) for each in found} == {(Outcome.UNVERIFIABLE, "p.yaml:2:3")}
@@ -169,8 +168,8 @@ def test_a_finding_names_both_values_and_where_the_demand_comes_from():
     seen = served(
         plan,
         has(99.0),
-        dataclasses.replace(has(2.0), name="limits"),
-        dataclasses.replace(has(float("inf")), name="unset"),
+        replace(has(2.0), name="limits"),
+        replace(has(float("inf")), name="unset"),
     )
     messages = "\n".join(each.message for each in judged(plan, seen))
     assert messages == (
@@ -264,7 +263,7 @@ def test_what_is_found_of_a_parameter_that_is(case: str):
 )
 def test_what_a_node_does_not_tell_is_one_unverifiable_finding(error: str, why: str):
     plan = plan_of(*(expected(name=f"p{number}") for number in range(10)))
-    seen = dataclasses.replace(
+    seen = replace(
         perfect(plan, Stage.ACTIVE), parameters=(NodeParameters(node="/arm", error=error),)
     )
     (finding,) = judged(plan, seen)
@@ -279,7 +278,7 @@ def test_a_node_that_nobody_asked_is_unverifiable_and_one_that_is_not_there_is_o
     plan = plan_of(expected())
     seen = perfect(plan, Stage.ACTIVE)
     assert [each.rule for each in judged(plan, seen)] == ["param.unverifiable"]
-    gone = dataclasses.replace(seen, nodes=())
+    gone = replace(seen, nodes=())
     assert [each.rule for each in judged(plan, gone)] == ["graph.missing-node"]
 
 
@@ -293,11 +292,9 @@ def reporting(plan: Plan, parameters: tuple[ParameterReport, ...] | None) -> Obs
     seen = perfect(plan, Stage.ACTIVE)
 
     def changed(each: NodeConfiguration) -> NodeConfiguration:
-        return dataclasses.replace(each, parameters=parameters)
+        return replace(each, parameters=parameters)
 
-    return dataclasses.replace(
-        seen, configurations=tuple(changed(each) for each in seen.configurations)
-    )
+    return replace(seen, configurations=tuple(changed(each) for each in seen.configurations))
 
 
 def test_nodes_of_ours_are_judged_by_their_report():
@@ -313,7 +310,7 @@ def test_nodes_of_ours_are_judged_by_their_report():
 
 def test_a_node_of_ours_without_a_report_has_no_second_finding():
     plan = plan_of(expected(), run=Run(kind=RunKind.PYTHON, python="robot:Arm"))
-    seen = dataclasses.replace(perfect(plan, Stage.ACTIVE), configurations=())
+    seen = replace(perfect(plan, Stage.ACTIVE), configurations=())
     assert [each.rule for each in judged(plan, seen)] == ["config.missing-report"]
 
 
@@ -370,7 +367,7 @@ OURS = Run(kind=RunKind.PYTHON, python="robot:Arm")
 
 def asked(seen: Observation, **answer: object) -> Observation:
     """What the parameter services say, beside what is in the report."""
-    return dataclasses.replace(seen, parameters=(NodeParameters(node="/arm", **answer),))
+    return replace(seen, parameters=(NodeParameters(node="/arm", **answer),))
 
 
 def test_the_services_of_a_node_of_ours_are_believed_only_where_its_report_has_no_parameters():
@@ -382,7 +379,7 @@ def test_the_services_of_a_node_of_ours_are_believed_only_where_its_report_has_n
 
 def test_a_node_of_ours_that_neither_reports_nor_answers_says_why():
     plan = plan_of(expected(), run=OURS)
-    seen = dataclasses.replace(perfect(plan, Stage.ACTIVE), configurations=())
+    seen = replace(perfect(plan, Stage.ACTIVE), configurations=())
     found = judged(plan, asked(seen, error="did not answer"))
     assert [
         (each.rule, each.message) for each in found if each.rule != "config.missing-report"

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 import random
 from collections import Counter
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import PRESETS
@@ -103,27 +103,25 @@ def test_no_dropped_fact_leaves_the_verdict_ok(plan: Plan, stage: Stage, data: s
     seen = perfect(plan, stage)
     planned_names = {each.full_name for each in plan.nodes}
     drops: list[Observation] = [
-        dataclasses.replace(seen, nodes=tuple(each for each in seen.nodes if each is not gone))
+        replace(seen, nodes=tuple(each for each in seen.nodes if each is not gone))
         for gone in seen.nodes
         if gone.full_name in planned_names
     ]
     drops += [
-        dataclasses.replace(
-            seen, endpoints=tuple(each for each in seen.endpoints if each is not gone)
-        )
+        replace(seen, endpoints=tuple(each for each in seen.endpoints if each is not gone))
         for gone in seen.endpoints
     ]
     drops += [
-        dataclasses.replace(
+        replace(
             seen, configurations=tuple(each for each in seen.configurations if each is not gone)
         )
         for gone in seen.configurations
     ]
     drops += [
-        dataclasses.replace(
+        replace(
             seen,
             configurations=tuple(
-                dataclasses.replace(
+                replace(
                     each, endpoints=tuple(report for report in each.endpoints if report is not gone)
                 )
                 for each in seen.configurations
@@ -145,7 +143,7 @@ def test_the_verdict_does_not_depend_on_the_order_of_what_was_seen(
 ):
     seen = perfect(plan)
     if seen.endpoints and data.draw(st.booleans()):
-        seen = dataclasses.replace(seen, endpoints=seen.endpoints[1:])
+        seen = replace(seen, endpoints=seen.endpoints[1:])
     chance = random.Random(seed)
 
     def shuffled(items: tuple) -> tuple:

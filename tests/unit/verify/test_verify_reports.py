@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import json
 from pathlib import Path
@@ -10,7 +9,9 @@ from typing import Any
 from xml.etree import ElementTree as ET
 
 import jsonschema
+import msgspec
 import pytest
+from msgspec.structs import replace
 
 from lifecycle import codec
 from lifecycle.manifest.model import EndpointKind, UniqueHow
@@ -174,8 +175,8 @@ def test_a_good_verdict_is_one_line_and_its_flows_with_the_tuples_that_carry_the
 
 def with_first_flow(**changes: object) -> Verdict:
     verdict = after(perfectly)
-    flow = dataclasses.replace(verdict.flows[0], **changes)
-    return dataclasses.replace(verdict, flows=(flow,))
+    flow = replace(verdict.flows[0], **changes)
+    return replace(verdict, flows=(flow,))
 
 
 def test_an_ipv6_flow_shows_its_flow_label_or_that_the_sender_sets_none():
@@ -273,7 +274,7 @@ ended after it was active, exit code 3: /one died; taken on trust: 1 depth
 
 
 def test_the_first_line_counts_the_findings_of_each_outcome_and_the_flows():
-    verdict = dataclasses.replace(
+    verdict = replace(
         WRITTEN,
         findings=(VIOLATED, VIOLATED, NOT_KNOWN, VIOLATED),
         flows=(*WRITTEN.flows, *WRITTEN.flows),
@@ -323,7 +324,7 @@ def test_a_schema_names_exactly_the_fields_of_its_type(name: str, definition: st
     document = schema(name)
     properties = (document["$defs"][definition] if definition else document)["properties"]
     # What its subject says is in no report.
-    assert set(properties) == {each.name for each in dataclasses.fields(type_)} - {"ends"}
+    assert set(properties) == {each.name for each in msgspec.structs.fields(type_)} - {"ends"}
 
 
 def test_a_node_configuration_fits_its_schema_and_one_with_an_unknown_key_does_not():
@@ -337,7 +338,7 @@ def test_a_node_configuration_fits_its_schema_and_one_with_an_unknown_key_does_n
 
 # --- the end of a run
 
-UNJUDGED = dataclasses.replace(
+UNJUDGED = replace(
     NOT_JUDGED,
     run=RunEnd(reason="interrupted; /talker is still configuring", reached=None, exit_code=130),
 )
@@ -389,7 +390,7 @@ def cases(verdict: Verdict, plan: Plan | None = PLAN, *, strict: bool = False) -
     return {name: "".join(tags) or "passed" for name, tags in found}
 
 
-INVALID = dataclasses.replace(
+INVALID = replace(
     UNJUDGED,
     verdict=Outcome.VIOLATED,
     findings=(
@@ -442,15 +443,15 @@ def test_what_may_be_unverifiable_neither_fails_nor_skips_a_test():
     assert "cannot verify the DSCP" in to_junit(unverifiable, PLAN)
     failed = [name for name, came in cases(unverifiable, strict=True).items() if came == "failure"]
     assert [each.partition("/")[0] for each in failed] == ["flow.dscp-unverifiable"]
-    policy = dataclasses.replace(PLAN.policy, unverifiable_blocks=True)
-    blocking = dataclasses.replace(PLAN, policy=policy)
+    policy = replace(PLAN.policy, unverifiable_blocks=True)
+    blocking = replace(PLAN, policy=policy)
     assert list(cases(unverifiable, blocking).values()).count("failure") == 1
 
 
 def test_what_refuses_nothing_is_placed_at_the_first_declaration():
-    first = dataclasses.replace(VIOLATED, outcome=Outcome.UNVERIFIABLE)
-    found = (first, dataclasses.replace(first, at="other.yaml:2:3"))
-    root = ET.fromstring(to_junit(dataclasses.replace(WRITTEN, findings=found, run=None), PLAN))
+    first = replace(VIOLATED, outcome=Outcome.UNVERIFIABLE)
+    found = (first, replace(first, at="other.yaml:2:3"))
+    root = ET.fromstring(to_junit(replace(WRITTEN, findings=found, run=None), PLAN))
     (case,) = (each for each in root.iter("testcase") if each.get("file"))
     assert (case.get("file"), case.get("line")) == ("my robot:1.yaml", "18")
 
@@ -466,10 +467,10 @@ def test_what_refuses_nothing_is_placed_at_the_first_declaration():
 def test_what_may_not_block_is_refused_by_who_is_strict_alone(
     rule: str, refuses: tuple[bool, bool]
 ):
-    found = dataclasses.replace(VIOLATED, rule=rule, outcome=Outcome.UNVERIFIABLE)
-    verdict = dataclasses.replace(WRITTEN, findings=(found,), run=None)
-    policy = dataclasses.replace(PLAN.policy, unverifiable_blocks=True)
-    blocking = dataclasses.replace(PLAN, policy=policy)
+    found = replace(VIOLATED, rule=rule, outcome=Outcome.UNVERIFIABLE)
+    verdict = replace(WRITTEN, findings=(found,), run=None)
+    policy = replace(PLAN.policy, unverifiable_blocks=True)
+    blocking = replace(PLAN, policy=policy)
     came = tuple(
         "failure" in cases(verdict, blocking, strict=strict).values() for strict in (False, True)
     )
@@ -478,7 +479,7 @@ def test_what_may_not_block_is_refused_by_who_is_strict_alone(
 
 def test_what_was_judged_before_a_run_failed_is_not_skipped():
     run = RunEnd(reason="failed: /camera (run.process-died)", reached="active", exit_code=6)
-    came = cases(dataclasses.replace(after(perfectly), run=run))
+    came = cases(replace(after(perfectly), run=run))
     assert {name for name, each in came.items() if each != "passed"} == {"run/end"}
 
 
@@ -495,7 +496,7 @@ def suite(text: str, name: str) -> str:
 
 
 def test_the_junit_of_a_manifest_and_of_a_run_is_spelled_so():
-    text = to_junit(dataclasses.replace(INVALID, run=None), None)
+    text = to_junit(replace(INVALID, run=None), None)
     assert text.startswith(
         '<?xml version="1.0" encoding="UTF-8"?>\n'
         f'<testsuites name="lifecycle verify" tests="{len(RULES) + 2}" failures="2"'
@@ -533,7 +534,7 @@ def test_the_junit_of_a_manifest_and_of_a_run_is_spelled_so():
 
 def test_the_junit_of_a_run_that_did_what_was_asked_for_says_how_it_ended():
     done = RunEnd(reason="done", reached="active", exit_code=0)
-    text = to_junit(dataclasses.replace(after(perfectly), run=done), PLAN)
+    text = to_junit(replace(after(perfectly), run=done), PLAN)
     assert suite(text, "run").splitlines()[-5:] == [
         '<testcase classname="run" name="end">',
         "<system-out>ended after it was active, exit code 0: done",
@@ -544,9 +545,9 @@ def test_the_junit_of_a_run_that_did_what_was_asked_for_says_how_it_ended():
 
 
 def test_the_junit_of_findings_and_flows_is_spelled_so():
-    first = dataclasses.replace(VIOLATED, outcome=Outcome.UNVERIFIABLE, message="cannot tell")
-    second = dataclasses.replace(VIOLATED, message="cannot accept that", at="other.yaml:2:3")
-    verdict = dataclasses.replace(WRITTEN, findings=(first, VIOLATED, second))
+    first = replace(VIOLATED, outcome=Outcome.UNVERIFIABLE, message="cannot tell")
+    second = replace(VIOLATED, message="cannot accept that", at="other.yaml:2:3")
+    verdict = replace(WRITTEN, findings=(first, VIOLATED, second))
     text = to_junit(verdict, PLAN)
     (case,) = (
         each
@@ -577,11 +578,9 @@ def test_the_junit_of_findings_and_flows_is_spelled_so():
     ]
     flows = ET.fromstring(text).find("testsuite[@name='flow']/system-out")
     assert flows.text == "/a: /one → /two: unverifiable\n"
-    both_flows = ET.fromstring(
-        to_junit(dataclasses.replace(verdict, flows=verdict.flows * 2), PLAN)
-    )
+    both_flows = ET.fromstring(to_junit(replace(verdict, flows=verdict.flows * 2), PLAN))
     assert both_flows.find("testsuite[@name='flow']/system-out").text == flows.text * 2
-    none = ET.fromstring(to_junit(dataclasses.replace(verdict, flows=()), PLAN))
+    none = ET.fromstring(to_junit(replace(verdict, flows=()), PLAN))
     assert none.find("testsuite[@name='flow']/system-out") is None
 
 
@@ -671,7 +670,7 @@ def test_the_sarif_of_a_verdict_is_spelled_so():
 
 def test_sarif_blames_the_end_of_a_run_only_where_no_finding_is_an_error():
     def results(**changes: object) -> list[dict]:
-        (run,) = json.loads(to_sarif(dataclasses.replace(WRITTEN, **changes)))["runs"]
+        (run,) = json.loads(to_sarif(replace(WRITTEN, **changes)))["runs"]
         return run["results"]
 
     assert [each["ruleId"] for each in results(findings=(NOT_KNOWN,))] == [
@@ -690,7 +689,7 @@ def test_sarif_blames_the_end_of_a_run_only_where_no_finding_is_an_error():
     assert results(findings=(), run=None) == []
     done = RunEnd(reason="done", reached="active", exit_code=0)
     assert results(findings=(), run=done) == []
-    (run,) = json.loads(to_sarif(dataclasses.replace(WRITTEN, run=done)))["runs"]
+    (run,) = json.loads(to_sarif(replace(WRITTEN, run=done)))["runs"]
     assert run["invocations"][0]["executionSuccessful"] is True
-    (run,) = json.loads(to_sarif(dataclasses.replace(WRITTEN, run=None)))["runs"]
+    (run,) = json.loads(to_sarif(replace(WRITTEN, run=None)))["runs"]
     assert "invocations" not in run

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.manifest.model import (
     EndpointKind,
@@ -98,7 +97,7 @@ FIRES: dict[str, tuple[Edit, list[str]]] = {
         both(
             drop_node("/viewer"),
             drop_report("/viewer"),
-            lambda seen: dataclasses.replace(
+            lambda seen: replace(
                 seen, endpoints=tuple(e for e in seen.endpoints if e.node != "/viewer")
             ),
         ),
@@ -327,7 +326,7 @@ SILENT: dict[str, Edit] = {
     "a subscription's lifespan, which DDS does not have": change_announced_qos(
         SUB, STATUS, lifespan_ns=5
     ),
-    "another order of everything": lambda seen: dataclasses.replace(
+    "another order of everything": lambda seen: replace(
         seen,
         nodes=seen.nodes[::-1],
         endpoints=seen.endpoints[::-1],
@@ -343,9 +342,9 @@ def test_no_rule_fires_on(case: str):
 
 def asking(health: Health) -> Plan:
     """The viewer is asked for its health."""
-    nodes = (PLAN.nodes[0], dataclasses.replace(PLAN.nodes[1], health=health))
+    nodes = (PLAN.nodes[0], replace(PLAN.nodes[1], health=health))
     assert nodes[1].key == "viewer"
-    return dataclasses.replace(PLAN, nodes=nodes)
+    return replace(PLAN, nodes=nodes)
 
 
 @pytest.mark.parametrize(
@@ -412,7 +411,7 @@ def test_a_node_that_has_ended_as_it_may_is_unverifiable_and_not_missing():
 
 
 def with_policy(**fields: object) -> Plan:
-    return dataclasses.replace(PLAN, policy=Policy(**fields))
+    return replace(PLAN, policy=Policy(**fields))
 
 
 def test_an_open_world_tolerates_nodes_and_endpoints_of_others():
@@ -530,9 +529,7 @@ def test_all_flows_of_which_nothing_is_reported_are_one_finding():
 
 
 def test_what_a_manifest_trusts_is_reported_and_does_not_count():
-    plan = dataclasses.replace(
-        foreign(), policy=Policy(trust=("flow.unreported",), unverifiable_blocks=True)
-    )
+    plan = replace(foreign(), policy=Policy(trust=("flow.unreported",), unverifiable_blocks=True))
     verdict = verify(plan, perfect(plan), stage=Stage.CONNECTED)
     assert (verdict.verdict, verdict.blocking) == (Outcome.OK, False)
     assert [each.rule for each in verdict.findings] == ["flow.unreported"]
@@ -551,7 +548,7 @@ def unwritten(*written: str) -> Plan:
         *(
             node(
                 key,
-                dataclasses.replace(end, qos_defaults=defaults),
+                replace(end, qos_defaults=defaults),
                 run=ATTACH,
                 managed=False,
             )
@@ -599,7 +596,7 @@ def test_a_written_depth_needs_keep_last_and_is_one_finding_for_all_endpoints_of
         node(
             "talker",
             *(
-                dataclasses.replace(publisher(name, line=line), qos_defaults=not_written(["depth"]))
+                replace(publisher(name, line=line), qos_defaults=not_written(["depth"]))
                 for name, line in (("a", 4), ("b", 5))
             ),
             run=ATTACH,
@@ -655,9 +652,9 @@ def defined(installed: str) -> Plan:
     plan = foreign()
     nodes = []
     for each in plan.nodes:
-        ends = (dataclasses.replace(end, type_hash=installed) for end in each.endpoints)
-        nodes.append(dataclasses.replace(each, endpoints=tuple(ends)))
-    return dataclasses.replace(plan, nodes=tuple(nodes))
+        ends = (replace(end, type_hash=installed) for end in each.endpoints)
+        nodes.append(replace(each, endpoints=tuple(ends)))
+    return replace(plan, nodes=tuple(nodes))
 
 
 def hashes(publishes: str | None, subscribes: str | None) -> Edit:
@@ -669,7 +666,7 @@ def hashes(publishes: str | None, subscribes: str | None) -> Edit:
 
 def test_a_stranger_of_another_definition_does_not_put_declared_ends_in_the_wrong():
     """No definition is installed here, and the stranger comes first by alphabet."""
-    plan = dataclasses.replace(defined(""), policy=Policy(undeclared_nodes=EndpointPolicy.OPEN))
+    plan = replace(defined(""), policy=Policy(undeclared_nodes=EndpointPolicy.OPEN))
     stranger = add_endpoint(PUB, "/a_guest", "/chatter", gid="99", type_hash=OTHER)
     verdict = verify(plan, both(hashes(HERE, HERE), stranger)(perfect(plan)), stage=Stage.CONNECTED)
     differing = [each for each in verdict.findings if each.rule == "graph.type-definition-differs"]
@@ -691,7 +688,7 @@ def test_without_any_hash_there_is_nothing_to_compare():
 
 def test_an_endpoint_that_only_the_report_tells_of_is_undeclared_already():
     camera = perfect(PLAN).configurations[0]
-    extra = dataclasses.replace(camera.endpoints[2], name="", resolved="/extra", gid="99")
+    extra = replace(camera.endpoints[2], name="", resolved="/extra", gid="99")
     edit = change_configuration("/robot/camera", endpoints=(*camera.endpoints, extra))
     assert findings_after(edit) == ["violated graph.undeclared-publisher: /extra"]
 
@@ -769,7 +766,7 @@ def test_a_late_name_of_a_service_is_that_of_the_node_on_its_participant_that_de
 def test_the_manifest_says_whose_nodes_may_listen(
     tolerated: tuple[str, ...], name: str, expected: Outcome
 ):
-    plan = dataclasses.replace(PLAN, policy=Policy(tolerated_nodes=tolerated))
+    plan = replace(PLAN, policy=Policy(tolerated_nodes=tolerated))
     seen = both(add_node(name), add_endpoint(SUB, name, STATUS, gid="99", qos=QosProfile(depth=0)))(
         perfect(plan)
     )
@@ -782,7 +779,7 @@ def test_the_manifest_says_whose_nodes_may_listen(
 
 
 def test_an_open_system_tolerates_who_publishes_too_and_says_so():
-    plan = dataclasses.replace(PLAN, policy=Policy(undeclared_nodes=EndpointPolicy.OPEN))
+    plan = replace(PLAN, policy=Policy(undeclared_nodes=EndpointPolicy.OPEN))
     seen = both(
         add_node("/guest"), add_endpoint(PUB, "/guest", STATUS, gid="99", qos=QosProfile())
     )(perfect(plan))

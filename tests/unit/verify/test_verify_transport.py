@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.manifest.model import DataLayer, EndpointKind, FlowTransport, Machine
 from lifecycle.network.nfe import (
@@ -196,7 +195,7 @@ def on_two_machines(*, declared: bool) -> Plan:
         node("one", subscription("a"), needs=[need(SUB, "a", STRICTLY)], machine="m1"),
         node("two", subscription("b"), needs=[need(SUB, "b", STRICTLY)], machine="m2"),
     )
-    return dataclasses.replace(plan, machines=MACHINES) if declared else plan
+    return replace(plan, machines=MACHINES) if declared else plan
 
 
 BOTH_BRIDGED = both(
@@ -323,10 +322,10 @@ def test_both_ends_of_a_flow_are_asked_which_process_they_are():
 def with_medium(medium: str, *, publishing: FlowTransport = FlowTransport.ANY) -> Plan:
     """A plan whose data layer somebody asked for, with this medium for the flow."""
     plan = pair(publishing, FlowTransport.ANY)
-    return dataclasses.replace(
+    return replace(
         plan,
         data_layer=DataLayer(at=at(5)),
-        flows=tuple(dataclasses.replace(each, medium=medium) for each in plan.flows),
+        flows=tuple(replace(each, medium=medium) for each in plan.flows),
     )
 
 
@@ -351,24 +350,22 @@ def test_a_flow_that_the_network_must_carry_is_found_wrong_once():
 def undecided() -> Plan:
     """A plan that only says which medium is expected."""
     plan = with_medium("shm")
-    return dataclasses.replace(plan, data_layer=DataLayer())
+    return replace(plan, data_layer=DataLayer())
 
 
 def with_end(plan: Plan, index: int, **changes: object) -> Plan:
     """The plan with the one endpoint of a node otherwise."""
     nodes = list(plan.nodes)
     (end,) = nodes[index].endpoints
-    nodes[index] = dataclasses.replace(
-        nodes[index], endpoints=(dataclasses.replace(end, **changes),)
-    )
-    return dataclasses.replace(plan, nodes=tuple(nodes))
+    nodes[index] = replace(nodes[index], endpoints=(replace(end, **changes),))
+    return replace(plan, nodes=tuple(nodes))
 
 
 def with_node(plan: Plan, index: int, **changes: object) -> Plan:
     """The plan with one node otherwise."""
     nodes = list(plan.nodes)
-    nodes[index] = dataclasses.replace(nodes[index], **changes)
-    return dataclasses.replace(plan, nodes=tuple(nodes))
+    nodes[index] = replace(nodes[index], **changes)
+    return replace(plan, nodes=tuple(nodes))
 
 
 NET = PlannedParticipant(name="_net", dscp=None, reason="", connection="net")

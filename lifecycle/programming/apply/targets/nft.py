@@ -9,7 +9,8 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
-from lifecycle import dataclasses
+from msgspec.structs import replace
+
 from lifecycle.errors import UsageError
 from lifecycle.programming.apply.ledger import Ledger, TargetRecord
 from lifecycle.programming.apply.target import (
@@ -188,7 +189,7 @@ class NftTarget:
         """Replace the table if anything differs."""
         marking, left_out = usable(rules, why_unmarked)
         if not marking:
-            return dataclasses.replace(self.remove(), left_out=left_out)
+            return replace(self.remove(), left_out=left_out)
         planned = self.plan(rules)
         recorded = self._ledger.record(KIND, self._scope) is not None
         if not planned.pending and recorded:

@@ -11,7 +11,8 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from lifecycle import dataclasses
+from msgspec.structs import replace
+
 from lifecycle.errors import UsageError
 from lifecycle.programming.apply.ledger import Ledger, TargetRecord
 from lifecycle.programming.apply.target import (
@@ -112,7 +113,7 @@ class TcTarget:
         """Bring qdisc, classes and table up to date."""
         planned, wanted, listing = self._planned(rules)
         if wanted is None:
-            return dataclasses.replace(self.remove(), left_out=planned.left_out)
+            return replace(self.remove(), left_out=planned.left_out)
         recorded = self._recorded()
         if not planned.pending and recorded:
             return planned

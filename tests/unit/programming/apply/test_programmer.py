@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.errors import UsageError
 from lifecycle.programming.apply import ledger as ledger_module
@@ -70,10 +70,10 @@ def test_another_plan_gives_the_same_flows_another_treatment(tmp_path: Path) -> 
     programs.update([report()], hold=True)
     before = plan()
     camera = before.node("camera")
-    video = dataclasses.replace(camera.endpoints[0], five_qi=82)
-    camera = dataclasses.replace(camera, endpoints=(video, *camera.endpoints[1:]))
+    video = replace(camera.endpoints[0], five_qi=82)
+    camera = replace(camera, endpoints=(video, *camera.endpoints[1:]))
 
-    programs.replan(dataclasses.replace(before, nodes=(camera, *before.nodes[1:])))
+    programs.replan(replace(before, nodes=(camera, *before.nodes[1:])))
     (changed,) = programs.update([report()], hold=True)
 
     assert [each.kind for each in changed.changes] == [ChangeKind.UPDATE]
@@ -291,9 +291,9 @@ def test_a_ledger_of_a_living_supervisor_is_no_orphan_and_of_a_dead_one_is(
     assert file.owner is not None
     assert file.owner.pid == os.getpid()
     assert not owner_is_dead(file)
-    dead = dataclasses.replace(file.owner, start_ticks=file.owner.start_ticks + 1)
-    assert owner_is_dead(dataclasses.replace(file, owner=dead))
-    assert owner_is_dead(dataclasses.replace(file, boot_id="another boot"))
+    dead = replace(file.owner, start_ticks=file.owner.start_ticks + 1)
+    assert owner_is_dead(replace(file, owner=dead))
+    assert owner_is_dead(replace(file, boot_id="another boot"))
     assert not owner_is_dead(LedgerFile())
 
 
@@ -308,8 +308,8 @@ def orphan(tmp_path: Path, server: NefServer, *, dead: bool) -> Path:
     if dead:
         written = ledger.read()
         assert written.owner is not None
-        owner = dataclasses.replace(written.owner, start_ticks=1)
-        text = ledger_module.to_json(dataclasses.replace(written, owner=owner))
+        owner = replace(written.owner, start_ticks=1)
+        text = ledger_module.to_json(replace(written, owner=owner))
         (directory / "programmed.json").write_bytes(text)
     return directory
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.programming.apply.ledger import Ledger
 from lifecycle.programming.apply.target import FlowChange, PartlyError, Target, TargetChanges
@@ -256,8 +257,8 @@ def test_a_pending_session_of_a_dead_run_is_found_and_removed(bench: Bench) -> N
     target = bench.make()
     target.apply([rule()])
     (record,) = bench.ledger.read().targets
-    died = dataclasses.replace(record.entries[0], id="")
-    bench.ledger.put(dataclasses.replace(record, entries=(died,)))
+    died = replace(record.entries[0], id="")
+    bench.ledger.put(replace(record, entries=(died,)))
 
     target.remove()
 

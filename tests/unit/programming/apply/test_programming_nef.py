@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.programming.apply.ledger import Ledger
 from lifecycle.programming.apply.target import ChangeKind, PartlyError, Target, TargetChanges
@@ -284,8 +285,8 @@ def test_a_server_error_leaves_a_pending_entry_that_the_next_apply_settles(bench
 def test_a_run_that_died_before_the_answer_is_found_and_removed_by_the_next(bench: Bench) -> None:
     bench.target.apply([rule()])
     (record,) = bench.ledger.read().targets
-    died = dataclasses.replace(record.entries[0], id="")
-    bench.ledger.put(dataclasses.replace(record, entries=(died,)))
+    died = replace(record.entries[0], id="")
+    bench.ledger.put(replace(record, entries=(died,)))
 
     bench.again().remove()
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 import shutil
 import subprocess
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.manifest.model import EndpointKind, Machine, UniqueHow
 from lifecycle.network.nfe import (
@@ -74,7 +74,7 @@ def report(topic: str = "/robot/video", **rest: object) -> FlowReport:
         transport="udp",
         outcome=Outcome.OK,
     )
-    return dataclasses.replace(ordinary, **rest)
+    return replace(ordinary, **rest)
 
 
 SHM = shared_memory()

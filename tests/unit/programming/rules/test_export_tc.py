@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import re
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.network.dscp import MAX_DSCP
 from lifecycle.programming.rules.tc import (
@@ -80,7 +80,7 @@ def test_a_removal_names_our_handle_so_that_nobody_elses_qdisc_goes() -> None:
 
 
 def test_ef_comes_first_and_less_than_best_effort_last() -> None:
-    rules = [dataclasses.replace(VIDEO, dscp=dscp, five_qi=None) for dscp in range(MAX_DSCP + 1)]
+    rules = [replace(VIDEO, dscp=dscp, five_qi=None) for dscp in range(MAX_DSCP + 1)]
     names = [each.name for each in classes_of(rules)]
     assert names[:4] == ["ef", "va", "dscp63", "dscp62"]
     assert names[-2:] == ["cs1", "le"]
@@ -89,13 +89,13 @@ def test_ef_comes_first_and_less_than_best_effort_last() -> None:
 
 
 def test_5qis_are_ranked_by_their_guarantee_and_then_their_priority() -> None:
-    rules = [dataclasses.replace(VIDEO, dscp=None, five_qi=each) for each in (9, 5, 4, 3, 85)]
+    rules = [replace(VIDEO, dscp=None, five_qi=each) for each in (9, 5, 4, 3, 85)]
     assert [each.name for each in classes_of(rules)] == ["5qi85", "5qi3", "5qi4", "5qi5", "5qi9"]
 
 
 def test_a_rule_without_dscp_and_5qi_and_one_of_df_stay_with_the_rest() -> None:
-    assert class_of(dataclasses.replace(VIDEO, dscp=None, five_qi=None)) is None
-    assert class_of(dataclasses.replace(VIDEO, dscp=0)) is None
+    assert class_of(replace(VIDEO, dscp=None, five_qi=None)) is None
+    assert class_of(replace(VIDEO, dscp=0)) is None
 
 
 def test_a_link_is_divided_without_remainder_lost_or_spent_twice() -> None:

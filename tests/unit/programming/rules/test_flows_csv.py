@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import csv
-import dataclasses
 import io
+
+from msgspec.structs import replace
 
 from lifecycle.manifest.model import UniqueHow
 from lifecycle.network.nfe import (
@@ -50,24 +51,24 @@ def test_a_flow_is_one_line_with_its_5_tuple_dscp_and_verdict() -> None:
 
 
 def test_a_pair_with_several_flows_has_one_line_each() -> None:
-    report = dataclasses.replace(VIDEO, destination=(nfe("10.0.0.2", 7001), nfe("10.1.0.2", 7001)))
+    report = replace(VIDEO, destination=(nfe("10.0.0.2", 7001), nfe("10.1.0.2", 7001)))
     assert [row["destination_address"] for row in rows(report)] == ["10.0.0.2", "10.1.0.2"]
 
 
 def test_an_ipv6_flow_has_its_label_in_five_hex_digits_or_says_that_none_is_set() -> None:
     def cell(flow_label: int) -> str:
-        source = dataclasses.replace(
+        source = replace(
             nfe("fd00::1", 7411), internet_protocol=InternetProtocol.IPV6, flow_label=flow_label
         )
-        end = dataclasses.replace(nfe("fd00::2", 7000), internet_protocol=InternetProtocol.IPV6)
-        (row,) = rows(dataclasses.replace(VIDEO, source=(source,), destination=(end,)))
+        end = replace(nfe("fd00::2", 7000), internet_protocol=InternetProtocol.IPV6)
+        (row,) = rows(replace(VIDEO, source=(source,), destination=(end,)))
         return row["flow_label"]
 
     assert (cell(0x12345), cell(0xABC), cell(0)) == ("0x12345", "0x00abc", "unset")
 
 
 def test_what_is_not_known_is_an_empty_cell_and_not_a_guess() -> None:
-    report = dataclasses.replace(
+    report = replace(
         VIDEO,
         source=(),
         destination=(),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import re
 import warnings
@@ -10,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 from openapi_core import OpenAPI
 from openapi_core.testing import MockRequest
 from openapi_core.validation.request.exceptions import InvalidRequestBody
@@ -128,13 +128,13 @@ def test_servers_differ_in_how_they_want_what_a_device_sends(
 def test_what_cannot_be_asked_for_is_named_with_its_reason(
     change: dict[str, object], reason: str
 ) -> None:
-    changed = dataclasses.replace(VIDEO, **change)
+    changed = replace(VIDEO, **change)
     assert reasons(nef_subscriptions([changed], nef())) == [reason]
 
 
 def test_a_default_class_takes_what_has_no_name() -> None:
     settings = nef(default_qos_reference="best")
-    changed = dataclasses.replace(VIDEO, five_qi=9)
+    changed = replace(VIDEO, five_qi=9)
     (request,) = nef_subscriptions([changed], settings).requests
     assert request.body["qosReference"] == "best"
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import re
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.network.dscp import MAX_DSCP
 from lifecycle.programming.rules.nftables import (
@@ -46,8 +46,7 @@ def test_nft_accepts_the_ruleset(tmp_path: Path) -> None:
 
 def test_nft_knows_how_every_dscp_is_spelled(tmp_path: Path) -> None:
     rules = [
-        dataclasses.replace(VIDEO, dscp=dscp, destination_port=1000 + dscp)
-        for dscp in range(MAX_DSCP + 1)
+        replace(VIDEO, dscp=dscp, destination_port=1000 + dscp) for dscp in range(MAX_DSCP + 1)
     ]
     file = tmp_path / "all.nft"
     file.write_text(render_nft(rules, system="all", digest=DIGEST), encoding="utf-8")
@@ -99,7 +98,7 @@ def test_without_rules_the_table_is_there_and_empty() -> None:
 
 
 def test_two_rules_of_one_5_tuple_are_one_element() -> None:
-    other = dataclasses.replace(VIDEO, names=(("/depth", "/robot/camera", "/viewer"),))
+    other = replace(VIDEO, names=(("/depth", "/robot/camera", "/viewer"),))
     elements = [
         line.strip()
         for line in render_nft([VIDEO, other], system="teleop", digest=DIGEST).splitlines()
@@ -114,7 +113,7 @@ def test_two_rules_of_one_5_tuple_are_one_element() -> None:
 
 
 def test_a_comment_that_nftables_would_not_keep_is_cut() -> None:
-    long = dataclasses.replace(VIDEO, names=((f'/{"é" * 100}"', "/robot/camera", "/viewer"),))
+    long = replace(VIDEO, names=((f'/{"é" * 100}"', "/robot/camera", "/viewer"),))
     (comment,) = re.findall(
         r'17910 comment "(.*)",', render_nft([long], system="teleop", digest=DIGEST)
     )

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import re
 
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.network.five_qi import dscp_mapping
 from lifecycle.network.nfe import TransportProtocol
@@ -163,8 +163,8 @@ def test_a_mapping_gives_the_dscp_where_only_a_5qi_is_asked_for() -> None:
     bare = plan()
     camera = bare.nodes[0]
     video, status = camera.endpoints[0], camera.endpoints[1]
-    changed = dataclasses.replace(camera, endpoints=(dataclasses.replace(video, dscp=None), status))
-    only_5qi = dataclasses.replace(bare, nodes=(changed, *bare.nodes[1:]))
+    changed = replace(camera, endpoints=(replace(video, dscp=None), status))
+    only_5qi = replace(bare, nodes=(changed, *bare.nodes[1:]))
     assert only(report(), plan=only_5qi).dscp is None
     mapping = dscp_mapping("azure_private_5g_core")
     assert only(report(), plan=only_5qi, mapping=mapping).dscp == 18
@@ -178,7 +178,7 @@ def test_flow_labels_are_given_to_ipv6_only_and_stay_with_the_5_tuple() -> None:
     assert only(v6, label_flows=True).flow_label == label
     assert only(v6).flow_label == 0
     assert only(report(), label_flows=True).flow_label == 0
-    moved = dataclasses.replace(v6, destination=(nfe("fd09::2", 7002),))
+    moved = replace(v6, destination=(nfe("fd09::2", 7002),))
     assert only(moved, label_flows=True).flow_label != label
 
 
@@ -215,12 +215,12 @@ def test_a_rule_that_no_filter_could_say_is_refused(
     change: dict[str, object], message: str
 ) -> None:
     with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
-        dataclasses.replace(VIDEO, **change)
+        replace(VIDEO, **change)
 
 
 def test_the_digest_is_equal_for_equal_rules_only() -> None:
-    assert rules_digest([VIDEO]) == rules_digest([dataclasses.replace(VIDEO)])
-    moved = dataclasses.replace(VIDEO, source_port=17999)
+    assert rules_digest([VIDEO]) == rules_digest([replace(VIDEO)])
+    moved = replace(VIDEO, source_port=17999)
     assert rules_digest([VIDEO]) != rules_digest([moved])
 
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import msgspec
 import pytest
+from msgspec.structs import replace
 
 from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import (
@@ -334,7 +334,7 @@ MODES = (Mode(name="all", at=HERE), Mode(name="less", inactive=("camera",), at=H
 
 
 def test_a_mode_takes_nodes_out_at_once_and_back_in_through_the_gate() -> None:
-    plan = dataclasses.replace(plan_of(planned_node("camera"), planned_node("viewer")), modes=MODES)
+    plan = replace(plan_of(planned_node("camera"), planned_node("viewer")), modes=MODES)
     play = Play(plan)
     play.see(INTRUDER)
     assert play.order(ControlRequest.MODE, mode="less") == ["camera deactivate"]
@@ -374,7 +374,7 @@ def test_a_manifest_is_applied_and_one_whose_node_fails_is_taken_back() -> None:
     ],
 )
 def test_a_violation_that_lasts_has_its_consequence(what: Consequence, asked: list[str]) -> None:
-    plan = dataclasses.replace(CHAIN, on_violation=(Reaction(rule=BY_DEFAULT, what=what),))
+    plan = replace(CHAIN, on_violation=(Reaction(rule=BY_DEFAULT, what=what),))
     play = Play(plan)
     play.see(INTRUDER)
     found = play.wait(1.0)
@@ -384,7 +384,7 @@ def test_a_violation_that_lasts_has_its_consequence(what: Consequence, asked: li
 
 def test_a_node_that_was_deactivated_for_a_violation_stays_so_until_it_is_resumed() -> None:
     reaction = Reaction(rule="param", what=Consequence.DEACTIVATE)
-    plan = dataclasses.replace(chain(), on_violation=(reaction,))
+    plan = replace(chain(), on_violation=(reaction,))
     play = Play(plan)
     play.see(("param.value-differs", "/viewer"))
     assert play.wait(1.0) == ["viewer deactivate"]

@@ -8,10 +8,11 @@ reading is used to check it: what nodes are is the world's, orders and verdicts 
 
 from __future__ import annotations
 
-import dataclasses
 import importlib
 import random
 from typing import Any
+
+from msgspec.structs import replace
 
 from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import (
@@ -97,19 +98,19 @@ def random_plan(r: random.Random) -> Plan:
         hosts = [each for each in nodes if not each.run.container]
         if kind is RunKind.ATTACH and hosts and r.random() < 0.5:
             loaded = {"component": "p/C", "container": r.choice(hosts).key}
-            node = dataclasses.replace(node, run=dataclasses.replace(node.run, **loaded))
+            node = replace(node, run=replace(node.run, **loaded))
         nodes.append(node)
     # Nodes of one process cannot wait for each other to start.
     plan = plan_of(*map(_startable(nodes), nodes))
     what = r.choice([*Consequence][:4])
     if what is not Consequence.MODE:
         reaction = Reaction(rule=BY_DEFAULT, what=what)
-        plan = dataclasses.replace(plan, on_violation=(reaction,))
+        plan = replace(plan, on_violation=(reaction,))
     modes = (
         Mode(name="all", at=HERE),
         Mode(name="some", inactive=tuple(each.key for each in nodes if r.random() < 0.4), at=HERE),
     )
-    return dataclasses.replace(plan, modes=modes) if r.random() < 0.5 else plan
+    return replace(plan, modes=modes) if r.random() < 0.5 else plan
 
 
 _KINDS = (
@@ -125,7 +126,7 @@ _KINDS = (
 def _startable(nodes: list[PlannedNode]) -> Any:
     def startable(node: PlannedNode) -> PlannedNode:
         after = tuple(each for each in node.after if each.condition is not Condition.STARTED)
-        return dataclasses.replace(node, after=after) if len(nodes) > 1 else node
+        return replace(node, after=after) if len(nodes) > 1 else node
 
     return startable
 
@@ -408,10 +409,10 @@ class World:
         r = self.r
         gone = {each.key for each in self.plan.nodes if r.random() < 0.15}
         nodes = [
-            dataclasses.replace(
+            replace(
                 each,
                 after=tuple(one for one in each.after if one.node not in gone),
-                run=dataclasses.replace(each.run, python=r.choice(["m:C", "m:D"])),
+                run=replace(each.run, python=r.choice(["m:C", "m:D"])),
             )
             for each in self.plan.nodes
             if each.key not in gone
@@ -421,10 +422,10 @@ class World:
         for each in nodes:
             self.level_of.setdefault(each.key, 0)
         modes = tuple(
-            dataclasses.replace(each, inactive=tuple(k for k in each.inactive if k not in gone))
+            replace(each, inactive=tuple(k for k in each.inactive if k not in gone))
             for each in self.plan.modes
         )
-        return dataclasses.replace(plan_of(*nodes), modes=modes)
+        return replace(plan_of(*nodes), modes=modes)
 
     def settle_down(self) -> None:
         """From now on nothing breaks, and what is wrong is over."""
