@@ -24,6 +24,7 @@ from lifecycle.graph.status import NodeStatus
 from lifecycle.manifest import written
 from lifecycle.network.dscp import MAX_DSCP, code_points
 from lifecycle.plan.model import Plan
+from lifecycle.supervisor.control.protocol import SystemStatus
 from lifecycle.supervisor.run.journal import JournalLine
 from lifecycle.verify.observation import NodeConfiguration
 from lifecycle.verify.verdict import Verdict
@@ -106,6 +107,17 @@ RESULTS = {
             "PlannedNode": (
                 *("managed", "parameters", "parameter_files", "remap", "after"),
                 *("timeouts", "log_level"),
+            ),
+        },
+    ),
+    "status": Result(
+        type_=SystemStatus,
+        title="Status of a running system (lifecycle status --format json)",
+        always={
+            "SystemStatus": ("not_ok", "mode", "manifest", "revision", "ends"),
+            "NodeStatus": (
+                *("unreported", "silent", "died", "connections", "uptime_s", "restarts"),
+                *("last_failure", "next_try_s", "cpu_s", "rss_bytes", "threads"),
             ),
         },
     ),

@@ -16,6 +16,7 @@ import click
 from lifecycle.cli.common import (
     NETWORKS,
     F,
+    asking,
     assignments_argument,
     export_option,
     format_option,
@@ -200,7 +201,11 @@ def _show(
     plan = _plan_of(target, assignments)
     if watch:
         with Watched(whole=format_ == "text") as shown:
-            follow_running(plan, lambda seen: shown.show(render_flows(seen.flows, format_)))
+            follow_running(
+                plan,
+                lambda seen: seen.verdict,
+                lambda verdict: shown.show(render_flows(verdict.flows, format_)),
+            )
         return ExitCode.OK
     asked = click.get_current_context().get_parameter_source("timeout")
     waits = asked is not click.core.ParameterSource.DEFAULT or supervisor_of(os.environ, plan, "")
@@ -219,10 +224,11 @@ def _plan_of(target: str, assignments: tuple[str, ...]) -> Plan:
     """Return the plan of a manifest, or that of a running system of this name."""
     if is_manifest(target) or target.endswith((".yaml", ".yml")):
         return load_plan(target, assignments)
-    from lifecycle.supervisor.run.looking import running_plan
+    from lifecycle.supervisor.control.client import look
 
     path, _ = target_plan(os.environ, target, assignments, "")
-    return running_plan(path)
+    with asking(path):
+        return look(path).plan
 
 
 def apply(

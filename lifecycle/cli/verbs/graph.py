@@ -60,6 +60,7 @@ def command(
             f"cannot print one {format_} picture after another", hint="give --output FILE"
         )
     path, plan = _found(target, assignments, machine)
+    from lifecycle.supervisor.control.client import look
     from lifecycle.supervisor.run import looking
 
     with Watched(whole=watch and output is None and format_ == "text") as shown:
@@ -74,14 +75,14 @@ def command(
         if path is not None:
             with asking(path):
                 if not watch:
-                    draw(looking.supervised_picture(path))
+                    draw(looking.picture_of(look(path)))
                 else:
                     for picture in looking.supervised_pictures(path):
                         draw(picture)
         elif plan is not None and watch:
-            looking.attached_pictures(plan, draw)
+            looking.follow_running(plan, lambda seen: seen.picture, draw)
         elif plan is not None:
-            picture = looking.attached_picture(plan, timeout_s=timeout)
+            picture = looking.judge_running(plan, timeout_s=timeout, strict=False).picture
             draw(picture)
             _say_if_empty(picture, plan)
     if path is not None and watch:

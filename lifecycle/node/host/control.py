@@ -78,18 +78,31 @@ class Command(msgspec.Struct, frozen=True, kw_only=True):
     """Supervisor → host.
 
     Attributes:
+        id: given as it is sent.
         node: fully qualified name.
         connection: name of a connection, for CONNECT_TO, MAP_TO and DISCONNECT_FROM.
         connections: what to connect to, for CONNECT_TO.
         endpoint: `publishers/video`, kind and declared name, for MAP_TO.
     """
 
-    id: int
+    id: int = 0
     node: str
     operation: Operation
     connection: str = ""
     connections: ParticipantConnections = ParticipantConnections()
     endpoint: str = ""
+
+    def __str__(self) -> str:
+        """Return what it asks as text, as it follows "cannot"."""
+        if self.operation is Operation.CONNECT_TO:
+            urls = ", ".join(self.connections.urls) or "no URL"
+            return f"connect {self.node!r} to {self.connection!r} ({urls})"
+        if self.operation is Operation.MAP_TO:
+            where = f"connection {self.connection!r}" if self.connection else "its own participant"
+            return f"map {self.endpoint!r} of {self.node!r} to {where}"
+        if self.operation is Operation.DISCONNECT_FROM:
+            return f"disconnect {self.node!r} from {self.connection!r}"
+        return f"{self.operation.value} {self.node!r}"
 
 
 class Event(msgspec.Struct, frozen=True, kw_only=True):

@@ -21,12 +21,11 @@ from msgspec.structs import replace
 from lifecycle.errors import BringUpError
 from lifecycle.graph.loop import set_within
 from lifecycle.manifest.model import Authority, Condition, DataLayerSource
-from lifecycle.node.host.control import Operation
+from lifecycle.node.host.control import Command, Operation
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.connections.desired_state import (
     ActualState,
     Instructions,
-    Step,
     not_wired,
     planned_instructions,
     steps,
@@ -394,7 +393,7 @@ class ConnectionAuthority:
         self,
         wiring: _Wiring,
         interface: NodeDriver | NodeInterfaceClient,
-        missing: Iterable[Step],
+        missing: Iterable[Command],
         node: NodeRun | None,
     ) -> None:
         """Make steps in order; the first that fails ends it."""

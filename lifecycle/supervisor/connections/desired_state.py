@@ -12,7 +12,7 @@ from collections.abc import Collection, Mapping
 
 import msgspec
 
-from lifecycle.node.host.control import Operation
+from lifecycle.node.host.control import Command, Operation
 from lifecycle.plan.model import ParticipantConnections, PlannedNode
 from lifecycle.verify.observation import NodeConfiguration
 from lifecycle.verify.outcome import Outcome
@@ -46,7 +46,7 @@ class ActualState(msgspec.Struct, frozen=True, kw_only=True):
     connections: tuple[tuple[str, tuple[str, ...]], ...] = ()
     mappings: tuple[tuple[str, str], ...] = ()
 
-    def after(self, step: Step) -> ActualState:
+    def after(self, step: Command) -> ActualState:
         """Return what the node has once `step` was made."""
         connections, mappings = dict(self.connections), dict(self.mappings)
         if step.operation is Operation.CONNECT_TO:
@@ -57,26 +57,6 @@ class ActualState(msgspec.Struct, frozen=True, kw_only=True):
             connections.pop(step.connection, None)
             mappings = {end: name for end, name in mappings.items() if name != step.connection}
         return ActualState(connections=tuple(connections.items()), mappings=tuple(mappings.items()))
-
-
-class Step(msgspec.Struct, frozen=True, kw_only=True):
-    """One request to one node: CONNECT_TO, MAP_TO or DISCONNECT_FROM."""
-
-    node: str
-    operation: Operation
-    connection: str
-    connections: ParticipantConnections = ParticipantConnections()
-    endpoint: str = ""
-
-    def __str__(self) -> str:
-        """Return the step as text, as it follows "cannot"."""
-        if self.operation is Operation.CONNECT_TO:
-            urls = ", ".join(self.connections.urls) or "no URL"
-            return f"connect {self.node!r} to {self.connection!r} ({urls})"
-        if self.operation is Operation.MAP_TO:
-            where = f"connection {self.connection!r}" if self.connection else "its own participant"
-            return f"map {self.endpoint!r} of {self.node!r} to {where}"
-        return f"disconnect {self.node!r} from {self.connection!r}"
 
 
 def planned_instructions(node: PlannedNode) -> Instructions:
@@ -117,7 +97,7 @@ def wired(configuration: NodeConfiguration) -> ActualState:
 
 def steps(
     wanted: Instructions, has: ActualState, *, ours: Collection[str] = ()
-) -> tuple[Step, ...]:
+) -> tuple[Command, ...]:
     """Return what is missing, in the order in which it is made: make before break.
 
     A connection whose URLs differ cannot be had twice under one name: it alone is broken first.
@@ -127,9 +107,9 @@ def steps(
         has: what is.
         ours: names of connections that this authority made; others are not its to break.
     """
-    step = functools.partial(Step, node=wanted.node)
+    step = functools.partial(Command, node=wanted.node)
     connections = dict(has.connections)
-    made: list[Step] = []
+    made: list[Command] = []
     stale: set[str] = set()
     for name, how in wanted.connections:
         if connections.get(name) == how.urls:

@@ -15,7 +15,7 @@ import msgspec
 
 from lifecycle.errors import BringUpError
 from lifecycle.manifest.model import RunKind
-from lifecycle.node.host.control import Operation
+from lifecycle.node.host.control import Command, Operation
 from lifecycle.supervisor.health.liveliness import Cause
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.control_channel import ControlChannel
@@ -226,7 +226,7 @@ class PeerSupervisors:
         async def have(channel: ControlChannel, node: str) -> None:
             # One that ends meanwhile has nothing to do any more.
             with contextlib.suppress(BringUpError):
-                await channel.request(node, operation)
+                await channel.request(Command(node=node, operation=operation))
 
         await asyncio.gather(
             *(

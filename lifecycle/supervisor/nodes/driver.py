@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from lifecycle.errors import BringUpError, MiddlewareError
-from lifecycle.node.host.control import Operation
+from lifecycle.node.host.control import Command, Operation
 from lifecycle.plan.model import PlannedNode
-from lifecycle.supervisor.connections.desired_state import Step
 from lifecycle.supervisor.gate.gate import Permit
 from lifecycle.supervisor.processes.control_channel import ControlChannel
 from lifecycle.verify.observation import NodeConfiguration
@@ -79,7 +78,7 @@ class ControlDriver:
             ChangedError: see there; what it is now is reported.
             BringUpError: the node refused or failed, or cannot be reached.
         """
-        reply = await self._channel.request(self._node, operation, permit)
+        reply = await self._channel.request(Command(node=self._node, operation=operation), permit)
         if not reply.ok:
             reason = reply.error or f"the node is {reply.state or 'in an unknown state'}"
             kind = ChangedError if reply.changed else BringUpError
@@ -96,19 +95,13 @@ class ControlDriver:
         """Ask the host what the node can be wired by."""
         return await self.configuration()
 
-    async def wire(self, step: Step) -> NodeConfiguration | None:
+    async def wire(self, step: Command) -> NodeConfiguration | None:
         """Send the step and wait for the reply.
 
         Raises:
             BringUpError: the node refused or failed, or cannot be reached.
         """
-        reply = await self._channel.request(
-            self._node,
-            step.operation,
-            connection=step.connection,
-            connections=step.connections,
-            endpoint=step.endpoint,
-        )
+        reply = await self._channel.request(step)
         if not reply.ok:
             raise BringUpError(f"cannot {step}: {reply.error or 'the node gives no reason'}")
         return reply.configuration
@@ -163,7 +156,7 @@ class NodeInterfaceClient:
         except MiddlewareError as error:
             raise BringUpError(error.message, hint=error.hint) from error
 
-    async def wire(self, step: Step) -> NodeConfiguration | None:
+    async def wire(self, step: Command) -> NodeConfiguration | None:
         """Call the node interface's service, and read what came of it.
 
         Raises:

@@ -11,11 +11,12 @@ import contextlib
 import socket
 from collections.abc import Callable
 
+from msgspec.structs import replace
+
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import BringUpError
 from lifecycle.middleware.process.busy_sign import BusySign, Overdue
 from lifecycle.node.host.control import Command, Event, HostSpec, Operation
-from lifecycle.plan.model import ParticipantConnections
 from lifecycle.supervisor.gate.gate import Permit
 
 _LONGEST_LINE = 1 << 24
@@ -121,38 +122,20 @@ class ControlChannel:
         """
         await asyncio.shield(self._ready)
 
-    def _tell(self, operation: Operation) -> None:
-        """Send what is not answered."""
-        if self._writer is not None:
-            command = Command(id=0, node="", operation=operation)
-            self._writer.write(to_json(command) + b"\n")
-
-    async def request(
-        self,
-        node: str,
-        operation: Operation,
-        permit: Permit | None = None,
-        *,
-        connection: str = "",
-        connections: ParticipantConnections = ParticipantConnections(),
-        endpoint: str = "",
-    ) -> Event:
+    async def request(self, command: Command, permit: Permit | None = None) -> Event:
         """Ask one node for one operation and wait for its reply.
 
         Args:
-            node: fully qualified name.
-            operation: what to do.
+            command: what to do.
             permit: needed for ACTIVATE, and for nothing else.
-            connection: of the node interface's operations, see Command.
-            connections: likewise.
-            endpoint: likewise.
 
         Raises:
             ChannelClosedError: the host ended before it replied.
             BringUpError: an activate request without a permit that holds.
             VerificationError: what changed since the permit's verdict does not allow it.
         """
-        if operation is Operation.ACTIVATE:
+        node = command.node
+        if command.operation is Operation.ACTIVATE:
             if permit is None:
                 raise BringUpError(f"cannot activate {node!r} without a permit from the gate")
             await permit.use(node)
@@ -161,21 +144,14 @@ class ControlChannel:
                 f"cannot reach {node!r}: its process closed the control channel"
             )
         self._next += 1
-        command = Command(
-            id=self._next,
-            node=node,
-            operation=operation,
-            connection=connection,
-            connections=connections,
-            endpoint=endpoint,
-        )
+        number = self._next
         reply: asyncio.Future[Event] = asyncio.get_running_loop().create_future()
-        self._replies[command.id] = reply
-        self._writer.write(to_json(command) + b"\n")
+        self._replies[number] = reply
+        self._writer.write(to_json(replace(command, id=number)) + b"\n")
         try:
             return await reply
         finally:
-            self._replies.pop(command.id, None)
+            self._replies.pop(number, None)
 
     async def _read(self, reader: asyncio.StreamReader) -> None:
         reason = "its process closed the control channel"
@@ -237,8 +213,8 @@ class ControlChannel:
         """End it in order, which makes the host shut down."""
         self._watch_no_more()
         if self._writer is not None:
-            self._tell(Operation.END)
             writer, self._writer = self._writer, None
+            writer.write(to_json(Command(node="", operation=Operation.END)) + b"\n")
             writer.close()
             closed = asyncio.ensure_future(writer.wait_closed())
             await asyncio.wait({closed}, timeout=_CLOSE_S)

@@ -8,24 +8,31 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar, Union, get_args
+from typing import Any
 
 import msgspec
 
-from lifecycle.codec import to_plain
 from lifecycle.node.host.control import Operation
 from lifecycle.supervisor.control.protocol import Failed, ProcessState, Reach
 from lifecycle.verify.verdict import Stage, Verdict
 
 
-class RunStarted(msgspec.Struct, frozen=True, kw_only=True):
+class Event(msgspec.Struct, frozen=True, kw_only=True, tag_field="event"):
+    """What happened in a run; its JSON names its kind as `event`."""
+
+    @property
+    def kind(self) -> str:
+        """Its name in JSON."""
+        return str(self.__struct_config__.tag)
+
+
+class RunStarted(Event, frozen=True, kw_only=True, tag="run"):
     """A supervisor took charge of a system.
 
     Attributes:
         log_directory: where each process's output is kept.
     """
 
-    kind: ClassVar[str] = "run"
     system: str
     domain_id: int
     rmw: str
@@ -35,7 +42,7 @@ class RunStarted(msgspec.Struct, frozen=True, kw_only=True):
     log_directory: str
 
 
-class ProcessChanged(msgspec.Struct, frozen=True, kw_only=True):
+class ProcessChanged(Event, frozen=True, kw_only=True, tag="process"):
     """A process changed its state.
 
     Attributes:
@@ -43,22 +50,20 @@ class ProcessChanged(msgspec.Struct, frozen=True, kw_only=True):
         detail: how it ended, `exit status 1`, `killed by SIGKILL`; else empty.
     """
 
-    kind: ClassVar[str] = "process"
     process: str
     state: ProcessState
     pid: int = 0
     detail: str = ""
 
 
-class RequestSent(msgspec.Struct, frozen=True, kw_only=True):
+class RequestSent(Event, frozen=True, kw_only=True, tag="request"):
     """A request to one node is about to be sent; what the gate's promise is checked against."""
 
-    kind: ClassVar[str] = "request"
     node: str
     operation: Operation
 
 
-class NodeChanged(msgspec.Struct, frozen=True, kw_only=True):
+class NodeChanged(Event, frozen=True, kw_only=True, tag="node"):
     """A node came a step further, or its state changed.
 
     Attributes:
@@ -66,14 +71,13 @@ class NodeChanged(msgspec.Struct, frozen=True, kw_only=True):
         state: lifecycle_msgs/State label; empty for a node that is not managed.
     """
 
-    kind: ClassVar[str] = "node"
     node: str
     reach: Reach
     state: str = ""
     connected: bool = False
 
 
-class WiringChanged(msgspec.Struct, frozen=True, kw_only=True):
+class WiringChanged(Event, frozen=True, kw_only=True, tag="wiring"):
     """The authority made a connection or a mapping, unmade one, or failed to.
 
     Attributes:
@@ -85,7 +89,6 @@ class WiringChanged(msgspec.Struct, frozen=True, kw_only=True):
         error: why it could not be made; empty if it was.
     """
 
-    kind: ClassVar[str] = "wiring"
     node: str
     operation: Operation
     connection: str = ""
@@ -95,7 +98,7 @@ class WiringChanged(msgspec.Struct, frozen=True, kw_only=True):
     error: str = ""
 
 
-class WiringLost(msgspec.Struct, frozen=True, kw_only=True):
+class WiringLost(Event, frozen=True, kw_only=True, tag="lost"):
     """A connection or a mapping that the authority had made is no more.
 
     Attributes:
@@ -103,13 +106,12 @@ class WiringLost(msgspec.Struct, frozen=True, kw_only=True):
         endpoint: `publishers/video`, of a mapping; empty for a connection.
     """
 
-    kind: ClassVar[str] = "lost"
     node: str
     connection: str = ""
     endpoint: str = ""
 
 
-class NodeSilent(msgspec.Struct, frozen=True, kw_only=True):
+class NodeSilent(Event, frozen=True, kw_only=True, tag="silent"):
     """Nothing can be expected of a node any more, though it has not left.
 
     Attributes:
@@ -117,13 +119,12 @@ class NodeSilent(msgspec.Struct, frozen=True, kw_only=True):
             "lost" from the network, or "told" by its own supervisor.
     """
 
-    kind: ClassVar[str] = "silent"
     node: str
     cause: str
     message: str
 
 
-class NodeAlive(msgspec.Struct, frozen=True, kw_only=True):
+class NodeAlive(Event, frozen=True, kw_only=True, tag="alive"):
     """A node is not silent any more.
 
     Attributes:
@@ -132,27 +133,24 @@ class NodeAlive(msgspec.Struct, frozen=True, kw_only=True):
             over, and no more is known.
     """
 
-    kind: ClassVar[str] = "alive"
     node: str
     silent_s: float
     there: bool = True
 
 
-class NodeJoined(msgspec.Struct, frozen=True, kw_only=True):
+class NodeJoined(Event, frozen=True, kw_only=True, tag="joined"):
     """A node is in the graph that was not there when it was last looked at."""
 
-    kind: ClassVar[str] = "joined"
     node: str
 
 
-class NodeLeft(msgspec.Struct, frozen=True, kw_only=True):
+class NodeLeft(Event, frozen=True, kw_only=True, tag="left"):
     """A node is not in the graph any more; what is silent leaves it when its DDS lease is over."""
 
-    kind: ClassVar[str] = "left"
     node: str
 
 
-class MachineConnection(msgspec.Struct, frozen=True, kw_only=True):
+class MachineConnection(Event, frozen=True, kw_only=True, tag="connection"):
     """The supervisor of another machine is connected, or not any more.
 
     Attributes:
@@ -162,48 +160,44 @@ class MachineConnection(msgspec.Struct, frozen=True, kw_only=True):
         left: its supervisor was shut down and said so; else the connection was lost.
     """
 
-    kind: ClassVar[str] = "connection"
     machine: str
     established: bool
     lost_s: float = 0.0
     left: bool = False
 
 
-class LogLine(msgspec.Struct, frozen=True, kw_only=True):
+class LogLine(Event, frozen=True, kw_only=True, tag="log"):
     """One line that a process wrote.
 
     Attributes:
         stream: "stdout" or "stderr".
     """
 
-    kind: ClassVar[str] = "log"
     process: str
     stream: str
     line: str
 
 
-class VerdictChanged(msgspec.Struct, frozen=True, kw_only=True):
+class VerdictChanged(Event, frozen=True, kw_only=True, tag="verdict"):
     """The running system was judged and the result differs from the one before."""
 
-    kind: ClassVar[str] = "verdict"
     stage: Stage
     verdict: Verdict
 
 
-class GateOpened(msgspec.Struct, frozen=True, kw_only=True):
+class GateOpened(Event, frozen=True, kw_only=True, tag="gate"):
     """The verdict lets the system activate.
 
     Attributes:
         trusted: what could not be verified and is taken on trust, in one line; empty if nothing.
     """
 
-    kind: ClassVar[str] = "gate"
     outcome: str
     nodes: tuple[str, ...]
     trusted: str = ""
 
 
-class SystemReached(msgspec.Struct, frozen=True, kw_only=True):
+class SystemReached(Event, frozen=True, kw_only=True, tag="system"):
     """The whole system is connected, verified or active.
 
     Attributes:
@@ -211,12 +205,11 @@ class SystemReached(msgspec.Struct, frozen=True, kw_only=True):
         elapsed_s: since the supervisor started.
     """
 
-    kind: ClassVar[str] = "system"
     reached: str
     elapsed_s: float
 
 
-class StageTimed(msgspec.Struct, frozen=True, kw_only=True):
+class StageTimed(Event, frozen=True, kw_only=True, tag="stage"):
     """How long a stage of bring-up took; `up --timings` has one of each once bring-up is over.
 
     Attributes:
@@ -227,14 +220,13 @@ class StageTimed(msgspec.Struct, frozen=True, kw_only=True):
         last: name of the node that was the last to come so far, where it was a node's to do.
     """
 
-    kind: ClassVar[str] = "stage"
     stage: str
     took_s: float
     elapsed_s: float
     last: str = ""
 
 
-class Failure(msgspec.Struct, frozen=True, kw_only=True):
+class Failure(Event, frozen=True, kw_only=True, tag="failure"):
     """A step that failed, or a process that ended unasked; the last verdict has it as a finding.
 
     Attributes:
@@ -245,7 +237,6 @@ class Failure(msgspec.Struct, frozen=True, kw_only=True):
         ends_run: the run ends for it; not so under --keep-going, and where it is started again.
     """
 
-    kind: ClassVar[str] = "failure"
     rule: str
     subject: str
     message: str
@@ -254,7 +245,7 @@ class Failure(msgspec.Struct, frozen=True, kw_only=True):
     ends_run: bool = True
 
 
-class RestartScheduled(msgspec.Struct, frozen=True, kw_only=True):
+class RestartScheduled(Event, frozen=True, kw_only=True, tag="backoff"):
     """A process failed that is to be started again; until then it is in backoff.
 
     Attributes:
@@ -265,7 +256,6 @@ class RestartScheduled(msgspec.Struct, frozen=True, kw_only=True):
         in_s: seconds until it is.
     """
 
-    kind: ClassVar[str] = "backoff"
     process: str
     nodes: tuple[str, ...]
     reason: str
@@ -274,7 +264,7 @@ class RestartScheduled(msgspec.Struct, frozen=True, kw_only=True):
     in_s: float
 
 
-class Restarted(msgspec.Struct, frozen=True, kw_only=True):
+class Restarted(Event, frozen=True, kw_only=True, tag="restarted"):
     """A process that failed is as far again as the system is: active and verified, or paused.
 
     Attributes:
@@ -283,27 +273,25 @@ class Restarted(msgspec.Struct, frozen=True, kw_only=True):
         took_s: since its failure.
     """
 
-    kind: ClassVar[str] = "restarted"
     process: str
     nodes: tuple[str, ...]
     restarts: int
     took_s: float
 
 
-class GaveUp(msgspec.Struct, frozen=True, kw_only=True):
+class GaveUp(Event, frozen=True, kw_only=True, tag="gave_up"):
     """A process failed too often to be started again; the run ends for it.
 
     Attributes:
         history: its failures, the last at the end.
     """
 
-    kind: ClassVar[str] = "gave_up"
     process: str
     restarts: int
     history: tuple[Failed, ...]
 
 
-class ConsequenceTaken(msgspec.Struct, frozen=True, kw_only=True):
+class ConsequenceTaken(Event, frozen=True, kw_only=True, tag="consequence"):
     """A violation of an active system lasts, and what the manifest asks for is done about it.
 
     Attributes:
@@ -313,7 +301,6 @@ class ConsequenceTaken(msgspec.Struct, frozen=True, kw_only=True):
         message: the finding's, a whole sentence.
     """
 
-    kind: ClassVar[str] = "consequence"
     action: str
     nodes: tuple[str, ...]
     rule: str
@@ -321,7 +308,7 @@ class ConsequenceTaken(msgspec.Struct, frozen=True, kw_only=True):
     message: str
 
 
-class ModeEntered(msgspec.Struct, frozen=True, kw_only=True):
+class ModeEntered(Event, frozen=True, kw_only=True, tag="mode"):
     """The system is in another mode.
 
     Attributes:
@@ -331,14 +318,13 @@ class ModeEntered(msgspec.Struct, frozen=True, kw_only=True):
         parameters: names of the nodes that have other parameters than in the mode before.
     """
 
-    kind: ClassVar[str] = "mode"
     mode: str
     before: str
     inactive: tuple[str, ...]
     parameters: tuple[str, ...] = ()
 
 
-class ManifestApplied(msgspec.Struct, frozen=True, kw_only=True):
+class ManifestApplied(Event, frozen=True, kw_only=True, tag="apply"):
     """A running system is to run by another manifest, does so, or goes back to the one before.
 
     Attributes:
@@ -351,7 +337,6 @@ class ManifestApplied(msgspec.Struct, frozen=True, kw_only=True):
         reason: why the system goes back; else empty.
     """
 
-    kind: ClassVar[str] = "apply"
     stage: str
     manifest: str
     revision: int
@@ -363,61 +348,30 @@ class ManifestApplied(msgspec.Struct, frozen=True, kw_only=True):
     reason: str = ""
 
 
-class Notice(msgspec.Struct, frozen=True, kw_only=True):
+class Notice(Event, frozen=True, kw_only=True, tag="notice"):
     """Something a person should know that changes nothing: orphans swept, a step forced."""
 
-    kind: ClassVar[str] = "notice"
     message: str
 
 
-class Stopping(msgspec.Struct, frozen=True, kw_only=True):
+class Stopping(Event, frozen=True, kw_only=True, tag="stopping"):
     """The system is being taken down."""
 
-    kind: ClassVar[str] = "stopping"
     reason: str
 
 
-class Stopped(msgspec.Struct, frozen=True, kw_only=True):
+class Stopped(Event, frozen=True, kw_only=True, tag="stopped"):
     """Nothing of the system runs any more.
 
     Attributes:
         reason: why the run ended, as in its report; empty if it did not come so far.
     """
 
-    kind: ClassVar[str] = "stopped"
     exit_code: int
     elapsed_s: float
     reason: str = ""
 
 
-Event = Union[  # noqa: UP007 - a run-time alias on Python 3.10
-    RunStarted,
-    ProcessChanged,
-    RequestSent,
-    NodeChanged,
-    WiringChanged,
-    WiringLost,
-    NodeSilent,
-    NodeAlive,
-    NodeJoined,
-    NodeLeft,
-    MachineConnection,
-    LogLine,
-    VerdictChanged,
-    GateOpened,
-    SystemReached,
-    StageTimed,
-    Failure,
-    RestartScheduled,
-    Restarted,
-    GaveUp,
-    ConsequenceTaken,
-    ModeEntered,
-    ManifestApplied,
-    Notice,
-    Stopping,
-    Stopped,
-]
 Listener = Callable[[Event], None]
 
 
@@ -448,18 +402,17 @@ class Emitter:
             listener(event)
 
 
-def to_record(event: Event) -> dict[str, object]:
+def to_record(event: Event) -> dict[str, Any]:
     """Return `event` as the JSON object that `--format json` prints."""
-    plain = to_plain(event)
-    assert isinstance(plain, dict)
+    plain: dict[str, Any] = msgspec.to_builtins(event)
     if isinstance(event, VerdictChanged):
         from lifecycle.verify.report import plain_findings  # imports every rule
 
         plain["verdict"]["findings"] = plain_findings(event.verdict)
-    return {"event": event.kind, **plain}
+    return plain
 
 
-_KINDS: dict[str, type[Event]] = {each.kind: each for each in get_args(Event)}
+_KINDS = {str(each.__struct_config__.tag): each for each in Event.__subclasses__()}
 
 
 def from_record(record: Mapping[str, Any]) -> Event | None:

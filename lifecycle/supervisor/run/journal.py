@@ -113,9 +113,7 @@ class Journal:
         if isinstance(event, VerdictChanged):
             verdict = replace(event.verdict, flows=(), open_endpoints=())
             event = replace(event, verdict=verdict)
-        plain = codec.to_plain(event)
-        assert isinstance(plain, dict)
-        line = self._line(event={"event": event.kind, **plain})
+        line = self._line(event=event)
         if self._waiting is not None:
             self._waiting.append(line)
         else:

@@ -34,7 +34,7 @@ from lifecycle.plan.model import Plan
 from lifecycle.run_directory import is_held, run_name, running, runtime_root
 from lifecycle.supervisor.connections.negotiation import Expectation, is_negotiated
 from lifecycle.supervisor.control.client import look
-from lifecycle.supervisor.control.protocol import ProcessState, Reach, SystemStatus
+from lifecycle.supervisor.control.protocol import ProcessState, Reach
 from lifecycle.supervisor.control.server import SupervisorSnapshot, follow
 from lifecycle.supervisor.gate.gate import closes
 from lifecycle.supervisor.gate.verification_loop import GracePeriod
@@ -92,6 +92,11 @@ class JudgedSystem(msgspec.Struct, frozen=True, kw_only=True):
         return "" if foreign else where(self.plan, self.rmw)
 
     @property
+    def picture(self) -> Picture:
+        """What was seen, drawn."""
+        return build_picture(self.plan, self.observation, self.verdict)
+
+    @property
     def notices(self) -> tuple[str, ...]:
         """What has to be known beside the verdict."""
         return tuple(each for each in (self.limits, self.where) if each)
@@ -118,18 +123,6 @@ def judge_running(
                 plan, observer_participant, timeout_s, strict=strict, empty_graph_s=empty_graph_s
             )
         )
-
-
-def running_plan(path: Path) -> Plan:
-    """Return the plan of the system that the supervisor of a run directory runs.
-
-    Raises:
-        UsageError: it runs no more, or does not answer.
-    """
-    try:
-        return look(path).plan
-    except TimeoutError as error:
-        raise UsageError(f"cannot ask {path.name!r}: its supervisor does not answer") from error
 
 
 async def _following(
@@ -162,9 +155,11 @@ async def _following(
                 pause_s = min(pause_s * 2, _ASK_AT_MOST_S)
 
 
-def follow_running(plan: Plan, on_verdict: Callable[[Verdict], None]) -> None:
-    """Judge what runs and report each verdict that differs from the last, until interrupted."""
-    asyncio.run(_following(plan, lambda seen: seen.verdict, on_verdict))
+def follow_running(
+    plan: Plan, of: Callable[[JudgedSystem], T], on_change: Callable[[T], None]
+) -> None:
+    """Judge what runs and give what `of` says of it whenever that differs, until interrupted."""
+    asyncio.run(_following(plan, of, on_change))
 
 
 def where(plan: Plan, rmw: str) -> str:
@@ -303,16 +298,6 @@ def supervisor_of(environment: Mapping[str, str], plan: Plan, machine: str) -> P
     return path if is_held(path) else None
 
 
-def supervised_picture(path: Path) -> Picture:
-    """Return what the supervisor of a run directory sees.
-
-    Raises:
-        UsageError: it runs no more.
-        TimeoutError: it does not answer.
-    """
-    return _drawn(look(path))
-
-
 def supervised_pictures(path: Path) -> Iterator[Picture]:
     """Yield what a supervisor sees, again whenever it differs, until the supervisor ends.
 
@@ -321,43 +306,16 @@ def supervised_pictures(path: Path) -> Iterator[Picture]:
     """
     last: Picture | None = None
     for seen in follow(path / "control"):
-        picture = _drawn(seen)
+        picture = picture_of(seen)
         if picture != last:
             last = picture
             yield picture
 
 
-def attached_picture(plan: Plan, *, timeout_s: float) -> Picture:
-    """Look from outside, and give what is not as declared so long to become so.
-
-    Raises:
-        MiddlewareError: no participant can be made.
-    """
-    return _attached(judge_running(plan, timeout_s=timeout_s, strict=False))
-
-
-def attached_pictures(plan: Plan, on_picture: Callable[[Picture], None]) -> None:
-    """Look from outside and give each picture that differs from the last, for ever."""
-    asyncio.run(_following(plan, _attached, on_picture))
-
-
-def _attached(seen: JudgedSystem) -> Picture:
-    return build_picture(seen.plan, seen.observation, seen.verdict)
-
-
-def _drawn(seen: SupervisorSnapshot) -> Picture:
+def picture_of(seen: SupervisorSnapshot) -> Picture:
+    """Return what a supervisor sees."""
     verdict = seen.verdict or verify(seen.plan, seen.observation, stage=Stage.ACTIVE)
-    return build_picture(
-        seen.plan,
-        seen.observation,
-        verdict,
-        phase=seen.status.phase,
-        supervised=_supervised(seen.status),
-    )
-
-
-def _supervised(status: SystemStatus) -> dict[str, Supervised]:
-    return {
+    supervised = {
         each.node: Supervised(
             pid=each.pid,
             dead=each.process_state is ProcessState.BACKOFF
@@ -365,8 +323,11 @@ def _supervised(status: SystemStatus) -> dict[str, Supervised]:
             silent=bool(each.silent),
             doing=each.doing or each.silent,
         )
-        for each in status.nodes
+        for each in seen.status.nodes
     }
+    return build_picture(
+        seen.plan, seen.observation, verdict, phase=seen.status.phase, supervised=supervised
+    )
 
 
 _logger = logging.getLogger(__name__)

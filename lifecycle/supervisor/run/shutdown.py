@@ -13,8 +13,7 @@ from typing import Any
 
 from lifecycle.errors import BringUpError, MiddlewareError
 from lifecycle.manifest.model import RunKind
-from lifecycle.node.host.control import Operation
-from lifecycle.supervisor.connections.desired_state import Step
+from lifecycle.node.host.control import Command, Operation
 from lifecycle.supervisor.control.protocol import ProcessState, Reach
 from lifecycle.supervisor.nodes.bring_up import died
 from lifecycle.supervisor.nodes.driver import ACTIVE, FINALIZED, INACTIVE
@@ -189,7 +188,7 @@ class TakeDown:
         for name in reversed(node.connections):
             if self._hurry.is_set() or node.stuck or node.is_gone or node.driver is None:
                 return
-            step = Step(node=node.name, operation=Operation.DISCONNECT_FROM, connection=name)
+            step = Command(node=node.name, operation=Operation.DISCONNECT_FROM, connection=name)
             limit_s = node.planned.timeouts.cleanup_s
             if await self._bounded(node, node.driver.wire(step), f"{step}", limit_s):
                 self._emit(WiringChanged(node=node.name, operation=step.operation, connection=name))

@@ -8,6 +8,7 @@ import json
 import sys
 from pathlib import Path
 
+import jsonschema
 import pytest
 from msgspec.structs import replace
 
@@ -23,6 +24,7 @@ from lifecycle.supervisor.control.ros_interface import (
     check_installed,
 )
 from lifecycle.supervisor.health.liveliness import Cause
+from tests import result_schemas
 from tests.unit.supervisor.fakes import run
 from tests.unit.supervisor.session_world import CHAIN, INTRUDED, FakeRosInterface, SessionWorld
 
@@ -121,6 +123,8 @@ async def test_diagnostics_come_from_active_on_each_second_and_at_once_when_some
             (OK, "robot: /camera", "active"),
             (OK, "robot: /viewer", "active"),
         ]
+        schema = json.loads(result_schemas.generate("status"))
+        jsonschema.Draft202012Validator(schema).validate(json.loads(ros.statuses[-1]))
         before = len(ros.statuses)
         world.intrude()
         await world.story.until(f"[verdict] active violated {INTRUDED}")
