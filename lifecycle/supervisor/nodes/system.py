@@ -520,7 +520,6 @@ class System:
             managed = kept.get(process.name)
             if managed is None and process.run.kind is not RunKind.ATTACH:
                 managed = self.make_process(process)
-                managed.joins = bool(kept)
             elif managed is not None:
                 # What it would be started with again: parameters may have been set since.
                 managed.planned = process

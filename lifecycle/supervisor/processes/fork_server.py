@@ -1,8 +1,8 @@
 """The supervisor's side of a fork server: processes are started over a socket.
 
-Owns: asking it to fork, and following its children by pidfd, so that an end is noticed at once. A
-run whose fork server dies fails: its children become this process's own, and are ended. Must not
-import rclpy.
+Owns: asking it to fork, following its children by pidfd, so that an end is noticed at once, and
+what they have started. A run whose fork server dies fails: its children become this process's own,
+and are ended. Must not import rclpy.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import BringUpError
 from lifecycle.graph.loop import set_within
-from lifecycle.run_directory import PROCESS_VARIABLE
+from lifecycle.run_directory import PROCESS_VARIABLE, groups_of
 from lifecycle.supervisor.processes.fork_server_main import (
     LARGEST_MESSAGE,
     MSG_CMSG_CLOEXEC,
@@ -30,17 +30,23 @@ from lifecycle.supervisor.processes.fork_server_main import (
 from lifecycle.supervisor.processes.fork_server_process import CLOSE_S, ForkServerProcess
 from lifecycle.supervisor.processes.orphans import (
     Lineage,
-    belonging,
     children,
     descendants,
-    end_left,
-    end_strays,
+    end,
+    marked,
+    reap_adopted,
 )
 from lifecycle.supervisor.processes.process import ManagedProcess, ProcessExit, run_delay_s
 from lifecycle.supervisor.processes.scope import scope
 
 _STATUS_WAIT_S = 1.0
 """The fork server reaps within microseconds; after this long its report does not come any more."""
+
+_LEFT_S = 0.5
+"""Between asking what a process left to end and killing it: another waits to start in its place."""
+
+_ROUNDS = 3
+"""How often what was started while others were ended is looked for."""
 
 _READY_S = 10.0
 """A fork server serves after 0.2 s; a loaded machine takes longer."""
@@ -253,10 +259,27 @@ class ForkServer:
         self._pending[message.id] = _Pending(born, process)
         return await born
 
-    def belonging(self, processes: Mapping[int, str]) -> frozenset[int]:
-        """Return the pids of all that processes have started; their names by pid."""
+    def belonging(self, processes: Mapping[int, str]) -> set[int]:
+        """Return the pids of all that processes have started, whether they live or not.
+
+        It belongs to one if it descends from it, is in its session or group, carries its name in
+        its environment, or descends from one of these.
+
+        Args:
+            processes: names of planned processes by pid.
+        """
+        lineage = Lineage()
         others = self._living() - processes.keys()
-        return frozenset(belonging(self._process.run_id, self, processes, others))
+        spared = {each for pid in others for each in lineage.of(pid)}
+        names = set(processes.values())
+        found = {pid for pid, name in marked(self._process.run_id).items() if name in names}
+        for pid in self.family():
+            groups = groups_of(pid)
+            if not processes.keys().isdisjoint(groups) and spared.isdisjoint(groups):
+                found.add(pid)
+        for pid in (*(found - spared), *processes):
+            found |= lineage.of(pid)
+        return found - spared - processes.keys() - {os.getpid(), self.pid}
 
     async def end_left(
         self, ended: Mapping[int, str], known: Collection[int] = ()
@@ -267,11 +290,16 @@ class ForkServer:
             ended: their names by pid.
             known: pids of what belonged to them before.
         """
-        return await end_left(self._process.run_id, self, ended, self._living(), known)
+        return await _until_none(lambda: self.belonging(ended) | (set(known) & self.family()))
 
     async def end_strays(self) -> tuple[int, ...]:
         """End, bounded, all that is left of the run but the fork server; return the pids."""
-        return await end_strays(self._process.run_id, self)
+        ours = {os.getpid(), self.pid}
+        ended = await _until_none(
+            lambda: (marked(self._process.run_id).keys() | self.family()) - ours
+        )
+        reap_adopted((self.pid,))
+        return ended
 
     def _living(self) -> set[int]:
         return {each.pid for each in self._children.values() if not each.exited.done()}
@@ -356,3 +384,14 @@ class ForkServer:
         if not await set_within(self._gone, CLOSE_S):
             self._process.popen.kill()
             await self._gone.wait()
+
+
+async def _until_none(left: Callable[[], Collection[int]]) -> tuple[int, ...]:
+    """End what is left, and what was started while that was ended; return the pids."""
+    ended: set[int] = set()
+    for _ in range(_ROUNDS):
+        found = await end(left(), _LEFT_S)
+        if not found:
+            break
+        ended.update(found)
+    return tuple(sorted(ended))

@@ -1,10 +1,10 @@
 """Ending processes that escaped: what our children left, and what a killed supervisor left.
 
-Owns: finding them without guessing, and ending them bounded. A process belongs to a run if it
-descends from the run's fork server, which adopts all that its descendants leave behind, or if its
-environment carries the run's id. Other children of this process do not: it may have become the
-supervisor by exec of a shell with background jobs. A pid alone never proves it. Must not import
-rclpy.
+Owns: finding them without guessing, and ending them bounded; what each process of a run has started
+is fork_server.py's. A process belongs to a run if it descends from the run's fork server, which
+adopts all that its descendants leave behind, or if its environment carries the run's id. Other
+children of this process do not: it may have become the supervisor by exec of a shell with
+background jobs. A pid alone never proves it. Must not import rclpy.
 """
 
 from __future__ import annotations
@@ -15,9 +15,8 @@ import os
 import select
 import signal
 import time
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from lifecycle.run_directory import (
     OWN_CHILD,
@@ -25,13 +24,9 @@ from lifecycle.run_directory import (
     RUN_VARIABLE,
     RunRecord,
     boot_id,
-    groups_of,
     is_process,
     parent_of,
 )
-
-if TYPE_CHECKING:
-    from lifecycle.supervisor.processes.fork_server import ForkServer
 
 GRACE_S = 3.0
 """Between asking an orphan to end and killing it."""
@@ -41,13 +36,7 @@ KILL_S = 5.0
 
 _TASKS = Path("/proc/self/task")
 
-_LEFT_S = 0.5
-"""Between asking what a process left to end and killing it: another waits to start in its place."""
-
 _LOOK_S = 0.02
-
-_ROUNDS = 3
-"""How often what was started while others were ended is looked for."""
 
 
 class _Orphan:
@@ -60,84 +49,6 @@ class _Orphan:
     def signal(self, number: int) -> None:
         with contextlib.suppress(ProcessLookupError):
             signal.pidfd_send_signal(self.pidfd, number)
-
-
-async def end_strays(run_id: str, family: ForkServer) -> tuple[int, ...]:
-    """End everything that still belongs to a run, but for this process and the fork server itself.
-
-    Args:
-        run_id: of the run.
-        family: all that the run has started.
-
-    Returns:
-        The pids that had to be ended.
-    """
-    ended: set[int] = set()
-    for _ in range(_ROUNDS):
-        strays = _marked(run_id).keys() | family.family()
-        found = await _end(strays - {os.getpid(), family.pid}, _LEFT_S)
-        if not found:
-            break
-        ended.update(found)
-    reap_adopted((family.pid,))
-    return tuple(sorted(ended))
-
-
-async def end_left(
-    run_id: str,
-    family: ForkServer,
-    ended: Mapping[int, str],
-    living: Collection[int],
-    known: Collection[int] = (),
-) -> tuple[int, ...]:
-    """End what some processes of a run have left that have ended, and nothing of any other.
-
-    Args:
-        run_id: of the run.
-        family: all that the run has started.
-        ended: names of the planned processes that have ended, by pid.
-        living: pids of those that were started and live.
-        known: pids of what belonged to them before.
-
-    Returns:
-        The pids that had to be ended.
-    """
-    ended_here: set[int] = set()
-    for _ in range(_ROUNDS):
-        left = belonging(run_id, family, ended, living) | (set(known) & family.family())
-        found = await _end(left, _LEFT_S)
-        if not found:
-            break
-        ended_here.update(found)
-    return tuple(sorted(ended_here))
-
-
-def belonging(
-    run_id: str, family: ForkServer, processes: Mapping[int, str], others: Collection[int]
-) -> set[int]:
-    """Return the pids of all that processes of a run have started, whether they live or not.
-
-    It belongs to one if it descends from it, is in its session or group, carries its name in its
-    environment, or descends from one of these.
-
-    Args:
-        run_id: of the run.
-        family: all that the run has started.
-        processes: names of planned processes by pid.
-        others: pids of the other ones that live.
-    """
-    lineage = Lineage()
-    every = family.family()
-    spared = {each for pid in others for each in lineage.of(pid)}
-    names = set(processes.values())
-    found = {pid for pid, name in _marked(run_id).items() if name in names}
-    for pid in every:
-        groups = groups_of(pid)
-        if not processes.keys().isdisjoint(groups) and spared.isdisjoint(groups):
-            found.add(pid)
-    for pid in (*(found - spared), *processes):
-        found |= lineage.of(pid)
-    return found - spared - processes.keys() - {os.getpid(), family.pid}
 
 
 def reap_adopted(spare: Iterable[int]) -> None:
@@ -161,11 +72,11 @@ def end_run(record: RunRecord) -> tuple[int, ...]:
     if record.boot_id != boot_id():
         return ()
     pids = {child.pid for child in record.children if is_process(child.pid, child.start_ticks)}
-    pids |= _marked(record.run_id).keys()
+    pids |= marked(record.run_id).keys()
     for pid in tuple(pids):
         pids.update(descendants(pid))
     pids.discard(os.getpid())
-    return asyncio.run(_end(pids, GRACE_S))
+    return asyncio.run(end(pids, GRACE_S))
 
 
 def children() -> frozenset[int]:
@@ -217,7 +128,7 @@ class Lineage:
         return found
 
 
-def _marked(run_id: str) -> dict[int, str]:
+def marked(run_id: str) -> dict[int, str]:
     """Return the planned process whose name each process carries that carries the run's id."""
     mark = f"{RUN_VARIABLE}={run_id}".encode()
     prefix = f"{PROCESS_VARIABLE}=".encode()
@@ -233,8 +144,8 @@ def _marked(run_id: str) -> dict[int, str]:
     return found
 
 
-async def _end(pids: Iterable[int], grace_s: float) -> tuple[int, ...]:
-    """End processes, bounded; return the pids of those that lived."""
+async def end(pids: Iterable[int], grace_s: float) -> tuple[int, ...]:
+    """End processes, killing what has not ended after `grace_s`; return those that lived."""
     orphans = []
     for pid in pids:
         with contextlib.suppress(ProcessLookupError):

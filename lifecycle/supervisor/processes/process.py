@@ -154,7 +154,6 @@ class ManagedProcess:
         may_end: it may end by itself, with exit status 0.
         started_s: when it was spawned, in seconds since the supervisor started.
         is_restarted: another one ran in its place before.
-        joins: others ran before it that have to discover it, and go on.
         last_stderr: the last line that it wrote to standard error; empty if none.
     """
 
@@ -185,7 +184,6 @@ class ManagedProcess:
         self._traceback = Traceback()
         self._signals: set[int] = set()
         self.is_restarted = False
-        self.joins = False
         self.on_stop: Callable[[bool], None] = lambda _: None
         kept = planned.run.output is not Output.SCREEN
         self.log = ProcessLog(logs, planned.name, kept=kept)

@@ -36,7 +36,7 @@ from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.middleware.fastdds.settings import has_shared_memory
 from lifecycle.middleware.fastdds.sockets import OpenSocket, open_sockets
 from lifecycle.middleware.rcl.graph import GraphObserver
-from lifecycle.network.connection_url import ConnectionUrl
+from lifecycle.network.connection_url import parse
 from lifecycle.plan.model import (
     ParticipantConnections,
     PlannedServer,
@@ -427,7 +427,7 @@ def test_clients_of_a_discovery_server_find_each_other_and_a_super_client_sees_t
         address="127.0.0.1",
         port=ports[7],
         tcp=tcp,
-        prefix=ConnectionUrl.__dataclass_fields__["server_prefix"].default,
+        prefix=parse(f"udpv4://127.0.0.1:7911?server=127.0.0.1:{ports[7]}").server_prefix,
     )
     argv, environment = discovery_server_command(server)
     assert not discovery_server_listens(server)
