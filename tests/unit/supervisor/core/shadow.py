@@ -15,13 +15,14 @@ from typing import Any
 from lifecycle.errors import ExitCode
 from lifecycle.supervisor.control.protocol import ControlRequest, ProcessState, Reach
 from lifecycle.supervisor.core import effects, inputs
-from lifecycle.supervisor.core.advance import advance
+from lifecycle.supervisor.core.advance import SIGINT, SIGKILL, SIGTERM, advance
 from lifecycle.supervisor.core.failure import exit_code_of
 from lifecycle.supervisor.core.reduce import take
-from lifecycle.supervisor.core.state import REACHES, Level, Options, Order, Step, new_run
+from lifecycle.supervisor.core.state import UP, Level, Options, Order, Step, new_run
 from lifecycle.supervisor.run.events import Event, Failure, NodeChanged, ProcessChanged, RequestSent
 from lifecycle.supervisor.run.options import Until, UpOptions
 
+SIGNALS = (SIGINT, SIGTERM, SIGKILL)
 _STATES = {"active": Level.ACTIVE, "finalized": Level.DOWN}
 
 
@@ -56,6 +57,10 @@ class Shadow:
         self.wants: Counter[str] = Counter()
         self.does: Counter[str] = Counter()
         self._orders = 0
+        self._stopping: set[str] = set()
+        self._levels: dict[str, Level] = {}
+        self._looked = self.run.mark
+        self._look: effects.Look | None = None
         self._wake: asyncio.TimerHandle | None = None
         self._follow(world)
         self.give(inputs.Tick())
@@ -64,12 +69,21 @@ class Shadow:
         """Have everything that the session learns be learnt here, too."""
         session = self._session
         world._emit.listen(self._on_event)
-        stands, stop = session._judge._stands, session.stop
+        judge, note = session._judge, world.graph.note
+        look, stands, stop = judge._look, judge._stands, session.stop
         begin, ordered = world.networks.begin, session._holding.ordered
+
+        async def look_too(stage: Any) -> Any:
+            self._looked = self.run.mark
+            return await look(stage)
 
         def stands_too(stage: Any, verdict: Any) -> None:
             stands(stage, verdict)
-            self.give(inputs.Verified(mark=self.run.mark, verdict=verdict))
+            self.give(inputs.Verified(mark=self._looked, verdict=verdict))
+
+        def note_too() -> None:
+            note()
+            self.give(inputs.Changed())
 
         def stop_too(reason: str, code: ExitCode) -> None:
             stop(reason, code)
@@ -102,7 +116,8 @@ class Shadow:
                 self.does[f"answer {order.ask.value} {answer.exit_code}"] += 1
             return answer
 
-        session._judge._stands, session.stop = stands_too, stop_too
+        judge._look, judge._stands, session.stop = look_too, stands_too, stop_too
+        world.graph.note = world.graph._hosts.changed = note_too
         session._holding._stop = stop_too
         session._holding.ordered = ordered_too
         world.networks.begin = begin_too
@@ -120,14 +135,14 @@ class Shadow:
                 self.wants[f"spawn {each.process}"] += 1
             elif isinstance(each, effects.Answer):
                 self.wants[f"answer {self._asked(each.order)} {int(each.code)}"] += 1
-            elif isinstance(each, effects.Ask) and each.step is Step.ACTIVATE:
-                self.wants[f"activate {self.run.nodes[each.node].name}"] += 1
+            elif isinstance(each, effects.Ask):
+                if each.step is Step.ACTIVATE:
+                    self.wants[f"activate {self.run.nodes[each.node].name}"] += 1
+                self._loop.call_soon(self._reply, each.node)
             elif isinstance(each, effects.Sweep):
                 again.append(inputs.Swept(process=each.process))
             elif isinstance(each, effects.Look):
-                latest = self._session._judge.latest
-                if latest is not None and self.run.held_s is not None:
-                    again.append(inputs.Verified(mark=each.mark, verdict=latest))
+                self._look = each
             elif isinstance(each, effects.Prepare):
                 again.append(inputs.Ready(error=self._session._fork_server.cannot_start))
             elif isinstance(each, effects.Give):
@@ -138,6 +153,19 @@ class Shadow:
             self._wake = self._loop.call_at(self._began_s + at_s, lambda: self.give(inputs.Tick()))
         for each in again:
             self._loop.call_soon(self.give, each)
+        if self._look is not None:
+            self._loop.call_soon(self._answer_look)
+
+    def _answer_look(self) -> None:
+        """Answer a look with the session's verdict, where nothing changed for the session since."""
+        judge, asked = self._session._judge, self._look
+        if (
+            asked is not None
+            and self.run.judged.mark < asked.mark
+            and judge.is_current(judge.latest)
+        ):
+            self._look = None
+            self.give(inputs.Verified(mark=asked.mark, verdict=judge.latest))
 
     def _asked(self, _: int) -> str:
         return "" if self.run.order is None else self.run.order.ask.value
@@ -165,7 +193,16 @@ class Shadow:
         if event.state is ProcessState.STARTING:
             self.does[f"spawn {event.process}"] += 1
             self._loop.call_soon(self.give, inputs.Spawned(process=event.process, pid=1))
+        elif event.state is ProcessState.STOPPING:
+            self._stopping.add(event.process)
         elif event.state is ProcessState.EXITED:
+            for node in self.run.nodes_of(event.process):
+                self._levels.pop(node.key, None)
+            process = self.run.processes.get(event.process)
+            if process is not None and event.process in self._stopping:
+                self._stopping.discard(event.process)
+                process.asked = max(process.asked, 0)
+                process.sent = [*process.sent, *SIGNALS]
             end = self._system.processes[event.process].ended.result()
             self.give(
                 inputs.Exited(
@@ -185,11 +222,23 @@ class Shadow:
         level = _STATES.get(event.state, Level.STARTED)
         if event.state == "inactive":
             level = Level.CONNECTED if event.connected else Level.CONFIGURED
-        request = node.request
-        if request is None or REACHES[request.step] is not level:
+        self._levels[node.key] = level
+        if not self._reply(node.key):
             self.give(inputs.Saw(levels={node.key: level}))
-            return
-        self.give(inputs.Replied(node=node.key, number=request.number, level=level))
+
+    def _reply(self, key: str) -> bool:
+        """Answer what the reducer asks of a node, if the session has brought it there."""
+        node = self.run.nodes.get(key)
+        request, level = None if node is None else node.request, self._levels.get(key)
+        if node is None or request is None or level is None:
+            return False
+        goal = node.after(request.step)
+        is_up = request.step in UP.values()
+        if level < goal if is_up else level > goal:
+            return False
+        begun = level if request.step is Step.START and not node.process else goal
+        self.give(inputs.Replied(node=key, number=request.number, level=begun))
+        return True
 
     def differences(self, exit_code: int) -> list[str]:
         """Return what one did and the other did not, and another exit code."""
