@@ -13,7 +13,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --co
 # Tests start hundreds of programs: where nothing may be compiled ahead, each compiles the whole package again.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test test-thorough test-kilted outside check check-static soak soak-tests bench bench-all hostile mutate docs schemas clean help
+.PHONY: demo test test-thorough test-kilted outside check check-static soak soak-tests bench bench-all hostile mutate docs schemas findings clean help
 
 help:
 	@echo "make demo    bring up a small robot from its manifest, verified, then shut it down"
@@ -29,6 +29,7 @@ help:
 	@echo "make hostile attack everything that reads what others wrote, and list what was not handled"
 	@echo "make mutate  change what judges, one small change at a time, and list what no test notices"
 	@echo "make schemas write the JSON Schemas of results from their types, into schemas/"
+	@echo "make findings write the texts of findings that tests compare with, to be read by a person"
 	@echo "make docs    build the documentation site, with the Python API, into build/site"
 
 $(STAMP): pyproject.toml
@@ -126,6 +127,9 @@ docs: $(VENV)/.docs
 
 schemas: $(STAMP)
 	$(BIN)/python -m tests.result_schemas
+
+findings: $(STAMP)
+	WRITE_FINDINGS=1 CI=1 $(PYTEST) -p no:xdist tests/unit/verify
 
 clean:
 	rm -rf mutants mutants.log $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
