@@ -1,31 +1,38 @@
-"""What was found, in one line for each finding, and its texts as `findings.json` has them.
+"""What was found, in one line for each finding, and its texts, which are lines of `findings.txt`.
 
-Tests compare lines; the texts of all findings of a test are compared here with those that somebody
-has read. `make findings` writes them anew: read the difference.
+Tests compare rules, places and the like. The texts of all that they find are in that file, one line
+for each, as a person has read them. `make findings` writes it anew: read the difference.
 """
 
 from __future__ import annotations
 
 import functools
-import json
 import os
-from collections import defaultdict
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import hypothesis
 
-from lifecycle.verify.verdict import Finding
+from lifecycle.verify import judge
+from lifecycle.verify.verdict import Finding, Verdict
 
-_READ = Path(__file__).with_name("findings.json")
+_FILE = Path(__file__).with_name("findings.txt")
 _WRITES = "WRITE_FINDINGS" in os.environ
-_found: defaultdict[str, list[list[str]]] = defaultdict(list)
+_found: set[str] = set()
+
+
+def verify(*what: Any, **how: Any) -> Verdict:
+    """Judge as `lifecycle.verify` does, and compare the texts of what is found."""
+    verdict = judge.verify(*what, **how)
+    _compare(verdict.findings)
+    return verdict
 
 
 def lines(findings: Iterable[Finding]) -> list[str]:
     """Return outcome, rule, subject, node and place (line:column) of each finding."""
     found = list(findings)
-    _compare([_texts(each) for each in found])
+    _compare(found)
     return [_line(each) for each in found]
 
 
@@ -36,25 +43,23 @@ def _line(finding: Finding) -> str:
     return f"{what}, {finding.node or 'no node'}{kind}{at}"
 
 
-def _texts(finding: Finding) -> str:
+def _text(finding: Finding) -> str:
     texts = (finding.message, finding.expected, finding.observed, finding.hint)
     assert all(isinstance(each, str) for each in texts), finding
-    return " | ".join((*texts, *finding.nodes))
+    return f"{finding.rule}: " + " | ".join((*texts, *finding.nodes)).replace("\n", "\\n")
 
 
-def _compare(texts: list[str]) -> None:
-    test = os.environ["PYTEST_CURRENT_TEST"].rpartition(" ")[0]
+def _compare(findings: Iterable[Finding]) -> None:
     if hypothesis.currently_in_test_context():
         return
-    number = len(_found[test])
-    _found[test].append(texts)
-    if _WRITES:
-        _READ.write_text(json.dumps(_found, indent=1, ensure_ascii=False, sort_keys=True) + "\n")
-    else:
-        assert texts == _as_read()[test][number], "read it, and run `make findings`"
+    texts = {_text(each) for each in findings}
+    if not _WRITES:
+        assert texts - _as_read() == set(), "read it, and run `make findings`"
+    elif not texts <= _found:
+        _found.update(texts)
+        _FILE.write_text("".join(f"{each}\n" for each in sorted(_found)))
 
 
 @functools.cache
-def _as_read() -> dict[str, list[list[str]]]:
-    found: dict[str, list[list[str]]] = json.loads(_READ.read_text())
-    return found
+def _as_read() -> set[str]:
+    return set(_FILE.read_text().splitlines())

@@ -11,7 +11,6 @@ from lifecycle.manifest.model import EndpointKind, EndpointPolicy, Policy, Run, 
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.plan.build import build_plan
 from lifecycle.plan.model import ParticipantConnections, Plan, PlannedParticipant
-from lifecycle.verify.judge import verify
 from lifecycle.verify.observation import Identity, NodeConfiguration, Observation
 from lifecycle.verify.rules.endpoints import differ
 from lifecycle.verify.verdict import Finding, Stage
@@ -38,7 +37,7 @@ from tests.unit.verify.edits import (
     drop_node,
     drop_report,
 )
-from tests.unit.verify.lines import lines
+from tests.unit.verify.lines import lines, verify
 from tests.unit.verify.perfect import perfect
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION

@@ -13,7 +13,7 @@ from lifecycle.network.nfe import (
 )
 from lifecycle.plan.build import build_plan
 from lifecycle.plan.model import Plan
-from lifecycle.verify.judge import flow_reports, verify
+from lifecycle.verify.judge import flow_reports
 from lifecycle.verify.matcher import lay_out
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import Finding, FlowReport, Stage
@@ -24,6 +24,7 @@ from tests.unit.verify.edits import (
     change_report,
     drop_report,
 )
+from tests.unit.verify.lines import verify
 from tests.unit.verify.perfect import perfect
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION

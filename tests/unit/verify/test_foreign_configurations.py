@@ -17,7 +17,6 @@ from lifecycle.graph.status import NodeStatusError
 from lifecycle.graph.status import decode as decode_status
 from lifecycle.plan.comparison import PlanNoticeError
 from lifecycle.plan.comparison import decode as decode_notice
-from lifecycle.verify.judge import verify
 from lifecycle.verify.observation import (
     LONGEST_CONFIGURATION,
     ConfigurationError,
@@ -25,6 +24,7 @@ from lifecycle.verify.observation import (
 )
 from lifecycle.verify.report import render_text, to_json, to_junit, to_sarif
 from lifecycle.verify.verdict import Stage
+from tests.unit.verify.lines import verify
 from tests.unit.verify.perfect import perfect
 from tests.unit.verify.test_verify_rules import PLAN
 

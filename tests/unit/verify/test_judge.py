@@ -14,12 +14,12 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.manifest.qos import Durability, Liveliness, QosProfile
 from lifecycle.plan.model import Plan
-from lifecycle.verify.judge import verify
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.tool_filter import takes_diagnostics
 from lifecycle.verify.verdict import OpenEndpoint, Stage, ToleratedNode, Verdict
 from tests.builders import at, need, node, planned, publisher, subscription
 from tests.unit.verify.edits import Edit, add_endpoint, add_node, both, change_report
+from tests.unit.verify.lines import verify
 from tests.unit.verify.perfect import perfect
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION

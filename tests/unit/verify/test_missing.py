@@ -7,7 +7,7 @@ from msgspec.structs import replace
 
 from lifecycle.manifest.model import EndpointKind, Policy
 from lifecycle.plan.build import build_plan
-from lifecycle.verify.judge import missing, not_ok, taken_on_trust, verify
+from lifecycle.verify.judge import missing, not_ok, taken_on_trust
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import RULES
 from lifecycle.verify.verdict import Finding, Stage, Verdict
@@ -22,6 +22,7 @@ from tests.unit.verify.edits import (
     drop_node,
     drop_report,
 )
+from tests.unit.verify.lines import verify
 from tests.unit.verify.perfect import perfect
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION

@@ -20,7 +20,6 @@ from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import Durability, History, Reliability
 from lifecycle.plan.build import build_plan
 from lifecycle.plan.model import Plan
-from lifecycle.verify.judge import verify
 from lifecycle.verify.observation import SERVES_NONE, NodeParameters, Observation, ParameterReport
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import Stage
@@ -31,6 +30,7 @@ from tests.unit.verify.edits import (
     change_endpoint,
     drop_endpoint,
 )
+from tests.unit.verify.lines import verify
 from tests.unit.verify.perfect import perfect
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION

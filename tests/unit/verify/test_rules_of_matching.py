@@ -8,7 +8,6 @@ from msgspec.structs import replace
 from lifecycle.manifest.model import EndpointKind, EndpointPolicy, Policy
 from lifecycle.manifest.qos import QosProfile, Reliability
 from lifecycle.plan.model import Plan
-from lifecycle.verify.judge import verify
 from lifecycle.verify.observation import Observation
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import Finding, Stage
@@ -23,6 +22,7 @@ from tests.unit.verify.edits import (
     change_report,
     drop_endpoint,
 )
+from tests.unit.verify.lines import verify
 from tests.unit.verify.perfect import perfect
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION

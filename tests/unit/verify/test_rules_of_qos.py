@@ -16,7 +16,6 @@ from lifecycle.manifest.qos import (
     Reliability,
 )
 from lifecycle.plan.model import Plan
-from lifecycle.verify.judge import verify
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import Finding, Stage
 from tests.builders import node, planned, publisher, subscription
@@ -28,7 +27,7 @@ from tests.unit.verify.edits import (
     change_announced_qos,
     change_endpoint,
 )
-from tests.unit.verify.lines import lines
+from tests.unit.verify.lines import lines, verify
 from tests.unit.verify.perfect import perfect
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION

@@ -7,12 +7,12 @@ from msgspec.structs import replace
 
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.plan.model import ExpectedParameter, Plan
-from lifecycle.verify.judge import verify
 from lifecycle.verify.observation import Observation
 from lifecycle.verify.tool_filter import CLOCK
 from lifecycle.verify.verdict import Stage
 from tests.builders import at, endpoint, node, planned, publisher
 from tests.unit.verify.edits import Edit, add_endpoint, add_node, both, change_endpoint
+from tests.unit.verify.lines import verify
 from tests.unit.verify.perfect import perfect
 
 PUB = EndpointKind.PUBLISHER

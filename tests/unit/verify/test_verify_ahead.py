@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from msgspec.structs import replace
 
-from lifecycle.verify.judge import verify
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import Stage
 from tests.builders import node, planned, publisher, subscription
+from tests.unit.verify.lines import verify
 from tests.unit.verify.perfect import perfect
 
 PLAN = planned(node("one", publisher("a")), node("two", subscription("a")))

@@ -18,7 +18,6 @@ from lifecycle.manifest.model import (
     RunKind,
 )
 from lifecycle.plan.model import ParticipantConnections, Plan, PlannedNode, PlannedParticipant
-from lifecycle.verify.judge import verify
 from lifecycle.verify.observation import Observation
 from lifecycle.verify.outcome import ConnectionReport, Outcome
 from lifecycle.verify.report import render_text, to_json
@@ -34,7 +33,7 @@ from tests.unit.verify.edits import (
     drop_node,
     drop_report,
 )
-from tests.unit.verify.lines import lines
+from tests.unit.verify.lines import lines, verify
 from tests.unit.verify.perfect import perfect
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION

@@ -10,7 +10,6 @@ from lifecycle.network.nfe import (
 )
 from lifecycle.plan.build import build_plan
 from lifecycle.plan.model import Plan
-from lifecycle.verify.judge import verify
 from lifecycle.verify.observation import Observation
 from lifecycle.verify.outcome import ConnectionReport, Outcome
 from lifecycle.verify.verdict import Finding, FlowReport, Stage
@@ -35,7 +34,7 @@ from tests.unit.verify.edits import (
     drop_endpoint_report,
     drop_report,
 )
-from tests.unit.verify.lines import lines
+from tests.unit.verify.lines import lines, verify
 from tests.unit.verify.perfect import perfect
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION

@@ -8,7 +8,6 @@ from msgspec.structs import replace
 from lifecycle.manifest.diagnostics import Diagnostic, Position, Severity
 from lifecycle.manifest.model import ParameterValue, Run, RunKind
 from lifecycle.plan.model import ExpectedParameter, Plan
-from lifecycle.verify.judge import verify
 from lifecycle.verify.observation import (
     LONGEST_VALUE,
     NodeConfiguration,
@@ -21,7 +20,7 @@ from lifecycle.verify.rules import RULES
 from lifecycle.verify.rules.parameters import spell
 from lifecycle.verify.verdict import Finding, Stage
 from tests.builders import at, node, planned
-from tests.unit.verify.lines import lines
+from tests.unit.verify.lines import lines, verify
 from tests.unit.verify.perfect import perfect
 
 ATTACH = Run(kind=RunKind.ATTACH)

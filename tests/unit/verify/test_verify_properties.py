@@ -13,11 +13,11 @@ from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import PRESETS
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.plan.model import Plan
-from lifecycle.verify.judge import verify
 from lifecycle.verify.observation import Observation
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import Stage
 from tests.builders import endpoint, need, node, planned
+from tests.unit.verify.lines import verify
 from tests.unit.verify.perfect import perfect
 
 TYPES = {

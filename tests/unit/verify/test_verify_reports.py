@@ -24,7 +24,6 @@ from lifecycle.network.nfe import (
 )
 from lifecycle.plan.build import build_plan
 from lifecycle.plan.model import Plan
-from lifecycle.verify.judge import verify
 from lifecycle.verify.observation import NodeConfiguration
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.report import render_text, to_json, to_junit, to_sarif
@@ -50,6 +49,7 @@ from tests.unit.verify.edits import (
     drop_node,
     drop_report,
 )
+from tests.unit.verify.lines import verify
 from tests.unit.verify.perfect import perfect
 
 SCHEMAS = Path(__file__).parents[3] / "schemas"

@@ -23,7 +23,6 @@ from lifecycle.manifest.qos import (
 )
 from lifecycle.plan.build import build_plan
 from lifecycle.plan.model import Plan
-from lifecycle.verify.judge import verify
 from lifecycle.verify.observation import HealthReport, Observation
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.run import node_of
@@ -56,6 +55,7 @@ from tests.unit.verify.edits import (
     drop_node,
     drop_report,
 )
+from tests.unit.verify.lines import verify
 from tests.unit.verify.perfect import perfect
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION

@@ -13,7 +13,6 @@ from lifecycle.network.nfe import (
     UniqueRequirement,
 )
 from lifecycle.plan.model import ParticipantConnections, Plan, PlannedParticipant
-from lifecycle.verify.judge import verify
 from lifecycle.verify.observation import Identity
 from lifecycle.verify.outcome import ConnectionReport, Outcome
 from lifecycle.verify.transport import carrier
@@ -25,6 +24,7 @@ from tests.unit.verify.edits import (
     change_configuration,
     change_report,
 )
+from tests.unit.verify.lines import verify
 from tests.unit.verify.perfect import perfect
 
 PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
