@@ -11,6 +11,7 @@ import socket
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -233,7 +234,8 @@ def test_the_control_socket_answers_and_tells_of_the_end_however_deep_it_lies(
 
     async def test() -> None:
         asked = asyncio.Event()
-        server = ControlServer(deep / "control", lambda: STATUS, asked.set)
+        session = SimpleNamespace(status=lambda: STATUS, stop=lambda *_: asked.set())
+        server = ControlServer(deep / "control", session)  # type: ignore[arg-type]
         await server.open()
         loop = asyncio.get_running_loop()
         answer = await loop.run_in_executor(

@@ -12,7 +12,7 @@ what a negotiation asks before it waits: what it waits for must not in turn wait
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -102,7 +102,7 @@ def authority_of(
         return None
     dynamic = layer.source is DataLayerSource.DYNAMIC
     source = NegotiatedSource(system.plan) if dynamic else PlannedSource(system.plan)
-    return ConnectionAuthority(system, source, emit, interface_of=reaching.node_interface)
+    return ConnectionAuthority(system, source, emit, reaching)
 
 
 class PlannedSource:
@@ -145,7 +145,7 @@ class ConnectionAuthority:
         system: whose nodes.
         source: what they must have.
         emit: where events go.
-        interface_of: the interface to a node that is not declared, by full name.
+        reaching: reaches nodes that are not declared.
     """
 
     def __init__(
@@ -153,13 +153,12 @@ class ConnectionAuthority:
         system: System,
         source: PlannedSource | NegotiatedSource,
         emit: Emitter,
-        *,
-        interface_of: Callable[[str], NodeDriver | NodeInterfaceClient],
+        reaching: ObserverParticipant,
     ) -> None:
         self._system = system
         self._source = source
         self._emit = emit
-        self._interface_of = interface_of
+        self._reaching = reaching
         self._wirings: dict[str, _Wiring] = {}
         self._others: dict[str, NodeConfiguration] = {}
         self._instructions: Mapping[str, Instructions] = {}
@@ -262,7 +261,7 @@ class ConnectionAuthority:
             if self._system.node_named(name) is not None or name not in self._others:
                 continue
             unmade = steps(Instructions(node=name), wiring.actual, ours=wiring.ours)
-            making = self._make(wiring, self._interface_of(name), unmade, None)
+            making = self._make(wiring, self._reaching.node_interface(name), unmade, None)
             try:
                 await asyncio.wait_for(making, RELEASE_S)
             except (BringUpError, asyncio.TimeoutError):
@@ -333,7 +332,7 @@ class ConnectionAuthority:
             elif name in self._others and name not in remote:
                 configuration = self._others[name]
                 if configuration.state in (INACTIVE, ACTIVE):
-                    yield name, self._interface_of(name), None, configuration
+                    yield name, self._reaching.node_interface(name), None, configuration
 
     async def _repair_node(
         self,

@@ -22,7 +22,7 @@ from lifecycle.supervisor.control.protocol import ProcessState
 from lifecycle.supervisor.nodes.bring_up import died
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.process import COMMAND_ESCALATION, ManagedProcess
-from lifecycle.supervisor.run.failure import StepFailedError, ended, finding_of
+from lifecycle.supervisor.run.failure import StepFailedError, finding_of
 from lifecycle.verify.rules.run import DEADLINE, START_FAILED
 from lifecycle.verify.verdict import Finding
 
@@ -112,26 +112,20 @@ def findings(system: System) -> tuple[Finding, ...]:
 
 
 async def _until_it_listens(planned: PlannedServer, process: ManagedProcess | None) -> None:
-    """Wait until it listens.
-
-    Over UDP nothing shows that from another machine: then there is nothing to wait for.
-    """
-    looking = _answering(planned) if process is None else _listening(planned, process.pid)
-    listening = asyncio.ensure_future(looking)
-    waits: set[asyncio.Future[object]] = {listening}  # type: ignore[arg-type]
-    if process is not None:
-        waits.add(process.ended)  # type: ignore[arg-type]
-    try:
-        await asyncio.wait(waits, timeout=START_S, return_when=asyncio.FIRST_COMPLETED)
+    """Wait until it listens; there is no event of that."""
+    loop = asyncio.get_running_loop()
+    deadline = loop.time() + START_S
+    log = "" if process is None else str(process.log.path)
+    while True:
         if process is not None and process.state is ProcessState.EXITED:
             raise StepFailedError(
                 f"cannot start the discovery server at {_where(planned)}: {process.ended.result()}",
                 rule=START_FAILED,
                 subject=NAME,
                 process=NAME,
-                log=str(process.log.path),
+                log=log,
             )
-        if not listening.done():
+        if (left_s := deadline - loop.time()) <= 0:
             machine = f" of machine {planned.machine!r}" if planned.machine else ""
             whose = "" if process is not None else f"{machine}, whose supervisor starts it,"
             raise StepFailedError(
@@ -139,29 +133,27 @@ async def _until_it_listens(planned: PlannedServer, process: ManagedProcess | No
                 f"for {START_S:g} s",
                 rule=DEADLINE,
                 subject=NAME,
-                log="" if process is None else str(process.log.path),
+                log=log,
             )
-        listening.result()
-    finally:
-        await ended(listening)
-
-
-async def _listening(planned: PlannedServer, pid: int) -> None:
-    """Wait until its port is open, as the kernel says; it has no way to notify us."""
-    while not discovery_server_listens(planned, pid):  # noqa: ASYNC110 - there is no event
-        await asyncio.sleep(LOOK_AGAIN_S)
-
-
-async def _answering(planned: PlannedServer) -> None:
-    """Wait until it takes a connection from here."""
-    while planned.tcp:
-        with contextlib.suppress(OSError):
-            _, writer = await asyncio.open_connection(planned.address, planned.port)
-            writer.close()
-            with contextlib.suppress(OSError):
-                await writer.wait_closed()
+        if process is not None and discovery_server_listens(planned, process.pid):
+            return
+        if process is None and await _answers(planned, left_s):
             return
         await asyncio.sleep(LOOK_AGAIN_S)
+
+
+async def _answers(planned: PlannedServer, timeout_s: float) -> bool:
+    """Return whether it takes a connection from here; over UDP nothing shows that, and it may."""
+    if planned.tcp:
+        try:
+            opening = asyncio.open_connection(planned.address, planned.port)
+            _, writer = await asyncio.wait_for(opening, timeout_s)
+        except (OSError, asyncio.TimeoutError):
+            return False
+        writer.close()
+        with contextlib.suppress(OSError):
+            await writer.wait_closed()
+    return True
 
 
 def _where(planned: PlannedServer) -> str:

@@ -10,25 +10,26 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Awaitable, Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
 from lifecycle.codec import to_json
-from lifecycle.errors import LifecycleError, MiddlewareError
+from lifecycle.errors import ExitCode, LifecycleError, MiddlewareError
 from lifecycle.manifest.model import Policy, RosInterfaceAccess
 from lifecycle.manifest.names import MODE_SERVICE, supervisor_prefix, supervisor_services
 from lifecycle.plan.model import Plan
-from lifecycle.supervisor.control import protocol
 from lifecycle.supervisor.control.orders import ACTIVE, PHASES, Order
 from lifecycle.supervisor.control.protocol import ControlRequest, NodeStatus, SystemStatus
 from lifecycle.supervisor.run.events import (
+    Emitter,
     Event,
     GateOpened,
     NodeChanged,
     NodeJoined,
+    Notice,
     ProcessChanged,
     RequestSent,
     Stopping,
@@ -42,6 +43,7 @@ from lifecycle.verify.verdict import Verdict
 if TYPE_CHECKING:
     from lifecycle.middleware.services.ros_interface import RosInterface as RosEntities
     from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
+    from lifecycle.supervisor.run.session import Session
 
 Entry = tuple[int, str, str, str, Sequence[tuple[str, str]]]
 """Level, name, message, hardware id and values of a diagnostic_msgs/DiagnosticStatus."""
@@ -94,40 +96,31 @@ class RosInterface:
     """What one run offers in ROS, from the moment that its system is active or held up.
 
     Args:
+        session: what is asked and ordered.
         plan: whose policy says what is allowed.
         machine: of this supervisor, where the system has several; else empty.
         participant: makes topics and services.
+        emit: takes a notice, once, of why nothing can be offered.
         modes: names of those that it may be asked to enter.
-        status: returns what is known now.
-        verdict: returns the last one; None before the first.
-        order: carries out an order.
-        down: begins to take the system down.
-        notify: told, once, why nothing can be offered.
     """
 
     def __init__(
         self,
+        session: Session,
         plan: Plan,
         machine: str,
         participant: ObserverParticipant,
         *,
+        emit: Emitter,
         modes: Iterable[str] = (),
-        status: Callable[[], SystemStatus],
-        verdict: Callable[[], Verdict | None],
-        order: Callable[[Order], Awaitable[protocol.Answer]],
-        down: Callable[[], None],
-        notify: Callable[[str], None],
     ) -> None:
+        self._session = session
         self._plan = plan
         self._access = plan.policy.ros_interface
         self._machine = machine
         self._modes = tuple(modes)
         self._participant = participant
-        self._status = status
-        self._verdict = verdict
-        self._order = order
-        self._down = down
-        self._notify = notify
+        self._emit = emit
         self._offer: RosEntities | None = None
         self._opens = self._access is not RosInterfaceAccess.OFF
         self._was_active = False
@@ -188,10 +181,11 @@ class RosInterface:
                 prefix, services, called, diagnoses=takes_diagnostics(self._plan)
             )
         except MiddlewareError as error:
-            self._notify(
+            why = (
                 f"cannot offer diagnostics and status in ROS: {error}; the system runs without; "
                 "'policy: {ros_interface: off}' does not try"
             )
+            self._emit(Notice(message=why))
         else:
             self._publish()
 
@@ -202,20 +196,21 @@ class RosInterface:
             self._in(EACH_S, self._publish)
 
     def _say(self, offer: RosEntities) -> None:
-        status = self._status()
+        seen = self._session.look()
+        status = seen.status
         if (timeless := _timeless(status)) != self._published:
             self._published = timeless
             offer.publish_status(to_json(status).decode())
         label = supervisor_label(status.system, self._machine)
         source = supervisor_prefix(status.system, self._machine)
         offer.publish_diagnostics(
-            diagnostics(status, self._verdict(), self._rules, label=label, source=source)
+            diagnostics(status, seen.verdict, self._rules, label=label, source=source)
         )
 
     def _called(self, name: str, answer: Answer) -> None:
         if name == _DOWN:
             answer(True, "the system is being taken down")
-            self._down()
+            self._session.stop("the down service", ExitCode.BRING_UP_FAILED)
         elif name.startswith(MODE_SERVICE) or name in {each.value for each in PHASES}:
             mode = name.removeprefix(MODE_SERVICE)
             order = (
@@ -227,17 +222,17 @@ class RosInterface:
             self._orders.add(task)
             task.add_done_callback(self._orders.discard)
         else:
-            status = self._status()
+            status = self._session.status()
             answer(status.verdict is not Outcome.VIOLATED, to_json(status).decode())
 
     async def _ordered(self, order: Order, answer: Answer) -> None:
         error = "cannot do this: the supervisor ends"
         try:
-            error = (await self._order(order)).error
+            error = (await self._session.order(order)).error
         except LifecycleError as refused:
             error = str(refused)
         finally:
-            answer(not error, error or self._status().phase)
+            answer(not error, error or self._session.status().phase)
 
 
 def _timeless(status: SystemStatus) -> SystemStatus:

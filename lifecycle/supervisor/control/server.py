@@ -9,14 +9,14 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import msgspec
 
 from lifecycle.codec import from_json, to_json
-from lifecycle.errors import UsageError
+from lifecycle.errors import ExitCode, UsageError
 from lifecycle.plan.model import Plan
 from lifecycle.run_directory import connect, short_path
 from lifecycle.supervisor.control.protocol import (
@@ -31,7 +31,7 @@ from lifecycle.verify.observation import Observation
 from lifecycle.verify.verdict import Verdict
 
 if TYPE_CHECKING:
-    from lifecycle.supervisor.control.orders import Order
+    from lifecycle.supervisor.run.session import Session
 
 _BURST_S = 0.05
 _CLOSE_S = 1.0
@@ -75,29 +75,12 @@ class ControlServer:
 
     Args:
         path: of the socket.
-        status: for STATUS.
-        down: for DOWN.
-        look: for LOOK and FOLLOW.
-        order: carries out an order.
-        differences: says how a plan differs from what runs.
+        session: what is asked.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        status: Callable[[], SystemStatus],
-        down: Callable[[], None],
-        *,
-        look: Callable[[], SupervisorSnapshot] | None = None,
-        order: Callable[[Order], Awaitable[Answer]] | None = None,
-        differences: Callable[[Plan], tuple[str, ...]] = lambda _: (),
-    ) -> None:
+    def __init__(self, path: Path, session: Session) -> None:
         self._path = path
-        self._status = status
-        self._down = down
-        self._look = look
-        self._order = order
-        self._differences = differences
+        self._session = session
         self._changed = asyncio.Event()
         self._server: asyncio.AbstractServer | None = None
         self._open: set[asyncio.StreamWriter] = set()
@@ -128,7 +111,7 @@ class ControlServer:
                 question = from_json(line, QuestionWithPlan)
                 if question.ask is ControlRequest.DOWN:
                     self._waiting.add(writer)
-                    self._down()
+                    self._session.stop("lifecycle down", ExitCode.BRING_UP_FAILED)
                 elif question.ask is ControlRequest.FOLLOW:
                     await self._follow(reader, writer)
                 else:
@@ -147,23 +130,23 @@ class ControlServer:
         self._changed = asyncio.Event()
 
     async def _answer(self, question: QuestionWithPlan) -> Answer:
-        if question.ask is ControlRequest.LOOK and self._look is not None:
-            return LookAnswer(look=self._look())
+        if question.ask is ControlRequest.LOOK:
+            return LookAnswer(look=self._session.look())
         from lifecycle.supervisor.control.orders import PHASES, Order  # clients need neither
 
-        if self._order is not None and question.ask in PHASES:
-            return await self._order(Order(**msgspec.structs.asdict(question)))
+        if question.ask in PHASES:
+            return await self._session.order(Order(**msgspec.structs.asdict(question)))
         if question.ask is ControlRequest.DIFFERENCES and question.plan is not None:
-            return Answer(differences=self._differences(question.plan))
-        return Answer(status=self._status())
+            return Answer(differences=self._session.differences(question.plan))
+        return Answer(status=self._session.status())
 
     async def _follow(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Send what is known now and after each change, until the client goes away."""
         gone = asyncio.ensure_future(reader.read())
         try:
-            while self._look is not None and not gone.done():
+            while not gone.done():
                 changed = self._changed
-                await _say(writer, LookAnswer(look=self._look()))
+                await _say(writer, LookAnswer(look=self._session.look()))
                 waiting = asyncio.ensure_future(changed.wait())
                 await asyncio.wait({gone, waiting}, return_when=asyncio.FIRST_COMPLETED)
                 waiting.cancel()

@@ -175,11 +175,13 @@ class SilenceMonitor:
                 self.came_back(names, Cause.STOPPED)
 
         def hung(why: Overdue | None) -> None:
-            assert process.channel is not None
             where = f"its process {process.name!r} (pid {process.pid})"
             if why is Overdue.HANGS:
-                limit_s, busy_s = process.channel.silent_s, process.channel.busy_s
-                what = f" {process.channel.what}" if process.channel.what else ""
+                assert process.channel is not None
+                assert process.channel.sign is not None
+                sign = process.channel.sign
+                limit_s, busy_s = sign.limit_s, sign.busy_s
+                what = f" {sign.what}" if sign.what else ""
                 at = process.where()
                 detail = (
                     f"a callback{what} in {where} has been running for more than {limit_s:g} s"

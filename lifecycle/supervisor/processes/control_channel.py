@@ -55,6 +55,7 @@ class ControlChannel:
         on_hang: called with why its executor is busy for too long, with None when it came back.
 
     Attributes:
+        sign: shows whether its executor is busy; None before `open` and once nobody watches it.
         failures: what kept its nodes from being constructed, each cause once, the first one first.
     """
 
@@ -67,7 +68,7 @@ class ControlChannel:
         self._spec = spec
         self._on_state = on_state
         self._on_hang = on_hang
-        self._sign: BusySign | None = None
+        self.sign: BusySign | None = None
         self._looking: asyncio.TimerHandle | None = None
         self.failures: list[HostFailedError] = []
         self._next = 0
@@ -78,25 +79,6 @@ class ControlChannel:
         self._writer: asyncio.StreamWriter | None = None
         self._task: asyncio.Task[None] | None = None
 
-    @property
-    def silent_s(self) -> float:
-        """Its executor may be busy for so long at a time: its nodes share it."""
-        return max(node.timeouts.silent_s for node in self._spec.nodes)
-
-    @property
-    def busy_s(self) -> float:
-        """Seconds that its executor has been busy; 0 if it is not, or nobody knows."""
-        return 0.0 if self._sign is None else self._sign.busy_s
-
-    @property
-    def what(self) -> str:
-        """What its executor does, as `of the service /reset`; empty where nobody knows."""
-        return "" if self._sign is None else self._sign.what
-
-    def where(self, pid: int) -> str:
-        """Return where the threads of the host stand; empty if it does not say, see BusySign."""
-        return "" if self._sign is None else self._sign.where(pid)
-
     async def open(self) -> socket.socket:
         """Make the pair, send the host its spec, and return the end that the host inherits.
 
@@ -105,8 +87,9 @@ class ControlChannel:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
         ours.setblocking(False)
         line = to_json(self._spec) + b"\n"
-        self._sign = BusySign.make(self.silent_s)
-        socket.send_fds(ours, [line[:1]], [self._sign.descriptor])
+        # Its nodes share its executor.
+        self.sign = BusySign.make(max(node.timeouts.silent_s for node in self._spec.nodes))
+        socket.send_fds(ours, [line[:1]], [self.sign.descriptor])
         self._look()
         reader, self._writer = await asyncio.open_connection(sock=ours, limit=_LONGEST_LINE)
         self._writer.write(line[1:])
@@ -189,8 +172,8 @@ class ControlChannel:
             self._on_state(event)
 
     def _look(self) -> None:
-        if self._sign is not None:
-            why, again_s = self._sign.look()
+        if self.sign is not None:
+            why, again_s = self.sign.look()
             self._looking = asyncio.get_running_loop().call_later(again_s, self._look)
             if why is not None:
                 self._on_hang(why)
@@ -198,9 +181,9 @@ class ControlChannel:
     def _watch_no_more(self) -> None:
         if self._looking is not None:
             self._looking.cancel()
-        if self._sign is not None:
-            self._sign.close()
-            self._sign = None
+        if self.sign is not None:
+            self.sign.close()
+            self.sign = None
 
     def _fail(self, error: ChannelClosedError) -> None:
         if not self._ready.done():

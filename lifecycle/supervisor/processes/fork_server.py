@@ -14,7 +14,6 @@ import signal
 import socket
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from typing import NamedTuple
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import BringUpError
@@ -126,13 +125,6 @@ class ForkServerChild:
         self.exited.set_result(exit_)
 
 
-class _Pending(NamedTuple):
-    """A process that the fork server was asked for."""
-
-    born: asyncio.Future[ForkServerChild]
-    process: ManagedProcess
-
-
 class ForkServer:
     """Starts processes: asks another one to fork.
 
@@ -144,7 +136,7 @@ class ForkServer:
     """
 
     def __init__(self, process: ForkServerProcess) -> None:
-        self._pending: dict[int, _Pending] = {}
+        self._pending: dict[int, tuple[asyncio.Future[ForkServerChild], ManagedProcess]] = {}
         self._children: dict[int, ForkServerChild] = {}
         self._next = 0
         self._loop = asyncio.get_running_loop()
@@ -256,7 +248,7 @@ class ForkServer:
         born: asyncio.Future[ForkServerChild] = self._loop.create_future()
         with self._asking():
             socket.send_fds(self._process.socket, [to_json(message)], descriptors)
-        self._pending[message.id] = _Pending(born, process)
+        self._pending[message.id] = (born, process)
         return await born
 
     def belonging(self, processes: Mapping[int, str]) -> set[int]:

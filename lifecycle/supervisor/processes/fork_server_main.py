@@ -89,36 +89,29 @@ class ChildReport(msgspec.Struct, frozen=True, kw_only=True):
 SERVES = "serves"
 """A message: say that you serve."""
 
-_CHILD_SIGNAL = -1
-_ENDED = os.WEXITED | os.WNOWAIT | os.WNOHANG
-_STOPS = os.WSTOPPED | os.WCONTINUED | os.WNOHANG
+_CHANGES = os.WNOHANG | os.WUNTRACED | os.WCONTINUED
 _WAKEUP_BYTES = 4096
-
-
-class _Child(msgspec.Struct, frozen=True, kw_only=True):
-    request: ForkRequest
-    pidfd: int
 
 
 class _ForkServer:
     def __init__(self, sock: socket.socket) -> None:
         self._sock = sock
         self._selector = selectors.DefaultSelector()
-        self._selector.register(sock, selectors.EVENT_READ, None)
-        self._children: dict[int, _Child] = {}  # by pid
-        # SIGCHLD notifies a parent that a child was stopped; nothing else does.
+        self._selector.register(sock, selectors.EVENT_READ)
+        self._children: dict[int, ForkRequest] = {}  # by pid
         self._signals = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
         signal.signal(signal.SIGCHLD, _arrived)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGCHLD})  # what started us may block it
         signal.set_wakeup_fd(self._signals[1], warn_on_full_buffer=False)
-        self._selector.register(self._signals[0], selectors.EVENT_READ, _CHILD_SIGNAL)
+        self._selector.register(self._signals[0], selectors.EVENT_READ)
 
     def serve(self) -> None:
         """Fork on request and report ends until the supervisor closes its side."""
         serves = True
         while serves:
             for key, _ in self._selector.select():
-                if key.data is not None:
-                    self._bury(key.data)
+                if key.fileobj is not self._sock:
+                    self._reap()
                 elif not self._request():
                     serves = False
         self._selector.unregister(self._sock)
@@ -159,41 +152,24 @@ class _ForkServer:
         for descriptor in descriptors:
             os.close(descriptor)
         if pid > 0:
+            self._children[pid] = request
             pidfd = os.pidfd_open(pid)
-            self._children[pid] = _Child(request=request, pidfd=pidfd)
-            self._selector.register(pidfd, selectors.EVENT_READ, pid)
             self._tell(ChildReport(id=request.id, pid=pid), pidfd)
+            os.close(pidfd)
 
-    def _bury(self, pid: int) -> None:
-        """Reap a child that has ended, or whatever SIGCHLD has announced."""
-        if pid == _CHILD_SIGNAL:
-            self._note_stops()
-            self._bury_adopted()
-        elif pid in self._children:  # not buried on the way to an adopted one
-            child = self._children.pop(pid)
-            self._selector.unregister(child.pidfd)
-            os.close(child.pidfd)
-            _, status = os.waitpid(pid, 0)
-            self._tell(ChildReport(id=child.request.id, pid=pid, status=status))
-
-    def _note_stops(self) -> None:
-        """Report which children were stopped or continue."""
+    def _reap(self) -> None:
+        """Report which children were stopped, continue or have ended; bury orphans, too."""
         with contextlib.suppress(BlockingIOError):
             os.read(self._signals[0], _WAKEUP_BYTES)
         with contextlib.suppress(ChildProcessError):
-            while (found := os.waitid(os.P_ALL, 0, _STOPS)) is not None:
-                if child := self._children.get(found.si_pid):
-                    stopped = found.si_code != os.CLD_CONTINUED
-                    self._tell(ChildReport(id=child.request.id, pid=found.si_pid, stopped=stopped))
-
-    def _bury_adopted(self) -> None:
-        """Reap orphans that have ended, and children where one of them is in between."""
-        with contextlib.suppress(ChildProcessError):
-            while (found := os.waitid(os.P_ALL, 0, _ENDED)) is not None:
-                if found.si_pid in self._children:
-                    self._bury(found.si_pid)
-                else:
-                    os.waitpid(found.si_pid, 0)
+            while (found := os.waitpid(-1, _CHANGES)) != (0, 0):
+                pid, status = found
+                lives = os.WIFSTOPPED(status) or os.WIFCONTINUED(status)
+                request = self._children.get(pid) if lives else self._children.pop(pid, None)
+                if request is not None:
+                    stopped = os.WIFSTOPPED(status) if lives else None
+                    ended = None if lives else status
+                    self._tell(ChildReport(id=request.id, pid=pid, status=ended, stopped=stopped))
 
     def _tell(self, report: ChildReport, *descriptors: int) -> None:
         # A supervisor that is gone is noticed by the next read.
@@ -207,17 +183,17 @@ class _ForkServer:
         commands are asked to.
         """
         began_s = time.monotonic()
-        for pid, child in self._children.items():
-            if not child.request.control:
+        for pid, request in self._children.items():
+            if not request.control:
                 _signal(pid, signal.SIGINT)
         while self._children:
             passed_s = time.monotonic() - began_s
-            left_s = {pid: c.request.grace_s - passed_s for pid, c in self._children.items()}
+            left_s = {pid: each.grace_s - passed_s for pid, each in self._children.items()}
             for pid, each_s in left_s.items():
                 if each_s <= 0:
                     _signal(pid, signal.SIGKILL)
-            for key, _ in self._selector.select(max(0.0, min(left_s.values())) or None):
-                self._bury(key.data)
+            self._selector.select(max(0.0, min(left_s.values())) or None)
+            self._reap()
 
     def _become(self, request: ForkRequest, descriptors: list[int]) -> NoReturn:
         """Turn this fork into the requested process; never returns to the fork server's code."""
@@ -230,8 +206,6 @@ class _ForkServer:
                 os.close(descriptor)
             self._selector.close()
             self._sock.close()
-            for child in self._children.values():
-                os.close(child.pidfd)
             # A host takes them itself, once there is something to shut down; until then it ends
             # at once, and without a KeyboardInterrupt in the middle of an import.
             signal.signal(signal.SIGINT, signal.SIG_DFL)

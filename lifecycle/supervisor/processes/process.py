@@ -212,7 +212,8 @@ class ManagedProcess:
 
         Empty of a process that does not say: it is a command, or was stopped.
         """
-        stacks = "" if self.channel is None else self.channel.where(self.pid)
+        sign = None if self.channel is None else self.channel.sign
+        stacks = "" if sign is None else sign.where(self.pid)
         for line in stacks.splitlines():
             self.log.add(line)
         return brief(stacks)

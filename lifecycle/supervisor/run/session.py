@@ -23,12 +23,13 @@ import msgspec
 from msgspec.structs import replace
 
 from lifecycle.errors import ExitCode
+from lifecycle.plan.model import Plan
 from lifecycle.run_directory import RunDirectory, start_ticks
 from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.connections.authority import authority_of
 from lifecycle.supervisor.connections.networks import Networks
-from lifecycle.supervisor.control.orders import ACTIVE, HELD, PAUSED, Revisions
-from lifecycle.supervisor.control.protocol import SystemStatus
+from lifecycle.supervisor.control.orders import ACTIVE, HELD, PAUSED, Order, Revisions
+from lifecycle.supervisor.control.protocol import Answer, SystemStatus
 from lifecycle.supervisor.control.ros_interface import RosInterface
 from lifecycle.supervisor.control.server import ControlServer, SupervisorSnapshot
 from lifecycle.supervisor.control.status import system_status
@@ -256,15 +257,12 @@ class Session:
         )
 
         self._ros_interface = RosInterface(
+            self,
             system.plan,
             min(system.machines or ("",)),
             observer_participant,
+            emit=emit,
             modes=() if system.remote else (each.name for each in system.plan.modes),
-            status=self.status,
-            verdict=lambda: self._judge.latest,
-            order=self._holding.ordered,
-            down=lambda: self._down("the down service"),
-            notify=lambda text: emit(Notice(message=text)),
         )
 
     def status(self) -> SystemStatus:
@@ -301,19 +299,17 @@ class Session:
             return
         self._stop.set_exception(_Stop(reason, exit_code))
 
-    def _down(self, reason: str) -> None:
-        self.stop(reason, ExitCode.BRING_UP_FAILED)
+    async def order(self, order: Order) -> Answer:
+        """Take an order from outside, if it fits what the system is doing; return its outcome."""
+        return await self._holding.ordered(order)
+
+    def differences(self, plan: Plan) -> tuple[str, ...]:
+        """Say how `plan` differs from what runs, one line each; empty if it does not."""
+        return self._revisions.differences(plan)
 
     async def run(self) -> UpResult:
         """Bring the system up, hold it, and take it down; never leaves anything running."""
-        server = ControlServer(
-            self._directory.socket_path,
-            self.status,
-            lambda: self._down("lifecycle down"),
-            look=self.look,
-            order=self._holding.ordered,
-            differences=self._revisions.differences,
-        )
+        server = ControlServer(self._directory.socket_path, self)
         await server.open()
         self._peer_supervisors.open()
         self._agreement.open()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -97,9 +98,8 @@ def test_the_control_socket_looks_follows_and_orders(tmp_path: Path) -> None:
         return Answer(exit_code=ExitCode.VIOLATED, error="cannot activate: no")
 
     async def test() -> None:
-        server = ControlServer(
-            tmp_path / "control", lambda: STATUS, lambda: None, look=lambda: seen, order=carry_out
-        )
+        session = SimpleNamespace(look=lambda: seen, order=carry_out)
+        server = ControlServer(tmp_path / "control", session)  # type: ignore[arg-type]
         await server.open()
         loop = asyncio.get_running_loop()
         assert await loop.run_in_executor(None, look, tmp_path) == seen

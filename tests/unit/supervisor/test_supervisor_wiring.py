@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Mapping
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from msgspec.structs import replace
@@ -102,7 +103,9 @@ class Wiring:
             self.world.system,
             self.source,
             self.world.emit,
-            interface_of=lambda name: pytest.fail(f"{name} is nobody that is known"),
+            SimpleNamespace(  # type: ignore[arg-type]
+                node_interface=lambda name: pytest.fail(f"{name} is nobody that is known")
+            ),
         )
         self.world.bring_up = BringUp(
             self.world.system,
