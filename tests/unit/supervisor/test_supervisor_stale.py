@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from types import SimpleNamespace
 from typing import Any
 
-from lifecycle.dataclasses import replace
+from msgspec.structs import replace
 
 from lifecycle.supervisor.control.protocol import ProcessState
 from lifecycle.supervisor.health.process_monitor import EndedProcesses
