@@ -111,28 +111,15 @@ PREFIX_DIGITS = 24
 """A GUID begins with its participant's prefix of 12 bytes (DDSI-RTPS §9.3.1)."""
 
 _ACTION_PART = "/_action/"
-_ACTION_SERVER_PARTS = frozenset(
-    {
-        (EndpointKind.SERVICE_SERVER, "send_goal"),
-        (EndpointKind.SERVICE_SERVER, "cancel_goal"),
-        (EndpointKind.SERVICE_SERVER, "get_result"),
-        (EndpointKind.PUBLISHER, "feedback"),
-        (EndpointKind.PUBLISHER, "status"),
-    }
-)
-_ACTION_CLIENT_PARTS = frozenset(
-    {
-        (EndpointKind.SERVICE_CLIENT, "send_goal"),
-        (EndpointKind.SERVICE_CLIENT, "cancel_goal"),
-        (EndpointKind.SERVICE_CLIENT, "get_result"),
-        (EndpointKind.SUBSCRIPTION, "feedback"),
-        (EndpointKind.SUBSCRIPTION, "status"),
-    }
-)
-_ACTION_SIDES = (
-    (EndpointKind.ACTION_SERVER, _ACTION_SERVER_PARTS),
-    (EndpointKind.ACTION_CLIENT, _ACTION_CLIENT_PARTS),
-)
+_ACTION_PARTS: Mapping[str, tuple[EndpointKind, str]] = {
+    "send_goal": (EndpointKind.SERVICE_SERVER, "_SendGoal"),
+    "cancel_goal": (EndpointKind.SERVICE_SERVER, "action_msgs/srv/CancelGoal"),
+    "get_result": (EndpointKind.SERVICE_SERVER, "_GetResult"),
+    "feedback": (EndpointKind.PUBLISHER, "_FeedbackMessage"),
+    "status": (EndpointKind.PUBLISHER, "action_msgs/msg/GoalStatusArray"),
+}
+"""Parts of an action: their kind in its server, whose other end is in its client, and their type;
+of a type that begins with the action's own, the end."""
 
 
 def tolerating_pattern(full_name: str, patterns: Collection[str] = TOLERATED_NODES) -> str:
@@ -541,10 +528,12 @@ def action_part(kind: EndpointKind, name: str) -> tuple[EndpointKind, str] | Non
     action, separator, part = name.rpartition(_ACTION_PART)
     if not separator or not action:
         return None
-    for side, parts in _ACTION_SIDES:
-        if (kind, part) in parts:
-            return side, action
-    return None
+    served, _ = _ACTION_PARTS.get(part, (None, ""))
+    if served is None:
+        return None
+    if kind is served:
+        return EndpointKind.ACTION_SERVER, action
+    return (EndpointKind.ACTION_CLIENT, action) if kind is served.other_end else None
 
 
 def fold_actions(endpoints: Iterable[ObservedEndpoint]) -> tuple[ObservedEndpoint, ...]:
@@ -572,13 +561,24 @@ def fold_actions(endpoints: Iterable[ObservedEndpoint]) -> tuple[ObservedEndpoin
         left = list(parts)
         if (node, side, name) in known and side is EndpointKind.ACTION_CLIENT:
             continue  # one that a node has several times is one end
-        while named.keys() == _ACTION_TYPES.keys():
+        while named.keys() == _ACTION_PARTS.keys():
             # What has another type makes the action complete, and is left over.
             chosen = {
                 part: next((e for e in found if e.type == part_type(part, type_)), found[0])
                 for part, found in named.items()
             }
-            kept.append(_folded(node, side, name, type_, chosen))
+            goals = chosen["send_goal"]
+            kept.append(
+                ObservedEndpoint(
+                    kind=side,
+                    node=node,
+                    name=name,
+                    type=type_,
+                    gid=goals.gid,
+                    address=goals.address,
+                    type_hash=_action_hash(chosen),
+                )
+            )
             serves = side is EndpointKind.ACTION_SERVER
             for part, each in chosen.items():
                 taken = [each] if serves else [e for e in named[part] if e.type == each.type]
@@ -592,35 +592,6 @@ def fold_actions(endpoints: Iterable[ObservedEndpoint]) -> tuple[ObservedEndpoin
     return tuple(kept)
 
 
-def _folded(
-    node: str,
-    side: EndpointKind,
-    name: str,
-    type_: str,
-    parts: Mapping[str, ObservedEndpoint],
-) -> ObservedEndpoint:
-    first = parts["send_goal"]
-    return ObservedEndpoint(
-        kind=side,
-        node=node,
-        name=name,
-        type=type_,
-        gid=first.gid,
-        address=first.address,
-        type_hash=_action_hash(parts.values()),
-    )
-
-
-_ACTION_TYPES: Mapping[str, str] = {
-    "send_goal": "_SendGoal",
-    "cancel_goal": "action_msgs/srv/CancelGoal",
-    "get_result": "_GetResult",
-    "feedback": "_FeedbackMessage",
-    "status": "action_msgs/msg/GoalStatusArray",
-}
-"""Types of the parts of an action; of those that begin with its own type, the ends."""
-
-
 def part_type(part: str, type_: str) -> str:
     """Return the type that a part of an action must have.
 
@@ -628,7 +599,7 @@ def part_type(part: str, type_: str) -> str:
         part: a hidden name or the end of one, `/dock/_action/send_goal`.
         type_: of the action, `robot/action/Dock`.
     """
-    end = _ACTION_TYPES[part.rpartition("/")[2]]
+    _, end = _ACTION_PARTS[part.rpartition("/")[2]]
     return f"{type_}{end}" if end.startswith("_") else end
 
 
@@ -636,7 +607,7 @@ def _action_type(parts: Mapping[str, Iterable[ObservedEndpoint]]) -> str:
     """Return the type of an action: that of most of its parts, of its goals where they differ."""
     found = [
         each.type.removesuffix(end)
-        for part, end in _ACTION_TYPES.items()
+        for part, (_, end) in _ACTION_PARTS.items()
         if end.startswith("_")
         for each in parts.get(part, ())
         if each.type.endswith(end)
@@ -644,10 +615,9 @@ def _action_type(parts: Mapping[str, Iterable[ObservedEndpoint]]) -> str:
     return max(found, key=found.count) if found else ""
 
 
-def _action_hash(parts: Iterable[ObservedEndpoint]) -> str | None:
+def _action_hash(parts: Mapping[str, ObservedEndpoint]) -> str | None:
     """Return the type hash of an action from those of its parts; None while one is not seen."""
-    hashes = {part.name.rpartition("/")[2]: part.type_hash for part in parts}
-    found = [hashes[part] for part in ("send_goal", "get_result", "feedback")]
+    found = [parts[part].type_hash for part in ("send_goal", "get_result", "feedback")]
     known = [each for each in found if each is not None]
     return join(known) if len(known) == len(found) else None
 

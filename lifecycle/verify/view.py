@@ -222,14 +222,6 @@ class View(msgspec.Struct, frozen=True, kw_only=True):
     flows: tuple[FlowView, ...]
     uniqueness: Uniqueness
 
-    def brings_up(self, node: PlannedNode) -> bool:
-        """Return whether the caller brings this node up, and so knows the state it must be in."""
-        return brings_up(node, self.machines)
-
-    def is_beyond(self, node: PlannedNode) -> bool:
-        """Return whether a node is out of reach: it uses the memory of a host that is not ours."""
-        return is_beyond(node, self.machines)
-
 
 def brings_up(node: PlannedNode, machines: frozenset[str] | None) -> bool:
     """Return whether a node is on one of the machines whose nodes the caller brings up."""

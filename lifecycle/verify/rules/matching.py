@@ -33,6 +33,7 @@ from lifecycle.verify.view import (
     SeenEndpoint,
     View,
     actual_qos,
+    brings_up,
 )
 
 UNMATCHED_LINK = Rule(
@@ -162,7 +163,7 @@ def _unknown_peers(view: View, topics: Mapping[str, _Ends]) -> Iterator[Finding]
         report = actual.report
         if report is None or not report.matched or not actual.planned.kind.is_topic:
             continue
-        if not view.brings_up(actual.node):
+        if not brings_up(actual.node, view.machines):
             continue
         publishers, subscriptions = topics.get(actual.planned.resolved, _NO_ENDS)
         end = _end(actual)

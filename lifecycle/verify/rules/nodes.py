@@ -17,7 +17,7 @@ from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.rules.endpoints import UNDECLARED
 from lifecycle.verify.tool_filter import of_supervisors
 from lifecycle.verify.verdict import Finding, Stage
-from lifecycle.verify.view import View
+from lifecycle.verify.view import View, brings_up, is_beyond
 
 MISSING_NODE = Rule(
     id="graph.missing-node",
@@ -82,10 +82,10 @@ def _missing(view: View) -> Iterator[Finding]:
             hint = f"look at the log of its container {node.run.container}"
         elif node.run.kind is RunKind.ATTACH:
             hint = "start it: the manifest attaches to it; compare domain, RMW and discovery range"
-        elif not view.brings_up(node):
+        elif not brings_up(node, view.machines):
             machine = f" --machine {node.machine}" if node.machine else ""
             hint = f"its machine has a supervisor of its own: lifecycle up MANIFEST{machine}"
-        beyond = view.is_beyond(node)
+        beyond = is_beyond(node, view.machines)
         if beyond:
             hint = f"the supervisor of machine {node.machine!r} verifies it"
         yield MISSING_NODE.on_node(

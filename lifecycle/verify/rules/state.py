@@ -9,7 +9,7 @@ from lifecycle.plan.model import PlannedNode
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.verdict import Finding, Stage
-from lifecycle.verify.view import NodeFacts, View
+from lifecycle.verify.view import NodeFacts, View, brings_up
 
 WRONG_STATE = Rule(
     id="state.wrong-state",
@@ -63,7 +63,7 @@ def _judge(view: View, facts: NodeFacts) -> Iterator[Finding]:
     wanted = _wanted(view.stage, node)
     allowed = {wanted}
     ahead = view.stage is Stage.CONNECTED and name in view.ahead
-    if ahead or (view.stage is Stage.CONNECTED and not view.brings_up(node)):
+    if ahead or (view.stage is Stage.CONNECTED and not brings_up(node, view.machines)):
         # Another supervisor brings it up, and its gate opens on the same proof, maybe before ours;
         # or an earlier gate let it through, and only others have to pass again.
         allowed.add(node.state.value)

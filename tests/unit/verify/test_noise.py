@@ -197,6 +197,12 @@ def test_an_action_has_the_hashes_of_its_goal_result_and_feedback():
     assert fold_actions(unannounced)[0].type_hash == ""
 
 
+def test_an_action_is_found_by_the_guid_and_address_of_its_goal_service():
+    goals, *others = parts()
+    (action,) = fold_actions([replace(goals, gid="0a", address="10.0.0.1"), *others])
+    assert (action.gid, action.address) == ("0a", "10.0.0.1")
+
+
 @pytest.mark.parametrize("missing", range(5))
 def test_an_incomplete_action_stays_in_parts(missing: int):
     some = [part for index, part in enumerate(parts()) if index != missing]
