@@ -2,8 +2,10 @@
 
 `Shadow` listens to a `SessionWorld`: what its events and its judge show becomes an input, and what
 the reducer wants is only noted. Compared are activate requests, starts of processes and the exit
-code, each by name and how often. Not a test: `python -m pytest -s -p no:xdist -p
-tests.unit.supervisor.core.shadow_stories FILES` prints the differences of their stories.
+code, each by name and how often; not when. A step that the session has done already is answered at
+once, and a process that the session ends counts as asked to end: so its limits, and which node is
+not discovered, are the session's. Run by test_shadow.py; by hand: `python -m pytest -p no:xdist -p
+tests.unit.supervisor.core.shadow_stories FILES`.
 """
 
 from __future__ import annotations
@@ -57,6 +59,7 @@ class Shadow:
         self.wants: Counter[str] = Counter()
         self.does: Counter[str] = Counter()
         self._orders = 0
+        self._graph = world.graph
         self._stopping: set[str] = set()
         self._levels: dict[str, Level] = {}
         self._looked = self.run.mark
@@ -119,7 +122,7 @@ class Shadow:
         judge._look, judge._stands, session.stop = look_too, stands_too, stop_too
         world.graph.note = world.graph._hosts.changed = note_too
         session._holding._stop = stop_too
-        session._holding.ordered = ordered_too
+        session._holding.ordered = session._ros_interface._order = ordered_too
         world.networks.begin = begin_too
 
     def give(self, given: Any) -> None:
@@ -146,7 +149,7 @@ class Shadow:
             elif isinstance(each, effects.Prepare):
                 again.append(inputs.Ready(error=self._session._fork_server.cannot_start))
             elif isinstance(each, effects.Give):
-                again.append(inputs.Given(node=each.node))
+                again.append(inputs.Given(node=each.node, error=self._refused(each.node)))
         if self._wake is not None:
             self._wake.cancel()
         if at_s < float("inf"):
@@ -166,6 +169,14 @@ class Shadow:
         ):
             self._look = None
             self.give(inputs.Verified(mark=asked.mark, verdict=judge.latest))
+
+    def _refused(self, key: str) -> str:
+        """Return why a node does not take its parameters; empty if it does."""
+        node = self.run.nodes[key]
+        given = [f"{each.name}={each.value}" for each in node.planned.expected_parameters]
+        refuses = self._graph.refuses
+        live = self._graph.refuses_live.get(node.name, "")
+        return live or (f"cannot set {refuses!r}" if refuses in given else "")
 
     def _asked(self, _: int) -> str:
         return "" if self.run.order is None else self.run.order.ask.value
