@@ -1,7 +1,7 @@
-"""What was found, in one line for each finding, and its texts, which are lines of `findings.txt`.
+"""What was found, in one line for each finding, and all of it, which is a line of `findings.txt`.
 
-Tests compare rules, places and the like. The texts of all that they find are in that file, one line
-for each, as a person has read them. `make findings` writes it anew: read the difference.
+Tests compare rules, places and the like. All that they find is in that file, with its texts, one
+line for each, as a person has read it. `make findings` writes it anew: read the difference.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def _line(finding: Finding) -> str:
 def _text(finding: Finding) -> str:
     texts = (finding.message, finding.expected, finding.observed, finding.hint)
     assert all(isinstance(each, str) for each in texts), finding
-    return f"{finding.rule}: " + " | ".join((*texts, *finding.nodes)).replace("\n", "\\n")
+    return " | ".join((_line(finding), *texts, *finding.nodes)).replace("\n", "\\n")
 
 
 def _compare(findings: Iterable[Finding]) -> None:

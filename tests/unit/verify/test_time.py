@@ -7,11 +7,18 @@ from msgspec.structs import replace
 
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.plan.model import ExpectedParameter, Plan
-from lifecycle.verify.observation import Observation
+from lifecycle.verify.observation import Observation, ParameterReport
 from lifecycle.verify.tool_filter import CLOCK
 from lifecycle.verify.verdict import Stage
 from tests.builders import at, endpoint, node, planned, publisher
-from tests.unit.verify.edits import Edit, add_endpoint, add_node, both, change_endpoint
+from tests.unit.verify.edits import (
+    Edit,
+    add_endpoint,
+    add_node,
+    both,
+    change_configuration,
+    change_endpoint,
+)
 from tests.unit.verify.lines import verify
 from tests.unit.verify.perfect import perfect
 
@@ -72,3 +79,42 @@ def test_who_publishes_the_clock_is_judged(
 def test_without_simulated_time_it_does_not_matter_who_publishes_it() -> None:
     verdict = verify(ALONE, plays(gid="1")(perfect(ALONE)), stage=Stage.CONNECTED)
     assert verdict.findings == ()
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("use_sim_time", True, ["time.no-clock"]),
+        ("use_sim_time", False, []),
+        ("other", True, []),
+    ],
+)
+def test_a_node_that_reports_to_use_simulated_time_needs_it(
+    name: str, value: bool, expected: list[str]
+) -> None:
+    reports = (ParameterReport.of(name, "bool", value=value, read_only=False),)
+    plan = planned(node("user", publisher("a")))
+    edit = change_configuration("/user", parameters=reports)
+    found = verify(plan, edit(perfect(plan)), stage=Stage.CONNECTED).findings
+    assert [each.rule for each in found if each.rule.startswith("time.")] == expected
+
+
+@pytest.mark.parametrize(("count", "named"), [(1, "/a"), (4, "/a, /b, /c, /d")])
+def test_few_nodes_without_a_clock_are_named(count: int, named: str) -> None:
+    assert without_clock(count) == f"cannot give {named} simulated time: nobody publishes /clock"
+
+
+def test_of_many_nodes_without_a_clock_four_are_named() -> None:
+    assert "cannot give /a, /b, /c, /d and 2 more simulated time" in without_clock(6)
+
+
+def without_clock(count: int) -> str:
+    plan = planned(*(node(each, publisher(each)) for each in "abcdef"[:count]))
+    given = ExpectedParameter(name="use_sim_time", type="bool", value=True, at=at(7))
+    plan = replace(
+        plan, nodes=tuple(replace(each, expected_parameters=(given,)) for each in plan.nodes)
+    )
+    found = verify(plan, perfect(plan), stage=Stage.CONNECTED).findings
+    (finding,) = (each for each in found if each.rule == "time.no-clock")
+    assert finding.at.endswith(":7:1")
+    return finding.message
