@@ -25,7 +25,7 @@ with Watched() as shown:
     shown.show("first")
     shown.show(text)
     while True:
-        time.sleep(60)
+        time.sleep(0.5)  # a signal just before it is handled after it
 """
 
 
@@ -63,7 +63,7 @@ def _read(end: int, *, until: bytes) -> bytes:
 
 
 def test_without_a_terminal_each_text_follows_the_other() -> None:
-    program = PROGRAM.replace("while True:\n        time.sleep(60)", "pass")
+    program = PROGRAM.partition("    while True:")[0]
     done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=True
     )
