@@ -18,8 +18,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 
-from msgspec.structs import replace
-
 from tests.net.fragments import IPV6_FRAGMENT, Fragments
 from tests.net.hosts import Host
 
@@ -248,7 +246,7 @@ class Capture:
             return
         if packet is None:
             return
-        packet = replace(packet, interface=interface)
+        packet = dataclasses.replace(packet, interface=interface)
         message = self._fragments.add(octets)[_UDP_HEADER:]
         if message[:4] == b"RTPS":
             self._learn_all(message)
@@ -259,7 +257,7 @@ class Capture:
             writers += [prefix + writer for writer, _ in _data(message)]
             readers += [prefix + reader for reader in _acknowledging(message)]
             self._learn_all(message)
-            packet = replace(
+            packet = dataclasses.replace(
                 packet,
                 participant=prefix,
                 discovers=any(each[12:] == _PARTICIPANT_WRITER for each in writers),

@@ -7,6 +7,7 @@ Owns: `Soaking`: brings the system up, does what a round says, asserts what must
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 import os
 import shutil
@@ -21,7 +22,6 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import psutil
-from msgspec.structs import replace
 
 from lifecycle.middleware.process.shared_memory import leftovers
 from tests.ros.supervisor.running import ROOT, command, environment, left_of
@@ -246,7 +246,7 @@ class Soaking:
             times = {each: max(at, healed) for each, at in times.items()}
             self._reports(run, done, expected, since, times, delayed_s)
         if done.manifest is not None and self._end_of_apply(run, expected) == "applied":
-            after = replace(after, manifest=done.manifest)
+            after = dataclasses.replace(after, manifest=done.manifest)
         if expected.goes_on is not None and self._goes_on(run, expected):
             after = expected.goes_on
         elif expected.exit_codes:
