@@ -29,7 +29,7 @@ help:
 	@echo "make hostile attack everything that reads what others wrote, and list what was not handled"
 	@echo "make mutate  change what judges, one small change at a time, and list what no test notices"
 	@echo "make schemas write the JSON Schemas of results from their types, into schemas/"
-	@echo "make findings write the texts of findings that tests compare with, to be read by a person"
+	@echo "make findings write all that tests of rules find, which they compare with: read the difference"
 	@echo "make docs    build the documentation site, with the Python API, into build/site"
 
 $(STAMP): pyproject.toml

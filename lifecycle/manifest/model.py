@@ -506,33 +506,19 @@ class Quantity(msgspec.Struct, frozen=True, kw_only=True):
         return f"{self.name} {self.value:g}" if self.value < 1e6 else f"{self.name} {self.value}"
 
 
-class FlowTerms(msgspec.Struct, frozen=True, kw_only=True):
-    """What an endpoint asks of its flow that its plan takes over as it is.
-
-    Attributes:
-        loss: highest share of messages lost or late that it bears, > 0 and <= 1; None if not
-            declared.
-        rate_hz: messages per second, > 0; likewise.
-        transport: NETWORK must not go by shared memory.
-        lossy: the data bear an unreliable transport (True), or do not (False); None leaves that to
-            the QoS and to the node's own hint, which this overrides.
-        quantities: each of its numbers that only a measurement could prove, as it is written.
-    """
-
-    unique: UniqueRequirement = UniqueRequirement.NOT_REQUIRED
-    loss: float | None = None
-    rate_hz: float | None = None
-    transport: FlowTransport = FlowTransport.ANY
-    lossy: bool | None = None
-    quantities: tuple[Quantity, ...] = ()
-
-
-class FlowNeed(FlowTerms, frozen=True, kw_only=True):
+class FlowNeed(msgspec.Struct, frozen=True, kw_only=True):
     """What one endpoint asks of its network flow.
 
     Attributes:
         kind: PUBLISHER or SUBSCRIPTION.
         name: the endpoint's declared name.
+        loss: highest share of messages lost or late that it bears, > 0 and <= 1; None if not
+            declared.
+        rate_hz: messages per second, > 0; None if not declared.
+        transport: NETWORK must not go by shared memory.
+        lossy: the data bear an unreliable transport (True), or do not (False); None leaves that to
+            the QoS and to the node's own hint, which this overrides.
+        quantities: each of its numbers that only a measurement could prove, as it is written.
         dscp: 0–63, of all that the endpoint sends: data, or a subscription's acknowledgements; None
             leaves it alone.
         transport_priority: DDS TRANSPORT_PRIORITY, mapped to a TOS byte by
@@ -547,6 +533,12 @@ class FlowNeed(FlowTerms, frozen=True, kw_only=True):
 
     kind: EndpointKind
     name: str
+    unique: UniqueRequirement = UniqueRequirement.NOT_REQUIRED
+    loss: float | None = None
+    rate_hz: float | None = None
+    transport: FlowTransport = FlowTransport.ANY
+    lossy: bool | None = None
+    quantities: tuple[Quantity, ...] = ()
     dscp: int | None = None
     transport_priority: int | None = None
     enforce: bool = True

@@ -29,7 +29,6 @@ from lifecycle.manifest.model import (
     Endpoint,
     EndpointKind,
     EndpointPolicy,
-    FlowTerms,
     FlowTransport,
     Link,
     Manifest,
@@ -556,7 +555,12 @@ def _planned_endpoint(
         raise PlanError(message, hint=hint, at=need.need.at)
     return replace(
         planned,
-        **declared(FlowTerms, need.need),
+        unique=need.need.unique,
+        loss=need.need.loss,
+        rate_hz=need.need.rate_hz,
+        transport=need.need.transport,
+        lossy=need.need.lossy,
+        quantities=need.need.quantities,
         dscp=need.dscp,
         enforce_dscp=need.need.enforce,
         dscp_reason=need.marking.reason,

@@ -146,7 +146,7 @@ class PlannedEndpoint(Endpoint, frozen=True, kw_only=True):
         resolved: fully qualified topic, service or action name after namespace and remap.
         loss: highest share of messages lost or late that it bears, > 0 and <= 1; None if not
             declared.
-        rate_hz: messages per second, > 0; likewise.
+        rate_hz: messages per second, > 0; None if not declared.
         transport: NETWORK must not go by shared memory.
         lossy: the data bear an unreliable transport (True), or do not (False); None leaves that to
             the QoS and to the node's own hint, which this overrides.

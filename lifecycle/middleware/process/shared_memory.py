@@ -156,8 +156,8 @@ def _unused(*, remove: bool) -> tuple[tuple[str, ...], bool]:
     # Reading what all processes map takes milliseconds, in which a participant that is made would
     # be refused its port for a lock of ours: none is held meanwhile.
     shared = {name for name, files in unowned.items() if "_port" in name or not _locks(files)}
-    if in_others := shared and shared & _mapped_by_any():
-        in_use = True
+    in_others = shared & _mapped_by_any() if shared else set()
+    in_use = in_use or bool(in_others)
     found: list[str] = []
     for group, files in unowned.items():
         if group in in_others:

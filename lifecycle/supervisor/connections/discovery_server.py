@@ -22,7 +22,7 @@ from lifecycle.supervisor.control.protocol import ProcessState
 from lifecycle.supervisor.nodes.bring_up import died
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.process import COMMAND_ESCALATION, ManagedProcess
-from lifecycle.supervisor.run.failure import StepFailedError, finding_of
+from lifecycle.supervisor.run.failure import StepFailedError, finding_of, within
 from lifecycle.verify.rules.run import DEADLINE, START_FAILED
 from lifecycle.verify.verdict import Finding
 
@@ -147,7 +147,7 @@ async def _answers(planned: PlannedServer, timeout_s: float) -> bool:
     if planned.tcp:
         try:
             opening = asyncio.open_connection(planned.address, planned.port)
-            _, writer = await asyncio.wait_for(opening, timeout_s)
+            _, writer = await within(timeout_s, opening)
         except (OSError, asyncio.TimeoutError):
             return False
         writer.close()

@@ -283,7 +283,7 @@ def _is_decided(view: View, flow: FlowView) -> bool:
 
 def _not_by_network(flow: FlowView, demanding: Actual, used: str) -> Finding:
     unknown = used == UNKNOWN
-    why = "nobody tells what carries it" if unknown else f"what carries it is {_WORDS[used]}"
+    why = "nothing shows what carries it" if unknown else f"what carries it is {_WORDS[used]}"
     return WRONG_TRANSPORT.finding(
         Outcome.UNVERIFIABLE if unknown else Outcome.VIOLATED,
         subject=flow.subject,
@@ -308,7 +308,7 @@ def _otherwise(flow: FlowView, used: str) -> Finding:
         observed=word,
         message=f"cannot {'verify' if unknown else 'accept'} what carries {flow.publisher} →"
         f" {flow.subscription} on {flow.planned.topic}: it must be {planned}, and"
-        f" {'nobody tells what it is' if unknown else f'it is {word}'}",
+        f" {'nothing shows what it is' if unknown else f'it is {word}'}",
         at=flow.at,
     )
 

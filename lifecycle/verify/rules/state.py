@@ -106,7 +106,7 @@ def _judge(view: View, facts: NodeFacts) -> Iterator[Finding]:
             node,
             expected=expected,
             observed="unknown",
-            message=f"cannot verify the state of node {name}: nobody tells it",
+            message=f"cannot verify the state of node {name}: no report and no service says it",
         )
 
 

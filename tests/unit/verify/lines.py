@@ -1,7 +1,7 @@
 """What was found, in one line for each finding, and all of it, which is a line of `findings.txt`.
 
 Tests compare rules, places and the like. All that they find is in that file, with its texts, one
-line for each, as a person has read it. `make findings` writes it anew: read the difference.
+line for each. `make findings` writes it anew: read the difference before you commit it.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def _compare(findings: Iterable[Finding]) -> None:
         return
     texts = {_text(each) for each in findings}
     if not _WRITES:
-        assert texts - _as_read() == set(), "read it, and run `make findings`"
+        assert texts - _as_read() == set(), "run `make findings`, and read the difference"
     elif not texts <= _found:
         _found.update(texts)
         _FILE.write_text("".join(f"{each}\n" for each in sorted(_found)))

@@ -14,7 +14,7 @@ from tests.unit.supervisor.core.shadow import Shadow
 
 LISTED = {
     "test_a_foreign_node_is_not_blamed_for_the_time_in_which_its_request_is_kept_back": (
-        "the fakes keep a request to a foreign node back themselves, and the reducer is not told: "
+        "the fakes keep a request to a foreign node back themselves, unseen by the reducer: "
         "the shell is to say `Replied(changed)` where the bytes leave"
     ),
     "test_what_becomes_wrong_while_another_node_is_restarted_is_found_within_a_second": (
