@@ -22,6 +22,7 @@ from lifecycle.cli.verbs.check import CheckReport
 from lifecycle.export.picture.model import Picture
 from lifecycle.graph.status import NodeStatus
 from lifecycle.manifest import written
+from lifecycle.manifest.model import Dscp
 from lifecycle.network.dscp import MAX_DSCP, code_points
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.control.protocol import SystemStatus
@@ -224,7 +225,7 @@ def generate_manifest() -> str:
     special = {
         written.ParameterTree: tree["anyOf"],
         written.OnViolation: [reaction, for_rules, {"$ref": "#/$defs/EnterMode"}],
-        written.Dscp: [{"enum": names}, {"type": "integer", "minimum": 0, "maximum": MAX_DSCP}],
+        Dscp: [{"enum": names}, {"type": "integer", "minimum": 0, "maximum": MAX_DSCP}],
     }
     for type_, branches in special.items():
         defs[type_.__name__] = {"description": _about(type_), "anyOf": branches}

@@ -36,6 +36,7 @@ from lifecycle.manifest.model import (
     Node,
     OnViolation,
     ParameterValue,
+    PublisherFlow,
     Quantity,
     Reaction,
     Resources,
@@ -459,7 +460,7 @@ def _flows(node: Cursor) -> list[FlowNeed]:
     needs = []
     for kind in (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION):
         for name, cursor in node.entries("flows", kind.value):
-            wanted = written.read(cursor.value.plain(), written.PublisherFlow, strict=False)
+            wanted = written.read(cursor.value.plain(), PublisherFlow, strict=False)
             five_qi = wanted.five_qi
             needs.append(
                 cursor.build(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import bisect
 import enum
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta
@@ -199,9 +199,18 @@ class FlowIdentification(enum.Enum):
 Text = Annotated[str, Meta(min_length=1)]
 Seconds = Annotated[float, Meta(gt=0, le=86400)]
 SecondsOrNone = Annotated[float, Meta(ge=0, le=86400)]
+Milliseconds = Annotated[float, Meta(gt=0, le=86_400_000)]
+UInt32 = Annotated[int, Meta(ge=0, le=2**32 - 1)]
 
 ParameterValue = bool | int | float | str | tuple[bool | int | float | str, ...]
 """A ROS parameter value; arrays are tuples of one scalar type."""
+
+
+class Special:
+    """A value for which msgspec has no type; `written.read_special` reads it."""
+
+    def __init__(self, value: Any) -> None:
+        self.value = value
 
 
 class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -506,47 +515,85 @@ class Quantity(msgspec.Struct, frozen=True, kw_only=True):
         return f"{self.name} {self.value:g}" if self.value < 1e6 else f"{self.name} {self.value}"
 
 
-class FlowNeed(msgspec.Struct, frozen=True, kw_only=True):
+class Dscp(Special):
+    """A differentiated services code point: a name (RFC 2474, 2597, 3246, …) or 0 to 63."""
+
+
+class SubscriptionFlow(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One subscription's flow.
+
+    Attributes:
+        unique: require_unique_network_flow_endpoints: whether this endpoint must have a network
+            flow endpoint that no other has.
+        dscp: Differentiated services code point of everything it sends, which is its
+            acknowledgements: the data carry the publisher's. A name (RFC 2474, 2597, 3246, …) or 0
+            to 63.
+        transport_priority: DDS TRANSPORT_PRIORITY of the DataReader, instead of 'dscp': goes
+            through 'network.transport_priority_mapping' to become a TOS byte, which is four times
+            the DSCP. Without a mapping it is the TOS byte.
+        enforce: Whether a DSCP that could not be applied is violated (true) or a warning (false).
+        transport: What carries it: what the planner chooses (any), an IP socket (network), shared
+            memory (shm), UDP (udpv4, udpv6), one datagram with TTL 0 for all subscriptions of the
+            host (multicast), TCP (tcpv4).
+        lossy: Whether the data bear an unreliable transport; what the node itself says if left out.
+    """
+
+    unique: UniqueRequirement = UniqueRequirement.NOT_REQUIRED
+    dscp: Dscp | None = None
+    transport_priority: Annotated[UInt32, Meta(examples=[184])] | None = None
+    enforce: bool = True
+    transport: FlowTransport = FlowTransport.ANY
+    lossy: bool | None = None
+
+
+class PublisherFlow(SubscriptionFlow, frozen=True, kw_only=True):
+    """One publisher's flow.
+
+    Attributes:
+        dscp: Differentiated services code point of everything it sends: a name (RFC 2474, 2597,
+            3246, …) or 0 to 63.
+        transport_priority: DDS TRANSPORT_PRIORITY, instead of 'dscp': goes through
+            'network.transport_priority_mapping' to become a TOS byte, which is four times the DSCP.
+            Without a mapping it is the TOS byte.
+        five_qi: 5G QoS identifier, 3GPP TS 23.501 Table 5.7.4-1; 'auto' proposes one from
+            'max_delay_ms', 'loss' and 'rate_hz' and says why.
+        max_delay_ms: Longest delay that this flow bears, milliseconds; that of the links of its
+            topic if left out.
+        loss: Highest share of messages lost or late that this flow bears.
+        rate_hz: Messages per second.
+        max_message_size: Largest serialized message, bytes; the bound of its type, where all its
+            fields have one, if left out.
+        non_blocking_send: Never wait for room in the socket's buffer: what finds it full is lost,
+            and only a RELIABLE publisher sends it again.
+    """
+
+    five_qi: Literal["auto"] | Annotated[int, Meta(ge=1, le=254)] | None = None
+    max_delay_ms: Milliseconds | None = None
+    loss: Annotated[float, Meta(gt=0, le=1)] | None = None
+    rate_hz: Annotated[float, Meta(gt=0, le=1_000_000)] | None = None
+    max_message_size: Annotated[int, Meta(ge=1, le=2**32 - 1)] | None = None
+    non_blocking_send: bool = False
+
+
+class FlowNeed(PublisherFlow, frozen=True, kw_only=True):
     """What one endpoint asks of its network flow.
 
     Attributes:
         kind: PUBLISHER or SUBSCRIPTION.
         name: the endpoint's declared name.
-        loss: highest share of messages lost or late that it bears, > 0 and <= 1; None if not
-            declared.
-        rate_hz: messages per second, > 0; None if not declared.
-        transport: NETWORK must not go by shared memory.
-        lossy: the data bear an unreliable transport (True), or do not (False); None leaves that to
-            the QoS and to the node's own hint, which this overrides.
-        quantities: each of its numbers that only a measurement could prove, as it is written.
-        dscp: 0–63, of all that the endpoint sends: data, or a subscription's acknowledgements; None
-            leaves it alone.
-        transport_priority: DDS TRANSPORT_PRIORITY, mapped to a TOS byte by
-            `Network.transport_priority_mapping`; None if not given. Never beside `dscp`.
-        enforce: a DSCP that could not be applied is violated (True) or a warning (False).
-        five_qi: 3GPP TS 23.501 Table 5.7.4-1 value; None if not asked for, or left to us.
+        dscp: 0–63, of all that the endpoint sends; None leaves it alone. Never beside
+            `transport_priority`.
+        five_qi: None if not asked for, or left to us.
         five_qi_auto: `five_qi: auto`: the planner proposes one.
-        max_delay_ms: longest delay that the flow bears, milliseconds, > 0; None if not declared.
-        max_message_size: largest serialized message, bytes, > 0; None takes the type's bound.
-        non_blocking_send: a send never waits; what finds the socket's buffer full is lost.
+        quantities: each of its numbers that only a measurement could prove, as it is written.
     """
 
     kind: EndpointKind
     name: str
-    unique: UniqueRequirement = UniqueRequirement.NOT_REQUIRED
-    loss: float | None = None
-    rate_hz: float | None = None
-    transport: FlowTransport = FlowTransport.ANY
-    lossy: bool | None = None
-    quantities: tuple[Quantity, ...] = ()
-    dscp: int | None = None
-    transport_priority: int | None = None
-    enforce: bool = True
+    dscp: int | None = None  # type: ignore[assignment]
     five_qi: int | None = None
     five_qi_auto: bool = False
-    max_delay_ms: float | None = None
-    max_message_size: int | None = None
-    non_blocking_send: bool = False
+    quantities: tuple[Quantity, ...] = ()
     at: Position
 
 

@@ -7,7 +7,7 @@ Owns: which keys there are, what their values may be, and what editors and messa
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar, Literal, TypeVar
+from typing import Annotated, ClassVar, Literal, TypeVar
 
 import msgspec
 from msgspec import Meta, Struct, field
@@ -17,24 +17,29 @@ from lifecycle.manifest.model import (
     Condition,
     DataLayerKeys,
     DiscoveryKeys,
+    Dscp,
     EndpointPolicy,
     Executor,
     FlowIdentification,
     FlowTransport,
     Limits,
+    Milliseconds,
     Output,
+    PublisherFlow,
     ResourceLimits,
     RosArguments,
     RosInterfaceAccess,
+    Special,
+    SubscriptionFlow,
     Supervision,
     TargetState,
     Text,
     Timeouts,
+    UInt32,
     UniqueHow,
 )
 from lifecycle.manifest.model import Health as NodeHealth
 from lifecycle.network.dscp import code_points, parse_dscp
-from lifecycle.network.nfe import UniqueRequirement
 
 T = TypeVar("T")
 
@@ -57,9 +62,7 @@ Namespace = Annotated[
 Prefix = Annotated[
     str, spelled(rf"^{_WORD}(/{_WORD})*\Z", "use letters, digits and '_', parts joined by '/'")
 ]
-Milliseconds = Annotated[float, Meta(gt=0, le=86_400_000)]
 Nanoseconds = Annotated[int, Meta(ge=0, le=2**63 - 1)]
-UInt32 = Annotated[int, Meta(ge=0, le=2**32 - 1)]
 Octet = Annotated[int, Meta(ge=0, le=255)]
 
 Scalar = str | int | float | bool
@@ -70,13 +73,6 @@ Values = Scalar | tuple[Scalar, ...]
 
 Truth = Literal[0, 1, "true", "false", "True", "False", "0", "1"] | bool
 """What `if:` and `unless:` may be once their substitutions are resolved."""
-
-
-class Special:
-    """A value for which msgspec has no type; `read_special` reads it."""
-
-    def __init__(self, value: Any) -> None:
-        self.value = value
 
 
 class ParameterTree(Special):
@@ -604,66 +600,6 @@ InterfaceReference = Annotated[
         examples=["local://camera.nodl.yaml"],
     ),
 ]
-
-
-class Dscp(Special):
-    """A differentiated services code point: a name (RFC 2474, 2597, 3246, …) or 0 to 63."""
-
-
-class SubscriptionFlow(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One subscription's flow.
-
-    Attributes:
-        unique: require_unique_network_flow_endpoints: whether this endpoint must have a network
-            flow endpoint that no other has.
-        dscp: Differentiated services code point of everything it sends, which is its
-            acknowledgements: the data carry the publisher's. A name (RFC 2474, 2597, 3246, …) or 0
-            to 63.
-        transport_priority: DDS TRANSPORT_PRIORITY of the DataReader, instead of 'dscp': goes
-            through 'network.transport_priority_mapping' to become a TOS byte, which is four times
-            the DSCP. Without a mapping it is the TOS byte.
-        enforce: Whether a DSCP that could not be applied is violated (true) or a warning (false).
-        transport: What carries it: what the planner chooses (any), an IP socket (network), shared
-            memory (shm), UDP (udpv4, udpv6), one datagram with TTL 0 for all subscriptions of the
-            host (multicast), TCP (tcpv4).
-        lossy: Whether the data bear an unreliable transport; what the node itself says if left out.
-    """
-
-    unique: UniqueRequirement = UniqueRequirement.NOT_REQUIRED
-    dscp: Dscp | None = None
-    transport_priority: Annotated[UInt32, Meta(examples=[184])] | None = None
-    enforce: bool = True
-    transport: FlowTransport = FlowTransport.ANY
-    lossy: bool | None = None
-
-
-class PublisherFlow(SubscriptionFlow, frozen=True, kw_only=True):
-    """One publisher's flow.
-
-    Attributes:
-        dscp: Differentiated services code point of everything it sends: a name (RFC 2474, 2597,
-            3246, …) or 0 to 63.
-        transport_priority: DDS TRANSPORT_PRIORITY, instead of 'dscp': goes through
-            'network.transport_priority_mapping' to become a TOS byte, which is four times the DSCP.
-            Without a mapping it is the TOS byte.
-        five_qi: 5G QoS identifier, 3GPP TS 23.501 Table 5.7.4-1; 'auto' proposes one from
-            'max_delay_ms', 'loss' and 'rate_hz' and says why.
-        max_delay_ms: Longest delay that this flow bears, milliseconds; that of the links of its
-            topic if left out.
-        loss: Highest share of messages lost or late that this flow bears.
-        rate_hz: Messages per second.
-        max_message_size: Largest serialized message, bytes; the bound of its type, where all its
-            fields have one, if left out.
-        non_blocking_send: Never wait for room in the socket's buffer: what finds it full is lost,
-            and only a RELIABLE publisher sends it again.
-    """
-
-    five_qi: Literal["auto"] | Annotated[int, Meta(ge=1, le=254)] | None = None
-    max_delay_ms: Milliseconds | None = None
-    loss: Annotated[float, Meta(gt=0, le=1)] | None = None
-    rate_hz: Annotated[float, Meta(gt=0, le=1_000_000)] | None = None
-    max_message_size: Annotated[int, Meta(ge=1, le=2**32 - 1)] | None = None
-    non_blocking_send: bool = False
 
 
 class Health(NodeHealth, frozen=True, kw_only=True):
