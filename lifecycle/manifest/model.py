@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta
 
-from lifecycle.codec import Positive, says
+from lifecycle.codec import says
 from lifecycle.manifest.diagnostics import Diagnostic, Position, Severity
 from lifecycle.manifest.qos import POLICIES, QosProfile
 from lifecycle.network.connection_url import ConnectionUrl
@@ -196,7 +196,17 @@ class FlowIdentification(enum.Enum):
     DSCP = "dscp"  # a DSCP of their own as the sixth element of the tuple; at most 64
 
 
+def spelled(pattern: str, message: str) -> Meta:
+    """Return the pattern of a string, with what is said of one that does not match."""
+    return Meta(pattern=pattern, extra_json_schema={"patternErrorMessage": message})
+
+
+WORD = "[A-Za-z_][A-Za-z0-9_]*"
+
 Text = Annotated[str, Meta(min_length=1)]
+NodeKey = Annotated[
+    str, spelled(rf"^{WORD}(/{WORD})*\Z", "write a node's key, as in 'camera' or 'left/camera'")
+]
 Seconds = Annotated[float, Meta(gt=0, le=86400)]
 SecondsOrNone = Annotated[float, Meta(ge=0, le=86400)]
 Milliseconds = Annotated[float, Meta(gt=0, le=86_400_000)]
@@ -801,21 +811,31 @@ class DataLayer(DataLayerKeys, frozen=True, kw_only=True):
     at: Position | None = None
 
 
-class Network(msgspec.Struct, frozen=True, kw_only=True):
-    """How flow needs become network resources; for the whole system.
+class NetworkKeys(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How flow needs become network resources.
 
     Attributes:
-        flow_identification: how publishers that need a unique flow get one.
-        transport_priority_mapping: how `transport_priority` becomes a TOS byte, as Connext Micro
-            computes it; None takes the value as the TOS byte itself (mask 0xff).
-        five_qi_dscp: marks publishers that ask for a 5QI and no DSCP; None marks none.
-        max_datagram_bytes: UDP payload that the path carries unfragmented; None assumes Ethernet.
+        flow_identification: How publishers that need a unique flow get one: sockets of their own
+            (participant), or a DSCP of their own as a sixth element of the tuple (dscp; at most 64,
+            and no router may read them as classes).
+        five_qi_dscp: Marks publishers that ask for a 5QI and no DSCP: a file of yours, or the name
+            of a published mapping. No mapping is normative; without this key a 5QI marks nothing.
+        max_datagram_bytes: UDP payload that the path carries without fragments; 1472 on Ethernet
+            with IPv4 if left out.
     """
 
     flow_identification: FlowIdentification = FlowIdentification.PARTICIPANT
     transport_priority_mapping: TransportPriorityMapping | None = None
-    five_qi_dscp: DscpMapping | None = None
-    max_datagram_bytes: Positive | None = None
+    five_qi_dscp: (
+        Annotated[Text, Meta(examples=["azure_private_5g_core", "our_network.json"])] | None
+    ) = None
+    max_datagram_bytes: Annotated[int, Meta(ge=1200, le=65500)] | None = None
+
+
+class Network(NetworkKeys, frozen=True, kw_only=True):
+    """How flow needs become network resources, the mapping read, and where that is written."""
+
+    five_qi_dscp: DscpMapping | None = None  # type: ignore[assignment]
     at: Position | None = None
 
 
@@ -861,24 +881,31 @@ class Policy(msgspec.Struct, frozen=True, kw_only=True):
     ros_interface_required: bool = False
 
 
-class Link(msgspec.Struct, frozen=True, kw_only=True):
-    """What must hold between one publisher's and one subscription's node.
+class LinkKeys(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One link.
 
     Attributes:
-        topic: fully qualified name.
-        from_node: manifest key of the publishing node.
-        to_node: manifest key of the subscribing node.
-        max_delay_ms: > 0; None if not asked for.
-        transport: overrides what would be negotiated for this pair.
-        quantities: each of its numbers that only a measurement could prove, as it is written.
+        topic: Fully qualified topic name, after namespace and remapping.
+        from: Key of the publishing node.
+        to: Key of the subscribing node.
+        unique: How unique the flow between them must be.
+        max_delay_ms: Longest delay allowed, milliseconds.
+        transport: What carries it: what the planner chooses (any), an IP socket (network), shared
+            memory (shm), UDP (udpv4, udpv6), one datagram with TTL 0 for all subscriptions of the
+            host (multicast), TCP (tcpv4).
     """
 
-    topic: str
-    from_node: str
-    to_node: str
+    topic: Annotated[Text, Meta(examples=["/robot/video"])]
+    from_node: NodeKey = msgspec.field(name="from")
+    to_node: NodeKey = msgspec.field(name="to")
     unique: UniqueHow = UniqueHow.NOT
-    max_delay_ms: float | None = None
+    max_delay_ms: Milliseconds | None = None
     transport: FlowTransport = FlowTransport.ANY
+
+
+class Link(LinkKeys, frozen=True, kw_only=True):
+    """A link, where it is written, and what of it nothing but a measurement could prove."""
+
     quantities: tuple[Quantity, ...] = ()
     at: Position
 

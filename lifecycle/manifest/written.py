@@ -14,16 +14,17 @@ from msgspec import Meta, Struct, field
 
 from lifecycle.manifest.model import (
     TOLERATED_NODES,
+    WORD,
     Condition,
     DataLayerKeys,
     DiscoveryKeys,
     Dscp,
     EndpointPolicy,
     Executor,
-    FlowIdentification,
-    FlowTransport,
     Limits,
-    Milliseconds,
+    LinkKeys,
+    NetworkKeys,
+    NodeKey,
     Output,
     PublisherFlow,
     ResourceLimits,
@@ -35,8 +36,7 @@ from lifecycle.manifest.model import (
     TargetState,
     Text,
     Timeouts,
-    UInt32,
-    UniqueHow,
+    spelled,
 )
 from lifecycle.manifest.model import Health as NodeHealth
 from lifecycle.network.dscp import code_points, parse_dscp
@@ -44,23 +44,12 @@ from lifecycle.network.dscp import code_points, parse_dscp
 T = TypeVar("T")
 
 
-def spelled(pattern: str, message: str) -> Meta:
-    """Return the pattern of a string, with what is said of one that does not match."""
-    return Meta(pattern=pattern, extra_json_schema={"patternErrorMessage": message})
-
-
-_WORD = "[A-Za-z_][A-Za-z0-9_]*"
 _TYPE = "[a-zA-Z][a-zA-Z0-9_]*"
 
-Name = Annotated[str, spelled(rf"^{_WORD}\Z", "use letters, digits and '_', not a digit first")]
-NodeKey = Annotated[
-    str, spelled(rf"^{_WORD}(/{_WORD})*\Z", "write a node's key, as in 'camera' or 'left/camera'")
-]
-Namespace = Annotated[
-    str, spelled(rf"^/?({_WORD}(/{_WORD})*)?\Z", "write a namespace, as in /left")
-]
+Name = Annotated[str, spelled(rf"^{WORD}\Z", "use letters, digits and '_', not a digit first")]
+Namespace = Annotated[str, spelled(rf"^/?({WORD}(/{WORD})*)?\Z", "write a namespace, as in /left")]
 Prefix = Annotated[
-    str, spelled(rf"^{_WORD}(/{_WORD})*\Z", "use letters, digits and '_', parts joined by '/'")
+    str, spelled(rf"^{WORD}(/{WORD})*\Z", "use letters, digits and '_', parts joined by '/'")
 ]
 Nanoseconds = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Octet = Annotated[int, Meta(ge=0, le=255)]
@@ -229,42 +218,6 @@ class Machine(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     address: Annotated[str, Meta(examples=["10.77.0.1", "fd00::1"])] = ""
 
 
-class PriorityMapping(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How a 'transport_priority' becomes a TOS byte, as RTI Connext Micro computes it.
-
-    Attributes:
-        mask: Bits of the priority that take part; 0xFF with the defaults of 'low' and 'high' takes
-            the priority as the TOS byte, 0 sets nothing.
-        low: TOS byte of the lowest priority.
-        high: TOS byte of the highest priority.
-    """
-
-    mask: UInt32
-    low: Octet = 0
-    high: Octet = 255
-
-
-class Network(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How flow needs become network resources.
-
-    Attributes:
-        flow_identification: How publishers that need a unique flow get one: sockets of their own
-            (participant), or a DSCP of their own as a sixth element of the tuple (dscp; at most 64,
-            and no router may read them as classes).
-        five_qi_dscp: Marks publishers that ask for a 5QI and no DSCP: a file of yours, or the name
-            of a published mapping. No mapping is normative; without this key a 5QI marks nothing.
-        max_datagram_bytes: UDP payload that the path carries without fragments; 1472 on Ethernet
-            with IPv4 if left out.
-    """
-
-    flow_identification: FlowIdentification = FlowIdentification.PARTICIPANT
-    transport_priority_mapping: PriorityMapping | None = None
-    five_qi_dscp: (
-        Annotated[Text, Meta(examples=["azure_private_5g_core", "our_network.json"])] | None
-    ) = None
-    max_datagram_bytes: Annotated[int, Meta(ge=1200, le=65500)] | None = None
-
-
 class Policy(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How strict checks and verification are.
 
@@ -357,7 +310,7 @@ class Run(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         Annotated[
             str,
             spelled(
-                rf"^{_WORD}(\.{_WORD})*:{_WORD}\Z",
+                rf"^{WORD}(\.{WORD})*:{WORD}\Z",
                 "write module:Class, as in examples.teleop.nodes:Camera",
             ),
             Meta(examples=["examples.teleop.nodes:Camera"]),
@@ -369,7 +322,7 @@ class Run(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             Annotated[
                 str,
                 spelled(
-                    rf"^{_WORD}\Z", "name an argument: letters, digits and '_', not a digit first"
+                    rf"^{WORD}\Z", "name an argument: letters, digits and '_', not a digit first"
                 ),
             ],
             Values,
@@ -386,7 +339,7 @@ class Run(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         dict[
             Annotated[
                 str,
-                spelled(rf"^{_WORD}\Z", "name an environment variable: letters, digits and '_'"),
+                spelled(rf"^{WORD}\Z", "name an environment variable: letters, digits and '_'"),
             ],
             Scalar,
         ]
@@ -397,7 +350,7 @@ class Run(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         Annotated[
             str,
             spelled(
-                rf"^[A-Za-z][A-Za-z0-9_]*/{_WORD}(::{_WORD})*\Z",
+                rf"^[A-Za-z][A-Za-z0-9_]*/{WORD}(::{WORD})*\Z",
                 "write package/Plugin, as in image_tools/image_tools::Cam2Image",
             ),
             Meta(examples=["image_tools/image_tools::Cam2Image"]),
@@ -804,28 +757,6 @@ class Group(Shared, frozen=True, kw_only=True):
     machine: Text | None = None
 
 
-class Link(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One link.
-
-    Attributes:
-        topic: Fully qualified topic name, after namespace and remapping.
-        from: Key of the publishing node.
-        to: Key of the subscribing node.
-        unique: How unique the flow between them must be.
-        max_delay_ms: Longest delay allowed, milliseconds.
-        transport: What carries it: what the planner chooses (any), an IP socket (network), shared
-            memory (shm), UDP (udpv4, udpv6), one datagram with TTL 0 for all subscriptions of the
-            host (multicast), TCP (tcpv4).
-    """
-
-    topic: Annotated[Text, Meta(examples=["/robot/video"])]
-    from_node: NodeKey = field(name="from")
-    to_node: NodeKey = field(name="to")
-    unique: UniqueHow = UniqueHow.NOT
-    max_delay_ms: Milliseconds | None = None
-    transport: FlowTransport = FlowTransport.ANY
-
-
 class Manifest(Shared, frozen=True, kw_only=True):
     """One system: what runs where, what it offers and needs, which network flows it must have.
 
@@ -856,9 +787,9 @@ class Manifest(Shared, frozen=True, kw_only=True):
     arguments: dict[Name, Argument] = field(default_factory=dict)
     machines: dict[Name, Machine] = field(default_factory=dict)
     discovery: DiscoveryKeys = DiscoveryKeys()
-    network: Network = Network()
+    network: NetworkKeys = NetworkKeys()
     data_layer: DataLayerKeys = DataLayerKeys()
     policy: Policy = Policy()
     on_violation: OnViolation | None = None
     modes: Annotated[dict[Name, Mode], Meta(min_length=1)] | None = None
-    links: tuple[Link, ...] = ()
+    links: tuple[LinkKeys, ...] = ()

@@ -158,13 +158,18 @@ def describe(dscp: int) -> str:
 _BITS_32 = 0xFFFFFFFF
 
 
-class TransportPriorityMapping(msgspec.Struct, frozen=True, kw_only=True):
-    """UDPInterfaceFactoryProperty's three transport priority fields.
+class TransportPriorityMapping(
+    msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
+):
+    """How a 'transport_priority' becomes a TOS byte, as RTI Connext Micro computes it.
+
+    These are UDPInterfaceFactoryProperty's three transport priority fields.
 
     Attributes:
-        mask: 0–0xFFFFFFFF, the bits of the priority that take part; 0 leaves the TOS byte alone.
-        low: 0–255, the TOS byte of the lowest priority.
-        high: 0–255, that of the highest; not below `low`.
+        mask: Bits of the priority that take part; 0xFF with the defaults of 'low' and 'high' takes
+            the priority as the TOS byte, 0 sets nothing.
+        low: TOS byte of the lowest priority.
+        high: TOS byte of the highest priority, not below 'low'.
     """
 
     mask: Annotated[int, says(minimum=0, maximum=0xFFFFFFFF)]
