@@ -18,7 +18,6 @@ from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.interface import Findings, build_inline, scalar_tuple
 from lifecycle.manifest.model import (
     BY_DEFAULT,
-    SUPERVISION_KEYS,
     After,
     Condition,
     ConnectionDeclaration,
@@ -96,16 +95,29 @@ def _consequences(cursor: Cursor) -> Iterator[tuple[str, Cursor]]:
         yield BY_DEFAULT, reactions
 
 
-def section_positions(root: Cursor) -> tuple[tuple[str, Position], ...]:
-    """Return positions of values of `discovery:`, `data_layer:` and `on_violation:`, by path."""
-    return (
-        *(
-            (f"{section}.{key}", value.at)
-            for section in ("discovery", "data_layer")
-            for key, value in root.entries(section)
-        ),
-        *((f"on_violation.{name}", each.key_at) for name, each in _consequences(root)),
-    )
+_NAMED_BY_USERS = ("on_violation", "remap", "connections", "parameters")
+"""Sections of which an entry is where its key is; of all others, a value is where it begins."""
+
+
+def positions_of(section: Cursor, keys: Iterable[str]) -> dict[str, Position]:
+    """Return where parts of a document are, by path below a section: `run.python`, `remap.scan`.
+
+    Args:
+        section: the document, or a node.
+        keys: those keys of it whose values are looked at, with all that is inside.
+    """
+    found = {}
+    if (reactions := section.get("on_violation")) is not None:
+        found[f"on_violation.{BY_DEFAULT}"] = reactions.key_at
+    pending: list[tuple[tuple[str, ...], Cursor]] = [
+        ((key,), each) for key in keys if (each := section.get(key)) is not None
+    ]
+    while pending:
+        steps, each = pending.pop()
+        is_named = steps[0] in _NAMED_BY_USERS and (len(steps) == 2 or steps[0] == "parameters")
+        found[".".join(steps)] = each.key_at if is_named else each.at
+        pending += [((*steps, key), inside) for key, inside in each.children()]
+    return found
 
 
 def _is_ipv4_group(text: str) -> bool:
@@ -163,30 +175,6 @@ def _map(connection: Cursor, interface: Interface) -> tuple[tuple[EndpointKind, 
     )
 
 
-def connection_positions(node: Cursor) -> list[tuple[str, Position]]:
-    """Return where the parts of a node's connections are, by path below the node.
-
-    `connections.net`, `connections.net.urls.0`, `connections.net.map.publishers.0`, and
-    `connections.net.map` where it is a single string.
-    """
-    positions = []
-    for name, connection in node.entries("connections"):
-        place = f"connections.{name}"
-        positions.append((place, connection.key_at))
-        for index, url in enumerate(connection.items("urls")):
-            positions.append((f"{place}.urls.{index}", url.at))
-        mapped = connection.get("map")
-        if mapped is None:
-            continue
-        if connection.text("map") == "all":
-            positions.append((f"{place}.map", mapped.at))
-            continue
-        for kind, names in mapped.entries():
-            for index, each in enumerate(names.items()):
-                positions.append((f"{place}.map.{kind}.{index}", each.at))
-    return positions
-
-
 def build_interface(
     node: Cursor, *, base: Path, environment: Mapping[str, str], found: Findings
 ) -> Interface:
@@ -214,13 +202,6 @@ def build_interface(
         return Interface(source=reference)
     found.extend(findings)
     return interface
-
-
-_PROGRAMS = ("python", "command", "package", "executable", "component", "container", "ros_args")
-_POSITIONED = (
-    *("machine", "namespace", "name", "process", "run", "interface", "log_level"),
-    *("state", "may_end", "health", *SUPERVISION_KEYS),
-)
 
 
 def build_node(
@@ -269,12 +250,7 @@ def build_node(
         interface=interface,
         flows=tuple(_flows(cursor)),
         connections=build_connections(cursor, interface, found),
-        positions=(
-            *_positions(cursor),
-            *((f"on_violation.{name}", each.key_at) for name, each in _consequences(cursor)),
-            *connection_positions(cursor),
-            *((f"parameters.{name}", at) for name, (_, at) in parameters.items()),
-        ),
+        positions=positions_of(cursor, {key for key, _ in cursor.entries()} - {"interface"}),
         written_paths=tuple(_written_paths(cursor)),
         at=cursor.key_at,
     )
@@ -501,19 +477,3 @@ def _written_paths(node: Cursor) -> Iterator[tuple[str, str]]:
     run = node.get("run")
     if run is not None and "working_directory" in run:
         yield "run.working_directory", run.text("working_directory")
-
-
-def _positions(cursor: Cursor) -> list[tuple[str, Position]]:
-    """Return the positions of the parts of a node that later checks point at."""
-    positions = []
-    for part in _POSITIONED:
-        value = cursor.get(part)
-        if value is not None:
-            positions.append((part, value.at))
-    run = cursor.get("run")
-    if run is not None:
-        # A missing program is reported where its name is written; an `attach: true` has none.
-        positions += [(f"run.{name}", each.at) for name, each in run.entries() if name in _PROGRAMS]
-    positions += [(f"remap.{name}", each.key_at) for name, each in cursor.entries("remap")]
-    files = enumerate(cursor.items("parameter_files"))
-    return positions + [(f"parameter_files.{index}", each.at) for index, each in files]

@@ -24,8 +24,8 @@ from lifecycle.manifest.building import (
     build_modes,
     build_node,
     build_on_violation,
+    positions_of,
     quantities,
-    section_positions,
 )
 from lifecycle.manifest.checks import check
 from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position, Severity
@@ -156,7 +156,7 @@ def build_manifest(
         modes=build_modes(root, found),
         nodes=nodes,
         links=tuple(_link(each) for each in root.items("links")),
-        positions=section_positions(root),
+        positions=positions_of(root, ("discovery", "data_layer", "on_violation")),
     )
 
 

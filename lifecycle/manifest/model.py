@@ -6,8 +6,8 @@ Nothing here knows YAML. Pure.
 
 from __future__ import annotations
 
-import bisect
 import enum
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -693,7 +693,7 @@ class Node(NodeDeclaration, frozen=True, kw_only=True):
         process: nodes with the same non-empty process name share one process.
         positions: where parts of the node are, by path below it: `machine`, `namespace`, `name`,
             `process`, `restart_sec`, `on_violation.param`, `remap.scan`, `parameters.rate`,
-            `parameter_files.0`; sorted, read with `where`.
+            `parameter_files.0`; read with `where`.
         written_paths: paths as the manifest writes them, by place: `parameter_files.0`,
             `run.working_directory`; what other fields have of them is absolute.
         shared: parts that are written for several nodes, by path as in `positions`.
@@ -704,7 +704,7 @@ class Node(NodeDeclaration, frozen=True, kw_only=True):
     flows: tuple[FlowNeed, ...] = ()
     endpoints: EndpointPolicy = EndpointPolicy.DECLARED
     connections: tuple[ConnectionDeclaration, ...] = ()
-    positions: tuple[tuple[str, Position], ...] = ()
+    positions: Mapping[str, Position] = msgspec.field(default_factory=dict)
     written_paths: tuple[tuple[str, str], ...] = ()
     shared: frozenset[str] = frozenset()
 
@@ -715,17 +715,7 @@ class Node(NodeDeclaration, frozen=True, kw_only=True):
 
     def where(self, part: str) -> Position:
         """Return the position of a part of this node; the node's own if that is not known."""
-        index = bisect.bisect_left(self.positions, part, key=_path)
-        found = self.positions[index : index + 1]
-        return found[0][1] if found and found[0][0] == part else self.at
-
-    def __post_init__(self) -> None:
-        """Sort `positions`: a node may have thousands of parameters, each looked up once."""
-        msgspec.structs.force_setattr(self, "positions", tuple(sorted(self.positions, key=_path)))
-
-
-def _path(entry: tuple[str, Position]) -> str:
-    return entry[0]
+        return self.positions.get(part, self.at)
 
 
 class Machine(msgspec.Struct, frozen=True, kw_only=True):
@@ -977,9 +967,9 @@ class Manifest(SystemDeclaration, frozen=True, kw_only=True):
     arguments: tuple[tuple[str, str], ...] = ()
     nodes: tuple[Node, ...] = ()
     links: tuple[Link, ...] = ()
-    positions: tuple[tuple[str, Position], ...] = ()
+    positions: Mapping[str, Position] = msgspec.field(default_factory=dict)
     left_out: tuple[str, ...] = ()
 
     def where(self, path: str, section: Position) -> Position:
         """Return the position of a value; that of its section where it is not written."""
-        return dict(self.positions).get(path, section)
+        return self.positions.get(path, section)

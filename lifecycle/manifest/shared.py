@@ -98,13 +98,12 @@ class Shared(msgspec.Struct, frozen=True, kw_only=True):
             # rcl takes the first rule that matches: the node's own.
             remap=(*node.remap, *((name, target) for name, (target, _) in remap.items())),
             shared=node.shared | positions.keys(),
-            positions=(*node.positions, *positions.items()),
+            positions={**node.positions, **positions},
         )
 
     def _supervised(self, node: Node) -> Node:
         """Return a node with what is done when it fails; of who starts it otherwise, nothing."""
-        own = dict(node.positions)
-        given = {key: each for key, each in self.supervision.items() if key not in own}
+        given = {key: each for key, each in self.supervision.items() if key not in node.positions}
         if not given or node.run.kind is RunKind.ATTACH:
             return node
         values = {key: value for key, (value, _) in given.items()}
@@ -112,7 +111,7 @@ class Shared(msgspec.Struct, frozen=True, kw_only=True):
             node,
             supervision=msgspec.structs.replace(node.supervision, **values),
             shared=node.shared | given.keys(),
-            positions=(*node.positions, *((key, at) for key, (_, at) in given.items())),
+            positions={**node.positions, **{key: at for key, (_, at) in given.items()}},
         )
 
 
@@ -158,7 +157,7 @@ def _for_no_node(nodes: Iterable[Node]) -> Iterator[Diagnostic]:
 
 def _own_supervision(node: Node) -> dict[str, object]:
     """Return what is written at the node itself."""
-    written = {key for key, _ in node.positions} - node.shared
+    written = node.positions.keys() - node.shared
     return {key: getattr(node.supervision, key) for key in SUPERVISION_KEYS if key in written}
 
 

@@ -144,7 +144,7 @@ def check_supervision(system: DeclaredSystem) -> Iterator[Diagnostic]:
         if node.supervision.restart is not Restart.NO
     }
     for node in system.manifest.nodes:
-        places = dict(node.positions)
+        places = node.positions
         own = [key for key in SUPERVISION_KEYS if key in places and key not in node.shared]
         if node.run.kind is RunKind.ATTACH:
             what = "it has its container's process" if node.run.component else "others start it"

@@ -199,6 +199,13 @@ class Cursor(msgspec.Struct, frozen=True, kw_only=True):
         for index, value in enumerate(cursor.value.data):
             yield Cursor(document=self.document, place=(*cursor.place, index), value=value)
 
+    def children(self) -> Iterator[tuple[str, Cursor]]:
+        """Return what is directly inside, by key or index; nothing inside a scalar."""
+        if isinstance(self.value.data, tuple):
+            yield from ((str(index), each) for index, each in enumerate(self.items()))
+        elif isinstance(self.value.data, Mapping):
+            yield from self.entries()
+
     def text(self, key: str, default: str = "") -> str:
         """Return a string; any other scalar as it was written."""
         cursor = self.get(key)
