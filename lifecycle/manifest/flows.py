@@ -15,7 +15,6 @@ from pathlib import Path
 import msgspec
 from msgspec.structs import replace
 
-from lifecycle.errors import LifecycleError
 from lifecycle.manifest.installed_types import bounded_size
 from lifecycle.manifest.model import (
     DiscoveryMode,
@@ -28,7 +27,7 @@ from lifecycle.manifest.model import (
     Node,
     RunKind,
 )
-from lifecycle.manifest.names import resolve
+from lifecycle.manifest.names import topic_of
 from lifecycle.network.dscp import (
     ECN_MASK,
     MAX_DSCP,
@@ -361,7 +360,7 @@ class FlowNeeds:
         return tuple(found.values())
 
     def _resolve(self, node: Node, need: FlowNeed) -> ResolvedNeed:
-        topic = _topic(node, need.kind, need.name)
+        topic = topic_of(node, need.name, need.kind)
         delay, size = self._max_delay_ms(node, need, topic), self._max_message_size(node, need)
         flow_class = class_of(need, max_delay_ms=delay, message_bytes=size)
         return ResolvedNeed(
@@ -438,15 +437,6 @@ def _add_subscription(
     )
 
 
-def _topic(node: Node, kind: EndpointKind, name: str) -> str:
-    try:
-        return resolve(
-            name, node_name=node.name, namespace=node.namespace, remap=node.remap, kind=kind
-        )
-    except LifecycleError:
-        return ""
-
-
 def _identified_by_receiver(manifest: Manifest) -> frozenset[str]:
     """Topics whose every subscription gets an NFE of its own."""
     answers: dict[str, bool] = {}
@@ -455,7 +445,7 @@ def _identified_by_receiver(manifest: Manifest) -> frozenset[str]:
         for endpoint in node.interface.endpoints:
             if endpoint.kind is not EndpointKind.SUBSCRIPTION:
                 continue
-            topic = _topic(node, endpoint.kind, endpoint.name)
+            topic = topic_of(node, endpoint.name, endpoint.kind)
             need = needs.get(endpoint.name)
             own = need is not None and need.unique.asks and node.run.kind is RunKind.PYTHON
             answers[topic] = answers.get(topic, True) and own

@@ -18,7 +18,7 @@ from collections.abc import Container, Iterable, Mapping, Sequence
 import msgspec
 
 from lifecycle.errors import ExitCode, LifecycleError
-from lifecycle.manifest.model import EndpointKind, RosInterfaceAccess
+from lifecycle.manifest.model import EndpointKind, NodeDeclaration, RosInterfaceAccess
 from lifecycle.manifest.yaml.yaml_parser import quote
 
 # rcl's lexer: a token has no two underscores in a row and does not start with a digit.
@@ -250,6 +250,23 @@ def resolve(
         return _resolve_action(name, expanded, rules, node_name, namespace)
     names = RemapKind.TOPIC if kind.is_topic else RemapKind.SERVICE
     return _remap(expanded, rules, names, node_name, namespace)
+
+
+def name_in_graph(node: NodeDeclaration, name: str, kind: EndpointKind) -> str:
+    """Return the fully qualified name that an endpoint of a node has in the graph.
+
+    Raises:
+        NameNotLegalError: see `resolve`.
+    """
+    return resolve(name, node_name=node.name, namespace=node.namespace, remap=node.remap, kind=kind)
+
+
+def topic_of(node: NodeDeclaration, name: str, kind: EndpointKind) -> str:
+    """Return `name_in_graph`; empty if a name is not legal, which checks report."""
+    try:
+        return name_in_graph(node, name, kind)
+    except LifecycleError:
+        return ""
 
 
 def matching_rule(

@@ -40,7 +40,7 @@ from lifecycle.manifest.model import (
     SystemDeclaration,
     UniqueHow,
 )
-from lifecycle.manifest.names import resolve
+from lifecycle.manifest.names import name_in_graph
 from lifecycle.manifest.shared import SIM_TIME
 from lifecycle.manifest.yaml.document import error, warning
 from lifecycle.manifest.yaml.source import read_bytes
@@ -68,27 +68,14 @@ def dependency_levels(nodes: Sequence[Node]) -> tuple[tuple[str, ...], ...]:
 
     Nodes of one level keep the manifest's order and do not wait for each other.
 
-    Raises:
-        PlanError: a node waits for itself along some path, or for a node that does not exist.
+    Args:
+        nodes: of a valid manifest: none waits for itself or for one that there is not.
     """
     order = {node.key: index for index, node in enumerate(nodes)}
-    for after in (each for node in nodes for each in node.after):
-        if after.node not in order:
-            raise PlanError(
-                f"cannot wait for node {after.node!r}: the manifest declares no such node",
-                at=after.at,
-            )
     sorter = graphlib.TopologicalSorter(
         {node.key: [each.node for each in node.after] for node in nodes}
     )
-    try:
-        sorter.prepare()
-    except graphlib.CycleError as error:
-        cycle = error.args[1][::-1]
-        last = nodes[order[cycle[-2]]]
-        at = next(each.at for each in last.after if each.node == cycle[-1])
-        message = f"cannot order the nodes: they wait for each other, {' → '.join(cycle)}"
-        raise PlanError(message, at=at) from error
+    sorter.prepare()
     levels = []
     while ready := sorter.get_ready():
         levels.append(tuple(sorted(ready, key=order.__getitem__)))
@@ -364,7 +351,8 @@ def check_plan(
 def _without_clock(manifest: Manifest) -> Iterator[Diagnostic]:
     """Warn of simulated time that no node is declared to publish; others may, like a bag."""
     if any(
-        each.kind is EndpointKind.PUBLISHER and _resolved(node, each) == "/clock"
+        each.kind is EndpointKind.PUBLISHER
+        and name_in_graph(node, each.name, each.kind) == "/clock"
         for node in manifest.nodes
         for each in node.interface.endpoints
     ):
@@ -529,23 +517,12 @@ def _digest(path: str) -> str:
     return hashlib.sha256(contents).hexdigest()[:16]
 
 
-def _resolved(node: Node, endpoint: Endpoint) -> str:
-    return resolve(
-        endpoint.name,
-        node_name=node.name,
-        namespace=node.namespace,
-        remap=node.remap,
-        kind=endpoint.kind,
-    )
-
-
 def _planned_endpoint(
     node: Node, endpoint: Endpoint, need: ResolvedNeed | None, hash_of: Callable[[str], str]
 ) -> PlannedEndpoint:
-    resolved = _resolved(node, endpoint)
     planned = PlannedEndpoint(
         **declared(Endpoint, endpoint),
-        resolved=resolved,
+        resolved=name_in_graph(node, endpoint.name, endpoint.kind),
         type_hash=hash_of(endpoint.type),
     )
     if need is None:

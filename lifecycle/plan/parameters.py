@@ -1,8 +1,7 @@
 """Expected parameter values of a node: declared parameters with the values that override them.
 
 Owns: from the manifest's sources of values to `ExpectedParameter`, and the one spelling of
-values that are compared. Reads parameter files. The checks, which know their layout, are imported
-late: a process that only needs a plan's types needs no YAML.
+values that are compared. Reads parameter files, whose layout the checks know.
 
 Values are taken, weakest first, from a declaration's default, what a `command:` itself sets after
 `--ros-args`, the parameter files, and `parameters:`. Among the sections of files rcl has an order
@@ -13,16 +12,23 @@ and of those that match a node the later wins. `-p` goes into the section `/**`.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 
+from lifecycle.manifest.checks.parameters import (
+    CommandParameter,
+    Section,
+    command_line_parameters,
+    given_value,
+    misfit,
+    read_sections,
+    shown_path,
+    type_of,
+)
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import Mode, ModeParameter, Node, ParameterDeclaration, ParameterValue
 from lifecycle.plan.model import ExpectedParameter, ModeParameters
-
-if TYPE_CHECKING:
-    from lifecycle.manifest.checks.parameters import Section
 
 GIVEN = "parameters"
 COMMAND = "command"
@@ -102,19 +108,11 @@ class ParameterFiles:
 
     def unread(self, node: Node) -> tuple[str, ...]:
         """Return the files of a node whose values are not known here."""
-        from lifecycle.manifest.checks.parameters import command_line_parameters
-
         named = [each.file for each in command_line_parameters(node) if each.file]
         files = [self._file(path) for path in (*named, *node.parameter_files)]
         return tuple(each.shown for each in files if not each.is_read)
 
     def _given(self, node: Node) -> dict[str, _Given]:
-        from lifecycle.manifest.checks.parameters import (
-            CommandParameter,
-            command_line_parameters,
-            given_value,
-        )
-
         name_of_node = node.full_name
         sections: dict[str, dict[str, _Given]] = {}
         own = [each for each in command_line_parameters(node) if each.node in ("", node.name)]
@@ -145,8 +143,6 @@ class ParameterFiles:
         return found
 
     def _file(self, path: str) -> _GivenFile:
-        from lifecycle.manifest.checks.parameters import read_sections, shown_path
-
         if path not in self._files:
             shown = shown_path(path, self._manifest)
             sections, flaws = read_sections(path, shown=shown)
@@ -155,8 +151,6 @@ class ParameterFiles:
 
 
 def _declared(declaration: ParameterDeclaration, given: _Given | None) -> ExpectedParameter:
-    from lifecycle.manifest.checks.parameters import misfit
-
     type_ = declaration.type
     if given is None and declaration.default is not None:
         default = as_type(declaration.default, type_)
@@ -175,8 +169,6 @@ def _declared(declaration: ParameterDeclaration, given: _Given | None) -> Expect
 
 
 def _in_mode(mode: str, given: ModeParameter, type_: str) -> ExpectedParameter:
-    from lifecycle.manifest.checks.parameters import type_of
-
     type_ = type_ or type_of(given.value)
     return ExpectedParameter(
         name=given.name,
@@ -188,8 +180,6 @@ def _in_mode(mode: str, given: ModeParameter, type_: str) -> ExpectedParameter:
 
 
 def _undeclared(name: str, given: _Given) -> ExpectedParameter | None:
-    from lifecycle.manifest.checks.parameters import type_of
-
     if given.value is None:
         return None
     return ExpectedParameter(

@@ -13,11 +13,11 @@ from pathlib import Path
 import msgspec
 from msgspec.structs import replace
 
-from lifecycle.errors import LifecycleError, did_you_mean
+from lifecycle.errors import did_you_mean
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.interface import Findings
 from lifecycle.manifest.model import EndpointKind, Link, Machine, Manifest, Node, Run
-from lifecycle.manifest.names import resolve
+from lifecycle.manifest.names import topic_of
 from lifecycle.manifest.yaml.document import Cursor, error
 from lifecycle.manifest.yaml.yaml_parser import quote
 
@@ -148,17 +148,9 @@ def _moved_topic(link: Link, old: dict[str, Node], new: dict[str, Node]) -> str:
         if key not in old:
             continue
         for endpoint in old[key].interface.endpoints:
-            if endpoint.kind is kind and _topic(old[key], endpoint.name) == link.topic:
-                return _topic(new[key], endpoint.name) or link.topic
+            if endpoint.kind is kind and topic_of(old[key], endpoint.name, kind) == link.topic:
+                return topic_of(new[key], endpoint.name, kind) or link.topic
     return link.topic
-
-
-def _topic(node: Node, name: str) -> str:
-    """Return the topic of an endpoint; empty if a name is not legal, which `checks` report."""
-    try:
-        return resolve(name, node_name=node.name, namespace=node.namespace, remap=node.remap)
-    except LifecycleError:
-        return ""
 
 
 def join(

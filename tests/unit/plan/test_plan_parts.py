@@ -10,7 +10,6 @@ import pytest
 import yaml
 from msgspec.structs import replace
 
-from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import (
     Condition,
     DiscoveryRange,
@@ -22,7 +21,6 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.plan.build import dependency_levels, planned_processes
-from lifecycle.plan.model import PlanError
 from lifecycle.plan.participants import command_line, parameter_text
 from tests.builders import link, need, node, planned, publisher, subscription
 
@@ -62,29 +60,6 @@ LEVELS = {
 def test_a_node_stands_one_level_below_the_last_one_it_waits_for(case: str):
     nodes, expected = LEVELS[case]
     assert dependency_levels(nodes) == expected
-
-
-def test_a_cycle_is_shown_as_a_path():
-    nodes = [
-        node("x", after=after("a")),
-        node("a", after=after("b")),
-        node("b", after=after("c")),
-        node("c", after=after("a")),
-    ]
-    with pytest.raises(PlanError) as error:
-        dependency_levels(nodes)
-    assert str(error.value) == (
-        "robot.lifecycle.yaml:30:5: cannot order the nodes: they wait for each other, a → b → c → a"
-    )
-
-
-def test_waiting_for_nobody_known_is_refused():
-    with pytest.raises(PlanError) as error:
-        dependency_levels([node("a", after=after("ghost"))])
-    assert error.value.message == (
-        "cannot wait for node 'ghost': the manifest declares no such node"
-    )
-    assert error.value.exit_code is ExitCode.MANIFEST_INVALID
 
 
 # --- participants
