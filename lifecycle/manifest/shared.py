@@ -15,7 +15,7 @@ import msgspec
 from msgspec.structs import replace
 
 from lifecycle.manifest.building import build_parameters
-from lifecycle.manifest.checks.parameters import is_implicit, read_sections, shown_path
+from lifecycle.manifest.checks.parameters import ParameterFiles, is_implicit
 from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.interface import Findings
 from lifecycle.manifest.model import (
@@ -130,9 +130,9 @@ def settle(manifest: Manifest, found: Findings) -> Manifest:
         if node.process:
             for key, value in _own_supervision(node).items():
                 own.setdefault(node.process, {}).setdefault(key, value)
+    files = ParameterFiles(manifest.path)
     nodes = tuple(
-        _settled(_as_its_process(node, own.get(node.process, {})), manifest.path)
-        for node in manifest.nodes
+        _settled(_as_its_process(node, own.get(node.process, {})), files) for node in manifest.nodes
     )
     return replace(manifest, nodes=nodes)
 
@@ -167,7 +167,7 @@ def _as_its_process(node: Node, process: Mapping[str, object]) -> Node:
     return replace(node, supervision=supervision) if process else node
 
 
-def _settled(node: Node, manifest: str) -> Node:
+def _settled(node: Node, files: ParameterFiles) -> Node:
     shared = {name for name, _ in node.parameters if f"parameters.{name}" in node.shared}
     if not shared:
         return node
@@ -177,8 +177,7 @@ def _settled(node: Node, manifest: str) -> Node:
     else:
         kept = set(shared)
     for path in node.parameter_files if kept else ():
-        sections, _ = read_sections(path, shown=shown_path(path, manifest))
-        for section in sections:
+        for section in files.read(path).sections:
             if section.matches(node.full_name):
                 kept -= {name for name, _, _ in section.parameters}
     gone = shared - kept

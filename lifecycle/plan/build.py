@@ -59,7 +59,7 @@ from lifecycle.plan.model import (
     declared,
     in_mode,
 )
-from lifecycle.plan.parameters import ParameterFiles, portable
+from lifecycle.plan.parameters import NodeParameters, portable
 from lifecycle.plan.participants import command_line, place_flows
 
 
@@ -357,7 +357,7 @@ def _without_clock(manifest: Manifest) -> Iterator[Diagnostic]:
         for each in node.interface.endpoints
     ):
         return
-    files = ParameterFiles(manifest.path, manifest.modes)
+    files = NodeParameters(manifest.path, manifest.modes)
     users = [
         (node, each)
         for node in manifest.nodes
@@ -385,7 +385,7 @@ def _wired(
     """Plan nodes, flows and how they are connected."""
     prefixes = search_prefixes(variables)
     needs = FlowNeeds(manifest, prefixes)
-    files = ParameterFiles(manifest.path, manifest.modes)
+    files = NodeParameters(manifest.path, manifest.modes)
     hash_of = functools.cache(functools.partial(installed_hash, prefixes=prefixes))
     digest_of = functools.cache(_digest)
     nodes = tuple(_planned_node(node, needs, files, hash_of, digest_of) for node in manifest.nodes)
@@ -450,7 +450,7 @@ def effective_range(discovery: Discovery, environment: Mapping[str, str]) -> Dis
 def _planned_node(
     node: Node,
     needs: FlowNeeds,
-    files: ParameterFiles,
+    files: NodeParameters,
     hash_of: Callable[[str], str],
     digest_of: Callable[[str], str],
 ) -> PlannedNode:

@@ -14,16 +14,12 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import msgspec
-
 from lifecycle.manifest.checks.parameters import (
     CommandParameter,
-    Section,
+    ParameterFiles,
     command_line_parameters,
     given_value,
     misfit,
-    read_sections,
-    shown_path,
     type_of,
 )
 from lifecycle.manifest.diagnostics import Position
@@ -46,14 +42,8 @@ class _Given(NamedTuple):
     at: Position
 
 
-class _GivenFile(msgspec.Struct, frozen=True, kw_only=True):
-    shown: str
-    sections: tuple[Section, ...]
-    is_read: bool
-
-
-class ParameterFiles:
-    """The parameter files of one manifest, each read once.
+class NodeParameters:
+    """What parameters the nodes of one manifest must have.
 
     Args:
         manifest: path of the manifest, beside which files are named in messages.
@@ -61,9 +51,8 @@ class ParameterFiles:
     """
 
     def __init__(self, manifest: str, modes: tuple[Mode, ...] = ()) -> None:
-        self._manifest = manifest
+        self._files = ParameterFiles(manifest)
         self._modes = modes
-        self._files: dict[str, _GivenFile] = {}
 
     def expected(self, node: Node) -> tuple[ExpectedParameter, ...]:
         """Return what a node's parameters must be: the declared ones first, then the given ones."""
@@ -109,8 +98,8 @@ class ParameterFiles:
     def unread(self, node: Node) -> tuple[str, ...]:
         """Return the files of a node whose values are not known here."""
         named = [each.file for each in command_line_parameters(node) if each.file]
-        files = [self._file(path) for path in (*named, *node.parameter_files)]
-        return tuple(each.shown for each in files if not each.is_read)
+        files = map(self._files.read, (*named, *node.parameter_files))
+        return tuple(each.shown for each in files if each.flaws)
 
     def _given(self, node: Node) -> dict[str, _Given]:
         name_of_node = node.full_name
@@ -125,7 +114,7 @@ class ParameterFiles:
                 given = _Given(value, COMMAND, optional=optional, at=node.at)
                 sections.setdefault("/**", {})[name] = given
                 continue
-            file = self._file(path)
+            file = self._files.read(path)
             for section in file.sections:
                 if section.matches(name_of_node):
                     sections.setdefault(section.pattern, {}).update(
@@ -141,13 +130,6 @@ class ParameterFiles:
             place = f"parameters.{name}"
             found[name] = _Given(value, GIVEN, place in node.shared, node.where(place))
         return found
-
-    def _file(self, path: str) -> _GivenFile:
-        if path not in self._files:
-            shown = shown_path(path, self._manifest)
-            sections, flaws = read_sections(path, shown=shown)
-            self._files[path] = _GivenFile(shown=shown, sections=sections, is_read=not flaws)
-        return self._files[path]
 
 
 def _declared(declaration: ParameterDeclaration, given: _Given | None) -> ExpectedParameter:

@@ -39,6 +39,7 @@ from lifecycle.manifest.checks.nodes import (
     check_supervision,
 )
 from lifecycle.manifest.checks.parameters import (
+    ParameterFiles,
     check_mode_parameters,
     check_parameter_files,
     check_parameters,
@@ -68,6 +69,11 @@ class Scope(msgspec.Struct, frozen=True, kw_only=True, dict=True):
         return search_prefixes(self.environment)
 
     @functools.cached_property
+    def files(self) -> ParameterFiles:
+        """The parameter files that nodes name."""
+        return ParameterFiles(self.system.manifest.path)
+
+    @functools.cached_property
     def needs(self) -> FlowNeeds:
         """What the endpoints of the system ask of their flows."""
         return FlowNeeds(self.system.manifest, self.prefixes)
@@ -80,8 +86,8 @@ CHECKS: tuple[Callable[[Scope], Iterator[Diagnostic]], ...] = (
     lambda scope: check_qos(scope.system),
     lambda scope: check_counterparts(scope.system),
     lambda scope: check_order(scope.system),
-    lambda scope: check_parameters(scope.system),
-    lambda scope: check_parameter_files(scope.system),
+    lambda scope: check_parameters(scope.system, scope.files),
+    lambda scope: check_parameter_files(scope.system, scope.files),
     lambda scope: check_machines(scope.system),
     lambda scope: check_processes(scope.system),
     lambda scope: check_programs(scope.system),
@@ -89,7 +95,7 @@ CHECKS: tuple[Callable[[Scope], Iterator[Diagnostic]], ...] = (
     lambda scope: check_health(scope.system),
     lambda scope: check_on_violation(scope.system),
     lambda scope: check_modes(scope.system),
-    lambda scope: check_mode_parameters(scope.system),
+    lambda scope: check_mode_parameters(scope.system, scope.files),
     lambda scope: check_ports(scope.system, scope.needs, scope.environment),
     lambda scope: check_discovery(scope.system, scope.environment),
     lambda scope: check_connections(scope.system, scope.needs),

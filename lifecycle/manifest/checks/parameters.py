@@ -142,7 +142,7 @@ def _show(value: ParameterValue) -> str:
     return quote(value)
 
 
-def check_parameters(system: DeclaredSystem) -> Iterator[Diagnostic]:
+def check_parameters(system: DeclaredSystem, files: ParameterFiles) -> Iterator[Diagnostic]:
     """Yield findings about the parameters of every node."""
     names: dict[str, set[str]] = {}
     for node in system.manifest.nodes:
@@ -151,7 +151,7 @@ def check_parameters(system: DeclaredSystem) -> Iterator[Diagnostic]:
         yield from _given(node)
         yield from _no_effect(node)
         yield from _for_no_node(node, names[node.process_name])
-        yield from _empty_arrays(node)
+        yield from _empty_arrays(node, files)
 
 
 def _given(node: Node) -> Iterator[Diagnostic]:
@@ -194,7 +194,7 @@ def _for_no_node(node: Node, names: Collection[str]) -> Iterator[Diagnostic]:
             yield warning("check.parameter-for-no-node", at, message, hint)
 
 
-def _empty_arrays(node: Node) -> Iterator[Diagnostic]:
+def _empty_arrays(node: Node, files: ParameterFiles) -> Iterator[Diagnostic]:
     """Warn of empty arrays whose type nothing declares: rcl reads none from `[]`."""
     if node.interface.parameters:
         return  # one that those do not declare is reported as such
@@ -209,8 +209,7 @@ def _empty_arrays(node: Node) -> Iterator[Diagnostic]:
     given += [
         each
         for path in node.parameter_files
-        if os.path.lexists(path)
-        for section in read_sections(path, shown=shown_path(path, node.at.file))[0]
+        for section in files.read(path).sections
         if section.matches(node.full_name)
         for each in section.parameters
     ]
@@ -221,7 +220,7 @@ def _empty_arrays(node: Node) -> Iterator[Diagnostic]:
             yield warning("check.parameter-empty-array", at, message, hint)
 
 
-def check_mode_parameters(system: DeclaredSystem) -> Iterator[Diagnostic]:
+def check_mode_parameters(system: DeclaredSystem, files: ParameterFiles) -> Iterator[Diagnostic]:
     """Yield findings about parameters that modes cannot set, or not set back."""
     modes = system.manifest.modes
     for mode in modes:
@@ -233,7 +232,7 @@ def check_mode_parameters(system: DeclaredSystem) -> Iterator[Diagnostic]:
                 yield error("check.mode", each.at, f"{what}: no such node", hint)
             elif why := _never_set(node, each):
                 yield error("check.mode", each.at, f"{what}{why[0]}", why[1])
-            elif not _is_given(node, each.name):
+            elif not _is_given(node, each.name, files):
                 others = [
                     other.name
                     for other in modes
@@ -265,7 +264,7 @@ def _never_set(node: Node, given: ModeParameter) -> tuple[str, str] | None:
     return None
 
 
-def _is_given(node: Node, name: str) -> bool:
+def _is_given(node: Node, name: str, files: ParameterFiles) -> bool:
     """Return whether it is known what a parameter is in a mode that says nothing of it."""
     if name in dict(node.parameters):
         return True
@@ -274,8 +273,7 @@ def _is_given(node: Node, name: str) -> bool:
     return any(
         name == found
         for path in node.parameter_files
-        if os.path.lexists(path)
-        for section in read_sections(path, shown=path)[0]
+        for section in files.read(path).sections
         if section.matches(node.full_name)
         for found, _, _ in section.parameters
     )
@@ -519,55 +517,69 @@ def _has_section(value: Value) -> bool:
     return PARAMETERS_KEY in data or any(map(_has_section, data.values()))
 
 
-class _ParameterFile(msgspec.Struct, kw_only=True):
-    """A file, read once for all nodes that name it."""
+class ParameterFile(msgspec.Struct, frozen=True, kw_only=True):
+    """What is known of a parameter file.
+
+    Attributes:
+        shown: how messages name it.
+        sections: in the file's order; none where it cannot be read.
+        flaws: what is wrong with it.
+    """
 
     shown: str
-    sections: tuple[Section, ...] = ()
-    readers: list[Node] = msgspec.field(default_factory=list)
-    readable: bool = True
+    sections: tuple[Section, ...]
+    flaws: tuple[Diagnostic, ...]
 
 
-def check_parameter_files(system: DeclaredSystem) -> Iterator[Diagnostic]:
+class ParameterFiles:
+    """The parameter files of one system, each read once.
+
+    Args:
+        manifest: path of the manifest, beside which files are named in messages.
+    """
+
+    def __init__(self, manifest: str) -> None:
+        self._folder = Path(manifest).parent
+        self._files: dict[str, ParameterFile] = {}
+
+    def read(self, path: str) -> ParameterFile:
+        """Return what an absolute path holds."""
+        if path not in self._files:
+            # relpath, not relative_to: a file may well lie beside the manifest's folder.
+            shown = os.path.normpath(self._folder / os.path.relpath(path, self._folder))
+            sections, flaws = read_sections(path, shown=shown)
+            self._files[path] = ParameterFile(shown=shown, sections=sections, flaws=flaws)
+        return self._files[path]
+
+
+def check_parameter_files(system: DeclaredSystem, files: ParameterFiles) -> Iterator[Diagnostic]:
     """Yield findings about every parameter file that a node names."""
-    files: dict[str, _ParameterFile] = {}
+    readers: dict[str, list[Node]] = {}
     for node in system.manifest.nodes:
         for index, path in enumerate(node.parameter_files):
-            if path not in files:
-                files[path] = _ParameterFile(shown=shown_path(path, system.manifest.path))
-                yield from _read(path, files[path], node, index)
-            files[path].readers.append(node)
+            if path not in readers:
+                yield from _flaws(path, files.read(path), node.where(f"parameter_files.{index}"))
+            readers.setdefault(path, []).append(node)
     for node in system.manifest.nodes:
-        yield from _unmatched_file_of_command(node, system)
-    for path, file in files.items():
-        for node in file.readers:
-            if file.readable:
-                yield from _unmatched_node(path, file, node)
-                yield from _values(file, node)
+        yield from _unmatched_file_of_command(node, system, files)
+    for path, nodes in readers.items():
+        file = files.read(path)
+        for node in () if file.flaws else nodes:
+            yield from _unmatched_node(path, file, node)
+            yield from _values(file, node)
         yield from _unmatched_sections(file, system)
-        yield from _unknown_to_all(file)
+        yield from _unknown_to_all(file, nodes)
 
 
-def shown_path(path: str, manifest: str) -> str:
-    """Return a file's path as the user would write it beside the manifest's."""
-    folder = Path(manifest).parent
-    # relpath, not relative_to: a file may well lie beside the manifest's folder.
-    return os.path.normpath(folder / os.path.relpath(path, folder))
-
-
-def _read(path: str, file: _ParameterFile, node: Node, index: int) -> Iterator[Diagnostic]:
-    at = node.where(f"parameter_files.{index}")
-    if not os.path.lexists(path):
-        message = f"cannot find the parameter file {file.shown!r}"
-        file.readable = False
-        yield error("check.parameter-file", at, message, nearest_file(Path(path)))
+def _flaws(path: str, file: ParameterFile, at: Position) -> Iterator[Diagnostic]:
+    if os.path.lexists(path):
+        yield from file.flaws
         return
-    file.sections, found = read_sections(path, shown=file.shown)
-    file.readable = not found
-    yield from found
+    message = f"cannot find the parameter file {file.shown!r}"
+    yield error("check.parameter-file", at, message, nearest_file(Path(path)))
 
 
-def _unmatched_node(path: str, file: _ParameterFile, node: Node) -> Iterator[Diagnostic]:
+def _unmatched_node(path: str, file: ParameterFile, node: Node) -> Iterator[Diagnostic]:
     name = node.full_name
     if any(section.matches(name) for section in file.sections):
         return
@@ -579,33 +591,31 @@ def _unmatched_node(path: str, file: _ParameterFile, node: Node) -> Iterator[Dia
     yield warning("check.parameter-file-unmatched", at, message, hint)
 
 
-def _unmatched_file_of_command(node: Node, system: DeclaredSystem) -> Iterator[Diagnostic]:
+def _unmatched_file_of_command(
+    node: Node, system: DeclaredSystem, files: ParameterFiles
+) -> Iterator[Diagnostic]:
     """Warn of sections of a command's `--params-file` that are for no node, or not for its own."""
-    files = [each.file for each in command_line_parameters(node) if each.file]
-    if not files:
+    paths = [each.file for each in command_line_parameters(node) if each.file]
+    if not paths:
         return
     process = node.process_name
     every = [each.full_name for each in system.manifest.nodes]
     names = [e.full_name for e in system.manifest.nodes if process == e.process_name]
-    for path in files:
-        if not os.path.lexists(path):
-            continue
-        shown = shown_path(path, system.manifest.path)
+    for file in map(files.read, paths):
         at = node.where("run.command")
-        sections = read_sections(path, shown=shown)[0]
-        mine = [each for each in sections if any(map(each.matches, names))]
+        mine = [each for each in file.sections if any(map(each.matches, names))]
         # One file for many processes has sections for the nodes of others.
-        for section in sections:
+        for section in file.sections:
             if not mine or not any(map(section.matches, every)):
                 message = (
-                    f"cannot use the parameters of {section.pattern!r} in {shown!r}: no node of "
-                    f"the process of {node.key!r} has that name"
+                    f"cannot use the parameters of {section.pattern!r} in {file.shown!r}: no node "
+                    f"of the process of {node.key!r} has that name"
                 )
                 hint = did_you_mean(section.pattern, names)
                 yield warning("check.parameter-file-unmatched", at, message, hint)
 
 
-def _unmatched_sections(file: _ParameterFile, system: DeclaredSystem) -> Iterator[Diagnostic]:
+def _unmatched_sections(file: ParameterFile, system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Warn of sections that match no node in a file of which others do: most are misspelt."""
     names = [node.full_name for node in system.manifest.nodes]
     dead = [each for each in file.sections if not any(each.matches(name) for name in names)]
@@ -617,7 +627,7 @@ def _unmatched_sections(file: _ParameterFile, system: DeclaredSystem) -> Iterato
         yield warning("check.parameter-file-unmatched", section.at, message, hint)
 
 
-def _values(file: _ParameterFile, node: Node) -> Iterator[Diagnostic]:
+def _values(file: ParameterFile, node: Node) -> Iterator[Diagnostic]:
     declared = {each.name: each for each in node.interface.parameters}
     for section in file.sections:
         if not section.matches(node.full_name):
@@ -638,10 +648,10 @@ def _values(file: _ParameterFile, node: Node) -> Iterator[Diagnostic]:
                 yield error("check.parameter-undeclared", at, message, hint)
 
 
-def _unknown_to_all(file: _ParameterFile) -> Iterator[Diagnostic]:
+def _unknown_to_all(file: ParameterFile, readers: list[Node]) -> Iterator[Diagnostic]:
     """Warn of a value for many nodes that none of them declares; some not declaring it is usual."""
     for section in file.sections:
-        nodes = [node for node in file.readers if section.matches(node.full_name)]
+        nodes = [node for node in readers if section.matches(node.full_name)]
         if not section.is_wildcard or not nodes:
             continue
         if not all(node.interface.parameters for node in nodes):
