@@ -89,8 +89,8 @@ class FlowParticipant:
         served: Node | None = None,
     ) -> None:
         self.name = name
-        self.settings = ParticipantSettings.of(
-            connections or ParticipantConnections(),
+        self.settings = ParticipantSettings(
+            connections=connections or ParticipantConnections(),
             transports=tuple(transports),
             max_datagram_bytes=max_datagram_bytes,
             non_blocking_send=non_blocking_send,
@@ -186,7 +186,7 @@ class FlowParticipant:
         Raises:
             MiddlewareError: the participant's endpoints are discovered statically.
         """
-        if self.settings.static_participants:
+        if self.settings.connections.static_participants:
             raise MiddlewareError(
                 f"cannot make {what} {name!r} on {self.name!r}: its endpoints are discovered "
                 "statically, which services and actions are not",

@@ -84,11 +84,7 @@ def discovery_profile(
 
 
 def discovery_environment(
-    directory: Path,
-    environment: Mapping[str, str] | None = None,
-    *,
-    peers: Iterable[tuple[str, int]] = (),
-    multicast_endpoints: bool = False,
+    directory: Path, *, peers: Iterable[tuple[str, int]] = (), multicast_endpoints: bool = False
 ) -> dict[str, str]:
     """Write the profile into `directory` and return the variables that apply it.
 
@@ -97,17 +93,15 @@ def discovery_environment(
 
     Args:
         directory: exists; it must outlive every process that is given the variables.
-        environment: what those processes otherwise get; None for this process's.
         peers: see `discovery_profile`.
         multicast_endpoints: see `discovery_profile`.
 
     Raises:
         MiddlewareError: the file cannot be written.
     """
-    current = os.environ if environment is None else environment
     version = installed()
     variables = (each.profiles_variable for each in DISTRIBUTIONS)
-    if any(map(current.get, variables)) or Path(version.default_profiles).exists():
+    if any(map(os.environ.get, variables)) or Path(version.default_profiles).exists():
         return {}
     path = directory.absolute() / _FILE_NAME
     # Renamed into place: a process that starts meanwhile reads the whole file or an older one.
@@ -205,6 +199,8 @@ def drop(parent: ET.Element, *tags: str) -> None:
         parent.remove(each)
 
 
-def text(parent: ET.Element, tag: str, content: str) -> None:
-    """Add a child with text."""
-    ET.SubElement(parent, tag).text = content
+def put(parent: ET.Element, path: str, content: object) -> None:
+    """Set the text of an element by its path; the ones on the way are made if there are none."""
+    for tag in path.split("/"):
+        parent = child(parent, tag)
+    parent.text = str(content)

@@ -117,7 +117,7 @@ class GraphObserver:
         node: Node | None = None,
     ) -> None:
         self.domain_id = domain_id
-        settings = ParticipantSettings.of(connections or ParticipantConnections())
+        settings = ParticipantSettings(connections=connections or ParticipantConnections())
         self.urls = settings.urls
         self.owns_node = node is None
         self._lock = threading.Lock()

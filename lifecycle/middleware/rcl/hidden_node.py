@@ -59,7 +59,8 @@ def quiet_node(
         MiddlewareError: rcl refused; nothing is left.
     """
     settings = settings or ParticipantSettings()
-    enclave = ("--ros-args", "--enclave", settings.static_name) if settings.static_name else ()
+    name_there = settings.connections.static_name
+    enclave = ("--ros-args", "--enclave", name_there) if name_there else ()
     context = rclpy.Context()
     node: Node | None = None
     try:

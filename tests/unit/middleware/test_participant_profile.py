@@ -15,6 +15,7 @@ from lifecycle.middleware.fastdds.profiles import (
     default_profile,
     discovery_profile,
 )
+from lifecycle.plan.model import ParticipantConnections
 
 UDP = ParticipantSettings(transports=("udpv4",))
 USERS = """<?xml version="1.0"?>
@@ -153,7 +154,8 @@ def test_of_a_server_that_a_profile_names_only_a_client_becomes_a_super_client(
         </discovery_config></builtin></rtps></participant></profiles></dds>"""
     )
     base = default_profile({"FASTRTPS_DEFAULT_PROFILES_FILE": str(path)})
-    root = made(ParticipantSettings(super_client=True), base=base)
+    connections = ParticipantConnections(super_client=True)
+    root = made(ParticipantSettings(connections=connections), base=base)
     assert texts(root, ".//discoveryProtocol") == [made_so]
 
 

@@ -13,7 +13,8 @@ from lifecycle.plan.model import ParticipantConnections
 
 
 def made(*urls: str, super_client: bool = False) -> ET.Element:
-    settings = ParticipantSettings.of(ParticipantConnections(urls=urls, super_client=super_client))
+    connections = ParticipantConnections(urls=urls, super_client=super_client)
+    settings = ParticipantSettings(connections=connections)
     text = profile("p", settings, domain_id=3, environment={})
     return ET.fromstring(text.replace(' xmlns="http://www.eprosima.com', ' x="'))
 
