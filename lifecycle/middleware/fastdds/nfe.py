@@ -34,7 +34,7 @@ from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.fastdds.sockets import udp_sockets
 from lifecycle.middleware.rcl import abi
 from lifecycle.middleware.rcl.qos import to_rclpy
-from lifecycle.middleware.versions import INSTALL
+from lifecycle.middleware.versions import INSTALL, private
 from lifecycle.network.medium import DEFAULT_RMW
 from lifecycle.network.nfe import (
     InternetProtocol,
@@ -210,6 +210,7 @@ def create_subscription(
     if _is_plain(node, topic, unique):
         subscription = node.create_subscription(type_, topic, callback, profile, **options)
     else:
+        listed = private(node, "_subscriptions", f"make a flow of its own for {topic!r}")
         group = options.get("callback_group") or node.default_callback_group
         raw = options.get("raw", False)
         events = options.get("event_callbacks") or SubscriptionEventCallbacks()
@@ -218,10 +219,11 @@ def create_subscription(
                 *(handle, type_, topic, callback, group, profile, raw), event_callbacks=events
             )
         group.add_entity(subscription)
-        node._subscriptions.append(subscription)  # noqa: SLF001 - as Node.create_subscription does
+        listed.append(subscription)  # as Node.create_subscription does
         for handler in subscription.event_handlers:
             node.add_waitable(handler)
-        node._wake_executor()  # noqa: SLF001
+        if node.executor is not None:
+            node.executor.wake()
     if content_filter is not None:
         _filter(node, subscription, *content_filter)
     return subscription

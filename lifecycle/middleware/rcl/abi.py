@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.versions import INSTALL, KNOWN_RCL, of_rcl, rcl_version
+from lifecycle.middleware.versions import INSTALL, KNOWN_RCL, of_rcl, private, rcl_version
 
 RCL_RET_OK = 0
 RCL_RET_TIMEOUT = 2
@@ -388,7 +388,7 @@ def type_support(message_type: object) -> int:
 
     rclpy must have used the class before: that is when its type support is loaded.
     """
-    capsule = type(message_type)._TYPE_SUPPORT  # type: ignore[attr-defined]  # noqa: SLF001
+    capsule = private(type(message_type), "_TYPE_SUPPORT", f"read the type of {message_type!r}")
     name = ctypes.pythonapi.PyCapsule_GetName
     name.restype, name.argtypes = ctypes.c_char_p, (ctypes.py_object,)
     pointer = ctypes.pythonapi.PyCapsule_GetPointer

@@ -34,7 +34,7 @@ from lifecycle.middleware.fastdds.settings import (
     participant_settings,
 )
 from lifecycle.middleware.fastdds.sockets import widen_discovery_buffers
-from lifecycle.middleware.versions import installed
+from lifecycle.middleware.versions import installed, private
 
 _QUIET: dict[str, Any] = {
     "enable_rosout": False,
@@ -169,6 +169,7 @@ def move(entity: MovedEndpoint, maker: Node, host: Node) -> None:
     """
     if isinstance(entity, Waitable):
         maker.remove_waitable(entity)
+        private(entity, "_node", "carry an action by a connection")
         entity._node = host  # noqa: SLF001 - whose executor works on goals, and which removes it
         host.add_waitable(entity)
         return

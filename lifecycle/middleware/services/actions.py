@@ -243,7 +243,7 @@ class GoalServer(ActionServer):  # type: ignore[misc]  # rclpy is not typed
         response.status = goal.status
         response.result = self.action_type.Result() if result is None else result
         # By the executor's next turn the server may be gone; without one, it is sent here.
-        future._set_executor(None)  # noqa: SLF001
+        private(future, "_set_executor", "answer who waits for a goal")(None)
         future.set_result(response)
 
     async def execute(self, taken_data: Any) -> None:
