@@ -86,16 +86,20 @@ def socket_descriptors() -> list[int]:
 def open_sockets() -> tuple[OpenSocket, ...]:
     """Return the bound UDP and listening TCP sockets of this process."""
     found: dict[OpenSocket, None] = {}
-    for each in sockets_here():
-        kind = _KINDS.get((each.family, each.type))
-        if kind is None:
-            continue
-        address, port = each.getsockname()[:2]
-        is_open = not kind.is_tcp or each.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN)
-        if port and is_open:
-            inode = os.fstat(each.fileno()).st_ino
-            found[OpenSocket(inode=inode, kind=kind, address=_address(address), port=port)] = None
+    for each, bound in _bound_here():
+        is_tcp = bound.kind.is_tcp
+        if bound.port and (not is_tcp or each.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN)):
+            found[bound] = None
     return tuple(found)
+
+
+def _bound_here() -> Iterator[tuple[socket.socket, OpenSocket]]:
+    """Yield as `sockets_here` does, with what each of them is bound to."""
+    for each in sockets_here():
+        if (kind := _KINDS.get((each.family, each.type))) is not None:
+            address, port = each.getsockname()[:2]
+            inode = os.fstat(each.fileno()).st_ino
+            yield each, OpenSocket(inode=inode, kind=kind, address=_address(address), port=port)
 
 
 def udp_sockets(*, of_others: bool = False) -> tuple[OpenSocket, ...]:
@@ -163,12 +167,8 @@ def own_sockets(nfes: Sequence[NetworkFlowEndpoint]) -> Iterator[list[socket.soc
     wanted = {(nfe.medium, _address(nfe.internet_address), nfe.transport_port) for nfe in nfes}
     with contextlib.ExitStack() as stack:
         found = []
-        for each in sockets_here():
-            kind = _KINDS.get((each.family, each.type))
-            if kind is None:
-                continue
-            address, port = each.getsockname()[:2]
-            if (kind, _address(address), port) in wanted:
+        for each, bound in _bound_here():
+            if (bound.kind, bound.address, bound.port) in wanted:
                 # Not by its own dup(), which would make the original wait where it must not.
                 duplicate = socket.socket(fileno=os.dup(each.fileno()))
                 found.append(stack.enter_context(duplicate))
