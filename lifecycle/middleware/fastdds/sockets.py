@@ -105,7 +105,12 @@ def _bound_here() -> Iterator[tuple[socket.socket, OpenSocket]]:
 def udp_sockets(*, of_others: bool = False) -> tuple[OpenSocket, ...]:
     """Return the UDP sockets of our network namespace, or only those that others have."""
     ours = {each.inode for each in open_sockets()} if of_others else set[int]()
-    return tuple(each for each in _listed() if each.inode not in ours)
+    found: list[OpenSocket] = []
+    for kind in UDP_UNICAST:
+        table = Path("/proc/thread-self/net", "udp6" if kind.ip_version == 6 else "udp")
+        with contextlib.suppress(FileNotFoundError):  # a kernel without IPv6
+            found += [each for each, _ in sockets_in(table, kind) if each.inode not in ours]
+    return tuple(found)
 
 
 def check_host(urls: Sequence[ConnectionUrl]) -> None:
@@ -263,21 +268,18 @@ def _is_free(kind: Medium, address: str, port: int) -> bool:
     return True
 
 
-def _listed() -> Iterator[OpenSocket]:
-    """Yield the bound UDP sockets of our network namespace, proc_net_udp.txt of Linux."""
-    for kind in UDP_UNICAST:
-        table = Path("/proc/thread-self/net", "udp6" if kind.ip_version == 6 else "udp")
-        with contextlib.suppress(FileNotFoundError):  # a kernel without IPv6
-            for line in table.read_text(encoding="ascii").splitlines()[1:]:
-                fields = line.split()
-                address, _, port = fields[1].partition(":")
-                # An address is written as 32-bit integers in the host's byte order.
-                words = [int(address[at : at + 8], 16) for at in range(0, len(address), 8)]
-                packed = struct.pack(f"={len(words)}I", *words)
-                if int(port, 16):
-                    yield OpenSocket(
-                        inode=int(fields[9]),
-                        kind=kind,
-                        address=socket.inet_ntop(kind.socket_family, packed),
-                        port=int(port, 16),
-                    )
+def sockets_in(table: Path, kind: Medium) -> Iterator[tuple[OpenSocket, str]]:
+    """Yield what is bound by a table of proc(5), `net/udp` and the like, and its state in hex.
+
+    Raises:
+        OSError: there is no such table.
+    """
+    for line in table.read_text(encoding="ascii").splitlines()[1:]:
+        fields = line.split()
+        written, _, port = fields[1].partition(":")
+        # An address is written as 32-bit integers in the host's byte order.
+        words = [int(written[at : at + 8], 16) for at in range(0, len(written), 8)]
+        address = socket.inet_ntop(kind.socket_family, struct.pack(f"={len(words)}I", *words))
+        if number := int(port, 16):
+            inode = int(fields[9])
+            yield OpenSocket(inode=inode, kind=kind, address=address, port=number), fields[3]

@@ -41,14 +41,12 @@ class ServiceUnansweredError(MiddlewareError):
     """A service was not there or did not answer before the deadline.
 
     Attributes:
-        service: fully qualified.
         found: whether it was there, so that the request was sent.
     """
 
     def __init__(self, service: str, *, found: bool, timeout_s: float) -> None:
         what = "it did not answer" if found else "nobody offers it"
         super().__init__(f"cannot call service {service!r}: {what} within {timeout_s:g} s")
-        self.service = service
         self.found = found
 
 
