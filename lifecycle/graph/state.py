@@ -204,12 +204,12 @@ class GraphState:
                 self._given = {**self._given, name: configuration}
             self._set(name, configuration=configuration)
 
-    def drop_configuration(self, node: str, reason: str = "its process ended") -> None:
+    def drop_configuration(self, node: str) -> None:
         """Forget a node (fully qualified) whose configuration was given: it is not there now."""
         with self._lock:
             if node in self._given:
                 self._given = {name: each for name, each in self._given.items() if name != node}
-                self._leave(node, reason)
+                self._leave(node, "its process ended")
 
     @property
     def given(self) -> Mapping[str, NodeConfiguration]:

@@ -114,11 +114,13 @@ class Prober:
         reached: whom it asks, and where.
 
     Attributes:
+        leaves_host: it asks participants of other hosts, too.
         ports: at which those that answered receive discovery, as they say.
     """
 
     def __init__(self, reached: Sequence[Reach]) -> None:
         self._reached = reached
+        self.leaves_host = any(to.address not in e.addresses for e in reached for to in e.targets)
         self._prefix = _VENDOR + os.urandom(10)
         self._sequence = 0
         self._joined = False
@@ -200,15 +202,6 @@ class Prober:
             for each in udp_sockets(of_others=True)
             if (at := asked.get(each.port))
             and (each.address in at or ipaddress.ip_address(each.address).is_unspecified)
-        )
-
-    @property
-    def leaves_host(self) -> bool:
-        """Whether it asks participants of other hosts, too."""
-        return any(
-            target.address not in each.addresses
-            for each in self._reached
-            for target in each.targets
         )
 
     def close(self) -> None:

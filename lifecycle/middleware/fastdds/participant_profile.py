@@ -12,7 +12,6 @@ from __future__ import annotations
 import copy
 import functools
 import os
-from collections.abc import Mapping
 from xml.etree import ElementTree as ET
 
 import msgspec
@@ -136,7 +135,6 @@ def profile(
     base: DefaultProfile | None = None,
     localhost_peers: tuple[str, ...] | None = None,
     domain_id: int = 0,
-    environment: Mapping[str, str] | None = None,
 ) -> str:
     """Return a participant profile as XML: `base` with what `settings` need.
 
@@ -148,7 +146,6 @@ def profile(
             ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST: no multicast, participants looked for on this
             host and on these static peers. None leaves discovery alone.
         domain_id: 0–232, which URLs with TCP need.
-        environment: None for this process's.
 
     Raises:
         MiddlewareError: `base`, or the environment, already chooses transports.
@@ -159,7 +156,7 @@ def profile(
     root = ET.Element("dds", xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles")
     profiles = ET.SubElement(root, "profiles")
     if settings.chooses_transports:
-        _refuse_second_choice(settings, base, os.environ if environment is None else environment)
+        _refuse_second_choice(settings, base)
         kinds = settings.transports or RMW_DEFAULT
         add_transports(
             name,
@@ -194,9 +191,7 @@ def profile(
     return ET.tostring(root, encoding="unicode", xml_declaration=True)
 
 
-def _refuse_second_choice(
-    settings: ParticipantSettings, base: DefaultProfile | None, environment: Mapping[str, str]
-) -> None:
+def _refuse_second_choice(settings: ParticipantSettings, base: DefaultProfile | None) -> None:
     wish = " and ".join(settings.transports or map(str, settings.urls)) or "a non-blocking send"
     if base is not None and (chosen := base.chosen_transports):
         raise MiddlewareError(
@@ -204,7 +199,7 @@ def _refuse_second_choice(
             f"of {base.file!r} already chooses its transports (<{chosen}>)",
             hint=f"take <{chosen}> out of it, or what needs {wish} out of the manifest",
         )
-    variable = environment.get(TRANSPORTS_VARIABLE, "")
+    variable = os.environ.get(TRANSPORTS_VARIABLE, "")
     if variable and not settings.transports and not settings.urls:
         raise MiddlewareError(
             f"cannot give a participant {wish}: {TRANSPORTS_VARIABLE}={variable!r} "

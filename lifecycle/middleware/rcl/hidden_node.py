@@ -159,7 +159,8 @@ Action: typing.TypeAlias = Waitable
 
 MovedEndpoint: typing.TypeAlias = Subscription | Service | Client | Action
 
-_LISTS = {Subscription: "_subscriptions", Service: "_services", Client: "_clients"}
+_KINDS = {Subscription: "subscription", Service: "service", Client: "client"}
+"""What rclpy's methods and lists of a node are called after."""
 
 
 def move(entity: MovedEndpoint, maker: Node, host: Node) -> None:
@@ -173,7 +174,7 @@ def move(entity: MovedEndpoint, maker: Node, host: Node) -> None:
         entity._node = host  # noqa: SLF001 - whose executor works on goals, and which removes it
         host.add_waitable(entity)
         return
-    name = _LISTS[type(entity)]
+    name = f"_{_KINDS[type(entity)]}s"
     if not (hasattr(maker, name) and hasattr(host, name)):
         if host.executor is not None:  # of another rclpy: all that is on the maker is spun there
             host.executor.add_node(maker)
@@ -192,10 +193,4 @@ def dismiss(entity: MovedEndpoint, host: Node) -> None:
     if isinstance(entity, Waitable):
         entity.destroy()
         return
-    for kind, destroy in (
-        (Subscription, host.destroy_subscription),
-        (Service, host.destroy_service),
-        (Client, host.destroy_client),
-    ):
-        if isinstance(entity, kind):
-            destroy(entity)
+    getattr(host, f"destroy_{_KINDS[type(entity)]}")(entity)

@@ -271,7 +271,7 @@ class NodeClients:
             for descriptor, type_, value in found
         )
 
-    async def give_parameters(self, planned: PlannedNode, *, timeout_s: float = TIMEOUT_S) -> None:
+    async def give_parameters(self, planned: PlannedNode) -> None:
         """Set the parameters that a running node has with other values than its plan gives it."""
         node = planned.full_name
         if not any(each.value is not None for each in planned.expected_parameters):
@@ -285,18 +285,13 @@ class NodeClients:
             return
         given = _messages(wanted.values())
         response = await self._calls.call(
-            f"{node}/set_parameters", SetParameters, timeout_s, parameters=given
+            f"{node}/set_parameters", SetParameters, TIMEOUT_S, parameters=given
         )
         for name, result in zip(wanted, response.results, strict=False):
             _check(f"set parameter {name!r} of {node!r}", result.successful, result.reason)
 
     async def set_parameters(
-        self,
-        node: str,
-        values: Mapping[str, Any],
-        types: Mapping[str, str],
-        *,
-        timeout_s: float = TIMEOUT_S,
+        self, node: str, values: Mapping[str, Any], types: Mapping[str, str]
     ) -> None:
         """Set parameters of a running node, all or none (rcl_interfaces, SetParametersAtomically).
 
@@ -304,13 +299,12 @@ class NodeClients:
             node: whose they are.
             values: by parameter.
             types: by parameter, names of rcl_interfaces: "int", "double_array".
-            timeout_s: for the answer.
         """
         given = _messages(Parameter(name, TYPES[types[name]], values[name]) for name in values)
         response = await self._calls.call(
             f"{node}/set_parameters_atomically",
             SetParametersAtomically,
-            timeout_s,
+            TIMEOUT_S,
             parameters=given,
         )
         what = f"set {', '.join(map(repr, values))} of {node!r} while it runs"

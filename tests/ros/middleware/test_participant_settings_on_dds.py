@@ -242,7 +242,8 @@ def test_a_participant_of_small_datagrams_still_receives_large_ones(
             "while not publisher.get_subscription_count(): time.sleep(0.005)\n"
             "publisher.publish(String(data='x' * 10_000))\n"
             "sys.stdin.read()\n"
-            "leave_and_exit(0, participants=[p])\n"
+            "p.destroy()\n"
+            "leave_and_exit(0)\n"
         )
         sender = subprocess.Popen(
             [sys.executable, "-c", script, str(domain_id)], stdin=subprocess.PIPE

@@ -15,7 +15,7 @@ from lifecycle.plan.model import ParticipantConnections
 def made(*urls: str, super_client: bool = False) -> ET.Element:
     connections = ParticipantConnections(urls=urls, super_client=super_client)
     settings = ParticipantSettings(connections=connections)
-    text = profile("p", settings, domain_id=3, environment={})
+    text = profile("p", settings, domain_id=3)
     return ET.fromstring(text.replace(' xmlns="http://www.eprosima.com', ' x="'))
 
 
