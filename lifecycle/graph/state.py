@@ -19,14 +19,7 @@ from typing import Any
 import msgspec
 from msgspec.structs import replace
 
-from lifecycle.graph.model import (
-    End,
-    GraphChange,
-    Link,
-    NodeView,
-    link,
-    match_ends,
-)
+from lifecycle.graph.model import End, GraphChange, Link, NodeView, link, match_ends
 from lifecycle.graph.status import NodeStatus
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.verify.observation import (
@@ -299,9 +292,7 @@ class GraphState:
         return Observation(
             nodes=tuple(
                 replace(
-                    each,
-                    state=states.get(each.full_name),
-                    health=look.health.get(each.full_name),
+                    each, state=states.get(each.full_name), health=look.health.get(each.full_name)
                 )
                 for each in (*look.nodes, *reported)
             ),

@@ -87,8 +87,7 @@ def _program() -> str:
         if found is not None:
             return found
     raise MiddlewareError(
-        f"cannot find {PROGRAM!r}",
-        hint=f"it comes with Fast DDS; set PATH, or {INSTALL}",
+        f"cannot find {PROGRAM!r}", hint=f"it comes with Fast DDS; set PATH, or {INSTALL}"
     )
 
 

@@ -256,24 +256,25 @@ class Settling:
         self._settle_s = settle_s
         self._began_s = time.monotonic()
         self._again_s = ANSWER_S
-        self._prober = Prober(reached) if reached else None
+        self._asks = bool(reached)
+        self._prober = Prober(reached)
         self._silent: frozenset[OpenSocket] = frozenset()
         self._familiar: frozenset[OpenSocket] = frozenset()
         self._known: frozenset[str] = frozenset()
         self._known_before: frozenset[str] = frozenset()
-        if self._prober is not None:
+        if self._asks:
             self._silent = self._prober.listeners()
             self._prober.ask()
 
     def within(self, settle_s: float) -> None:
         """Take so many seconds for those in which everybody is known, where nobody can be asked."""
-        if self._prober is None:
+        if not self._asks:
             self._settle_s = settle_s
 
     @property
     def unasked_s(self) -> float:
         """Seconds that are waited for because nobody can be asked; 0 where all can be."""
-        return self._settle_s if self._prober is None else 0.0
+        return 0.0 if self._asks else self._settle_s
 
     def left_s(self, named: frozenset[str]) -> float:
         """Return for how many seconds a look may still miss a participant; 0 once it cannot.
@@ -284,7 +285,7 @@ class Settling:
         self._known |= named  # who was known and left is not on the way into the graph
         age_s = time.monotonic() - self._began_s
         left_s = max(0.0, self._settle_s - age_s)
-        if self._prober is None or not left_s:
+        if not (self._asks and left_s):
             return left_s
         if age_s < ANSWER_S:
             return ANSWER_S - age_s
@@ -313,7 +314,7 @@ class Settling:
             everybody: wait also for what those have to say that are known: this process did not
                 run for a while.
         """
-        if self._prober is None:
+        if not self._asks:
             if everybody:
                 self._began_s = time.monotonic()
             return everybody
@@ -341,14 +342,13 @@ class Settling:
 
     def addresses(self) -> dict[str, str]:
         """Return the IP address of each participant that has answered, by GUID prefix."""
-        return {} if self._prober is None else self._prober.answers()
+        return self._prober.answers()
 
     def ask(self) -> None:
         """Have all answer once more, so that their `addresses` are known."""
-        if self._prober is not None:
+        if self._asks:
             self._prober.ask()
 
     def close(self) -> None:
         """Ask nobody any more."""
-        if self._prober is not None:
-            self._prober.close()
+        self._prober.close()

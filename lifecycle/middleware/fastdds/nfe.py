@@ -59,9 +59,7 @@ _UNIQUE_PORTS = range(7000, 7400)
 """Fast DDS looks for a unique port in [portBase − 400, portBase), in every domain."""
 
 
-def get_network_flow_endpoints(
-    entity: Publisher | Subscription,
-) -> tuple[NetworkFlowEndpoint, ...]:
+def get_network_flow_endpoints(entity: Publisher | Subscription) -> tuple[NetworkFlowEndpoint, ...]:
     """Return the NFEs of a publisher or subscription, as rmw lists them.
 
     With Fast DDS a publisher's are its participant's sender sockets and a subscription's the

@@ -22,11 +22,7 @@ _logger = logging.getLogger(__name__)
 
 
 def leave_and_exit(
-    code: int,
-    *,
-    nodes: Iterable[Any] = (),
-    contexts: Iterable[Any] = (),
-    deadline_s: float = 2.0,
+    code: int, *, nodes: Iterable[Any] = (), contexts: Iterable[Any] = (), deadline_s: float = 2.0
 ) -> NoReturn:
     """Destroy what is given, flush the standard streams and end the process; never returns.
 

@@ -151,10 +151,7 @@ class Rcl:
     def __init__(self) -> None:
         version = rcl_version()
         if of_rcl(version) is None:
-            raise MiddlewareError(
-                f"rcl {version} is not known (known: {KNOWN_RCL})",
-                hint=INSTALL,
-            )
+            raise MiddlewareError(f"rcl {version} is not known (known: {KNOWN_RCL})", hint=INSTALL)
         pointer, size, integer = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int
         self._get_error_string = bind("rcutils", "rcutils_get_error_string", _ErrorString)
         self._reset_error = bind("rcutils", "rcutils_reset_error", None)

@@ -29,10 +29,7 @@ from rclpy.waitable import Waitable
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
-from lifecycle.middleware.fastdds.settings import (
-    discovery_by_profile,
-    participant_settings,
-)
+from lifecycle.middleware.fastdds.settings import discovery_by_profile, participant_settings
 from lifecycle.middleware.fastdds.sockets import widen_discovery_buffers
 from lifecycle.middleware.versions import installed, private
 
@@ -47,11 +44,7 @@ _hidden: weakref.WeakSet[Node] = weakref.WeakSet()
 
 
 def quiet_node(
-    name: str,
-    namespace: str,
-    domain_id: int,
-    *,
-    settings: ParticipantSettings | None = None,
+    name: str, namespace: str, domain_id: int, *, settings: ParticipantSettings | None = None
 ) -> tuple[rclpy.Context, Node]:
     """Return a new context and on it a node with nothing of its own but parameter events.
 
@@ -67,12 +60,7 @@ def quiet_node(
         with discovery_by_profile(settings):
             context.init(args=[*enclave], domain_id=domain_id, initialize_logging=False)
         with participant_settings(context, settings, is_new=True):
-            node = Node(
-                name,
-                namespace=namespace,
-                context=context,
-                **_QUIET,
-            )
+            node = Node(name, namespace=namespace, context=context, **_QUIET)
     except Exception as error:
         if node is not None:
             node.destroy_node()
@@ -107,10 +95,7 @@ _numbers = itertools.count()
 
 @contextlib.contextmanager
 def made_participant(
-    context: rclpy.Context,
-    settings: ParticipantSettings,
-    *,
-    is_new: bool = False,
+    context: rclpy.Context, settings: ParticipantSettings, *, is_new: bool = False
 ) -> Iterator[None]:
     """Make the participant of a context with these settings; construct its first node in the block.
 

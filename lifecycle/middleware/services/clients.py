@@ -247,13 +247,13 @@ class NodeClients:
         found = await read_parameters(self._calls, node, None, timeout_s=timeout_s)
         return tuple(
             CapturedParameter(
-                name=descriptor.name,
+                name=of.name,
                 type=type_,
                 value=value,
-                description=descriptor.description,
-                read_only=descriptor.read_only,
+                description=of.description,
+                read_only=of.read_only,
             )
-            for descriptor, type_, value in found
+            for of, type_, value in found
         )
 
     async def report_parameters(
@@ -262,13 +262,8 @@ class NodeClients:
         """Read those parameters of a node that are named and that it has; None reads all."""
         found = await read_parameters(self._calls, node, names, timeout_s=timeout_s)
         return tuple(
-            ParameterReport.of(
-                descriptor.name,
-                type_ or type_word(descriptor.type),
-                value,
-                read_only=descriptor.read_only,
-            )
-            for descriptor, type_, value in found
+            ParameterReport.of(of.name, type_ or type_word(of.type), value, read_only=of.read_only)
+            for of, type_, value in found
         )
 
     async def give_parameters(self, planned: PlannedNode) -> None:

@@ -120,10 +120,9 @@ class ServiceCalls:
 
     def open(self, service: str, type_: type[Any]) -> bool:
         """Make the client of a service now; False if there is one already."""
-        if (service, type_, False) in self._clients:
-            return False
+        is_new = (service, type_, False) not in self._clients
         self._client(service, type_)
-        return True
+        return is_new
 
     def forget(self, prefix: str) -> None:
         """Drop the clients of services whose name starts with `prefix`, of a node that left."""
