@@ -108,15 +108,13 @@ def made_participant(
     Raises:
         MiddlewareError: as `participant_settings`.
     """
-    first: Any = None
+    with participant_settings(context, settings, is_new=is_new):
+        first = bare_node(context)
     try:
-        with participant_settings(context, settings, is_new=is_new):
-            first = bare_node(context)
         widen_discovery_buffers(context.get_domain_id())
         yield
     finally:
-        if first is not None:
-            first.destroy_when_not_in_use()
+        first.destroy_when_not_in_use()
 
 
 def _security_hint() -> str:
