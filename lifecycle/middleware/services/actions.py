@@ -71,6 +71,7 @@ class GoalClient(ActionClient):  # type: ignore[misc]  # rclpy is not typed
         self._destroyed = False
         self.action_name = ""
         super().__init__(node, action_type, name, callback_group=group)
+        private(self, "_node", f"make action client {name!r}")
 
     def send_goal(self, goal: Any, **options: Any) -> Any:
         """As rclpy's, outside of callbacks: it waits for the result."""
