@@ -162,29 +162,25 @@ def check_free(urls: Sequence[ConnectionUrl]) -> None:
                 )
 
 
-@contextlib.contextmanager
-def own_sockets(nfes: Sequence[NetworkFlowEndpoint]) -> Iterator[list[socket.socket]]:
-    """Yield duplicates of this process's sockets that `nfes` names; they are closed afterwards.
+def own_sockets(nfes: Sequence[NetworkFlowEndpoint]) -> Iterator[socket.socket]:
+    """Yield duplicates of this process's sockets that `nfes` names, as `sockets_here` does.
 
     Raises:
         MiddlewareError: there is none.
     """
     wanted = {(nfe.medium, _address(nfe.internet_address), nfe.transport_port) for nfe in nfes}
-    with contextlib.ExitStack() as stack:
-        found = []
-        for each, bound in _bound_here():
-            if (bound.kind, bound.address, bound.port) in wanted:
-                # Not by its own dup(), which would make the original wait where it must not.
-                duplicate = socket.socket(fileno=os.dup(each.fileno()))
-                found.append(stack.enter_context(duplicate))
-        if not found:
-            listed = ", ".join(f"{nfe.internet_address}:{nfe.transport_port}" for nfe in nfes)
-            raise MiddlewareError(
-                f"cannot find the sockets of this publisher among network flow endpoints "
-                f"[{listed}]: it has no UDP or TCP socket in this process",
-                hint="a publisher that only has shared memory cannot be marked",
-            )
-        yield found
+    is_found = False
+    for each, bound in _bound_here():
+        if (bound.kind, bound.address, bound.port) in wanted:
+            is_found = True
+            yield each
+    if not is_found:
+        listed = ", ".join(f"{nfe.internet_address}:{nfe.transport_port}" for nfe in nfes)
+        raise MiddlewareError(
+            f"cannot find the sockets of this publisher among network flow endpoints [{listed}]: "
+            "it has no UDP or TCP socket in this process",
+            hint="a publisher that only has shared memory cannot be marked",
+        )
 
 
 def set_dscp(nfes: Sequence[NetworkFlowEndpoint], dscp: int) -> None:
@@ -200,15 +196,14 @@ def set_dscp(nfes: Sequence[NetworkFlowEndpoint], dscp: int) -> None:
     Raises:
         MiddlewareError: no socket found, or the kernel kept another value.
     """
-    with own_sockets(nfes) as found:
-        for each in found:
-            option = _DSCP_OPTION[each.family]
-            try:
-                each.setsockopt(*option, dscp << 2)
-            except OSError as error:
-                raise MiddlewareError(f"cannot set DSCP {dscp}: {error.strerror}") from error
-            if (kept := each.getsockopt(*option) >> 2) != dscp:
-                raise MiddlewareError(f"cannot set DSCP {dscp}: the kernel keeps {kept}")
+    for each in own_sockets(nfes):
+        option = _DSCP_OPTION[each.family]
+        try:
+            each.setsockopt(*option, dscp << 2)
+        except OSError as error:
+            raise MiddlewareError(f"cannot set DSCP {dscp}: {error.strerror}") from error
+        if (kept := each.getsockopt(*option) >> 2) != dscp:
+            raise MiddlewareError(f"cannot set DSCP {dscp}: the kernel keeps {kept}")
 
 
 def get_dscps(nfes: Sequence[NetworkFlowEndpoint]) -> set[int]:
@@ -217,8 +212,7 @@ def get_dscps(nfes: Sequence[NetworkFlowEndpoint]) -> set[int]:
     Raises:
         MiddlewareError: no socket found.
     """
-    with own_sockets(nfes) as found:
-        return {each.getsockopt(*_DSCP_OPTION[each.family]) >> 2 for each in found}
+    return {each.getsockopt(*_DSCP_OPTION[each.family]) >> 2 for each in own_sockets(nfes)}
 
 
 def widen_discovery_buffers(domain_id: int) -> int:

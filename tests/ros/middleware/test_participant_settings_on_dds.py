@@ -268,8 +268,8 @@ def test_sends_that_must_not_wait_go_by_sockets_that_do_not(
         FlowParticipant("_patient", "/", domain_id, transports=transports) as wait_under_load,
     ):
         for participant, waits in ((hasty, False), (wait_under_load, True)):
-            with own_sockets(senders_of(participant.node)) as sockets:
-                assert {os.get_blocking(each.fileno()) for each in sockets} == {waits}
+            sockets = own_sockets(senders_of(participant.node))
+            assert {os.get_blocking(each.fileno()) for each in sockets} == {waits}
         assert hasty.has_shared_memory is (not transports)
 
 
