@@ -165,7 +165,11 @@ def create_subscription(
     profile = to_rclpy(qos)
     if content_filter is not None:
         abi.load()  # before anything is made
-    if _is_plain(node, topic, unique):
+    if unique is UniqueRequirement.STRICTLY_REQUIRED and not abi.is_known():
+        hint = f"ask for optionally_required, or {INSTALL}"
+        resolved = node.resolve_topic_name(topic)
+        raise _not_feasible("subscription", resolved, unique, abi.refusal(), hint)
+    if unique is UniqueRequirement.NOT_REQUIRED or not abi.is_known():
         subscription = node.create_subscription(type_, topic, callback, profile, **options)
     else:
         listed = private(node, "_subscriptions", f"make a flow of its own for {topic!r}")
@@ -222,13 +226,10 @@ def create_publisher(
         MiddlewareError: STRICTLY_REQUIRED; nothing was made.
     """
     if unique is UniqueRequirement.STRICTLY_REQUIRED:
-        raise _not_feasible(
-            "publisher",
-            node.resolve_topic_name(topic),
-            unique,
-            "Unique network flow endpoints not supported on publishers",
-            "give the publisher its own participant, or ask for optionally_required",
-        )
+        reason = "Unique network flow endpoints not supported on publishers"
+        hint = "give the publisher its own participant, or ask for optionally_required"
+        resolved = node.resolve_topic_name(topic)
+        raise _not_feasible("publisher", resolved, unique, reason, hint)
     return node.create_publisher(type_, topic, to_rclpy(qos), **options)
 
 
@@ -239,23 +240,6 @@ def _not_feasible(
         f"cannot create {kind} {topic!r} with network flow endpoints {unique.value}: {reason}",
         hint=hint,
     )
-
-
-def _is_plain(node: Node, topic: str, unique: UniqueRequirement) -> bool:
-    """Return whether rclpy makes a subscription: nothing else is wanted, or can be had.
-
-    Raises:
-        MiddlewareError: STRICTLY_REQUIRED, with an rcl that is not known.
-    """
-    if unique is UniqueRequirement.STRICTLY_REQUIRED and not abi.is_known():
-        raise _not_feasible(
-            "subscription",
-            node.resolve_topic_name(topic),
-            unique,
-            abi.refusal(),
-            f"ask for optionally_required, or {INSTALL}",
-        )
-    return unique is UniqueRequirement.NOT_REQUIRED or not abi.is_known()
 
 
 @contextlib.contextmanager

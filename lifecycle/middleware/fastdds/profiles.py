@@ -12,7 +12,7 @@ profile asks for multicast (docs/performance.md has the measurements).
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -165,26 +165,21 @@ def default_profile(environment: Mapping[str, str] | None = None) -> DefaultProf
         files.append(version.default_profiles)
     found = None
     for file in files:
-        for element in _default_participants(file):
-            name = element.get("profile_name", "")
-            found = DefaultProfile(file=file, name=name, element=element)
+        try:
+            root = ET.fromstring(Path(file).read_bytes())  # noqa: S314 - Fast DDS trusts it, too
+        except OSError as error:
+            raise MiddlewareError(f"cannot read profiles {file!r}: {error.strerror}") from error
+        except ET.ParseError as error:
+            raise MiddlewareError(f"cannot read profiles {file!r}: {error}") from error
+        for each in root.iter():
+            # Fast DDS does not look at namespaces; with them, no name would be found here.
+            if isinstance(each.tag, str):
+                each.tag = each.tag.rpartition("}")[2]
+        for each in root.iter("participant"):
+            if each.get("is_default_profile") == "true":
+                name = each.get("profile_name", "")
+                found = DefaultProfile(file=file, name=name, element=each)
     return found
-
-
-def _default_participants(file: str) -> Iterator[ET.Element]:
-    try:
-        root = ET.fromstring(Path(file).read_bytes())  # noqa: S314 - Fast DDS trusts it, too
-    except OSError as error:
-        raise MiddlewareError(f"cannot read profiles {file!r}: {error.strerror}") from error
-    except ET.ParseError as error:
-        raise MiddlewareError(f"cannot read profiles {file!r}: {error}") from error
-    for element in root.iter():
-        # Fast DDS does not look at namespaces; with them, no name would be found here.
-        if isinstance(element.tag, str):
-            element.tag = element.tag.rpartition("}")[2]
-    for element in root.iter("participant"):
-        if element.get("is_default_profile") == "true":
-            yield element
 
 
 def child(parent: ET.Element, tag: str) -> ET.Element:

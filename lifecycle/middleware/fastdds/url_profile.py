@@ -275,14 +275,12 @@ def _add_discovery(
             # Named peers replace the groups by which Fast DDS otherwise announces.
             searched.extend(lists[_DISCOVERY_GROUPS])
         builtin.append(searched)
-    if all(family.kind.is_udp and _all_ports_fixed(family) for family in found):
-        # Else Fast DDS would take other ports for busy ones, and no peer would look there.
-        put(builtin, "mutation_tries", 0)
-
-
-def _all_ports_fixed(family: UrlTransport) -> bool:
-    ports = [url.port for url in family.urls if not url.transport.is_group]
-    return bool(family.option("metatraffic_port") and ports and all(ports))
+    for family in found:
+        ports = [url.port for url in family.urls if not url.transport.is_group]
+        if not (family.kind.is_udp and family.option("metatraffic_port") and ports and all(ports)):
+            return
+    # Else Fast DDS would take other ports for busy ones, and no peer would look there.
+    put(builtin, "mutation_tries", 0)
 
 
 def _check(found: Sequence[UrlTransport], urls: Sequence[ConnectionUrl]) -> None:

@@ -285,14 +285,13 @@ class ServerWatch:
                 self._matched = matched
             if has_changed:
                 self._changed()
-            return not matched and self._is_offered()
+            if isinstance(self._client, Client):
+                service = self._client.service_name
+            else:
+                service = f"{self._client.action_name}/_action/send_goal"
+            return not matched and bool(self._node.count_services(service))
         except _GONE:
             return False  # it was destroyed meanwhile
-
-    def _is_offered(self) -> bool:
-        if isinstance(self._client, Client):
-            return bool(self._node.count_services(self._client.service_name))
-        return bool(self._node.count_services(f"{self._client.action_name}/_action/send_goal"))
 
 
 def _is_ready(client: AnyClient) -> bool:
