@@ -14,7 +14,7 @@ import itertools
 import os
 import typing
 import weakref
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import rclpy
@@ -91,6 +91,19 @@ def bare_node(context: rclpy.Context) -> Any:
 
 
 _numbers = itertools.count()
+
+
+def republish_names(nodes: Iterable[Node]) -> None:
+    """Make the participants of `nodes` publish anew which nodes and endpoints they have.
+
+    After an outage rmw_dds_common keeps the name of a node whose participant was dropped, and found
+    again, out of the graph until then. rmw_fastrtps publishes it whenever a node or an endpoint is
+    made or destroyed. Here it is a hidden node without endpoints, for a moment: when an endpoint
+    ends, a discovery server of Fast DDS 2.14 drops whatever it has not relayed yet of that
+    participant's other endpoints, and never sends it again. Take one node of each participant.
+    """
+    for node in nodes:
+        bare_node(node.context).destroy_when_not_in_use()
 
 
 @contextlib.contextmanager
