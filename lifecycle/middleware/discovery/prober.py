@@ -142,6 +142,8 @@ class Prober:
             counted: at its own socket, too. Not every RMW answers at each address that a
                 participant has: Cyclone DDS chooses one.
         """
+        if not self._reached:
+            return
         with self._lock:
             self._leave()
             self._joined = True
@@ -250,6 +252,9 @@ class Settling:
     Args:
         reached: whom our participant, which listens already, can ask.
         settle_s: seconds in which everybody is known.
+
+    Attributes:
+        prober: which asks; without anybody to ask it does nothing.
     """
 
     def __init__(self, reached: Sequence[Reach], settle_s: float = SETTLE_S) -> None:
@@ -257,14 +262,12 @@ class Settling:
         self._began_s = time.monotonic()
         self._again_s = ANSWER_S
         self._asks = bool(reached)
-        self._prober = Prober(reached)
-        self._silent: frozenset[OpenSocket] = frozenset()
+        self.prober = Prober(reached)
         self._familiar: frozenset[OpenSocket] = frozenset()
         self._known: frozenset[str] = frozenset()
         self._known_before: frozenset[str] = frozenset()
-        if self._asks:
-            self._silent = self._prober.listeners()
-            self._prober.ask()
+        self._silent = self.prober.listeners()
+        self.prober.ask()
 
     def within(self, settle_s: float) -> None:
         """Take so many seconds for those in which everybody is known, where nobody can be asked."""
@@ -289,17 +292,17 @@ class Settling:
             return left_s
         if age_s < ANSWER_S:
             return ANSWER_S - age_s
-        unknown = self._prober.answers().keys() - self._known
+        unknown = self.prober.answers().keys() - self._known
         self._silent = frozenset(
-            each for each in self._silent if each.port not in self._prober.ports
+            each for each in self._silent if each.port not in self.prober.ports
         )
         if self._silent:  # only those that are still there
-            self._silent &= self._prober.listeners()
+            self._silent &= self.prober.listeners()
         if not unknown and not self._silent:
             return 0.0
         if age_s >= self._again_s:
             self._again_s = 2 * age_s
-            self._prober.ask(counted=bool(self._silent))
+            self.prober.ask(counted=bool(self._silent))
         return min(left_s, ANSWER_S)
 
     def expect_newcomers(self, named: frozenset[str], own: str, *, everybody: bool = False) -> bool:
@@ -320,8 +323,8 @@ class Settling:
             return everybody
         if self.left_s(named) > 0 and not everybody:
             return True
-        everybody |= self._prober.leaves_host and time.monotonic() - self._began_s > _OFTEN_S
-        listeners = self._prober.listeners()
+        everybody |= self.prober.leaves_host and time.monotonic() - self._began_s > _OFTEN_S
+        listeners = self.prober.listeners()
         came = listeners - self._familiar
         new = {
             each
@@ -332,23 +335,14 @@ class Settling:
         if not everybody and len({each.port for each in came}) <= len(new):
             return False
         # Who answered and did not come into the graph in all of the time is waited for no more.
-        self._known |= self._prober.answers().keys()
+        self._known |= self.prober.answers().keys()
         self._known_before = self._known
-        self._prober.ports.clear()
+        self.prober.ports.clear()
         self._silent = came
         self._began_s, self._again_s = time.monotonic(), ANSWER_S
-        self._prober.ask()
+        self.prober.ask()
         return True
-
-    def addresses(self) -> dict[str, str]:
-        """Return the IP address of each participant that has answered, by GUID prefix."""
-        return self._prober.answers()
-
-    def ask(self) -> None:
-        """Have all answer once more, so that their `addresses` are known."""
-        if self._asks:
-            self._prober.ask()
 
     def close(self) -> None:
         """Ask nobody any more."""
-        self._prober.close()
+        self.prober.close()

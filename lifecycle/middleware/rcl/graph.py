@@ -494,7 +494,7 @@ class GraphObserver:
         One whose address is not known is asked for it: it answers within a moment, and the next
         look has it.
         """
-        known = self.settling.addresses()
+        known = self.settling.prober.answers()
         for endpoint in endpoints:
             prefix = endpoint.gid[:PREFIX_DIGITS]
             if not prefix:
@@ -504,7 +504,7 @@ class GraphObserver:
             is_coming = time.monotonic() - since_s < _NAMED_S
             if prefix not in known and prefix not in self._asked_for and not is_coming:
                 self._asked_for.add(prefix)
-                self.settling.ask()
+                self.settling.prober.ask()
             yield replace(endpoint, address=known.get(prefix, ""))
 
 
