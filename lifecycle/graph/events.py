@@ -81,11 +81,7 @@ class GraphEvents:
         self._state = state
 
     def on(
-        self,
-        kinds: EventKind | Iterable[EventKind],
-        callback: Callback,
-        *,
-        node: str | None = None,
+        self, kinds: EventKind | Iterable[EventKind], callback: Callback, *, node: str | None = None
     ) -> Remove:
         """Have `callback` called with each event of these kinds from now on.
 

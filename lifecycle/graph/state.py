@@ -19,14 +19,7 @@ from typing import Any
 import msgspec
 from msgspec.structs import replace
 
-from lifecycle.graph.model import (
-    End,
-    GraphChange,
-    Link,
-    NodeView,
-    link,
-    match_ends,
-)
+from lifecycle.graph.model import End, GraphChange, Link, NodeView, link, match_ends
 from lifecycle.graph.status import NodeStatus
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.verify.observation import (
@@ -204,12 +197,12 @@ class GraphState:
                 self._given = {**self._given, name: configuration}
             self._set(name, configuration=configuration)
 
-    def drop_configuration(self, node: str, reason: str = "its process ended") -> None:
+    def drop_configuration(self, node: str) -> None:
         """Forget a node (fully qualified) whose configuration was given: it is not there now."""
         with self._lock:
             if node in self._given:
                 self._given = {name: each for name, each in self._given.items() if name != node}
-                self._leave(node, reason)
+                self._leave(node, "its process ended")
 
     @property
     def given(self) -> Mapping[str, NodeConfiguration]:
@@ -299,9 +292,7 @@ class GraphState:
         return Observation(
             nodes=tuple(
                 replace(
-                    each,
-                    state=states.get(each.full_name),
-                    health=look.health.get(each.full_name),
+                    each, state=states.get(each.full_name), health=look.health.get(each.full_name)
                 )
                 for each in (*look.nodes, *reported)
             ),

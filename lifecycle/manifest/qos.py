@@ -70,6 +70,15 @@ class QosProfile(msgspec.Struct, frozen=True, kw_only=True):
     liveliness_lease_duration_ns: int | None = None
 
 
+UNKNOWN_QOS = QosProfile(
+    history=History.UNKNOWN,
+    depth=0,
+    reliability=Reliability.UNKNOWN,
+    durability=Durability.UNKNOWN,
+    liveliness=Liveliness.UNKNOWN,
+)
+"""Nothing is known; compatible with nothing for certain."""
+
 POLICIES = (
     "history",
     "depth",

@@ -106,7 +106,8 @@ def private(owner: object, name: str, what: str) -> Any:
     found = getattr(owner, name, None)
     if found is None:
         raise MiddlewareError(
-            f"cannot {what}: this rclpy has no {name}, which that of {KNOWN_RCL} has", hint=INSTALL
+            f"cannot {what}: rclpy of rcl {rcl_version()} has no {name}; known: {KNOWN_RCL}",
+            hint=INSTALL,
         )
     return found
 

@@ -33,15 +33,6 @@ from lifecycle.verify.tool_filter import DeclaredNames
 from lifecycle.verify.uniqueness import Uniqueness
 from lifecycle.verify.verdict import Stage
 
-UNKNOWN_QOS = QosProfile(
-    history=History.UNKNOWN,
-    depth=0,
-    reliability=Reliability.UNKNOWN,
-    durability=Durability.UNKNOWN,
-    liveliness=Liveliness.UNKNOWN,
-)
-"""Nothing is known; compatible with nothing for certain."""
-
 _BY_STRENGTH = (
     UniqueRequirement.STRICTLY_REQUIRED,
     UniqueRequirement.OPTIONALLY_REQUIRED,

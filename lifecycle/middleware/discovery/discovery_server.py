@@ -6,19 +6,18 @@ watching and ending it is supervisor/'s. Must not import rclpy.
 
 from __future__ import annotations
 
-import ipaddress
+import contextlib
 import os
 import re
 import shutil
-import socket
-import struct
 import sysconfig
 from collections.abc import Mapping
 from pathlib import Path
 
 from lifecycle.errors import MiddlewareError
+from lifecycle.middleware.fastdds.sockets import sockets_in
 from lifecycle.middleware.versions import DISTRIBUTIONS, INSTALL, installed
-from lifecycle.network.medium import TRANSPORTS_VARIABLE
+from lifecycle.network.medium import DEFAULT_TCP, RMW_DISCOVERY, TRANSPORTS_VARIABLE
 from lifecycle.plan.model import PlannedServer
 
 PROGRAM = "fast-discovery-server"
@@ -70,21 +69,16 @@ def discovery_server_listens(server: PlannedServer, pid: int | None = None) -> b
         server: address, port and transport.
         pid: of the server, whose network is looked at; None for this process's.
     """
-    owner = "self" if pid is None else str(pid)
-    table = Path(f"/proc/{owner}/net/{'tcp' if server.tcp else 'udp'}")
-    wanted = {_spelt(server.address, server.port), _spelt("0.0.0.0", server.port)}  # noqa: S104
-    try:
-        lines = table.read_text(encoding="ascii").splitlines()[1:]
-    except (FileNotFoundError, ProcessLookupError):
-        return False
-    fields = [line.split() for line in lines]
-    return any(field[1] in wanted and (not server.tcp or field[3] == _LISTEN) for field in fields)
-
-
-def _spelt(address: str, port: int) -> str:
-    """Return how /proc/net spells an IPv4 address and a port: in the host's byte order."""
-    (word,) = struct.unpack("=I", socket.inet_aton(str(ipaddress.IPv4Address(address))))
-    return f"{word:08X}:{port:04X}"
+    owner, name = "self" if pid is None else str(pid), "tcp" if server.tcp else "udp"
+    table, kind = Path("/proc", owner, "net", name), DEFAULT_TCP if server.tcp else RMW_DISCOVERY
+    with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+        return any(
+            each.port == server.port
+            and each.address in (server.address, kind.any_address)
+            and (not server.tcp or state == _LISTEN)
+            for each, state in sockets_in(table, kind)
+        )
+    return False
 
 
 def _program() -> str:
@@ -93,18 +87,12 @@ def _program() -> str:
         if found is not None:
             return found
     raise MiddlewareError(
-        f"cannot find {PROGRAM!r}",
-        hint=f"it comes with Fast DDS; set PATH, or {INSTALL}",
+        f"cannot find {PROGRAM!r}", hint=f"it comes with Fast DDS; set PATH, or {INSTALL}"
     )
 
 
 def _library_paths() -> list[str]:
     """Return where the wheels keep Fast DDS and what it needs; what is not there is left out."""
-    places = (
-        Path(sysconfig.get_path("data")) / "lib",
-        *(
-            Path(sysconfig.get_path("purelib")) / f"ros_{library}.libs"
-            for library in ("fastrtps", "fastdds")
-        ),
-    )
+    data, pure = (Path(sysconfig.get_path(each)) for each in ("data", "purelib"))
+    places = (data / "lib", pure / "ros_fastrtps.libs", pure / "ros_fastdds.libs")
     return [str(place) for place in places if place.is_dir()]

@@ -156,7 +156,7 @@ def _listed(domain_id: int, family: UrlTransport) -> Reach:
             targets.append(Target(peer.address, peer.port))
     if all(url.multicast for url in family.urls):
         targets += _groups(domain_id, family.kind, (name for name, found in here.items() if found))
-    fixed = family.metatraffic_port
+    fixed = family.option("metatraffic_port")
     receivers = (fixed,) if fixed else _receivers(domain_id, family.kind)
     addresses = tuple(each for found in here.values() for each in found)
     return Reach(family.kind, tuple(targets), addresses, receivers)

@@ -181,7 +181,7 @@ class AliveSubscription:
             node.create_subscription(
                 Empty,
                 topic + ALIVE_PULSE,
-                _ignore,
+                lambda _: None,  # nothing is published: the writer's liveliness is the message
                 _ASSERTED,
                 event_callbacks=_no_subscription_events(liveliness=changed),
             ),
@@ -194,10 +194,6 @@ class AliveSubscription:
         """Destroy the subscriptions."""
         for each in self._subscriptions:
             self._node.destroy_subscription(each)
-
-
-def _ignore(message: Empty) -> None:
-    """Nothing is ever published: the writer's liveliness is the message."""
 
 
 PLANS_TOPIC = "/_lifecycle/plans"

@@ -114,11 +114,13 @@ class Prober:
         reached: whom it asks, and where.
 
     Attributes:
+        leaves_host: it asks participants of other hosts, too.
         ports: at which those that answered receive discovery, as they say.
     """
 
     def __init__(self, reached: Sequence[Reach]) -> None:
         self._reached = reached
+        self.leaves_host = any(to.address not in e.addresses for e in reached for to in e.targets)
         self._prefix = _VENDOR + os.urandom(10)
         self._sequence = 0
         self._joined = False
@@ -140,6 +142,8 @@ class Prober:
             counted: at its own socket, too. Not every RMW answers at each address that a
                 participant has: Cyclone DDS chooses one.
         """
+        if not self._reached:
+            return
         with self._lock:
             self._leave()
             self._joined = True
@@ -202,15 +206,6 @@ class Prober:
             and (each.address in at or ipaddress.ip_address(each.address).is_unspecified)
         )
 
-    @property
-    def leaves_host(self) -> bool:
-        """Whether it asks participants of other hosts, too."""
-        return any(
-            target.address not in each.addresses
-            for each in self._reached
-            for target in each.targets
-        )
-
     def close(self) -> None:
         """Leave for good."""
         with self._lock:
@@ -257,30 +252,32 @@ class Settling:
     Args:
         reached: whom our participant, which listens already, can ask.
         settle_s: seconds in which everybody is known.
+
+    Attributes:
+        prober: which asks; without anybody to ask it does nothing.
     """
 
     def __init__(self, reached: Sequence[Reach], settle_s: float = SETTLE_S) -> None:
         self._settle_s = settle_s
         self._began_s = time.monotonic()
         self._again_s = ANSWER_S
-        self._prober = Prober(reached) if reached else None
-        self._silent: frozenset[OpenSocket] = frozenset()
+        self._asks = bool(reached)
+        self.prober = Prober(reached)
         self._familiar: frozenset[OpenSocket] = frozenset()
         self._known: frozenset[str] = frozenset()
         self._known_before: frozenset[str] = frozenset()
-        if self._prober is not None:
-            self._silent = self._prober.listeners()
-            self._prober.ask()
+        self._silent = self.prober.listeners()
+        self.prober.ask()
 
     def within(self, settle_s: float) -> None:
         """Take so many seconds for those in which everybody is known, where nobody can be asked."""
-        if self._prober is None:
+        if not self._asks:
             self._settle_s = settle_s
 
     @property
     def unasked_s(self) -> float:
         """Seconds that are waited for because nobody can be asked; 0 where all can be."""
-        return self._settle_s if self._prober is None else 0.0
+        return 0.0 if self._asks else self._settle_s
 
     def left_s(self, named: frozenset[str]) -> float:
         """Return for how many seconds a look may still miss a participant; 0 once it cannot.
@@ -291,21 +288,21 @@ class Settling:
         self._known |= named  # who was known and left is not on the way into the graph
         age_s = time.monotonic() - self._began_s
         left_s = max(0.0, self._settle_s - age_s)
-        if self._prober is None or not left_s:
+        if not (self._asks and left_s):
             return left_s
         if age_s < ANSWER_S:
             return ANSWER_S - age_s
-        unknown = self._prober.answers().keys() - self._known
+        unknown = self.prober.answers().keys() - self._known
         self._silent = frozenset(
-            each for each in self._silent if each.port not in self._prober.ports
+            each for each in self._silent if each.port not in self.prober.ports
         )
         if self._silent:  # only those that are still there
-            self._silent &= self._prober.listeners()
+            self._silent &= self.prober.listeners()
         if not unknown and not self._silent:
             return 0.0
         if age_s >= self._again_s:
             self._again_s = 2 * age_s
-            self._prober.ask(counted=bool(self._silent))
+            self.prober.ask(counted=bool(self._silent))
         return min(left_s, ANSWER_S)
 
     def expect_newcomers(self, named: frozenset[str], own: str, *, everybody: bool = False) -> bool:
@@ -320,14 +317,14 @@ class Settling:
             everybody: wait also for what those have to say that are known: this process did not
                 run for a while.
         """
-        if self._prober is None:
+        if not self._asks:
             if everybody:
                 self._began_s = time.monotonic()
             return everybody
         if self.left_s(named) > 0 and not everybody:
             return True
-        everybody |= self._prober.leaves_host and time.monotonic() - self._began_s > _OFTEN_S
-        listeners = self._prober.listeners()
+        everybody |= self.prober.leaves_host and time.monotonic() - self._began_s > _OFTEN_S
+        listeners = self.prober.listeners()
         came = listeners - self._familiar
         new = {
             each
@@ -338,24 +335,14 @@ class Settling:
         if not everybody and len({each.port for each in came}) <= len(new):
             return False
         # Who answered and did not come into the graph in all of the time is waited for no more.
-        self._known |= self._prober.answers().keys()
+        self._known |= self.prober.answers().keys()
         self._known_before = self._known
-        self._prober.ports.clear()
+        self.prober.ports.clear()
         self._silent = came
         self._began_s, self._again_s = time.monotonic(), ANSWER_S
-        self._prober.ask()
+        self.prober.ask()
         return True
-
-    def addresses(self) -> dict[str, str]:
-        """Return the IP address of each participant that has answered, by GUID prefix."""
-        return {} if self._prober is None else self._prober.answers()
-
-    def ask(self) -> None:
-        """Have all answer once more, so that their `addresses` are known."""
-        if self._prober is not None:
-            self._prober.ask()
 
     def close(self) -> None:
         """Ask nobody any more."""
-        if self._prober is not None:
-            self._prober.close()
+        self.prober.close()

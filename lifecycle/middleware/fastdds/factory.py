@@ -14,6 +14,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import functools
+import hashlib
 import threading
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -34,6 +35,8 @@ _STRING = "NSt7__cxx1112basic_stringIcSt11char_traitsIcESaIcEEE"
 _QOS_ROOM_BYTES = 16384
 """Thirteen times sizeof(DomainParticipantQos) in 2.14.5."""
 _OK = 0
+DRAFT = "lifecycle_draft_of_a_profile"
+"""The name of a profile, and what those of its transports begin with, before it has one."""
 
 
 class _String(ctypes.Structure):
@@ -125,47 +128,36 @@ def fast_dds_refusal() -> str:
     return ""
 
 
-def load_profile(name: str, xml: str) -> None:
-    """Make a participant profile known to this process; again is harmless.
-
-    Args:
-        name: of the profile; Fast DDS keeps it, and what was first loaded under it, for good.
-        xml: contains it, not as a default profile.
-
-    Raises:
-        MiddlewareError: Fast DDS refused it, which it explains on standard error.
-    """
-    dds = _library()
-    with dds.lock:
-        if name in dds.loaded:
-            return
-        if (result := dds.load(xml)) != _OK:
-            raise MiddlewareError(
-                f"cannot load participant profile {name!r}: Fast DDS refused it (code {result})"
-            )
-        dds.loaded.add(name)
-
-
 @contextlib.contextmanager
-def default_participant(name: str) -> Iterator[None]:
-    """Have participants that are created inside the block made from a loaded profile.
+def default_participant(xml: str) -> Iterator[None]:
+    """Have participants that are created inside the block made from a profile.
 
     The default QoS before it is put back exactly, whatever set it. One block at a time: other
     threads that use this function wait; participants that they create otherwise meanwhile get this
     profile too.
 
+    Args:
+        xml: the profile, not as a default one, with DRAFT for its name. Fast DDS keeps each for
+            good, so equal ones are loaded once.
+
     Raises:
-        MiddlewareError: no such profile, or Fast DDS refused it.
+        MiddlewareError: Fast DDS refused it, which it explains on standard error.
     """
     dds = _library()
+    name = f"lifecycle_{hashlib.sha256(xml.encode()).hexdigest()[:16]}"
+    data = name.encode()
+    text = _String(data=data, size=len(data), capacity=len(data))
     with dds.lock, dds.copied_default() as before, dds.copied_default() as wanted:
-        data = name.encode()
-        text = _String(data=data, size=len(data), capacity=len(data))
-        result = dds.qos_from_profile(dds.factory(), ctypes.byref(text), wanted)
+        result = _OK if name in dds.loaded else dds.load(xml.replace(DRAFT, name))
+        if result == _OK:
+            dds.loaded.add(name)
+            result = dds.qos_from_profile(dds.factory(), ctypes.byref(text), wanted)
         if result == _OK:
             result = dds.set_default_qos(dds.factory(), wanted)
         if result != _OK:
-            raise MiddlewareError(f"cannot use participant profile {name!r}: code {result}")
+            raise MiddlewareError(
+                f"cannot use participant profile {name!r}: Fast DDS refused it (code {result})"
+            )
         try:
             yield
         finally:

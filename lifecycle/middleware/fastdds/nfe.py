@@ -34,7 +34,7 @@ from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.fastdds.sockets import udp_sockets
 from lifecycle.middleware.rcl import abi
 from lifecycle.middleware.rcl.qos import to_rclpy
-from lifecycle.middleware.versions import INSTALL
+from lifecycle.middleware.versions import INSTALL, private
 from lifecycle.network.medium import DEFAULT_RMW
 from lifecycle.network.nfe import (
     InternetProtocol,
@@ -59,40 +59,7 @@ _UNIQUE_PORTS = range(7000, 7400)
 """Fast DDS looks for a unique port in [portBase − 400, portBase), in every domain."""
 
 
-class NetworkFlowEndpointsUnsupported(MiddlewareError):  # noqa: N818 - states a fact, not a fault
-    """The RMW cannot report network flow endpoints.
-
-    Attributes:
-        reason: the RMW's own message.
-    """
-
-    def __init__(self, message: str, *, reason: str, hint: str = "") -> None:
-        super().__init__(message, hint=hint)
-        self.reason = reason
-
-
-class UniqueFlowNotFeasible(MiddlewareError):  # noqa: N818 - states a fact, not a fault
-    """The RMW cannot give this endpoint network flow endpoints of its own; none was made.
-
-    Attributes:
-        topic: fully qualified.
-        reason: the RMW's own message.
-    """
-
-    def __init__(
-        self, kind: str, topic: str, unique: UniqueRequirement, reason: str, hint: str
-    ) -> None:
-        super().__init__(
-            f"cannot create {kind} {topic!r} with network flow endpoints {unique.value}: {reason}",
-            hint=hint,
-        )
-        self.topic = topic
-        self.reason = reason
-
-
-def get_network_flow_endpoints(
-    entity: Publisher | Subscription,
-) -> tuple[NetworkFlowEndpoint, ...]:
+def get_network_flow_endpoints(entity: Publisher | Subscription) -> tuple[NetworkFlowEndpoint, ...]:
     """Return the NFEs of a publisher or subscription, as rmw lists them.
 
     With Fast DDS a publisher's are its participant's sender sockets and a subscription's the
@@ -103,13 +70,20 @@ def get_network_flow_endpoints(
     Ask a publisher only before its participant has peers, see `senders_of`.
 
     Raises:
-        NetworkFlowEndpointsUnsupported: this RMW has no such function.
-        MiddlewareError: the call failed, or the installed rcl is not known.
+        MiddlewareError: this RMW has no such function, or the installed rcl is not known.
         rclpy.exceptions.InvalidHandle: the entity was destroyed.
     """
-    return read_handle(
-        entity.handle, "publisher" if isinstance(entity, Publisher) else "subscription"
-    )
+    kind = "publisher" if isinstance(entity, Publisher) else "subscription"
+    rcl = abi.load()
+    with entity.handle:
+        code, found = rcl.flow_endpoints(kind, entity.handle.pointer)
+    if code != abi.RCL_RET_OK:
+        unsupported = code == abi.RCL_RET_UNSUPPORTED
+        raise MiddlewareError(
+            f"cannot read the network flow endpoints of a {kind}: {rcl.take_error()}",
+            hint=f"set RMW_IMPLEMENTATION={DEFAULT_RMW}" if unsupported else "",
+        )
+    return tuple(map(_convert, found))
 
 
 _SENDERS: weakref.WeakKeyDictionary[Context, tuple[NetworkFlowEndpoint, ...]] = (
@@ -135,21 +109,6 @@ def senders_of(node: Node) -> tuple[NetworkFlowEndpoint, ...]:
             raise MiddlewareError(f"cannot find a publisher of {node.get_name()!r} to ask")
         known = _SENDERS[node.context] = get_network_flow_endpoints(publisher)
     return known
-
-
-def read_handle(handle: Any, kind: str) -> tuple[NetworkFlowEndpoint, ...]:
-    """Ask rmw for the NFEs of rclpy's bare handle of a `kind`."""
-    rcl = abi.load()
-    with handle:
-        code, found = rcl.flow_endpoints(kind, handle.pointer)
-    if code != abi.RCL_RET_OK:
-        reason = rcl.take_error()
-        message = f"cannot read the network flow endpoints of a {kind}: {reason}"
-        if code == abi.RCL_RET_UNSUPPORTED:
-            hint = f"set RMW_IMPLEMENTATION={DEFAULT_RMW}"
-            raise NetworkFlowEndpointsUnsupported(message, reason=reason, hint=hint)
-        raise MiddlewareError(message)
-    return tuple(map(_convert, found))
 
 
 def _convert(nfe: abi.Nfe) -> NetworkFlowEndpoint:
@@ -201,15 +160,19 @@ def create_subscription(
         **options: of rclpy's `create_subscription`: callback_group, event_callbacks, raw.
 
     Raises:
-        UniqueFlowNotFeasible: not possible here; no endpoint is left.
-        MiddlewareError: the endpoint could not be made at all.
+        MiddlewareError: not possible here; no endpoint is left.
     """
     profile = to_rclpy(qos)
     if content_filter is not None:
         abi.load()  # before anything is made
-    if _is_plain(node, topic, unique):
+    if unique is UniqueRequirement.STRICTLY_REQUIRED and not abi.is_known():
+        hint = f"ask for optionally_required, or {INSTALL}"
+        resolved = node.resolve_topic_name(topic)
+        raise _not_feasible("subscription", resolved, unique, abi.refusal(), hint)
+    if unique is UniqueRequirement.NOT_REQUIRED or not abi.is_known():
         subscription = node.create_subscription(type_, topic, callback, profile, **options)
     else:
+        listed = private(node, "_subscriptions", f"make a flow of its own for {topic!r}")
         group = options.get("callback_group") or node.default_callback_group
         raw = options.get("raw", False)
         events = options.get("event_callbacks") or SubscriptionEventCallbacks()
@@ -218,10 +181,11 @@ def create_subscription(
                 *(handle, type_, topic, callback, group, profile, raw), event_callbacks=events
             )
         group.add_entity(subscription)
-        node._subscriptions.append(subscription)  # noqa: SLF001 - as Node.create_subscription does
+        listed.append(subscription)  # as Node.create_subscription does
         for handler in subscription.event_handlers:
             node.add_waitable(handler)
-        node._wake_executor()  # noqa: SLF001
+        if node.executor is not None:
+            node.executor.wake()
     if content_filter is not None:
         _filter(node, subscription, *content_filter)
     return subscription
@@ -259,34 +223,23 @@ def create_publisher(
     `FlowParticipant`. Arguments as `create_subscription`.
 
     Raises:
-        UniqueFlowNotFeasible: STRICTLY_REQUIRED; nothing was made.
+        MiddlewareError: STRICTLY_REQUIRED; nothing was made.
     """
     if unique is UniqueRequirement.STRICTLY_REQUIRED:
-        raise UniqueFlowNotFeasible(
-            "publisher",
-            node.resolve_topic_name(topic),
-            unique,
-            "Unique network flow endpoints not supported on publishers",
-            "give the publisher its own participant, or ask for optionally_required",
-        )
+        reason = "Unique network flow endpoints not supported on publishers"
+        hint = "give the publisher its own participant, or ask for optionally_required"
+        resolved = node.resolve_topic_name(topic)
+        raise _not_feasible("publisher", resolved, unique, reason, hint)
     return node.create_publisher(type_, topic, to_rclpy(qos), **options)
 
 
-def _is_plain(node: Node, topic: str, unique: UniqueRequirement) -> bool:
-    """Return whether rclpy makes a subscription: nothing else is wanted, or can be had.
-
-    Raises:
-        UniqueFlowNotFeasible: STRICTLY_REQUIRED, with an rcl that is not known.
-    """
-    if unique is UniqueRequirement.STRICTLY_REQUIRED and not abi.is_known():
-        raise UniqueFlowNotFeasible(
-            "subscription",
-            node.resolve_topic_name(topic),
-            unique,
-            abi.refusal(),
-            f"ask for optionally_required, or {INSTALL}",
-        )
-    return unique is UniqueRequirement.NOT_REQUIRED or not abi.is_known()
+def _not_feasible(
+    kind: str, topic: str, unique: UniqueRequirement, reason: str, hint: str
+) -> MiddlewareError:
+    return MiddlewareError(
+        f"cannot create {kind} {topic!r} with network flow endpoints {unique.value}: {reason}",
+        hint=hint,
+    )
 
 
 @contextlib.contextmanager
@@ -314,7 +267,7 @@ def _unique_handle(
         raise
     # A handle whose init failed is zero inside; rcl's fini accepts that.
     handle.destroy_when_not_in_use()
-    raise UniqueFlowNotFeasible("subscription", resolved, unique, refusal, _subscription_hint())
+    raise _not_feasible("subscription", resolved, unique, refusal, _subscription_hint())
 
 
 def _made_unique(
@@ -328,17 +281,15 @@ def _made_unique(
     with handle, node.handle:
         owner = node.handle.pointer
         code = rcl.remake_unique(handle.pointer, owner, type_, topic, unique.rmw_value)
+        if code == abi.RCL_RET_OK and unique is not UniqueRequirement.STRICTLY_REQUIRED:
+            return ""
+        if code == abi.RCL_RET_OK:
+            code, nfes = rcl.flow_endpoints("subscription", handle.pointer)
         if code != abi.RCL_RET_OK:
             return rcl.take_error()
-    if unique is not UniqueRequirement.STRICTLY_REQUIRED:
-        return ""
-    try:
-        nfes = read_handle(handle, "subscription")
-    except NetworkFlowEndpointsUnsupported as error:
-        return error.reason
     if not nfes:
         return "the RMW lists no network flow endpoint for it"
-    if not any(is_ip(each) for each in nfes):
+    if not any(is_ip(_convert(each)) for each in nfes):
         # The article defines network flows for UDP and TCP over IP only.
         return "the RMW lists only shared memory for it, which is no network flow"
     return ""

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import time
 import typing
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import rclpy
@@ -34,9 +34,7 @@ from lifecycle.middleware.rcl import hidden_node
 from lifecycle.middleware.rcl.abi import is_known
 from lifecycle.middleware.rcl.hidden_node import forget_hidden, quiet_node
 from lifecycle.middleware.rcl.qos import to_rclpy
-from lifecycle.network.medium import Medium
 from lifecycle.network.nfe import NetworkFlowEndpoint
-from lifecycle.plan.model import ParticipantConnections
 
 _RELEASE_S = 0.2
 """An executor that waits for endpoints lets go of them within a millisecond of being woken."""
@@ -55,12 +53,9 @@ class FlowParticipant:
         namespace: absolute.
         domain_id: 0–232.
         dscp: 0–63, set on its sender sockets before any user data can leave them; None leaves them.
-        transports: see ParticipantSettings, as the next two are.
-        max_datagram_bytes: largest UDP payload it sends, 500–65500.
-        non_blocking_send: never wait for room in a socket's buffer.
-        connections: what it is connected to and by; then `transports` must be empty.
         served: the node whose executor runs the callbacks of subscriptions, services and clients
             made here, gated by its callback groups; None leaves them to the executor of `node`.
+        **settings: of the participant, see ParticipantSettings.
 
     Attributes:
         name: likewise.
@@ -82,19 +77,11 @@ class FlowParticipant:
         domain_id: int,
         *,
         dscp: int | None = None,
-        transports: Sequence[Medium] = (),
-        max_datagram_bytes: int | None = None,
-        non_blocking_send: bool = False,
-        connections: ParticipantConnections | None = None,
         served: Node | None = None,
+        **settings: Any,
     ) -> None:
         self.name = name
-        self.settings = ParticipantSettings.of(
-            connections or ParticipantConnections(),
-            transports=tuple(transports),
-            max_datagram_bytes=max_datagram_bytes,
-            non_blocking_send=non_blocking_send,
-        )
+        self.settings = ParticipantSettings(**settings)
         self._dscp = _one_dscp(dscp, self.settings)
         self._served = served
         self._moved: list[hidden_node.MovedEndpoint] = []
@@ -186,7 +173,7 @@ class FlowParticipant:
         Raises:
             MiddlewareError: the participant's endpoints are discovered statically.
         """
-        if self.settings.static_participants:
+        if self.settings.connections.static_participants:
             raise MiddlewareError(
                 f"cannot make {what} {name!r} on {self.name!r}: its endpoints are discovered "
                 "statically, which services and actions are not",
@@ -259,11 +246,8 @@ class FlowParticipant:
             for port in (url.port, url.metatraffic_port, url.output_port)
             if port is not None
         }
-        return (
-            {each.inode for each in sockets.open_sockets() if each.port in ports}
-            if ports
-            else set()
-        )
+        found = sockets.open_sockets() if ports else ()
+        return {each.inode for each in found if each.port in ports}
 
     def _receive(self, entity: hidden_node.MovedEndpoint) -> None:
         if self._served is not None:

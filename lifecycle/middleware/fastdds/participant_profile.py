@@ -10,14 +10,14 @@ is refused.
 from __future__ import annotations
 
 import copy
+import functools
 import os
-from collections.abc import Mapping
 from xml.etree import ElementTree as ET
 
 import msgspec
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.fastdds.profiles import DefaultProfile, child, drop, text
+from lifecycle.middleware.fastdds.profiles import DefaultProfile, child, put
 from lifecycle.middleware.fastdds.static_edp import endpoint_table
 from lifecycle.middleware.fastdds.url_profile import (
     UrlTransport,
@@ -31,8 +31,8 @@ from lifecycle.network.medium import RMW_DEFAULT, TRANSPORTS_VARIABLE, Medium
 from lifecycle.plan.model import (
     ParticipantConnections,
     PlannedNode,
+    PlannedParticipant,
     StaticEndpoint,
-    StaticParticipant,
 )
 
 _OFTEN, _OFTEN_NS = 60, 50_000_000
@@ -43,8 +43,10 @@ _CONNECTING_NS = 500_000_000
 dials again only when there is something to send: what gets lost so comes with the next
 announcement, or with the one after it."""
 
+_CONFIG = "builtin/discovery_config"
 
-class ParticipantSettings(msgspec.Struct, frozen=True, kw_only=True):
+
+class ParticipantSettings(msgspec.Struct, frozen=True, kw_only=True, dict=True):
     """What a participant needs that the process's default does not give it.
 
     Attributes:
@@ -56,61 +58,34 @@ class ParticipantSettings(msgspec.Struct, frozen=True, kw_only=True):
             None leaves it to Fast DDS.
         non_blocking_send: a send that finds the socket's buffer full drops the datagram instead of
             waiting: a reliable writer sends it again, a best effort one has lost it.
-        urls: what it is connected to and by; then `transports` must be empty.
-        super_client: as a client of a discovery server, receive everything.
-        static_participants: whose endpoints are known without being announced, its own too.
-        static_name: its own name among them; its context must have it as its enclave.
+        connections: what it is connected to and by; with URLs `transports` must be empty, and its
+            context must have `static_name` as its enclave.
         announces_often: at first, where a profile of the user's does not say how often.
 
     Raises:
+        ConnectionUrlError: a URL that is none.
         MiddlewareError: URLs that one participant cannot have together, or transports beside them.
     """
 
     transports: tuple[Medium, ...] = ()
     max_datagram_bytes: int | None = None
     non_blocking_send: bool = False
-    urls: tuple[ConnectionUrl, ...] = ()
-    super_client: bool = False
-    static_participants: tuple[StaticParticipant, ...] = ()
-    static_name: str = ""
+    connections: ParticipantConnections = ParticipantConnections()
     announces_often: bool = False
 
     @classmethod
-    def of(
-        cls,
-        connections: ParticipantConnections,
-        *,
-        transports: tuple[Medium, ...] = (),
-        max_datagram_bytes: int | None = None,
-        non_blocking_send: bool = False,
-    ) -> ParticipantSettings:
-        """Return the settings of a participant that is connected so.
+    def of(cls, planned: PlannedNode | PlannedParticipant) -> ParticipantSettings:
+        """Return the settings of a participant that carries a planned node, or is planned itself.
 
         Raises:
             ConnectionUrlError: a URL that is none.
             MiddlewareError: what one participant cannot have together.
         """
-        urls = tuple(parse_url(url) for url in connections.urls)
-        sizes = [url.max_datagram_bytes for url in urls if url.max_datagram_bytes is not None]
-        if max_datagram_bytes is not None:
-            sizes.append(max_datagram_bytes)
         return cls(
-            transports=transports,
-            max_datagram_bytes=min(sizes, default=None),
-            non_blocking_send=non_blocking_send,
-            urls=urls,
-            super_client=connections.super_client,
-            static_participants=connections.static_participants,
-            static_name=connections.static_name,
-        )
-
-    @classmethod
-    def of_node(cls, node: PlannedNode) -> ParticipantSettings:
-        """Return the settings of a participant that carries a planned node; raises as `of`."""
-        return cls.of(
-            node.connections,
-            transports=node.transports,
-            max_datagram_bytes=node.max_datagram_bytes,
+            transports=planned.transports,
+            max_datagram_bytes=planned.max_datagram_bytes,
+            non_blocking_send=isinstance(planned, PlannedParticipant) and planned.non_blocking_send,
+            connections=planned.connections,
         )
 
     def __post_init__(self) -> None:
@@ -122,25 +97,21 @@ class ParticipantSettings(msgspec.Struct, frozen=True, kw_only=True):
             )
         families(self.urls)
 
+    @functools.cached_property
+    def urls(self) -> tuple[ConnectionUrl, ...]:
+        """Those of its connections."""
+        return tuple(map(parse_url, self.connections.urls))
+
     @property
     def chooses_transports(self) -> bool:
         """Whether its profile has transport descriptors of its own."""
         return bool(self.transports or self.urls) or self.non_blocking_send
 
     @property
-    def transports_to_have(self) -> tuple[UrlTransport, ...]:
-        """What its profile describes: those of its URLs, or Fast DDS's default where none is asked.
-
-        The default is shared memory and UDP over IPv4.
-        """
-        kinds = self.transports or RMW_DEFAULT
-        return families(self.urls) or tuple(UrlTransport(kind=Medium(each)) for each in kinds)
-
-    @property
     def static_endpoints(self) -> tuple[StaticEndpoint, ...]:
         """Its own lines in the table of static discovery; empty without one."""
-        own = (each for each in self.static_participants if each.name == self.static_name)
-        return next((each.endpoints for each in own), ())
+        by_name = {each.name: each.endpoints for each in self.connections.static_participants}
+        return by_name.get(self.connections.static_name, ())
 
     @property
     def governs_discovery(self) -> bool:
@@ -153,7 +124,7 @@ class ParticipantSettings(msgspec.Struct, frozen=True, kw_only=True):
             self.chooses_transports
             or self.max_datagram_bytes is not None
             or self.announces_often
-            or self.super_client
+            or self.connections.super_client
         )
 
 
@@ -164,7 +135,6 @@ def profile(
     base: DefaultProfile | None = None,
     localhost_peers: tuple[str, ...] | None = None,
     domain_id: int = 0,
-    environment: Mapping[str, str] | None = None,
 ) -> str:
     """Return a participant profile as XML: `base` with what `settings` need.
 
@@ -176,7 +146,6 @@ def profile(
             ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST: no multicast, participants looked for on this
             host and on these static peers. None leaves discovery alone.
         domain_id: 0–232, which URLs with TCP need.
-        environment: None for this process's.
 
     Raises:
         MiddlewareError: `base`, or the environment, already chooses transports.
@@ -187,52 +156,42 @@ def profile(
     root = ET.Element("dds", xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles")
     profiles = ET.SubElement(root, "profiles")
     if settings.chooses_transports:
-        _refuse_second_choice(settings, base, os.environ if environment is None else environment)
+        _refuse_second_choice(settings, base)
+        kinds = settings.transports or RMW_DEFAULT
         add_transports(
             name,
             profiles,
             rtps,
-            settings.transports_to_have,
+            families(settings.urls) or [UrlTransport(kind=Medium(each)) for each in kinds],
             domain_id=domain_id,
-            super_client=settings.super_client,
             non_blocking_send=settings.non_blocking_send,
             localhost_peers=localhost_peers,
         )
-    if settings.static_participants:
-        config = child(child(rtps, "builtin"), "discovery_config")
-        text(config, "EDP", "STATIC")
-        table = endpoint_table(settings.static_participants)
-        text(config, "static_edp_xml_config", f"data://{table}")
-    if settings.max_datagram_bytes is not None:
+    if table := settings.connections.static_participants:
+        put(rtps, f"{_CONFIG}/EDP", "STATIC")
+        put(rtps, f"{_CONFIG}/static_edp_xml_config", f"data://{endpoint_table(table)}")
+    sizes = (settings.max_datagram_bytes, *(url.max_datagram_bytes for url in settings.urls))
+    if given := [each for each in sizes if each is not None]:
         # Not maxMessageSize of a transport: it is the receive buffer's size as well, and would cut
         # what others send.
-        _set_property(rtps, "fastdds.max_message_size", str(settings.max_datagram_bytes))
-    for each in rtps.iter("discoveryProtocol") if settings.super_client else ():
+        _set_property(rtps, "fastdds.max_message_size", str(min(given)))
+    for each in rtps.iter("discoveryProtocol") if settings.connections.super_client else ():
         if (each.text or "").strip() == "CLIENT":
             each.text = "SUPER_CLIENT"
-    _set_announcements(rtps, settings, is_users=base is not None and base.is_users)
+    is_users = base is not None and base.is_users
+    if settings.announces_often and not is_users:
+        put(rtps, f"{_CONFIG}/initialAnnouncements/count", _OFTEN)
+        put(rtps, f"{_CONFIG}/initialAnnouncements/period/nanosec", _OFTEN_NS)
+    again = f"{_CONFIG}/leaseAnnouncement"
+    connects = not all(url.transport.is_udp for url in settings.urls)
+    if connects and not (is_users and rtps.find(again) is not None):
+        put(rtps, f"{again}/sec", 0)
+        put(rtps, f"{again}/nanosec", _CONNECTING_NS)
     profiles.append(participant)
     return ET.tostring(root, encoding="unicode", xml_declaration=True)
 
 
-def _set_announcements(rtps: ET.Element, settings: ParticipantSettings, *, is_users: bool) -> None:
-    if settings.announces_often and not is_users:
-        config = child(child(rtps, "builtin"), "discovery_config")
-        drop(config, "initialAnnouncements")
-        often = ET.SubElement(config, "initialAnnouncements")
-        text(often, "count", str(_OFTEN))
-        text(ET.SubElement(often, "period"), "nanosec", str(_OFTEN_NS))
-    if not all(url.transport.is_udp for url in settings.urls):
-        config = child(child(rtps, "builtin"), "discovery_config")
-        if not (is_users and config.find("leaseAnnouncement") is not None):
-            drop(config, "leaseAnnouncement")
-            again = ET.SubElement(config, "leaseAnnouncement")
-            text(again, "nanosec", str(_CONNECTING_NS))
-
-
-def _refuse_second_choice(
-    settings: ParticipantSettings, base: DefaultProfile | None, environment: Mapping[str, str]
-) -> None:
+def _refuse_second_choice(settings: ParticipantSettings, base: DefaultProfile | None) -> None:
     wish = " and ".join(settings.transports or map(str, settings.urls)) or "a non-blocking send"
     if base is not None and (chosen := base.chosen_transports):
         raise MiddlewareError(
@@ -240,7 +199,7 @@ def _refuse_second_choice(
             f"of {base.file!r} already chooses its transports (<{chosen}>)",
             hint=f"take <{chosen}> out of it, or what needs {wish} out of the manifest",
         )
-    variable = environment.get(TRANSPORTS_VARIABLE, "")
+    variable = os.environ.get(TRANSPORTS_VARIABLE, "")
     if variable and not settings.transports and not settings.urls:
         raise MiddlewareError(
             f"cannot give a participant {wish}: {TRANSPORTS_VARIABLE}={variable!r} "
@@ -255,5 +214,5 @@ def _set_property(rtps: ET.Element, name: str, value: str) -> None:
         if (each.findtext("name") or "").strip() == name:
             properties.remove(each)
     element = ET.SubElement(properties, "property")
-    text(element, "name", name)
-    text(element, "value", value)
+    put(element, "name", name)
+    put(element, "value", value)

@@ -12,7 +12,7 @@ profile asks for multicast (docs/performance.md has the measurements).
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -84,11 +84,7 @@ def discovery_profile(
 
 
 def discovery_environment(
-    directory: Path,
-    environment: Mapping[str, str] | None = None,
-    *,
-    peers: Iterable[tuple[str, int]] = (),
-    multicast_endpoints: bool = False,
+    directory: Path, *, peers: Iterable[tuple[str, int]] = (), multicast_endpoints: bool = False
 ) -> dict[str, str]:
     """Write the profile into `directory` and return the variables that apply it.
 
@@ -97,17 +93,15 @@ def discovery_environment(
 
     Args:
         directory: exists; it must outlive every process that is given the variables.
-        environment: what those processes otherwise get; None for this process's.
         peers: see `discovery_profile`.
         multicast_endpoints: see `discovery_profile`.
 
     Raises:
         MiddlewareError: the file cannot be written.
     """
-    current = os.environ if environment is None else environment
     version = installed()
     variables = (each.profiles_variable for each in DISTRIBUTIONS)
-    if any(map(current.get, variables)) or Path(version.default_profiles).exists():
+    if any(map(os.environ.get, variables)) or Path(version.default_profiles).exists():
         return {}
     path = directory.absolute() / _FILE_NAME
     # Renamed into place: a process that starts meanwhile reads the whole file or an older one.
@@ -171,26 +165,21 @@ def default_profile(environment: Mapping[str, str] | None = None) -> DefaultProf
         files.append(version.default_profiles)
     found = None
     for file in files:
-        for element in _default_participants(file):
-            name = element.get("profile_name", "")
-            found = DefaultProfile(file=file, name=name, element=element)
+        try:
+            root = ET.fromstring(Path(file).read_bytes())  # noqa: S314 - Fast DDS trusts it, too
+        except OSError as error:
+            raise MiddlewareError(f"cannot read profiles {file!r}: {error.strerror}") from error
+        except ET.ParseError as error:
+            raise MiddlewareError(f"cannot read profiles {file!r}: {error}") from error
+        for each in root.iter():
+            # Fast DDS does not look at namespaces; with them, no name would be found here.
+            if isinstance(each.tag, str):
+                each.tag = each.tag.rpartition("}")[2]
+        for each in root.iter("participant"):
+            if each.get("is_default_profile") == "true":
+                name = each.get("profile_name", "")
+                found = DefaultProfile(file=file, name=name, element=each)
     return found
-
-
-def _default_participants(file: str) -> Iterator[ET.Element]:
-    try:
-        root = ET.fromstring(Path(file).read_bytes())  # noqa: S314 - Fast DDS trusts it, too
-    except OSError as error:
-        raise MiddlewareError(f"cannot read profiles {file!r}: {error.strerror}") from error
-    except ET.ParseError as error:
-        raise MiddlewareError(f"cannot read profiles {file!r}: {error}") from error
-    for element in root.iter():
-        # Fast DDS does not look at namespaces; with them, no name would be found here.
-        if isinstance(element.tag, str):
-            element.tag = element.tag.rpartition("}")[2]
-    for element in root.iter("participant"):
-        if element.get("is_default_profile") == "true":
-            yield element
 
 
 def child(parent: ET.Element, tag: str) -> ET.Element:
@@ -205,6 +194,8 @@ def drop(parent: ET.Element, *tags: str) -> None:
         parent.remove(each)
 
 
-def text(parent: ET.Element, tag: str, content: str) -> None:
-    """Add a child with text."""
-    ET.SubElement(parent, tag).text = content
+def put(parent: ET.Element, path: str, content: object) -> None:
+    """Set the text of an element by its path; the ones on the way are made if there are none."""
+    for tag in path.split("/"):
+        parent = child(parent, tag)
+    parent.text = str(content)

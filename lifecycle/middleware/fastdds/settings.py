@@ -13,7 +13,6 @@ static peer.
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import os
 import weakref
 from collections.abc import Iterator
@@ -25,11 +24,11 @@ from rclpy.utilities import get_rmw_implementation_identifier
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds.factory import (
+    DRAFT,
     RMW,
     default_participant,
     fast_dds_refusal,
     load_endpoint_profiles,
-    load_profile,
 )
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings, profile
 from lifecycle.middleware.fastdds.profiles import (
@@ -54,7 +53,7 @@ def observer_settings(settings: ParticipantSettings, *, super_client: bool) -> P
 
     Args:
         settings: what it needs otherwise.
-        super_client: it is to be, see ParticipantSettings.
+        super_client: it is to be, see ParticipantConnections.
 
     Returns:
         `settings`, where they, a profile or the environment say what transports it has, and with
@@ -63,7 +62,8 @@ def observer_settings(settings: ParticipantSettings, *, super_client: bool) -> P
     if get_rmw_implementation_identifier() != RMW or fast_dds_refusal():
         return settings
     if settings or super_client:
-        return replace(settings, super_client=super_client)
+        connections = replace(settings.connections, super_client=super_client)
+        return replace(settings, connections=connections)
     with contextlib.suppress(MiddlewareError):  # Fast DDS ignores such a profile
         base = default_profile()
         if not (os.environ.get(TRANSPORTS_VARIABLE) or (base and base.chosen_transports)):
@@ -154,36 +154,25 @@ def _applied(context: Context, settings: ParticipantSettings) -> Iterator[None]:
             hint=f"set RMW_IMPLEMENTATION={RMW}",
         )
     if settings.urls:
-        _check_environment(settings)
+        server = os.environ.get(DISCOVERY_SERVER_VARIABLE, "")
+        if server and not any(url.server for url in settings.urls):
+            raise MiddlewareError(
+                f"cannot connect by {str(settings.urls[0])!r}: {DISCOVERY_SERVER_VARIABLE}="
+                f"{server!r} makes every participant a client of that server",
+                hint=f"unset {DISCOVERY_SERVER_VARIABLE}, or name the server in the URL, "
+                "server=ADDRESS:PORT",
+            )
         check_host(settings.urls)
-    if settings.static_participants:
-        load_endpoint_profiles(settings.static_endpoints)
+    load_endpoint_profiles(settings.static_endpoints)
     is_open = settings.chooses_transports and not settings.governs_discovery
-    draft = profile(
-        _DRAFT,
+    xml = profile(
+        DRAFT,
         settings,
         base=default_profile(),
         localhost_peers=_localhost_peers() if is_open else None,
         domain_id=context.get_domain_id(),
     )
-    # The name says what is in it: equal profiles are loaded once.
-    name = f"lifecycle_{hashlib.sha256(draft.encode()).hexdigest()[:16]}"
-    load_profile(name, draft.replace(_DRAFT, name))
-    with default_participant(name):
+    with default_participant(xml):
         # Under its lock: no other participant of ours is made in between.
         check_free(settings.urls)
         yield
-
-
-_DRAFT = "lifecycle_draft_of_a_profile"
-
-
-def _check_environment(settings: ParticipantSettings) -> None:
-    server = os.environ.get(DISCOVERY_SERVER_VARIABLE, "")
-    if server and not any(url.server for url in settings.urls):
-        raise MiddlewareError(
-            f"cannot connect by {str(settings.urls[0])!r}: {DISCOVERY_SERVER_VARIABLE}={server!r} "
-            "makes every participant a client of that server",
-            hint=f"unset {DISCOVERY_SERVER_VARIABLE}, or name the server in the URL, "
-            "server=ADDRESS:PORT",
-        )

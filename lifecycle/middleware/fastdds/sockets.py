@@ -86,22 +86,31 @@ def socket_descriptors() -> list[int]:
 def open_sockets() -> tuple[OpenSocket, ...]:
     """Return the bound UDP and listening TCP sockets of this process."""
     found: dict[OpenSocket, None] = {}
-    for each in sockets_here():
-        kind = _KINDS.get((each.family, each.type))
-        if kind is None:
-            continue
-        address, port = each.getsockname()[:2]
-        is_open = not kind.is_tcp or each.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN)
-        if port and is_open:
-            inode = os.fstat(each.fileno()).st_ino
-            found[OpenSocket(inode=inode, kind=kind, address=_address(address), port=port)] = None
+    for each, bound in _bound_here():
+        is_tcp = bound.kind.is_tcp
+        if bound.port and (not is_tcp or each.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN)):
+            found[bound] = None
     return tuple(found)
+
+
+def _bound_here() -> Iterator[tuple[socket.socket, OpenSocket]]:
+    """Yield as `sockets_here` does, with what each of them is bound to."""
+    for each in sockets_here():
+        if (kind := _KINDS.get((each.family, each.type))) is not None:
+            address, port = each.getsockname()[:2]
+            inode = os.fstat(each.fileno()).st_ino
+            yield each, OpenSocket(inode=inode, kind=kind, address=_address(address), port=port)
 
 
 def udp_sockets(*, of_others: bool = False) -> tuple[OpenSocket, ...]:
     """Return the UDP sockets of our network namespace, or only those that others have."""
     ours = {each.inode for each in open_sockets()} if of_others else set[int]()
-    return tuple(each for each in _listed() if each.inode not in ours)
+    found: list[OpenSocket] = []
+    for kind in UDP_UNICAST:
+        table = Path("/proc/thread-self/net", "udp6" if kind.ip_version == 6 else "udp")
+        with contextlib.suppress(FileNotFoundError):  # a kernel without IPv6
+            found += [each for each, _ in sockets_in(table, kind) if each.inode not in ours]
+    return tuple(found)
 
 
 def check_host(urls: Sequence[ConnectionUrl]) -> None:
@@ -153,33 +162,25 @@ def check_free(urls: Sequence[ConnectionUrl]) -> None:
                 )
 
 
-@contextlib.contextmanager
-def own_sockets(nfes: Sequence[NetworkFlowEndpoint]) -> Iterator[list[socket.socket]]:
-    """Yield duplicates of this process's sockets that `nfes` names; they are closed afterwards.
+def own_sockets(nfes: Sequence[NetworkFlowEndpoint]) -> Iterator[socket.socket]:
+    """Yield duplicates of this process's sockets that `nfes` names, as `sockets_here` does.
 
     Raises:
         MiddlewareError: there is none.
     """
     wanted = {(nfe.medium, _address(nfe.internet_address), nfe.transport_port) for nfe in nfes}
-    with contextlib.ExitStack() as stack:
-        found = []
-        for each in sockets_here():
-            kind = _KINDS.get((each.family, each.type))
-            if kind is None:
-                continue
-            address, port = each.getsockname()[:2]
-            if (kind, _address(address), port) in wanted:
-                # Not by its own dup(), which would make the original wait where it must not.
-                duplicate = socket.socket(fileno=os.dup(each.fileno()))
-                found.append(stack.enter_context(duplicate))
-        if not found:
-            listed = ", ".join(f"{nfe.internet_address}:{nfe.transport_port}" for nfe in nfes)
-            raise MiddlewareError(
-                f"cannot find the sockets of this publisher among network flow endpoints "
-                f"[{listed}]: it has no UDP or TCP socket in this process",
-                hint="a publisher that only has shared memory cannot be marked",
-            )
-        yield found
+    is_found = False
+    for each, bound in _bound_here():
+        if (bound.kind, bound.address, bound.port) in wanted:
+            is_found = True
+            yield each
+    if not is_found:
+        listed = ", ".join(f"{nfe.internet_address}:{nfe.transport_port}" for nfe in nfes)
+        raise MiddlewareError(
+            f"cannot find the sockets of this publisher among network flow endpoints [{listed}]: "
+            "it has no UDP or TCP socket in this process",
+            hint="a publisher that only has shared memory cannot be marked",
+        )
 
 
 def set_dscp(nfes: Sequence[NetworkFlowEndpoint], dscp: int) -> None:
@@ -195,15 +196,14 @@ def set_dscp(nfes: Sequence[NetworkFlowEndpoint], dscp: int) -> None:
     Raises:
         MiddlewareError: no socket found, or the kernel kept another value.
     """
-    with own_sockets(nfes) as found:
-        for each in found:
-            option = _DSCP_OPTION[each.family]
-            try:
-                each.setsockopt(*option, dscp << 2)
-            except OSError as error:
-                raise MiddlewareError(f"cannot set DSCP {dscp}: {error.strerror}") from error
-            if (kept := each.getsockopt(*option) >> 2) != dscp:
-                raise MiddlewareError(f"cannot set DSCP {dscp}: the kernel keeps {kept}")
+    for each in own_sockets(nfes):
+        option = _DSCP_OPTION[each.family]
+        try:
+            each.setsockopt(*option, dscp << 2)
+        except OSError as error:
+            raise MiddlewareError(f"cannot set DSCP {dscp}: {error.strerror}") from error
+        if (kept := each.getsockopt(*option) >> 2) != dscp:
+            raise MiddlewareError(f"cannot set DSCP {dscp}: the kernel keeps {kept}")
 
 
 def get_dscps(nfes: Sequence[NetworkFlowEndpoint]) -> set[int]:
@@ -212,8 +212,7 @@ def get_dscps(nfes: Sequence[NetworkFlowEndpoint]) -> set[int]:
     Raises:
         MiddlewareError: no socket found.
     """
-    with own_sockets(nfes) as found:
-        return {each.getsockopt(*_DSCP_OPTION[each.family]) >> 2 for each in found}
+    return {each.getsockopt(*_DSCP_OPTION[each.family]) >> 2 for each in own_sockets(nfes)}
 
 
 def widen_discovery_buffers(domain_id: int) -> int:
@@ -263,21 +262,18 @@ def _is_free(kind: Medium, address: str, port: int) -> bool:
     return True
 
 
-def _listed() -> Iterator[OpenSocket]:
-    """Yield the bound UDP sockets of our network namespace, proc_net_udp.txt of Linux."""
-    for kind in UDP_UNICAST:
-        table = Path("/proc/thread-self/net", "udp6" if kind.ip_version == 6 else "udp")
-        with contextlib.suppress(FileNotFoundError):  # a kernel without IPv6
-            for line in table.read_text(encoding="ascii").splitlines()[1:]:
-                fields = line.split()
-                address, _, port = fields[1].partition(":")
-                # An address is written as 32-bit integers in the host's byte order.
-                words = [int(address[at : at + 8], 16) for at in range(0, len(address), 8)]
-                packed = struct.pack(f"={len(words)}I", *words)
-                if int(port, 16):
-                    yield OpenSocket(
-                        inode=int(fields[9]),
-                        kind=kind,
-                        address=socket.inet_ntop(kind.socket_family, packed),
-                        port=int(port, 16),
-                    )
+def sockets_in(table: Path, kind: Medium) -> Iterator[tuple[OpenSocket, str]]:
+    """Yield what is bound by a table of proc(5), `net/udp` and the like, and its state in hex.
+
+    Raises:
+        OSError: there is no such table.
+    """
+    for line in table.read_text(encoding="ascii").splitlines()[1:]:
+        fields = line.split()
+        written, _, port = fields[1].partition(":")
+        # An address is written as 32-bit integers in the host's byte order.
+        words = [int(written[at : at + 8], 16) for at in range(0, len(written), 8)]
+        address = socket.inet_ntop(kind.socket_family, struct.pack(f"={len(words)}I", *words))
+        if number := int(port, 16):
+            inode = int(fields[9])
+            yield OpenSocket(inode=inode, kind=kind, address=address, port=number), fields[3]

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from xml.etree import ElementTree as ET
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.fastdds.profiles import text
+from lifecycle.middleware.fastdds.profiles import put
 from lifecycle.plan.model import StaticEndpoint, StaticParticipant
 
 
@@ -22,17 +22,17 @@ def endpoint_table(participants: Sequence[StaticParticipant]) -> str:
     root = ET.Element("staticdiscovery")
     for participant in participants:
         element = ET.SubElement(root, "participant")
-        text(element, "name", participant.name)
+        put(element, "name", participant.name)
         for endpoint in participant.endpoints:
             line = ET.SubElement(element, "writer" if endpoint.writer else "reader")
-            text(line, "userId", str(endpoint.user_id))
-            text(line, "topicName", endpoint.topic)
-            text(line, "topicDataType", endpoint.type)
-            text(line, "topicKind", "NO_KEY")
+            put(line, "userId", endpoint.user_id)
+            put(line, "topicName", endpoint.topic)
+            put(line, "topicDataType", endpoint.type)
+            put(line, "topicKind", "NO_KEY")
             reliability = "RELIABLE" if endpoint.reliable else "BEST_EFFORT"
-            text(line, "reliabilityQos", f"{reliability}_RELIABILITY_QOS")
+            put(line, "reliabilityQos", f"{reliability}_RELIABILITY_QOS")
             durability = "TRANSIENT_LOCAL" if endpoint.transient_local else "VOLATILE"
-            text(line, "durabilityQos", f"{durability}_DURABILITY_QOS")
+            put(line, "durabilityQos", f"{durability}_DURABILITY_QOS")
     return ET.tostring(root, encoding="unicode")
 
 
@@ -43,7 +43,7 @@ def endpoint_profiles(endpoints: Sequence[StaticEndpoint]) -> str:
     for endpoint in endpoints:
         tag = "data_writer" if endpoint.writer else "data_reader"
         element = ET.SubElement(profiles, tag, profile_name=endpoint.profile)
-        text(element, "userDefinedID", str(endpoint.user_id))
+        put(element, "userDefinedID", endpoint.user_id)
     return ET.tostring(root, encoding="unicode", xml_declaration=True)
 
 

@@ -61,12 +61,8 @@ def refuse_unsupported(nodes: Iterable[PlannedNode]) -> None:
 
 def _chosen(node: PlannedNode) -> Iterator[str]:
     """Yield the keys for which rmw_fastrtps alone cannot make the participants of a node."""
-    if ParticipantSettings.of_node(node):
+    if ParticipantSettings.of(node):
         yield "'connections', 'transport' or 'discovery' as declared"
     for each in node.participants:
-        if ParticipantSettings.of(
-            each.connections,
-            transports=each.transports,
-            max_datagram_bytes=each.max_datagram_bytes,
-        ):
+        if ParticipantSettings.of(each):
             yield f"'transport' or 'connections' as declared ({each.reason})"

@@ -22,12 +22,7 @@ _logger = logging.getLogger(__name__)
 
 
 def leave_and_exit(
-    code: int,
-    *,
-    nodes: Iterable[Any] = (),
-    contexts: Iterable[Any] = (),
-    participants: Iterable[Any] = (),
-    deadline_s: float = 2.0,
+    code: int, *, nodes: Iterable[Any] = (), contexts: Iterable[Any] = (), deadline_s: float = 2.0
 ) -> NoReturn:
     """Destroy what is given, flush the standard streams and end the process; never returns.
 
@@ -39,14 +34,11 @@ def leave_and_exit(
         code: exit code, 0–255.
         nodes: rclpy nodes, destroyed in this order.
         contexts: rclpy contexts, shut down and destroyed after the nodes.
-        participants: `FlowParticipant`s, observers and the like, destroyed before the nodes.
         deadline_s: seconds, > 0, for all of it.
     """
     try:
         exit_after(deadline_s, code)
         give_up_dead_connections()
-        for participant in participants:
-            _attempt(participant.destroy)
         for node in nodes:
             _release(node)
         for context in contexts:

@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from lifecycle.errors import MiddlewareError
-from lifecycle.middleware.versions import INSTALL, KNOWN_RCL, of_rcl, rcl_version
+from lifecycle.middleware.versions import INSTALL, KNOWN_RCL, of_rcl, private, rcl_version
 
 RCL_RET_OK = 0
 RCL_RET_TIMEOUT = 2
@@ -151,59 +151,42 @@ class Rcl:
     def __init__(self) -> None:
         version = rcl_version()
         if of_rcl(version) is None:
-            raise MiddlewareError(
-                f"rcl {version} is not known (known: {KNOWN_RCL})",
-                hint=INSTALL,
-            )
+            raise MiddlewareError(f"rcl {version} is not known (known: {KNOWN_RCL})", hint=INSTALL)
         pointer, size, integer = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int
-        rcutils, rmw, rcl = (_open(f"lib{name}.so") for name in ("rcutils", "rmw", "rcl"))
-        self._get_error_string = _bind(rcutils, "rcutils_get_error_string", _ErrorString)
-        self._reset_error = _bind(rcutils, "rcutils_reset_error", None)
-        self.default_allocator: Allocator = _bind(
-            rcutils, "rcutils_get_default_allocator", Allocator
+        self._get_error_string = bind("rcutils", "rcutils_get_error_string", _ErrorString)
+        self._reset_error = bind("rcutils", "rcutils_reset_error", None)
+        self.default_allocator: Allocator = bind(
+            "rcutils", "rcutils_get_default_allocator", Allocator
         )()
-        self.nfe_set_address = _bind(
-            rmw,
-            "rmw_network_flow_endpoint_set_internet_address",
-            integer,
-            (pointer, ctypes.c_char_p, size),
+        nfe = "rmw_network_flow_endpoint"
+        self.nfe_set_address = bind(
+            "rmw", f"{nfe}_set_internet_address", integer, (pointer, ctypes.c_char_p, size)
         )
-        self.nfe_array_fini = _bind(
-            rmw, "rmw_network_flow_endpoint_array_fini", integer, (pointer,)
+        self.nfe_array_fini = bind("rmw", f"{nfe}_array_fini", integer, (pointer,))
+        rcl = functools.partial(bind, "rcl")
+        self.default_options = rcl("rcl_subscription_get_default_options", _PaddedOptions)
+        self.options = rcl(
+            "rcl_subscription_get_options", ctypes.POINTER(SubscriptionOptions), (pointer,)
         )
-        self.default_options = _bind(rcl, "rcl_subscription_get_default_options", _PaddedOptions)
-        self.options = _bind(
-            rcl,
-            "rcl_subscription_get_options",
-            ctypes.POINTER(SubscriptionOptions),
-            (pointer,),
+        self.subscription_init = rcl(
+            "rcl_subscription_init", integer, (*[pointer] * 3, ctypes.c_char_p, pointer)
         )
-        self.subscription_init = _bind(
-            rcl,
-            "rcl_subscription_init",
-            integer,
-            (pointer, pointer, pointer, ctypes.c_char_p, pointer),
-        )
-        self.subscription_fini = _bind(rcl, "rcl_subscription_fini", integer, (pointer, pointer))
+        self.subscription_fini = rcl("rcl_subscription_fini", integer, (pointer, pointer))
         self.nfes = {
-            kind: _bind(
-                rcl, f"rcl_{kind}_get_network_flow_endpoints", integer, (pointer, pointer, pointer)
-            )
+            kind: rcl(f"rcl_{kind}_get_network_flow_endpoints", integer, (pointer,) * 3)
             for kind in ("publisher", "subscription")
         }
-        self.graph_guard: Callable[[int], int] = _bind(
-            rcl, "rcl_node_get_graph_guard_condition", pointer, (pointer,)
+        self.graph_guard: Callable[[int], int] = rcl(
+            "rcl_node_get_graph_guard_condition", pointer, (pointer,)
         )
-        self.zero_wait_set = _bind(rcl, "rcl_get_zero_initialized_wait_set", WaitSet)
-        self.wait_set_init = _bind(
-            rcl, "rcl_wait_set_init", integer, (pointer, *([size] * 6), pointer, Allocator)
+        self.zero_wait_set = rcl("rcl_get_zero_initialized_wait_set", WaitSet)
+        self.wait_set_init = rcl(
+            "rcl_wait_set_init", integer, (pointer, *[size] * 6, pointer, Allocator)
         )
-        self.wait_set_fini = _bind(rcl, "rcl_wait_set_fini", integer, (pointer,))
-        self.wait_set_clear = _bind(rcl, "rcl_wait_set_clear", integer, (pointer,))
-        self.wait_set_add_guard = _bind(
-            rcl, "rcl_wait_set_add_guard_condition", integer, (pointer, pointer, pointer)
-        )
-        self.wait = _bind(rcl, "rcl_wait", integer, (pointer, ctypes.c_int64))
+        self.wait_set_fini = rcl("rcl_wait_set_fini", integer, (pointer,))
+        self.wait_set_clear = rcl("rcl_wait_set_clear", integer, (pointer,))
+        self.wait_set_add_guard = rcl("rcl_wait_set_add_guard_condition", integer, (pointer,) * 3)
+        self.wait = rcl("rcl_wait", integer, (pointer, ctypes.c_int64))
         self._check_layout(version)
 
     def take_error(self) -> str:
@@ -388,7 +371,7 @@ def type_support(message_type: object) -> int:
 
     rclpy must have used the class before: that is when its type support is loaded.
     """
-    capsule = type(message_type)._TYPE_SUPPORT  # type: ignore[attr-defined]  # noqa: SLF001
+    capsule = private(type(message_type), "_TYPE_SUPPORT", f"read the type of {message_type!r}")
     name = ctypes.pythonapi.PyCapsule_GetName
     name.restype, name.argtypes = ctypes.c_char_p, (ctypes.py_object,)
     pointer = ctypes.pythonapi.PyCapsule_GetPointer
@@ -397,7 +380,7 @@ def type_support(message_type: object) -> int:
 
 
 def bind(library: str, symbol: str, result: Any, arguments: Sequence[Any] = ()) -> Any:
-    """Return a function of a library, or of one that it needs, after `load`.
+    """Return a function of a library, or of one that it needs.
 
     Args:
         library: "rcl" for librcl.so.
@@ -408,10 +391,6 @@ def bind(library: str, symbol: str, result: Any, arguments: Sequence[Any] = ()) 
     Raises:
         MiddlewareError: there is none.
     """
-    return _bind(_open(f"lib{library}.so"), symbol, result, arguments)
-
-
-def _open(library: str) -> ctypes.CDLL:
     # Importing rclpy loads the very same libraries; dlopen then finds them by name wherever they
     # are installed, and never a second copy.
     try:
@@ -419,14 +398,9 @@ def _open(library: str) -> ctypes.CDLL:
     except ImportError as error:
         raise MiddlewareError(f"cannot import rclpy: {error}", hint=INSTALL) from error
     try:
-        return ctypes.CDLL(library)
+        function = getattr(ctypes.CDLL(f"lib{library}.so"), symbol)
     except OSError as error:
-        raise MiddlewareError(f"cannot load {library!r}: {error}", hint=INSTALL) from error
-
-
-def _bind(library: ctypes.CDLL, symbol: str, result: Any, arguments: Sequence[Any] = ()) -> Any:
-    try:
-        function = getattr(library, symbol)
+        raise MiddlewareError(f"cannot load 'lib{library}.so': {error}", hint=INSTALL) from error
     except AttributeError as error:
         raise MiddlewareError(
             f"cannot find {symbol!r} in the installed ROS libraries (rcl {rcl_version() or '?'})",

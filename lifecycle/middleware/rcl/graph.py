@@ -117,11 +117,10 @@ class GraphObserver:
         node: Node | None = None,
     ) -> None:
         self.domain_id = domain_id
-        settings = ParticipantSettings.of(connections or ParticipantConnections())
+        settings = ParticipantSettings(connections=connections or ParticipantConnections())
         self.urls = settings.urls
         self.owns_node = node is None
         self._lock = threading.Lock()
-        self._callbacks: tuple[Callable[[], None], ...] = ()
         self._destroyed = False
         self._ours: frozenset[str] = frozenset()
         self._asked_for: set[str] = set()
@@ -130,14 +129,17 @@ class GraphObserver:
         self._time_came = self._clock_closed = False
         self._context: rclpy.Context | None = None
         if node is None:
-            self._context, node = _observing_node(domain_id, settings)
-            reached = reach(domain_id, settings.urls, os.environ) if OVER_DDS else ()
-            self.settling = Settling(reached, settle_s(settings.urls, os.environ))
+            name = f"_lifecycle_observer_{os.getpid()}"
+            chosen = observer_settings(settings, super_client=is_served(self.urls, os.environ))
+            with _as_super_client():
+                self._context, node = quiet_node(name, "/", domain_id, settings=chosen)
+            reached = reach(domain_id, self.urls, os.environ) if OVER_DDS else ()
+            self.settling = Settling(reached, settle_s(self.urls, os.environ))
         else:
             self.settling = Settling(())
         self.node = node
         self._guard = GraphGuard.of(node)
-        self._unwatch = self._guard.follow(node, self._changed)
+        self._unwatch = self._guard.follow(node, lambda: None)  # it also says if it fails
         self._name = self.node.get_fully_qualified_name()
         self._dead: frozenset[str] = frozenset()
         self._topics_before: frozenset[str] = frozenset()
@@ -164,14 +166,7 @@ class GraphObserver:
         Returns:
             A function that takes the callback away again.
         """
-        with self._lock:
-            self._callbacks += (callback,)
-
-        def remove() -> None:
-            with self._lock:
-                self._callbacks = tuple(each for each in self._callbacks if each is not callback)
-
-        return remove
+        return self._guard.follow(self.node, callback)
 
     def snapshot(
         self, *, declared: Collection[str] = (), names: DeclaredNames = NO_NAMES
@@ -342,7 +337,7 @@ class GraphObserver:
         ended = {each[:PROCESS_DIGITS] for each in prefixes} - {own[:PROCESS_DIGITS]}
         if not ended <= self._dead:
             self._dead |= ended
-            self._changed()
+            self._guard.notify()
 
     def _is_dead(self, endpoint: ObservedEndpoint) -> bool:
         return endpoint.gid[:PROCESS_DIGITS] in self._dead
@@ -409,11 +404,7 @@ class GraphObserver:
     def _take_time(self, _: object) -> None:
         if not self._time_came:
             self._time_came = True
-            self._changed()
-
-    def _changed(self) -> None:
-        for callback in self._callbacks:
-            callback()
+            self._guard.notify()
 
     def _timed(self, endpoint: ObservedEndpoint) -> ObservedEndpoint:
         """Say of who publishes /clock that no time came from it, while that is so."""
@@ -503,7 +494,7 @@ class GraphObserver:
         One whose address is not known is asked for it: it answers within a moment, and the next
         look has it.
         """
-        known = self.settling.addresses()
+        known = self.settling.prober.answers()
         for endpoint in endpoints:
             prefix = endpoint.gid[:PREFIX_DIGITS]
             if not prefix:
@@ -513,16 +504,8 @@ class GraphObserver:
             is_coming = time.monotonic() - since_s < _NAMED_S
             if prefix not in known and prefix not in self._asked_for and not is_coming:
                 self._asked_for.add(prefix)
-                self.settling.ask()
+                self.settling.prober.ask()
             yield replace(endpoint, address=known.get(prefix, ""))
-
-
-def _observing_node(domain_id: int, settings: ParticipantSettings) -> tuple[rclpy.Context, Node]:
-    """Return a new context and its node; raises MiddlewareError if no participant can be made."""
-    served = is_served(settings.urls, os.environ)
-    chosen = observer_settings(settings, super_client=served)
-    with _as_super_client():
-        return quiet_node(f"_lifecycle_observer_{os.getpid()}", "/", domain_id, settings=chosen)
 
 
 _SUPER_CLIENT_VARIABLE = "ROS_SUPER_CLIENT"

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
     AnyClient: TypeAlias = Client | ActionClient
 
-Callback = Callable[[], bool | None]
+Callback = Callable[[], object]
 
 _logger = logging.getLogger(__name__)
 _SOON_S, _AGAIN_S = 0.002, 0.2
@@ -111,7 +111,7 @@ class GraphGuard:
             self._stop()
             if nodes:
                 self._start(nodes[0])
-                self._notify()  # changes in between were not reported
+                self.notify()  # changes in between were not reported
 
     def _start(self, node: Node) -> None:
         watch = _Guarded(node) if abi.is_known() else _Comparison(node)
@@ -129,21 +129,21 @@ class GraphGuard:
 
     def _run(self, watch: _Comparison) -> None:
         try:
-            watch.run(self._notify)
+            watch.run(self.notify)
         except MiddlewareError as error:
             _logger.exception("the graph is no longer watched")
             self.failure = error
-            self._notify()
+            self.notify()
 
-    def _notify(self) -> bool:
-        """Call all back; return whether any is to be called again."""
+    def notify(self) -> bool:
+        """Call all back, in this thread; return whether any is to be called again."""
         wanted = [_call(callback) for _, callback in self._callbacks.values()]
         return any(wanted)
 
 
 def _call(callback: Callback) -> bool:
     try:
-        return bool(callback())
+        return callback() is True
     except Exception:
         _logger.exception("cannot handle a graph change")
         return False
@@ -285,14 +285,13 @@ class ServerWatch:
                 self._matched = matched
             if has_changed:
                 self._changed()
-            return not matched and self._is_offered()
+            if isinstance(self._client, Client):
+                service = self._client.service_name
+            else:
+                service = f"{self._client.action_name}/_action/send_goal"
+            return not matched and bool(self._node.count_services(service))
         except _GONE:
             return False  # it was destroyed meanwhile
-
-    def _is_offered(self) -> bool:
-        if isinstance(self._client, Client):
-            return bool(self._node.count_services(self._client.service_name))
-        return bool(self._node.count_services(f"{self._client.action_name}/_action/send_goal"))
 
 
 def _is_ready(client: AnyClient) -> bool:

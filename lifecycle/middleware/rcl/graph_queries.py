@@ -20,7 +20,7 @@ from rclpy.utilities import get_rmw_implementation_identifier
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.installed_types import join
 from lifecycle.manifest.model import EndpointKind
-from lifecycle.manifest.qos import Durability, History, Liveliness, QosProfile, Reliability
+from lifecycle.manifest.qos import UNKNOWN_QOS
 from lifecycle.middleware.rcl.qos import from_rclpy
 from lifecycle.verify.observation import ObservedEndpoint
 from lifecycle.verify.tool_filter import known_node
@@ -40,14 +40,6 @@ _GID_BYTES = 16
 
 _REFUSED = (ValueError, rclpy_implementation.RCLError)
 """What rclpy's queries raise where a name or a value cannot be had: UnicodeDecodeError is one."""
-
-_UNKNOWN_QOS = QosProfile(
-    history=History.UNKNOWN,
-    depth=0,
-    reliability=Reliability.UNKNOWN,
-    durability=Durability.UNKNOWN,
-    liveliness=Liveliness.UNKNOWN,
-)
 
 Ends = tuple[list[ObservedEndpoint], list[ObservedEndpoint]]
 """Of a service's servers or clients: what reads or writes requests, then replies."""
@@ -177,7 +169,7 @@ def node_names(node: Node) -> list[str]:
 def unreadable(kind: EndpointKind, name: str) -> ObservedEndpoint:
     """Return what stands for all endpoints of a topic of which one has a name that is no UTF-8."""
     return ObservedEndpoint(
-        kind=kind, node="", name=name, type="", qos=_UNKNOWN_QOS, gid="", type_hash=""
+        kind=kind, node="", name=name, type="", qos=UNKNOWN_QOS, gid="", type_hash=""
     )
 
 

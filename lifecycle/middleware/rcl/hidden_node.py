@@ -14,7 +14,7 @@ import itertools
 import os
 import typing
 import weakref
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import rclpy
@@ -29,12 +29,9 @@ from rclpy.waitable import Waitable
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
-from lifecycle.middleware.fastdds.settings import (
-    discovery_by_profile,
-    participant_settings,
-)
+from lifecycle.middleware.fastdds.settings import discovery_by_profile, participant_settings
 from lifecycle.middleware.fastdds.sockets import widen_discovery_buffers
-from lifecycle.middleware.versions import installed
+from lifecycle.middleware.versions import installed, private
 
 _QUIET: dict[str, Any] = {
     "enable_rosout": False,
@@ -47,11 +44,7 @@ _hidden: weakref.WeakSet[Node] = weakref.WeakSet()
 
 
 def quiet_node(
-    name: str,
-    namespace: str,
-    domain_id: int,
-    *,
-    settings: ParticipantSettings | None = None,
+    name: str, namespace: str, domain_id: int, *, settings: ParticipantSettings | None = None
 ) -> tuple[rclpy.Context, Node]:
     """Return a new context and on it a node with nothing of its own but parameter events.
 
@@ -59,19 +52,15 @@ def quiet_node(
         MiddlewareError: rcl refused; nothing is left.
     """
     settings = settings or ParticipantSettings()
-    enclave = ("--ros-args", "--enclave", settings.static_name) if settings.static_name else ()
+    name_there = settings.connections.static_name
+    enclave = ("--ros-args", "--enclave", name_there) if name_there else ()
     context = rclpy.Context()
     node: Node | None = None
     try:
         with discovery_by_profile(settings):
             context.init(args=[*enclave], domain_id=domain_id, initialize_logging=False)
         with participant_settings(context, settings, is_new=True):
-            node = Node(
-                name,
-                namespace=namespace,
-                context=context,
-                **_QUIET,
-            )
+            node = Node(name, namespace=namespace, context=context, **_QUIET)
     except Exception as error:
         if node is not None:
             node.destroy_node()
@@ -104,12 +93,22 @@ def bare_node(context: rclpy.Context) -> Any:
 _numbers = itertools.count()
 
 
+def republish_names(nodes: Iterable[Node]) -> None:
+    """Make the participants of `nodes` publish anew which nodes and endpoints they have.
+
+    After an outage rmw_dds_common keeps the name of a node whose participant was dropped, and found
+    again, out of the graph until then. rmw_fastrtps publishes it whenever a node or an endpoint is
+    made or destroyed. Here it is a hidden node without endpoints, for a moment: when an endpoint
+    ends, a discovery server of Fast DDS 2.14 drops whatever it has not relayed yet of that
+    participant's other endpoints, and never sends it again. Take one node of each participant.
+    """
+    for node in nodes:
+        bare_node(node.context).destroy_when_not_in_use()
+
+
 @contextlib.contextmanager
 def made_participant(
-    context: rclpy.Context,
-    settings: ParticipantSettings,
-    *,
-    is_new: bool = False,
+    context: rclpy.Context, settings: ParticipantSettings, *, is_new: bool = False
 ) -> Iterator[None]:
     """Make the participant of a context with these settings; construct its first node in the block.
 
@@ -122,15 +121,13 @@ def made_participant(
     Raises:
         MiddlewareError: as `participant_settings`.
     """
-    first: Any = None
+    with participant_settings(context, settings, is_new=is_new):
+        first = bare_node(context)
     try:
-        with participant_settings(context, settings, is_new=is_new):
-            first = bare_node(context)
         widen_discovery_buffers(context.get_domain_id())
         yield
     finally:
-        if first is not None:
-            first.destroy_when_not_in_use()
+        first.destroy_when_not_in_use()
 
 
 def _security_hint() -> str:
@@ -158,7 +155,8 @@ Action: typing.TypeAlias = Waitable
 
 MovedEndpoint: typing.TypeAlias = Subscription | Service | Client | Action
 
-_LISTS = {Subscription: "_subscriptions", Service: "_services", Client: "_clients"}
+_KINDS = {Subscription: "subscription", Service: "service", Client: "client"}
+"""What rclpy's methods and lists of a node are called after."""
 
 
 def move(entity: MovedEndpoint, maker: Node, host: Node) -> None:
@@ -168,10 +166,11 @@ def move(entity: MovedEndpoint, maker: Node, host: Node) -> None:
     """
     if isinstance(entity, Waitable):
         maker.remove_waitable(entity)
+        private(entity, "_node", "carry an action by a connection")
         entity._node = host  # noqa: SLF001 - whose executor works on goals, and which removes it
         host.add_waitable(entity)
         return
-    name = _LISTS[type(entity)]
+    name = f"_{_KINDS[type(entity)]}s"
     if not (hasattr(maker, name) and hasattr(host, name)):
         if host.executor is not None:  # of another rclpy: all that is on the maker is spun there
             host.executor.add_node(maker)
@@ -190,10 +189,4 @@ def dismiss(entity: MovedEndpoint, host: Node) -> None:
     if isinstance(entity, Waitable):
         entity.destroy()
         return
-    for kind, destroy in (
-        (Subscription, host.destroy_subscription),
-        (Service, host.destroy_service),
-        (Client, host.destroy_client),
-    ):
-        if isinstance(entity, kind):
-            destroy(entity)
+    getattr(host, f"destroy_{_KINDS[type(entity)]}")(entity)

@@ -90,19 +90,15 @@ def _nanoseconds(duration: Duration) -> int | None:
 _NAME = re.compile(r"(?P<package>[a-z][a-z0-9_]*)/(?P<kind>msg|srv|action)/(?P<type>[A-Z]\w*)")
 
 
-class UnknownInterfaceError(MiddlewareError):
-    """An interface type that is not spelled as ROS does, or is not installed."""
-
-
 def import_interface(name: str) -> type[Any]:
     """Return the class of `package/msg/Type`, `package/srv/Type` or `package/action/Type`.
 
     Raises:
-        UnknownInterfaceError: malformed, or the package or the type is not installed.
+        MiddlewareError: malformed, or the package or the type is not installed.
     """
     parts = _NAME.fullmatch(name)
     if parts is None:
-        raise UnknownInterfaceError(
+        raise MiddlewareError(
             f"cannot read interface type {name!r}: write package/msg/Type, package/srv/Type or "
             "package/action/Type"
         )
@@ -112,7 +108,7 @@ def import_interface(name: str) -> type[Any]:
     except ModuleNotFoundError as error:
         if error.name not in (package, f"{package}.{kind}"):
             raise
-        raise UnknownInterfaceError(
+        raise MiddlewareError(
             f"cannot find interface type {name!r}: no package {package!r} with {kind} interfaces "
             "is installed",
             hint=f"install {package}, or source the workspace that has it",
@@ -122,7 +118,7 @@ def import_interface(name: str) -> type[Any]:
         import difflib
 
         near = difflib.get_close_matches(type_, dir(module), n=1)
-        raise UnknownInterfaceError(
+        raise MiddlewareError(
             f"cannot find interface type {name!r}: package {package!r} has no {kind} {type_!r}",
             hint=f"did you mean {package}/{kind}/{near[0]}?" if near else "",
         )
@@ -133,7 +129,7 @@ def load_type_support(name: str) -> None:
     """Import an interface, and of a message or service what rcl needs of it: a shared library.
 
     Raises:
-        UnknownInterfaceError: see import_interface.
+        MiddlewareError: see import_interface.
     """
     found = import_interface(name)
     with warnings.catch_warnings():

@@ -203,6 +203,7 @@ _DONE_IN = {
 }
 """Labels of the states in which nothing is left to do of a transition."""
 _CHANGE, _CALLBACKS = "_LifecycleNodeMixin__change_state", "_callbacks"
+_MACHINE = "_state_machine"
 _DRIVE = "drive a node of rclpy.lifecycle in this process"
 
 
@@ -237,6 +238,7 @@ class RclpyStateMachine:
         if self._is_complete:
             return
         self._is_complete = True
+        private(self._node, _MACHINE, _DRIVE)
         callbacks = private(self._node, _CALLBACKS, _DRIVE)  # registered once, by its constructor
         for state, callback in tuple(callbacks.items()):
             callbacks[state] = self._reporting(callback)
@@ -247,12 +249,12 @@ class RclpyStateMachine:
     @property
     def label(self) -> str:
         """Of the state, as lifecycle_msgs/State has it."""
-        machine = getattr(self._node, "_state_machine", None)
+        machine = getattr(self._node, _MACHINE, None)  # None: its constructor runs
         return "unconfigured" if machine is None else str(machine.current_state[1])
 
     def destroy(self) -> None:
         """Let go of the node, after it was destroyed: rclpy keeps its participant for this else."""
-        self._node._state_machine.destroy_when_not_in_use()  # noqa: SLF001
+        private(self._node, _MACHINE, _DRIVE).destroy_when_not_in_use()
 
     def change(self, transition: str) -> Any:
         """Run a transition, callbacks included, and return what its callback returned.

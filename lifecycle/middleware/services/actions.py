@@ -71,6 +71,7 @@ class GoalClient(ActionClient):  # type: ignore[misc]  # rclpy is not typed
         self._destroyed = False
         self.action_name = ""
         super().__init__(node, action_type, name, callback_group=group)
+        private(self, "_node", f"make action client {name!r}")
 
     def send_goal(self, goal: Any, **options: Any) -> Any:
         """As rclpy's, outside of callbacks: it waits for the result."""
@@ -243,7 +244,7 @@ class GoalServer(ActionServer):  # type: ignore[misc]  # rclpy is not typed
         response.status = goal.status
         response.result = self.action_type.Result() if result is None else result
         # By the executor's next turn the server may be gone; without one, it is sent here.
-        future._set_executor(None)  # noqa: SLF001
+        private(future, "_set_executor", "answer who waits for a goal")(None)
         future.set_result(response)
 
     async def execute(self, taken_data: Any) -> None:

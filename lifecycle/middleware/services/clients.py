@@ -247,13 +247,13 @@ class NodeClients:
         found = await read_parameters(self._calls, node, None, timeout_s=timeout_s)
         return tuple(
             CapturedParameter(
-                name=descriptor.name,
+                name=of.name,
                 type=type_,
                 value=value,
-                description=descriptor.description,
-                read_only=descriptor.read_only,
+                description=of.description,
+                read_only=of.read_only,
             )
-            for descriptor, type_, value in found
+            for of, type_, value in found
         )
 
     async def report_parameters(
@@ -262,16 +262,11 @@ class NodeClients:
         """Read those parameters of a node that are named and that it has; None reads all."""
         found = await read_parameters(self._calls, node, names, timeout_s=timeout_s)
         return tuple(
-            ParameterReport.of(
-                descriptor.name,
-                type_ or type_word(descriptor.type),
-                value,
-                read_only=descriptor.read_only,
-            )
-            for descriptor, type_, value in found
+            ParameterReport.of(of.name, type_ or type_word(of.type), value, read_only=of.read_only)
+            for of, type_, value in found
         )
 
-    async def give_parameters(self, planned: PlannedNode, *, timeout_s: float = TIMEOUT_S) -> None:
+    async def give_parameters(self, planned: PlannedNode) -> None:
         """Set the parameters that a running node has with other values than its plan gives it."""
         node = planned.full_name
         if not any(each.value is not None for each in planned.expected_parameters):
@@ -285,18 +280,13 @@ class NodeClients:
             return
         given = _messages(wanted.values())
         response = await self._calls.call(
-            f"{node}/set_parameters", SetParameters, timeout_s, parameters=given
+            f"{node}/set_parameters", SetParameters, TIMEOUT_S, parameters=given
         )
         for name, result in zip(wanted, response.results, strict=False):
             _check(f"set parameter {name!r} of {node!r}", result.successful, result.reason)
 
     async def set_parameters(
-        self,
-        node: str,
-        values: Mapping[str, Any],
-        types: Mapping[str, str],
-        *,
-        timeout_s: float = TIMEOUT_S,
+        self, node: str, values: Mapping[str, Any], types: Mapping[str, str]
     ) -> None:
         """Set parameters of a running node, all or none (rcl_interfaces, SetParametersAtomically).
 
@@ -304,13 +294,12 @@ class NodeClients:
             node: whose they are.
             values: by parameter.
             types: by parameter, names of rcl_interfaces: "int", "double_array".
-            timeout_s: for the answer.
         """
         given = _messages(Parameter(name, TYPES[types[name]], values[name]) for name in values)
         response = await self._calls.call(
             f"{node}/set_parameters_atomically",
             SetParametersAtomically,
-            timeout_s,
+            TIMEOUT_S,
             parameters=given,
         )
         what = f"set {', '.join(map(repr, values))} of {node!r} while it runs"

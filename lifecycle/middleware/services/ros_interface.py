@@ -17,23 +17,17 @@ from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile
 from rclpy.task import Future
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from lifecycle.manifest.names import DIAGNOSTICS_TOPIC, supervisor_status_topic
+from lifecycle.middleware.rcl.qos import latched
 
-_LATCHED = QoSProfile(
-    depth=1,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
-_DIAGNOSTICS = QoSProfile(
-    depth=10,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.VOLATILE,
-)
+_DIAGNOSTICS = QoSProfile(depth=10)
+"""Reliable and volatile, as rclpy has it by default."""
+
 _LAST = Duration(nanoseconds=200_000_000)
 """Within so long who is there has acknowledged what was published last: a round trip or two."""
 
@@ -70,7 +64,7 @@ class RosInterface:
         quiet = PublisherEventCallbacks(use_default_callbacks=False)
         # rclpy's own methods, as everywhere on an observer's node.
         self._status = Node.create_publisher(
-            node, String, supervisor_status_topic(prefix), _LATCHED, event_callbacks=quiet
+            node, String, supervisor_status_topic(prefix), latched(1), event_callbacks=quiet
         )
         self._diagnostics = (
             Node.create_publisher(

@@ -41,14 +41,12 @@ class ServiceUnansweredError(MiddlewareError):
     """A service was not there or did not answer before the deadline.
 
     Attributes:
-        service: fully qualified.
         found: whether it was there, so that the request was sent.
     """
 
     def __init__(self, service: str, *, found: bool, timeout_s: float) -> None:
         what = "it did not answer" if found else "nobody offers it"
         super().__init__(f"cannot call service {service!r}: {what} within {timeout_s:g} s")
-        self.service = service
         self.found = found
 
 
@@ -122,10 +120,9 @@ class ServiceCalls:
 
     def open(self, service: str, type_: type[Any]) -> bool:
         """Make the client of a service now; False if there is one already."""
-        if (service, type_, False) in self._clients:
-            return False
+        is_new = (service, type_, False) not in self._clients
         self._client(service, type_)
-        return True
+        return is_new
 
     def forget(self, prefix: str) -> None:
         """Drop the clients of services whose name starts with `prefix`, of a node that left."""

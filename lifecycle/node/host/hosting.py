@@ -54,7 +54,7 @@ from lifecycle.verify.observation import NodeConfiguration
 def process_context(spec: HostSpec) -> Context:
     """Initialise rclpy for a process and return its default context."""
     try:
-        settings = ParticipantSettings.of_node(spec.nodes[0])
+        settings = ParticipantSettings.of(spec.nodes[0])
     except LifecycleError:  # reported where the node is made
         settings = ParticipantSettings()
     with discovery_by_profile(settings):
@@ -87,7 +87,7 @@ class Participants:
         Raises:
             LifecycleError: its participant cannot be made as planned.
         """
-        settings = ParticipantSettings.of_node(planned)
+        settings = ParticipantSettings.of(planned)
         context = self._made.get(settings)
         if context is not None:
             yield context

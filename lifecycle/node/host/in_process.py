@@ -83,7 +83,7 @@ class NodeInProcess:
         self._logs: list[str] = []
         self._closed = False
         self._context = Context()
-        with discovery_by_profile(ParticipantSettings.of_node(planned)):
+        with discovery_by_profile(ParticipantSettings.of(planned)):
             self._context.init(args=[], domain_id=domain_id)
         self._executor = NodeExecutor(context=self._context)
         self.watching = Watching()
@@ -113,7 +113,7 @@ class NodeInProcess:
 
         @contextlib.contextmanager
         def carrying(each: PlannedNode) -> Iterator[Context]:
-            with made_participant(self._context, ParticipantSettings.of_node(each)):
+            with made_participant(self._context, ParticipantSettings.of(each)):
                 yield self._context
 
         adoption = Adoption(carrying, self, mode=Mode.MANUAL)

@@ -40,12 +40,11 @@ from rclpy.node import Node
 from rclpy.timer import Timer
 
 from lifecycle.manifest.model import Executor
-from lifecycle.middleware.discovery.names import republish_names
 from lifecycle.middleware.process.busy_sign import BusySign, label
 from lifecycle.middleware.process.stacks import show_stacks_here
 from lifecycle.middleware.process.teardown import leave_and_exit
 from lifecycle.middleware.rcl.executor import NodeExecutor, described
-from lifecycle.middleware.rcl.hidden_node import hidden_nodes
+from lifecycle.middleware.rcl.hidden_node import hidden_nodes, republish_names
 from lifecycle.middleware.rcl.rclpy_nodes import Watching
 from lifecycle.node.author.node import LifecycleNode
 from lifecycle.node.lifecycle.execution import hint

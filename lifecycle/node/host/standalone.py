@@ -150,7 +150,7 @@ def run(
     """
     report = functools.partial(_report_line, say or _print)
     mode = parse_mode(lifecycle) if lifecycle is not None else None
-    settings = ParticipantSettings() if spec is None else ParticipantSettings.of_node(spec)
+    settings = ParticipantSettings() if spec is None else ParticipantSettings.of(spec)
     with discovery_by_profile(settings):
         rclpy.init(
             args=sys.argv if arguments is None else arguments,
@@ -205,7 +205,7 @@ def _adopt(
 
     @contextlib.contextmanager
     def carrying(planned: PlannedNode) -> Iterator[Context]:
-        with made_participant(context, ParticipantSettings.of_node(planned)):
+        with made_participant(context, ParticipantSettings.of(planned)):
             yield context
 
     adoption = Adoption(carrying, loop, mode=mode, use_global_arguments=True)

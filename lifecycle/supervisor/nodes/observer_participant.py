@@ -190,7 +190,7 @@ class ObserverParticipant:
 
     def republish_names(self) -> None:
         """Announce our node to the graph again."""
-        from lifecycle.middleware.discovery.names import republish_names
+        from lifecycle.middleware.rcl.hidden_node import republish_names
 
         republish_names([self._node])
 

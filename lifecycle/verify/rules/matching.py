@@ -20,14 +20,13 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from lifecycle.manifest.model import EndpointKind, EndpointPolicy
 from lifecycle.manifest.names import DIAGNOSTICS_TOPIC
-from lifecycle.manifest.qos import Certainty, incompatibilities
+from lifecycle.manifest.qos import UNKNOWN_QOS, Certainty, incompatibilities
 from lifecycle.verify.observation import ObservedEndpoint
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
 from lifecycle.verify.tool_filter import NOISE_TOPICS
 from lifecycle.verify.verdict import Finding
 from lifecycle.verify.view import (
-    UNKNOWN_QOS,
     Actual,
     FlowView,
     SeenEndpoint,

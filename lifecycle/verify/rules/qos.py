@@ -10,6 +10,7 @@ from lifecycle.manifest.qos import (
     BEST_AVAILABLE_NS,
     INFINITE_NS,
     POLICIES,
+    UNKNOWN_QOS,
     Certainty,
     History,
     Incompatibility,
@@ -21,7 +22,6 @@ from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import Rule
 from lifecycle.verify.verdict import Finding
 from lifecycle.verify.view import (
-    UNKNOWN_QOS,
     Actual,
     NodeFacts,
     SeenEndpoint,

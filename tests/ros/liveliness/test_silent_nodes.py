@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 import yaml
 
-from lifecycle.middleware.discovery.names import republish_names
+from lifecycle.middleware.rcl.hidden_node import republish_names
 from tests.ros.supervisor.running import ROOT, Event, Up, environment, up, verb
 from tests.stalls import Stalls, assert_in_time, noted_stalls
 

@@ -39,7 +39,8 @@ def main() -> None:
         executor.spin_once(timeout_sec=0.1)
     print(json.dumps(lengths), flush=True)
     released.join()
-    leave_and_exit(0, participants=[participant])
+    participant.destroy()
+    leave_and_exit(0)
 
 
 if __name__ == "__main__":

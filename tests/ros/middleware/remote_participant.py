@@ -26,7 +26,8 @@ def main() -> None:
     participant.create_publisher(String, "/flow", QosProfile())
     print("there", flush=True)
     sys.stdin.read()
-    leave_and_exit(0, participants=[participant])
+    participant.destroy()
+    leave_and_exit(0)
 
 
 if __name__ == "__main__":

@@ -17,14 +17,11 @@ from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.qos import Durability, History, Liveliness, QosProfile, Reliability
 from lifecycle.middleware import versions
 from lifecycle.middleware.fastdds.nfe import (
-    NetworkFlowEndpointsUnsupported,
-    UniqueFlowNotFeasible,
     create_subscription,
     get_network_flow_endpoints,
 )
 from lifecycle.middleware.rcl import abi, hidden_node
 from lifecycle.middleware.rcl.qos import (
-    UnknownInterfaceError,
     from_rclpy,
     import_interface,
     to_rclpy,
@@ -47,7 +44,7 @@ def test_another_major_of_rcl_is_refused_before_anything_is_called(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(abi, "rcl_version", lambda: "11.0.0")
-    monkeypatch.setattr(abi, "_open", lambda _: pytest.fail("a library was loaded"))
+    monkeypatch.setattr(abi, "bind", lambda *_: pytest.fail("a library was loaded"))
     with pytest.raises(MiddlewareError) as refused:
         abi.Rcl()
     assert str(refused.value) == (f"rcl 11.0.0 is not known (known: {KNOWN_RCL}); {INSTALL}")
@@ -82,7 +79,7 @@ def test_with_an_unknown_rcl_only_what_strictly_requires_a_unique_flow_is_refuse
     create_subscription(node, String, "/a", ignore, QosProfile(), unique=optionally)
     assert node.count_subscribers("/a") == 1
     strictly = UniqueRequirement.STRICTLY_REQUIRED
-    with pytest.raises(UniqueFlowNotFeasible) as refused:
+    with pytest.raises(MiddlewareError) as refused:
         create_subscription(node, String, "/b", ignore, QosProfile(), unique=strictly)
     assert str(refused.value) == (
         "cannot create subscription '/b' with network flow endpoints strictly_required: rcl 11.0.0 "
@@ -118,9 +115,8 @@ def test_an_rmw_without_network_flow_endpoints_says_so_in_its_own_words(
     make_node: MakeNode,
 ) -> None:
     publisher = make_node("node").create_publisher(String, "/a", 10)
-    with pytest.raises(NetworkFlowEndpointsUnsupported) as refused:
+    with pytest.raises(MiddlewareError) as refused:
         get_network_flow_endpoints(publisher)
-    assert refused.value.reason == "not supported by rmw_other"
     assert str(refused.value) == (
         "cannot read the network flow endpoints of a publisher: not supported by rmw_other; set "
         "RMW_IMPLEMENTATION=rmw_fastrtps_cpp"
@@ -131,7 +127,7 @@ def test_an_rmw_without_network_flow_endpoints_says_so_in_its_own_words(
 def test_an_rmw_that_only_pretends_to_be_strict_is_refused(make_node: MakeNode) -> None:
     node = make_node("node")
     strictly = UniqueRequirement.STRICTLY_REQUIRED
-    with pytest.raises(UniqueFlowNotFeasible) as refused:
+    with pytest.raises(MiddlewareError) as refused:
         create_subscription(node, String, "/a", ignore, QosProfile(), unique=strictly)
     assert str(refused.value) == (
         "cannot create subscription '/a' with network flow endpoints strictly_required: not "
@@ -147,9 +143,9 @@ def test_an_endpoint_that_listens_nowhere_is_refused(
 ) -> None:
     monkeypatch.setitem(abi.load().nfes, "subscription", lambda *_: abi.RCL_RET_OK)
     strictly = UniqueRequirement.STRICTLY_REQUIRED
-    with pytest.raises(UniqueFlowNotFeasible) as refused:
+    with pytest.raises(MiddlewareError) as refused:
         create_subscription(make_node("n"), String, "/a", ignore, QosProfile(), unique=strictly)
-    assert refused.value.reason == "the RMW lists no network flow endpoint for it"
+    assert "strictly_required: the RMW lists no network flow endpoint for it;" in str(refused.value)
 
 
 def test_errors_lose_the_places_in_c_files_and_are_used_up() -> None:
@@ -236,7 +232,7 @@ def test_interfaces_are_found_by_their_ros_names() -> None:
     ],
 )
 def test_an_interface_that_cannot_be_had_says_why(name: str, message: str) -> None:
-    with pytest.raises(UnknownInterfaceError) as refused:
+    with pytest.raises(MiddlewareError) as refused:
         import_interface(name)
     assert str(refused.value) == message
 

@@ -107,8 +107,9 @@ def test_a_process_that_hangs_with_the_gil_held_still_ends_with_its_code() -> No
         "import ctypes\n"
         "from lifecycle.middleware.process.teardown import leave_and_exit\n"
         "class Hangs:\n"
-        "    def destroy(self): ctypes.PyDLL(None).sleep(60)\n"
-        "leave_and_exit(6, participants=[Hangs()], deadline_s=0.2)\n"
+        "    waitables = ()\n"
+        "    def destroy_node(self): ctypes.PyDLL(None).sleep(60)\n"
+        "leave_and_exit(6, nodes=[Hangs()], deadline_s=0.2)\n"
     )
     assert subprocess.run([sys.executable, "-c", hang], check=False, timeout=50).returncode == 6
 
@@ -119,10 +120,11 @@ def test_an_exception_while_leaving_is_logged_and_the_rest_still_destroyed() -> 
         "from lifecycle.middleware.process.teardown import leave_and_exit\n"
         "logging.basicConfig(format='%(message)s')\n"
         "class Breaks:\n"
-        "    def destroy(self): raise OSError('broken')\n"
-        "class Works:\n"
-        "    def destroy(self): print('destroyed')\n"
-        "leave_and_exit(0, participants=[Breaks(), Works()])\n"
+        "    waitables = ()\n"
+        "    def destroy_node(self): raise OSError('broken')\n"
+        "class Works(Breaks):\n"
+        "    def destroy_node(self): print('destroyed')\n"
+        "leave_and_exit(0, nodes=[Breaks(), Works()])\n"
     )
     done = subprocess.run(
         [sys.executable, "-c", leave], check=True, capture_output=True, text=True, timeout=30

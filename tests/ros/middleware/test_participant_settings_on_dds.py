@@ -242,7 +242,8 @@ def test_a_participant_of_small_datagrams_still_receives_large_ones(
             "while not publisher.get_subscription_count(): time.sleep(0.005)\n"
             "publisher.publish(String(data='x' * 10_000))\n"
             "sys.stdin.read()\n"
-            "leave_and_exit(0, participants=[p])\n"
+            "p.destroy()\n"
+            "leave_and_exit(0)\n"
         )
         sender = subprocess.Popen(
             [sys.executable, "-c", script, str(domain_id)], stdin=subprocess.PIPE
@@ -267,8 +268,8 @@ def test_sends_that_must_not_wait_go_by_sockets_that_do_not(
         FlowParticipant("_patient", "/", domain_id, transports=transports) as wait_under_load,
     ):
         for participant, waits in ((hasty, False), (wait_under_load, True)):
-            with own_sockets(senders_of(participant.node)) as sockets:
-                assert {os.get_blocking(each.fileno()) for each in sockets} == {waits}
+            sockets = own_sockets(senders_of(participant.node))
+            assert {os.get_blocking(each.fileno()) for each in sockets} == {waits}
         assert hasty.has_shared_memory is (not transports)
 
 

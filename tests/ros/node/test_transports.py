@@ -79,8 +79,8 @@ def test_a_flow_that_needs_the_network_has_no_shared_memory_and_its_node_has(
     made = next(m for m in node.lifecycle.data_layer.mappings if m.endpoint.name == "video")
     assert made.connection is not None
     assert made.connection.participant is not None
-    with own_sockets(senders_of(made.connection.participant.node)) as sockets:
-        assert not any(os.get_blocking(each.fileno()) for each in sockets)
+    sockets = own_sockets(senders_of(made.connection.participant.node))
+    assert not any(os.get_blocking(each.fileno()) for each in sockets)
 
 
 def test_nodes_of_one_process_share_a_participant_exactly_if_their_transports_are_equal(

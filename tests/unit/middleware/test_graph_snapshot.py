@@ -103,7 +103,7 @@ Look = Callable[[Graph], GraphObserver]
 @pytest.fixture
 def look(monkeypatch: pytest.MonkeyPatch) -> Look:
     """Return an observer of what is given, which nothing wakes."""
-    guard = SimpleNamespace(failure=None, follow=lambda *_: lambda: None)
+    guard = SimpleNamespace(failure=None, follow=lambda *_: lambda: None, notify=lambda: False)
     monkeypatch.setattr(graph, "GraphGuard", SimpleNamespace(of=lambda _: guard))
     return GraphObserver.on  # type: ignore[return-value]
 

@@ -15,6 +15,7 @@ from lifecycle.middleware.fastdds.profiles import (
     default_profile,
     discovery_profile,
 )
+from lifecycle.plan.model import ParticipantConnections
 
 UDP = ParticipantSettings(transports=("udpv4",))
 USERS = """<?xml version="1.0"?>
@@ -49,7 +50,7 @@ def users(tmp_path: Path, extra: str = "") -> DefaultProfile:
 
 def made(settings: ParticipantSettings, **options: Any) -> ET.Element:
     """Return the profile, parsed, without its namespace."""
-    text = profile("p", settings, environment={}, **options)
+    text = profile("p", settings, **options)
     return ET.fromstring(text.replace(' xmlns="http://www.eprosima.com', ' x="'))
 
 
@@ -153,7 +154,8 @@ def test_of_a_server_that_a_profile_names_only_a_client_becomes_a_super_client(
         </discovery_config></builtin></rtps></participant></profiles></dds>"""
     )
     base = default_profile({"FASTRTPS_DEFAULT_PROFILES_FILE": str(path)})
-    root = made(ParticipantSettings(super_client=True), base=base)
+    connections = ParticipantConnections(super_client=True)
+    root = made(ParticipantSettings(connections=connections), base=base)
     assert texts(root, ".//discoveryProtocol") == [made_so]
 
 
@@ -177,17 +179,19 @@ def test_transports_that_the_user_chose_are_not_replaced(tmp_path: Path, choice:
     made(ParticipantSettings(max_datagram_bytes=1400), base=base)
 
 
-def test_the_environments_choice_of_transports_is_not_replaced_by_a_default() -> None:
+def test_the_environments_choice_of_transports_is_not_replaced_by_a_default(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     settings = ParticipantSettings(non_blocking_send=True)
-    environment = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv6"}
+    monkeypatch.setenv("FASTDDS_BUILTIN_TRANSPORTS", "UDPv6")
     with pytest.raises(MiddlewareError) as refused:
-        profile("p", settings, environment=environment)
+        profile("p", settings)
     assert str(refused.value) == (
         "cannot give a participant a non-blocking send: FASTDDS_BUILTIN_TRANSPORTS='UDPv6' already "
         "chooses its transports; unset it, or say "
         "FASTDDS_BUILTIN_TRANSPORTS=UDPv6?non_blocking=true"
     )
-    assert "UDPv4" in profile("p", UDP, environment=environment), "the manifest is more precise"
+    assert "UDPv4" in profile("p", UDP), "the manifest is more precise"
 
 
 def test_settings_that_need_nothing_are_false() -> None:

@@ -273,8 +273,7 @@ def test_another_process_that_listens_is_waited_for_until_it_answers_and_its_nod
         contextlib.closing(Settling(reach(25, (parse(url),), {}))) as settling,
         socket.socket(peer.family, socket.SOCK_DGRAM) as answering,
     ):
-        assert settling._prober is not None
-        answering.connect((address, settling._prober._sockets[0].getsockname()[1]))
+        answering.connect((address, settling.prober._sockets[0].getsockname()[1]))
         time.sleep(ANSWER_S)
         assert not settled(settling)
         answering.send(announced(port + 2))

@@ -54,15 +54,18 @@ def test_endpoints_go_by_multicast_only_where_no_other_host_is_looked_for(
 
 
 def test_the_environment_names_a_complete_file(tmp_path: Path) -> None:
-    environment = discovery_environment(tmp_path, {})
+    environment = discovery_environment(tmp_path)
     assert environment == {VARIABLE: str(tmp_path / "quick_discovery.xml")}
     assert Path(environment[VARIABLE]).read_text(encoding="utf-8") == discovery_profile()
     assert list(tmp_path.iterdir()) == [tmp_path / "quick_discovery.xml"]
 
 
 @pytest.mark.parametrize("variable", [VARIABLE, "FASTDDS_DEFAULT_PROFILES_FILE"])
-def test_a_users_own_profile_is_left_alone(tmp_path: Path, variable: str) -> None:
-    assert discovery_environment(tmp_path, {variable: "/own.xml"}) == {}
+def test_a_users_own_profile_is_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, variable: str
+) -> None:
+    monkeypatch.setenv(variable, "/own.xml")
+    assert discovery_environment(tmp_path) == {}
     assert list(tmp_path.iterdir()) == []
 
 
@@ -71,12 +74,12 @@ def test_a_users_profile_in_the_working_directory_is_left_alone(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "DEFAULT_FASTRTPS_PROFILES.xml").touch()
-    assert discovery_environment(tmp_path, {}) == {}
+    assert discovery_environment(tmp_path) == {}
 
 
 def test_a_directory_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     with pytest.raises(MiddlewareError) as refused:
-        discovery_environment(tmp_path / "missing", {})
+        discovery_environment(tmp_path / "missing")
     assert str(refused.value) == (
         f"cannot write the discovery profile '{tmp_path}/missing/quick_discovery.xml': "
         "No such file or directory"

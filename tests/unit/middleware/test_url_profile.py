@@ -13,8 +13,9 @@ from lifecycle.plan.model import ParticipantConnections
 
 
 def made(*urls: str, super_client: bool = False) -> ET.Element:
-    settings = ParticipantSettings.of(ParticipantConnections(urls=urls, super_client=super_client))
-    text = profile("p", settings, domain_id=3, environment={})
+    connections = ParticipantConnections(urls=urls, super_client=super_client)
+    settings = ParticipantSettings(connections=connections)
+    text = profile("p", settings, domain_id=3)
     return ET.fromstring(text.replace(' xmlns="http://www.eprosima.com', ' x="'))
 
 
