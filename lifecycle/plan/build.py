@@ -69,7 +69,7 @@ def dependency_levels(nodes: Sequence[Node]) -> tuple[tuple[str, ...], ...]:
     Nodes of one level keep the manifest's order and do not wait for each other.
 
     Args:
-        nodes: of a valid manifest: none waits for itself or for one that there is not.
+        nodes: of a manifest without errors (`check.after-cycle`, `check.after-unknown`).
     """
     order = {node.key: index for index, node in enumerate(nodes)}
     sorter = graphlib.TopologicalSorter(

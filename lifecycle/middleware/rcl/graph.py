@@ -139,7 +139,7 @@ class GraphObserver:
             self.settling = Settling(())
         self.node = node
         self._guard = GraphGuard.of(node)
-        self._unwatch = self._guard.follow(node, lambda: None)  # it also says if it fails
+        self._unwatch = self._guard.follow(node, lambda: None)  # it runs while one follows
         self._name = self.node.get_fully_qualified_name()
         self._dead: frozenset[str] = frozenset()
         self._topics_before: frozenset[str] = frozenset()

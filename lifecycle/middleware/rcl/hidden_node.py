@@ -52,8 +52,8 @@ def quiet_node(
         MiddlewareError: rcl refused; nothing is left.
     """
     settings = settings or ParticipantSettings()
-    name_there = settings.connections.static_name
-    enclave = ("--ros-args", "--enclave", name_there) if name_there else ()
+    static_name = settings.connections.static_name
+    enclave = ("--ros-args", "--enclave", static_name) if static_name else ()
     context = rclpy.Context()
     node: Node | None = None
     try:
