@@ -36,7 +36,8 @@ from lifecycle.manifest.loading import load
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.plan.build import build_plan
 from lifecycle.plan.model import Plan
-from lifecycle.supervisor.gate.verification_loop import ChangeCounter, VerificationLoop
+from lifecycle.supervisor.health.agreement import Agreement
+from lifecycle.supervisor.judging.judge import Judge
 from lifecycle.verify.observation import (
     EndpointReport,
     Identity,
@@ -187,11 +188,10 @@ class Supervised:
         self._configurations = seen.configurations
         loop = GraphLoop(own_thread=False)
         self._graph = Observer(self.shown, None, loop)  # type: ignore[arg-type]
-        self.changes = 0
-        world = World(plan, folder)
-        counter = ChangeCounter(world.system, self)
-        self.loop = VerificationLoop(world.system, self, counter, world.emit, strict=False)
-        self.close = counter.close
+        system: Any = World(plan, folder).system
+        agreement: Any = Agreement(system, None, None)  # type: ignore[arg-type]
+        self.state: Any = self
+        self.judge = Judge(system, self, looker=None, agreement=agreement)  # type: ignore[arg-type]
 
     async def observe(self, plan: Plan) -> Observation:
         """Give what nodes report, and look."""
@@ -204,10 +204,6 @@ class Supervised:
         del everybody
         return False
 
-    async def wait_change(self) -> None:
-        """Wait for ever: each look is asked for."""
-        await asyncio.Event().wait()
-
     def put_configuration(self, configuration: NodeConfiguration) -> None:
         """Give what a host reports."""
         self._graph.state.put_configuration(configuration)
@@ -215,7 +211,7 @@ class Supervised:
     async def look(self) -> None:
         """Look and judge after one endpoint has gone or come back."""
         self.shown.turn += 1
-        await self.loop.settled(Stage.ACTIVE)
+        await self.judge.look(Stage.ACTIVE, frozenset())
 
 
 async def measure_look(plan: Plan, folder: Path) -> float:
@@ -227,7 +223,7 @@ async def measure_look(plan: Plan, folder: Path) -> float:
     for _ in range(LOOKS):
         await supervised.look()
     took_s = time.process_time() - begun
-    await supervised.close()
+    supervised.judge.close()
     return 1e3 * took_s / LOOKS
 
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 
 import msgspec
 
@@ -376,3 +376,18 @@ def concerns(plan: Plan, own: frozenset[str], notice: PlanNotice) -> bool:
     if notice.system == plan.system and not theirs.isdisjoint(notice.machines):
         return True
     return not {each.full_name for each in plan.nodes}.isdisjoint(notice.nodes)
+
+
+_MOST_LINES = 20
+
+
+def difference_lines(found: Iterable[PlanDifference]) -> tuple[str, ...]:
+    """Phrase differences with their places in the new manifest, at most 20 of them."""
+    every = tuple(found)
+    lines = []
+    for each in every[:_MOST_LINES]:
+        place = f"{each.at.spelled}: " if each.at else ""
+        lines.append(f"{place}{each.path}: was {each.old}, is {each.new}")
+    if len(every) > _MOST_LINES:
+        lines.append(f"and {len(every) - _MOST_LINES} more")
+    return tuple(lines)

@@ -45,7 +45,7 @@ class Mutant:
     Attributes:
         module: the mutated module, which holds all its mutants.
         key: mutmut's name of it, for `mutmut show`.
-        place: `lifecycle.verify.judge._blocks`, `lifecycle.supervisor.gate.gate.Gate.judge`.
+        place: `lifecycle.verify.judge._blocks`, `lifecycle.supervisor.core.gate.is_open`.
         exit_code: what mutmut noted; None if it was not tried.
     """
 

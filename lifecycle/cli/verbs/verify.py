@@ -65,7 +65,7 @@ def command(  # noqa: PLR0917 - click passes options by name
 
 def exit_code(verdict: Verdict, *, strict: bool) -> ExitCode:
     """Return the exit code of a verdict."""
-    from lifecycle.supervisor.gate.gate import closes
+    from lifecycle.supervisor.core.gate import closes
     from lifecycle.verify.outcome import Outcome
 
     if not closes(verdict, strict=strict):

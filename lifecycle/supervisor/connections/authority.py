@@ -50,9 +50,13 @@ _BEYOND = (Condition.CONNECTED, Condition.ACTIVE, Condition.HEALTHY)
 def configured_before_any_connect(system: System) -> frozenset[str]:
     """Return the keys of this supervisor's managed nodes that no `after:` holds behind a connect.
 
+    None where nothing is negotiated.
+
     A managed node's start waits for `started` alone and its configure for `configured`; but the
     start of a plain node waits for any condition, and a node that depends on it waits with it.
     """
+    if system.plan.data_layer.source is not DataLayerSource.DYNAMIC:
+        return frozenset()
     held: dict[str, bool] = {}
 
     def is_held(key: str) -> bool:
@@ -165,10 +169,10 @@ class ConnectionAuthority:
         self._making = 0
         self._wake = asyncio.Event()
         self._following: asyncio.Task[None] | None = None
+        self._closed = False
         layer = system.plan.data_layer
         self._dynamic = layer.source is DataLayerSource.DYNAMIC
         self._repairs = layer.events
-        self._early = configured_before_any_connect(system) if self._dynamic else frozenset()
 
     async def wire(self, node: NodeRun) -> None:
         """Make everything that a configured node must have before it connects.
@@ -202,21 +206,10 @@ class ConnectionAuthority:
 
     def replan(self, plan: Plan, names: Collection[str]) -> None:
         """Forget what these nodes were instructed: they are started again, by this plan."""
-        if self._dynamic:
-            self._early = configured_before_any_connect(self._system)
         self._source.replan(plan, names)
         for name in names:
             self._wirings.pop(name, None)
         self._instructions = {}
-
-    async def ready(self, node: NodeRun) -> None:
-        """Wait until every node is configured on whose interface this one's wiring may depend."""
-        for key in self._early:
-            other = self._system.nodes[key]
-            while not other.has_reached(Condition.CONFIGURED):
-                node.doing = f"waits to connect until {other.name} is configured"
-                await other.changed.wait()
-        node.doing = ""
 
     def look(self, observation: Observation) -> None:
         """Take what was seen: negotiate again, and have what is missing made."""
@@ -227,7 +220,7 @@ class ConnectionAuthority:
         }
         for each in observation.configurations:
             node = self._system.node_named(each.name)
-            if node is not None and node.process is None:
+            if node is not None and not node.core.process:
                 node.configuration = each
         if not (self._dynamic or self._repairs):
             return
@@ -237,11 +230,12 @@ class ConnectionAuthority:
             if problem not in before:
                 self._emit(Notice(message=problem))
         self._wake.set()
-        if self._following is None:
+        if self._following is None and not self._closed:
             self._following = asyncio.ensure_future(self._follow())
 
     async def close(self) -> None:
         """Stop following, and disconnect what was made on nodes that are not declared."""
+        self._closed = True
         if self._following is not None:
             if self._following.done():
                 self._following.result()
@@ -318,12 +312,12 @@ class ConnectionAuthority:
         self,
     ) -> Iterable[tuple[str, NodeDriver | NodeInterfaceClient, NodeRun | None, NodeConfiguration]]:
         dead = self._system.dead()
-        remote = {each.name for each in self._system.remote.values()}
+        remote = {each.full_name for each in self._system.remote.values()}
         for name in self._instructions:
             node = self._system.node_named(name)
             if node is not None:
                 configuration = node.configuration
-                if node.driver is None or node.stuck or name in dead or configuration is None:
+                if node.driver is None or node.core.stuck or name in dead or configuration is None:
                     continue
                 if node.found == ACTIVE:
                     continue  # it is verified as it was found
@@ -406,7 +400,7 @@ class ConnectionAuthority:
                 attempt=max(1, wiring.rounds),
             )
             if node is not None:
-                node.doing = f"is told to {step}"
+                node.told = str(step)
             self._making += 1
             try:
                 configuration = await interface.wire(step)
@@ -416,7 +410,7 @@ class ConnectionAuthority:
             finally:
                 self._making -= 1
                 if node is not None:
-                    node.doing = ""
+                    node.told = ""
             wiring.actual = wiring.actual.after(step)
             if step.operation is Operation.CONNECT_TO and step.connection not in wiring.ours:
                 wiring.ours.append(step.connection)
@@ -430,7 +424,7 @@ class ConnectionAuthority:
                 else:
                     self._others[configuration.name] = configuration
             self._emit(event)
-        self._system.touched.set()
+        self._system.touch()
 
 
 def _backoff_s(rounds: int) -> float:

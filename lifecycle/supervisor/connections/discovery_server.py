@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
+import signal
 from typing import TYPE_CHECKING
 
 from lifecycle.errors import BringUpError, MiddlewareError
@@ -19,11 +20,11 @@ from lifecycle.middleware.discovery.discovery_server import (
 )
 from lifecycle.plan.model import PlannedProcess, PlannedServer
 from lifecycle.supervisor.control.protocol import ProcessState
-from lifecycle.supervisor.nodes.bring_up import died
 from lifecycle.supervisor.nodes.system import System
-from lifecycle.supervisor.processes.process import COMMAND_ESCALATION, ManagedProcess
+from lifecycle.supervisor.processes.process import ManagedProcess, ProcessExit
+from lifecycle.supervisor.run.events import Failure, ProcessChanged
 from lifecycle.supervisor.run.failure import StepFailedError, finding_of, within
-from lifecycle.verify.rules.run import DEADLINE, START_FAILED
+from lifecycle.verify.rules.run import DEADLINE, PROCESS_DIED, START_FAILED
 from lifecycle.verify.verdict import Finding
 
 if TYPE_CHECKING:
@@ -34,6 +35,9 @@ NAME = "discovery_server"
 
 START_S = 10.0
 """It listens within 50 ms; a loaded machine takes longer."""
+
+_ESCALATION = ((signal.SIGINT, 2.0), (signal.SIGTERM, 1.0), (signal.SIGKILL, 5.0))
+"""Signals that end it, and seconds to wait for its end after each."""
 
 LOOK_AGAIN_S = 0.02
 """Between two looks whether it listens: a process that is not ours to change does not notify us."""
@@ -88,15 +92,34 @@ async def begin(system: System, spawner: ForkServer, *, ours: bool) -> None:
         raise StepFailedError(
             f"cannot start the discovery server: {error}", rule=START_FAILED, subject=NAME
         ) from error
+    _say(system, ProcessState.STARTING)
     await _until_it_listens(planned, process)
-    process.running()
+    _say(system, ProcessState.RUNNING)
 
 
 async def end(system: System, hurry: asyncio.Event) -> None:
     """End it, if it is ours; nothing of the system may need it any more."""
-    if system.server is not None:
-        is_over = system.server.state is ProcessState.EXITED
-        await system.server.end(() if is_over else COMMAND_ESCALATION, hurry)
+    server = system.server
+    if server is None or server.child is None:
+        return
+    if not server.ended.done():
+        _say(system, ProcessState.STOPPING)
+    for number, wait_s in _ESCALATION:
+        if server.ended.done():
+            break
+        if not hurry.is_set() or number == signal.SIGKILL:
+            server.signal(number)
+            await asyncio.wait({server.ended}, timeout=wait_s)
+    await server.release()
+    if server.ended.done():
+        _say(system, ProcessState.EXITED)
+
+
+def _say(system: System, state: ProcessState) -> None:
+    server = system.server
+    assert server is not None
+    detail = str(server.ended.result()) if server.ended.done() else ""
+    system.emit(ProcessChanged(process=NAME, state=state, pid=server.pid, detail=detail))
 
 
 def findings(system: System) -> tuple[Finding, ...]:
@@ -106,9 +129,21 @@ def findings(system: System) -> tuple[Finding, ...]:
     observer is one, of participants that join after it (0 of 4 tries; other clients 10 of 12).
     """
     server = system.server
-    if server is None or server.state is not ProcessState.EXITED:
+    if server is None or not server.ended.done():
         return ()
-    return (finding_of(died(server)),)
+    return (finding_of(death(server, server.ended.result())),)
+
+
+def death(server: ManagedProcess, end: ProcessExit) -> Failure:
+    """Return the failure that its end is."""
+    words = f": {server.last_words}" if server.last_words else ""
+    return Failure(
+        rule=PROCESS_DIED.id,
+        subject=NAME,
+        message=f"cannot keep process {NAME!r} running: pid {server.pid} died: {end}{words}",
+        process=NAME,
+        log=server.log.shown,
+    )
 
 
 async def _until_it_listens(planned: PlannedServer, process: ManagedProcess | None) -> None:
@@ -117,7 +152,7 @@ async def _until_it_listens(planned: PlannedServer, process: ManagedProcess | No
     deadline = loop.time() + START_S
     log = "" if process is None else str(process.log.path)
     while True:
-        if process is not None and process.state is ProcessState.EXITED:
+        if process is not None and process.ended.done():
             raise StepFailedError(
                 f"cannot start the discovery server at {_where(planned)}: {process.ended.result()}",
                 rule=START_FAILED,

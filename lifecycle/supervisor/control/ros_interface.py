@@ -21,8 +21,9 @@ from lifecycle.errors import ExitCode, LifecycleError, MiddlewareError
 from lifecycle.manifest.model import Policy, RosInterfaceAccess
 from lifecycle.manifest.names import MODE_SERVICE, supervisor_prefix, supervisor_services
 from lifecycle.plan.model import Plan
-from lifecycle.supervisor.control.orders import ACTIVE, PHASES, Order
+from lifecycle.supervisor.control.orders import Order
 from lifecycle.supervisor.control.protocol import ControlRequest, NodeStatus, SystemStatus
+from lifecycle.supervisor.core.orders import FITS
 from lifecycle.supervisor.run.events import (
     Emitter,
     Event,
@@ -43,7 +44,7 @@ from lifecycle.verify.verdict import Verdict
 if TYPE_CHECKING:
     from lifecycle.middleware.services.ros_interface import RosInterface as RosEntities
     from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
-    from lifecycle.supervisor.run.session import Session
+    from lifecycle.supervisor.shell.supervisor import Supervisor
 
 Entry = tuple[int, str, str, str, Sequence[tuple[str, str]]]
 """Level, name, message, hardware id and values of a diagnostic_msgs/DiagnosticStatus."""
@@ -106,7 +107,7 @@ class RosInterface:
 
     def __init__(
         self,
-        session: Session,
+        session: Supervisor,
         plan: Plan,
         machine: str,
         participant: ObserverParticipant,
@@ -144,7 +145,7 @@ class RosInterface:
         elif isinstance(event, Stopping):
             self._stop()
         elif self._opens and not self._was_active and isinstance(event, _ON_ITS_WAY):
-            self._was_active = isinstance(event, SystemReached) and event.reached == ACTIVE
+            self._was_active = isinstance(event, SystemReached) and event.reached == "active"
             self._in(AFTER_ACTIVE_S if self._was_active else HELD_UP_S, self._open)
 
     def close(self) -> None:
@@ -211,7 +212,7 @@ class RosInterface:
         if name == _DOWN:
             answer(True, "the system is being taken down")
             self._session.stop("the down service", ExitCode.BRING_UP_FAILED)
-        elif name.startswith(MODE_SERVICE) or name in {each.value for each in PHASES}:
+        elif name.startswith(MODE_SERVICE) or name in {each.value for each in FITS}:
             mode = name.removeprefix(MODE_SERVICE)
             order = (
                 Order(ask=ControlRequest(name))

@@ -31,7 +31,8 @@ from lifecycle.verify.observation import Observation
 from lifecycle.verify.verdict import Verdict
 
 if TYPE_CHECKING:
-    from lifecycle.supervisor.run.session import Session
+    from lifecycle.supervisor.control.orders import Order
+    from lifecycle.supervisor.shell.supervisor import Supervisor
 
 _BURST_S = 0.05
 _CLOSE_S = 1.0
@@ -54,12 +55,6 @@ class SupervisorSnapshot(msgspec.Struct, frozen=True, kw_only=True):
     verdict: Verdict | None
 
 
-class QuestionWithPlan(Question, frozen=True, kw_only=True):
-    """Question as a supervisor reads it."""
-
-    plan: Plan | None = None
-
-
 class LookAnswer(Answer, frozen=True, kw_only=True):
     """Answer to LOOK and FOLLOW.
 
@@ -78,7 +73,7 @@ class ControlServer:
         session: what is asked.
     """
 
-    def __init__(self, path: Path, session: Session) -> None:
+    def __init__(self, path: Path, session: Supervisor) -> None:
         self._path = path
         self._session = session
         self._changed = asyncio.Event()
@@ -105,10 +100,12 @@ class ControlServer:
         )
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        from lifecycle.supervisor.control.orders import Order  # clients do not need it
+
         self._open.add(writer)
         try:
             while line := await reader.readline():
-                question = from_json(line, QuestionWithPlan)
+                question = from_json(line, Order)
                 if question.ask is ControlRequest.DOWN:
                     self._waiting.add(writer)
                     self._session.stop("lifecycle down", ExitCode.BRING_UP_FAILED)
@@ -129,13 +126,11 @@ class ControlServer:
         self._changed.set()
         self._changed = asyncio.Event()
 
-    async def _answer(self, question: QuestionWithPlan) -> Answer:
+    async def _answer(self, question: Order) -> Answer:
         if question.ask is ControlRequest.LOOK:
             return LookAnswer(look=self._session.look())
-        from lifecycle.supervisor.control.orders import PHASES, Order  # clients need neither
-
-        if question.ask in PHASES:
-            return await self._session.order(Order(**msgspec.structs.asdict(question)))
+        if question.is_order:
+            return await self._session.order(question)
         if question.ask is ControlRequest.DIFFERENCES and question.plan is not None:
             return Answer(differences=self._session.differences(question.plan))
         return Answer(status=self._session.status())

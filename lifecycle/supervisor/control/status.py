@@ -5,10 +5,14 @@ Owns: how a status is drawn from the running system and its last verdict. Must n
 
 from __future__ import annotations
 
+import datetime as dt
 from typing import TYPE_CHECKING
 
+from msgspec.structs import replace
+
 from lifecycle.manifest.model import EndpointKind, RunKind, UniqueHow
-from lifecycle.supervisor.control.protocol import NodeStatus, SystemStatus
+from lifecycle.supervisor.control.protocol import NodeStatus, ProcessState, SystemStatus
+from lifecycle.supervisor.core.advance import phase_of
 from lifecycle.verify.judge import not_ok
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.state import WRONG_STATE
@@ -17,32 +21,35 @@ from lifecycle.verify.verdict import FlowReport, Verdict
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from lifecycle.supervisor.core.state import Process, Run
     from lifecycle.supervisor.nodes.system import NodeRun, System
-    from lifecycle.supervisor.policy.schedule import RestartSchedule
     from lifecycle.verify.observation import NodeConfiguration
 
 
+def process_state(run: Run, process: Process) -> ProcessState:
+    """Return the state of a process as people and clients read it."""
+    if process.state is not None:
+        return process.state
+    if process.end is None:
+        return ProcessState.STARTING
+    return ProcessState.BACKOFF if process.failed and not run.ending else ProcessState.EXITED
+
+
 def node_status(
-    node: NodeRun,
-    verdict: Verdict | None,
-    silent: str,
-    *,
-    elapsed_s: float,
-    schedule: RestartSchedule,
+    system: System, node: NodeRun, *, elapsed_s: float, began_at: dt.datetime
 ) -> NodeStatus:
     """Return what is known of one node.
 
     Args:
+        system: whose it is.
         node: which.
-        verdict: the last one; None before the first.
-        silent: why nothing can be expected of it.
         elapsed_s: seconds since the supervisor started.
-        schedule: knows of restarts.
+        began_at: when it did.
     """
-    process = node.process
-    runs = process is not None and process.pid != 0 and not process.is_gone
-    known = None if process is None else schedule
-    died = _died(node)
+    run, verdict = system.run, system.run.judged.verdict
+    process, known = node.process, run.processes.get(node.core.process)
+    runs = known is not None and known.is_alive and process is not None and process.pid != 0
+    died = _died(run, known, 0 if process is None else process.pid)
     configuration = None if died else node.configuration
     flows = [
         flow
@@ -52,15 +59,20 @@ def node_status(
     matches = _matches(node, configuration, flows)
     cpu_s, rss_bytes, threads = _use(process.pid) if runs and process is not None else (None,) * 3
     external = node.planned.run.kind is RunKind.ATTACH
+    last = None if known is None or not known.failures else known.failures[-1]
+    if last is not None:
+        at = began_at + dt.timedelta(seconds=last.elapsed_s)
+        last = replace(last, at=at.isoformat(timespec="milliseconds"))
+    due_s = node.core.due_s - elapsed_s
     return NodeStatus(
         node=node.name,
         process="" if external else node.planned.process,
-        process_state=None if node.process is None else node.process.state,
-        pid=node.pid,
+        process_state=None if known is None else process_state(run, known),
+        pid=0 if process is None else process.pid,
         managed=node.planned.managed,
         reach=node.reach,
         state="" if died else _state(node, verdict),
-        doing=node.doing or node.withheld,
+        doing=node.doing or node.core.withheld,
         matched=matches.count(True),
         unreported=matches.count(None),
         endpoints=len(matches),
@@ -70,7 +82,7 @@ def node_status(
             node.name in (finding.node, finding.subject)
             for finding in (() if verdict is None else verdict.findings)
         ),
-        silent=silent,
+        silent=system.liveliness.silent.get(node.name, ""),
         died=died,
         connections=tuple(
             each
@@ -78,9 +90,9 @@ def node_status(
             if each.name
         ),
         uptime_s=elapsed_s - process.started_s if runs and process is not None else None,
-        restarts=0 if known is None else known.restarts(node.planned.process),
-        last_failure=None if known is None else known.last_failure(node.planned.process),
-        next_try_s=None if known is None else known.next_try_s(node.planned.process),
+        restarts=0 if known is None else known.restarts,
+        last_failure=last,
+        next_try_s=due_s if known is not None and known.failed and due_s > 0 else None,
         cpu_s=cpu_s,
         rss_bytes=rss_bytes,
         threads=threads,
@@ -135,41 +147,28 @@ def _matches(
     return [reported.get(each, True if each in ok else None) for each in places]
 
 
-def _died(node: NodeRun) -> str:
+def _died(run: Run, process: Process | None, pid: int) -> str:
     """Say how a node's process ended without being asked to; empty if it has not."""
-    process = node.process
-    if process is None or not process.died or not process.ended.done():
+    if process is None or process.end is None or process.asked >= 0 or process.is_over:
         return ""
-    return f"pid {process.pid} died: {process.ended.result()}"
+    if process.by_hand or (run.ending is not None and not process.failures and not run.deaths):
+        return ""
+    return f"pid {pid} died: {process.end.text}"
 
 
-def system_status(
-    system: System,
-    verdict: Verdict | None,
-    *,
-    phase: str,
-    supervisor: int,
-    elapsed_s: float,
-    schedule: RestartSchedule,
-    ends: str,
-) -> SystemStatus:
+def system_status(system: System, *, supervisor: int, elapsed_s: float, ends: str) -> SystemStatus:
     """Return what is known of the whole system, with what its processes use now."""
-    silent = system.liveliness.silent
+    verdict = system.run.judged.verdict
+    began_at = dt.datetime.now(dt.timezone.utc) - dt.timedelta(seconds=elapsed_s)
     return SystemStatus(
         system=system.plan.system,
         domain_id=system.plan.domain_id,
-        phase=phase,
+        phase=phase_of(system.run),
         verdict=None if verdict is None else verdict.verdict,
         supervisor=supervisor,
         elapsed_s=elapsed_s,
         nodes=tuple(
-            node_status(
-                node,
-                verdict,
-                silent.get(node.name, ""),
-                elapsed_s=elapsed_s,
-                schedule=schedule,
-            )
+            node_status(system, node, elapsed_s=elapsed_s, began_at=began_at)
             for node in system.nodes.values()
         ),
         not_ok="" if verdict is None else not_ok(verdict),

@@ -31,8 +31,13 @@ SIGINT, SIGTERM, SIGKILL = 2, 15, 9
 OWN_S = 0.5
 """Our hosts keep the limits of transitions themselves and know more: they speak first."""
 
+_THEIRS = (Step.CONFIGURE, Step.CONNECT, Step.ACTIVATE, Step.DEACTIVATE)
+
 GLANCE_S = 1.0
 """For so long a system that is to be no more than connected is judged; it gates nothing."""
+
+NOTICE_S = 0.5
+"""Another supervisor says that it ends before its nodes do, but by another topic than theirs."""
 
 Escalation = tuple[tuple[int, float], ...]
 """Steps to end a process: (signal number, 0 to close its channel; seconds until the next)."""
@@ -68,8 +73,8 @@ def wanted(run: Run, node: Node) -> Level:
 
 def is_kept_inactive(run: Run, node: Node) -> bool:
     """Return whether a node is not to be active although the manifest has it so."""
-    if node.base is Level.ACTIVE:
-        return False  # it is adopted as it was found
+    if node.base is Level.ACTIVE and node.level is Level.ACTIVE:
+        return run.paused or bool(node.withheld)  # it is adopted as it was found
     asked = run.attempt is not None and run.attempt.asks_for(node.key)
     if run.options.until < Level.ACTIVE:
         return True
@@ -115,12 +120,20 @@ def holds_up(run: Run, node: Node, target: Level) -> str:
     container = run.nodes.get(node.planned.run.container)
     if node.planned.run.component and container is not None and container.level < Level.STARTED:
         return f"{container.name} is started"
+    if target is Level.CONNECTED and run.options.wires and not node.wired:
+        # What a negotiation asks of a node must not wait for a connection of another.
+        early = (run.nodes[key] for key in run.early if key in run.nodes)
+        late = (each.name for each in early if each.level < Level.CONFIGURED)
+        return next((f"{name} is configured" for name in late), "")
     return ""
 
 
 def goal_of(run: Run, node: Node) -> Level:
     """Return where a node goes from here: as wanted, and never below what it was found in."""
-    return max(wanted(run, node), node.base)
+    least = node.base
+    if run.ending is None and (run.paused or node.withheld):
+        least = min(least, node.gate)  # it is adopted as it was found, and obeys orders
+    return max(wanted(run, node), least)
 
 
 def is_walking(run: Run, node: Node) -> bool:
@@ -128,10 +141,24 @@ def is_walking(run: Run, node: Node) -> bool:
     goal = goal_of(run, node)
     if node.guarded > gate.GUARD_TRIES and goal > Level.DOWN:
         return False  # it is left to the verdict
-    if node.planned.run.kind is RunKind.COMMAND and not node.planned.managed and goal:
+    if only_appears(node) and goal:  # it reports nothing: a verdict says whether it is there
         process = run.processes.get(node.process)
-        return process is None or not process.is_alive  # it reports nothing: a verdict says it
+        return bool(node.process) and (process is None or not process.is_alive)
     return min(goal, node.gate) > node.level or goal < node.may_be_at or node.renew
+
+
+def only_appears(node: Node) -> bool:
+    """Return whether all that is known of a node's start is that it is in the graph."""
+    run = node.planned.run
+    return run.kind is not RunKind.PYTHON and not (node.planned.managed or run.component)
+
+
+def is_awaited(run: Run) -> bool:
+    """Return whether a node of ours that is to be there, and only appears, has not appeared."""
+    return any(
+        each.process and only_appears(each) and each.level < Level.STARTED <= wanted(run, each)
+        for each in run.nodes.values()
+    )
 
 
 def is_at_gate(run: Run) -> bool:
@@ -171,6 +198,8 @@ def advance(run: Run) -> list[effects.Effect]:
         effects.Answer(order=number, code=code, error=error) for number, code, error in run.outbox
     ]
     run.outbox = []
+    if run.adopting and run.ending is None:
+        return found
     if run.order is not None and run.ready is None and run.ending is None:
         run.ready = False
         found.append(effects.Prepare())
@@ -195,7 +224,7 @@ def _next(run: Run, node: Node) -> Step | None:
     goal = goal_of(run, node)
     if node.level > goal:
         return _step_down(run, node, goal)
-    if node.level < goal and run.fails_s == NEVER_S:
+    if node.level < goal and run.fails_s == NEVER_S and run.ending is None:
         return _step_up(run, node)
     return None
 
@@ -216,13 +245,15 @@ def _step_up(run: Run, node: Node) -> Step | None:
         if not passes or change or run.switch is not None or not gate.is_open(run):
             return None
     if target is Level.CONNECTED and run.options.wires and not node.wired:
-        return Step.WIRE if node.wirable else None
+        return Step.WIRE
     return UP[target]
 
 
 def _step_down(run: Run, node: Node, goal: Level) -> Step | None:
     process = run.processes.get(node.process)
-    if not can_be_asked(run, node) or _waits_for_dependents(run, node, wanted(run, node)):
+    # One that stays, and is silent, is asked all the same: its limit decides.
+    asked = can_be_asked(run, node) if goal is Level.DOWN else not node.stuck
+    if not asked or _waits_for_dependents(run, node, wanted(run, node)):
         return None
     if process is not None and (not process.is_alive or process.asked >= 0):
         return None
@@ -262,20 +293,21 @@ def _ask(run: Run, node: Node, step: Step) -> effects.Ask:
     limits = node.planned.timeouts
     limit_s = {
         Step.START: limits.start_s,
-        Step.CONFIGURE: limits.configure_s + OWN_S,
+        Step.CONFIGURE: limits.configure_s,
         Step.WIRE: limits.connect_s,
-        Step.CONNECT: limits.connect_s + OWN_S,
-        Step.ACTIVATE: limits.activate_s + OWN_S,
-        Step.DEACTIVATE: limits.deactivate_s + OWN_S,
+        Step.CONNECT: limits.connect_s,
+        Step.ACTIVATE: limits.activate_s,
+        Step.DEACTIVATE: limits.deactivate_s,
         Step.SHUTDOWN: limits.shutdown_s,
     }.get(step, limits.cleanup_s)
-    appears = step is Step.START and not node.planned.managed and not node.planned.holds
+    appears = step is Step.START and only_appears(node) and not node.planned.holds
     run.requests += 1
     node.request = Request(
         number=run.requests,
         step=step,
         since_s=run.now_s,
         limit_s=NEVER_S if appears else limit_s,
+        own_s=OWN_S if step in _THEIRS else 0.0,
     )
     if step is not Step.ACTIVATE:
         return effects.Ask(node=node.key, step=step, number=run.requests)
@@ -362,16 +394,22 @@ def _parameters(run: Run) -> Iterator[effects.Give]:
             yield effects.Give(node=key)
         switch.to_ask = set()
     if change is not None and not change.taken:
+        later = {key: each for key, each in change.to_give.items() if key in change.giving}
         for key, values in change.to_give.items():
-            change.giving.add(key)
-            change.given[key] = values
-            yield effects.Give(node=key, values=values)
-        change.to_give = {}
+            if key not in later:  # it has still to answer what it was asked on the way here
+                change.giving.add(key)
+                change.given[key] = values
+                yield effects.Give(node=key, values=values)
+        change.to_give = later
 
 
 def is_settled_down(run: Run) -> bool:
     """Return whether nothing has still to be deactivated."""
-    return not any(goal_of(run, each) < each.may_be_at for each in run.nodes.values())
+    return not any(
+        goal_of(run, each) < each.may_be_at
+        for each in run.nodes.values()
+        if not each.stuck and each.guarded <= gate.GUARD_TRIES
+    )
 
 
 def _gate(run: Run) -> Iterator[effects.Effect]:
@@ -380,12 +418,15 @@ def _gate(run: Run) -> Iterator[effects.Effect]:
     judged, passage = run.judged, run.passage
     programs = passage is not None and not (passage.programmed or passage.programming)
     if programs and gate.is_open(run) and passage and judged.verdict:
+        run.requests += 1
         passage.programming, passage.flows = True, judged.verdict.flows
-        yield effects.Program(verdict=judged.verdict)
+        passage.number = run.requests
+        yield effects.Program(verdict=judged.verdict, number=run.requests)
     # A loop that looks while its nodes are on their way would look at each step of each.
     active = frozenset(each.name for each in run.nodes.values() if each.level is Level.ACTIVE)
     due = judged.mark != run.mark or judged.again_s <= run.now_s
-    if due and not judged.looking and (active or is_at_gate(run)):
+    watched = active and run.held_s is not None
+    if due and not judged.looking and (watched or is_at_gate(run)):
         stage = stage_of(run)
         judged.looking, judged.again_s = True, NEVER_S
         yield effects.Look(
@@ -401,7 +442,7 @@ def _gate(run: Run) -> Iterator[effects.Effect]:
 def late_at_s(request: Request) -> float:
     """Return when a request is late: its process's time without a processor does not count."""
     waited_s = min(request.waited_s, 9 * request.limit_s)
-    return request.since_s + request.limit_s + waited_s
+    return request.since_s + request.limit_s + request.own_s + waited_s
 
 
 def barks_at_s(process: Process) -> float:
@@ -416,8 +457,10 @@ def barks_at_s(process: Process) -> float:
 def wakes_at_s(run: Run) -> float:
     """Return when something is to be done although nothing happens; NEVER_S if nothing is."""
     now_s = run.now_s
-    times = [late_at_s(each.request) for each in run.nodes.values() if each.request is not None]
-    times += [each.due_s for each in run.nodes.values()]
+    late = [late_at_s(each.request) for each in run.nodes.values() if each.request is not None]
+    if any(each <= now_s for each in late):
+        return now_s  # only a tick says so
+    times = [*late, *(each.due_s for each in run.nodes.values())]
     times += [each.asked_until_s for each in run.processes.values() if each.is_alive]
     times += map(barks_at_s, run.processes.values())
     if run.ending is None:
@@ -426,12 +469,18 @@ def wakes_at_s(run: Run) -> float:
         for each in (run.attempt, run.passage):
             if each is not None:
                 times += [each.until_s, gate.refuses_at_s(run, each.until_s)]
+                times.append(each.until_s + gate.LEAST_S)
+        if run.attempt is not None and not run.attempt.said:
+            times.append(run.attempt.since_s + gate.SAY_S)
         if run.passage is not None:
             times.append(run.passage.late_s)
+        if run.waits_s is not None and not run.said:
+            times.append(gate.refuses_at_s(run, run.waits_s + run.options.timeout_s))
         if run.change is not None:
             times.append(run.change.until_s)
         if run.held_s is not None and run.options.hold_s is not None:
-            times += [run.held_s + run.options.hold_s, run.held_s + run.options.hold_s + GLANCE_S]
+            over_s = run.held_s + run.options.hold_s
+            times += [over_s, over_s + NOTICE_S, over_s + GLANCE_S]
     return min((each for each in times if each > now_s), default=NEVER_S)
 
 

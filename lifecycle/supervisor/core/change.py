@@ -11,19 +11,28 @@ from msgspec.structs import replace
 
 from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import TargetState
+from lifecycle.plan.build import attached_to
 from lifecycle.plan.change import change_between
+from lifecycle.plan.comparison import difference_lines
 from lifecycle.plan.model import Plan, PlannedNode, in_mode
-from lifecycle.supervisor.core.advance import is_settled_down, waiting
+from lifecycle.supervisor.core.advance import is_settled_down, phase_of, waiting
 from lifecycle.supervisor.core.state import (
     Attempt,
     Change,
     Level,
     Order,
+    Process,
     Run,
     Switch,
     install,
 )
-from lifecycle.supervisor.run.events import Event, ManifestApplied, ModeEntered, Notice
+from lifecycle.supervisor.run.events import (
+    Event,
+    ManifestApplied,
+    ModeEntered,
+    Notice,
+    SystemReached,
+)
 
 # Modes
 
@@ -32,12 +41,14 @@ def enter_mode(run: Run, mode: str, *, back: bool = False) -> list[Event]:
     """Have nodes be as a mode says: what it keeps inactive goes down first, without a gate."""
     active = frozenset(key for key, each in run.nodes.items() if each.is_gated)
     had = {key: each.planned.expected_parameters for key, each in run.nodes.items()}
-    run.switch = Switch(mode=mode, before=run.mode, active=active, to_ask=set(), back=back)
+    run.switch = Switch(mode=mode, before=run.mode, active=active, back=back)
     run.mode, run.plan = mode, in_mode(run.plan, mode)
     for key, node in run.nodes.items():
         node.planned = run.plan.node(key)
-        if node.planned.expected_parameters != had[key] and node.level >= Level.STARTED:
-            run.switch.to_ask.add(key)
+        if node.planned.expected_parameters != had[key]:
+            run.switch.given = (*run.switch.given, node.name)
+            if node.level >= Level.STARTED:
+                run.switch.to_ask.add(key)
     run.changed()
     return []
 
@@ -46,8 +57,12 @@ def leave_mode(run: Run, before: str, error: str, code: ExitCode) -> list[Event]
     """Go back to the mode before: a node refuses a parameter, or the gate stays closed."""
     text = f"cannot enter mode {run.mode!r}: back to {before!r}"
     run.attempt = run.passage = None
-    run.answer(code, error)
-    events = [Notice(message=text), *enter_mode(run, before, back=True)]
+    said = [Notice(message=text)]
+    if run.order is not None:
+        run.undone = code, error
+    else:
+        said.append(Notice(message=error))
+    events: list[Event] = [*said, *enter_mode(run, before, back=True)]
     for node in run.nodes.values():
         if node.is_gated:
             node.refused = False  # it is let through again as soon as the gate allows it
@@ -65,11 +80,16 @@ def settle_mode(run: Run) -> list[Event]:
         mode=switch.mode,
         before=switch.before,
         inactive=tuple(each.full_name for each in inactive if each.key in run.nodes),
+        parameters=switch.given,
     )
     more = {key for key, each in run.nodes.items() if each.is_gated} - switch.active
-    if more and not (switch.back or run.paused):
-        until_s = run.now_s + run.options.timeout_s
-        run.attempt = Attempt(until_s=until_s, mode=switch.before)
+    if run.paused:
+        return [entered]
+    if not more:
+        is_whole = phase_of(run) == "active"
+        return [entered, *([SystemReached(reached="active", elapsed_s=run.now_s)] * is_whole)]
+    until_s = run.now_s + run.options.timeout_s
+    run.attempt = Attempt(until_s=until_s, mode="" if switch.back else switch.before)
     return [entered]
 
 
@@ -87,7 +107,11 @@ def apply(run: Run, order: Order) -> list[Event]:
         run.answer(ExitCode.OK)
         return []
     known = {each.key for each in plan.nodes}
-    failed = {key for key, each in run.nodes.items() if each.due_s > run.now_s}
+    failed = {
+        key
+        for key, each in run.nodes.items()
+        if each.due_s > run.now_s or _stays_down(run.process_of(each))
+    }
     again = {*change.removed, *change.restarted, *(failed & known)}
     down = run.whole(again)
     run.change = Change(
@@ -101,6 +125,7 @@ def apply(run: Run, order: Order) -> list[Event]:
             for key, each in run.nodes.items()
             if each.level is Level.ACTIVE or (key in failed and not each.withheld)
         ),
+        timeout_s=order.timeout_s or run.options.timeout_s,
         until_s=run.now_s + (order.timeout_s or run.options.timeout_s),
         down=set(down),
         touched={*down, *change.added},
@@ -115,6 +140,11 @@ def apply(run: Run, order: Order) -> list[Event]:
     return [_said(run, "begun")]
 
 
+def _stays_down(process: Process | None) -> bool:
+    """Return whether the run goes on without a process that has failed."""
+    return process is not None and process.stays_down and not process.is_over
+
+
 def go_back(run: Run, reason: str, code: ExitCode) -> list[Event]:
     """Have the system run by the manifest before: what was done is undone."""
     change = run.change
@@ -127,7 +157,6 @@ def go_back(run: Run, reason: str, code: ExitCode) -> list[Event]:
         change.taken = False
         change.down = {key for key in change.touched if key in run.nodes}
     change.touched |= change.down
-    change.giving = set()
     change.to_give = {
         key: replace(each, before=each.now, now=each.before)
         for key, each in change.given.items()
@@ -185,12 +214,16 @@ def _take(run: Run, change: Change) -> None:
     run.first = plan
     for key in change.down:
         run.nodes.pop(key, None)
-    install(run, _connected_as(in_mode(plan, run.mode), stays, before))
+    adopted = {each.key for each in plan.nodes if each.full_name in run.adopted}
+    plan = attached_to(in_mode(plan, run.mode), adopted)
+    install(run, _connected_as(plan, stays, before))
     for key in change.touched & run.nodes.keys():
         process = run.processes.get(run.nodes[key].process)
         if process is not None and process.state is None:
             process.by_hand, process.failed, process.away_s = True, False, None
+            process.stays_down = False
     change.taken, change.down = True, set()
+    run.came = bool(change.touched)
     run.changed()
     keys = change.active if change.back else None
     run.attempt = Attempt(until_s=change.until_s, activates=not run.paused, keys=keys)
@@ -217,17 +250,33 @@ def _finish(run: Run, change: Change) -> list[Event]:
         run.change = None
         run.answer(ExitCode.OK)
         return events
-    state = change.state or ("held" if waiting(run) else "paused" if run.paused else "active")
-    text = (
-        f"cannot apply {change.plan.manifest_path}: {change.reason}\n"
-        f"{change.before.manifest_path} is in force again, revision {run.revision}: {state}"
-    )
+    text = undone(run, change)
     events = [_said(run, "rolled_back", change.reason), Notice(message=text)]
     run.change = None
     run.answer(change.code, text)
     if change.ends:
         run.failures, run.fails_s = [*run.failures, *change.ends], run.now_s
     return events
+
+
+def undone(run: Run, change: Change) -> str:
+    """Say what became of a manifest that could not be applied, and what the system is now."""
+    before = change.before.manifest_path
+    text = f"cannot apply {change.plan.manifest_path}: {change.reason}\n"
+    if ends := [*change.ends, *run.failures]:
+        why = "; ".join(each.message for each in ends)
+        return f"{text}cannot go back to {before}: {why}; the system is taken down"
+    kept = any(each.withheld or each.refused for each in run.nodes.values())
+    now = "paused" if run.paused else "held" if kept or waiting(run) else "active"
+    how = f"{now} and verified"
+    if change.again:
+        how = f"and what failed meanwhile is started again as its policy says: {change.again}"
+    elif change.state:
+        resume = "" if now == "active" else ": lifecycle resume"
+        how = f"but {change.state}; it is {now}{resume}"
+    elif now == "held":
+        how = "verified, and held as before: lifecycle resume"
+    return f"{text}{before} is in force again, revision {run.revision}, {how}"
 
 
 def _said(run: Run, stage: str, reason: str = "") -> Event:
@@ -246,6 +295,7 @@ def _said(run: Run, stage: str, reason: str = "") -> Event:
     what = change.change
     return replace(
         event,
+        differences=difference_lines(what.differences),
         added=named(what.added),
         removed=named(what.removed),
         restarted=named(what.restarted),

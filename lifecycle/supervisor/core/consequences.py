@@ -49,7 +49,7 @@ def settle_consequences(run: Run) -> list[Event]:
         return []
     if busy or run.options.until < Level.ACTIVE:
         return []
-    verdict = gate.without(run, verdict, away(run))
+    verdict = gate.of_those_there(run, gate.without(run, verdict, away(run)))
     run.judged.tried &= {gate.key_of(each) for each in verdict.findings}
     coming = _coming_elsewhere(run, verdict.findings)
     asked: dict[gate.Key, tuple[Consequence, Finding, tuple[str, ...], str]] = {}
@@ -58,8 +58,9 @@ def settle_consequences(run: Run) -> list[Event]:
         if each.outcome is Outcome.VIOLATED and due and coming.isdisjoint(each.nodes):
             asked[gate.key_of(each)] = due
     run.judged.asked = {key: run.judged.asked.get(key, run.now_s) for key in asked}
+    until_s = gate.holds_until_s(run)
     lasting = [
-        due for key, due in asked.items() if run.now_s - run.judged.asked[key] >= gate.SETTLED_S
+        due for key, due in asked.items() if until_s - run.judged.asked[key] >= gate.SETTLED_S
     ]
     if not lasting:
         return []
@@ -89,7 +90,8 @@ def _take(
     if what is Consequence.MODE:
         return [said, *enter_mode(run, mode)]
     if what is Consequence.PAUSE:
-        run.paused = True
+        run.paused = run.pauses = True
+        keys = tuple(key for key, each in run.nodes.items() if each.is_gated)
     for key in keys:
         run.nodes[key].withheld = f"{reason}; lifecycle resume"
     return [said]

@@ -56,9 +56,10 @@ class Look(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Program(msgspec.Struct, frozen=True, kw_only=True):
-    """Program networks with the flows of a verdict; `Programmed`."""
+    """Program networks with the flows of a verdict; `Programmed` with the same number."""
 
     verdict: Verdict
+    number: int
 
 
 class Give(msgspec.Struct, frozen=True, kw_only=True):

@@ -11,11 +11,13 @@ from collections.abc import Iterable
 from msgspec.structs import replace
 
 from lifecycle.errors import ExitCode
-from lifecycle.supervisor.control.protocol import ControlRequest, Failed
+from lifecycle.manifest.model import RunKind
+from lifecycle.supervisor.control.protocol import ControlRequest, Failed, ProcessState
 from lifecycle.supervisor.core import gate
 from lifecycle.supervisor.core.advance import holds_up, phase_of, wanted
-from lifecycle.supervisor.core.change import go_back
+from lifecycle.supervisor.core.change import go_back, undone
 from lifecycle.supervisor.core.inputs import Exited
+from lifecycle.supervisor.core.restart import RestartPolicy, group_of
 from lifecycle.supervisor.core.state import (
     NEVER_S,
     UP,
@@ -26,11 +28,11 @@ from lifecycle.supervisor.core.state import (
     Run,
     Step,
 )
-from lifecycle.supervisor.policy.restart import RestartPolicy, group_of
 from lifecycle.supervisor.run.events import (
     Event,
     Failure,
     GaveUp,
+    Notice,
     RestartScheduled,
     Stopping,
 )
@@ -56,13 +58,24 @@ _ING = {
 }
 
 
+APPEARING = "waiting to appear in the graph"
+
+
 def doing(run: Run, node: Node) -> str:
     """Return what a node does, or waits for, as in messages; empty when nothing."""
     if node.request is not None:
+        hosted = node.planned.run.kind is RunKind.PYTHON or node.planned.run.component
+        if node.request.step is Step.START and not hosted:
+            return APPEARING
         return _ING.get(node.request.step, "being taken down")
+    process = run.processes.get(node.process)
+    if process is not None and process.state is ProcessState.STARTING:
+        return _ING[Step.START]
     higher = [each for each in node.levels if each > node.level]
     if not higher or wanted(run, node) <= node.level:
         return ""
+    if higher[0] is Level.ACTIVE and (run.passage is None or not run.passage.opened):
+        return ""  # it waits for the gate as all others do
     held = holds_up(run, node, higher[0])
     return f"waits to {UP[higher[0]].value} until {held}" if held else ""
 
@@ -91,8 +104,39 @@ def death(run: Run, process: Process, given: Exited) -> list[Failure]:
     while_ = f" while {while_}" if while_ else ""
     why = f": {process.why}" if process.why else ""
     words = f": {given.words}" if given.words else ""
-    text = f"cannot keep {what} running: pid {process.pid} died{while_}: {given.text}{words}{why}"
+    end = f"{given.text}{_not_run(process, given)}"
+    text = f"cannot keep {what} running: pid {process.pid} died{while_}: {end}{words}{why}"
     return [_failure(PROCESS_DIED, name, text, process)]
+
+
+def _not_run(process: Process, given: Exited) -> str:
+    """Name the program of a command where its status says, as of a shell, that it cannot be run."""
+    why = {126: "may not be run", 127: "is not there"}.get(given.status or 0)
+    argv = process.planned.argv
+    if why is None or process.planned.run.kind is not RunKind.COMMAND or not argv:
+        return ""
+    return f", as of a program that {why}: {argv[0]!r}"
+
+
+def forced(process: Process) -> Event:
+    """Return what is said of a process that did not end when it was asked to."""
+    name = _SIGNALS.get(process.sent[-1], str(process.sent[-1]))
+    return Notice(message=f"process {process.name!r} had to be ended with {name}")
+
+
+def activated(node: Node) -> Event:
+    """Return what is said of a node that the gate has not let through, and that is active."""
+    text = f"{node.name!r} was activated by its own code or another client while the gate is closed"
+    tries = gate.GUARD_TRIES
+    if node.guarded < tries:
+        return Notice(message=f"{text}: it is deactivated")
+    if node.guarded == tries:
+        in_vain = f"it is deactivated for the last time, after {tries - 1} times in vain"
+        return Notice(message=f"{text}: {in_vain}")
+    return Notice(message=f"{text}: {gate.ACTIVATES_ITSELF}")
+
+
+_SIGNALS = {2: "SIGINT", 9: "SIGKILL", 15: "SIGTERM"}
 
 
 def _start_failed(name: str, text: str) -> str:
@@ -106,15 +150,29 @@ def of_step(run: Run, node: Node, what: Rule, message: str) -> Failure:
     return _failure(what, node.name, text, process)
 
 
-def too_late(run: Run, node: Node, limit_s: float) -> Failure:
+def too_late(run: Run, node: Node, limit_s: float, where: str = "") -> Failure:
     """Return the failure of a node whose step takes longer than it may."""
-    text = f"cannot bring up {node.name!r}: it was still {doing(run, node)} after {limit_s:g} s"
+    what = doing(run, node)
+    at = f", in {where}" if where else ""
+    text = f"cannot bring up {node.name!r}: it was still {what} after {limit_s:g} s{at}"
+    text += _unnamed(run, node)
     return _failure(DEADLINE, node.name, text, run.process_of(node))
+
+
+def _unnamed(run: Run, node: Node) -> str:
+    """Say how a node is named that a command may call otherwise; empty where that is not it."""
+    process, planned = run.processes.get(node.process), node.planned
+    if process is None or planned.run.kind is not RunKind.COMMAND:
+        return ""
+    named = any(each.endswith(f"__node:={planned.name}") for each in process.planned.argv)
+    if named or doing(run, node) != APPEARING:
+        return ""
+    return f"; if its code calls it otherwise, write 'name: {planned.name}' at nodes.{planned.key}"
 
 
 def _failure(what: Rule, subject: str, message: str, process: Process | None) -> Failure:
     name = "" if process is None else process.name
-    log = "" if process is None or process.end is None else process.end.log
+    log = "" if process is None else process.log
     return Failure(rule=what.id, subject=subject, message=message, process=name, log=log)
 
 
@@ -140,8 +198,10 @@ def fail(run: Run, failure: Failure, end: Exited | None = None) -> list[Event]:
         assert process is not None
         _cut_short(run, failure)
         return _back_off(run, process, failure, end)
-    if run.options.keep_going and run.held_s is not None and end is not None and process:
-        process.stays_down = True
+    died = end is not None or failure.rule == PROCESS_DIED.id
+    if run.options.keep_going and run.held_s is not None and died:
+        if process is not None:
+            process.stays_down = True
         run.judged.counted = run.judged.counted or _named([failure])
         run.deaths.append(failure)
         return [goes_on(failure)]
@@ -172,6 +232,7 @@ def _fails_in_change(run: Run, failure: Failure, end: Exited | None) -> list[Eve
         change.down |= keys
         change.touched |= keys
     elif _is_covered(process, end) and process is not None:
+        change.again = failure.message
         events += _back_off(run, process, failure, end)
     else:
         change.ends = [*change.ends, failure]
@@ -196,7 +257,9 @@ def _cut_short(run: Run, failure: Failure) -> None:
     """Answer the order that a failure cuts short; a pause goes on. All wait for the gate again."""
     order = run.order
     run.passage = None
-    if order is None:
+    if order is None or run.change is not None:
+        if run.change is not None:
+            run.change.again = failure.message
         if run.attempt is not None:
             run.attempt.at_gate = False
             run.attempt.until_s = run.now_s + run.options.timeout_s
@@ -232,7 +295,7 @@ def _back_off(run: Run, process: Process, failure: Failure, end: Exited | None) 
             process=process.name,
             nodes=tuple(run.nodes[key].name for key in keys),
             reason=failure.message,
-            stderr="",
+            stderr=process.failures[-1].stderr,
             restarts=process.restarts,
             in_s=due_s - run.now_s,
         )
@@ -246,6 +309,8 @@ def _remembered(run: Run, failure: Failure, end: Exited | None) -> Failed:
         subject=failure.subject,
         message=failure.message,
         exit_status=None if end is None else end.status,
+        signal="" if end is None or not end.signal else end.text.removeprefix("killed by "),
+        stderr="" if end is None else end.stderr,
         elapsed_s=run.now_s,
     )
 
@@ -253,13 +318,13 @@ def _remembered(run: Run, failure: Failure, end: Exited | None) -> Failed:
 def _given_up(process: Process, failure: Failure, *, was_up: bool) -> Failure:
     how = process.supervision
     burst = how.start_limit_burst
-    lines = "".join(
-        f"\n  at {each.elapsed_s:.1f} s: {each.message}" for each in process.failures[-burst:]
+    lines = "; ".join(
+        f"at {each.elapsed_s:.1f} s, {each.message}" for each in process.failures[-burst:]
     )
     within = f"within {how.start_limit_interval_sec:g} s" if was_up else "during bring-up"
     text = (
         f"cannot keep {process.name!r} running: it was started {burst} time{'s' * (burst != 1)} "
-        f"{within} (start_limit_burst, start_limit_interval_sec) and failed again:{lines}"
+        f"{within} (start_limit_burst, start_limit_interval_sec) and failed again: {lines}"
     )
     return Failure(
         rule=GAVE_UP.id,
@@ -277,11 +342,14 @@ def end(run: Run, ending: Ending) -> list[Event]:
     """End the run: from now on everything is to be down. Whatever is open is answered."""
     if run.ending is not None:
         return []
-    run.ending = ending
+    run.ending, ending.deaths = ending, len(run.deaths)
+    change = run.change
     run.attempt = run.passage = run.switch = run.change = None
     open_ = [*([run.order] if run.order is not None else []), *run.orders]
     text = f"cannot go on: {run.plan.system!r} is being taken down"
     said = "; ".join(each.message for each in ending.failures) or text
+    if change is not None and change.back and ending.failures:
+        said = undone(run, change)
     for order in open_:
         own = order is run.order and bool(ending.failures)
         run.outbox = [*run.outbox, (order.id, ExitCode.BRING_UP_FAILED, said if own else text)]
@@ -295,14 +363,21 @@ def end_failed(run: Run) -> list[Event]:
     gave_up = any(each.rule == GAVE_UP.id for each in run.failures)
     code = ExitCode.SUPERVISION_GAVE_UP if gave_up else ExitCode.BRING_UP_FAILED
     reason = _also(run, _named(run.failures))
-    failures = tuple(run.failures)
-    return end(run, Ending(code=code, stopping="rolling back", reason=reason, failures=failures))
+    ending = Ending(
+        code=code,
+        stopping="rolling back",
+        reason=reason,
+        failures=tuple(run.failures),
+        failed=True,
+    )
+    return end(run, ending)
 
 
 def end_refused(run: Run, verdict: Verdict, stopping: str) -> list[Event]:
     """End the run because the gate stays closed."""
     reason = _also(run, f"{stopping}; {not_ok(verdict) or verdict.verdict.value}")
-    return end(run, Ending(code=gate.exit_code(verdict), stopping=stopping, reason=reason))
+    code = gate.exit_code(verdict)
+    return end(run, Ending(code=code, stopping=stopping, reason=reason, failed=True))
 
 
 def end_done(run: Run) -> list[Event]:
@@ -350,11 +425,13 @@ def _outcome(run: Run, meanwhile: str) -> tuple[ExitCode, str]:
     left = follows_from_shut_down(run, verdict)
     held = phase_of(run) == "held" and run.options.until is Level.ACTIVE
     closed = gate.closes(verdict, strict=run.options.strict) and not left
+    down = ", ".join(each.name for each in run.processes.values() if each.failed)
     found = (
         (closed and verdict.verdict is Outcome.VIOLATED, f"violated; {not_ok(verdict)}"),
         (bool(meanwhile), f"violated meanwhile, {meanwhile}"),
         (closed, f"unverifiable; {not_ok(verdict)}"),
         (held, "held at the gate, and not active"),
+        (bool(down), f"down, and to be started again: {down}"),
     )
     why = next((text for holds, text in found if holds), "")
     unverifiable = ExitCode.UNVERIFIABLE if why.startswith("unver") else ExitCode.VIOLATED
@@ -363,6 +440,16 @@ def _outcome(run: Run, meanwhile: str) -> tuple[ExitCode, str]:
 
 def _named(failures: Iterable[Failure]) -> str:
     return f"failed: {', '.join(f'{each.subject} ({each.rule})' for each in failures)}"
+
+
+def only_elsewhere(run: Run) -> bool:
+    """Return whether all that is violated is of nodes of supervisors not known to end."""
+    verdict = run.judged.verdict
+    found = () if verdict is None else verdict.findings
+    violated = [each for each in found if each.outcome is Outcome.VIOLATED]
+    names = {run.plan.node(key).full_name for key in run.elsewhere}
+    elsewhere = violated and all(not names.isdisjoint(each.nodes) for each in violated)
+    return bool(elsewhere) and verdict is not None and not follows_from_shut_down(run, verdict)
 
 
 def follows_from_shut_down(run: Run, verdict: Verdict) -> bool:
@@ -393,14 +480,28 @@ def exit_code_of(run: Run) -> ExitCode:
 
 def fail_late(run: Run, limit_s: float) -> list[Event]:
     """Fail a bring-up, or an order, that takes too long: say what every node was doing."""
-    busy = [each for each in run.nodes.values() if each.request is not None]
+    busy = [
+        each
+        for each in run.nodes.values()
+        if each.request is not None and wanted(run, each) is not Level.DOWN
+    ]
     culprit = busy[0] if busy else None
     subject = run.plan.system if culprit is None else culprit.name
     text = f"cannot bring up {run.plan.system!r} within {limit_s:.3g} s: {unfinished(run)}"
+    text += next(filter(None, (_unnamed(run, each) for each in run.nodes.values())), "")
     for node in busy:
         node.stuck = bool(node.process)
     process = None if culprit is None else run.process_of(culprit)
-    if run.attempt is not None:
-        run.attempt.until_s = NEVER_S
     run.passage = None
-    return fail(run, _failure(DEADLINE, subject, text, process))
+    events = fail(run, _failure(DEADLINE, subject, text, process))
+    if run.failures:
+        run.fails_s = run.now_s  # all that is missing is named
+    if run.attempt is not None:
+        run.attempt.until_s = NEVER_S if run.failures else run.now_s + limit_s
+    return events
+
+
+def fail_for_good(run: Run, failure: Failure) -> list[Event]:
+    """Fail the run whatever is to be kept going: nothing can be started any more."""
+    run.failures, run.fails_s = [*run.failures, failure], run.now_s
+    return []

@@ -19,6 +19,7 @@ from lifecycle.verify.judge import not_ok, with_findings, with_only
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import rule
 from lifecycle.verify.rules.catalogue import Heals
+from lifecycle.verify.rules.nodes import UNATTRIBUTED_ENDPOINT
 from lifecycle.verify.rules.state import ACTIVATED_AT_CLOSED_GATE, MISSING_REPORT
 from lifecycle.verify.verdict import Finding, Stage, Verdict
 
@@ -36,6 +37,14 @@ LEAST_S = 2.0
 
 LASTS_S = 1.0
 """A violation that lasts for longer is in the exit code."""
+
+SAY_S = 2.0
+"""A gate that stays closed for so long says what it waits for, and until when."""
+
+ACTIVATES_ITSELF = (
+    "leave its activation to the supervisor: remove trigger_activate or change_state from its "
+    "code, and end the client that asks for it"
+)
 
 GUARD_TRIES = 5
 """A node that others activate again and again is not deactivated for ever."""
@@ -63,7 +72,7 @@ def allows(run: Run) -> bool:
 
 def is_open(run: Run) -> bool:
     """Return whether an activate request may be sent now."""
-    return run.judged.mark == run.mark and allows(run)
+    return run.judged.mark == run.mark and not run.judged.waits and allows(run)
 
 
 def exit_code(verdict: Verdict) -> ExitCode:
@@ -92,6 +101,16 @@ def patience_s(verdict: Verdict) -> float:
     return NEVER_S
 
 
+def is_latest(run: Run) -> bool:
+    """Return whether nothing has changed since the verdict."""
+    return run.judged.mark == run.mark
+
+
+def holds_until_s(run: Run) -> float:
+    """Return until when what was found is known to be so: what changed since may have mended it."""
+    return run.now_s if is_latest(run) else run.judged.seen_s
+
+
 def refuses_at_s(run: Run, until_s: float) -> float:
     """Return when the gate has stayed closed for long enough; NEVER_S while it may open.
 
@@ -102,11 +121,15 @@ def refuses_at_s(run: Run, until_s: float) -> float:
     judged = run.judged
     if judged.verdict is None or allows(run):
         return NEVER_S
+    if judged.waits:
+        return until_s  # what speaks against it is being mended
     if any(each.guarded > GUARD_TRIES for each in run.nodes.values()):
         return run.now_s
     if any(each.due_s > run.now_s for each in run.nodes.values()):
         return until_s  # what comes again may mend it
-    return min(until_s, judged.since_s + patience_s(judged.verdict))
+    over_s = judged.since_s + patience_s(judged.verdict)
+    lasts = is_latest(run) or judged.seen_s >= over_s
+    return min(until_s, over_s) if lasts else until_s
 
 
 def take_verdict(run: Run, given: Verified, away: Collection[str], stage: Stage) -> list[Event]:
@@ -121,8 +144,12 @@ def take_verdict(run: Run, given: Verified, away: Collection[str], stage: Stage)
     judged = run.judged
     guarded = tuple(_guarded(each) for each in run.nodes.values() if is_foreign_activation(each))
     verdict = with_findings(given.verdict, guarded, run.plan.policy)
+    at_gate = run.attempt is not None and run.attempt.at_gate
+    if run.held_s is not None and (run.attempt or run.change) and not at_gate:
+        verdict = without(run, verdict, away)  # they are away because it was ordered
     judged.looking = False
-    judged.mark = given.mark
+    judged.mark, judged.waits = given.mark, given.waits
+    judged.seen_s = run.now_s
     judged.again_s = NEVER_S if given.again_s is None else run.now_s + given.again_s
     found = frozenset((each.rule, each.subject) for each in verdict.findings)
     if found != judged.found or judged.verdict is None:
@@ -140,7 +167,9 @@ def is_foreign_activation(node: Node) -> bool:
 
 def _guarded(node: Node) -> Finding:
     given_up = node.guarded > GUARD_TRIES
-    what = f"it was deactivated {GUARD_TRIES} times" if given_up else "it is being deactivated"
+    what = "it is being deactivated"
+    if given_up:
+        what = f"it was deactivated {GUARD_TRIES} times; {ACTIVATES_ITSELF}"
     return ACTIVATED_AT_CLOSED_GATE.on_node(
         Outcome.VIOLATED,
         node.planned,
@@ -164,6 +193,18 @@ def without(run: Run, verdict: Verdict, names: Collection[str]) -> Verdict:
     return with_only(verdict, findings, run.plan.policy) if names else verdict
 
 
+def of_those_there(run: Run, verdict: Verdict) -> Verdict:
+    """Return a verdict without endpoints that may be of who comes up: its name is known last."""
+    known = tuple(each for each in verdict.findings if each.rule != UNATTRIBUTED_ENDPOINT.id)
+    if known == verdict.findings:
+        return verdict
+    comes = any(
+        process.is_alive and any(each.level < each.gate for each in run.nodes_of(process.name))
+        for process in run.processes.values()
+    )
+    return with_only(verdict, known, run.plan.policy) if comes else verdict
+
+
 def key_of(finding: Finding) -> Key:
     """Return what makes a finding the same one in a later verdict."""
     kind = "" if finding.endpoint is None else finding.endpoint.value
@@ -178,16 +219,18 @@ def see_violations(run: Run, away: Collection[str]) -> None:
     judged = run.judged
     if judged.verdict is None:
         return
-    if run.held_s is None or not any(each.level is Level.ACTIVE for each in run.nodes.values()):
-        judged.violated = {}
+    active = any(each.level is Level.ACTIVE for each in run.nodes.values())
+    if run.held_s is None or run.attempt is not None or run.change is not None or not active:
+        judged.violated = {}  # what an order brings about is judged at its gate
         return
-    verdict = without(run, judged.verdict, {*away, *run.left})
+    verdict = of_those_there(run, without(run, judged.verdict, {*away, *run.left}))
     found = {key_of(each): each for each in verdict.findings if each.outcome is Outcome.VIOLATED}
     keys = [*found]
     if verdict.verdict is Outcome.VIOLATED and not found:
         keys = [("", verdict.verdict.value, "", "")]
     judged.violated = {key: judged.violated.get(key, run.now_s) for key in keys}
-    lasting = [key for key, since_s in judged.violated.items() if run.now_s - since_s >= LASTS_S]
+    until_s = holds_until_s(run)
+    lasting = [key for key, since_s in judged.violated.items() if until_s - since_s >= LASTS_S]
     if lasting:
         findings = tuple(found[key] for key in lasting if key in found)
         text = not_ok(replace(verdict, findings=findings)) or _named(keys[0])

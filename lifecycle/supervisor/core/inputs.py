@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from lifecycle.manifest.model import Condition
+from lifecycle.plan.model import Plan
 from lifecycle.verify.verdict import Verdict
 
 if TYPE_CHECKING:
@@ -15,16 +16,25 @@ if TYPE_CHECKING:
 
 
 class Tick(msgspec.Struct, frozen=True, kw_only=True):
-    """Time has passed; by process, seconds of it in which it was ready to run, and had no CPU."""
+    """Time has passed.
 
+    Attributes:
+        at_s: until when the rest was measured; what is late by then is given up.
+        waited_s: by node, seconds since its request in which its process had no CPU, and wanted it.
+        where: by node whose request is late, what it is doing; what is not known is left out.
+    """
+
+    at_s: float = float("inf")
     waited_s: Mapping[str, float] = {}
+    where: Mapping[str, str] = {}
 
 
 class Spawned(msgspec.Struct, frozen=True, kw_only=True):
-    """A process was started, or cannot be: `error`."""
+    """A process was started, or cannot be: `error`; `log` is the file with its output."""
 
     process: str
     pid: int = 0
+    log: str = ""
     error: str = ""
 
 
@@ -36,27 +46,32 @@ class Exited(msgspec.Struct, frozen=True, kw_only=True):
         signal: number of the signal that ended it; 0 if none did.
         text: both for people, `exit status 1`.
         words: what it said of it; empty if nothing.
+        stderr: the last line that it wrote there; empty if none.
         clean: it is an end that somebody asked for, as systemd.service(5) has it.
         crash: the program broke.
         reports: why it cannot host nodes, as it said: full name (or empty) and message.
-        log: file with its output.
     """
 
     process: str
     status: int | None = None
     signal: int = 0
     text: str = ""
+    stderr: str = ""
     words: str = ""
     clean: bool = False
     crash: bool = False
     reports: tuple[tuple[str, str], ...] = ()
-    log: str = ""
 
 
 class Swept(msgspec.Struct, frozen=True, kw_only=True):
-    """Nothing is left of a process that ended: what it started has ended, the graph forgot it."""
+    """Nothing is left of a process that ended: what it started has ended, the graph forgot it.
+
+    Attributes:
+        reported: by node of others, the URLs of each of its connections, as it reports them.
+    """
 
     process: str
+    reported: Mapping[str, Mapping[str, tuple[str, ...]]] = {}
 
 
 class Replied(msgspec.Struct, frozen=True, kw_only=True):
@@ -64,6 +79,7 @@ class Replied(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         changed: it is not as it was verified, and was not activated: the gate is asked again.
+        already: nothing was asked of it: it was there before.
     """
 
     node: str
@@ -71,6 +87,7 @@ class Replied(msgspec.Struct, frozen=True, kw_only=True):
     level: Level
     error: str = ""
     changed: bool = False
+    already: bool = False
 
 
 class Saw(msgspec.Struct, frozen=True, kw_only=True):
@@ -80,13 +97,11 @@ class Saw(msgspec.Struct, frozen=True, kw_only=True):
         levels: of nodes of ours whose state others may change.
         health: whether nodes are healthy, as far as that is known.
         elsewhere: conditions that nodes of other supervisors have reached.
-        wirable: the authority knows how these nodes are to be connected.
     """
 
     levels: Mapping[str, Level] = {}
     health: Mapping[str, bool] = {}
     elsewhere: Mapping[str, frozenset[Condition]] = {}
-    wirable: frozenset[str] = frozenset()
 
 
 class Changed(msgspec.Struct, frozen=True, kw_only=True):
@@ -99,18 +114,21 @@ class Verified(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         mark: of the moment at which it began.
         again_s: look again after so long, as nobody says when what is missing is there.
+        waits: something is awaited that may speak against it: it opens nothing.
         undiscovered: key of a node that others do not discover over TCP although it runs.
     """
 
     mark: int
     verdict: Verdict
     again_s: float | None = None
+    waits: bool = False
     undiscovered: str = ""
 
 
 class Programmed(msgspec.Struct, frozen=True, kw_only=True):
-    """Networks have the flows of the verdict, or cannot be programmed."""
+    """Networks have the flows of the verdict, or cannot be programmed; `number` is the effect's."""
 
+    number: int
     error: str = ""
 
 
@@ -147,14 +165,16 @@ class Stop(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Silent(msgspec.Struct, frozen=True, kw_only=True):
-    """A node cannot be reached, or can be again: `why` is empty.
+    """A node is silent, or is not any more: `why` is empty.
 
     Attributes:
+        away: nothing reaches it; one that only hangs may answer in time.
         hangs: it is stopped or hangs, for which its process's watchdog ends it.
     """
 
     node: str
     why: str = ""
+    away: bool = False
     hangs: bool = False
 
 
@@ -164,15 +184,34 @@ class Left(msgspec.Struct, frozen=True, kw_only=True):
     nodes: frozenset[str]
 
 
+class Adopted(msgspec.Struct, frozen=True, kw_only=True):
+    """It is known what of the system runs already: `plan` attaches to it, `nodes` by full name."""
+
+    plan: Plan
+    nodes: frozenset[str]
+
+
+class Refused(msgspec.Struct, frozen=True, kw_only=True):
+    """Something was found, beside all looks, that closes the gate for good."""
+
+    verdict: Verdict
+
+
 class Broken(msgspec.Struct, frozen=True, kw_only=True):
-    """Something failed that is no node's: the discovery server died, the fork server died."""
+    """Something failed that is no node's: the discovery server died, the fork server died.
+
+    Attributes:
+        finds: it is by what nodes find each other, and not by what they are started: those that run
+            may go on.
+    """
 
     subject: str
     message: str
     rule: str = "run.process-died"
+    finds: bool = False
 
 
 Input = (
     Tick | Spawned | Exited | Swept | Replied | Saw | Changed | Verified | Programmed | Given
-    | Ready | Ordered | Stop | Silent | Left | Broken
+    | Ready | Ordered | Stop | Silent | Left | Adopted | Refused | Broken
 )  # fmt: skip

@@ -11,11 +11,11 @@ from lifecycle.supervisor.control.protocol import ControlRequest
 from lifecycle.supervisor.core import advance
 from lifecycle.supervisor.core.change import apply, enter_mode
 from lifecycle.supervisor.core.passing import reached
+from lifecycle.supervisor.core.restart import group_of
 from lifecycle.supervisor.core.state import Attempt, Level, Node, Order, Run
-from lifecycle.supervisor.policy.restart import group_of
 from lifecycle.supervisor.run.events import Event
 
-_SAID = {
+SAID = {
     ControlRequest.MODE: "switch the mode of",
     ControlRequest.APPLY: "apply another manifest to",
 }
@@ -53,57 +53,93 @@ def settled_phase(run: Run) -> str:
 
 def refusal(run: Run, order: Order) -> str:
     """Return why an order cannot be carried out now; empty if it can."""
-    what = f"cannot {_SAID.get(order.ask, order.ask.value)} {run.plan.system!r}"
+    what = f"cannot {SAID.get(order.ask, order.ask.value)} {run.plan.system!r}"
     phases, hint = FITS[order.ask]
     phase = settled_phase(run)
     if phase not in phases:
         return f"{what}: it is {phase}; {hint}"
+    return _unfit(run, order)
+
+
+def _unfit(run: Run, order: Order) -> str:
+    """Say why an order can be carried out in no phase; empty if it can."""
+    if order.first is not None and order.first is not run.first:
+        what = f"cannot {SAID.get(order.ask, order.ask.value)} {run.plan.system!r}"
+        return f"{what}: another manifest was applied meanwhile; ask again"
+    if order.ask in _STARTS and run.broken:
+        what = f"cannot {SAID.get(order.ask, order.ask.value)} {order.node or run.plan.system!r}"
+        return (
+            f"{what}: the discovery server has died, and without it nobody who comes again is "
+            "found; start the system again: lifecycle down, then lifecycle up"
+        )
     if order.node and named(run, order.node) is None:
-        return f"cannot restart {order.node!r}: this supervisor runs no such node"
-    if order.ask is ControlRequest.MODE:
-        modes = [each.name for each in run.plan.modes]
-        if order.mode not in modes:
-            known = f"the modes {', '.join(modes)}" if modes else "no modes"
-            hint = did_you_mean(order.mode, modes) if modes else "declare them under 'modes:'"
-            text = f"cannot enter mode {order.mode!r} of {run.plan.system!r}: it has {known}"
-            return f"{text}; {hint}" if hint else text
-        if run.elsewhere:
-            return f"{what}: nodes on other machines run in it, too"
+        return _not_restarted(run, order.node)
+    return _not_entered(run, order.mode) if order.ask is ControlRequest.MODE else ""
+
+
+def _not_restarted(run: Run, name: str) -> str:
+    """Say why a node is none that can be restarted."""
+    known = run.nodes.get(name) or run.node_named(name)
+    if known is not None:
+        return f"cannot restart {known.name!r}: it is attached, no process of this supervisor"
+    ours = sorted(each.name for each in run.nodes.values() if run.process_of(each) is not None)
+    return f"cannot restart {name!r}: this supervisor runs no such node; it runs: {', '.join(ours)}"
+
+
+def _not_entered(run: Run, mode: str) -> str:
+    """Say why a mode cannot be entered; empty if it can."""
+    system, modes = run.plan.system, [each.name for each in run.plan.modes]
+    if mode not in modes:
+        known = f"the modes {', '.join(modes)}" if modes else "no modes"
+        hint = did_you_mean(mode, modes) if modes else "declare them under 'modes:'"
+        text = f"cannot enter mode {mode!r} of {system!r}: it has {known}"
+        return f"{text}; {hint}" if hint else text
+    if run.elsewhere:
+        return (
+            f"cannot switch the mode of {system!r}: nodes on other machines run in it, too; modes "
+            "are switched where one supervisor runs all nodes"
+        )
     return ""
 
 
 def named(run: Run, name: str) -> Node | None:
     """Return the node that an order names, if it is ours to restart."""
     node = run.nodes.get(name) or run.node_named(name)
-    return None if node is None or run.process_of(node) is None else node
+    ours = node is not None and (node.planned.run.component or run.process_of(node) is not None)
+    return node if ours else None
 
 
 def take_order(run: Run, order: Order) -> list[Event]:
     """Take an order: it is refused at once, carried out, or waits for the one under way."""
-    applies = run.order is not None and run.order.ask is ControlRequest.APPLY
-    if run.ending is not None:
-        text = f"cannot go on: {run.plan.system!r} is being taken down"
-        run.outbox = [*run.outbox, (order.id, ExitCode.BRING_UP_FAILED, text)]
-    elif applies or run.held_s is None:
-        why = refusal(run, order)
-        if applies:
-            why = (
-                f"cannot {order.ask.value} {run.plan.system!r}: it is {advance.phase_of(run)}, "
-                "another manifest is being applied to it; ask again once 'lifecycle apply' has "
-                "ended; 'lifecycle down' is taken at once"
-            )
-        run.outbox = [*run.outbox, (order.id, ExitCode.USAGE, why)]
+    code, why = refused_at_once(run, order)
+    if why:
+        run.outbox = [*run.outbox, (order.id, code, why)]
     else:
         run.orders.append(order)
     return []
 
 
+def refused_at_once(run: Run, order: Order) -> tuple[ExitCode, str]:
+    """Return why an order is not even kept until its turn comes; an empty text if it is."""
+    if run.ending is not None:
+        text = f"cannot go on: {run.plan.system!r} is being taken down"
+        return ExitCode.BRING_UP_FAILED, text
+    if run.order is not None and run.order.ask is ControlRequest.APPLY:
+        return ExitCode.USAGE, (
+            f"cannot {SAID.get(order.ask, order.ask.value)} {run.plan.system!r}: it is "
+            f"{advance.phase_of(run)}, another manifest is being applied to it; ask again once "
+            "'lifecycle apply' has ended; 'lifecycle down' is taken at once"
+        )
+    return ExitCode.USAGE, refusal(run, order) if run.held_s is None else _unfit(run, order)
+
+
 def settle_orders(run: Run) -> list[Event]:
     """Be done with the order that is carried out, and begin the next."""
     events: list[Event] = []
+    if run.pauses and _is_done(run):
+        run.pauses = False
+        events.append(reached(run, "paused"))
     if run.order is not None and run.ready and _is_done(run):
-        if run.paused and run.order.ask in (ControlRequest.PAUSE, ControlRequest.RESTART):
-            events.append(reached(run, "paused"))
         run.answer(ExitCode.OK)
     while run.order is None and run.orders and _is_free(run):
         order = run.orders.popleft()
@@ -119,11 +155,12 @@ def settle_orders(run: Run) -> list[Event]:
 
 def _is_free(run: Run) -> bool:
     """Return whether nothing else is under way that an order would have to wait for."""
-    return run.switch is None and run.change is None and run.attempt is None and not run.failures
+    busy = run.switch or run.change or run.attempt or run.failures
+    return not busy and advance.is_settled_down(run)
 
 
 def _is_done(run: Run) -> bool:
-    return _is_free(run) and run.passage is None and advance.is_settled_down(run)
+    return _is_free(run) and run.passage is None
 
 
 def begin(run: Run) -> list[Event]:
@@ -134,12 +171,13 @@ def begin(run: Run) -> list[Event]:
         return apply(run, order)
     run.passage = None
     if order.ask is ControlRequest.PAUSE:
-        run.paused = True
+        run.paused = run.pauses = True
     elif order.ask is ControlRequest.MODE:
         return enter_mode(run, order.mode)
     else:
         if order.ask is ControlRequest.RESTART:
             _restart(run, order)
+            run.pauses = run.paused
         opens = order.ask is ControlRequest.RESUME or not run.paused
         until_s = run.now_s + run.options.timeout_s
         run.attempt = Attempt(until_s=until_s, activates=opens, judges=opens)
@@ -151,9 +189,12 @@ def _restart(run: Run, order: Order) -> None:
     """Have nodes go down once, with all that comes and goes with them; failures are forgotten."""
     node = named(run, order.node) if order.node else None
     keys = set(run.nodes)
+    names = {each.process for each in run.nodes.values()}
     if node is not None:
         keys = set(run.whole({node.key}))
         keys |= _gone_with(run, keys)
+        names = {run.nodes[key].process for key in keys}
+    run.deaths = [each for each in run.deaths if each.process not in names]
     for key in keys:
         each = run.nodes[key]
         each.due_s = 0.0

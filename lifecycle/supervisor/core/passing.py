@@ -10,18 +10,21 @@ from __future__ import annotations
 from lifecycle.errors import ExitCode
 from lifecycle.supervisor.core import advance, failure, gate
 from lifecycle.supervisor.core.change import go_back, leave_mode
-from lifecycle.supervisor.core.state import Level, Passage, Run
+from lifecycle.supervisor.core.inputs import Programmed
+from lifecycle.supervisor.core.state import Attempt, Level, Passage, Run
 from lifecycle.supervisor.run.events import Event, Failure, GateOpened, Notice, SystemReached
 from lifecycle.verify.judge import not_ok, taken_on_trust
 from lifecycle.verify.rules.run import NOT_PROGRAMMED, TRANSITION_FAILED
 from lifecycle.verify.verdict import Verdict
+
+CLOSED = "the verdict keeps the gate closed"
 
 
 def settle(run: Run) -> list[Event]:
     """Take attempt and passage as far as the state allows."""
     if run.ending is not None or run.failures:
         return []
-    events = _arrive(run)
+    events = [*_come(run), *_arrive(run)]
     if run.passage is not None:
         return [*events, *_go_on(run)]
     return [*events, *_open(run)]
@@ -35,21 +38,31 @@ def _arrive(run: Run) -> list[Event]:
     change = run.change is not None and not run.change.taken
     coming = run.held_s is None and any(each.due_s > run.now_s for each in run.nodes.values())
     if change or run.switch is not None or coming or not advance.is_at_gate(run):
-        late = run.now_s >= attempt.until_s
-        if late and run.change is not None and not run.change.back:
-            text = f"cannot bring up {run.plan.system!r} in time: {failure.unfinished(run)}"
-            return go_back(run, text, ExitCode.BRING_UP_FAILED)
-        return failure.fail_late(run, run.options.timeout_s) if late else []
+        return _late(run, failure.unfinished(run)) if run.now_s >= attempt.until_s else []
     left_s = attempt.until_s - run.now_s
     fresh_s = run.options.timeout_s if run.held_s is not None else min(left_s, run.options.gate_s)
     if run.change is None:
         attempt.until_s = run.now_s + fresh_s
-    attempt.at_gate = True
+    attempt.at_gate, attempt.since_s = True, run.now_s
     run.changed()
     attempt.mark = run.mark
     run.judged.found, run.judged.since_s = frozenset(), run.now_s
     if not attempt.judges:
         run.attempt = None
+    return []
+
+
+def _come(run: Run) -> list[Event]:
+    """Say that all who came up are at the gate."""
+    change = run.change is not None and not run.change.taken
+    coming = any(each.due_s > run.now_s or each.renew for each in run.nodes.values())
+    if not run.came or change or coming or not advance.is_at_gate(run):
+        return []
+    attempt = run.attempt
+    waited = attempt is not None and attempt.at_gate and run.now_s >= attempt.since_s + gate.SAY_S
+    if not waited and advance.is_awaited(run):
+        return []
+    run.came, run.again = False, run.held_s is not None
     return [reached(run, "connected")]
 
 
@@ -57,9 +70,28 @@ def _open_for_returned(run: Run) -> list[Event]:
     """Let through what was started again by policy, and nobody waits for."""
     busy = run.switch is not None or run.change is not None or run.held_s is None
     keys = () if busy else advance.waiting(run)
-    if not keys or not gate.is_open(run):
+    if busy or not (keys or run.again) or not advance.is_at_gate(run):
+        run.waits_s, run.said = None, False
         return []
-    return [reached(run, "verified"), *_begin(run, keys, run.now_s + gate.AGAIN_S)]
+    if not gate.is_open(run):
+        return _say_closed(run) if keys else []
+    _begin(run, keys, run.now_s + gate.AGAIN_S)
+    return [reached(run, "verified")]
+
+
+def _say_closed(run: Run) -> list[Event]:
+    """Say once that nodes wait at a gate that stays closed; they go on waiting."""
+    judged, verdict = run.judged, run.judged.verdict
+    if run.waits_s is None:
+        run.waits_s, judged.found, judged.since_s = run.now_s, frozenset(), run.now_s
+        run.changed()
+    until_s = run.waits_s + run.options.timeout_s
+    if run.said or verdict is None or judged.mark != run.mark:
+        return []
+    if run.now_s < gate.refuses_at_s(run, until_s):
+        return []
+    run.said = True
+    return [Notice(message=gate.refusal(verdict))]
 
 
 def _open(run: Run) -> list[Event]:
@@ -69,17 +101,40 @@ def _open(run: Run) -> list[Event]:
     if not attempt.at_gate or run.judged.mark < attempt.mark:
         return []
     if gate.is_open(run):
-        events = [reached(run, "verified")]
         if attempt.activates:
-            return [*events, *_begin(run, advance.waiting(run), attempt.until_s)]
-        run.attempt = None
-        return events
+            _begin(run, advance.waiting(run), attempt.until_s)
+        else:
+            run.attempt = None
+        return [reached(run, "verified")]
     if run.now_s >= gate.refuses_at_s(run, attempt.until_s):
         return _refused(run, again=False)
-    return []
+    # The verdict may allow it, and never be of a moment that lasts.
+    late = run.now_s >= attempt.until_s + gate.LEAST_S
+    return _late(run, "it changes all the time") if late else _say_waiting(run, attempt)
 
 
-def _begin(run: Run, keys: tuple[str, ...], until_s: float) -> list[Event]:
+def _late(run: Run, why: str) -> list[Event]:
+    """Give up what was to be at the gate, or through it, by now."""
+    change = run.change
+    if change is None or change.back:
+        return failure.fail_late(run, run.options.timeout_s)
+    text = f"cannot bring up {run.plan.system!r} within {change.timeout_s:.3g} s: {why}"
+    return go_back(run, text, ExitCode.BRING_UP_FAILED)
+
+
+def _say_waiting(run: Run, attempt: Attempt) -> list[Event]:
+    verdict = run.judged.verdict
+    if attempt.said or run.now_s < attempt.since_s + gate.SAY_S or verdict is None:
+        return []
+    attempt.said = True
+    if gate.allows(run):
+        return []
+    left_s = max(0.0, attempt.until_s - run.now_s)
+    text = f"waits up to {left_s:.0f} s more for its gate: {not_ok(verdict)}"
+    return [Notice(message=text)]
+
+
+def _begin(run: Run, keys: tuple[str, ...], until_s: float) -> None:
     run.judged.violated = {}
     run.passage = Passage(
         waiting=keys,
@@ -87,19 +142,18 @@ def _begin(run: Run, keys: tuple[str, ...], until_s: float) -> list[Event]:
         late_s=max(until_s, run.now_s + run.options.timeout_s),
         paused=run.paused,
     )
-    return []
 
 
-def programmed(run: Run, error: str) -> list[Event]:
+def programmed(run: Run, given: Programmed) -> list[Event]:
     """Take it that networks are programmed: the gate opens for those that wait at it."""
-    passage, verdict = run.passage, run.judged.verdict
-    if passage is None or not passage.programming or verdict is None:
-        return []
+    passage = run.passage
+    if passage is None or not passage.programming or passage.number != given.number:
+        return []  # that passage was given up
     passage.programming = False
-    if error:
+    if given.error:
         run.passage = None
-        name = run.plan.system
-        return failure.fail(run, Failure(rule=NOT_PROGRAMMED.id, subject=name, message=error))
+        found = Failure(rule=NOT_PROGRAMMED.id, subject=run.plan.system, message=given.error)
+        return failure.fail(run, found)
     passage.programmed = True
     return []
 
@@ -132,11 +186,14 @@ def _let_through(run: Run, passage: Passage, verdict: Verdict) -> list[Event]:
     for key in passage.waiting:
         run.nodes[key].withheld, run.nodes[key].refused = "", False
     names = tuple(run.nodes[key].name for key in passage.waiting)
+    if not names and (run.change is not None or run.attempt is None):
+        return []
     return [GateOpened(outcome=verdict.verdict.value, nodes=names, trusted=run.trusted)]
 
 
 def _passed(run: Run) -> list[Event]:
     run.attempt = run.passage = None
+    run.again = False
     for node in run.nodes.values():
         if node.level is Level.ACTIVE:
             node.guarded = 0
@@ -153,14 +210,16 @@ def reached(run: Run, what: str) -> Event:
     return SystemReached(reached=what, elapsed_s=run.now_s)
 
 
-def _withdraw(run: Run) -> None:
+def _withdraw(run: Run) -> list[Event]:
     """Have those be inactive again that were let through since the gate opened."""
     passage = run.passage
-    for key in () if passage is None else passage.sent:
-        if key in run.nodes:
-            run.nodes[key].let_through = False
+    begun = [] if passage is None else [run.nodes[key] for key in passage.sent & run.nodes.keys()]
+    for node in begun:
+        node.let_through = False
     if passage is not None and passage.paused:
         run.paused = True
+    names = ", ".join(sorted(each.name for each in begun))
+    return [Notice(message=f"the gate closed again: {names} is deactivated")] if begun else []
 
 
 def _refused(run: Run, *, again: bool) -> list[Event]:
@@ -170,30 +229,33 @@ def _refused(run: Run, *, again: bool) -> list[Event]:
     text, code = gate.refusal(verdict, again=again), gate.exit_code(verdict)
     keys = advance.waiting(run)
     if run.held_s is None:
-        stopping = "the verdict keeps the gate closed"
+        stopping = CLOSED
         if again:
             stopping = "the system changed before every node was activated"
         if attempt is not None and run.now_s >= attempt.until_s:
-            over = f"the {run.options.timeout_s:g} s of the bring-up are over (--timeout)"
+            over = f"the {round(attempt.until_s, 1):g} s of the bring-up are over (--timeout)"
             stopping = f"{stopping}, and {over}"
         return failure.end_refused(run, verdict, stopping)
     sent = () if run.passage is None else tuple(run.passage.sent)
-    _withdraw(run)
+    said = _withdraw(run)
     run.attempt = run.passage = None
+    run.again = False
     change = run.change
     if change is not None and not change.back:
-        return go_back(run, text, code)
+        return [*said, *go_back(run, text, code)]
+    said.append(Notice(message=text))
     if attempt is None:
-        return [Notice(message=text)]
+        return said
     for key in (*keys, *sent):
-        run.nodes[key].refused = True
+        # With what is started again by its policy these pass, too.
+        run.nodes[key].refused = change is None or not change.again
     if change is not None:
         change.state = f"its verdict is {verdict.verdict.value}: {not_ok(verdict)}"
     elif attempt.mode:
-        return [Notice(message=text), *leave_mode(run, attempt.mode, text, code)]
+        return [*said, *leave_mode(run, attempt.mode, text, code)]
     elif run.order is not None:
         run.answer(code, text)
-    return [Notice(message=text)]
+    return said
 
 
 def _became_another(run: Run) -> list[Event]:
@@ -202,9 +264,13 @@ def _became_another(run: Run) -> list[Event]:
     assert verdict is not None
     assert passage is not None
     if run.change is not None and not run.change.back:
-        _withdraw(run)
+        said = _withdraw(run)
         run.attempt = run.passage = None
-        return go_back(run, gate.refusal(verdict), gate.exit_code(verdict))
+        return [*said, *go_back(run, gate.refusal(verdict), gate.exit_code(verdict))]
+    if run.change is not None:
+        run.attempt = run.passage = None
+        run.change.state = f"its verdict is {verdict.verdict.value}: {not_ok(verdict)}"
+        return [Notice(message=gate.refusal(verdict))]
     if attempt is not None:
         if run.order is not None:
             run.answer(gate.exit_code(verdict), gate.refusal(verdict))

@@ -31,8 +31,9 @@ from lifecycle.supervisor.core.state import (
     Request,
     Run,
     Step,
+    install,
 )
-from lifecycle.supervisor.run.events import Event, Failure, Notice, Restarted
+from lifecycle.supervisor.run.events import Event, Failure, Notice, Restarted, VerdictChanged
 from lifecycle.verify.rules.run import NOT_WIRED, START_FAILED, TRANSITION_FAILED
 
 _UPWARDS = (*UP.values(), Step.WIRE)
@@ -48,10 +49,9 @@ def take(run: Run, now_s: float, given: inputs.Input) -> list[Event]:
         now_s: of the input, on the run's clock, which begins at 0 and only goes forward.
         given: what happened.
     """
-    passed_s, run.now_s = max(0.0, now_s - run.now_s), max(run.now_s, now_s)
-    if isinstance(given, inputs.Tick):
-        _waited(run, given, passed_s)
-    events = [*_HANDLERS[type(given)](run, given), *_due(run)]
+    run.now_s = max(run.now_s, now_s)
+    events = _HANDLERS[type(given)](run, given)
+    _see_time(run)
     quiet = 0
     while quiet < _PASSES:  # what moved without a word is looked at once more
         more = _settle(run)
@@ -84,6 +84,7 @@ def _spawned(run: Run, given: inputs.Spawned) -> list[Event]:
     process = run.processes.get(given.process)
     if process is None or process.state is not ProcessState.STARTING:
         return []
+    process.log = given.log
     if not given.error:
         process.pid = given.pid or -1
         return []
@@ -110,7 +111,8 @@ def _exited(run: Run, given: inputs.Exited) -> list[Event]:
         _is_down(node)
     run.changed()
     if process.asked >= 0:
-        return _died_when_asked(run, process, given, failures)
+        forced = [] if process.asked == 0 or run.hurry else [failure.forced(process)]
+        return [*forced, *_died_when_asked(run, process, given, failures)]
     if process.is_over:
         process.stays_down = True
         return []
@@ -145,7 +147,7 @@ def _is_down(node: Node) -> None:
     node.level = node.base = Level.DOWN
     node.request = None
     node.stuck = node.wired = node.healthy = node.let_through = False
-    node.silent, node.guarded = "", 0
+    node.silent, node.hangs, node.guarded = "", "", 0
 
 
 def _swept(run: Run, given: inputs.Swept) -> list[Event]:
@@ -160,7 +162,7 @@ def _swept(run: Run, given: inputs.Swept) -> list[Event]:
         return []
     keys = [key for key, each in run.nodes.items() if run.process_of(each) is process]
     try:
-        plan = restarted(run.plan, keys, first=run.first)
+        plan = restarted(run.plan, keys, first=run.first, reported=given.reported)
     except PlanError as error:
         found = Failure(rule=START_FAILED.id, subject=run.plan.system, message=error.message)
         return failure.fail(run, found)
@@ -174,18 +176,18 @@ def _silent(run: Run, given: inputs.Silent) -> list[Event]:
     node = run.nodes.get(given.node)
     if node is None:
         return []
-    node.silent = given.why
+    node.silent = given.why if given.away else ""
     run.changed()
+    node.hangs = given.why if given.hangs else ""
     process = run.process_of(node)
     if process is not None:
-        hangs = bool(given.why) and given.hangs
+        why = next((each.hangs for each in run.nodes_of(process.name) if each.hangs), "")
+        hangs = bool(why)
         since_s = run.now_s if process.hangs_s is None else process.hangs_s
         process.hangs_s = since_s if hangs else None
         how = process.supervision
         process.why = (
-            f"its watchdog ended it after {how.watchdog_sec:g} s, because {given.why}"
-            if hangs
-            else ""
+            f"its watchdog ended it after {how.watchdog_sec:g} s, because {why}" if hangs else ""
         )
     return []
 
@@ -197,7 +199,7 @@ def _replied(run: Run, given: inputs.Replied) -> list[Event]:
     node = run.nodes.get(given.node)
     if node is None or node.request is None or node.request.number != given.number:
         return []  # it was given up
-    step, node.request = node.request.step, None
+    step, node.request, was = node.request.step, None, node.level
     goal = advance.goal_of(run, node)
     run.changed()
     if given.changed:
@@ -208,8 +210,12 @@ def _replied(run: Run, given: inputs.Replied) -> list[Event]:
     if given.error:
         return _step_failed(run, node, step, given, goal)
     node.level = given.level
+    if step in UP.values() and step is not Step.ACTIVATE:
+        run.came = True
     if step in UP.values():
         node.level = max(given.level, node.after(step))
+    if given.already and node.base is was and not node.process and not node.planned.run.component:
+        node.base = node.level  # it was found so
     if step is Step.START:
         _is_there(run, node)
     elif step is Step.WIRE:
@@ -249,12 +255,11 @@ def _saw(run: Run, given: inputs.Saw) -> list[Event]:
         node = run.nodes.get(key)
         if node is None:
             continue
-        run.changed()
         idle = node.request is None and node.level in (Level.CONFIGURED, Level.CONNECTED)
         if level is Level.ACTIVE and idle and not node.let_through:
+            run.changed()
             node.level, node.guarded = Level.ACTIVE, node.guarded + 1
-            text = f"{node.name!r} was activated by its own code or another client while the "
-            events.append(Notice(message=f"{text}gate is closed"))
+            events.append(failure.activated(node))
     for key, healthy in given.health.items():
         if key in run.nodes and run.nodes[key].healthy != healthy:
             run.nodes[key].healthy = healthy
@@ -263,12 +268,38 @@ def _saw(run: Run, given: inputs.Saw) -> list[Event]:
         if run.elsewhere.get(key) != conditions:
             run.elsewhere = {**run.elsewhere, key: conditions}
             run.changed()
-    for node in run.nodes.values():
-        node.wirable = not run.options.wires or node.wirable or node.key in given.wirable
     return events
 
 
 # Everything else
+
+
+def _tick(run: Run, given: inputs.Tick) -> list[Event]:
+    for key, waited_s in given.waited_s.items():
+        node = run.nodes.get(key)
+        if node is not None and node.request is not None:
+            node.request.waited_s = max(node.request.waited_s, waited_s)
+    events: list[Event] = []
+    at_s = min(given.at_s, run.now_s)
+    for node in [*run.nodes.values()]:  # at no other input: how long it waited is known at this one
+        if node.request is not None and at_s >= advance.late_at_s(node.request):
+            events += _late(run, node, node.request, given.where.get(node.key, ""))
+    return events
+
+
+def _adopted(run: Run, given: inputs.Adopted) -> list[Event]:
+    install(run, given.plan, own=frozenset(each.planned.process for each in run.nodes.values()))
+    run.adopting, run.adopted = False, given.nodes
+    run.changed()
+    return []
+
+
+def _refused(run: Run, given: inputs.Refused) -> list[Event]:
+    if run.ending is not None:
+        return []
+    run.judged.verdict = given.verdict
+    said = VerdictChanged(stage=advance.stage_of(run), verdict=given.verdict)
+    return [said, *failure.end_refused(run, given.verdict, passing.CLOSED)]
 
 
 def _verified(run: Run, given: inputs.Verified) -> list[Event]:
@@ -322,7 +353,10 @@ def _left(run: Run, given: inputs.Left) -> list[Event]:
 
 def _broken(run: Run, given: inputs.Broken) -> list[Event]:
     found = Failure(rule=given.rule, subject=given.subject, message=given.message)
-    return [] if run.ending else failure.fail(run, found)
+    run.broken = run.broken or given.finds
+    if run.ending is not None:
+        return []
+    return failure.fail(run, found) if given.finds else failure.fail_for_good(run, found)
 
 
 def _changed(run: Run, _: inputs.Changed) -> list[Event]:
@@ -331,7 +365,7 @@ def _changed(run: Run, _: inputs.Changed) -> list[Event]:
 
 
 _HANDLERS: dict[type, Callable[[Run, Any], list[Event]]] = {
-    inputs.Tick: lambda _run, _given: [],
+    inputs.Tick: _tick,
     inputs.Spawned: _spawned,
     inputs.Exited: _exited,
     inputs.Swept: _swept,
@@ -339,13 +373,15 @@ _HANDLERS: dict[type, Callable[[Run, Any], list[Event]]] = {
     inputs.Saw: _saw,
     inputs.Changed: _changed,
     inputs.Verified: _verified,
-    inputs.Programmed: lambda run, given: passing.programmed(run, given.error),
+    inputs.Programmed: passing.programmed,
     inputs.Given: _given,
     inputs.Ready: _ready,
     inputs.Ordered: lambda run, given: orders.take_order(run, given.order),
     inputs.Stop: _stop,
     inputs.Silent: _silent,
     inputs.Left: _left,
+    inputs.Adopted: _adopted,
+    inputs.Refused: _refused,
     inputs.Broken: _broken,
 }
 
@@ -353,28 +389,16 @@ _HANDLERS: dict[type, Callable[[Run, Any], list[Event]]] = {
 # Time
 
 
-def _waited(run: Run, given: inputs.Tick, passed_s: float) -> None:
-    for node in run.nodes.values():
-        if node.request is not None:
-            waited_s = given.waited_s.get(node.process, 0.0)
-            node.request.waited_s += min(max(waited_s, 0.0), passed_s)
-
-
-def _due(run: Run) -> list[Event]:
-    events: list[Event] = []
-    for node in [*run.nodes.values()]:
-        if node.request is not None and run.now_s >= advance.late_at_s(node.request):
-            events += _late(run, node, node.request)
+def _see_time(run: Run) -> None:
     for process in run.processes.values():
         if run.now_s >= advance.barks_at_s(process):
             process.barks = True
     gate.see_violations(run, advance.away(run))
-    return events
 
 
-def _late(run: Run, node: Node, request: Request) -> list[Event]:
+def _late(run: Run, node: Node, request: Request, where: str) -> list[Event]:
     goal = advance.goal_of(run, node)
-    late = failure.too_late(run, node, request.limit_s)
+    late = failure.too_late(run, node, request.limit_s, where)
     node.request, node.stuck = None, True
     run.changed()
     if run.ending is not None or goal is Level.DOWN or request.step is Step.UNLOAD:
@@ -398,16 +422,32 @@ def _give_up_steps(run: Run) -> None:
         request = node.request
         if request is None or advance.wanted(run, node) is not Level.DOWN:
             continue
-        if run.hurry or (request.step in _UPWARDS and node.process):
+        ours = node.process or request.step is Step.START
+        if run.hurry or (request.step in _UPWARDS and ours):
             node.request, node.stuck = None, True
 
 
 def _begin_anew(run: Run) -> None:
     """Let nodes come up again that went down once, with all of their process."""
+    groups: dict[str, list[Node]] = {}
     for node in run.nodes.values():
-        process = run.processes.get(node.process)
-        if node.renew and node.is_down and (process is None or process.state is None):
+        groups.setdefault(node.process or f"/{node.key}", []).append(node)
+    for name, members in groups.items():
+        process = run.processes.get(name)
+        renewed = [each for each in members if each.renew]
+        if not all(each.is_down for each in renewed) or (process and process.state is not None):
+            continue
+        needs = {after.node for each in renewed for after in each.planned.after}
+        if any(_is_going(run, run.nodes[key]) for key in needs & run.nodes.keys()):
+            continue  # who goes down first comes up last
+        for node in renewed:
             node.renew = node.stuck = False
+
+
+def _is_going(run: Run, node: Node) -> bool:
+    """Return whether a node is on its way down to come up again, or its process is."""
+    process = run.processes.get(node.process)
+    return node.renew and (not node.is_down or (process is not None and process.state is not None))
 
 
 def _hold(run: Run) -> list[Event]:
@@ -419,19 +459,23 @@ def _hold(run: Run) -> list[Event]:
     hold_s = run.options.hold_s
     if hold_s is None or run.now_s < run.held_s + hold_s or run.order is not None or run.failures:
         return []
-    judged = run.judged
+    judged, over_s = run.judged, run.held_s + hold_s
     waits = judged.mark != run.mark and any(
         each.level is Level.ACTIVE for each in run.nodes.values()
     )
+    if run.now_s < over_s + advance.NOTICE_S and failure.only_elsewhere(run):
+        return []  # who runs these may be about to say that it ends, too
     if run.options.until < Level.ACTIVE and not run.options.verifies:
         waits = not (gate.allows(run) and judged.mark == run.mark)
-    waits = waits and run.now_s < run.held_s + hold_s + advance.GLANCE_S
+    waits = waits and run.now_s < over_s + advance.GLANCE_S
     return [] if waits else failure.end_done(run)
 
 
 def _returned(run: Run) -> list[Event]:
     """Say of processes that failed that they are as far again as they are to be."""
     events: list[Event] = []
+    if run.ending is not None or run.passage is not None:
+        return []
     for process in run.processes.values():
         if process.away_s is None or process.failed or process.state is not ProcessState.RUNNING:
             continue

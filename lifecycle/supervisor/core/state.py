@@ -22,7 +22,7 @@ from lifecycle.plan.change import GivenParameters, PlanChange
 from lifecycle.plan.model import Plan, PlannedNode, PlannedProcess
 from lifecycle.supervisor.control.protocol import ControlRequest, Failed, ProcessState
 from lifecycle.supervisor.core.inputs import Exited
-from lifecycle.supervisor.policy.restart import RestartPolicy
+from lifecycle.supervisor.core.restart import RestartPolicy
 from lifecycle.supervisor.run.events import Failure
 from lifecycle.verify.verdict import Verdict
 
@@ -92,13 +92,27 @@ HOLDS = {
 
 
 class Request(msgspec.Struct, kw_only=True):
-    """The one request to a node that is not answered yet; what it waited without CPU is free."""
+    """The one request to a node that is not answered yet.
+
+    Attributes:
+        limit_s: that the manifest sets; `own_s` more for who keeps it itself and says why.
+        waited_s: of the time since, without CPU: it does not count.
+    """
 
     number: int
     step: Step
     since_s: float
     limit_s: float
+    own_s: float = 0.0
     waited_s: float = 0.0
+
+
+_MANAGED = {
+    TargetState.UNCONFIGURED: (Level.DOWN, Level.STARTED),
+    TargetState.INACTIVE: (Level.DOWN, Level.STARTED, Level.CONFIGURED, Level.CONNECTED),
+    TargetState.ACTIVE: tuple(Level),
+}
+_PLAIN = (Level.DOWN, Level.STARTED, Level.ACTIVE)
 
 
 class Node(msgspec.Struct, kw_only=True):
@@ -107,9 +121,10 @@ class Node(msgspec.Struct, kw_only=True):
     Attributes:
         process: name of its process; empty for one that this supervisor does not start.
         base: how far it was found; it is not taken further down. DOWN for one that we start.
-        wirable: the authority knows how it is to be connected; `wired`: it is.
+        wired: the authority has connected it as it is to be.
         stuck: a request to it was given up; a further one would wait behind it.
         silent: why it cannot be reached; empty while it can.
+        hangs: why its process's watchdog is to end it; empty if it is not.
         renew: it is to go down once, whatever it is wanted to be.
         due_s: it is not started before.
         withheld: why a consequence keeps it inactive until a person lets it through the gate.
@@ -123,11 +138,11 @@ class Node(msgspec.Struct, kw_only=True):
     level: Level = Level.DOWN
     base: Level = Level.DOWN
     request: Request | None = None
-    wirable: bool = True
     wired: bool = False
     healthy: bool = False
     stuck: bool = False
     silent: str = ""
+    hangs: str = ""
     renew: bool = False
     due_s: float = 0.0
     withheld: str = ""
@@ -149,16 +164,14 @@ class Node(msgspec.Struct, kw_only=True):
     def levels(self) -> tuple[Level, ...]:
         """The levels that it has, in order: a plain node is neither configured nor connected."""
         if self.planned.managed:
-            top = {TargetState.UNCONFIGURED: Level.STARTED, TargetState.INACTIVE: Level.CONNECTED}
-            last = top.get(self.planned.state, Level.ACTIVE)
-            return tuple(each for each in Level if each <= last)
-        held = self.planned.holds and self.planned.state is TargetState.ACTIVE
-        return (Level.DOWN, Level.STARTED, *((Level.ACTIVE,) if held else ()))
+            return _MANAGED[self.planned.state]
+        return _PLAIN if self.is_gated else _PLAIN[:-1]
 
     @property
     def gate(self) -> Level:
         """The level at which it waits for the gate, or is left without one."""
-        return max(each for each in self.levels if each < Level.ACTIVE)
+        levels = self.levels
+        return levels[-2] if levels[-1] is Level.ACTIVE else levels[-1]
 
     @property
     def is_gated(self) -> bool:
@@ -189,6 +202,7 @@ class Process(msgspec.Struct, kw_only=True):
     Attributes:
         state: None before it is started, and once nothing is left of it.
         end: how it ended; None while it has not.
+        log: file with its output; empty before it was started.
         sweeping: what it left is being ended, and forgotten by the graph.
         policy: when it is started again, over all of its lives; None before the first.
         by_hand: it is started next by a person, and its failures are forgotten.
@@ -209,6 +223,7 @@ class Process(msgspec.Struct, kw_only=True):
     state: ProcessState | None = None
     pid: int = 0
     end: Exited | None = None
+    log: str = ""
     sweeping: bool = False
     policy: RestartPolicy | None = None
     by_hand: bool = False
@@ -261,6 +276,7 @@ class Order(msgspec.Struct, kw_only=True, frozen=True):
         id: by which it is answered, once.
         node: for RESTART, key or full name; empty for the whole system.
         timeout_s: for APPLY; 0 is as long as a bring-up may take.
+        first: the manifest that it was checked against; None if that is of no account.
     """
 
     id: int
@@ -269,6 +285,7 @@ class Order(msgspec.Struct, kw_only=True, frozen=True):
     mode: str = ""
     plan: Plan | None = None
     timeout_s: float = 0.0
+    first: Plan | None = None
 
 
 class Passage(msgspec.Struct, kw_only=True):
@@ -276,6 +293,7 @@ class Passage(msgspec.Struct, kw_only=True):
 
     Attributes:
         waiting: keys of the nodes; `sent`: of those that were sent their requests.
+        number: of the request that networks are programmed by.
         programming: networks are being programmed with `flows`; `programmed`: they have them.
         opened: the gate is open for the nodes, as far as nothing changes.
         until_s: for so long what changes meanwhile may heal.
@@ -287,6 +305,7 @@ class Passage(msgspec.Struct, kw_only=True):
     until_s: float
     late_s: float
     flows: object = None
+    number: int = 0
     paused: bool = False
     sent: set[str] = msgspec.field(default_factory=set)
     programming: bool = False
@@ -300,7 +319,8 @@ class Attempt(msgspec.Struct, kw_only=True):
     Attributes:
         until_s: when its time is over; it begins anew when all are at the gate.
         at_gate: the nodes have come as far.
-        mark: of the moment at which they had.
+        mark: of the moment at which they had; `since_s`: when that was.
+        said: it was said what the gate waits for.
         judges: the gate is to open; else they are only to come to it.
         activates: nodes are let through; else the system is only verified.
         keys: of those that are, also where an order or a consequence kept them; None for all.
@@ -310,6 +330,8 @@ class Attempt(msgspec.Struct, kw_only=True):
     until_s: float
     at_gate: bool = False
     mark: int = 0
+    since_s: float = NEVER_S
+    said: bool = False
     judges: bool = True
     activates: bool = True
     keys: frozenset[str] | None = None
@@ -325,6 +347,7 @@ class Switch(msgspec.Struct, kw_only=True):
 
     Attributes:
         active: keys of the nodes that were to be active before.
+        given: of those whose parameters are others in this mode.
         to_ask: keys of those that are to be given parameters; `asked`: that have not answered.
         back: the system goes back to the mode before.
     """
@@ -332,7 +355,8 @@ class Switch(msgspec.Struct, kw_only=True):
     mode: str
     before: str
     active: frozenset[str]
-    to_ask: set[str]
+    given: tuple[str, ...] = ()
+    to_ask: set[str] = msgspec.field(default_factory=set)
     asked: set[str] = msgspec.field(default_factory=set)
     back: bool = False
 
@@ -349,6 +373,8 @@ class Change(msgspec.Struct, kw_only=True):
         given: what nodes were asked to take; who did not answer may have taken it.
         taken: the manifest is in force.
         back: the system goes back to the manifest before.
+        state: why the gate stayed closed for the manifest before; empty if it did not.
+        again: what failed meanwhile, and is started again by its policy; empty if nothing.
         ends: what failed of others meanwhile, and ends the run.
     """
 
@@ -358,6 +384,7 @@ class Change(msgspec.Struct, kw_only=True):
     revision: int
     mode: str
     active: frozenset[str]
+    timeout_s: float
     until_s: float
     touched: set[str] = msgspec.field(default_factory=set)
     down: set[str] = msgspec.field(default_factory=set)
@@ -369,6 +396,7 @@ class Change(msgspec.Struct, kw_only=True):
     reason: str = ""
     code: ExitCode = ExitCode.OK
     state: str = ""
+    again: str = ""
     ends: list[Failure] = []
 
 
@@ -378,7 +406,9 @@ class Judged(msgspec.Struct, kw_only=True):
     Attributes:
         verdict: the latest; None before the first.
         mark: of the moment that it is of.
+        waits: something is awaited that may speak against it: it opens nothing.
         again_s: look again then, although nothing is known to have changed.
+        seen_s: when it came.
         since_s: since when its findings are the same, `found`.
         violated: since when each violation lasts.
         counted: the first that lasted, as text; it is in the exit code.
@@ -389,8 +419,10 @@ class Judged(msgspec.Struct, kw_only=True):
 
     verdict: Verdict | None = None
     mark: int = -1
+    waits: bool = False
     looking: bool = False
     again_s: float = NEVER_S
+    seen_s: float = 0.0
     since_s: float = 0.0
     found: frozenset[tuple[str, str]] = frozenset()
     violated: dict[tuple[str, str, str, str], float] = {}
@@ -401,12 +433,17 @@ class Judged(msgspec.Struct, kw_only=True):
 
 
 class Ending(msgspec.Struct, kw_only=True):
-    """Why the run ends: in short, and as the report has it."""
+    """Why the run ends: in short, and as the report has it; `failed`: as nobody asked for.
+
+    `deaths`: how many had died before, and the run went on without them.
+    """
 
     code: ExitCode
     stopping: str
     reason: str
     failures: tuple[Failure, ...] = ()
+    failed: bool = False
+    deaths: int = 0
 
 
 class Options(msgspec.Struct, kw_only=True, frozen=True):
@@ -439,10 +476,18 @@ class Run(msgspec.Struct, kw_only=True):
         first: as it was made from the manifest in force.
         elsewhere: conditions that nodes of other supervisors have reached, by key.
         left: full names of nodes whose supervisor was shut down, and said so.
+        early: keys of the nodes that are configured before any node is wired.
+        broken: what processes are started by, or found by, has died.
+        adopted: full names of nodes that ran before, and are left to who started them.
+        adopting: it has still to be known what runs already; nothing is begun before.
         mark: counts what may change a verdict.
         requests: counts what nodes were asked.
+        came: nodes have come up, and not all are at the gate since; `again`: and not yet judged.
+        undone: how the order under way is answered once what it did is undone.
+        waits_s: since when nodes wait at the gate that nobody asked for; `said`: it was said.
         furthest: "connected", "verified" or "active", as far as it came; empty before.
         held_s: since when it is held; None before it was up.
+        pauses: it is to be said that it is paused, once nothing is active.
         ready: None: it has still to be known whether processes can be started; False: it is asked.
         failures: that end the run, as soon as what is in a step has failed, too, or not.
         fails_s: then it ends all the same.
@@ -457,6 +502,10 @@ class Run(msgspec.Struct, kw_only=True):
     processes: dict[str, Process]
     elsewhere: dict[str, frozenset[Condition]] = {}
     left: frozenset[str] = frozenset()
+    early: frozenset[str] = frozenset()
+    adopted: frozenset[str] = frozenset()
+    adopting: bool = False
+    broken: bool = False
     revision: int = 1
     revisions: int = 1
     mode: str = ""
@@ -464,9 +513,15 @@ class Run(msgspec.Struct, kw_only=True):
     mark: int = 0
     requests: int = 0
     judged: Judged = msgspec.field(default_factory=Judged)
+    came: bool = True
+    again: bool = False
+    undone: tuple[ExitCode, str] | None = None
+    waits_s: float | None = None
+    said: bool = False
     furthest: str = ""
     held_s: float | None = None
     paused: bool = False
+    pauses: bool = False
     attempt: Attempt | None = None
     passage: Passage | None = None
     orders: deque[Order] = msgspec.field(default_factory=deque)
@@ -520,8 +575,9 @@ class Run(msgspec.Struct, kw_only=True):
     def answer(self, code: ExitCode, error: str = "") -> None:
         """Answer the order that is carried out, and be done with it."""
         if self.order is not None:
+            code, error = self.undone or (code, error)
             self.outbox = [*self.outbox, (self.order.id, code, error)]
-        self.order, self.ready = None, None
+        self.order, self.ready, self.undone = None, None, None
 
     def whole(self, keys: Iterable[str]) -> tuple[str, ...]:
         """Return the keys with those of all that comes and goes with these nodes."""
@@ -550,10 +606,16 @@ def new_run(plan: Plan, options: Options, *, own: frozenset[str] | None = None) 
     run.mode = plan.modes[0].name if plan.modes else ""
     install(run, plan, own=own)
     run.elsewhere = {each.key: frozenset() for each in plan.nodes if each.key not in run.nodes}
+    begin(run, options)
+    return run
+
+
+def begin(run: Run, options: Options) -> None:
+    """Have a run of which nothing was started yet be as a person asks."""
     active = options.until is Level.ACTIVE
     judges = active or options.verifies
+    run.options = options
     run.attempt = Attempt(until_s=options.timeout_s, activates=active, judges=judges)
-    return run
 
 
 def install(run: Run, plan: Plan, *, own: frozenset[str] | None = None) -> None:

@@ -182,7 +182,7 @@ class Agreement:
             return  # it left before we came
         others = (each for each in self._known if not notice.replaces(each))
         self._known = [*others, notice][-_MOST:]
-        self._system.touched.set()
+        self._system.touch()
 
     def _different(self) -> Iterator[Finding]:
         ours = "" if self._said is None else self._said.checksum
@@ -203,7 +203,7 @@ class Agreement:
     def _unknown(self, observation: Observation) -> Iterator[Finding]:
         """Yield a finding for each machine that is there and has not said what it planned."""
         seen = {each.full_name for each in observation.nodes}
-        remote = [(each.name, each.planned) for each in self._system.remote.values()]
+        remote = [(each.full_name, each) for each in self._system.remote.values()]
         waits_s: list[float] = []
         for machine in dict.fromkeys(planned.machine for _, planned in remote):
             ours = [(name, planned.run) for name, planned in remote if planned.machine == machine]
@@ -230,7 +230,7 @@ class Agreement:
         if waits_s:
             if self._again is not None:
                 self._again.cancel()
-            self._again = self._loop.call_later(min(waits_s), self._system.touched.set)
+            self._again = self._loop.call_later(min(waits_s), self._system.touch)
 
     def _says(self, machine: str, names: set[str]) -> bool:
         """Whether some notice is of a supervisor that runs the machine, or its nodes."""

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from lifecycle.errors import MiddlewareError
 from lifecycle.graph.loop import set_within
 from lifecycle.manifest.model import RunKind
-from lifecycle.supervisor.control.protocol import Reach
+from lifecycle.supervisor.core.state import Level
 from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.run.events import Notice
 from lifecycle.supervisor.run.failure import ended
@@ -109,9 +109,9 @@ class Answering:
         now_s = asyncio.get_running_loop().time()
         present, liveliness = self._system.present, self._system.liveliness
         for each in self._system.nodes.values():
-            if _is_hosted(each) or each.is_gone or not each.is_up or each.reach is Reach.STOPPED:
+            if each.is_hosted or each.is_gone or not _is_tried(each):
                 continue
-            if each.doing and each.reach is not Reach.WAITING:
+            if each.doing and each.core.level is not Level.DOWN:
                 continue  # it answers after its transition
             if present is not None and each.name not in present:
                 continue
@@ -177,12 +177,13 @@ class Answering:
             return None
 
 
-def _is_hosted(node: NodeRun) -> bool:
-    return node.process is not None and node.process.planned.run.kind is RunKind.PYTHON
+def _is_tried(node: NodeRun) -> bool:
+    """Whether a node is up, or may be there unseen: a command says nothing of itself."""
+    command = node.planned.run.kind is RunKind.COMMAND and not node.planned.managed
+    process = node.process
+    return node.is_up or (command and process is not None and process.pid != 0)
 
 
 def _is_asked(node: NodeRun) -> bool:
     """Whether a node is up, and in no host of ours; one in a transition answers after it."""
-    if _is_hosted(node):
-        return False
-    return node.reach not in (Reach.WAITING, Reach.STOPPED) and not node.doing
+    return not node.is_hosted and node.core.level is not Level.DOWN and not node.doing

@@ -3,7 +3,7 @@
 Owns: `SilenceMonitor`, which turns what is noticed of processes and machines into events, findings
 and the status of nodes. Nothing here waits or asks: the kernel says that a process was stopped or
 that an executor hangs (middleware/process/busy_sign.py), DDS that a machine is lost. A process
-that ended is not silent but dead, see process_monitor.py. Must not import rclpy.
+that ended is not silent but dead: shell/processes.py. Must not import rclpy.
 """
 
 from __future__ import annotations

@@ -80,7 +80,7 @@ class PeerSupervisors:
         plan = self._system.plan
         remote: dict[str, list[str]] = {}
         for each in self._system.remote.values():
-            remote.setdefault(each.planned.machine, []).append(each.name)
+            remote.setdefault(each.machine, []).append(each.full_name)
         for machine, nodes in remote.items():
             if machine:
                 what = f"the supervisor of machine {machine!r}"

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING
 
+from lifecycle.plan.model import Plan
 from lifecycle.printable import one_line
 from lifecycle.run_directory import start_ticks
 from lifecycle.supervisor.nodes.system import NodeRun, System
@@ -64,7 +65,9 @@ def ran_before(
     )
 
 
-async def adopt(system: System, participant: ObserverParticipant) -> tuple[Finding, ...]:
+async def adopt(
+    system: System, participant: ObserverParticipant
+) -> tuple[Plan, tuple[Finding, ...]]:
     """Take the nodes of a system that run already as if its manifest attached to them.
 
     Args:
@@ -72,7 +75,8 @@ async def adopt(system: System, participant: ObserverParticipant) -> tuple[Findi
         participant: shows what runs.
 
     Returns:
-        A finding for each node that runs more than once; nothing is adopted then.
+        The plan that attaches to them, and a finding for each node that runs more than once;
+        nothing is adopted then.
 
     Raises:
         StepFailedError: of a process with several nodes only some run.
@@ -83,8 +87,8 @@ async def adopt(system: System, participant: ObserverParticipant) -> tuple[Findi
     count = {each.full_name: each.count for each in nodes}
     found = {key: node for key, node in system.nodes.items() if node.name in count}
     if twice := [each for each in found.values() if count[each.name] > 1]:
-        return tuple(_runs_twice(each, count[each.name]) for each in twice)
-    for process in system.processes.values():
+        return system.plan, tuple(_runs_twice(each, count[each.name]) for each in twice)
+    for process in system.run.processes.values():
         missing = [key for key in process.planned.nodes if key not in found]
         if 0 < len(missing) < len(process.planned.nodes):
             name = system.nodes[missing[0]].name
@@ -97,8 +101,8 @@ async def adopt(system: System, participant: ObserverParticipant) -> tuple[Findi
     if not found:
         system.emit(Notice(message="nothing is adopted: no node of the manifest runs yet"))
     processes = participant.processes()
-    system.adopt({key: _where(processes.get(each.name, {})) for key, each in found.items()})
-    return ()
+    where = {key: _where(processes.get(each.name, {})) for key, each in found.items()}
+    return system.adopt(where), ()
 
 
 def _runs_twice(node: NodeRun, count: int) -> Finding:

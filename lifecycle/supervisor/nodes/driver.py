@@ -1,13 +1,12 @@
 """Drives one managed node: over our control channel, or through its lifecycle services.
 
 Owns: `NodeDriver`, of two kinds. Deadlines are the caller's: every call may be cancelled. The order
-of operations is bring_up.py's. Must not import rclpy at run time.
+of operations is the core's. Must not import rclpy at run time.
 """
 
 from __future__ import annotations
 
 import asyncio
-import functools
 from collections.abc import Awaitable
 from typing import TYPE_CHECKING
 
@@ -16,12 +15,12 @@ import msgspec
 from lifecycle.errors import BringUpError, MiddlewareError
 from lifecycle.node.host.control import Command, Operation
 from lifecycle.plan.model import PlannedNode
-from lifecycle.supervisor.gate.gate import Permit
 from lifecycle.supervisor.processes.control_channel import ControlChannel
 from lifecycle.verify.observation import NodeConfiguration
 
 if TYPE_CHECKING:
     from lifecycle.middleware.services.clients import NodeClients
+    from lifecycle.supervisor.shell.permit import Permit
 
 ACTIVE = "active"
 INACTIVE = "inactive"
@@ -220,7 +219,7 @@ class ServiceDriver(NodeInterfaceClient):
         wanted, reason, asked, accepted = _REACHED[operation], "it is", False, False
         for _ in range(_TRIES):
             if state == wanted and operation is Operation.ACTIVATE and permit is not None:
-                await permit.use(self._node)
+                await permit.use()
                 # The gate may have had it deactivated meanwhile.
                 state = await self._settled(limit_s)
             if state == wanted:
@@ -253,7 +252,7 @@ class ServiceDriver(NodeInterfaceClient):
             self._node,
             operation.value,
             timeout_s=limit_s,
-            before=functools.partial(permit.use, self._node),
+            before=permit.use,
         )
 
     def _active_again(self) -> ActiveError:

@@ -1,260 +1,172 @@
-"""The running system: its processes and nodes, and how far each has been brought up.
+"""What is known of the processes and nodes of one supervisor, beside what the core decides by.
 
-Owns: `System`, `NodeRun` and the waits on "this node has reached that condition"; and `RemoteNode`,
-the same for a node that another supervisor brings up on another machine, as far as the graph and
-its own report show. What is done with them is bring_up.py's, gate/hold.py's and run/shutdown.py's.
-Must not import rclpy.
+Owns: `System` and `NodeRun`: processes with their channels and logs, drivers, what nodes report of
+themselves. How far a node is, and what it is to be, is the core's (`core.state.Run`): here it is
+only read. Must not import rclpy.
 """
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
 from lifecycle.errors import BringUpError
-from lifecycle.manifest.model import Condition, RunKind, TargetState
+from lifecycle.manifest.model import Condition, RosArguments, RunKind, TargetState
 from lifecycle.node.host.control import Event as HostEvent
-from lifecycle.node.host.control import Operation
 from lifecycle.plan.build import attached_to
-from lifecycle.plan.model import Plan, PlannedNode, PlannedProcess, in_mode
-from lifecycle.supervisor.control.protocol import Reach
-from lifecycle.supervisor.gate.gate import Permit
+from lifecycle.plan.model import Plan, PlannedNode, PlannedProcess
+from lifecycle.plan.parameters import DEFAULT
+from lifecycle.supervisor.control.protocol import ProcessState, Reach
+from lifecycle.supervisor.core import failure
+from lifecycle.supervisor.core.state import Level, Node, Options, Run, new_run
 from lifecycle.supervisor.health.liveliness import SilenceMonitor
 from lifecycle.supervisor.nodes.driver import ACTIVE, INACTIVE, NodeCondition, NodeDriver
 from lifecycle.supervisor.processes.fork_server_main import GRACE_S
 from lifecycle.supervisor.processes.logs import LogDirectory
 from lifecycle.supervisor.processes.process import ManagedProcess, own_run_delay_s
-from lifecycle.supervisor.run.events import Emitter, NodeChanged, Notice, RequestSent
-from lifecycle.verify.observation import HealthReport, NodeConfiguration, Observation
+from lifecycle.supervisor.run.events import Emitter, NodeChanged, Notice
+from lifecycle.verify.observation import HealthReport, NodeConfiguration
 from lifecycle.verify.rules.health import health_of
 
 if TYPE_CHECKING:
     from lifecycle.graph.graph import Graph
-    from lifecycle.supervisor.gate.verification_loop import ChangeCounter
-
-ASK_AGAIN_S = 0.2
-"""A remote node is asked again so long after, because the event that it connected may be missed:
-its announcer may not be matched yet."""
-
-
-class RemoteNode:
-    """One node that another supervisor brings up.
-
-    Attributes:
-        reached: every condition that holds as of the last look.
-        awaited: the last one that others may wait for.
-        changed: replaced and set when `reached` changes.
-    """
-
-    def __init__(self, planned: PlannedNode) -> None:
-        self.planned = planned
-        self.awaited = Condition.ACTIVE if planned.health is None else Condition.HEALTHY
-        self.reached: frozenset[Condition] = frozenset()
-        self.changed = asyncio.Event()
-
-    @property
-    def name(self) -> str:
-        """Fully qualified node name."""
-        return self.planned.full_name
-
-    def has_reached(self, condition: Condition) -> bool:
-        """Whether the condition holds; for a node that is not managed all follow its start."""
-        return condition in self.reached
-
-    def see(self, observation: Observation) -> None:
-        """Take what was seen, and notify who waits."""
-        reached = frozenset(_conditions(self.planned, observation))
-        if reached != self.reached:
-            self.reached = reached
-            self.changed.set()
-            self.changed = asyncio.Event()
-
-
-async def follow_remote(system: System, observer: Graph, changes: ChangeCounter) -> None:
-    """Look at every change, until the remote nodes that others wait for have reached everything."""
-    nodes = system.awaited()
-    # Ours report by themselves: only these have to be asked.
-    plan = replace(system.plan, nodes=tuple(each.planned for each in nodes))
-    while not all(each.has_reached(each.awaited) for each in nodes):
-        count = changes.count
-        observation = await observer.observe(plan)
-        for each in nodes:
-            each.see(observation)
-        # One that was not there at all announces itself.
-        there = any(each.reached for each in nodes)
-        await changes.beyond(count, ASK_AGAIN_S if there else None)
-
-
-async def follow_health(system: System, observer: Graph, changes: ChangeCounter) -> None:
-    """Take from the graph the health that others wait for, where no host of ours reports all.
-
-    It looks at every change, until it is cancelled; it returns at once if nobody waits so.
-    """
-    keys = {
-        after.node
-        for node in system.nodes.values()
-        for after in node.planned.after
-        if after.condition is Condition.HEALTHY
-    }
-    awaited = [each for key, each in system.nodes.items() if key in keys]
-    awaited = [each for each in awaited if not each.reports_health]
-    if not awaited:
-        return
-    plan = replace(system.plan, nodes=tuple(each.planned for each in awaited))
-    while True:
-        count = changes.count
-        observation = await observer.observe(plan)
-        own = {each.name: _own_health(each) for each in observation.configurations}
-        published = {each.full_name: each.health for each in observation.nodes}
-        for each in awaited:
-            each.health = own.get(each.name), published.get(each.name)
-            each.wake()
-        await changes.beyond(count, ASK_AGAIN_S)
-
-
-def _conditions(planned: PlannedNode, observation: Observation) -> Iterable[Condition]:
-    name = planned.full_name
-    observed = next((each for each in observation.nodes if each.full_name == name), None)
-    if observed is None:
-        return ()
-    report = next((each for each in observation.configurations if each.name == name), None)
-    up_to_active = (Condition.STARTED, Condition.CONFIGURED, Condition.CONNECTED, Condition.ACTIVE)
-    said = health_of(planned, _own_health(report), observed.health)
-    healthy = (Condition.HEALTHY,) if said.ok else ()
-    if not planned.managed:
-        return (*up_to_active, *healthy)
-    state = observed.state or (report.state if report is not None else "")
-    if state == ACTIVE:
-        return (*up_to_active, *healthy)
-    if state != INACTIVE:
-        return (Condition.STARTED,)
-    # A node that is not ours makes its data layer in configure, and has no such report.
-    if report is None or report.connected:
-        return (Condition.STARTED, Condition.CONFIGURED, Condition.CONNECTED)
-    return (Condition.STARTED, Condition.CONFIGURED)
-
-
-_ORDER = list(Reach)
-
 
 _NOT_ANSWERED = HealthReport(ok=None, message="it has not answered since its state changed")
 
-
-def _own_health(report: NodeConfiguration | None) -> HealthReport | None:
-    """Return what a node says of itself; what it said while it was inactive is no answer."""
-    return None if report is None or report.state == INACTIVE else report.health
-
-
-_CONDITIONS = {
-    Condition.STARTED: Reach.STARTED,
-    Condition.CONFIGURED: Reach.CONFIGURED,
-    Condition.CONNECTED: Reach.CONNECTED,
-    Condition.ACTIVE: Reach.ACTIVE,
-    Condition.HEALTHY: Reach.ACTIVE,
+_REACHES = {
+    Level.STARTED: Reach.STARTED,
+    Level.CONFIGURED: Reach.CONFIGURED,
+    Level.CONNECTED: Reach.CONNECTED,
+    Level.ACTIVE: Reach.ACTIVE,
 }
-
-_REPORTING = {
-    True: (Reach.CONFIGURED, Reach.CONNECTED, Reach.ACTIVE),
-    False: (Reach.STARTED, Reach.ACTIVE),
-}
-"""How far a node has come that has something to report, by whether it is managed."""
 
 _REFRESH_S = 1.0
 """A host answers from its executor within a millisecond; this long it is busy or hung."""
 
 
 class NodeRun:
-    """One node of the plan as it runs.
+    """One node of this supervisor as it runs.
 
     Attributes:
-        driver: None for a node that nothing holds.
-        process: None for a node that this supervisor does not start.
-        reach: how far it is brought up.
-        doing: what it does or waits for at this moment, for messages; empty when nothing.
-        undo: what has to be undone, oldest first.
-        permit: the gate's, of the activate that is in `undo`; None for what needed none.
-        stuck: an operation on it was given up: a polite request would wait behind it.
+        core: what is decided by of it: how far it is, its request.
+        driver: None for a node that nothing holds, or that is not there.
+        state: lifecycle_msgs/State label; empty for a node that is not managed.
+        connected: its data layer is made.
+        configuration: what it reports of itself; None before it does.
         connections: names of what the authority connected it to, oldest first.
         found: state in which it was adopted, `running` for one that is not managed; empty for one
             that is not adopted.
         reports_changes: its host reports unasked when its configuration changes.
         unload: has its container unload a component; None for what is not loaded into one.
-        is_up: it was started and brought as far as its gate; cleared when it goes down.
+        told: the step of wiring that it is asked for just now; empty when none.
         health: what it, and /diagnostics of it, was seen to say of it in the graph.
-        withheld: why a consequence of a violation keeps it inactive, until a person lets it through
-            the gate again; empty if none does.
     """
 
-    def __init__(self, planned: PlannedNode, emit: Emitter) -> None:
-        self.planned = planned
-        self.reach = Reach.WAITING
+    def __init__(self, system: System, core: Node) -> None:
+        self.core = core
         self.found = ""
-        self.withheld = ""
-        self.changed = asyncio.Event()
-        self._emit = emit
-        self._begin(None)
+        self._system = system
+        self._said = NodeChanged(node=core.name, reach=Reach.WAITING)
+        self.begin()
 
-    def _begin(self, process: ManagedProcess | None) -> None:
+    def begin(self) -> None:
+        """Know nothing of it: it is started anew, or its process has ended."""
         self.driver: NodeDriver | None = None
-        self.process = process
         self.state = ""
         self.connected = False
         self.configuration: NodeConfiguration | None = None
-        self.doing = ""
-        self.undo: list[Operation] = []
-        self.permit: Permit | None = None
-        self.stuck = False
         self.connections: tuple[str, ...] = ()
         self.reports_changes = False
         self.unload: Callable[[], Awaitable[None]] | None = None
-        self.is_up = False
+        self.told = ""
         self.health: tuple[HealthReport | None, HealthReport | None] = (None, None)
 
-    def renew(self, process: ManagedProcess | None) -> None:
-        """Begin again, in a new process, after the node was taken down."""
-        self._begin(process)
-        self.advance(Reach.WAITING)
-
     @property
-    def is_let_through(self) -> bool:
-        """Whether it was asked to activate: waiting for its turn is not enough."""
-        asked = self.permit is None or self.name in self.permit.sent
-        return Operation.ACTIVATE in self.undo and asked
+    def planned(self) -> PlannedNode:
+        """As the plan has it now."""
+        return self.core.planned
 
     @property
     def name(self) -> str:
         """Fully qualified node name."""
-        return self.planned.full_name
+        return self.core.name
+
+    @property
+    def process(self) -> ManagedProcess | None:
+        """Its process; None before it is started, and for one that this supervisor does not."""
+        return self._system.processes.get(self.core.process)
+
+    @property
+    def is_hosted(self) -> bool:
+        """Whether it is in a host of ours."""
+        return bool(self.core.process) and self.planned.run.kind is RunKind.PYTHON
+
+    @property
+    def is_gone(self) -> bool:
+        """Whether its process has ended."""
+        process = self._system.run.processes.get(self.core.process)
+        return process is not None and process.end is not None
+
+    @property
+    def reach(self) -> Reach:
+        """How far it is brought up, as people and clients read it."""
+        run, level = self._system.run, self.core.level
+        if level is not Level.DOWN:
+            return _REACHES[level]
+        process = run.process_of(self.core)
+        stays = run.ending is not None or (process is not None and process.stays_down)
+        was_up = self._said.reach is not Reach.WAITING
+        return Reach.STOPPED if stays and was_up else Reach.WAITING
+
+    @property
+    def doing(self) -> str:
+        """What it does or waits for at this moment, for messages; empty when nothing."""
+        what = failure.doing(self._system.run, self.core)
+        if what.endswith(f"is {Condition.HEALTHY.value}"):
+            keys = (each.node for each in self.planned.after if each.condition is Condition.HEALTHY)
+            others = (self._system.nodes[key] for key in keys if key in self._system.nodes)
+            what += next((each.unhealthy_reason for each in others if each.unhealthy_reason), "")
+        return f"told to {self.told}" if self.told else what
+
+    @property
+    def is_up(self) -> bool:
+        """Whether it was brought as far as its gate."""
+        return self.core.level >= self.core.gate
 
     @property
     def is_to_be_active(self) -> bool:
         """Whether the gate is to activate it."""
         return self.planned.holds and self.planned.state is TargetState.ACTIVE
 
-    @property
-    def pid(self) -> int:
-        """Its process; 0 if that was not started by this supervisor."""
-        return 0 if self.process is None else self.process.pid
-
-    @property
-    def is_gone(self) -> bool:
-        """Whether its process has ended, as far as that is noticed."""
-        return self.process is not None and self.process.is_gone
-
     def run_delay_s(self) -> float:
         """Return the run delay of its process and ours, seconds: ready to run, but without CPU."""
         return own_run_delay_s() if self.process is None else self.process.run_delay_s()
 
     @property
+    def is_to_be_given(self) -> bool:
+        """Whether its command line cannot give it all of its parameters, see `command_line`."""
+        planned, process = self.planned, self.process
+        empty = [each for each in planned.expected_parameters if each.value == ()]
+        if planned.run.component and empty:
+            return True
+        if process is None or planned.run.kind is not RunKind.COMMAND:
+            return False
+        if planned.run.ros_args is RosArguments.NONE:
+            return bool(planned.parameters or planned.parameter_files)
+        if planned.mode_parameters or any(each.source != DEFAULT for each in empty):
+            return True  # it may come again in another mode; rcl reads no empty array
+        shared = len(process.planned.nodes) > 1
+        return shared and planned.namespace != "/" and bool(planned.parameters)
+
+    @property
     def reports_health(self) -> bool:
         """Whether its host reports all that the manifest asks of its health."""
         asked = self.planned.health
-        ours = self.process is not None and self.process.channel is not None
-        return asked is None or (ours and not asked.diagnostics)
+        return asked is None or (self.is_hosted and not asked.diagnostics)
 
     @property
     def _known_health(self) -> HealthReport:
@@ -272,25 +184,12 @@ class NodeRun:
     def unhealthy_reason(self) -> str:
         """What is wrong with it, for messages; empty if nothing, or it is not active."""
         said = self._known_health.message
-        return f": {said}" if said and self.reach is Reach.ACTIVE else ""
+        return f": {said}" if said and self.core.level is Level.ACTIVE else ""
 
-    def has_reached(self, condition: Condition) -> bool:
-        """Whether the condition holds; for a node that is not managed all follow its start."""
-        if self.reach is Reach.STOPPED:
-            return False
-        if condition is Condition.HEALTHY and not self.is_healthy:
-            return False
-        if not self.planned.managed:
-            return self.reach is not Reach.WAITING
-        return _ORDER.index(self.reach) >= _ORDER.index(_CONDITIONS[condition])
-
-    def advance(self, reach: Reach, condition: NodeCondition | None = None) -> None:
-        """Note that the node reached `reach`, and notify its listeners and waiters."""
-        self.reach = reach
-        if condition is not None:
-            self._take(condition.state, connected=condition.connected)
-            self.learn(condition.configuration)
-        self._tell()
+    def take(self, condition: NodeCondition) -> None:
+        """Take what it said of itself in a reply."""
+        self.report(condition.state, connected=condition.connected)
+        self.learn(condition.configuration)
 
     def learn(self, configuration: NodeConfiguration | None) -> None:
         """Take a configuration that was asked for; None is nothing to take.
@@ -303,24 +202,8 @@ class NodeRun:
 
     def report(self, state: str, *, connected: bool) -> None:
         """Note a state that the node itself reported, asked by us or by others."""
-        if (state, connected) != (self.state, self.connected):
-            self._take(state, connected=connected)
-            self._tell()
-
-    async def perform(self, operation: Operation, permit: Permit | None = None) -> NodeCondition:
-        """Send one operation to a managed node.
-
-        Raises:
-            BringUpError: the node refused, failed or cannot be reached.
-            VerificationError: what changed since the permit's verdict does not allow it.
-        """
-        assert self.driver is not None
-        if permit is not None:
-            await permit.renewed()
-        self._emit(RequestSent(node=self.name, operation=operation))
-        return await self.driver.perform(operation, permit)
-
-    def _take(self, state: str, *, connected: bool) -> None:
+        if (state, connected) == (self.state, self.connected):
+            return
         self.state, self.connected = state, connected
         known = self.configuration
         if known is not None:
@@ -328,19 +211,16 @@ class NodeRun:
             stale = known.health is not None and known.state != state
             health = _NOT_ANSWERED if stale else known.health
             self.configuration = replace(known, state=state, connected=connected, health=health)
+        self.say()
 
-    def _tell(self) -> None:
-        self._emit(
-            NodeChanged(
-                node=self.name, reach=self.reach, state=self.state, connected=self.connected
-            )
+    def say(self) -> None:
+        """Say how far it is, where that is new."""
+        now = NodeChanged(
+            node=self.name, reach=self.reach, state=self.state, connected=self.connected
         )
-        self.wake()
-
-    def wake(self) -> None:
-        """Have those look again that wait for it."""
-        self.changed.set()
-        self.changed = asyncio.Event()
+        if now != self._said:
+            self._said = now
+            self._system.emit(now)
 
 
 class System:
@@ -352,19 +232,19 @@ class System:
         logs: the directory of the processes' log files.
 
     Attributes:
-        logs: likewise, with what could not be written there.
+        run: what is decided by; changed by the supervisor's loop alone.
+        nodes: by key.
+        processes: by name, those that were started; the last one of each name.
+        remote: the plan's other nodes, which another supervisor brings up, by key.
         machines: those whose nodes it brings up; None if that is all of them.
-        remote: the plan's other nodes, which another supervisor brings up.
+        logs: likewise, with what could not be written there.
         adopts: takes nodes that others started as they are found, active ones too.
         adopted: the nodes that ran before it, by full name, with the process that each is in as
             people read it; empty where that is not known.
-        touched: set whenever a node reported something of itself: time to judge again.
-        mode: name of the one that it is in, or is on its way to; empty for a plan without modes.
+        on_change: called whenever something is not as it was judged: time to judge again.
+        on_health: likewise with a node that may be as healthy as others wait for.
         liveliness: which nodes are silent.
         present: names of the nodes that are in the graph; None before it was first looked at.
-        first: the plan as it was made from the manifest in force, without what became of it since.
-        revision: number of that manifest, 1 for the one that the run began with; one that is taken
-            later has a number of its own, also if it is given back.
         server: the discovery server, where this supervisor runs one.
         expected: the plan as it must be seen now; where the data layer is negotiated while the
             system runs, it follows.
@@ -379,41 +259,71 @@ class System:
         processes: Iterable[PlannedProcess],
         variables: tuple[tuple[str, str], ...] = (),
     ) -> None:
-        self.first = plan
-        self.revision = self._last_revision = 1
-        self.plan = plan
+        own = tuple(processes)
+        self.run: Run = new_run(plan, Options(), own=frozenset(each.name for each in own))
         self.expected = plan
-        self.mode = plan.modes[0].name if plan.modes else ""
         self.server: ManagedProcess | None = None
         self.emit = emit
-        own = tuple(processes)
         self.logs = LogDirectory(logs, lambda text: emit(Notice(message=text)))
         self._variables = variables
-        self.processes = {
-            each.name: self.make_process(each)
-            for each in own
-            if each.run.kind is not RunKind.ATTACH
-        }
-        self.nodes = {
-            key: NodeRun(plan.node(key), emit) for process in own for key in process.nodes
-        }
-        for process in self.processes.values():
-            for key in process.planned.nodes:
-                self.nodes[key].process = process
-        self.remote = {
-            node.key: RemoteNode(node) for node in plan.nodes if node.key not in self.nodes
-        }
+        self.processes: dict[str, ManagedProcess] = {}
+        self.nodes: dict[str, NodeRun] = {}
+        self.remote = {key: plan.node(key) for key in self.run.elsewhere}
         self.machines = frozenset(each.machine for each in own) if self.remote else None
-        self._by_name = {node.name: node for node in self.nodes.values()}
+        self._by_name: dict[str, NodeRun] = {}
         self.adopts = False
         self.adopted: dict[str, str] = {}
-        self.touched = asyncio.Event()
+        self.on_change: Callable[[], None] = lambda: None
+        self.on_health: Callable[[NodeRun], None] = lambda _: None
         self.present: frozenset[str] | None = None
-        self.liveliness = SilenceMonitor(emit, self.touched.set, self._is_there)
+        self.liveliness = SilenceMonitor(emit, self.touch, self._is_there)
+        self.follow()
 
-    def _may_end(self, planned: PlannedProcess) -> bool:
-        nodes = [self.plan.node(key) for key in planned.nodes]
-        return bool(nodes) and all(each.may_end for each in nodes)
+    @property
+    def plan(self) -> Plan:
+        """As it must be now: in its mode, with the ports of what was started again."""
+        return self.run.plan
+
+    @property
+    def first(self) -> Plan:
+        """As it was made from the manifest in force, without what became of it since."""
+        return self.run.first
+
+    @property
+    def mode(self) -> str:
+        """Name of the mode that it is in, or is on its way to; empty for a plan without modes."""
+        return self.run.mode
+
+    @property
+    def revision(self) -> int:
+        """Number of the manifest in force; 1 for the one that the run began with."""
+        return self.run.revision
+
+    def mode_by(self, plan: Plan) -> str:
+        """Return the mode that it would be in by another manifest: the same, if that has it."""
+        names = [each.name for each in plan.modes]
+        return self.mode if self.mode in names else next(iter(names), "")
+
+    def touch(self) -> None:
+        """Note that something may be other than it was judged."""
+        self.on_change()
+
+    def follow(self) -> None:
+        """Have nodes and processes be those of the run, as another manifest has others."""
+        run = self.run
+        if run.nodes.keys() == self.nodes.keys() and all(
+            self.nodes[key].core is core for key, core in run.nodes.items()
+        ):
+            return
+        known = self.nodes
+        self.nodes = {
+            key: known[key] if key in known and known[key].core is core else NodeRun(self, core)
+            for key, core in run.nodes.items()
+        }
+        self._by_name = {node.name: node for node in self.nodes.values()}
+        self.processes = {
+            name: each for name, each in self.processes.items() if name in run.processes
+        }
 
     def make_process(self, planned: PlannedProcess) -> ManagedProcess:
         """Return a process of this run, not yet started."""
@@ -424,13 +334,6 @@ class System:
             emit=self.emit,
             variables=self._variables,
             nodes={each.full_name: each.key for each in nodes},
-            may_end=self._may_end(planned),
-            carries=[
-                each.full_name
-                for each in self.plan.nodes
-                if each.key in planned.nodes
-                or (each.run.component and each.run.container in planned.nodes)
-            ],
             # A host of ours deactivates its nodes and shuts them down.
             grace_s=GRACE_S
             + sum(
@@ -440,27 +343,49 @@ class System:
             ),
         )
 
-    def over(self) -> dict[str, str]:
-        """Return how the process ended of each node that has ended by itself as it may."""
-        return {
-            node.name: str(node.process.ended.result())
+    def carried_by(self, process: str) -> tuple[NodeRun, ...]:
+        """Return the nodes that are gone with a process, loaded components included."""
+        run = self.run
+        return tuple(
+            node
             for node in self.nodes.values()
-            if node.process is not None and node.process.is_over
-        }
-
-    def _is_there(self, name: str) -> bool:
-        """Whether a node has started, and is in the graph as far as that is known."""
-        node = self._by_name.get(name)
-        if node is not None and node.reach in (Reach.WAITING, Reach.STOPPED):
-            return False
-        return self.present is None or name in self.present
+            if node.core.process == process
+            or (
+                (found := run.process_of(node.core)) is not None
+                and found.name == process
+                and node.planned.run.component
+            )
+        )
 
     def node_named(self, name: str) -> NodeRun | None:
         """Return the node with this fully qualified name."""
         return self._by_name.get(name)
 
-    def adopt(self, running: Mapping[str, str]) -> None:
-        """Leave nodes to who started them: none of them is started, nor ended.
+    def over(self) -> dict[str, str]:
+        """Return how the process ended of each node that has ended by itself as it may."""
+        found = {}
+        for node in self.nodes.values():
+            process = self.run.processes.get(node.core.process)
+            if process is not None and process.is_over and process.end is not None:
+                found[node.name] = process.end.text
+        return found
+
+    def dead(self) -> frozenset[str]:
+        """Return the names of the nodes whose process has ended.
+
+        Discovery shows them until their lease runs out.
+        """
+        return frozenset(node.name for node in self.nodes.values() if node.is_gone)
+
+    def _is_there(self, name: str) -> bool:
+        """Whether a node has started, and is in the graph as far as that is known."""
+        node = self._by_name.get(name)
+        if node is not None and node.core.level is Level.DOWN:
+            return False
+        return self.present is None or name in self.present
+
+    def adopt(self, running: Mapping[str, str]) -> Plan:
+        """Leave nodes to who started them; return the plan that attaches to them.
 
         Args:
             running: by key, the process that each is in as people read it; of the processes that
@@ -468,102 +393,24 @@ class System:
         """
         self.adopts = True
         for key, where in running.items():
-            node = self.nodes[key]
-            self.adopted[node.name] = where
-            if node.process is not None:
-                self.processes.pop(node.process.name, None)
-                node.process = None
-        self.replan(attached_to(self.plan, running))
+            self.adopted[self.nodes[key].name] = where
+        return attached_to(self.plan, running)
 
-    def replan(self, plan: Plan) -> None:
-        """Take a plan whose participants are connected otherwise; running nodes do not notice."""
-        self.plan = self.expected = plan
-        for key, node in self.nodes.items():
-            node.planned = plan.node(key)
-
-    def enter(self, mode: str) -> None:
-        """Have nodes be as a mode of the plan says; running nodes do not notice."""
-        self.mode = mode
-        self.replan(in_mode(self.plan, mode))
-
-    def mode_by(self, plan: Plan) -> str:
-        """Return the mode that it would be in by another manifest: the same, if that has it."""
-        names = [each.name for each in plan.modes]
-        return self.mode if self.mode in names else next(iter(names), "")
-
-    def take(
-        self, plan: Plan, nodes: Collection[NodeRun], revision: int | None = None
-    ) -> tuple[NodeRun, ...]:
-        """Take another manifest's plan; what of it reaches processes may differ for `nodes` alone.
-
-        Args:
-            plan: of which all nodes are this supervisor's.
-            nodes: those that were taken down, with all of their processes.
-            revision: of one that was in force before; None for a new one.
-
-        Returns:
-            The nodes to bring up in their place.
-        """
-        adopted = {each.key for each in plan.nodes if each.full_name in self.adopted}
-        if revision is None:
-            revision = self._last_revision = self._last_revision + 1
-        self.revision = revision
-        ran, self.first = self.first, plan
-        self.mode = self.mode_by(plan)
-        down = {each.planned.key: each for each in nodes}
-        stay = {key: each for key, each in self.nodes.items() if key not in down}
-        taken = _connected_as(attached_to(in_mode(plan, self.mode), adopted), stay, ran)
-        self.plan = self.expected = taken
-        kept = {each.process.name: each.process for each in stay.values() if each.process}
-        self.nodes, self.processes = {}, {}
-        for process in taken.processes:
-            managed = kept.get(process.name)
-            if managed is None and process.run.kind is not RunKind.ATTACH:
-                managed = self.make_process(process)
-            elif managed is not None:
-                # What it would be started with again: parameters may have been set since.
-                managed.planned = process
-                managed.may_end = self._may_end(process)
-            if managed is not None:
-                self.processes[process.name] = managed
-            for key in process.nodes:
-                if key in stay:
-                    self.nodes[key] = stay[key]
-                    stay[key].planned = self.plan.node(key)
-                    continue
-                node = self.nodes[key] = NodeRun(self.plan.node(key), self.emit)
-                node.process = managed
-                node.advance(Reach.WAITING)
-        self._by_name = {node.name: node for node in self.nodes.values()}
-        return tuple(each for key, each in self.nodes.items() if key not in stay)
-
-    def renew(self, nodes: Iterable[NodeRun]) -> None:
-        """Let nodes that were taken down, with all of their processes, be brought up again."""
-        processes: dict[str, ManagedProcess] = {}
-        for node in nodes:
-            old = node.process
-            if old is not None and old.name not in processes:
-                processes[old.name] = self.make_process(old.planned)
-                processes[old.name].is_restarted = True
-            node.renew(None if old is None else processes[old.name])
-        self.processes.update(processes)
+    def note_found(self, node: NodeRun, state: str) -> None:
+        """Note, and say, how a node was found that others started and that is adopted."""
+        others = not node.core.process and not node.planned.run.component
+        if not self.adopts or not others or node.found:
+            return
+        node.found = state
+        where = self.adopted.get(node.name)
+        message = f"{node.name!r} is adopted, found {state}" + (f": {where}" if where else "")
+        self.emit(Notice(message=message))
 
     @property
     def living(self) -> tuple[ManagedProcess, ...]:
         """Every process that was started and has not ended, the discovery server included."""
         every = (*self.processes.values(), *(() if self.server is None else (self.server,)))
-        return tuple(each for each in every if each.pid and not each.is_gone)
-
-    def dead(self) -> frozenset[str]:
-        """Return the names of the nodes whose process has ended.
-
-        Discovery shows them until their lease runs out, 20 s by default.
-        """
-        return frozenset(
-            node.name
-            for node in self.nodes.values()
-            if node.process is not None and node.process.is_gone
-        )
+        return tuple(each for each in every if each.pid and not each.ended.done())
 
     def on_host_event(self, event: HostEvent) -> None:
         """Take a host's event about one of its nodes, in the order in which it comes.
@@ -575,50 +422,14 @@ class System:
         if node is None:
             return
         if event.configuration is not None:
-            before = node.configuration
             node.configuration = event.configuration
             reports = event.kind == "configuration" or event.reports
             node.reports_changes = node.reports_changes or reports
-            if before is not None and before.health != event.configuration.health:
-                node.wake()
-        if event.kind == "reply":
-            if event.reports:
-                self.touched.set()
-            return
-        if event.state:
+        if event.kind != "reply" and event.state:
             node.report(event.state, connected=event.connected)
-        self.touched.set()
-
-    async def reached(self, node: NodeRun, condition: Condition, step: str) -> None:
-        """Wait until everything that holds `step` of `node` has reached `condition`.
-
-        The wait has no deadline of its own: the nodes waited for have theirs, and so has the
-        whole bring-up.
-        """
-        for after in node.planned.after:
-            if after.condition is not condition:
-                continue
-            other = self.nodes.get(after.node) or self.remote[after.node]
-            while not other.has_reached(condition):
-                node.doing = f"waits to {step} until {other.name} is {condition.value}"
-                if condition is Condition.HEALTHY and isinstance(other, NodeRun):
-                    node.doing += other.unhealthy_reason
-                await other.changed.wait()
-        node.doing = ""
-
-    def awaited(self) -> tuple[RemoteNode, ...]:
-        """Return the nodes of others that ours wait for."""
-        keys = {after.node for node in self.nodes.values() for after in node.planned.after}
-        return tuple(node for key, node in self.remote.items() if key in keys)
-
-    def dependents(self, key: str) -> tuple[NodeRun, ...]:
-        """Return the nodes that depend on `key`: those that are taken down before it."""
-        return tuple(
-            node
-            for node in self.nodes.values()
-            if node.planned.run.container == key
-            or any(after.node == key for after in node.planned.after)
-        )
+        self.on_health(node)
+        if event.kind != "reply" or event.reports:
+            self.touch()
 
     async def refresh(self, observer: Graph, *, marks: bool = False) -> None:
         """Read the configuration of every reachable node and give it to the observer.
@@ -634,8 +445,8 @@ class System:
             node
             for node in self.nodes.values()
             if node.driver is not None
-            and node.reach in _REPORTING[node.planned.managed]
-            and not node.stuck
+            and node.core.level >= (Level.CONFIGURED if node.planned.managed else Level.STARTED)
+            and not node.core.stuck
             and node.name not in self.liveliness.silent
         ]
         await asyncio.gather(
@@ -660,23 +471,15 @@ class System:
         node.learn(fresh)
 
 
-def _connected_as(plan: Plan, running: Mapping[str, NodeRun], before: Plan) -> Plan:
-    """Return a plan with the connections that running nodes have: a restart may have moved them.
+def level_of(node: NodeRun) -> Level:
+    """Return how far a node is by what it said of itself; where it said nothing, what is noted."""
+    if not node.planned.managed or not node.state:
+        return node.core.level
+    if node.state == ACTIVE:
+        return Level.ACTIVE
+    if node.state == INACTIVE:
+        return Level.CONNECTED if node.connected else Level.CONFIGURED
+    return Level.STARTED
 
-    Args:
-        plan: of another manifest.
-        running: nodes that stay, by key.
-        before: the plan of the manifest by which they were started.
-    """
-    planned = {each.key: each for each in before.nodes}
 
-    def connected(node: PlannedNode) -> PlannedNode:
-        was, run = planned.get(node.key), running.get(node.key)
-        if was is None or run is None:
-            return node
-        if (was.connections, was.participants) != (node.connections, node.participants):
-            return node
-        now = run.planned
-        return replace(node, connections=now.connections, participants=now.participants)
-
-    return replace(plan, nodes=tuple(map(connected, plan.nodes)))
+PROCESS_ENDED = (ProcessState.EXITED, ProcessState.BACKOFF)

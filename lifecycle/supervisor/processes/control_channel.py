@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import socket
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
@@ -17,7 +18,9 @@ from lifecycle.codec import from_json, to_json
 from lifecycle.errors import BringUpError
 from lifecycle.middleware.process.busy_sign import BusySign, Overdue
 from lifecycle.node.host.control import Command, Event, HostSpec, Operation
-from lifecycle.supervisor.gate.gate import Permit
+
+if TYPE_CHECKING:
+    from lifecycle.supervisor.shell.permit import Permit
 
 _LONGEST_LINE = 1 << 24
 """Bytes; a node configuration with thousands of endpoints is one line."""
@@ -115,13 +118,13 @@ class ControlChannel:
         Raises:
             ChannelClosedError: the host ended before it replied.
             BringUpError: an activate request without a permit that holds.
-            VerificationError: what changed since the permit's verdict does not allow it.
+            ChangedError: what changed since the verdict does not allow it.
         """
         node = command.node
         if command.operation is Operation.ACTIVATE:
             if permit is None:
                 raise BringUpError(f"cannot activate {node!r} without a permit from the gate")
-            await permit.use(node)
+            await permit.use()
         if self._writer is None or self._task is None or self._task.done():
             raise ChannelClosedError(
                 f"cannot reach {node!r}: its process closed the control channel"
@@ -135,6 +138,11 @@ class ControlChannel:
             return await reply
         finally:
             self._replies.pop(number, None)
+
+    async def drained(self, timeout_s: float) -> None:
+        """Wait, bounded, for what a host that has ended wrote before."""
+        if self._task is not None:
+            await asyncio.wait({self._task}, timeout=timeout_s)
 
     async def _read(self, reader: asyncio.StreamReader) -> None:
         reason = "its process closed the control channel"

@@ -1,8 +1,7 @@
-"""One process of a system: how it is started, its states, its output, and its bounded end.
+"""One process of a system: how it is started, its output, its channel, and how it ended.
 
-Owns: `ManagedProcess`, whose states are not called as those of nodes: only nodes are "active"; and
-deadlines on a loaded machine: time in which a process was ready to run but had no CPU does not
-count. What starts it is fork_server.py, or a test; what the whole system does is nodes/system.py's.
+Owns: `ManagedProcess`, and how long a process was ready to run but had no CPU, which counts in no
+deadline. When it is started and ended is the core's; what starts it is fork_server.py, or a test.
 Must not import rclpy.
 """
 
@@ -13,9 +12,9 @@ import contextlib
 import functools
 import os
 import signal
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -23,7 +22,6 @@ from lifecycle.manifest.model import Output
 from lifecycle.middleware.process.stacks import brief
 from lifecycle.plan.model import PlannedProcess
 from lifecycle.printable import log_line
-from lifecycle.supervisor.control.protocol import ProcessState
 from lifecycle.supervisor.processes.control_channel import ControlChannel
 from lifecycle.supervisor.processes.fork_server_main import GRACE_S
 from lifecycle.supervisor.processes.logs import (
@@ -34,7 +32,7 @@ from lifecycle.supervisor.processes.logs import (
     logger_in,
     logger_of,
 )
-from lifecycle.supervisor.run.events import Emitter, LogLine, ProcessChanged
+from lifecycle.supervisor.run.events import Emitter, LogLine
 
 if TYPE_CHECKING:
     from lifecycle.supervisor.processes.fork_server import ForkServer, ForkServerChild
@@ -98,37 +96,8 @@ _CRASHES = (
 )
 
 
-Escalation = Sequence[tuple[int, float]]
-"""Steps to end a process: (signal number, 0 for none; seconds to wait for its end after it)."""
-
-ESCALATION: Escalation = (
-    (0, 2.0),
-    (signal.SIGINT, 2.0),
-    (signal.SIGTERM, 1.0),
-    (signal.SIGKILL, 5.0),
-)
-"""For hosts, whose control channel was closed: destroying a participant may hang for good."""
-
-STUCK_ESCALATION: Escalation = (
-    (0, 1.0),
-    (signal.SIGTERM, 0.5),
-    (signal.SIGKILL, 5.0),
-)
-"""For a host with a callback in progress: asked politely, it would first have to finish it."""
-
-STARTING_ESCALATION: Escalation = (
-    (signal.SIGTERM, 1.5),
-    (signal.SIGKILL, 5.0),
-)
-"""For a process whose nodes are not there yet: nothing to undo, and nothing to wait for.
-
-Not SIGINT: Python answers that with a traceback from the middle of an import."""
-
 _LONGEST_WORDS = 300
 """Characters of an error that a message repeats."""
-
-COMMAND_ESCALATION: Escalation = ESCALATION[1:]
-"""For foreign commands: rclpy and rclcpp end on SIGINT."""
 
 
 class ManagedProcess:
@@ -143,15 +112,11 @@ class ManagedProcess:
     Attributes:
         planned: what the plan declares of it.
         environment: (name, value) on top of the supervisor's own environment.
-        carries: full names of the nodes that are gone with it, loaded components included.
-        state: in the order of ProcessState; from any but the last it may be EXITED next.
         channel: to our host; None for a foreign command.
         child: None before it was spawned.
         ended: resolves with how it ended.
-        asked_to_end: `end` was called while it lived.
         on_stop: called with True when a signal stopped it, False when it continues; set before
             `spawn`.
-        may_end: it may end by itself, with exit status 0.
         started_s: when it was spawned, in seconds since the supervisor started.
         is_restarted: another one ran in its place before.
         last_stderr: the last line that it wrote to standard error; empty if none.
@@ -165,24 +130,17 @@ class ManagedProcess:
         emit: Emitter,
         variables: tuple[tuple[str, str], ...] = (),
         nodes: Mapping[str, str] | None = None,
-        may_end: bool = False,
         grace_s: float = GRACE_S,
-        carries: Iterable[str] = (),
     ) -> None:
         self.planned = planned
-        self.carries = tuple(carries)
         self.grace_s = grace_s
-        self.may_end = may_end
         self.environment = tuple({**dict(variables), **dict(planned.environment)}.items())
-        self.state = ProcessState.STARTING
         self.channel: ControlChannel | None = None
         self.child: ForkServerChild | None = None
         self.ended: asyncio.Future[ProcessExit] = asyncio.get_running_loop().create_future()
-        self.asked_to_end = False
         self.started_s = emit.elapsed_s
         self.last_stderr = ""
         self._traceback = Traceback()
-        self._signals: set[int] = set()
         self.is_restarted = False
         self.on_stop: Callable[[bool], None] = lambda _: None
         kept = planned.run.output is not Output.SCREEN
@@ -227,7 +185,6 @@ class ManagedProcess:
         """
         for log in (self.log, *self._node_logs.values()):
             log.open()
-        self._emit(ProcessChanged(process=self.name, state=self.state))
         ends: list[int] = []
         control = None
         try:
@@ -253,85 +210,10 @@ class ManagedProcess:
         """Return its run delay and ours, seconds: ready to run, but without CPU."""
         return own_run_delay_s() + (0.0 if self.child is None else self.child.run_delay_s())
 
-    def running(self) -> None:
-        """Note that the process does its work: its nodes are there."""
-        if self.state is ProcessState.STARTING:
-            self._change(ProcessState.RUNNING)
-
-    def back_off(self) -> None:
-        """Note that it has ended and that another one is to be started in its place."""
-        if self.state is ProcessState.STARTING and self.child is None:
-            self.state = ProcessState.EXITED
-        if self.state is ProcessState.EXITED:
-            self._change(ProcessState.BACKOFF)
-
-    @property
-    def is_gone(self) -> bool:
-        """Whether it has ended, in backoff or for good."""
-        return self.state in (ProcessState.EXITED, ProcessState.BACKOFF)
-
-    async def end(self, escalation: Escalation, hurry: asyncio.Event) -> str:
-        """End the process and everything in its group, bounded.
-
-        Args:
-            escalation: tried in order until it ended.
-            hurry: once set, waits are cut short and SIGKILL comes at once.
-
-        Returns:
-            The name of the signal that was needed beyond the first step; empty if none was.
-        """
-        if self.child is None or self.ended.done():
-            await self._release()
-            return ""
-        if self.state in (ProcessState.STARTING, ProcessState.RUNNING):
-            self.asked_to_end = True
-            self._change(ProcessState.STOPPING)
-        if self.channel is not None:
-            await self.channel.close()
-        needed = ""
-        for index, (number, wait_s) in enumerate(escalation):
-            if hurry.is_set() and number != signal.SIGKILL:
-                continue
-            if number:
-                self._signals.add(number)
-                self.child.signal(number)
-                needed = signal.Signals(number).name if index else ""
-            if await self._wait(wait_s, hurry if number != signal.SIGKILL else None):
-                break
-        await self._release()
-        return needed
-
-    async def _wait(self, wait_s: float, hurry: asyncio.Event | None) -> bool:
-        """Wait for the end; False when `wait_s` passed or there is a hurry first."""
-        waits: set[asyncio.Future[Any]] = {self.ended}
-        hurried = None if hurry is None else asyncio.ensure_future(hurry.wait())
-        if hurried is not None:
-            waits.add(hurried)
-        try:
-            await asyncio.wait(waits, timeout=wait_s, return_when=asyncio.FIRST_COMPLETED)
-        finally:
-            if hurried is not None:
-                hurried.cancel()
-        return self.ended.done()
-
-    @property
-    def died(self) -> bool:
-        """Whether it ended although it was not asked to, and not as it may."""
-        return self.state is ProcessState.EXITED and not self.asked_to_end and not self.is_over
-
-    @property
-    def crashed(self) -> bool:
-        """Whether it was asked to end, and died instead: of nothing that we sent it.
-
-        A host of ours exits with 0, or with 1 where a callback kept it from shutting down, which it
-        says. Commands have exit statuses of their own for SIGINT.
-        """
-        if not self.asked_to_end or not self.ended.done():
-            return False
-        end = self.ended.result()
-        if end.signal is not None:
-            return end.signal not in self._signals and not end.is_clean
-        return end.is_crash or (self.channel is not None and (end.status or 0) > 1)
+    def signal(self, number: int) -> None:
+        """Send a signal to the process and everything in its group; harmless once it ended."""
+        if self.child is not None:
+            self.child.signal(number)
 
     @property
     def last_words(self) -> str:
@@ -347,33 +229,19 @@ class ManagedProcess:
         text = log_line(text or self.last_stderr.strip())
         return text if len(text) <= _LONGEST_WORDS else f"{text[: _LONGEST_WORDS - 1]}…"
 
-    @property
-    def is_over(self) -> bool:
-        """Whether it has ended by itself as all of its nodes may: with exit status 0."""
-        return self.may_end and self.ended.done() and self.ended.result().status == 0
-
     def _exited(self, exited: asyncio.Future[ProcessExit]) -> None:
-        # Before anybody is notified: a listener that raises must not lose it.
-        self.state = ProcessState.EXITED
-        self.ended.set_result(exited.result())
         for each in self._readers:
             each.drain()
-        self._say(detail=str(exited.result()))
+        self.ended.set_result(exited.result())
 
-    async def _release(self) -> None:
+    async def release(self) -> None:
+        """Let go of its channel, its output and its logs, once it has ended or was never there."""
         if self.channel is not None:
             await self.channel.close()
         for reader in self._readers:
             reader.close()
         for log in (self.log, *self._node_logs.values()):
             log.close()
-
-    def _change(self, state: ProcessState, detail: str = "") -> None:
-        self.state = state
-        self._say(detail)
-
-    def _say(self, detail: str = "") -> None:
-        self._emit(ProcessChanged(process=self.name, state=self.state, pid=self.pid, detail=detail))
 
     def _line(self, stream: str, line: str) -> None:
         self.log.add(line)
@@ -384,54 +252,6 @@ class ManagedProcess:
             self._node_logs[logger].add(line)
         if self.planned.run.output is not Output.LOG:
             self._emit(LogLine(process=self.name, stream=stream, line=line))
-
-
-PROMPT_S = 1.0
-"""What is done within this, or a tenth of its limit, is not worth looking, which takes a file of
-each thread: most steps are, of many nodes at once, too."""
-
-SLICE_S = 1.0
-"""How often is looked whether a process could run, while it is waited for."""
-
-_LEAST_S = 0.01
-"""What is left of a limit may shrink by half each time, and never end."""
-
-AT_MOST = 10.0
-"""However loaded the machine is, a limit lasts no longer than so many times its seconds."""
-
-
-async def wait_under_load(
-    waits: Collection[asyncio.Future[Any]], limit_s: float, run_delay: Callable[[], float]
-) -> bool:
-    """Wait until one of some futures is done, or the limit is over; whether one is done.
-
-    Args:
-        waits: not cancelled here.
-        limit_s: seconds, > 0, in which the process can run. Its run delay comes on top, up to
-            `AT_MOST` times the limit in all.
-        run_delay: seconds of run delay so far, of all threads together.
-    """
-    prompt_s = min(PROMPT_S, limit_s / 10)
-    done, _ = await asyncio.wait(waits, timeout=prompt_s, return_when=asyncio.FIRST_COMPLETED)
-    if done:
-        return True
-    loop = asyncio.get_running_loop()
-    began_s = now_s = loop.time()
-    left_s = limit_s - prompt_s
-    waited_s = run_delay()
-    while left_s > 0 and now_s - began_s < AT_MOST * limit_s:
-        done, _ = await asyncio.wait(
-            waits, timeout=min(max(left_s, _LEAST_S), SLICE_S), return_when=asyncio.FIRST_COMPLETED
-        )
-        if done:
-            return True
-        before_s, now_s = now_s, loop.time()
-        waited_before_s, waited_s = waited_s, run_delay()
-        # Threads that wait at once have waited no longer for it, and one that ends takes its own
-        # along.
-        passed_s = now_s - before_s
-        left_s -= passed_s - min(max(waited_s - waited_before_s, 0.0), passed_s)
-    return any(each.done() for each in waits)
 
 
 def run_delay_s(pid: int) -> float:

@@ -1,14 +1,13 @@
-"""A failed step of bring-up as a finding; concurrent tasks of which the first failure ends all.
+"""A failed step of bring-up as a finding; tasks that end when they are to.
 
-Owns: `StepFailedError`, how failures join a verdict, so that every
-run ends in one verdict that names each cause once; `together`, what asyncio.TaskGroup does, which
-Python 3.10 does not have; `failure_of`; `ended`; and `Worker`, a thread for what blocks.
+Owns: `StepFailedError`, how failures join a verdict, so that every run ends in one verdict that
+names each cause once; `ended`, `within`; and `Worker`, a thread for what blocks.
 """
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Coroutine, Iterable
+from collections.abc import Callable, Collection, Coroutine, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
@@ -20,7 +19,7 @@ from lifecycle.supervisor.run.events import Failure
 from lifecycle.supervisor.run.options import UpResult
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import Rule, rule
-from lifecycle.verify.rules.run import PROCESS_DIED, node_of
+from lifecycle.verify.rules.run import node_of
 from lifecycle.verify.verdict import NOT_JUDGED, Finding, RunEnd, Verdict
 
 
@@ -32,8 +31,6 @@ class StepFailedError(BringUpError):
         subject: fully qualified node name, or the process where no node is to blame.
         process: name of the process concerned; empty if there is none of ours.
         log: the file with all that its process wrote; empty if there is none.
-        gone: full names of the nodes that are not there any more, as their process has ended.
-        others: what else had failed by then for causes of its own, each named once.
     """
 
     def __init__(
@@ -44,31 +41,8 @@ class StepFailedError(BringUpError):
         self.subject = subject
         self.process = process
         self.log = log
-        self.gone: tuple[str, ...] = ()
-        self.others: tuple[StepFailedError, ...] = ()
 
-    @property
-    def every(self) -> tuple[StepFailedError, ...]:
-        """This one and the others."""
-        return (self, *self.others)
-
-    @property
-    def reason(self) -> str:
-        """What failed, in one line that names each cause; the findings say the rest."""
-        return f"failed: {', '.join(f'{each.subject} ({each.rule.id})' for each in self.every)}"
-
-    def joined(self, others: Iterable[StepFailedError]) -> StepFailedError:
-        """Return this one with more that failed, but for what it names already."""
-        for each in [one for other in others for one in other.every]:
-            named = {(one.rule, one.subject) for one in self.every}
-            processes = {one.process for one in self.every if one.process}
-            # A process that says why it cannot go on, and then ends, has failed once.
-            again = each.rule == PROCESS_DIED and each.process in processes
-            if (each.rule, each.subject) not in named and not again:
-                self.others = (*self.others, each)
-        return self
-
-    def event(self, *, ends_run: bool = True) -> Failure:
+    def event(self) -> Failure:
         """Return the failure as listeners get it."""
         return Failure(
             rule=self.rule.id,
@@ -76,20 +50,20 @@ class StepFailedError(BringUpError):
             message=self.message,
             process=self.process,
             log=self.log,
-            ends_run=ends_run,
         )
 
 
-def finding_of(failure: StepFailedError) -> Finding:
+def finding_of(failure: Failure) -> Finding:
     """Return the finding that a failure is."""
-    return failure.rule.finding(
+    found = rule(failure.rule)
+    return found.finding(
         Outcome.VIOLATED,
         subject=failure.subject,
         expected="",
         observed="",
         message=failure.message,
         node=node_of(failure.subject),
-        hint=f"{failure.rule.fix}: {failure.log}" if failure.log and failure.rule.names_log else "",
+        hint=f"{found.fix}: {failure.log}" if failure.log and found.names_log else "",
     )
 
 
@@ -106,19 +80,30 @@ def never_connected(verdict: Verdict, reason: str, exit_code: ExitCode) -> Verdi
 
 
 def with_failure(verdict: Verdict, failure: StepFailedError) -> Verdict:
+    """Return `verdict`, violated, with a failed step as its first finding."""
+    return with_failures(verdict, (failure.event(),))
+
+
+def with_failures(
+    verdict: Verdict, failures: Iterable[Failure], gone: Collection[str] = ()
+) -> Verdict:
     """Return `verdict`, violated, with all that failed as its first findings, each once.
 
     What only follows from a process that ended is not said again: that its nodes are not there, and
     that others lack what they brought along.
+
+    Args:
+        verdict: the last one.
+        failures: see above.
+        gone: full names of the nodes that are not there any more, as their process has ended.
     """
-    findings = tuple(finding_of(each) for each in failure.every)
+    findings = tuple({(each.rule, each.subject): finding_of(each) for each in failures}.values())
     named = {(each.rule, each.subject) for each in findings}
-    gone = {name for each in failure.every for name in each.gone}
     rest = (
         each
         for each in verdict.findings
         if (each.rule, each.subject) not in named
-        and (rule(each.rule).about is None or gone.isdisjoint((each.subject, *each.nodes)))
+        and (rule(each.rule).about is None or set(gone).isdisjoint((each.subject, *each.nodes)))
     )
     return replace(verdict, verdict=Outcome.VIOLATED, blocking=True, findings=(*findings, *rest))
 
@@ -169,33 +154,6 @@ async def within(seconds: float, work: Coroutine[Any, Any, T]) -> T:
     if not task.done() or (not done and task.cancelled()):
         raise asyncio.TimeoutError
     return task.result()
-
-
-async def failure_of(step: Coroutine[Any, Any, None]) -> StepFailedError | None:
-    """Carry out a step; return its failure, None if there is none."""
-    try:
-        await step
-    except StepFailedError as failure:
-        return failure
-    return None
-
-
-async def together(coroutines: Iterable[Coroutine[Any, Any, None]]) -> None:
-    """Run all at once; the first exception cancels the others and is raised.
-
-    Nothing is still running when it returns, whichever way.
-    """
-    tasks = [asyncio.ensure_future(each) for each in coroutines]
-    if not tasks:
-        return
-    try:
-        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_EXCEPTION)
-    finally:
-        await ended(*tasks)
-    # In the order given, so that a failure is the same from run to run where two come at once.
-    for task in tasks:
-        if task in done and not task.cancelled() and (error := task.exception()) is not None:
-            raise error
 
 
 class Worker:

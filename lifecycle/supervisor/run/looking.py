@@ -36,10 +36,10 @@ from lifecycle.supervisor.connections.negotiation import Expectation, is_negotia
 from lifecycle.supervisor.control.client import look
 from lifecycle.supervisor.control.protocol import ProcessState, Reach
 from lifecycle.supervisor.control.server import SupervisorSnapshot, follow
-from lifecycle.supervisor.gate.gate import closes
-from lifecycle.supervisor.gate.verification_loop import GracePeriod
+from lifecycle.supervisor.core.gate import closes
 from lifecycle.supervisor.health.answering import ANSWER_S, TRIES
 from lifecycle.supervisor.health.liveliness import not_answering
+from lifecycle.supervisor.judging.grace_period import GracePeriod
 from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant, settled
 from lifecycle.supervisor.processes.scope import unlimited
 from lifecycle.supervisor.run.options import onlooker_connections, own_machines

@@ -23,7 +23,7 @@ ENDED_BY: dict[int, tuple[str, ExitCode]] = {
 """What each signal is called as the reason of an end, and the exit code of a run that it cut short.
 
 A run that had come as far as it was asked to, and that nothing bound to stay, was not cut short by
-SIGTERM or SIGHUP: see session.py."""
+SIGTERM or SIGHUP: core/failure.py."""
 
 
 class Ended(KeyboardInterrupt):

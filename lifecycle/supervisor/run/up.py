@@ -85,8 +85,8 @@ from lifecycle.supervisor.run.options import (
 )
 from lifecycle.supervisor.run.records import Records
 from lifecycle.supervisor.run.service_manager import ServiceManager
-from lifecycle.supervisor.run.session import Session
 from lifecycle.supervisor.run.signals import Ending
+from lifecycle.supervisor.shell.supervisor import Means, Supervisor
 from lifecycle.verify.verdict import NOT_JUDGED
 
 LEAVE_S = 10.0
@@ -187,24 +187,27 @@ def up(
                 observer_participant = await _observer_participant(plan, options, emit, ending)
                 leaving.callback(_succeed(directory, observer_participant).destroy)
                 emit(_started(system, observer_participant, str(logs)))
-                session = Session(
+                supervisor = Supervisor(
                     system,
                     options,
-                    directory=directory,
-                    records=records,
-                    fork_server=fork_server,
-                    observer_participant=observer_participant,
-                    networks=networks,
-                    emit=emit,
-                    ending=ending,
+                    Means(
+                        directory=directory,
+                        records=records,
+                        fork_server=fork_server,
+                        participant=observer_participant,
+                        networks=networks,
+                        ending=ending,
+                    ),
                 )
-                leaving.push_async_callback(session.leave)
-                on_start(session.status)
-                return await session.run()
+                leaving.push_async_callback(supervisor.leave)
+                on_start(supervisor.status)
+                return await supervisor.run()
             except StepFailedError as failure:
                 emit(failure.event())
                 verdict = never_connected(
-                    with_failure(NOT_JUDGED, failure), failure.reason, failure.exit_code
+                    with_failure(NOT_JUDGED, failure),
+                    f"failed: {failure.subject} ({failure.rule.id})",
+                    failure.exit_code,
                 )
                 return UpResult(exit_code=failure.exit_code, verdict=verdict)
             finally:
@@ -403,7 +406,7 @@ def _started(system: System, observer_participant: ObserverParticipant, logs: st
         rmw=observer_participant.rmw,
         discovery_range=system.plan.discovery_range.value,
         nodes=tuple(each.name for each in system.nodes.values()),
-        processes=tuple(system.processes),
+        processes=tuple(system.run.processes),
         log_directory=logs,
     )
 

@@ -25,7 +25,7 @@ from rclpy.node import Node
 from lifecycle.errors import ExitCode
 from lifecycle.middleware.versions import KNOWN_FAST_DDS, KNOWN_RCL
 from lifecycle.network.ports import participant_ports
-from lifecycle.supervisor.gate.verification_loop import SETTLED_S
+from lifecycle.supervisor.core.gate import SETTLED_S
 from tests.ros.middleware.free_ports import free_ports
 from tests.ros.supervisor.running import (
     BOUND_S,

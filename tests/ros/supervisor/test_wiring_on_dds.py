@@ -20,7 +20,7 @@ import pytest
 from lifecycle.errors import ExitCode
 from lifecycle.middleware.rcl.graph import GraphObserver
 from lifecycle.middleware.services.clients import NodeClients
-from lifecycle.supervisor.gate.verification_loop import SETTLED_S
+from lifecycle.supervisor.core.gate import SETTLED_S
 from tests.ros.middleware.free_ports import free_ports
 from tests.ros.supervisor.running import BOUND_S, ENOUGH, ROOT, Up, left_of, pair, up, verb
 

@@ -21,8 +21,7 @@ from msgspec.structs import replace
 from lifecycle.codec import from_json, to_json
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.node.host.control import Command, Event, HostSpec, Operation
-from lifecycle.plan.model import Plan, PlannedNode
-from lifecycle.supervisor.nodes.bring_up import BringUp
+from lifecycle.plan.model import Plan
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.process import ManagedProcess, ProcessExit
 from lifecycle.supervisor.run.events import Emitter
@@ -161,9 +160,10 @@ class FakeProcess:
         self._name = process.name
         self._stdout = os.dup(stdout)
         self._task: asyncio.Task[None] | None = None
+        self._host: socket.socket | None = None
         if control is not None:
-            host = socket.socket(fileno=os.dup(control))
-            self._task = asyncio.ensure_future(self._serve(host))
+            self._host = socket.socket(fileno=os.dup(control))
+            self._task = asyncio.ensure_future(self._serve(self._host))
         else:
             self._task = asyncio.ensure_future(self._appear())
 
@@ -182,6 +182,8 @@ class FakeProcess:
         if not self.exited.done():
             if self._task is not None:
                 self._task.cancel()
+            if self._host is not None:
+                self._host.close()  # it ended before it served
             os.close(self._stdout)
             self.exited.set_result(how)
             self._spawner.gone(self._name)
@@ -195,6 +197,7 @@ class FakeProcess:
         self._spawner.came(self._name, f"/{self._name}")
 
     async def _serve(self, control: socket.socket) -> None:
+        self._host = None
         control.setblocking(False)
         reader, writer = await asyncio.open_connection(sock=control)
         with contextlib.closing(writer):
@@ -211,7 +214,7 @@ class FakeProcess:
                     continue
                 state, connected = _STATES.get(command.operation, ("active", True))
                 before = self._spawner.interfaces.get(command.node)
-                if command.operation is Operation.REPUBLISH_NAMES and before is not None:
+                if command.operation not in _STATES and before is not None:
                     state, connected = before.state, before.connected
                 what = " ".join(
                     filter(None, (command.node, command.operation.value, _what(command)))
@@ -447,14 +450,6 @@ class World:
         self.emit = Emitter()
         self.emit.listen(self.events.append)
         self.system = System(plan, emit=self.emit, logs=directory, processes=plan.processes)
-        self.appeared: dict[str, asyncio.Event] = {}
-        self.bring_up = BringUp(
-            self.system,
-            spawner_of=lambda _: self.spawner,
-            services=self._no_services,
-            appears=self._appears,
-            recorded=lambda: None,
-        )
 
     @property
     def log(self) -> list[str]:
@@ -464,13 +459,6 @@ class World:
     def heard(self, kind: type[T]) -> list[T]:
         """Events of one kind."""
         return [event for event in self.events if isinstance(event, kind)]
-
-    async def _appears(self, name: str) -> None:
-        await self.appeared.setdefault(name, asyncio.Event()).wait()
-
-    @staticmethod
-    def _no_services(node: PlannedNode) -> Any:
-        raise AssertionError(f"nobody may drive {node.key} through services")
 
 
 Check = Callable[[Path], Coroutine[Any, Any, None]]

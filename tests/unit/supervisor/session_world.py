@@ -12,7 +12,7 @@ import contextlib
 import signal
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from msgspec.structs import replace
 
@@ -61,13 +61,15 @@ from lifecycle.supervisor.run.history import journal_files, read_run
 from lifecycle.supervisor.run.journal import Journal
 from lifecycle.supervisor.run.options import UpOptions, UpResult
 from lifecycle.supervisor.run.records import Records
-from lifecycle.supervisor.run.session import Session
 from lifecycle.supervisor.run.signals import Ending
+from lifecycle.supervisor.shell.supervisor import Means, Supervisor
 from lifecycle.verify.observation import NodeConfiguration, Observation, ObservedNode
 from lifecycle.verify.rules import rule
 from lifecycle.verify.verdict import Verdict
 from tests.builders import plan_of, planned_node
 from tests.unit.supervisor.fakes import FakeSpawner, interface_of
+
+E = TypeVar("E", bound=Event)
 
 SHUTDOWN_S = 30.0
 """However a node or a process resists, a system of the size of these is down within so long."""
@@ -502,6 +504,9 @@ class SessionWorld:
         networks: to be programmed.
         result: of the run; None before its end.
         status: gives what `lifecycle status` shows; during the run.
+        supervisor: likewise.
+        prepare: called once that is made, before it runs.
+        events: so far.
     """
 
     def __init__(self, plan: Plan, tmp_path: Path, **options: Any) -> None:
@@ -514,6 +519,9 @@ class SessionWorld:
         self.ending = Ending()
         self.result: UpResult | None = None
         self.status: Callable[[], SystemStatus]
+        self.supervisor: Supervisor
+        self.prepare: Callable[[], None] = lambda: None
+        self.events: list[Event] = []
         self._stopping_at_s: float | None = None
         self._tmp_path = tmp_path
         self._emit = Emitter(loop.time)
@@ -560,17 +568,16 @@ class SessionWorld:
         """Run the session to its end."""
         kept = self.journal.writing(self._tmp_path / "logs")
         with self.ending, self._run_directory() as directory, kept:
-            session = Session(
-                self.system,
-                self._options,
+            means = Means(
                 directory=directory,
                 records=Records(directory, self.system, self.hosts, self._emit),
                 fork_server=self.hosts,
-                observer_participant=self.graph,
+                participant=self.graph,
                 networks=self.networks,
-                emit=self._emit,
                 ending=self.ending,
             )
+            session = self.supervisor = Supervisor(self.system, self._options, means)
+            self.prepare()
             self.status = session.status
             self.result = await session.run()
             await session.leave()
@@ -653,7 +660,12 @@ class SessionWorld:
         """Let a process end as by a crash."""
         self.hosts.processes[process].end(ProcessExit(signal=signal.SIGSEGV))
 
+    def heard(self, kind: type[E]) -> list[E]:
+        """Events of one kind."""
+        return [each for each in self.events if isinstance(each, kind)]
+
     def _take(self, event: Event) -> None:
+        self.events.append(event)
         if isinstance(event, Stopping):
             self._stopping_at_s = self._emit.elapsed_s
         self.story.append(_line(event, self._emit.elapsed_s))

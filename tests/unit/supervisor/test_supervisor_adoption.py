@@ -18,7 +18,7 @@ from lifecycle.plan.model import Plan
 from lifecycle.supervisor.control.server import ControlRequest
 from lifecycle.supervisor.run.options import Until
 from tests.builders import plan_of, planned_node
-from tests.unit.supervisor.fakes import World, run
+from tests.unit.supervisor.fakes import run
 from tests.unit.supervisor.session_world import INTRUDED, SessionWorld, over
 
 ROBOT = plan_of(
@@ -216,13 +216,3 @@ async def test_nothing_is_asked_of_a_node_that_ran_before_one_of_ours(
     assert world.messages == [
         ("cannot drive /new: a node of this name ran before (pid 7, by hand), and would obey, too")
     ]
-
-
-async def test_another_manifest_starts_nothing_beside_what_is_adopted(tmp_path: Path) -> None:
-    system = World(ROBOT, tmp_path).system
-    system.adopt({"lidar": ""})
-    system.take(ROBOT, tuple(system.nodes.values()))
-    assert sorted(system.processes) == ["arm", "camera", "logger", "new"]
-    lidar = system.nodes["lidar"]
-    assert (lidar.process, lidar.planned.run.kind) == (None, RunKind.ATTACH)
-    assert system.first == ROBOT

@@ -68,6 +68,8 @@ class Left:
         self.plan = two_machines() if plan is None else plan
         processes = [each for each in self.plan.processes if each.name in own]
         self.system = System(self.plan, emit=Emitter(), logs=directory, processes=processes)
+        self.touched = asyncio.Event()
+        self.system.on_change = self.touched.set
         self.machines: frozenset[str] = frozenset()
         self.air = Air()
         self.agreement = Agreement(self.system, self.air, self)
@@ -98,7 +100,7 @@ async def test_who_planned_the_same_is_no_finding_and_who_did_not_is_named(tmp_p
     assert left.found() == []
     await left.hears(two_machines(log_level="debug"))
     assert left.found() == [DIFFER]
-    assert left.system.touched.is_set()
+    assert left.touched.is_set()
     (finding,) = left.agreement.findings(VIEWER)
     assert finding.subject == "the supervisor of machine 'right'"
     await left.hears(two_machines())
@@ -113,8 +115,8 @@ async def test_a_machine_that_does_not_say_what_it_planned_is_waited_for_and_the
     assert left.found(NOBODY) == []
     left.machines = frozenset({"right"})
     assert left.found(NOBODY) == [WAITS]
-    left.system.touched.clear()
-    await asyncio.wait_for(left.system.touched.wait(), 2 * ANNOUNCED_S)
+    left.touched.clear()
+    await asyncio.wait_for(left.touched.wait(), 2 * ANNOUNCED_S)
     assert left.found(NOBODY) == [UNKNOWN]
     await left.hears(two_machines())
     assert left.found(NOBODY) == left.found(VIEWER) == []
@@ -223,13 +225,13 @@ def test_after_it_was_closed_nothing_is_announced_taken_or_woken(tmp_path: Path)
         left.append(Left(tmp_path))
         assert left[0].found(VIEWER) == [WAITS]
         left[0].agreement.close()
-        left[0].system.touched.clear()
+        left[0].touched.clear()
         left[0].agreement.announce(two_machines())
         left[0].agreement.leave("lifecycle down")
         await left[0].hears(two_machines(log_level="debug"))
         await asyncio.sleep(2 * ANNOUNCED_S)
         assert (len(left[0].air.said), left[0].air.destroyed) == (1, 1)
-        assert not left[0].system.touched.is_set()
+        assert not left[0].touched.is_set()
         left[0].agreement.close()
         assert left[0].air.destroyed == 1
 
@@ -243,7 +245,7 @@ def test_what_is_no_notice_is_passed_over_and_logged(
     async def test() -> None:
         left = Left(tmp_path)
         await left.receives("no notice")
-        assert not left.system.touched.is_set()
+        assert not left.touched.is_set()
         left.agreement.close()
 
     with caplog.at_level(logging.WARNING):
@@ -256,7 +258,7 @@ async def test_what_does_not_concern_us_was_received_before_or_left_before_wakes
     tmp_path: Path,
 ) -> None:
     left = Left(tmp_path)
-    touched = left.system.touched
+    touched = left.touched
 
     async def woken_by(of: Plan, **changed: object) -> bool:
         touched.clear()
@@ -310,14 +312,14 @@ async def test_we_look_when_the_first_of_several_machines_had_its_time_and_then_
         (ANNOUNCED_S, [UNKNOWN, WAITS]),
         (1.9 * ANNOUNCED_S, [UNKNOWN, UNKNOWN]),
     ):
-        left.system.touched.clear()
-        await left.system.touched.wait()
+        left.touched.clear()
+        await left.touched.wait()
         assert loop.time() == pytest.approx(looked_s)
         assert left.found(NOBODY) == found
     # There is nothing more to wait for.
-    left.system.touched.clear()
+    left.touched.clear()
     await asyncio.sleep(10 * ANNOUNCED_S)
-    assert not left.system.touched.is_set()
+    assert not left.touched.is_set()
 
 
 async def test_a_machine_that_comes_has_its_time_to_announce_and_we_look_when_it_is_over(
@@ -328,15 +330,15 @@ async def test_a_machine_that_comes_has_its_time_to_announce_and_we_look_when_it
     assert left.found(VIEWER) == [WAITS]
     await asyncio.sleep(0.75 * ANNOUNCED_S)
     assert left.found(VIEWER) == [WAITS]
-    left.system.touched.clear()
-    await left.system.touched.wait()
+    left.touched.clear()
+    await left.touched.wait()
     assert loop.time() == pytest.approx(ANNOUNCED_S)
     assert left.found(VIEWER) == [UNKNOWN]
     # It went, and came again.
     assert left.found(NOBODY) == []
     assert left.found(VIEWER) == [WAITS]
-    left.system.touched.clear()
-    await left.system.touched.wait()
+    left.touched.clear()
+    await left.touched.wait()
     assert loop.time() == pytest.approx(2 * ANNOUNCED_S)
 
 

@@ -12,16 +12,13 @@ from lifecycle.errors import BringUpError
 from lifecycle.manifest.model import RunKind
 from lifecycle.node.host.control import Operation
 from lifecycle.plan.model import PlannedNode
-from lifecycle.supervisor.control.protocol import Reach
-from lifecycle.supervisor.gate.gate import Gate
+from lifecycle.supervisor.core.state import Level
 from lifecycle.supervisor.health.answering import ANSWER_S, SHOWN_S, TRIES, Answering
-from lifecycle.supervisor.nodes.driver import ActiveError, ServiceDriver
+from lifecycle.supervisor.nodes.driver import ActiveError, ChangedError, ServiceDriver
 from lifecycle.supervisor.run.events import Notice
 from lifecycle.supervisor.run.failure import ended
-from lifecycle.verify.outcome import Outcome
 from tests.builders import plan_of, planned_node
 from tests.unit.supervisor.fakes import World, run
-from tests.unit.supervisor.test_supervisor_gate import ForeignNode, verdict_of
 
 
 class _Node:
@@ -58,8 +55,7 @@ def _before_the_gate(
         world = World(plan_of(planned_node("base", kind=RunKind.ATTACH, managed=False)), tmp_path)
         system = world.system
         system.present = frozenset({"/base"})
-        system.nodes["base"].is_up = True
-        system.nodes["base"].advance(Reach.STARTED)
+        system.nodes["base"].core.level = Level.STARTED
         answering = Answering(system, node)
         asking = asyncio.ensure_future(answering.follow())
         loop = asyncio.get_running_loop()
@@ -107,6 +103,57 @@ def test_a_node_that_serves_nothing_is_named_and_not_found(
     assert notices == ["'/base' serves no parameters: whether it hangs is not seen"]
 
 
+class ForeignNode:
+    """The lifecycle services of a managed node that others started; remembers the requests."""
+
+    def __init__(self) -> None:
+        self.state = "inactive"
+        self.requests: list[str] = []
+
+    async def get_state(self, node: str, *, timeout_s: float) -> str:
+        return self.state
+
+    async def get_available_transitions(self, node: str, *, timeout_s: float) -> tuple[str, ...]:
+        return ("activate", "cleanup", "shutdown")
+
+    async def change_state(
+        self,
+        node: str,
+        transition: str,
+        *,
+        timeout_s: float,
+        before: Callable[[], Awaitable[None]] | None = None,
+    ) -> bool:
+        if before is not None:
+            await before()
+        self.requests.append(transition)
+        self.state = "active"
+        return True
+
+
+class Permit:
+    """Lets a request leave, or keeps it back."""
+
+    def __init__(self, *, holds: bool = True) -> None:
+        self._holds = holds
+
+    async def use(self) -> None:
+        if not self._holds:
+            raise ChangedError("the gate closed again")
+
+
+async def test_a_foreign_node_gets_no_activate_request_without_a_permit_that_holds() -> None:
+    node = ForeignNode()
+    driver = ServiceDriver(node, planned_node("b"))  # type: ignore[arg-type]
+    with pytest.raises(BringUpError, match="cannot activate '/b' without a permit"):
+        await driver.perform(Operation.ACTIVATE)
+    with pytest.raises(ChangedError):
+        await driver.perform(Operation.ACTIVATE, Permit(holds=False))  # type: ignore[arg-type]
+    assert node.requests == []
+    await driver.perform(Operation.ACTIVATE, Permit())  # type: ignore[arg-type]
+    assert node.requests == ["activate"]
+
+
 class _Moved(ForeignNode):
     """Somebody moves it right after each of the first requests."""
 
@@ -137,8 +184,7 @@ async def test_a_node_that_somebody_moves_meanwhile_is_asked_again() -> None:
     assert node.requests == ["deactivate", "deactivate"]
     node = _Moved("inactive", "inactive")
     driver = ServiceDriver(node, planned_node("b"))  # type: ignore[arg-type]
-    permit = Gate(strict=False).judge(verdict_of(Outcome.OK))
-    assert (await driver.perform(Operation.ACTIVATE, permit)).state == "active"
+    assert (await driver.perform(Operation.ACTIVATE, Permit())).state == "active"
     assert node.requests == ["activate", "activate"]
 
 

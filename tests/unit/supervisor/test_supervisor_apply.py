@@ -351,10 +351,10 @@ async def test_other_orders_are_refused_meanwhile(tmp_path: Path) -> None:
         )
         for order in (ControlRequest.PAUSE, ControlRequest.RESTART):
             said = await world.order(order)
-            assert said == f"2 cannot {order.value} 'robot': it is connecting, {why}"
+            assert said == f"2 cannot {order.value} 'robot': it is applying, {why}"
         for dry_run in (False, True):
             assert _told(await world.apply(CHAIN, dry_run=dry_run)) == (
-                f"2 cannot apply another manifest to 'robot': it is connecting, {why}"
+                f"2 cannot apply another manifest to 'robot': it is applying, {why}"
             )
         assert _told(await applying) == "0"
         # What no command line sends is refused, too.
@@ -365,9 +365,9 @@ async def test_other_orders_are_refused_meanwhile(tmp_path: Path) -> None:
 STAGES = {
     "/viewer deactivate": "applying",
     "/viewer shutdown": "applying",
-    "/arm configure": "connecting",
-    "networks programmed": "verifying",
-    "/arm activate": "activating",
+    "/arm configure": "applying",
+    "networks programmed": "applying",
+    "/arm activate": "applying",
     "[apply] rolling_back": "rolling back",
 }
 

@@ -23,11 +23,11 @@ from lifecycle.manifest.model import (
 from lifecycle.manifest.model import Restart as RestartWhen
 from lifecycle.node.host.control import Event as HostEvent
 from lifecycle.plan.model import Plan, in_mode
-from lifecycle.supervisor.control.protocol import Reach
 from lifecycle.supervisor.control.server import ControlRequest
+from lifecycle.supervisor.core.consequences import reaction_of
+from lifecycle.supervisor.core.state import Level
 from lifecycle.supervisor.nodes.driver import NodeCondition
-from lifecycle.supervisor.nodes.system import NodeRun
-from lifecycle.supervisor.policy.consequences import reaction_of
+from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.run.events import Emitter
 from lifecycle.verify.observation import HealthReport
 from lifecycle.verify.outcome import Outcome
@@ -254,19 +254,20 @@ async def test_a_violation_enters_a_mode_once_and_one_that_its_gate_refuses_is_l
     ]
 
 
-def test_what_a_node_said_of_its_health_while_it_was_inactive_lets_nobody_through() -> None:
-    camera = replace(planned_node("camera"), health=Health(check=True))
-    node = NodeRun(camera, Emitter())
+async def test_what_a_node_said_of_its_health_while_it_was_inactive_is_no_answer(
+    tmp_path: Path,
+) -> None:
+    plan = plan_of(replace(planned_node("camera"), health=Health(check=True)))
+    node = System(plan, emit=Emitter(), logs=tmp_path, processes=plan.processes).nodes["camera"]
     well = configuration("/camera", health=HealthReport(ok=True))
-    node.advance(
-        Reach.CONNECTED, NodeCondition(state="inactive", connected=True, configuration=well)
-    )
-    node.advance(Reach.ACTIVE, NodeCondition(state="active", connected=True))
-    assert node.has_reached(Condition.ACTIVE)
-    assert not node.has_reached(Condition.HEALTHY)
+    node.take(NodeCondition(state="inactive", connected=True, configuration=well))
+    assert node.is_healthy
+    node.core.level = Level.ACTIVE
+    node.take(NodeCondition(state="active", connected=True))
+    assert not node.is_healthy
     assert node.unhealthy_reason == ": it has not answered since its state changed"
     node.learn(replace(well, state="active"))
-    assert node.has_reached(Condition.HEALTHY)
+    assert node.is_healthy
 
 
 async def test_a_node_waits_until_another_is_healthy_and_one_that_no_longer_is_has_a_consequence(

@@ -5,20 +5,18 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 from msgspec.structs import replace
 
 from lifecycle.manifest.model import Condition, Machine
-from lifecycle.plan.model import Plan
-from lifecycle.supervisor.nodes.system import RemoteNode, System, follow_remote
 from lifecycle.supervisor.run.failure import ended
 from lifecycle.supervisor.run.options import address_that_is_down
+from lifecycle.supervisor.shell.looks import conditions
 from lifecycle.verify.observation import Observation, ObservedNode
 from tests.builders import HERE, configuration, plan_of, planned_node
-from tests.unit.supervisor.fakes import World, run
+from tests.unit.supervisor.fakes import run
 
 STARTED, CONFIGURED, CONNECTED, ACTIVE, HEALTHY = Condition
 
@@ -50,65 +48,8 @@ def _seen(state: str | None, *, connected: bool | None = None) -> Observation:
 def test_a_remote_node_has_reached_what_is_seen_of_it(
     observation: Observation, reached: tuple[Condition, ...]
 ) -> None:
-    async def main() -> tuple[Condition, ...]:
-        node = RemoteNode(planned_node("camera"))
-        node.see(observation)
-        return tuple(each for each in Condition if node.has_reached(each))
-
-    assert run(main()) == reached
-
-
-def test_a_remote_node_that_leaves_has_reached_nothing_any_more() -> None:
-    async def main() -> bool:
-        node = RemoteNode(planned_node("camera"))
-        node.see(_seen("active"))
-        node.see(Observation())
-        return node.has_reached(STARTED)
-
-    assert not run(main())
-
-
-class _Graph:
-    """A graph that shows the next observation at each change, and what it was asked for."""
-
-    def __init__(self, *observations: Observation) -> None:
-        self.observations = list(observations)
-        self.asked: list[tuple[str, ...]] = []
-        self.count = 0
-
-    async def observe(self, plan: Plan) -> Observation:
-        self.asked.append(tuple(node.full_name for node in plan.nodes))
-        await asyncio.sleep(0)
-        return self.observations[min(self.count, len(self.observations) - 1)]
-
-    async def beyond(self, count: int, timeout_s: float | None) -> bool:
-        await asyncio.sleep(0)
-        self.count = count + 1
-        return True
-
-
-def test_a_step_that_a_remote_node_holds_goes_on_once_that_is_seen(tmp_path: Path) -> None:
-    async def main() -> tuple[str, _Graph]:
-        viewer, camera = planned_node("viewer", after={"camera": CONNECTED}), planned_node("camera")
-        plan = plan_of(viewer, camera)
-        world = World(plan, tmp_path)
-        mine = [each for each in plan.processes if "viewer" in each.nodes]
-        system = System(plan, emit=world.emit, logs=tmp_path, processes=mine)
-        node = system.nodes["viewer"]
-        waiting = asyncio.ensure_future(system.reached(node, CONNECTED, "connect"))
-        await asyncio.sleep(0)
-        doing = node.doing
-        graph = _Graph(Observation(), _seen("inactive", connected=False), _seen("active"))
-        await follow_remote(system, graph, graph)
-        await asyncio.wait_for(waiting, 1.0)
-        assert node.doing == ""
-        assert system.machines == frozenset({""})
-        return doing, graph
-
-    doing, graph = run(main())
-    assert doing == "waits to connect until /camera is connected"
-    # Only what ours wait for is asked, and nobody once it is active.
-    assert graph.asked == [("/camera",)] * 3
+    found = conditions(planned_node("camera"), observation)
+    assert tuple(each for each in Condition if each in found) == reached
 
 
 def test_a_task_that_loses_a_cancellation_is_ended_all_the_same() -> None:

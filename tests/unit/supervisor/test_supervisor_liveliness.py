@@ -15,6 +15,7 @@ from lifecycle.manifest.model import DiscoveryRange, Machine, Run, RunKind, Time
 from lifecycle.middleware.process.busy_sign import BusySign, Overdue
 from lifecycle.node.host.control import HostSpec, Operation
 from lifecycle.plan.model import Plan
+from lifecycle.supervisor.core.state import install
 from lifecycle.supervisor.health.liveliness import Cause, SilenceMonitor
 from lifecycle.supervisor.health.peer_supervisors import Listener, PeerSupervisors
 from lifecycle.supervisor.nodes.system import System
@@ -281,7 +282,8 @@ async def test_a_reloaded_plan_has_its_own_attached_nodes_followed_and_no_others
     assert set(system.liveliness.silent) == {"/lidar"}
 
     plan = attached("radar", "sonar")
-    system.take(plan, tuple(system.nodes.values()))
+    install(system.run, plan)
+    system.follow()
     air.ears.clear()
     peer_supervisors.renew()
     assert air.destroyed == 2
@@ -307,7 +309,17 @@ async def test_a_loss_has_us_and_our_hosts_prepare_and_after_it_tell_our_names_a
     air = FakeAir()
     peer_supervisors = PeerSupervisors(world.system, air)
     peer_supervisors.open()
-    await world.bring_up.connect(30)
+    (planned,) = plan.processes[:1]
+    process = world.system.processes[planned.name] = world.system.make_process(planned)
+    spec = HostSpec(
+        system="robot",
+        process=planned.name,
+        domain_id=0,
+        discovery_range=DiscoveryRange.LOCALHOST,
+        nodes=plan.nodes[:1],
+    )
+    await process.spawn(world.spawner, ControlChannel(spec, world.system.on_host_event))
+    await process.channel.ready()
     listener = air.ears["robot/desk"].listener
     listener.alive(True)
     await asyncio.sleep(1)
@@ -325,8 +337,8 @@ async def test_a_loss_has_us_and_our_hosts_prepare_and_after_it_tell_our_names_a
     asked = [each for each in operations if f"/camera {each.value}" in world.log]
     assert [each.value for each in asked] == done
     await peer_supervisors.close()
-    for process in world.system.processes.values():
-        await process.end(((9, 5.0),), asyncio.Event())
+    process.signal(9)
+    await process.release()
 
 
 def test_a_process_that_was_killed_while_it_was_busy_does_not_hang() -> None:

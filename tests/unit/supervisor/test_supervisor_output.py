@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 import re
-from types import SimpleNamespace
+from pathlib import Path
 
 import msgspec
 import pytest
@@ -24,8 +24,10 @@ from lifecycle.network.nfe import (
 )
 from lifecycle.node.host.control import Operation
 from lifecycle.supervisor.control.protocol import NodeStatus, ProcessState, Reach, SystemStatus
-from lifecycle.supervisor.control.status import node_status
+from lifecycle.supervisor.control.status import system_status
+from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.run.events import (
+    Emitter,
     Event,
     Failure,
     GateOpened,
@@ -433,27 +435,22 @@ def test_a_flow_shows_its_tuple_dscp_and_tos_requirement_and_verdict() -> None:
     assert json.loads(render_flows([FLOW], "json"))[0]["topic"] == "/video"
 
 
-def test_a_command_is_shown_as_it_was_judged_and_matches_where_its_flows_are_ok() -> None:
-    planned = planned_of(node("camera", publisher("/video"), publisher("/audio"))).nodes[0]
-    command = SimpleNamespace(
-        name="/camera",
-        planned=planned,
-        process=None,
-        configuration=None,
-        pid=0,
-        reach=Reach.ACTIVE,
-        state="active",
-        doing="",
-        withheld="",
-        reports_changes=False,
-    )
+async def test_a_command_is_shown_as_it_was_judged_and_matches_where_its_flows_are_ok(
+    tmp_path: Path,
+) -> None:
+    plan = planned_of(node("camera", publisher("/video"), publisher("/audio")))
+    system = System(plan, emit=Emitter(), logs=tmp_path, processes=plan.processes)
+    command = system.nodes["camera"]
+    command.state = "active"
     wrong = replace(
         verdict_of(Outcome.VIOLATED, "state.wrong-state").findings[0],
         node="/camera",
         observed="inactive",
     )
     verdict = replace(verdict_of(Outcome.OK), findings=(wrong,), flows=(FLOW,))
-    shown = node_status(command, verdict, "", elapsed_s=0.0, schedule=None)
+    system.run.judged.verdict = verdict
+    (shown,) = system_status(system, supervisor=1, elapsed_s=0.0, ends="").nodes
     assert (shown.state, shown.matched, shown.unreported, shown.endpoints) == ("inactive", 1, 1, 2)
-    hosted = SimpleNamespace(**{**vars(command), "reports_changes": True})
-    assert node_status(hosted, verdict, "", elapsed_s=0.0, schedule=None).state == "active"
+    command.reports_changes = True
+    (shown,) = system_status(system, supervisor=1, elapsed_s=0.0, ends="").nodes
+    assert shown.state == "active"

@@ -37,11 +37,7 @@ from lifecycle.supervisor.processes.logs import (
     ros_log_root,
 )
 from lifecycle.supervisor.processes.orphans import end_run
-from lifecycle.supervisor.processes.process import (
-    COMMAND_ESCALATION,
-    ManagedProcess,
-    ProcessExit,
-)
+from lifecycle.supervisor.processes.process import ManagedProcess, ProcessExit
 from lifecycle.supervisor.run.events import Emitter, LogLine
 from lifecycle.verify.outcome import Outcome
 from tests.builders import teleop
@@ -75,7 +71,8 @@ class _Bench:
 
     async def close(self) -> None:
         for process in self._processes:
-            await process.end(COMMAND_ESCALATION, asyncio.Event())
+            process.signal(signal.SIGKILL)
+            await process.release()
         await self.fork_server.close()
 
     async def start(
@@ -101,6 +98,15 @@ class _Bench:
         return process
 
 
+async def _ended(process: ManagedProcess) -> None:
+    """End a process as the supervisor does, by ever stronger means."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
+        if not process.ended.done():
+            process.signal(number)
+            await asyncio.wait({process.ended}, timeout=1.0)
+    await process.release()
+
+
 @contextlib.asynccontextmanager
 async def _bench(tmp_path: Path) -> Any:
     fork_server = ForkServer(ForkServerProcess(preload=False))
@@ -118,7 +124,7 @@ async def test_a_command_gets_its_arguments_environment_and_session_and_its_end_
     async with _bench(tmp_path) as bench:
         process = await bench.start(PYTHON, "-c", code, environment=(("COLOUR", "red"),))
         assert await process.ended == ProcessExit(status=3)
-        await process.end(COMMAND_ESCALATION, asyncio.Event())
+        await _ended(process)
         assert bench.lines == ["red True"]
         assert process.log.path.read_text() == "red True\n"
 
@@ -139,7 +145,7 @@ async def test_a_program_that_does_not_exist_says_so_in_its_output(tmp_path: Pat
     async with _bench(tmp_path) as bench:
         process = await bench.start("/no/such/program")
         assert await process.ended == ProcessExit(status=127)
-        await process.end(COMMAND_ESCALATION, asyncio.Event())
+        await _ended(process)
         said = "cannot run '/no/such/program': No such file or directory\n"
         assert process.log.path.read_text() == said
 
@@ -153,12 +159,11 @@ async def test_a_process_that_ignores_sigint_and_sigterm_is_killed_with_its_grou
         "print(subprocess.Popen(['sleep', '60']).pid, flush=True)\n"
         "time.sleep(60)"
     )
-    steps = ((signal.SIGINT, 0.1), (signal.SIGTERM, 0.1), (signal.SIGKILL, 5.0))
     async with _bench(tmp_path) as bench:
         process = await bench.start(PYTHON, "-c", code)
         await bench.spoke.wait()
         grandchild = psutil.Process(int(bench.lines[0]))
-        assert await process.end(steps, asyncio.Event()) == "SIGKILL"
+        await _ended(process)
         assert process.ended.result() == ProcessExit(signal=signal.SIGKILL)
         grandchild.wait(BOUND_S)
 
@@ -176,7 +181,7 @@ async def test_a_fork_server_that_is_killed_starts_nothing_more_and_its_children
             await bench.start("true")
         assert str(caught.value) == f"cannot start process 'it': {how}"
         assert not first.ended.done()
-        await first.end(COMMAND_ESCALATION, asyncio.Event())
+        await _ended(first)
         assert first.ended.done()
 
 
@@ -418,7 +423,8 @@ def test_systemd_limits_a_process_in_a_scope_that_has_its_pid_and_descriptors(
         async with _bench(tmp_path) as bench:
             process = await bench.start("sh", "-c", "echo $$", resources=resources)
             assert await process.ended == ProcessExit(status=0)
-            await process.end(COMMAND_ESCALATION, asyncio.Event())
+            process.signal(signal.SIGKILL)
+            await process.release()
             assert bench.lines == [str(process.pid)]
 
     _run(test())

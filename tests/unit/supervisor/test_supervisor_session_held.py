@@ -193,15 +193,15 @@ async def test_what_changes_while_a_system_is_resumed_has_it_paused_again(tmp_pa
         "/camera activate",
         f"[verdict] connected violated {INTRUDED}",
         "[notice] the gate closed again: /camera is deactivated",
-        "/camera deactivate",
         f"[notice] {REFUSED_AGAIN}",
+        "/camera deactivate",
         "[verdict] connected ok",
     ]
     assert world.since("[gate]", 3)[:4] == [
         OPENED,
         "/camera activate",
         "/viewer activate",
-        "[system] active at 6.5 s",
+        "[system] active at 6.0 s",
     ]
 
 
@@ -257,13 +257,14 @@ async def test_a_restarted_node_stays_inactive_while_the_system_is_wrong_and_can
         await asyncio.sleep(1.0)
         assert await world.order(ControlRequest.RESUME) == "0"
         assert await world.order(ControlRequest.DOWN) == "0"
-    assert world.since("[verdict] active violated")[1:-ENDING] == [
+    assert world.since("[system] active")[1:-ENDING] == [
         "/viewer deactivate",
         *VIEWER_DOWN,
         "viewer start",
         "/viewer configure",
         "/viewer connect",
         "[system] connected at 0.0 s",
+        f"[verdict] connected violated {INTRUDED}",
         f"[notice] {REFUSED}",
         "[verdict] connected ok",
         "[system] verified at 1.5 s",
@@ -303,7 +304,7 @@ async def test_an_order_that_comes_during_another_is_carried_out_after_it(tmp_pa
             await world.story.until(line, times)
             other = asyncio.ensure_future(world.order(second))
             await asyncio.wait({one, other}, return_when=asyncio.FIRST_COMPLETED)
-            assert not other.done()
+            assert one.done()
             answers.append((await one, await other))
         assert await world.order(ControlRequest.DOWN) == "0"
     assert answers == [

@@ -8,7 +8,7 @@ from msgspec.structs import replace
 from lifecycle.manifest.model import EndpointKind, FlowTransport
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.connections.negotiation import NegotiatedSource
-from lifecycle.supervisor.gate.verification_loop import PASSING_S, GracePeriod
+from lifecycle.supervisor.judging.grace_period import PASSING_S, GracePeriod
 from lifecycle.verify.judge import verify
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import Finding, Stage, Verdict

@@ -142,7 +142,7 @@ class Play:
             effects.Spawn: lambda: inputs.Spawned(process=effect.process, pid=1, error=way),
             effects.Sweep: lambda: inputs.Swept(process=effect.process),
             effects.Look: lambda: inputs.Verified(mark=effect.mark, verdict=self.found),
-            effects.Program: lambda: inputs.Programmed(error=way),
+            effects.Program: lambda: inputs.Programmed(number=effect.number, error=way),
             effects.Give: lambda: inputs.Given(node=effect.node, error=way),
             effects.Prepare: lambda: inputs.Ready(error=way),
         }[type(effect)]()

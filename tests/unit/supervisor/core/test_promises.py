@@ -31,9 +31,9 @@ PROMISES = {
 SOURCES = Path(lifecycle.supervisor.core.__file__).parent
 
 MUTANTS = [
-    ("gate", "gate.py", "run.judged.mark == run.mark and allows(run)", "allows(run)"),
-    ("gate", "gate.py", "run.judged.mark == run.mark and allows(run)", "True"),
-    ("gate", "gate.py", "    judged.mark = given.mark", "    judged.mark = run.mark"),
+    ("gate", "gate.py", "run.judged.mark == run.mark and not", "not"),
+    ("gate", "gate.py", "run.judged.waits and allows(run)", "run.judged.waits"),
+    ("gate", "gate.py", "judged.waits = given.mark,", "judged.waits = run.mark,"),
     ("gate", "advance.py", " or not gate.is_open(run):", ":"),
     (
         "gate",
@@ -53,8 +53,8 @@ MUTANTS = [
     (
         "withheld",
         "state.py",
-        "TargetState.INACTIVE: Level.CONNECTED}",
-        "TargetState.INACTIVE: Level.ACTIVE}",
+        "(Level.DOWN, Level.STARTED, Level.CONFIGURED, Level.CONNECTED)",
+        "tuple(Level)",
     ),
     ("order", "advance.py", "    if holds_up(run, node, target):", "    if False:"),
     ("order", "advance.py", "    return not run.hurry and any(", "    return False and any("),
@@ -63,7 +63,7 @@ MUTANTS = [
     (
         "ends",
         "reduce.py",
-        "        if node.request is not None and run.now_s >= advance.late_at_s",
+        "        if node.request is not None and at_s >= advance.late_at_s",
         "        if False and late_at_s",
     ),
     ("processes", "advance.py", " or _is_to_end(run, process):", ":"),
@@ -83,7 +83,7 @@ MUTANTS = [
     ("up", "failure.py", "max(node.due_s, due_s)", "NEVER_S"),
     ("violations", "gate.py", "LASTS_S = 1.0", "LASTS_S = 60.0"),
     ("violations", "failure.py", "_outcome(run, run.judged.counted)", '_outcome(run, "")'),
-    ("answers", "state.py", "        self.order, self.ready = None, None", "        pass"),
+    ("answers", "state.py", "        self.order, self.ready, self.undone =", "        _ ="),
     ("answers", "failure.py", "    for order in open_:", "    for order in []:"),
     ("answers", "reduce.py", "        run.answer(ExitCode.BRING_UP_FAILED, text)", "        pass"),
 ]

@@ -24,7 +24,13 @@ from lifecycle.plan.model import Plan
 from lifecycle.supervisor.control.protocol import ControlRequest
 from lifecycle.supervisor.core import inputs
 from lifecycle.supervisor.core.state import Level, Options, new_run
-from lifecycle.supervisor.run.events import Failure, GaveUp, ManifestApplied, Restarted
+from lifecycle.supervisor.run.events import (
+    Failure,
+    GaveUp,
+    ManifestApplied,
+    Restarted,
+    SystemReached,
+)
 from tests.builders import HERE, plan_of, planned_node
 from tests.unit.supervisor.core.playbook import Play
 from tests.unit.supervisor.core.world import verdict
@@ -310,6 +316,72 @@ def test_one_node_is_restarted_through_the_gate_and_waits_for_an_order_if_that_s
     assert play.see() == []
     play.order(ControlRequest.RESUME)
     assert play.levels == "4 4"
+
+
+def test_a_plain_process_that_was_restarted_passes_the_gate_and_its_ports_are_programmed() -> None:
+    plain = planned_node("driver", managed=False, kind=RunKind.COMMAND, supervision=AGAIN)
+    play = Play(plan_of(plain, planned_node("viewer")))
+    play.die("driver")
+    assert play.wait(5.0) == ["spawn driver", "driver start", "program"]
+    said = [each.reached for each in play.events if isinstance(each, SystemReached)]
+    assert said == 2 * ["connected", "verified", "active"]
+
+
+def test_a_gate_stays_closed_for_good_only_by_a_verdict_of_what_is_there_now() -> None:
+    play = Play(CHAIN, ways={"camera connect": "hang"})
+    play.found = verdict(INTRUDER)
+    connects = play.held.pop()
+    play.ways["look"] = "hang"
+    play.give(inputs.Replied(node="camera", number=connects.number, level=Level.CONNECTED))
+    first = play.held.pop()
+    play.give(inputs.Changed())  # while it was looked
+    play.give(inputs.Verified(mark=first.mark, verdict=play.found))
+    play.wait(3.0)
+    assert play.run.ending is None
+    looks = play.held.pop()
+    play.ways.clear()
+    play.found = verdict()
+    play.give(inputs.Verified(mark=looks.mark, verdict=play.found))
+    assert play.levels == "4 4"
+
+
+@pytest.mark.parametrize(("restarts", "code"), [(True, 0), (False, 4)])
+def test_an_endpoint_of_nobody_counts_only_where_no_process_is_coming_up(
+    restarts: bool, code: int
+) -> None:
+    play = Play(chain(), hold_s=10.0)
+    if restarts:
+        play.ways["viewer configure"] = "hang"
+        play.die("viewer")
+        play.wait(2.0)
+    play.see(("graph.unattributed-endpoint", "/rosout"))
+    play.wait(3.0)
+    play.see()
+    if restarts:
+        play.ways.clear()
+        asked = play.held.pop()
+        play.give(inputs.Replied(node="viewer", number=asked.number, level=Level.CONFIGURED))
+    play.wait(1.0)
+    assert play.levels == "4 4"
+    play.wait(10.0)
+    assert play.code == code
+
+
+def test_a_system_is_connected_again_once_its_plain_node_has_appeared() -> None:
+    plain = planned_node("driver", managed=False, kind=RunKind.COMMAND, supervision=AGAIN)
+    play = Play(plan_of(plain, planned_node("viewer")))
+    play.ways["driver start"] = "hang"
+    play.see(("graph.missing-node", "/driver"))
+    play.die("driver")
+    play.wait(5.0)
+    appears = play.held.pop()
+    said = [each.reached for each in play.events if isinstance(each, SystemReached)]
+    assert said == ["connected", "verified", "active"]
+    before = len(play.events)
+    play.give(inputs.Replied(node="driver", number=appears.number, level=Level.STARTED))
+    play.see()
+    said = [each.reached for each in play.events[before:] if isinstance(each, SystemReached)]
+    assert said == ["connected", "verified", "active"]
 
 
 def test_an_order_waits_for_the_one_under_way_and_fits_then_or_not() -> None:

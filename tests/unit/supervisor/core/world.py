@@ -260,7 +260,7 @@ class World:
             self.judged_mark = self.looks[effect.mark]
             self.give(inputs.Verified(mark=effect.mark, verdict=self.judge()))
         elif kind == "Program":
-            self.give(inputs.Programmed())
+            self.give(inputs.Programmed(number=effect.number))
         elif kind == "Give":
             error = "refused" if not self.calm and r.random() < 0.2 else ""
             self.give(inputs.Given(node=effect.node, error=error))
@@ -485,9 +485,11 @@ class World:
 
     def check_idle(self) -> None:
         """While nothing is asked of anybody, only what the gate let through is active."""
+        if any(each.request is not None for each in self.run.nodes.values()):
+            return  # one of them may be what another waits for
         for node in self.run.nodes.values():
             foreign = self.level_of[node.key] == 4 and node.key not in self.let
-            silent = node.stuck or node.silent or node.guarded > 5 or node.request is not None
+            silent = node.stuck or node.silent or node.guarded > 5
             assert silent or not foreign or self.run.ending, "withheld: what others activated is"
 
     def check_up(self) -> None:

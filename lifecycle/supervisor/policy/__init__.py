@@ -1,1 +1,0 @@
-"""What the manifest wants done about what goes wrong: it decides, others notice and carry out."""

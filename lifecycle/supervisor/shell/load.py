@@ -1,0 +1,91 @@
+"""For how long nodes that are asked for a step had no processor: that counts in no deadline."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from lifecycle.supervisor.core.state import NEVER_S
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from lifecycle.supervisor.nodes.system import System
+
+SLICE_S = 1.0
+"""How often is looked whether a process could run, while it is waited for.
+
+What is done within this, or a tenth of its limit, is not worth looking, which takes a file of each
+thread: most steps are, of many nodes at once, too."""
+
+
+class _Measured(msgspec.Struct):
+    number: int
+    at_s: float
+    delay_s: float
+    waited_s: float = 0.0
+
+
+class Load:
+    """Measures the run delay of the processes of one system while steps take long.
+
+    Args:
+        system: whose nodes are asked.
+    """
+
+    def __init__(self, system: System) -> None:
+        self._system = system
+        self._measured: dict[str, _Measured] = {}
+
+    def next_s(self, now_s: float) -> float:
+        """Return when to measure next, by the run's time; infinity while nothing is asked."""
+        times = []
+        for key, node in self._system.run.nodes.items():
+            request = node.request
+            if request is None or request.limit_s == NEVER_S:
+                self._measured.pop(key, None)
+                continue
+            known = self._measured.get(key)
+            if known is None or known.number != request.number:
+                self._measured.pop(key, None)
+                prompt_s = min(SLICE_S, request.limit_s / 10)
+                times.append(request.since_s + prompt_s)
+            else:
+                times.append(known.at_s + SLICE_S)
+        return max(now_s, min(times, default=float("inf")))
+
+    def measure(self, now_s: float) -> tuple[Mapping[str, float], Mapping[str, str]]:
+        """Return by node how long its process had no CPU, and what late ones are doing."""
+        waited_s: dict[str, float] = {}
+        where: dict[str, str] = {}
+        for key, node in self._system.nodes.items():
+            request = node.core.request
+            if request is None or request.limit_s == NEVER_S:
+                continue
+            begins_s = request.since_s + min(SLICE_S, request.limit_s / 10)
+            if now_s < begins_s:
+                continue
+            delay_s = node.run_delay_s()
+            known = self._measured.get(key)
+            if known is None or known.number != request.number:
+                # That it is looked at late is the machine's fault, too.
+                waited_s[key] = now_s - begins_s
+                self._measured[key] = _Measured(request.number, now_s, delay_s, waited_s[key])
+            else:
+                # Threads that wait at once have waited no longer for it, and one that ends takes
+                # its own along.
+                passed_s = now_s - known.at_s
+                known.waited_s += min(max(delay_s - known.delay_s, 0.0), passed_s)
+                known.at_s, known.delay_s = now_s, delay_s
+                waited_s[key] = known.waited_s
+            waited = min(waited_s.get(key, 0.0), 9 * request.limit_s)
+            if now_s >= request.since_s + request.limit_s + request.own_s + waited:
+                where[key] = self._where(key)
+        return waited_s, {key: text for key, text in where.items() if text}
+
+    def _where(self, key: str) -> str:
+        node = self._system.nodes[key]
+        if node.told:
+            return f"told to {node.told}"
+        return "" if node.process is None else node.process.where()

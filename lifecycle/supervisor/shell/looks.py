@@ -1,0 +1,358 @@
+"""Looks when the core asks for it, and says what is seen of nodes that do not report: Look.
+
+Owns: what is asked once more before a gate opens, which verdicts of a held system are kept back for
+a moment, when to look again although nobody says that something changed, and which node is not
+discovered over TCP although it runs.
+
+Fast DDS 2.14 sometimes never uses a TCP connection that it has dialled: if the answer to its first
+message arrives before the port inside the connection was noted, which happens when the dialling
+thread loses its processor in between, the answer is ignored (BIND_CONNECTION_RESPONSE in
+RTCPMessageManager::processRTCPMessage). Then nothing is sent that way for as long as both
+participants live, and the dialled one takes no other connection from the same port. A participant
+on another port is discovered by all from the beginning.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import Counter
+from collections.abc import Collection, Mapping
+from typing import TYPE_CHECKING
+
+from msgspec.structs import replace
+
+from lifecycle.graph.loop import set_within
+from lifecycle.manifest.model import Condition
+from lifecycle.plan.model import Plan, PlannedNode
+from lifecycle.plan.restart import moving_nodes
+from lifecycle.supervisor.control.protocol import ProcessState
+from lifecycle.supervisor.core import advance, gate, inputs
+from lifecycle.supervisor.core.state import Level
+from lifecycle.supervisor.judging.grace_period import GracePeriod
+from lifecycle.supervisor.nodes.driver import ACTIVE, INACTIVE
+from lifecycle.supervisor.run.events import Notice
+from lifecycle.verify.judge import not_ok
+from lifecycle.verify.observation import HealthReport, NodeConfiguration, Observation
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.rules import rule
+from lifecycle.verify.rules.catalogue import About
+from lifecycle.verify.rules.health import health_of
+from lifecycle.verify.rules.nodes import MISSING_NODE
+from lifecycle.verify.verdict import Stage, Verdict
+
+if TYPE_CHECKING:
+    from lifecycle.supervisor.core.state import Attempt
+    from lifecycle.supervisor.nodes.system import NodeRun
+    from lifecycle.supervisor.shell.supervisor import Supervisor
+
+QUIET_S = 0.005
+"""Changes come in bursts: look again once it was quiet for so long ..."""
+
+BURST_S = 0.05
+"""... or a burst lasts longer than this."""
+
+ASK_AGAIN_S = 0.02
+"""Two other participants match without our graph changing, so while that is missing the nodes are
+asked again: after this long, then twice as long each time, ..."""
+
+ASK_AGAIN_AT_MOST_S = 0.5
+"""... up to this."""
+
+REMOTE_S = 0.2
+"""A remote node is asked again so long after, because the event that it connected may be missed:
+its announcer may not be matched yet."""
+
+UNCHANGED_S = 5.0
+"""Who is discovered at all over TCP is after 0.1–1.6 s, on a machine with both processors busy
+after 1–4 s; findings that have not changed for so long do not change any more."""
+
+SHOWN_S = 0.5
+"""The graph shows the state of a node of others within so long after it changed."""
+
+TRIES = 3
+"""So many nodes are started again before a gate at most: each takes 1–5 s of the bring-up."""
+
+
+class Looks:
+    """Looks at the system of one supervisor.
+
+    Args:
+        shell: gets the inputs.
+    """
+
+    def __init__(self, shell: Supervisor) -> None:
+        self._shell = shell
+        self._system = shell.system
+        self._graph = shell.means.participant.graph
+        self._grace_period = GracePeriod()
+        self._latest: Verdict | None = None
+        self._was_stale = False
+        self._again_s = ASK_AGAIN_S
+        self._attempt: Attempt | None = None
+        self._seen_last: inputs.Saw | None = None
+        self._activated_s: dict[str, float] = {}
+        self._found: frozenset[tuple[str, str]] = frozenset()
+        self._found_s = 0.0
+        self._tries: Counter[str] = Counter()
+
+    async def look(self) -> None:
+        """Look and judge, once a burst of changes is over."""
+        run, judge = self._system.run, self._shell.judge
+        loop = asyncio.get_running_loop()
+        waits = run.held_s is not None or not gate.allows(run) or self._was_stale
+        if self._latest is not None and waits:
+            await self._quiet()
+        newcomers_until_s = loop.time() + gate.UNVERIFIABLE_S
+        is_read_again = False
+        while True:
+            self._shell.catch_up()
+            mark, stage = run.mark, advance.stage_of(run)
+            active = frozenset(
+                each.name for each in run.nodes.values() if each.level is Level.ACTIVE
+            )
+            found = await judge.look(stage, frozenset() if stage is Stage.ACTIVE else active)
+            closes = gate.closes(found, strict=run.options.strict)
+            if closes or stage is not Stage.CONNECTED or not self._is_waited_for():
+                break
+            if not is_read_again:
+                is_read_again = True
+                # Nodes of others need not say that their parameters changed, or that they hang.
+                has_asked = await self._shell.answering.asked(self._left_s())
+                if self._graph.reread_parameters() or has_asked:
+                    continue
+            lately = loop.time() < newcomers_until_s
+            if not (lately and self._graph.expect_newcomers()):
+                break  # else the next look waits for them
+        self._saw(judge.seen)
+        self._was_stale = run.mark != mark
+        self._shell.give(self._verified(mark, stage, found))
+
+    def _is_waited_for(self) -> bool:
+        run = self._system.run
+        at_gate = run.attempt is not None and run.attempt.at_gate
+        return at_gate or run.passage is not None or bool(advance.waiting(run))
+
+    def _left_s(self) -> float:
+        run = self._system.run
+        until_s = [each.until_s for each in (run.attempt, run.passage) if each is not None]
+        return max(0.0, min(until_s, default=run.now_s) - self._shell.now_s())
+
+    def _verified(self, mark: int, stage: Stage, found: Verdict) -> inputs.Verified:
+        run, judge = self._system.run, self._shell.judge
+        now_s = asyncio.get_running_loop().time()
+        verdict, waits_s = found, [float("inf")]
+        waits = False
+        watched = run.held_s is not None and run.attempt is None and run.passage is None
+        if watched:
+            verdict, again_s = self._grace_period.after(
+                self._latest, found, self._system.expected, now_s
+            )
+            waits = again_s is not None
+            waits_s += [again_s] if again_s is not None else []
+        self._latest = verdict
+        if not gate.closes(found, strict=run.options.strict) and stage is Stage.CONNECTED:
+            unsaid_s = judge.unsaid_s(found)
+            if unsaid_s > 0:
+                waits = True
+                waits_s.append(unsaid_s)
+        if judge.asks_again(found):
+            if run.attempt is not self._attempt:
+                self._attempt, self._again_s = run.attempt, ASK_AGAIN_S
+            waits_s.append(ASK_AGAIN_AT_MOST_S if watched else self._again_s)
+            self._again_s = min(self._again_s * 2, ASK_AGAIN_AT_MOST_S)
+        if run.change is not None and judge.is_reconciling:
+            waits = True
+            waits_s.append(ASK_AGAIN_AT_MOST_S)
+        undiscovered = self._undiscovered(stage, found, now_s, waits_s)
+        again_s = min(waits_s)
+        return inputs.Verified(
+            mark=mark,
+            verdict=verdict,
+            again_s=None if again_s == float("inf") else again_s,
+            waits=waits,
+            undiscovered=undiscovered,
+        )
+
+    async def _quiet(self) -> None:
+        """Let a burst of changes pass."""
+        loop = asyncio.get_running_loop()
+        until_s = loop.time() + BURST_S
+        while loop.time() < until_s and await set_within(self._shell.changed, QUIET_S):
+            pass
+
+    # Who is not discovered over TCP
+
+    def _undiscovered(
+        self, stage: Stage, found: Verdict, now_s: float, waits_s: list[float]
+    ) -> str:
+        """Return the key of the node to be started again on a fresh port; empty if none is."""
+        run = self._system.run
+        same = frozenset((each.rule, each.subject) for each in found.findings)
+        if same != self._found or not self._is_waited_for():
+            self._found, self._found_s = same, now_s
+        if run.attempt is None or not run.attempt.at_gate or run.passage is not None:
+            self._tries.clear()
+            return ""
+        if stage is not Stage.CONNECTED or not gate.closes(found, strict=run.options.strict):
+            return ""
+        restartable = self._restartable()
+        if not restartable or self._tries.total() >= TRIES:
+            return ""
+        name = undiscovered(found, restartable, self._tries)
+        left_s = self._found_s + UNCHANGED_S - now_s
+        if name is None or run.attempt.until_s - run.now_s <= UNCHANGED_S + max(left_s, 0.0):
+            return ""
+        if left_s > 0:
+            waits_s.append(left_s)
+            return ""
+        self._tries[name] += 1
+        self._found_s = now_s
+        text = (
+            f"{name!r} is started again on a fresh port: not discovered over TCP "
+            f"for {UNCHANGED_S:g} s ({not_ok(found)}); try {self._tries.total()} of {TRIES}"
+        )
+        self._system.emit(Notice(message=text))
+        node = self._system.node_named(name)
+        assert node is not None
+        return node.core.key
+
+    def _restartable(self) -> frozenset[str]:
+        """Return the names of nodes that could be started again on fresh ports before the gate."""
+        run = self._system.run
+        moving = moving_nodes(run.plan)
+        active = {each.process for each in run.nodes.values() if each.level is Level.ACTIVE}
+        return frozenset(
+            each.name
+            for key, each in run.nodes.items()
+            if key in moving
+            and each.process not in active
+            and each.process in run.processes
+            and run.processes[each.process].state is ProcessState.RUNNING
+        )
+
+    # Nodes that do not report
+
+    async def follow(self) -> None:
+        """Look at nodes of others, and at ours that others may drive, while no verdict is made."""
+        while True:
+            changed = self._shell.changed
+            plan = self._followed()
+            if plan.nodes and not self._is_looked_at():
+                self._saw(await self._graph.observe(plan))
+            remote = any(self._system.run.elsewhere.values())
+            await set_within(changed, REMOTE_S if remote else None)
+
+    def _is_looked_at(self) -> bool:
+        run = self._system.run
+        active = any(each.level is Level.ACTIVE for each in run.nodes.values())
+        watched = active and run.held_s is not None
+        return run.judged.looking or watched or advance.is_at_gate(run)
+
+    def _followed(self) -> Plan:
+        run = self._system.run
+        awaited = {after.node for each in run.nodes.values() for after in each.planned.after}
+        healthy = {
+            after.node
+            for each in run.nodes.values()
+            for after in each.planned.after
+            if after.condition is Condition.HEALTHY
+        }
+        keys = {key for key in run.elsewhere if key in awaited}
+        for key, node in self._system.nodes.items():
+            foreign = node.planned.managed and not node.is_hosted
+            if foreign or (key in healthy and not node.reports_health):
+                keys.add(key)
+        return replace(run.plan, nodes=tuple(each for each in run.plan.nodes if each.key in keys))
+
+    def _saw(self, seen: Observation) -> None:
+        """Say what is seen of nodes that do not report to us, where that is new."""
+        nodes = self._system.nodes
+        states = {each.full_name: each.state for each in seen.nodes}
+        own = {each.name: own_health(each) for each in seen.configurations}
+        published = {each.full_name: each.health for each in seen.nodes}
+        levels, health = {}, {}
+        for key, node in nodes.items():
+            if self._is_news(node, states.get(node.name)):
+                levels[key] = Level.ACTIVE
+                node.report(ACTIVE, connected=True)
+            if not node.reports_health:
+                node.health = own.get(node.name), published.get(node.name)
+            health[key] = node.is_healthy
+        elsewhere = {key: conditions(each, seen) for key, each in self._system.remote.items()}
+        saw = inputs.Saw(levels=levels, health=health, elsewhere=elsewhere)
+        if saw != self._seen_last or levels:
+            self._seen_last = saw
+            self._shell.give(saw)
+
+    def _is_news(self, node: NodeRun, state: str | None) -> bool:
+        """Whether a node of others is seen to have been activated since it was seen so before."""
+        now_s, key = asyncio.get_running_loop().time(), node.core.key
+        if node.is_hosted or not node.planned.managed or state != ACTIVE:
+            self._activated_s.pop(key, None)
+            return False
+        if node.core.level is Level.ACTIVE:
+            return False
+        # The graph may show for a moment what it was before it was deactivated.
+        is_news = now_s - self._activated_s.get(key, -SHOWN_S) >= SHOWN_S
+        if is_news:
+            self._activated_s[key] = now_s
+            asyncio.get_running_loop().call_later(SHOWN_S, self._system.touch)
+        return is_news
+
+
+def own_health(report: NodeConfiguration | None) -> HealthReport | None:
+    """Return what a node says of itself; what it said while it was inactive is no answer."""
+    return None if report is None or report.state == INACTIVE else report.health
+
+
+def conditions(planned: PlannedNode, seen: Observation) -> frozenset[Condition]:
+    """Return the conditions that a node of another supervisor is seen to have reached."""
+    name = planned.full_name
+    observed = next((each for each in seen.nodes if each.full_name == name), None)
+    if observed is None:
+        return frozenset()
+    report = next((each for each in seen.configurations if each.name == name), None)
+    up_to_active = (Condition.STARTED, Condition.CONFIGURED, Condition.CONNECTED, Condition.ACTIVE)
+    said = health_of(planned, own_health(report), observed.health)
+    healthy = (Condition.HEALTHY,) if said.ok else ()
+    state = observed.state or (report.state if report is not None else "")
+    if not planned.managed or state == ACTIVE:
+        return frozenset((*up_to_active, *healthy))
+    if state != INACTIVE:
+        return frozenset((Condition.STARTED,))
+    # A node that is not ours makes its data layer in configure, and has no such report.
+    if report is None or report.connected:
+        return frozenset(up_to_active[:3])
+    return frozenset(up_to_active[:2])
+
+
+def undiscovered(
+    verdict: Verdict, restartable: Collection[str], tries: Mapping[str, int]
+) -> str | None:
+    """Return the full name of the node to start again; None where that would mend nothing.
+
+    Of two ends that do not match either may be the undiscovered one: it is who lacks most,
+    then who was started again least often, then the last by name.
+
+    Args:
+        verdict: that keeps the gate closed.
+        restartable: full names of nodes that get fresh ports when they are started again, and whose
+            process is ours and holds no active node.
+        tries: how often each was started again before.
+    """
+    violated = [each for each in verdict.findings if each.outcome is Outcome.VIOLATED]
+    if not all(rule(each.rule).if_undiscovered for each in violated):
+        return None
+    missing = [each for each in violated if each.rule == MISSING_NODE.id]
+    # Who is not there yet, or not so far, keeps others waiting that nothing is wrong with.
+    coming = (each for each in violated if rule(each.rule).about is About.PROGRESS)
+    awaited = {each.node for each in (*missing, *coming)}
+    unmatched = (each for each in violated if rule(each.rule).about is About.MATCH)
+    pairs = (each.ends for each in unmatched if awaited.isdisjoint(each.ends))
+    lacks = Counter(
+        name
+        for names in (*pairs, *((each.node,) for each in missing))
+        for name in names
+        if name in restartable
+    )
+    return max(lacks, key=lambda name: (lacks[name], -tries.get(name, 0), name), default=None)

@@ -1,0 +1,220 @@
+"""Starts processes, sends them signals, and ends what they left: Spawn, Signal and Sweep.
+
+Owns: what the core hears of a process: `Spawned`, `Exited`, `Swept`. When it is asked for is the
+core's alone.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from lifecycle.errors import BringUpError
+from lifecycle.graph.loop import set_within
+from lifecycle.manifest.model import RunKind
+from lifecycle.node.host.control import HostSpec
+from lifecycle.run_directory import start_ticks
+from lifecycle.supervisor.control.protocol import ProcessState
+from lifecycle.supervisor.core import effects, inputs
+from lifecycle.supervisor.judging.judge import FORGOTTEN_S
+from lifecycle.supervisor.processes.control_channel import ControlChannel
+from lifecycle.supervisor.run.events import Notice
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from lifecycle.plan.model import PlannedNode
+    from lifecycle.supervisor.nodes.system import NodeRun
+    from lifecycle.supervisor.processes.process import ManagedProcess
+    from lifecycle.supervisor.shell.supervisor import Supervisor
+
+_WORDS_S = 0.1
+"""For what a process wrote to its channel just before it ended."""
+
+_AGAIN_S = 0.2
+"""What ended processes left is forgotten bit by bit, and not all of it is a change of the graph."""
+
+_PREFIX_DIGITS = 24
+
+
+class Processes:
+    """The processes of one supervisor.
+
+    Args:
+        shell: gets the inputs.
+
+    Attributes:
+        releasing: what processes that ended had open is being closed; each ends within a second.
+    """
+
+    def __init__(self, shell: Supervisor) -> None:
+        self._shell = shell
+        self._system = shell.system
+        self._means = shell.means
+        self._belonging: dict[str, set[int]] = {}  # what processes had started as they were ended
+        self.releasing: list[asyncio.Task[None]] = []
+
+    def spawn(self, effect: effects.Spawn) -> None:
+        """Start a process."""
+        system = self._system
+        before = system.processes.get(effect.process)
+        process = system.make_process(system.run.processes[effect.process].planned)
+        process.is_restarted = before is not None
+        system.processes[effect.process] = process
+        for node in system.carried_by(effect.process):
+            node.begin()
+        self._shell.start(self._spawn(process))
+
+    async def _spawn(self, process: ManagedProcess) -> None:
+        system = self._system
+        nodes = [system.nodes[key] for key in process.planned.nodes]
+        hung = system.liveliness.watch_over(process, [node.name for node in nodes])
+        channel = None
+        if process.planned.run.kind is RunKind.PYTHON:
+            spec = HostSpec(
+                system=system.plan.system,
+                process=process.name,
+                domain_id=system.plan.domain_id,
+                discovery_range=system.plan.discovery_range,
+                nodes=tuple(node.planned for node in nodes),
+                folders=manifest_folders(node.planned for node in nodes),
+                log=process.log.shown,
+            )
+            channel = ControlChannel(spec, system.on_host_event, hung)
+        try:
+            await process.spawn(self._means.fork_server, channel)
+        except (BringUpError, OSError) as error:
+            text = error.message if isinstance(error, BringUpError) else str(error)
+            self._shell.give(
+                inputs.Spawned(process=process.name, log=process.log.shown, error=text)
+            )
+            await process.release()
+            return
+        process.ended.add_done_callback(lambda _: self._ended(process))
+        self._shell.give(
+            inputs.Spawned(process=process.name, pid=process.pid, log=process.log.shown)
+        )
+        self._means.records.write()
+
+    def _ended(self, process: ManagedProcess) -> None:
+        """Say how a process ended; of one that was starting, once all is read that it said."""
+        try:
+            if process.channel is not None and self._is_starting(process):
+                self._shell.start(self._ended_early(process.channel, process))
+            else:
+                self._say_end(process)
+        except Exception as error:  # noqa: BLE001 - a callback of a future loses it
+            self._shell.broke(error)
+
+    def _is_starting(self, process: ManagedProcess) -> bool:
+        core = self._system.run.processes.get(process.name)
+        return core is not None and core.state is ProcessState.STARTING
+
+    async def _ended_early(self, channel: ControlChannel, process: ManagedProcess) -> None:
+        await channel.drained(_WORDS_S)
+        self._say_end(process)
+
+    def _say_end(self, process: ManagedProcess) -> None:
+        system, channel = self._system, process.channel
+        end = process.ended.result()
+        carried = system.carried_by(process.name)
+        self.forget(process.pid, carried)
+        self._shell.judge.left(each.resolved for node in carried for each in node.planned.endpoints)
+        self._shell.give(
+            inputs.Exited(
+                process=process.name,
+                status=end.status,
+                signal=end.signal or 0,
+                text=str(end),
+                words=process.last_words,
+                stderr=process.last_stderr,
+                clean=end.is_clean,
+                crash=end.is_crash,
+                reports=tuple(
+                    (each.node, each.message)
+                    for each in (() if channel is None else channel.failures)
+                ),
+            )
+        )
+        self.releasing.append(self._shell.start(process.release()))
+
+    def signal(self, effect: effects.Signal) -> None:
+        """Send a process a signal, or close its channel, by which a host of ours ends."""
+        process = self._system.processes.get(effect.process)
+        if process is None:
+            return
+        if self._system.run.ending is None and effect.process not in self._belonging:
+            # What writes to it may end as soon as nobody reads a process's output any more.
+            pids = {process.pid: process.name}
+            self._belonging[effect.process] = set(self._means.fork_server.belonging(pids))
+        if process.channel is not None:
+            self._shell.start(process.channel.close())
+        if effect.number:
+            process.signal(effect.number)
+
+    async def sweep(self, effect: effects.Sweep) -> None:
+        """End what a process left, and wait until the graph shows none of its nodes any more."""
+        system, fork_server = self._system, self._means.fork_server
+        process = system.processes[effect.process]
+        carried = system.carried_by(effect.process)
+        known = self._belonging.pop(effect.process, set())
+        if system.run.ending is None:
+            left = await fork_server.end_left({process.pid: process.name}, known)
+            if left:
+                pids = ", ".join(map(str, left))
+                text = f"ended what {process.name!r} left behind: {pids}"
+                system.emit(Notice(message=text))
+            for node in carried:
+                self._means.participant.graph.drop_configuration(node.name)
+            for pid in {*left, *known}:
+                if start_ticks(pid) is None:
+                    self.forget(pid, carried)
+            await asyncio.gather(*(self._vanishes(node.name) for node in carried))
+        names = {each.name for each in system.nodes.values()}
+        self._shell.again |= {node.name for node in carried}
+        self._shell.give(
+            inputs.Swept(
+                process=effect.process,
+                reported={
+                    each.name: {report.name: report.urls for report in each.connections}
+                    for each in self._shell.judge.seen.configurations
+                    if each.name not in names
+                },
+            )
+        )
+
+    def forget(self, pid: int, nodes: Iterable[NodeRun]) -> None:
+        """Count what a process left in the graph no more: the kernel says that it has ended."""
+        nodes = tuple(nodes)
+        self._means.participant.discovery.ended(
+            pid,
+            nodes=[node.name for node in nodes],
+            reported=[prefix for node in nodes for prefix in _reported(node)],
+        )
+
+    async def _vanishes(self, name: str) -> None:
+        """Wait until discovery shows no node of this name, or its lease must have run out."""
+        loop = asyncio.get_running_loop()
+        until_s = loop.time() + FORGOTTEN_S
+        while self._system.run.ending is None and (left_s := until_s - loop.time()) > 0:
+            changed = self._shell.changed
+            if not await self._shell.is_seen(name):
+                return
+            await set_within(changed, min(left_s, _AGAIN_S))
+
+
+def _reported(node: NodeRun) -> Iterable[str]:
+    """Yield the GUID prefixes that a node said are its own."""
+    configuration = node.configuration
+    if configuration is None:
+        return
+    yield configuration.identity.node_id.rpartition("@")[2]
+    for each in configuration.endpoints:
+        yield each.gid[:_PREFIX_DIGITS]
+
+
+def manifest_folders(nodes: Iterable[PlannedNode]) -> tuple[str, ...]:
+    """Return the absolute folders of the manifests that declare some nodes."""
+    folders = (str(Path(node.at.file).absolute().parent) for node in nodes if node.at.file)
+    return tuple(dict.fromkeys(folders))

@@ -1,0 +1,302 @@
+"""Asks nodes for steps, and gives them parameters: Ask and Give.
+
+Owns: how each step is carried out on each kind of node (in a host of ours, through its services,
+loaded into a container, only seen in the graph), and what the core hears of it: `Replied`, `Given`.
+Which step is due, and for how long, is the core's alone.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Awaitable
+from typing import TYPE_CHECKING
+
+from msgspec.structs import replace
+
+from lifecycle.errors import BringUpError, MiddlewareError
+from lifecycle.graph.loop import set_within
+from lifecycle.manifest.model import RunKind
+from lifecycle.node.host.control import Command, Operation
+from lifecycle.plan.parameters import GIVEN
+from lifecycle.supervisor.core import effects, inputs
+from lifecycle.supervisor.core.gate import ACTIVATES_ITSELF, GUARD_TRIES
+from lifecycle.supervisor.core.state import REACHES, Level, Step
+from lifecycle.supervisor.nodes.adoption import ran_before
+from lifecycle.supervisor.nodes.driver import (
+    ACTIVE,
+    INACTIVE,
+    UNCONFIGURED,
+    ActiveError,
+    ChangedError,
+    ControlDriver,
+    NodeCondition,
+)
+from lifecycle.supervisor.nodes.system import level_of
+from lifecycle.supervisor.processes.control_channel import ChannelClosedError, HostFailedError
+from lifecycle.supervisor.run.events import Notice, RequestSent, WiringChanged
+from lifecycle.supervisor.run.failure import within
+from lifecycle.supervisor.shell.permit import Permit
+from lifecycle.verify.judge import with_findings
+from lifecycle.verify.verdict import NOT_JUDGED
+
+if TYPE_CHECKING:
+    from lifecycle.supervisor.nodes.system import NodeRun
+    from lifecycle.supervisor.shell.supervisor import Supervisor
+
+_DEATH_S = 0.5
+"""A closed channel usually means a dying process; its end says more than the channel did."""
+
+BY_ITSELF = "was activated by its own code or another client while the gate is closed"
+
+_OPERATIONS = {
+    Step.CONFIGURE: Operation.CONFIGURE,
+    Step.CONNECT: Operation.CONNECT,
+    Step.ACTIVATE: Operation.ACTIVATE,
+    Step.DEACTIVATE: Operation.DEACTIVATE,
+    Step.DISCONNECT: Operation.DISCONNECT,
+    Step.CLEANUP: Operation.CLEANUP,
+    Step.SHUTDOWN: Operation.SHUTDOWN,
+}
+
+
+class Requests:
+    """What is asked of the nodes of one supervisor; one request to a node at a time.
+
+    Args:
+        shell: gets the inputs.
+    """
+
+    def __init__(self, shell: Supervisor) -> None:
+        self._shell = shell
+        self._system = shell.system
+        self._means = shell.means
+        self._tasks: dict[str, tuple[int, asyncio.Task[None]]] = {}
+
+    def ask(self, effect: effects.Ask) -> None:
+        """Ask a node for a step."""
+        node = self._system.nodes[effect.node]
+        task = self._shell.start(self._carry_out(node, effect))
+        self._tasks[effect.node] = effect.number, task
+
+    def drop(self) -> None:
+        """End what is done for requests that the core has given up."""
+        nodes = self._system.run.nodes
+        for key, (number, task) in tuple(self._tasks.items()):
+            node = nodes.get(key)
+            request = None if node is None else node.request
+            if request is None or request.number != number:
+                del self._tasks[key]
+                if task is not asyncio.current_task():
+                    task.cancel()
+
+    async def _carry_out(self, node: NodeRun, effect: effects.Ask) -> None:
+        reply = inputs.Replied(node=effect.node, number=effect.number, level=node.core.level)
+        try:
+            reply = replace(reply, **await self._step(node, effect.step))
+        except ChangedError:
+            reply = replace(reply, level=node.core.level, changed=True)
+        except ActiveError as error:  # it is left as it was found
+            reply = replace(reply, level=node.core.level, error=error.message)
+        except BringUpError as error:
+            process = node.process
+            if process is not None and isinstance(error, ChannelClosedError | HostFailedError):
+                await asyncio.wait({process.ended}, timeout=_DEATH_S)
+                if process.ended.done():
+                    return  # its end says it
+            reply = replace(reply, level=level_of(node), error=error.message)
+        except MiddlewareError as error:
+            text = f"{error.message}; {error.hint}" if error.hint else error.message
+            reply = replace(reply, level=node.core.level, error=text)
+        self._shell.give(reply)
+
+    async def _step(self, node: NodeRun, step: Step) -> dict[str, object]:
+        """Carry out a step; return what is to be said of it."""
+        if step is Step.START:
+            return {"level": await self._start(node)}
+        if step is Step.WIRE:
+            assert self._shell.authority is not None
+            await self._shell.authority.wire(node)
+            return {"level": Level.CONFIGURED}
+        if step is Step.UNLOAD:
+            if node.unload is not None:
+                await node.unload()
+            node.begin()
+            return {"level": Level.DOWN}
+        if step in (Step.CONFIGURE, Step.CONNECT, Step.ACTIVATE):
+            condition = await self._upwards(node, step)
+            return {"level": REACHES[step], "already": condition.already}
+        return {"level": await self._downwards(node, step)}
+
+    # Upwards
+
+    async def _upwards(self, node: NodeRun, step: Step) -> NodeCondition:
+        permit = None
+        if step is Step.CONFIGURE:
+            condition = await self._configure(node)
+        else:
+            if step is Step.ACTIVATE:
+                permit = Permit(self._shell, node.core.key)
+                await permit.use()
+            condition = await self._perform(node, _OPERATIONS[step], permit)
+        node.take(condition)
+        if step is Step.CONFIGURE:
+            await self._give_what_is_missing(node)
+        return condition
+
+    async def _perform(
+        self, node: NodeRun, operation: Operation, permit: Permit | None = None
+    ) -> NodeCondition:
+        if node.driver is None:
+            raise BringUpError(f"cannot {operation.value} {node.name!r}: it is not there")
+        self._system.emit(RequestSent(node=node.name, operation=operation))
+        return await node.driver.perform(operation, permit)
+
+    async def _configure(self, node: NodeRun) -> NodeCondition:
+        """Configure a node; one that this run started and that is active is deactivated first.
+
+        Nobody but its own code has had it activate, so nothing depends on that; one that others
+        started may be at work.
+        """
+        for _ in range(GUARD_TRIES):
+            try:
+                return await self._perform(node, Operation.CONFIGURE)
+            except ActiveError:
+                if node.planned.run.kind is RunKind.ATTACH:
+                    raise
+            self._system.emit(Notice(message=f"{node.name!r} {BY_ITSELF}: it is deactivated"))
+            with contextlib.suppress(ActiveError):  # it may have been activated again: see above
+                await self._perform(node, Operation.DEACTIVATE)
+        raise BringUpError(
+            f"cannot configure {node.name!r}: it was activated again each of the {GUARD_TRIES} "
+            f"times that it was deactivated; {ACTIVATES_ITSELF}"
+        )
+
+    async def _start(self, node: NodeRun) -> Level:
+        """Wait until a node is there, and know by what it is driven."""
+        planned, process = node.planned, node.process
+        if planned.run.component:
+            await self._load(node)
+        if process is not None and process.channel is not None:
+            await process.channel.ready()
+            if planned.holds:
+                node.driver = ControlDriver(process.channel, node.name)
+            if planned.managed:
+                node.state = UNCONFIGURED
+            return Level.STARTED
+        await self._appears(node.name)
+        if planned.managed or node.is_to_be_given:
+            self._check_alone(node)
+        if not planned.managed:
+            if node.is_to_be_given and not planned.may_end:
+                await self._give_what_is_missing(node)
+            self._system.note_found(node, "running")
+            return Level.STARTED
+        driver = node.driver = self._means.participant.driver(planned)
+        condition = await driver.start()
+        self._system.note_found(node, condition.state)
+        node.take(condition)
+        if node.found and condition.state == ACTIVE:
+            return Level.ACTIVE  # it is verified as it is: no gate has to let it in
+        await self._give_what_is_missing(node)
+        return Level.STARTED
+
+    async def _load(self, node: NodeRun) -> None:
+        """Have its container load a component, which runs."""
+        name = node.planned.run.container
+        container = self._system.nodes.get(name)
+        full_name = name if container is None else container.name
+        node.unload = await self._means.participant.load(node.planned, full_name)
+
+    async def _appears(self, name: str) -> None:
+        """Wait until discovery shows a node of this name; the core sets the limit."""
+        while True:
+            changed = self._shell.changed
+            if await self._shell.is_seen(name):
+                return
+            await set_within(changed, None)
+
+    def _check_alone(self, node: NodeRun) -> None:
+        """Make sure, as well as it can be known, that only one node of its name is asked."""
+        process = node.process
+        if process is None or process.is_restarted:
+            return
+        processes = self._means.participant.processes().get(node.name, {})
+        if found := ran_before(node, processes, self._means.fork_server.family()):
+            verdict = with_findings(NOT_JUDGED, found, self._system.expected.policy)
+            self._shell.give(inputs.Refused(verdict=verdict))
+
+    # Downwards
+
+    async def _downwards(self, node: NodeRun, step: Step) -> Level:
+        """Undo a step, unless the node is not as far any more; return where it is then."""
+        if step is Step.DISCONNECT:
+            await self._unwire(node)
+        done = REACHES[step]
+        reports = isinstance(node.driver, ControlDriver)  # others may have moved any other
+        if reports and node.planned.managed and not _applies(step, node):
+            return min(done, level_of(node))
+        condition = await self._perform(node, _OPERATIONS[step])
+        node.take(condition)
+        if step is Step.DEACTIVATE and not node.planned.managed:
+            return Level.STARTED
+        return done
+
+    async def _unwire(self, node: NodeRun) -> None:
+        """Unmake what the authority connected the node to, the last connection first."""
+        for name in reversed(node.connections):
+            if node.driver is None:
+                break
+            step = Command(node=node.name, operation=Operation.DISCONNECT_FROM, connection=name)
+            limit_s = node.planned.timeouts.cleanup_s
+            try:
+                await within(limit_s, node.driver.wire(step))
+            except (BringUpError, asyncio.TimeoutError) as error:
+                text = str(error) or f"cannot {step} within {limit_s:g} s"
+                self._system.emit(Notice(message=text))
+                continue
+            self._system.emit(
+                WiringChanged(node=node.name, operation=step.operation, connection=name)
+            )
+        node.connections = ()
+
+    # Parameters
+
+    async def give(self, effect: effects.Give) -> None:
+        """Set parameters of a running node."""
+        node, clients = self._system.nodes[effect.node], self._means.participant.clients
+        giving: Awaitable[None]
+        if effect.values is None:
+            planned = node.planned
+            # All of them, also those that it has by default.
+            all_ = tuple(replace(each, source=GIVEN) for each in planned.in_mode(self._system.mode))
+            giving = clients.give_parameters(replace(planned, expected_parameters=all_))
+        else:
+            giving = clients.set_parameters(node.name, effect.values.now, effect.values.types)
+        error = ""
+        try:
+            await giving
+        except MiddlewareError as refused:
+            error = refused.message
+        self._shell.give(inputs.Given(node=effect.node, error=error))
+
+    async def _give_what_is_missing(self, node: NodeRun) -> None:
+        """Set parameters where no command line can; what it has not yet, it may have later."""
+        if not node.is_to_be_given:
+            return
+        try:
+            await self._means.participant.clients.give_parameters(node.planned)
+        except MiddlewareError as error:
+            # Judged by what it has then, which names the parameter.
+            self._system.emit(Notice(message=error.message))
+        self._system.touch()
+
+
+def _applies(step: Step, node: NodeRun) -> bool:
+    """Whether there is something to undo in the state that the node is in; it may have failed."""
+    return {
+        Step.DEACTIVATE: node.state == ACTIVE,
+        Step.DISCONNECT: node.state == INACTIVE and node.connected,
+        Step.CLEANUP: node.state == INACTIVE,
+        Step.SHUTDOWN: node.state != "finalized",
+    }[step]

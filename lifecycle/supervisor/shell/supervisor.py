@@ -1,0 +1,633 @@
+"""One run of one system, from the first process to the last: the loop that owns its state.
+
+Owns: `Supervisor`: it takes inputs one after the other (`core.reduce.take`), says what is said of
+them, and has ports carry out what the core wants done then (`core.advance`). What is done, and
+when, is the core's alone. Must not import rclpy.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import signal
+from collections import deque
+from collections.abc import Coroutine, Iterator
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+from msgspec.structs import replace
+
+from lifecycle.errors import BringUpError, ExitCode, UsageError
+from lifecycle.manifest.model import Authority
+from lifecycle.plan.model import Plan
+from lifecycle.run_directory import RunDirectory
+from lifecycle.supervisor.connections import discovery_server
+from lifecycle.supervisor.connections.authority import (
+    authority_of,
+    configured_before_any_connect,
+)
+from lifecycle.supervisor.connections.networks import Networks
+from lifecycle.supervisor.control.orders import Order, Revisions
+from lifecycle.supervisor.control.protocol import Answer, ControlRequest, SystemStatus
+from lifecycle.supervisor.control.ros_interface import RosInterface
+from lifecycle.supervisor.control.server import ControlServer, SupervisorSnapshot
+from lifecycle.supervisor.control.status import process_state, system_status
+from lifecycle.supervisor.core import advance, effects, gate, inputs
+from lifecycle.supervisor.core import state as core
+from lifecycle.supervisor.core.orders import refused_at_once
+from lifecycle.supervisor.core.reduce import take
+from lifecycle.supervisor.health import agreement
+from lifecycle.supervisor.health.agreement import Agreement
+from lifecycle.supervisor.health.answering import Answering
+from lifecycle.supervisor.health.liveliness import Cause
+from lifecycle.supervisor.health.peer_supervisors import PeerSupervisors
+from lifecycle.supervisor.judging.judge import Judge
+from lifecycle.supervisor.nodes.adoption import adopt
+from lifecycle.supervisor.nodes.system import NodeRun, System
+from lifecycle.supervisor.processes.orphans import reap_adopted
+from lifecycle.supervisor.run.events import (
+    LogLine,
+    Notice,
+    ProcessChanged,
+    Stopped,
+)
+from lifecycle.supervisor.run.failure import StepFailedError, ended
+from lifecycle.supervisor.run.options import Until, UpOptions, UpResult
+from lifecycle.supervisor.run.records import Records
+from lifecycle.supervisor.run.signals import ENDED_BY, Ending
+from lifecycle.supervisor.shell.ending import result_of
+from lifecycle.supervisor.shell.load import Load
+from lifecycle.supervisor.shell.looks import Looks
+from lifecycle.supervisor.shell.processes import Processes
+from lifecycle.supervisor.shell.requests import Requests
+from lifecycle.verify.rules.run import PROCESS_DIED
+from lifecycle.verify.verdict import NOT_JUDGED
+
+if TYPE_CHECKING:
+    from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
+    from lifecycle.supervisor.processes.fork_server import ForkServer
+
+
+_BROKEN_S = 20.0
+"""For a system to be taken down by a supervisor that has an error itself."""
+
+
+class Means(msgspec.Struct, frozen=True, kw_only=True):
+    """What a supervisor acts by.
+
+    Attributes:
+        directory: acquired for this run.
+        records: of this run.
+        fork_server: starts processes.
+        participant: sees the graph and reaches foreign nodes; made before any process.
+        networks: programmed while the system is active.
+        ending: knows of signals that came before.
+    """
+
+    directory: RunDirectory
+    records: Records
+    fork_server: ForkServer
+    participant: ObserverParticipant
+    networks: Networks
+    ending: Ending
+
+
+class Supervisor:
+    """A supervisor of one system; `run` it once.
+
+    Args:
+        system: the part of a plan that this supervisor is responsible for.
+        options: what the person asked for.
+        means: what it acts by.
+
+    Attributes:
+        authority: connects nodes; None where they connect themselves.
+        moved: set, and replaced, at each input.
+        changed: set, and replaced, whenever what a verdict looks at may be another.
+        again: names of nodes that are started again, since the plan was last given to who connects.
+    """
+
+    def __init__(self, system: System, options: UpOptions, means: Means) -> None:
+        self.system = system
+        self.means = means
+        self._options = options
+        self._emit = system.emit
+        self._loop = asyncio.get_running_loop()
+        self._inbox: deque[inputs.Input] = deque()
+        self._is_taking = False
+        self._touched = False
+        self._graph_changes = means.participant.graph.changes
+        self._tasks: set[asyncio.Task[Any]] = set()
+        self._wake: asyncio.TimerHandle | None = None
+        self._said: dict[str, object] = {}
+        self._answers: dict[int, asyncio.Future[Answer]] = {}
+        self._plans: tuple[Plan, Plan] = (system.plan, system.first)
+        self._ends: asyncio.Task[None] | None = None
+        self._last = NOT_JUDGED
+        self._programming: asyncio.Task[None] | None = None
+        self._over = asyncio.Event()
+        self._hurry = asyncio.Event()
+        self._error: BaseException | None = None
+        self._silent: dict[str, str] = {}
+        self.moved = asyncio.Event()
+        self.changed = asyncio.Event()
+        self.again: set[str] = set()
+        self._begin(system.run)
+        self.authority = authority_of(system, self._emit, means.participant)
+        self._peers = PeerSupervisors(system, means.participant)
+        self._agreement = Agreement(system, means.participant, self._peers)
+        self.answering = Answering(system, means.participant)
+        self.judge = Judge(
+            system,
+            means.participant.graph,
+            looker=self.authority,
+            agreement=self._agreement,
+        )
+        self._revisions = Revisions(system, options)
+        self._processes = Processes(self)
+        self._requests = Requests(self)
+        self._looks = Looks(self)
+        self._load = Load(system)
+        self._ros_interface = RosInterface(
+            self,
+            system.plan,
+            min(system.machines or ("",)),
+            means.participant,
+            emit=self._emit,
+            modes=() if system.remote else (each.name for each in system.plan.modes),
+        )
+        system.on_change = self._touch
+        system.on_health = self._health
+        system.liveliness.listen(self._silence)
+
+    def _begin(self, run: core.Run) -> None:
+        """Tell the core what the person asked for."""
+        options, timeout_s = self._options, self._options.bring_up_s(len(run.processes))
+        hold_s = options.stop_after_s
+        if hold_s is None and options.until is not Until.ACTIVE:
+            hold_s = 0.0
+        wires = self.system.plan.data_layer.authority is Authority.SUPERVISOR
+        core.begin(
+            run,
+            core.Options(
+                until=core.Level.ACTIVE if options.until is Until.ACTIVE else core.Level.CONNECTED,
+                verifies=options.until is Until.VERIFIED,
+                hold_s=hold_s,
+                timeout_s=timeout_s,
+                gate_s=options.gate_s(timeout_s),
+                strict=options.strict,
+                keep_going=options.keep_going,
+                wires=wires,
+            ),
+        )
+        run.adopting = options.adopt
+        if wires:
+            run.early = configured_before_any_connect(self.system)
+
+    # What others ask
+
+    def status(self) -> SystemStatus:
+        """Return what is known now."""
+        run = self.system.run
+        ends = "" if run.ending is None else self._why(run.ending)
+        return system_status(
+            self.system, supervisor=os.getpid(), elapsed_s=self._emit.elapsed_s, ends=ends
+        )
+
+    def look(self) -> SupervisorSnapshot:
+        """Return all that is known now."""
+        return SupervisorSnapshot(
+            plan=self.system.expected,
+            status=self.status(),
+            observation=self.judge.seen,
+            verdict=self.system.run.judged.verdict,
+        )
+
+    def stop(self, reason: str, exit_code: ExitCode) -> None:
+        """Ask the run to end; once it ends, an interrupt asks it to hurry.
+
+        Args:
+            reason: as text.
+            exit_code: of the run, if this cuts it short.
+        """
+        hurries = exit_code is ExitCode.INTERRUPTED
+        self.give(inputs.Stop(reason=reason, code=int(exit_code), hurries=hurries))
+
+    def differences(self, plan: Plan) -> tuple[str, ...]:
+        """Say how `plan` differs from what runs, one line each; empty if it does not."""
+        return self._revisions.differences(plan)
+
+    async def order(self, order: Order) -> Answer:
+        """Take an order from outside, if it fits what the system is doing; return its outcome."""
+        applies = order.ask is ControlRequest.APPLY
+        change = None
+        try:
+            self._revisions.check(order)
+        except UsageError as error:
+            return Answer(exit_code=error.exit_code, error=str(error))
+        if applies:
+            assert order.plan is not None
+            change = self._revisions.said(self._revisions.change(order.plan), order.plan)
+        number = len(self._answers)
+        ordered = core.Order(
+            id=number,
+            ask=order.ask,
+            node=order.node,
+            mode=order.mode,
+            plan=order.plan if applies else None,
+            timeout_s=order.timeout_s,
+            first=self.system.first,
+        )
+        if change is not None and order.dry_run:
+            code, why = refused_at_once(self.system.run, ordered)
+            differs = ExitCode.VIOLATED if change.differences else ExitCode.OK
+            return Answer(exit_code=code if why else differs, error=why, change=change)
+        answer = self._answers[number] = self._loop.create_future()
+        self.give(inputs.Ordered(order=ordered))
+        done: Answer = await asyncio.shield(answer)
+        if change is not None and done.exit_code == ExitCode.OK:
+            return replace(done, change=replace(change, revision=self.system.revision))
+        return done
+
+    # The loop
+
+    def now_s(self) -> float:
+        """Return the run's time, in seconds."""
+        return self._emit.elapsed_s
+
+    def give(self, given: inputs.Input) -> None:
+        """Take an input; one that comes while another is taken is taken after it."""
+        self._inbox.append(given)
+        if self._is_taking:
+            return
+        self._is_taking = True
+        try:
+            while self._inbox:
+                self._take(self._inbox.popleft())
+        except Exception as error:  # noqa: BLE001 - nothing may be left running for it
+            self._is_taking = False
+            self.broke(error)
+        finally:
+            self._is_taking = False
+
+    def _take(self, given: inputs.Input) -> None:
+        run = self.system.run
+        events = take(run, self.now_s(), given)
+        self.system.follow()
+        self._say_states()
+        for event in events:
+            self._emit(event)
+        self._requests.drop()
+        effects_ = advance.advance(run)
+        self._say_states()
+        for effect in effects_:
+            self._perform(effect)
+        self.moved.set()
+        self.moved = asyncio.Event()
+        self._follow_plan()
+        if run.hurry:
+            self._hurry.set()
+        if run.ending is not None:
+            self._end(run.ending)
+            if run.is_over:
+                self._over.set()
+        elif self.system.remote and (left := self._agreement.left()) != run.left:
+            self.give(inputs.Left(nodes=left))
+
+    def _perform(self, effect: effects.Effect) -> None:
+        if isinstance(effect, effects.Ask):
+            self._requests.ask(effect)
+        elif isinstance(effect, effects.Spawn):
+            self._processes.spawn(effect)
+        elif isinstance(effect, effects.Signal):
+            self._processes.signal(effect)
+        elif isinstance(effect, effects.Sweep):
+            self.start(self._processes.sweep(effect))
+        elif isinstance(effect, effects.Look):
+            self.start(self._looks.look())
+        elif isinstance(effect, effects.Program):
+            if self._programming is not None:
+                self._programming.cancel()  # for a passage that was given up
+            self._programming = self.start(self._program(effect))
+        elif isinstance(effect, effects.Give):
+            self.start(self._requests.give(effect))
+        elif isinstance(effect, effects.Prepare):
+            self.start(self._prepare())
+        elif isinstance(effect, effects.Answer):
+            answer = self._answers[effect.order]
+            if not answer.done():
+                answer.set_result(Answer(exit_code=effect.code, error=effect.error))
+        else:
+            self._wake_at(effect.at_s)
+
+    def _wake_at(self, at_s: float) -> None:
+        if self._wake is not None:
+            self._wake.cancel()
+        wait_s = max(0.0, min(at_s, self._load.next_s(self.now_s())) - self.now_s())
+        self._wake = self._loop.call_later(wait_s, self._tick)
+
+    def _tick(self) -> None:
+        at_s = self.now_s()
+        waited_s, where = self._load.measure(at_s)
+        self.give(inputs.Tick(at_s=at_s, waited_s=waited_s, where=where))
+
+    def start(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        """Carry something out beside the loop; it is over before the run is."""
+        task = asyncio.ensure_future(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._done)
+        return task
+
+    def _done(self, task: asyncio.Task[None]) -> None:
+        self._tasks.discard(task)
+        if not task.cancelled() and (error := task.exception()) is not None:
+            self.broke(error)
+
+    def broke(self, error: BaseException) -> None:
+        """Take the system down for an error of our own, which is raised in the end, bounded."""
+        if self._error is None:
+            self._error = error
+            self._loop.call_later(_BROKEN_S, self._give_up)
+            self.stop("an error of the supervisor", ExitCode.INTERNAL)
+        elif not self._over.is_set():
+            self._give_up()
+
+    def _give_up(self) -> None:
+        """End everything that runs: it cannot be taken down in order."""
+        for process in self.system.living:
+            process.signal(signal.SIGKILL)
+        self._over.set()
+
+    # What changes
+
+    def catch_up(self) -> None:
+        """Take every change that has been noticed, and not been taken yet."""
+        graph = self.means.participant.graph
+        if self._touched or graph.changes != self._graph_changes or self.judge.is_behind:
+            self._touched, self._graph_changes = False, graph.changes
+            self.give(inputs.Changed())
+            self.changed.set()
+            self.changed = asyncio.Event()
+
+    def _touch(self) -> None:
+        """Note a change; changes come in bursts, and are taken once for all that come at once."""
+        if not self._touched:
+            self._touched = True
+            self._loop.call_soon(self.catch_up)
+
+    async def _follow_graph(self) -> None:
+        while True:
+            await self.means.participant.graph.wait_change()
+            self.catch_up()
+
+    def _health(self, node: NodeRun) -> None:
+        if node.core.healthy != node.is_healthy:
+            self.give(inputs.Saw(health={node.core.key: node.is_healthy}))
+
+    def _silence(self) -> None:
+        """Say which nodes are silent now."""
+        liveliness = self.system.liveliness
+        hangs = {**liveliness.causes(Cause.HUNG), **liveliness.causes(Cause.STOPPED)}
+        known, self._silent = self._silent, dict(liveliness.silent)
+        for name in {name for name in {**known, **self._silent} if self._is_news(name, known)}:
+            if (node := self.system.node_named(name)) is not None:
+                away, why = liveliness.is_out_of_reach(name), self._silent.get(name, "")
+                hung = name in hangs
+                self.give(inputs.Silent(node=node.core.key, why=why, away=away, hangs=hung))
+
+    def _is_news(self, name: str, known: dict[str, str]) -> bool:
+        return known.get(name) != self._silent.get(name)
+
+    async def is_seen(self, name: str) -> bool:
+        """Return whether discovery shows a node of this name."""
+        observation = await self.means.participant.graph.observe(self.system.plan)
+        return any(each.full_name == name for each in observation.nodes)
+
+    def may_activate(self, key: str) -> bool:
+        """Return whether the gate is open for a node in this very moment."""
+        self.catch_up()
+        run = self.system.run
+        node, passage = run.nodes.get(key), run.passage
+        if node is None or passage is None or run.ending is not None or run.failures:
+            return False
+        passes = passage.opened and key in passage.waiting
+        return passes and gate.is_open(run) and advance.wanted(run, node) is core.Level.ACTIVE
+
+    def _follow_plan(self) -> None:
+        """Give a plan that differs, or has nodes that come again, to who connects them."""
+        run = self.system.run
+        if not self.again and (run.plan, run.first) == self._plans:
+            return
+        plan, first = self._plans
+        if run.first is not first:
+            keys = {each.key for each in first.nodes} ^ run.nodes.keys()
+            names = {each.key: each.full_name for each in (*first.nodes, *run.plan.nodes)}
+            self.again |= {names[key] for key in keys}
+        self._plans, again, self.again = (run.plan, run.first), frozenset(self.again), set()
+        if run.plan is not plan:
+            self.system.expected = run.plan
+        if self.authority is not None:
+            self.authority.replan(run.plan, again)
+            run.early = configured_before_any_connect(self.system)
+        self.means.networks.replan(run.plan)
+        self._peers.renew()
+        if run.first is not first:
+            self._agreement.announce(run.first)
+
+    # What is said
+
+    def _say_states(self) -> None:
+        run = self.system.run
+        for process in run.processes.values():
+            state = process_state(run, process)
+            if process.state is None and process.end is None:
+                continue
+            if self._said.get(process.name) != state:
+                self._said[process.name] = state
+                detail = "" if process.end is None else process.end.text
+                pid = max(process.pid, 0)
+                self._emit(
+                    ProcessChanged(process=process.name, state=state, pid=pid, detail=detail)
+                )
+        for node in self.system.nodes.values():
+            node.say()
+
+    @staticmethod
+    def _why(ending: core.Ending) -> str:
+        said = "; ".join(each.message for each in ending.failures)
+        return said or ending.reason
+
+    # What is done
+
+    async def _program(self, effect: effects.Program) -> None:
+        passage = self.system.run.passage
+        until_s = self.now_s() if passage is None else passage.until_s
+        error = ""
+        try:
+            left_s = max(gate.LEAST_S, until_s - self.now_s())
+            await self.means.networks.begin(effect.verdict, left_s)
+        except StepFailedError as failed:
+            error = failed.message
+        self.give(inputs.Programmed(number=effect.number, error=error))
+
+    async def _prepare(self) -> None:
+        error = ""
+        try:
+            await self.means.fork_server.ready()
+        except BringUpError as failed:
+            error = failed.message
+        self.give(inputs.Ready(error=error))
+
+    async def _adopt(self) -> None:
+        """Take what runs already as it is found, before anything is started."""
+        from lifecycle.verify.judge import with_findings
+
+        try:
+            plan, findings = await adopt(self.system, self.means.participant)
+        except StepFailedError as failed:
+            self.give(
+                inputs.Broken(subject=failed.subject, message=failed.message, rule=failed.rule.id)
+            )
+            return
+        if findings:
+            verdict = with_findings(NOT_JUDGED, findings, self.system.plan.policy)
+            self.give(inputs.Refused(verdict=verdict))
+        else:
+            self.give(inputs.Adopted(plan=plan, nodes=frozenset(self.system.adopted)))
+
+    async def _watch(self, died: asyncio.Future[Any], subject: str, rule: str) -> None:
+        """Say that what others depend on has died."""
+        message = await asyncio.shield(died)
+        if self.system.run.ending is None:
+            text = message if isinstance(message, str) else str(message)
+            self.give(inputs.Broken(subject=subject, message=f"cannot go on: {text}", rule=rule))
+
+    # From begin to end
+
+    async def run(self) -> UpResult:
+        """Bring the system up, hold it, and take it down; never leaves anything running."""
+        server = ControlServer(self.means.directory.socket_path, self)
+        await server.open()
+        self._peers.open()
+        self._agreement.open()
+        self._emit.listen(lambda event: None if isinstance(event, LogLine) else server.changed())
+        self._emit.listen(self._ros_interface.on_event)
+        self._ros_interface.begin()
+        result = UpResult(exit_code=ExitCode.INTERNAL, verdict=NOT_JUDGED)
+        beside = [
+            asyncio.ensure_future(each)
+            for each in (
+                self._follow_graph(),
+                self._looks.follow(),
+                self.answering.follow(),
+                self._watch(self.means.fork_server.died, "fork server", PROCESS_DIED.id),
+                self._watch_server(),
+            )
+        ]
+        for each in beside:
+            each.add_done_callback(self._done)
+        try:
+            with self._signals():
+                if self._options.adopt:
+                    self.start(self._adopt())
+                self.give(inputs.Tick())
+                try:
+                    await self._over.wait()
+                except BaseException:
+                    self.stop("interrupted", ExitCode.INTERRUPTED)
+                    await self._over.wait()
+                    raise
+                await ended(*beside)
+                await self._leave_nothing()
+            result = result_of(self.system, self._last)
+        finally:
+            await ended(*beside, *self._tasks)
+            if self._wake is not None:
+                self._wake.cancel()
+            self.judge.close()
+            self._ros_interface.close()
+            run = result.verdict.run
+            self._emit(
+                Stopped(
+                    exit_code=result.exit_code,
+                    elapsed_s=self._emit.elapsed_s,
+                    reason="" if run is None else run.reason,
+                )
+            )
+            await server.close(result.exit_code)
+        if self._error is not None:
+            raise self._error
+        return result
+
+    async def _watch_server(self) -> None:
+        server = self.system.server
+        if server is None:
+            return
+        end = await asyncio.shield(server.ended)
+        if self.system.run.ending is None:
+            found = discovery_server.death(server, end)
+            self.give(
+                inputs.Broken(
+                    subject=found.subject, message=found.message, rule=found.rule, finds=True
+                )
+            )
+
+    def _end(self, ending: core.Ending) -> None:
+        """Begin to leave, once."""
+        if self._ends is not None:
+            return
+        latest = self.system.run.judged.verdict
+        if latest is not None:
+            self._last = self.system.liveliness.by_now(latest)
+        how = agreement.FAILED if ending.failed else ""
+        self._agreement.leave(f"{how}{ending.stopping}")
+        self.means.participant.prepare_to_leave()
+        if self._programming is not None:
+            self._programming.cancel()  # nothing is programmed once all is removed
+        authority = self.authority
+        self._ends = self.start(_nothing() if authority is None else authority.close())
+
+    async def _leave_nothing(self) -> None:
+        """Undo what is no process's: after the last message has left, and before strays end."""
+        await asyncio.gather(*self._processes.releasing)
+        await ended(*filter(None, (self._programming,)))
+        if self._ends is not None:
+            await asyncio.wait({self._ends})
+        try:
+            await self.means.networks.close(self._hurry)
+        finally:
+            await discovery_server.end(self.system, self._hurry)
+        if left := await self.means.fork_server.end_strays():
+            pids = ", ".join(map(str, left))
+            self._emit(Notice(message=f"ended processes that were left behind: {pids}"))
+        self.system.logs.report_lost()
+
+    async def leave(self) -> None:
+        """Leave the exchange with other supervisors, after `run`; Fast DDS can hang in it."""
+        self.means.participant.prepare_to_leave()
+        self._agreement.close()
+        await self._peers.close()
+
+    @contextlib.contextmanager
+    def _signals(self) -> Iterator[None]:
+        fork_server, ending = self.means.fork_server, self.means.ending
+        ends = ending.numbers
+        for number in ends:
+            self._loop.add_signal_handler(number, self._ended_by, number)
+        self._loop.add_signal_handler(signal.SIGCHLD, lambda: reap_adopted(fork_server.waited_for))
+        if ending.number is not None:
+            self._loop.call_soon(self._ended_by, ending.number)
+        try:
+            yield
+        finally:
+            for number in (*ends, signal.SIGCHLD):
+                self._loop.remove_signal_handler(number)
+            ending.resume()
+
+    def _ended_by(self, number: int) -> None:
+        self.stop(*ENDED_BY[number])
+
+
+async def _nothing() -> None:
+    """Nothing is to be left."""

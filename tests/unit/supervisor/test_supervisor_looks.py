@@ -1,0 +1,167 @@
+"""When a system is looked at again, what is kept back for a moment, and what a look leaves out."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from msgspec.structs import replace
+
+from lifecycle.supervisor.judging.grace_period import PASSING_S
+from lifecycle.supervisor.judging.judge import HEALTH_S, without
+from lifecycle.verify.observation import NodeParameters, Observation, ObservedEndpoint, ObservedNode
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.verdict import Stage, Verdict
+from tests.builders import configuration, plan_of, planned_node
+from tests.unit.supervisor.fakes import verdict_of
+from tests.unit.supervisor.session_world import CHAIN, SessionWorld
+
+OK = verdict_of(Outcome.OK)
+MISSING = verdict_of(Outcome.VIOLATED, "graph.missing-node")
+UNMATCHED = verdict_of(Outcome.VIOLATED, "graph.unmatched-link")
+UNATTRIBUTED = verdict_of(Outcome.UNVERIFIABLE, "graph.unattributed-endpoint")
+
+
+class Judged(SessionWorld):
+    """A run in which each look finds what `found` says; `looks`: when there was one."""
+
+    def __init__(self, tmp_path: Path, **options: Any) -> None:
+        super().__init__(CHAIN, tmp_path, **options)
+        self.found: Callable[[float], Verdict] = lambda _: OK
+        self.looks: list[float] = []
+        self.prepare = self._prepare
+
+    def _prepare(self) -> None:
+        async def look(stage: Stage, ahead: frozenset[str]) -> Verdict:
+            del stage, ahead
+            self.looks.append(asyncio.get_running_loop().time())
+            return self.found(self.looks[-1])
+
+        self.supervisor.judge.look = look  # type: ignore[method-assign]
+
+
+async def test_nodes_are_asked_for_a_match_at_growing_intervals_up_to_half_a_second(
+    tmp_path: Path,
+) -> None:
+    world = Judged(tmp_path, stop_after_s=0.0)
+    world.found = lambda now_s: UNMATCHED if now_s < 5.0 else OK
+    await world.run()
+    waits_s = [b - a for a, b in zip(world.looks, world.looks[1:], strict=False)]
+    assert waits_s[:6] == [
+        pytest.approx(each, abs=0.02) for each in (0.02, 0.04, 0.08, 0.16, 0.32, 0.5)
+    ]
+    assert world.outline[-1] == "[stopped] 0"
+
+
+async def test_what_somebody_reports_is_not_polled_for(tmp_path: Path) -> None:
+    world = Judged(tmp_path, timeout_s=20.0)
+    world.found = lambda _: MISSING
+    await world.run()
+    assert len(world.looks) <= 3
+    assert world.outline[-1] == "[stopped] 4"
+
+
+async def test_a_burst_of_changes_is_one_look_and_one_that_does_not_end_is_looked_at(
+    tmp_path: Path,
+) -> None:
+    world = Judged(tmp_path, stop_after_s=10.0)
+    async with world.running("[system] active"):
+        await asyncio.sleep(1.0)
+        before = len(world.looks)
+        for _ in range(10):
+            world.graph.note()
+            await asyncio.sleep(0.001)
+        await asyncio.sleep(0.5)
+        assert len(world.looks) - before == 1
+        before = len(world.looks)
+        for _ in range(500):
+            world.graph.note()
+            await asyncio.sleep(0.002)
+        assert 15 <= len(world.looks) - before <= 21
+
+
+@pytest.mark.parametrize(("lasts_s", "is_said"), [(0.5, False), (3.0, True)])
+async def test_while_held_a_newcomer_without_a_name_is_kept_back_for_a_moment(
+    tmp_path: Path, lasts_s: float, is_said: bool
+) -> None:
+    world = Judged(tmp_path, stop_after_s=10.0)
+    async with world.running("[system] active"):
+        await asyncio.sleep(2.0)
+        world.found = lambda _: UNATTRIBUTED
+        world.graph.note()
+        await asyncio.sleep(lasts_s)
+        world.found = lambda _: OK
+        world.graph.note()
+    said = [each for each in world.story if each.startswith("[verdict] active unverifiable")]
+    assert bool(said) is is_said
+    assert PASSING_S < 3.0
+
+
+async def test_before_the_gate_a_newcomer_without_a_name_is_said_at_once(tmp_path: Path) -> None:
+    world = Judged(tmp_path, strict=True)
+    world.found = lambda _: UNATTRIBUTED
+    await world.run()
+    assert world.outline[7].startswith("[verdict] connected unverifiable")
+    assert world.outline[-1] == "[stopped] 5"
+
+
+async def test_a_node_that_must_be_healthy_is_given_time_to_say_how_it_is_once(
+    tmp_path: Path,
+) -> None:
+    world = Judged(tmp_path, stop_after_s=0.0)
+    unsaid = verdict_of(Outcome.UNVERIFIABLE, "node.unhealthy")
+    unsaid = replace(unsaid, findings=(replace(unsaid.findings[0], node="/camera"),))
+    world.found = lambda _: unsaid
+    await world.run()
+    assert f"[system] verified at {HEALTH_S:.1f} s" in world.outline
+
+
+async def test_a_silent_node_is_not_asked_for_and_is_judged_silent(tmp_path: Path) -> None:
+    world = SessionWorld(CHAIN, tmp_path, stop_after_s=10.0)
+    asked: list[list[str]] = []
+    observe = world.graph.observe
+
+    async def noted(plan: Any) -> Observation:
+        asked.append([each.key for each in plan.nodes])
+        return await observe(plan)
+
+    world.graph.observe = noted  # type: ignore[method-assign]
+    async with world.running("[system] active"):
+        await asyncio.sleep(1.0)
+        world.system.processes["camera"].on_stop(True)
+        await world.story.until("[verdict] active violated run.silent-node /camera")
+        assert asked[-1] == ["viewer"]
+
+
+async def test_what_a_process_left_in_the_graph_counts_no_more(tmp_path: Path) -> None:
+    plan = plan_of(planned_node("camera"), planned_node("viewer"))
+    world = SessionWorld(plan, tmp_path, stop_after_s=5.0, keep_going=True)
+    forgotten: list[int] = []
+    world.graph.ended = lambda pid, **_: forgotten.append(pid)  # type: ignore[method-assign]
+    world.hosts.lingers_s = 60.0
+    async with world.running("[system] active"):
+        world.kill("camera")
+        await world.story.until("[verdict] active violated graph.missing-node /camera")
+    assert forgotten[0] == world.hosts.processes["camera"].pid
+
+
+def test_a_dead_node_is_gone_although_discovery_shows_it_and_a_second_one_stays() -> None:
+    seen = Observation(
+        nodes=(
+            ObservedNode(full_name="/camera"),
+            ObservedNode(full_name="/viewer", count=2),
+            ObservedNode(full_name="/arm"),
+        ),
+        endpoints=(
+            ObservedEndpoint(node="/camera", kind=None, name="/out", type="t", gid=""),  # type: ignore[arg-type]
+        ),
+        configurations=(configuration("/camera"),),
+        parameters=(NodeParameters(node="/camera"),),
+    )
+    left = without(seen, frozenset({"/camera", "/viewer"}))
+    assert [(each.full_name, each.count) for each in left.nodes] == [("/viewer", 1), ("/arm", 1)]
+    assert (left.endpoints, left.configurations, left.parameters) == ((), (), ())
+    assert without(seen, frozenset()) is seen
