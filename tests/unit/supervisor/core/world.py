@@ -228,9 +228,13 @@ class World:
 
     def pass_time(self, to_s: float) -> None:
         self.now_s = to_s
-        over = self.run.ending is not None or self.seen_s is None
-        self.lasted = self.lasted or (not over and to_s - self.seen_s > 1.0)
+        if self.judged_mark == self.mark:  # else what changed may have mended it
+            self.see_how_long()
         self.give(self.core.inputs.Tick())
+
+    def see_how_long(self) -> None:
+        over = self.run.ending is not None or self.seen_s is None
+        self.lasted = self.lasted or (not over and self.now_s - self.seen_s > 1.0)
 
     def __str__(self) -> str:
         return f"in phase {self.core.advance.phase_of(self.run)}: {self.run.nodes} {self.pending}"
@@ -340,6 +344,7 @@ class World:
         held = self.run.held_s is not None and any(each >= 4 for each in self.level_of.values())
         wrong = held and self.intruder_s is not None
         self.seen_s = (self.now_s if self.seen_s is None else self.seen_s) if wrong else None
+        self.see_how_long()
         return verdict(*found)
 
     # What breaks, and who orders what
