@@ -251,7 +251,7 @@ class ConnectionAuthority:
             await set_within(self._wake, again_s)
 
     async def _release(self) -> None:
-        for name, wiring in self._wirings.items():
+        for name, wiring in tuple(self._wirings.items()):  # nodes leave meanwhile
             if self._system.node_named(name) is not None or name not in self._others:
                 continue
             unmade = steps(Instructions(node=name), wiring.actual, ours=wiring.ours)

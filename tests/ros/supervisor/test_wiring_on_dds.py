@@ -183,7 +183,7 @@ def test_a_node_that_nobody_declared_is_negotiated_with_wired_and_never_driven(
             assert told(run, "/guest")[0][0] == "connect_to"
             assert not [each for each in run.of_kind("request") if each["node"] == "/guest"]
             run.signal(signal.SIGTERM)
-            assert run.finish() == ExitCode.OK
+            assert run.finish() == ExitCode.OK, run.said()
             # It is somebody else's: it goes on without us, and without what we gave it.
             assert guest.poll() is None
             assert told(run, "/guest")[-1][0] == "disconnect_from"
