@@ -38,7 +38,6 @@ class Case:
         says: what must be in the output, whatever its lines.
         not_says: what must not be in the output.
         within_s: the command ends within so many seconds.
-        before: how the installation before part 10 answered, in words; for the table only.
         quick: is in `make test`, too.
     """
 
@@ -57,7 +56,6 @@ class Case:
     says: tuple[str, ...] = ()
     not_says: tuple[str, ...] = ()
     within_s: float = 60.0
-    before: str = ""
     quick: bool = False
 
     @property

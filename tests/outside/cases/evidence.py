@@ -355,7 +355,6 @@ CASES = (
         exit_code=4,
         verdict=VIOLATED,
         findings=("graph.unknown-peer",),
-        before="ok, exit 0; 75 messages of the stranger received",
         quick=True,
     ),
     Case(
@@ -368,7 +367,6 @@ CASES = (
         verdict=VIOLATED,
         findings=("graph.unknown-peer",),
         activated=NOBODY,
-        before="ok, exit 0",
     ),
     Case(
         attack="a subscription that no graph shows listens to the talker",
@@ -378,7 +376,6 @@ CASES = (
         exit_code=4,
         verdict=VIOLATED,
         findings=("graph.unknown-peer",),
-        before="ok, exit 0",
     ),
     Case(
         attack="`ros2 topic echo` beside a strict robot disturbs nothing",
@@ -388,7 +385,6 @@ CASES = (
         exit_code=0,
         verdict=OK,
         activated=frozenset({"talker", "listener"}),
-        before="the same",
     ),
     Case(
         attack="tools that come and go disturb nothing",
@@ -397,7 +393,6 @@ CASES = (
         story=tools_that_come_and_go,
         exit_code=0,
         verdict=OK,
-        before="the same",
     ),
     Case(
         attack="a node takes its mark away after it was activated",
@@ -407,7 +402,6 @@ CASES = (
         exit_code=4,
         verdict=VIOLATED,
         findings=("flow.dscp-not-applied",),
-        before="ok for 22 s, exit 0",
     ),
     Case(
         attack="a node takes its mark away between connect and gate",
@@ -418,7 +412,6 @@ CASES = (
         verdict=VIOLATED,
         says=("DSCP",),
         activated=NOBODY,
-        before="activated first, found later",
     ),
     Case(
         attack="a node takes its mark away and gives it back until it is active",
@@ -428,7 +421,6 @@ CASES = (
         exit_code=4,
         verdict=VIOLATED,
         findings=("flow.dscp-not-applied",),
-        before="exit code 4 or 6",
     ),
     Case(
         attack="a node that keeps its mark is ok",
@@ -436,7 +428,6 @@ CASES = (
         verb=("up", "--strict", "--stop-after", "3"),
         exit_code=0,
         verdict=OK,
-        before="the same",
     ),
     Case(
         attack="a flow between two programs that report nothing",
@@ -447,7 +438,6 @@ CASES = (
         verdict=UNVERIFIABLE,
         findings=("flow.unreported",),
         says=("flow.unreported",),
-        before="ok, no finding",
         quick=True,
     ),
     Case(
@@ -458,7 +448,6 @@ CASES = (
         exit_code=5,
         verdict=UNVERIFIABLE,
         findings=("flow.unreported",),
-        before="ok, exit 0",
     ),
     Case(
         attack="the manifest trusts what nobody reports",
@@ -468,7 +457,6 @@ CASES = (
         exit_code=0,
         verdict=OK,
         says=("flow.unreported",),
-        before="no such key",
     ),
     Case(
         attack="one end in our host proves the flow",
@@ -478,7 +466,6 @@ CASES = (
         exit_code=0,
         verdict=OK,
         not_findings=("flow.unreported",),
-        before="the same",
     ),
     Case(
         attack="a manifest trusts a rule that there is not",
@@ -487,7 +474,6 @@ CASES = (
         verb=("check",),
         exit_code=3,
         says=("system.lifecycle.yaml:4:18", "flow.unreported"),
-        before="no such key",
     ),
     Case(
         attack="a foreign node says of itself what only it can know",
@@ -499,7 +485,6 @@ CASES = (
         verdict=UNVERIFIABLE,
         findings=("graph.qos-unverifiable", "flow.wrong-transport"),
         activated=NOBODY,
-        before="ok, exit 0",
         quick=True,
     ),
     Case(
@@ -510,7 +495,6 @@ CASES = (
         exit_code=0,
         verdict=UNVERIFIABLE,
         findings=("graph.qos-unverifiable", "flow.wrong-transport"),
-        before="ok, exit 0",
     ),
     Case(
         attack="a foreign node passes for one of a host where no supervisor runs",
@@ -523,7 +507,6 @@ CASES = (
         exit_code=4,
         verdict=VIOLATED,
         findings=("config.missing-report",),
-        before="ok, exit 0",
     ),
     Case(
         attack="a node of ours that no supervisor started proves what it says",
@@ -534,7 +517,6 @@ CASES = (
         exit_code=0,
         verdict=OK,
         activated=frozenset({"talker", "listener"}),
-        before="the same",
     ),
     Case(
         attack="`verify` from another process proves what nodes say under their supervisor",
@@ -543,6 +525,5 @@ CASES = (
         story=verify_beside,
         exit_code=0,
         verdict=OK,
-        before="the same",
     ),
 )

@@ -190,7 +190,6 @@ def _intruder(name: str, *does: str, manifest: str = RESET, quick: bool = False)
         verdict=VIOLATED,
         activated=NOBODY,
         received=NOBODY,
-        before="ok, and most answers were the stranger's",
         quick=quick,
     )
 
@@ -206,7 +205,6 @@ def _node(
         exit_code=4,
         verdict=VIOLATED,
         findings=findings,
-        before="ok",
         quick=quick,
     )
 
@@ -299,7 +297,6 @@ CASES = (
         verdict=VIOLATED,
         findings=("graph.undeclared-publisher",),
         says=("dds:",),
-        before="ok: it was seen by nobody",
     ),
     Case(
         attack="a plain node has only what rclpy gives it",
@@ -318,7 +315,6 @@ CASES = (
             verdict=VIOLATED,
             findings=("time.no-clock",),
             activated=NOBODY,
-            before="ok",
         )
         for how, document, node in (
             ("in line", "", SIM),
@@ -331,7 +327,6 @@ CASES = (
         manifest=SIMULATED % ("", SIM, ""),
         verb=("check",),
         says=("no node declares a publisher of '/clock'",),
-        before="no word of it",
     ),
     Case(
         attack="an undeclared player publishes the time",
@@ -341,7 +336,6 @@ CASES = (
         verdict=UNVERIFIABLE,
         findings=("time.undeclared-clock",),
         says=("rosbag2_player",),
-        before="ok, and not listed",
         quick=True,
     ),
     Case(
@@ -353,7 +347,6 @@ CASES = (
         verdict=VIOLATED,
         findings=("time.several-clocks",),
         activated=NOBODY,
-        before="ok",
     ),
     Case(
         attack="the player begins late",
@@ -377,6 +370,5 @@ CASES = (
         verb=("up", "--stop-after", "4"),
         verdict=UNVERIFIABLE,
         findings=("time.silent-clock",),
-        before="ok",
     ),
 )

@@ -218,7 +218,6 @@ CASES = (
         story=lasting,
         exit_code=4,
         says=("violated meanwhile", "/stranger (graph.undeclared-node)"),
-        before="exit 0",
         quick=True,
     ),
     Case(
@@ -237,7 +236,6 @@ CASES = (
         story=brief,
         exit_code=0,
         says=(NOT_COUNTED, "/stranger (graph.undeclared-node)"),
-        before="exit 0, and the last line says nothing of it",
     ),
     Case(
         attack="a stranger comes and goes again and again, never for a second",
@@ -246,7 +244,6 @@ CASES = (
         story=flapping,
         exit_code=0,
         says=(NOT_COUNTED, "/stranger (graph.undeclared-node)"),
-        before="exit 0, and the last line says nothing of it",
     ),
     Case(
         attack="strangers relieve each other, none for a second",
@@ -255,7 +252,6 @@ CASES = (
         story=taking_turns,
         exit_code=0,
         says=(NOT_COUNTED, "/stranger_0 (graph.undeclared-node)"),
-        before="exit 0, and the last line says nothing of it",
     ),
     Case(
         attack="a stranger publishes when the time of --stop-after is over",
@@ -272,7 +268,6 @@ CASES = (
         story=then_down,
         exit_code=0,
         says=("violated meanwhile",),
-        before="exit 0, and the last line says nothing of it",
     ),
     Case(
         attack="a stranger publishes while a node is restarted by hand",
@@ -280,7 +275,6 @@ CASES = (
         verb=("up", "--strict", "--stop-after", "9"),
         story=across_a_restart,
         exit_code=4,
-        before="the same, in one run",
     ),
     Case(
         attack="a slow node is restarted by hand, and nothing is wrong",
@@ -298,7 +292,6 @@ CASES = (
         files=SLOW,
         verb=STRICT_12,
         story=still_before_the_gate,
-        before="exit 4, but activated first",
         quick=True,
         **REFUSED,
     ),
@@ -308,7 +301,6 @@ CASES = (
         files=SLOW,
         verb=STRICT_12,
         story=still_before_the_gate,
-        before="exit 4, but activated first",
         **REFUSED,
     ),
     Case(
@@ -339,7 +331,6 @@ CASES = (
         verdict=VIOLATED,
         findings=("graph.undeclared-node",),
         received=frozenset({"hello"}),
-        before="the same, in one run",
     ),
     Case(
         attack="a stranger comes shortly before the gate, long after the supervisor",
@@ -347,7 +338,6 @@ CASES = (
         files=SLOW,
         verb=STRICT_12,
         story=late,
-        before="exit 4, but activated first",
         **REFUSED,
     ),
     Case(
@@ -359,6 +349,5 @@ CASES = (
         verdict=VIOLATED,
         findings=("graph.undeclared-node",),
         activated=NOBODY,
-        before="exit 4, but activated first",
     ),
 )
