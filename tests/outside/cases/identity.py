@@ -176,6 +176,31 @@ class TwoServers(Node):
 '''
 }
 
+ANSWERING = """
+import rclpy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from std_srvs.srv import Trigger
+
+
+def answer(_, response):
+    response.message = "real"
+    return response
+
+
+rclpy.init()
+node = rclpy.create_node("server")
+qos = QoSProfile(depth=10, reliability=ReliabilityPolicy.%s)
+node.create_service(Trigger, "/reset", answer, qos_profile=qos)
+try:
+    rclpy.spin(node)
+except BaseException:
+    node.destroy_node()
+    rclpy.try_shutdown()
+"""
+ANSWERED = RESET.replace('{python: "nodes:Server"}', "{command: [python3, answering.py]}").replace(
+    "    interface: {service_servers", "    managed: false\n    interface: {service_servers"
+)
+
 REFUSED = ("up", "--strict", "--stop-after", "2", "--timeout", "6")
 DOCK = "action_servers: [{name: /dock, type: test_msgs/action/Fibonacci}]"
 
@@ -240,6 +265,24 @@ CASES = (
         manifest=RESET,
         verdict=OK,
         received=frozenset({"real"}),
+    ),
+    Case(
+        attack="a service is served by another program as declared",
+        manifest=ANSWERED,
+        files={"answering.py": ANSWERING % "RELIABLE"},
+        verb=("up", "--stop-after", "2"),
+        received=frozenset({"real"}),
+    ),
+    Case(
+        attack="a server of a declared service is none that DDS matches with its client",
+        manifest=ANSWERED,
+        files={"answering.py": ANSWERING % "BEST_EFFORT"},
+        verb=REFUSED,
+        exit_code=4,
+        verdict=VIOLATED,
+        findings=("graph.unmatched-client",),
+        activated=NOBODY,
+        says=("matched on service /reset: the client counts no server as available",),
     ),
     Case(
         attack="a publisher has a participant of its own",
