@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from tests.outside.running import Run
@@ -66,3 +66,6 @@ class Case:
 
 NOBODY: frozenset[str] = frozenset()
 """For `activated` and `received`."""
+
+REFUSED: Mapping[str, Any] = {"exit_code": 4, "verdict": VIOLATED, "activated": NOBODY}
+"""What a case expects whose gate must not open."""

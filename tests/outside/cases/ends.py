@@ -13,6 +13,7 @@ from tests.outside.case import OK, VIOLATED, Case
 from tests.outside.running import Run
 
 DIED = "run.process-died"
+FELL = {"exit_code": 6, "verdict": VIOLATED, "findings": (DIED,)}
 
 CHILD = """\
 import rclpy, signal, sys
@@ -268,11 +269,9 @@ CASES = (
         manifest=PAIR,
         files=_dies("on_deactivate", "os.abort()"),
         verb=("up", "--stop-after", "1"),
-        exit_code=6,
-        verdict=VIOLATED,
-        findings=(DIED,),
         says=("/one", "SIGABRT"),
         quick=True,
+        **FELL,
     ),
     *(
         Case(
@@ -280,10 +279,8 @@ CASES = (
             manifest=PAIR,
             files=_dies(handler, how),
             verb=("up", "--stop-after", "1"),
-            exit_code=6,
-            verdict=VIOLATED,
-            findings=(DIED,),
             within_s=20.0,
+            **FELL,
         )
         for handler, how in (
             ("on_disconnect", "os.kill(os.getpid(), signal.SIGKILL)"),
@@ -300,10 +297,8 @@ CASES = (
             "class Two(LifecycleNode):\n    def on_cleanup(self): os._exit(3)\n",
         ),
         verb=("up", "--stop-after", "1"),
-        exit_code=6,
-        verdict=VIOLATED,
-        findings=(DIED,),
         says=("/one (run.process-died)", "/two (run.process-died)"),
+        **FELL,
     ),
     Case(
         attack="a node aborts on the way down after Ctrl-C",
@@ -321,9 +316,7 @@ CASES = (
         files=_dies("on_cleanup", "os.abort()"),
         verb=("up",),
         story=_is_ended,
-        exit_code=6,
-        verdict=VIOLATED,
-        findings=(DIED,),
+        **FELL,
     ),
     Case(
         attack="a node aborts while the system is paused",
@@ -331,10 +324,8 @@ CASES = (
         files=_dies("on_deactivate", "os.abort()"),
         verb=("up",),
         story=_is_paused,
-        exit_code=6,
-        verdict=VIOLATED,
-        findings=(DIED,),
         not_findings=("graph.missing-node",),
+        **FELL,
     ),
     Case(
         attack="a command segfaults when it is asked to end",
@@ -349,10 +340,8 @@ CASES = (
             )
         },
         verb=("up", "--stop-after", "1"),
-        exit_code=6,
-        verdict=VIOLATED,
-        findings=(DIED,),
         says=("SIGSEGV",),
+        **FELL,
     ),
     Case(
         attack="a command that ends with a traceback on Ctrl-C is healthy",
@@ -395,12 +384,10 @@ CASES = (
             )
         },
         verb=("up", "--stop-after", "20"),
-        exit_code=6,
-        verdict=VIOLATED,
-        findings=(DIED,),
         not_findings=("graph.missing-node", "state.not-active"),
         says=("ZeroDivisionError: division by zero", "ending.py:6)"),
         quick=True,
+        **FELL,
     ),
     Case(
         attack="a command dies of an exception with control characters in it",
@@ -417,12 +404,10 @@ CASES = (
             )
         },
         verb=("up", "--stop-after", "20"),
-        exit_code=6,
-        verdict=VIOLATED,
-        findings=(DIED,),
         not_findings=("graph.missing-node", "graph.missing-endpoint", "graph.unmatched"),
         says=("Key: \\\\x1b[2Jxxx",),
         not_says=("x" * 400 + " (",),
+        **FELL,
     ),
     Case(
         attack="a node fails later than start_limit_interval_sec at each start",
@@ -453,8 +438,6 @@ CASES = (
         files=TALKATIVE,
         verb=("up", "--strict"),
         story=nobody_reads,
-        exit_code=6,
-        verdict=VIOLATED,
-        findings=(DIED,),
+        **FELL,
     ),
 )

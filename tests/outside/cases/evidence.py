@@ -11,7 +11,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from tests.outside.case import NOBODY, OK, UNVERIFIABLE, VIOLATED, Case
+from tests.outside.case import NOBODY, OK, REFUSED, UNVERIFIABLE, VIOLATED, Case
 from tests.outside.cases.healthy import PAIR
 from tests.outside.running import Run
 
@@ -363,10 +363,8 @@ CASES = (
         files=SLOW_LISTENER,
         verb=("up", "--strict", "--stop-after", "2", "--timeout", "12"),
         story=hidden_publisher_before_the_gate,
-        exit_code=4,
-        verdict=VIOLATED,
         findings=("graph.unknown-peer",),
-        activated=NOBODY,
+        **REFUSED,
     ),
     Case(
         attack="a subscription that no graph shows listens to the talker",
@@ -382,7 +380,6 @@ CASES = (
         manifest=PAIR,
         verb=("up", "--strict", "--stop-after", "3"),
         strangers=(("_ros2cli_4711", "sub:/chatter"),),
-        exit_code=0,
         verdict=OK,
         activated=frozenset({"talker", "listener"}),
     ),
@@ -391,7 +388,6 @@ CASES = (
         manifest=PAIR,
         verb=("up", "--strict", "--stop-after", "9"),
         story=tools_that_come_and_go,
-        exit_code=0,
         verdict=OK,
     ),
     Case(
@@ -408,10 +404,8 @@ CASES = (
         manifest=MARKED % "resetting:WhenConnected",
         files={**RESETTING, **SLOW_LISTENER},
         verb=("up", "--strict", "--stop-after", "2", "--timeout", "8"),
-        exit_code=4,
-        verdict=VIOLATED,
         says=("DSCP",),
-        activated=NOBODY,
+        **REFUSED,
     ),
     Case(
         attack="a node takes its mark away and gives it back until it is active",
@@ -426,7 +420,6 @@ CASES = (
         attack="a node that keeps its mark is ok",
         manifest=MARKED % "nodes:Talker",
         verb=("up", "--strict", "--stop-after", "3"),
-        exit_code=0,
         verdict=OK,
     ),
     Case(
@@ -434,7 +427,6 @@ CASES = (
         manifest=FOREIGN % ("", COMMAND),
         files=PLAIN,
         verb=("up", "--stop-after", "1"),
-        exit_code=0,
         verdict=UNVERIFIABLE,
         findings=("flow.unreported",),
         says=("flow.unreported",),
@@ -454,7 +446,6 @@ CASES = (
         manifest=FOREIGN % (TRUST, COMMAND),
         files=PLAIN,
         verb=("up", "--strict", "--stop-after", "1"),
-        exit_code=0,
         verdict=OK,
         says=("flow.unreported",),
     ),
@@ -463,7 +454,6 @@ CASES = (
         manifest=FOREIGN % ("", HOSTED),
         files=PLAIN,
         verb=("up", "--strict", "--stop-after", "1"),
-        exit_code=0,
         verdict=OK,
         not_findings=("flow.unreported",),
     ),
@@ -492,7 +482,6 @@ CASES = (
         manifest=LYING % LIES,
         files=LIAR,
         verb=("up", "--stop-after", "1"),
-        exit_code=0,
         verdict=UNVERIFIABLE,
         findings=("graph.qos-unverifiable", "flow.wrong-transport"),
     ),
@@ -514,7 +503,6 @@ CASES = (
         files={"own.yaml": HONEST % 'python: "nodes:Talker"'},
         verb=("up", "--strict", "--stop-after", "1"),
         story=node_of_ours,
-        exit_code=0,
         verdict=OK,
         activated=frozenset({"talker", "listener"}),
     ),
@@ -523,7 +511,6 @@ CASES = (
         manifest=HONEST % 'python: "nodes:Talker"',
         verb=("up", "--strict", "--stop-after", "12"),
         story=verify_beside,
-        exit_code=0,
         verdict=OK,
     ),
 )

@@ -231,7 +231,6 @@ CASES = (
         manifest=one("Short"),
         files=FILES,
         verb=("up", "--strict", "--stop-after", "3"),
-        exit_code=0,
         verdict=OK,
         not_findings=("run.silent-node",),
         activated=HANG,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tests.outside.case import NOBODY, OK, UNVERIFIABLE, VIOLATED, Case
+from tests.outside.case import NOBODY, OK, REFUSED, UNVERIFIABLE, VIOLATED, Case
 from tests.outside.running import Run
 
 RESET = """\
@@ -201,7 +201,7 @@ ANSWERED = RESET.replace('{python: "nodes:Server"}', "{command: [python3, answer
     "    interface: {service_servers", "    managed: false\n    interface: {service_servers"
 )
 
-REFUSED = ("up", "--strict", "--stop-after", "2", "--timeout", "6")
+BRIEFLY = ("up", "--strict", "--stop-after", "2", "--timeout", "6")
 DOCK = "action_servers: [{name: /dock, type: test_msgs/action/Fibonacci}]"
 
 
@@ -209,13 +209,11 @@ def _intruder(name: str, *does: str, manifest: str = RESET, quick: bool = False)
     return Case(
         attack=f"another process has a node {name}: {' '.join(does)}",
         manifest=manifest,
-        verb=REFUSED,
+        verb=BRIEFLY,
         strangers=((name, *does),),
-        exit_code=4,
-        verdict=VIOLATED,
-        activated=NOBODY,
         received=NOBODY,
         quick=quick,
+        **REFUSED,
     )
 
 
@@ -226,7 +224,7 @@ def _node(
         attack=attack,
         manifest=ONE % (program, interface),
         files=MORE,
-        verb=REFUSED,
+        verb=BRIEFLY,
         exit_code=4,
         verdict=VIOLATED,
         findings=findings,
@@ -277,12 +275,10 @@ CASES = (
         attack="a server of a declared service is none that DDS matches with its client",
         manifest=ANSWERED,
         files={"answering.py": ANSWERING % "BEST_EFFORT"},
-        verb=REFUSED,
-        exit_code=4,
-        verdict=VIOLATED,
+        verb=BRIEFLY,
         findings=("graph.unmatched-client",),
-        activated=NOBODY,
         says=("matched on service /reset: the client counts no server as available",),
+        **REFUSED,
     ),
     Case(
         attack="a publisher has a participant of its own",
@@ -322,7 +318,6 @@ CASES = (
         files=MORE,
         verb=("up", "--stop-after", "2"),
         not_findings=("graph.type-mismatch", "graph.undeclared-action-server"),
-        exit_code=0,
     ),
     _node(
         "a node publishes strings on its transition_event",
@@ -335,7 +330,7 @@ CASES = (
         attack="another program's node publishes on a topic of DDS without the prefix of ROS",
         manifest=FOREIGN,
         files={"raw.py": RAW},
-        verb=REFUSED,
+        verb=BRIEFLY,
         exit_code=4,
         verdict=VIOLATED,
         findings=("graph.undeclared-publisher",),
@@ -353,11 +348,9 @@ CASES = (
             attack=f"nobody publishes the time of a node: {how}",
             manifest=SIMULATED % (document, node, ""),
             files=PARAMETERS,
-            verb=REFUSED,
-            exit_code=4,
-            verdict=VIOLATED,
+            verb=BRIEFLY,
             findings=("time.no-clock",),
-            activated=NOBODY,
+            **REFUSED,
         )
         for how, document, node in (
             ("in line", "", SIM),
@@ -385,11 +378,9 @@ CASES = (
         attack="two players publish the time",
         manifest=SIMULATED % ("", SIM, ""),
         strangers=(("rosbag2_player", "clock"), ("rqt_clock", "clock")),
-        verb=REFUSED,
-        exit_code=4,
-        verdict=VIOLATED,
+        verb=BRIEFLY,
         findings=("time.several-clocks",),
-        activated=NOBODY,
+        **REFUSED,
     ),
     Case(
         attack="the player begins late",

@@ -7,7 +7,7 @@ import signal
 import time
 from collections.abc import Callable
 
-from tests.outside.case import NOBODY, VIOLATED, Case
+from tests.outside.case import NOBODY, REFUSED, VIOLATED, Case
 from tests.outside.cases.identity import PAIR as TWO
 from tests.outside.running import Run
 
@@ -150,9 +150,7 @@ CASES = (
         % "",
         files=CHANGES,
         verb=("up", "--strict", "--stop-after", "2", "--timeout", "6"),
-        exit_code=4,
-        verdict=VIOLATED,
-        activated=NOBODY,
+        **REFUSED,
     ),
     Case(
         attack="a stranger has the name of a declared node",

@@ -113,7 +113,6 @@ def _arrives(who: str, run: str, how: str, spelled: str, is_: str, quick: bool) 
         files={} if how == "inline" else in_file(values),
         verb=("up", "--strict", "--stop-after", "1"),
         story=has(f"gain={is_} DOUBLE", SPECIAL, *EMPTY),
-        exit_code=0,
         verdict=OK,
         quick=quick,
     )
@@ -229,7 +228,6 @@ CASES = (
         manifest=system(MANAGED, given="parameter_files: [values.yaml]"),
         files=in_file("{gain: 2.0}", "/valeus"),
         verb=("up", "--stop-after", "1"),
-        exit_code=0,
         verdict=UNVERIFIABLE,
         findings=("param.reached-none",),
         activated=frozenset({"values"}),
@@ -278,7 +276,6 @@ CASES = (
             "    restart_sec: 1",
         ),
         verb=("up", "--strict", "--stop-after", "1"),
-        exit_code=0,
         verdict=OK,
         says=("note: ", "never given up"),
         activated=frozenset({"values"}),
@@ -291,7 +288,6 @@ CASES = (
             "    restart_sec: 1",
         ),
         verb=("check", "--strict"),
-        exit_code=0,
         says=("note: ", "(1 note)"),
     ),
     Case(

@@ -164,7 +164,6 @@ CASES = (
         manifest=PAIR,
         verb=("up", "--strict", "--stop-after", "0.2"),
         story=_announced(_nothing, at_most=6),
-        exit_code=0,
         verdict=OK,
         quick=True,
     ),
@@ -187,7 +186,6 @@ CASES = (
         manifest=PAIR,
         verb=("up", "--strict", "--stop-after", "5"),
         story=_announced(_nothing, at_most=6),
-        exit_code=0,
         verdict=OK,
     ),
     Case(
@@ -195,7 +193,6 @@ CASES = (
         manifest=PAIR,
         verb=("up", "--strict", "--stop-after", "5"),
         story=_announced(_restarted, at_most=20),
-        exit_code=0,
         verdict=OK,
     ),
     Case(
@@ -211,7 +208,6 @@ CASES = (
             manifest=PAIR,
             verb=("plan",),
             story=_under(limit, says, *words),
-            exit_code=0,
             quick="800000" in limit,
         )
         for limit, says, words in (
@@ -228,7 +224,6 @@ CASES = (
             manifest=PAIR,
             verb=("plan",),
             story=_mounted("4k", *words),
-            exit_code=0,
         )
         for words in (_UP, _VERIFY)
     ),
@@ -238,7 +233,6 @@ CASES = (
             manifest=PAIR,
             verb=("plan",),
             story=_under(limit, "ended after it was active", *_UP, code=0),
-            exit_code=0,
         )
         for limit in ("ulimit -n 64", "ulimit -v 1500000")
     ),
