@@ -144,6 +144,7 @@ CASES = (
     ),
     Case(
         attack="a node sets a declared parameter in on_configure",
+        findings=("param.value-differs",),
         manifest=TWO.replace("nodes:Listener", "changes:SetsAtOnce").replace(
             "    interface: {sub", "    parameters: {gain: 1.0}\n    interface: {sub"
         )
