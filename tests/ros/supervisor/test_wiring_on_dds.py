@@ -220,24 +220,6 @@ def served() -> dict[str, Any]:
     }
 
 
-def test_a_discovery_server_that_dies_is_a_failure_that_names_it(
-    tmp_path: Path, fresh_domain: int
-) -> None:
-    options = ("--until", "connected", "--stop-after", "30")
-    with up(pair(tmp_path, fresh_domain, edit=served()), *options, runtime=tmp_path) as run:
-        run.until("process", process="discovery_server", state="running")
-        pid = run.pid_of("discovery_server")
-        run.until("system", reached="connected")
-        os.kill(pid, signal.SIGKILL)
-        assert run.finish() == ExitCode.BRING_UP_FAILED
-        finding = run.verdict["findings"][0]
-        assert (finding["rule"], finding["subject"]) == ("run.process-died", "discovery_server")
-        assert finding["message"] == (
-            f"cannot keep process 'discovery_server' running: pid {pid} died: killed by SIGKILL"
-        )
-        run.assert_nothing_left()
-
-
 def test_the_server_starts_before_any_node_and_ends_after_all_of_them(
     tmp_path: Path, fresh_domain: int
 ) -> None:
