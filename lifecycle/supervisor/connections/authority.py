@@ -32,7 +32,7 @@ from lifecycle.supervisor.connections.desired_state import (
     wired,
 )
 from lifecycle.supervisor.connections.negotiation import NegotiatedSource
-from lifecycle.supervisor.nodes.driver import ACTIVE, INACTIVE
+from lifecycle.supervisor.nodes.driver import ACTIVE, INACTIVE, NodeInterfaceClient
 from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.run.events import Emitter, Notice, WiringChanged, WiringLost
 from lifecycle.supervisor.run.failure import ended
@@ -40,7 +40,7 @@ from lifecycle.verify.observation import NodeConfiguration, Observation
 from lifecycle.verify.verdict import Finding
 
 if TYPE_CHECKING:
-    from lifecycle.supervisor.nodes.driver import NodeDriver, NodeInterfaceClient
+    from lifecycle.supervisor.nodes.driver import NodeDriver
     from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
 
 _BEYOND = (Condition.CONNECTED, Condition.ACTIVE, Condition.HEALTHY)
@@ -255,7 +255,9 @@ class ConnectionAuthority:
             if self._system.node_named(name) is not None or name not in self._others:
                 continue
             unmade = steps(Instructions(node=name), wiring.actual, ours=wiring.ours)
-            making = self._make(wiring, self._reaching.node_interface(name), unmade, None)
+            making = self._make(
+                wiring, NodeInterfaceClient(self._reaching.clients, name), unmade, None
+            )
             try:
                 await asyncio.wait_for(making, RELEASE_S)
             except (BringUpError, asyncio.TimeoutError):
@@ -326,7 +328,12 @@ class ConnectionAuthority:
             elif name in self._others and name not in remote:
                 configuration = self._others[name]
                 if configuration.state in (INACTIVE, ACTIVE):
-                    yield name, self._reaching.node_interface(name), None, configuration
+                    yield (
+                        name,
+                        NodeInterfaceClient(self._reaching.clients, name),
+                        None,
+                        configuration,
+                    )
 
     async def _repair_node(
         self,

@@ -32,7 +32,7 @@ from lifecycle.verify.verdict import Finding, Stage, Verdict
 if TYPE_CHECKING:
     from lifecycle.graph.graph import Graph
     from lifecycle.supervisor.connections.authority import ConnectionAuthority
-    from lifecycle.supervisor.health.agreement import Agreement
+    from lifecycle.supervisor.health.peers import Peers
     from lifecycle.supervisor.nodes.system import System
 
 FORGOTTEN_S = DEFAULT_LEASE_S + 1.0
@@ -56,7 +56,7 @@ class Judge:
         system: which.
         observer: sees the graph.
         looker: learns of each look how nodes are connected; None where nodes connect themselves.
-        agreement: of the supervisors of other hosts.
+        peers: the supervisors of other hosts.
 
     Attributes:
         seen: what was seen last.
@@ -68,12 +68,12 @@ class Judge:
         observer: Graph,
         *,
         looker: ConnectionAuthority | None,
-        agreement: Agreement,
+        peers: Peers,
     ) -> None:
         self._system = system
         self._observer = observer
         self._looker = looker
-        self._agreement = agreement
+        self._peers = peers
         self._standstill = Standstill()
         self._stills = 0
         self.seen = Observation()
@@ -134,8 +134,8 @@ class Judge:
         verdict = with_findings(
             verdict, (*wiring, *system.liveliness.findings(), *limits), expected.policy
         )
-        verdict = self._agreement.explained(verdict)
-        more = (*self._agreement.findings(observation), *discovery_server.findings(system))
+        verdict = self._peers.explained(verdict)
+        more = (*self._peers.findings(observation), *discovery_server.findings(system))
         return with_findings(verdict, more, expected.policy)
 
     def _asked(self) -> Plan:

@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING
 from msgspec.structs import replace
 
 from lifecycle.errors import BringUpError
-from lifecycle.manifest.model import Condition, RosArguments, RunKind, TargetState
+from lifecycle.manifest.model import Condition, RosArguments, RunKind
 from lifecycle.node.host.control import Event as HostEvent
 from lifecycle.plan.build import attached_to
 from lifecycle.plan.model import Plan, PlannedNode, PlannedProcess
 from lifecycle.plan.parameters import DEFAULT
-from lifecycle.supervisor.control.protocol import ProcessState, Reach
+from lifecycle.supervisor.control.protocol import Reach
 from lifecycle.supervisor.core import failure
 from lifecycle.supervisor.core.state import Level, Node, Options, Run, new_run
 from lifecycle.supervisor.health.liveliness import SilenceMonitor
@@ -136,11 +136,6 @@ class NodeRun:
     def is_up(self) -> bool:
         """Whether it was brought as far as its gate."""
         return self.core.level >= self.core.gate
-
-    @property
-    def is_to_be_active(self) -> bool:
-        """Whether the gate is to activate it."""
-        return self.planned.holds and self.planned.state is TargetState.ACTIVE
 
     def run_delay_s(self) -> float:
         """Return the run delay of its process and ours, seconds: ready to run, but without CPU."""
@@ -480,6 +475,3 @@ def level_of(node: NodeRun) -> Level:
     if node.state == INACTIVE:
         return Level.CONNECTED if node.connected else Level.CONFIGURED
     return Level.STARTED
-
-
-PROCESS_ENDED = (ProcessState.EXITED, ProcessState.BACKOFF)

@@ -31,6 +31,7 @@ from lifecycle.supervisor.nodes.driver import (
     ChangedError,
     ControlDriver,
     NodeCondition,
+    ServiceDriver,
 )
 from lifecycle.supervisor.nodes.system import level_of
 from lifecycle.supervisor.processes.control_channel import ChannelClosedError, HostFailedError
@@ -192,7 +193,7 @@ class Requests:
                 await self._give_what_is_missing(node)
             self._system.note_found(node, "running")
             return Level.STARTED
-        driver = node.driver = self._means.participant.driver(planned)
+        driver = node.driver = ServiceDriver(self._means.participant.clients, planned)
         condition = await driver.start()
         self._system.note_found(node, condition.state)
         node.take(condition)
@@ -206,7 +207,9 @@ class Requests:
         name = node.planned.run.container
         container = self._system.nodes.get(name)
         full_name = name if container is None else container.name
-        node.unload = await self._means.participant.load(node.planned, full_name)
+        node.unload = await self._means.participant.clients.load_component(
+            node.planned, full_name, timeout_s=node.planned.timeouts.start_s
+        )
 
     async def _appears(self, name: str) -> None:
         """Wait until discovery shows a node of this name; the core sets the limit."""

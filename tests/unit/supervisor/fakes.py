@@ -12,7 +12,7 @@ import os
 import selectors
 import signal
 import socket
-from collections.abc import Callable, Collection, Coroutine, Mapping, Sequence
+from collections.abc import Callable, Collection, Coroutine, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -21,7 +21,7 @@ from msgspec.structs import replace
 from lifecycle.codec import from_json, to_json
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.node.host.control import Command, Event, HostSpec, Operation
-from lifecycle.plan.model import Plan
+from lifecycle.plan.model import Plan, PlannedProcess
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.process import ManagedProcess, ProcessExit
 from lifecycle.supervisor.run.events import Emitter
@@ -444,12 +444,15 @@ def verdict_of(outcome: Outcome, *rules: str, blocking: bool | None = None) -> V
 class World:
     """A system of fakes with everything recorded."""
 
-    def __init__(self, plan: Plan, directory: Path) -> None:
+    def __init__(
+        self, plan: Plan, directory: Path, processes: Iterable[PlannedProcess] | None = None
+    ) -> None:
         self.spawner = FakeSpawner()
         self.events: list[SupervisorEvent] = []
         self.emit = Emitter()
         self.emit.listen(self.events.append)
-        self.system = System(plan, emit=self.emit, logs=directory, processes=plan.processes)
+        own = plan.processes if processes is None else processes
+        self.system = System(plan, emit=self.emit, logs=directory, processes=own)
 
     @property
     def log(self) -> list[str]:

@@ -11,7 +11,6 @@ import pytest
 from lifecycle.errors import BringUpError
 from lifecycle.manifest.model import RunKind
 from lifecycle.node.host.control import Operation
-from lifecycle.plan.model import PlannedNode
 from lifecycle.supervisor.core.state import Level
 from lifecycle.supervisor.health.answering import ANSWER_S, SHOWN_S, TRIES, Answering
 from lifecycle.supervisor.nodes.driver import ActiveError, ChangedError, ServiceDriver
@@ -31,9 +30,9 @@ class _Node:
         self.asked_s: list[float] = []
 
     async def answers(
-        self, node: PlannedNode, *, timeout_s: float, repeat: bool = False
+        self, node: str, *, managed: bool, timeout_s: float, repeat: bool = False
     ) -> bool | None:
-        del node, repeat
+        del node, managed, repeat
         loop = asyncio.get_running_loop()
         self.asked_s.append(loop.time())
         if not self.shows:
@@ -41,9 +40,9 @@ class _Node:
         await asyncio.sleep(min(timeout_s, max(0.0, self.from_s - loop.time())))
         return loop.time() >= self.from_s
 
-    def serves_nothing(self, node: PlannedNode) -> bool:
+    def serves_parameters(self, node: str) -> bool | None:
         del node
-        return self.is_sure
+        return False if self.is_sure else None
 
 
 def _before_the_gate(
