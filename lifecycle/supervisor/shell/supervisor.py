@@ -132,7 +132,7 @@ class Supervisor:
         self.changed = asyncio.Event()
         self.again: set[str] = set()
         self._begin(system.run)
-        self.authority = authority_of(system, self._emit, means.participant)
+        self.authority = authority_of(system, means.participant)
         self._peers = Peers(system, means.participant)
         self.answering = Answering(system, means.participant.clients)
         self.judge = Judge(
