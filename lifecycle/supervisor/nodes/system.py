@@ -8,6 +8,7 @@ only read. Must not import rclpy.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,7 +25,13 @@ from lifecycle.supervisor.control.protocol import Reach
 from lifecycle.supervisor.core import failure
 from lifecycle.supervisor.core.state import Level, Node, Options, Run, new_run
 from lifecycle.supervisor.health.liveliness import SilenceMonitor
-from lifecycle.supervisor.nodes.driver import ACTIVE, INACTIVE, NodeCondition, NodeDriver
+from lifecycle.supervisor.nodes.driver import (
+    ACTIVE,
+    INACTIVE,
+    ControlDriver,
+    NodeCondition,
+    NodeDriver,
+)
 from lifecycle.supervisor.processes.fork_server_main import GRACE_S
 from lifecycle.supervisor.processes.logs import LogDirectory
 from lifecycle.supervisor.processes.process import ManagedProcess, own_run_delay_s
@@ -158,6 +165,11 @@ class NodeRun:
         return shared and planned.namespace != "/" and bool(planned.parameters)
 
     @property
+    def is_marked(self) -> bool:
+        """Whether the plan says what DSCP any of its endpoints sends with."""
+        return any(each.dscp is not None for each in self.planned.endpoints)
+
+    @property
     def reports_health(self) -> bool:
         """Whether its host reports all that the manifest asks of its health."""
         asked = self.planned.health
@@ -283,21 +295,6 @@ class System:
     def first(self) -> Plan:
         """As it was made from the manifest in force, without what became of it since."""
         return self.run.first
-
-    @property
-    def mode(self) -> str:
-        """Name of the mode that it is in, or is on its way to; empty for a plan without modes."""
-        return self.run.mode
-
-    @property
-    def revision(self) -> int:
-        """Number of the manifest in force; 1 for the one that the run began with."""
-        return self.run.revision
-
-    def mode_by(self, plan: Plan) -> str:
-        """Return the mode that it would be in by another manifest: the same, if that has it."""
-        names = [each.name for each in plan.modes]
-        return self.mode if self.mode in names else next(iter(names), "")
 
     def touch(self) -> None:
         """Note that something may be other than it was judged."""
@@ -446,24 +443,20 @@ class System:
         ]
         await asyncio.gather(
             *(
-                self._refresh(node)
+                _refresh(node, node.driver)
                 for node in nodes
-                if not node.reports_changes
-                or (marks and any(each.dscp is not None for each in node.planned.endpoints))
+                if isinstance(node.driver, ControlDriver)  # any other is read from the graph
+                and (not node.reports_changes or (marks and node.is_marked))
             )
         )
         for node in nodes:
             if node.configuration is not None:
                 observer.state.put_configuration(node.configuration)
 
-    @staticmethod
-    async def _refresh(node: NodeRun) -> None:
-        assert node.driver is not None
-        try:
-            fresh = await asyncio.wait_for(node.driver.configuration(), _REFRESH_S)
-        except (BringUpError, asyncio.TimeoutError):
-            return
-        node.learn(fresh)
+
+async def _refresh(node: NodeRun, driver: ControlDriver) -> None:
+    with contextlib.suppress(BringUpError, asyncio.TimeoutError):
+        node.learn(await asyncio.wait_for(driver.interface(), _REFRESH_S))
 
 
 def level_of(node: NodeRun) -> Level:

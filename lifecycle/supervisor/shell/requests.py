@@ -272,7 +272,9 @@ class Requests:
         if effect.values is None:
             planned = node.planned
             # All of them, also those that it has by default.
-            all_ = tuple(replace(each, source=GIVEN) for each in planned.in_mode(self._system.mode))
+            all_ = tuple(
+                replace(each, source=GIVEN) for each in planned.in_mode(self._system.run.mode)
+            )
             giving = clients.give_parameters(replace(planned, expected_parameters=all_))
         else:
             giving = clients.set_parameters(node.name, effect.values.now, effect.values.types)

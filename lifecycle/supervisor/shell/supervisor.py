@@ -244,7 +244,7 @@ class Supervisor:
         self.give(inputs.Ordered(order=ordered))
         done: Answer = await asyncio.shield(answer)
         if change is not None and done.exit_code == ExitCode.OK:
-            return replace(done, change=replace(change, revision=self.system.revision))
+            return replace(done, change=replace(change, revision=self.system.run.revision))
         return done
 
     # The loop
