@@ -32,6 +32,7 @@ from lifecycle.supervisor.connections.desired_state import (
     wired,
 )
 from lifecycle.supervisor.connections.negotiation import NegotiatedSource
+from lifecycle.supervisor.core.state import Level
 from lifecycle.supervisor.nodes.driver import ACTIVE, INACTIVE, NodeInterfaceClient
 from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.run.events import Notice, WiringChanged, WiringLost
@@ -314,7 +315,7 @@ class ConnectionAuthority:
             else:
                 if node.driver is None or node.core.stuck or name in dead:
                     continue
-                if not configuration.connected or node.found == ACTIVE:
+                if not configuration.connected or node.core.base is Level.ACTIVE:
                     continue  # the latter is verified as it was found
                 interface = node.driver
             wiring = self._wirings.setdefault(name, _Wiring())

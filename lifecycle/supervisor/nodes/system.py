@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Awaitable, Callable, Iterable, Mapping
+from collections.abc import Awaitable, Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,7 +18,6 @@ from msgspec.structs import replace
 from lifecycle.errors import BringUpError
 from lifecycle.manifest.model import Condition, RosArguments, RunKind
 from lifecycle.node.host.control import Event as HostEvent
-from lifecycle.plan.build import attached_to
 from lifecycle.plan.model import Plan, PlannedNode, PlannedProcess
 from lifecycle.plan.parameters import DEFAULT
 from lifecycle.supervisor.control.protocol import Reach
@@ -65,8 +64,6 @@ class NodeRun:
         connected: its data layer is made.
         configuration: what it reports of itself; None before it does.
         connections: names of what the authority connected it to, oldest first.
-        found: state in which it was adopted, `running` for one that is not managed; empty for one
-            that is not adopted.
         reports_changes: its host reports unasked when its configuration changes.
         unload: has its container unload a component; None for what is not loaded into one.
         told: the step of wiring that it is asked for just now; empty when none.
@@ -75,7 +72,6 @@ class NodeRun:
 
     def __init__(self, system: System, core: Node) -> None:
         self.core = core
-        self.found = ""
         self._system = system
         self._said = NodeChanged(node=core.name, reach=Reach.WAITING)
         self.begin()
@@ -245,9 +241,8 @@ class System:
         remote: the plan's other nodes, which another supervisor brings up, by key.
         machines: those whose nodes it brings up; None if that is all of them.
         logs: likewise, with what could not be written there.
-        adopts: takes nodes that others started as they are found, active ones too.
         adopted: the nodes that ran before it, by full name, with the process that each is in as
-            people read it; empty where that is not known.
+            people read it, empty where that is not known; None if none is to be adopted.
         on_change: called whenever something is not as it was judged: time to judge again.
         on_health: likewise with a node that may be as healthy as others wait for.
         liveliness: which nodes are silent.
@@ -278,8 +273,7 @@ class System:
         self.remote = {key: plan.node(key) for key in self.run.elsewhere}
         self.machines = frozenset(each.machine for each in own) if self.remote else None
         self._by_name: dict[str, NodeRun] = {}
-        self.adopts = False
-        self.adopted: dict[str, str] = {}
+        self.adopted: dict[str, str] | None = None
         self.on_change: Callable[[], None] = lambda: None
         self.on_health: Callable[[NodeRun], None] = lambda _: None
         self.present: frozenset[str] | None = None
@@ -376,27 +370,10 @@ class System:
             return False
         return self.present is None or name in self.present
 
-    def adopt(self, running: Mapping[str, str]) -> Plan:
-        """Leave nodes to who started them; return the plan that attaches to them.
-
-        Args:
-            running: by key, the process that each is in as people read it; of the processes that
-                would have been started for them, all nodes.
-        """
-        self.adopts = True
-        for key, where in running.items():
-            self.adopted[self.nodes[key].name] = where
-        return attached_to(self.plan, running)
-
-    def note_found(self, node: NodeRun, state: str) -> None:
-        """Note, and say, how a node was found that others started and that is adopted."""
+    def is_adopted(self, node: NodeRun) -> bool:
+        """Whether a node that others started is taken as it is found, also where it is active."""
         others = not node.core.process and not node.planned.run.component
-        if not self.adopts or not others or node.found:
-            return
-        node.found = state
-        where = self.adopted.get(node.name)
-        message = f"{node.name!r} is adopted, found {state}" + (f": {where}" if where else "")
-        self.emit(Notice(message=message))
+        return others and self.adopted is not None
 
     @property
     def living(self) -> tuple[ManagedProcess, ...]:

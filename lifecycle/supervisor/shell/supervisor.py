@@ -491,7 +491,7 @@ class Supervisor:
             verdict = with_findings(NOT_JUDGED, findings, self.system.plan.policy)
             self.give(inputs.Refused(verdict=verdict))
         else:
-            self.give(inputs.Adopted(plan=plan, nodes=frozenset(self.system.adopted)))
+            self.give(inputs.Adopted(plan=plan, nodes=frozenset(self.system.adopted or ())))
 
     async def _watch(self, died: asyncio.Future[Any], subject: str, rule: str) -> None:
         """Say that what others depend on has died."""
