@@ -17,7 +17,7 @@ from lifecycle.manifest.model import EndpointKind
 from lifecycle.middleware.fastdds.profiles import DEFAULT_LEASE_S
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.connections import discovery_server
-from lifecycle.supervisor.health.liveliness import NodeArrivals
+from lifecycle.supervisor.health.liveliness import arrivals
 from lifecycle.supervisor.judging.standstill import Standstill
 from lifecycle.supervisor.processes.scope import unlimited
 from lifecycle.verify.judge import verify, with_findings, with_only
@@ -77,7 +77,6 @@ class Judge:
         self._standstill = Standstill()
         self._stills = 0
         self.seen = Observation()
-        self._presence = NodeArrivals(system.emit)
         self._unsaid: dict[str, float] = {}
         self._asked_of: tuple[Plan, frozenset[str], Plan] | None = None
         self._left: dict[str, float] = {}  # topics of processes that ended, and until when
@@ -115,8 +114,7 @@ class Judge:
         await system.refresh(self._observer, marks=stage is Stage.CONNECTED)
         observation = without(await self._observer.observe(self._asked()), system.dead())
         self.seen = observation
-        self._presence.see(observation)
-        system.present = self._presence.present
+        system.present = arrivals(system.present or (), observation, system.emit)
         if self._looker is not None:
             self._looker.look(observation)
         expected = system.expected

@@ -387,7 +387,7 @@ class FakeNetworks(Networks):
         if self.fails:
             raise StepFailedError(self.fails, rule=rule("run.not-programmed"), subject="robot")
 
-    async def close(self, hurry: asyncio.Event | None = None) -> None:
+    async def close(self, hurry: asyncio.Event) -> None:
         del hurry
         self._log.append("networks restored")
 
