@@ -56,12 +56,12 @@ class Revisions:
 
     def change(self, plan: Plan) -> PlanChange:
         """Return what `plan` is for the system that runs."""
-        system = self._system
-        return change_between(system.first, plan, modes=(system.mode, system.mode_by(plan)))
+        run = self._system.run
+        return change_between(run.first, plan, modes=(run.mode, run.mode_by(plan)))
 
     def said(self, change: PlanChange, plan: Plan) -> ChangedNodes:
         """Return a change in the words of the control socket, with the revision in force."""
-        return said(change, self._system.first, plan, self._system.revision)
+        return said(change, self._system.first, plan, self._system.run.revision)
 
     def check(self, order: Order) -> None:
         """Make sure that nothing but the manifest that the order means will run.
@@ -127,7 +127,7 @@ class Revisions:
                 what, "a TCP port that was used is not connected to again by who used it"
             )
         for key in (*change.restarted, *change.removed):
-            if (name := system.nodes[key].name) in system.adopted:
+            if (name := system.nodes[key].name) in system.run.adopted:
                 raise UsageError(
                     f"{what}: {name!r} would be taken down, and was adopted",
                     hint="who started it ends it; then lifecycle down, and lifecycle up",

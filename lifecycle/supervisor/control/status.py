@@ -172,8 +172,8 @@ def system_status(system: System, *, supervisor: int, elapsed_s: float, ends: st
             for node in system.nodes.values()
         ),
         not_ok="" if verdict is None else not_ok(verdict),
-        mode=system.mode,
+        mode=system.run.mode,
         manifest=system.first.manifest_path,
-        revision=system.revision,
+        revision=system.run.revision,
         ends=ends,
     )

@@ -100,9 +100,7 @@ def apply(run: Run, order: Order) -> list[Event]:
     """Have the system run by another manifest; nothing is done where nothing differs."""
     plan = order.plan
     assert plan is not None
-    then = run.mode if run.mode in [each.name for each in plan.modes] else ""
-    then = then or next((each.name for each in plan.modes), "")
-    change = change_between(run.first, plan, modes=(run.mode, then))
+    change = change_between(run.first, plan, modes=(run.mode, run.mode_by(plan)))
     if not change.differences:
         run.answer(ExitCode.OK)
         return []
@@ -203,11 +201,10 @@ def _is_down(run: Run, change: Change) -> bool:
 def _take(run: Run, change: Change) -> None:
     """Exchange the plan; what stays is connected as it is."""
     plan, before = (change.before, change.plan) if change.back else (change.plan, change.before)
-    modes = [each.name for each in plan.modes]
     if change.back:
         run.mode, run.revision = change.mode, change.revision
     else:
-        run.mode = run.mode if run.mode in modes else next(iter(modes), "")
+        run.mode = run.mode_by(plan)
         run.revisions += 1
         run.revision = run.revisions
     stays = {key: each.planned for key, each in run.nodes.items() if key not in change.down}

@@ -267,7 +267,12 @@ async def _unanswering(
     nodes = tuple(each for each in plan.nodes if each.full_name in silent)
     for _ in range(TRIES):
         answers = await asyncio.gather(
-            *(observer_participant.answers(each, timeout_s=ANSWER_S) for each in nodes),
+            *(
+                observer_participant.clients.answers(
+                    each.full_name, managed=each.managed, timeout_s=ANSWER_S
+                )
+                for each in nodes
+            ),
             return_exceptions=True,  # who cannot be asked is in the verdict by other rules
         )
         nodes = tuple(node for node, answer in zip(nodes, answers, strict=True) if answer is False)
