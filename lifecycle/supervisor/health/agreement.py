@@ -192,7 +192,7 @@ class Agreement:
             who = _who(notice, self._plan.system)
             theirs = notice.checksum[: len(ours)]
             yield PLANS_DIFFER.finding(
-                Outcome.VIOLATED,
+                outcome=Outcome.VIOLATED,
                 subject=who,
                 expected=f"plan {ours}",
                 observed=f"plan {theirs}",
@@ -220,7 +220,7 @@ class Agreement:
             assert self._said is not None
             who = f"the supervisor of machine {machine!r}"
             yield PLAN_UNKNOWN.finding(
-                Outcome.VIOLATED if left_s > 0 else Outcome.UNVERIFIABLE,
+                outcome=Outcome.VIOLATED if left_s > 0 else Outcome.UNVERIFIABLE,
                 subject=who,
                 expected=f"plan {self._said.checksum}",
                 observed="not announced yet" if left_s > 0 else "not announced",

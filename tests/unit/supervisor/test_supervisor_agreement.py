@@ -152,7 +152,7 @@ async def test_only_the_absence_of_who_was_shut_down_is_how_a_system_of_several_
     tmp_path: Path,
 ) -> None:
     unmatched = UNMATCHED_FLOW.finding(
-        Outcome.VIOLATED,
+        outcome=Outcome.VIOLATED,
         subject="/video: /camera → /viewer",
         ends=("/camera", "/viewer"),
         expected="matched",
@@ -160,7 +160,7 @@ async def test_only_the_absence_of_who_was_shut_down_is_how_a_system_of_several_
         message="cannot see /camera → /viewer matched on /video: the subscription is missing",
     )
     intruder = UNDECLARED_NODE.finding(
-        Outcome.VIOLATED,
+        outcome=Outcome.VIOLATED,
         subject="/viewer",
         expected="no such node",
         observed="node",
@@ -385,7 +385,7 @@ async def test_shut_down_are_the_machines_of_our_system_whose_supervisor_says_so
 
 def _missing(node: str) -> Finding:
     return MISSING_NODE.finding(
-        Outcome.VIOLATED,
+        outcome=Outcome.VIOLATED,
         subject=node,
         expected="node in the graph",
         observed="no such node",
