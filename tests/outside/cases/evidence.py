@@ -355,7 +355,6 @@ CASES = (
         exit_code=4,
         verdict=VIOLATED,
         findings=("graph.unknown-peer",),
-        quick=True,
     ),
     Case(
         attack="a publisher that no graph shows is there before the gate",

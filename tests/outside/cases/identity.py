@@ -217,9 +217,7 @@ def _intruder(name: str, *does: str, manifest: str = RESET, quick: bool = False)
     )
 
 
-def _node(
-    attack: str, program: str, interface: str = "", *findings: str, quick: bool = False
-) -> Case:
+def _node(attack: str, program: str, interface: str = "", *findings: str) -> Case:
     return Case(
         attack=attack,
         manifest=ONE % (program, interface),
@@ -228,7 +226,6 @@ def _node(
         exit_code=4,
         verdict=VIOLATED,
         findings=findings,
-        quick=quick,
     )
 
 
@@ -310,7 +307,6 @@ CASES = (
         "HalfStatus",
         DOCK,
         "graph.type-mismatch",
-        quick=True,
     ),
     Case(
         attack="an action is served as declared",
@@ -372,7 +368,6 @@ CASES = (
         verdict=UNVERIFIABLE,
         findings=("time.undeclared-clock",),
         says=("rosbag2_player",),
-        quick=True,
     ),
     Case(
         attack="two players publish the time",

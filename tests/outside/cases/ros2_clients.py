@@ -87,7 +87,6 @@ CASES = (
         exit_code=130,
         verdict=OK,
         activated=EVERYBODY,
-        quick=True,
     ),
     Case(
         attack="ros2 reads states and parameters",

@@ -102,7 +102,7 @@ WAYS = (
 )
 
 
-def _arrives(who: str, run: str, how: str, spelled: str, is_: str, quick: bool) -> Case:
+def _arrives(who: str, run: str, how: str, spelled: str, is_: str) -> Case:
     values = GIVEN % spelled
     return Case(
         attack=f"{spelled}, NaN and empty arrays reach {who}, {how}",
@@ -114,13 +114,12 @@ def _arrives(who: str, run: str, how: str, spelled: str, is_: str, quick: bool) 
         verb=("up", "--strict", "--stop-after", "1"),
         story=has(f"gain={is_} DOUBLE", SPECIAL, *EMPTY),
         verdict=OK,
-        quick=quick,
     )
 
 
 CASES = (
     *(
-        _arrives(who, run, how, spelled, is_, quick=run == MANAGED and how == "in a file")
+        _arrives(who, run, how, spelled, is_)
         for who, run, spelled, is_ in WAYS
         for how in ("inline", "in a file")
     ),
@@ -221,7 +220,6 @@ CASES = (
         verdict=UNVERIFIABLE,
         findings=("param.reached-none",),
         activated=NOBODY,
-        quick=True,
     ),
     Case(
         attack="the gate opens on a value that reached nobody, and says so",

@@ -20,7 +20,7 @@ from lifecycle.middleware.rcl.hidden_node import republish_names
 from tests.ros.supervisor.running import ROOT, Event, Up, environment, up, verb
 from tests.stalls import Stalls, assert_in_time, noted_stalls
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.thorough
 
 NODES = "benchmarks.liveliness_nodes"
 WITHIN_S = 1.0
@@ -147,6 +147,7 @@ def silences(running: Up, node: str) -> list[Event]:
     return [event for event in running.of_kind("silent") if event["node"] == node]
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("way", ["sleep", "busy", "locked"])
 def test_a_hung_executor_is_noticed_within_a_second_and_so_is_its_end(
     start: Callable[..., Up], tmp_path: Path, way: str, stalls: Stalls
@@ -186,6 +187,7 @@ def test_a_hung_executor_is_noticed_within_a_second_and_so_is_its_end(
     assert_in_time(late_s)
 
 
+@pytest.mark.alone
 def test_a_stopped_process_is_noticed_at_once_and_so_is_its_continuation(
     start: Callable[..., Up], stalls: Stalls
 ) -> None:
@@ -240,6 +242,7 @@ def test_a_system_with_a_stopped_node_is_taken_down_without_waiting_for_it(
     running.assert_nothing_left()
 
 
+@pytest.mark.alone
 def test_a_killed_node_is_dead_and_not_silent(start: Callable[..., Up], stalls: Stalls) -> None:
     running = start("--keep-going")
     running.until("system", reached="active")
@@ -253,6 +256,7 @@ def test_a_killed_node_is_dead_and_not_silent(start: Callable[..., Up], stalls: 
     assert silences(running, "/quiet") == []
 
 
+@pytest.mark.alone
 def test_a_callback_may_take_as_long_as_the_manifest_allows(
     start: Callable[..., Up], tmp_path: Path
 ) -> None:
@@ -265,6 +269,7 @@ def test_a_callback_may_take_as_long_as_the_manifest_allows(
     assert silences(running, "/hanging") == []
 
 
+@pytest.mark.alone
 def test_a_transition_that_takes_long_is_not_a_hang(start: Callable[..., Up]) -> None:
     slow = {"run": {"python": "tests.ros.liveliness.nodes:Slow"}}
     running = start("--stop-after", "0", hanging=slow)
@@ -281,6 +286,7 @@ def test_nodes_join_and_leave_the_graph_as_events(start: Callable[..., Up]) -> N
     running.until("left", node="/quiet")
 
 
+@pytest.mark.alone
 def test_a_node_that_somebody_else_runs_is_heard_by_whoever_attaches_to_it(
     start: Callable[..., Up], tmp_path: Path, stalls: Stalls
 ) -> None:

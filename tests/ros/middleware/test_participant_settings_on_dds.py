@@ -174,6 +174,7 @@ def test_inside_a_process_no_transport_carries_anything(
             assert carrying(loopback.until_now()) == []
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("range_", ["LOCALHOST", "SUBNET", "SYSTEM_DEFAULT"])
 @pytest.mark.parametrize("transports", [UDP, ("udpv6",), ("udpv4", "udpv6")])
 def test_chosen_transports_are_all_there_is_in_every_discovery_range(

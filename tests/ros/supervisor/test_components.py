@@ -120,6 +120,7 @@ def test_components_in_a_container_of_others_come_and_go(
         run.close()
 
 
+@pytest.mark.thorough
 def test_what_a_container_did_counts_where_its_reply_is_lost(
     tmp_path: Path, fresh_domain: int
 ) -> None:

@@ -19,7 +19,7 @@ from lifecycle.middleware.process.shared_memory import leftovers, sweep
 from tests.ros.middleware.free_ports import free_ports
 from tests.ros.supervisor.running import ENOUGH, Up, pair, up, verb
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.thorough
 
 _PORTS = 20
 """More than a planner gives out to two nodes from `first_port` on."""
@@ -153,6 +153,7 @@ def test_a_killed_process_is_gone_for_everybody_within_its_lease_and_comes_back_
         run.assert_nothing_left()
 
 
+@pytest.mark.alone  # all of /dev/shm is compared
 def test_shared_memory_of_a_process_killed_as_soon_as_it_has_made_it_is_removed(
     tmp_path: Path, fresh_domain: int
 ) -> None:

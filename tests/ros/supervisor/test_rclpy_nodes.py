@@ -167,6 +167,7 @@ def test_a_node_of_rclpy_lifecycle_is_driven_by_its_own_state_machine(
         up.assert_gate_held()
 
 
+@pytest.mark.thorough
 def test_a_function_may_return_several_nodes_of_one_process(
     fresh_domain: int, tmp_path: Path, wait_until: Any
 ) -> None:
@@ -188,6 +189,7 @@ def test_a_function_may_return_several_nodes_of_one_process(
         assert is_proven(up)
 
 
+@pytest.mark.thorough
 def test_callbacks_run_in_several_threads_where_the_executor_has_them(
     fresh_domain: int, tmp_path: Path
 ) -> None:
@@ -246,6 +248,7 @@ def test_a_hung_callback_is_noticed_whatever_the_executor_unless_others_go_on_be
         assert {each["node"] for each in up.of_kind("silent")} == {"/many", "/events"}
 
 
+@pytest.mark.thorough
 def test_what_a_callback_of_rclpy_lifecycle_raises_is_logged_and_ends_the_bring_up(
     fresh_domain: int, tmp_path: Path
 ) -> None:
@@ -262,6 +265,7 @@ def test_what_a_callback_of_rclpy_lifecycle_raises_is_logged_and_ends_the_bring_
         assert "OSError: no such camera" in log_of(up, "broken")
 
 
+@pytest.mark.thorough
 def test_flows_of_plain_nodes_are_unique_and_marked_as_the_manifest_asks(
     fresh_domain: int, tmp_path: Path, wait_until: Any
 ) -> None:
@@ -299,6 +303,7 @@ def test_flows_of_plain_nodes_are_unique_and_marked_as_the_manifest_asks(
         up.assert_nothing_left()
 
 
+@pytest.mark.thorough
 def test_nodes_of_rclpy_run_in_a_test_as_ours_do(lifecycle_node: Any, tmp_path: Path) -> None:
     says = [{"name": "words", "type": _STRING, "qos": {"depth": 7}}]
     shared = {"managed": False, "process": "both", "arguments": {"word": "pair"}}
