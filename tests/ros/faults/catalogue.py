@@ -50,12 +50,6 @@ STATIC = (
         message="std_msgs/msg/Int32",
     ),
     Fault(
-        name="a remap leads the subscription to a topic that nobody publishes",
-        edits={f"{LISTENER}/remap": {"chatter": "/chattter"}, "links": []},
-        exit_code=ExitCode.MANIFEST_INVALID,
-        subject="/chattter",
-    ),
-    Fault(
         name="the declared QoS profiles are incompatible",
         edits={
             f"{TALKER}/interface/publishers/0/qos": "sensor_data",
@@ -64,46 +58,6 @@ STATIC = (
         exit_code=ExitCode.MANIFEST_INVALID,
         subject="/chatter",
         message="reliability",
-    ),
-    Fault(
-        name="a link names a topic that its node does not publish",
-        edits={"links/0/topic": "/chat"},
-        exit_code=ExitCode.MANIFEST_INVALID,
-        subject="/chat",
-    ),
-    Fault(
-        name="two nodes are declared under one name",
-        edits={f"{LISTENER}/name": "talker"},
-        exit_code=ExitCode.MANIFEST_INVALID,
-        subject="/talker",
-    ),
-    Fault(
-        name="two nodes wait for each other",
-        edits={
-            f"{LISTENER}/after": {"talker": "active"},
-            f"{TALKER}/after": {"listener": "active"},
-        },
-        exit_code=ExitCode.MANIFEST_INVALID,
-        subject="talker",
-        message="listener",
-    ),
-    Fault(
-        name="a parameter is set that the interface does not declare",
-        edits={f"{TALKER}/parameters": {"misbehav": ""}},
-        exit_code=ExitCode.MANIFEST_INVALID,
-        subject="misbehav",
-    ),
-    Fault(
-        name="a flow is asked of an endpoint that does not exist",
-        edits={f"{TALKER}/flows": {"publishers": {"chat": {"unique": "strictly_required"}}}},
-        exit_code=ExitCode.MANIFEST_INVALID,
-        subject="chat",
-    ),
-    Fault(
-        name="a link demands a unique flow that no endpoint asks for",
-        edits={"links/0/unique": "strongly"},
-        exit_code=ExitCode.MANIFEST_INVALID,
-        subject="/chatter",
     ),
     Fault(
         name="a strictly unique publisher is asked of a command",
