@@ -14,10 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 
 from lifecycle.errors import ExitCode
-from tests.ros.supervisor.running import BOUND_S, ENOUGH, ROOT, Up, verb
+from tests.ros.supervisor.running import BOUND_S, ENOUGH, ROOT, Up, verb, write
 
 FOLDER = ROOT / "tests" / "ros" / "supervisor" / "composition"
 VARIABLES = {"PYTHONPATH": str(FOLDER)}
@@ -33,15 +32,7 @@ def component(plugin: str, container: str, *, managed: bool = False, **rest: Any
 
 
 def system(folder: Path, domain_id: int, **nodes: Any) -> Path:
-    document = {
-        "manifest_version": 1,
-        "system": "composed",
-        "discovery": {"domain_id": domain_id, "range": "localhost"},
-        "nodes": nodes,
-    }
-    file = folder / "composed.lifecycle.yaml"
-    file.write_text(yaml.safe_dump(document))
-    return file
+    return write(folder, domain_id, nodes, "composed")
 
 
 def talker_and_hearer(container: str, values: Path) -> dict[str, Any]:

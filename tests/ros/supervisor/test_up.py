@@ -34,6 +34,7 @@ from tests.ros.supervisor.running import (
     pair,
     up,
     verb,
+    write,
 )
 
 
@@ -131,14 +132,8 @@ def test_nodes_that_keep_each_other_from_the_processor_are_not_too_late(
     tmp_path: Path, fresh_domain: int
 ) -> None:
     node = {"run": {"python": "tests.ros.supervisor.systems:Quiet"}, "timeouts": {"start_s": 0.5}}
-    document = {
-        "manifest_version": 1,
-        "system": "crowd",
-        "discovery": {"domain_id": fresh_domain, "range": "localhost"},
-        "nodes": {f"node_{index}": node for index in range(12)},
-    }
-    manifest = tmp_path / "crowd.lifecycle.yaml"
-    manifest.write_text(json.dumps(document))
+    nodes = {f"node_{index}": node for index in range(12)}
+    manifest = write(tmp_path, fresh_domain, nodes, "crowd")
     one_processor = ("taskset", "--cpu-list", str(min(os.sched_getaffinity(0))))
     options = ("--until", "connected")
     with up(manifest, *options, runtime=tmp_path, through=one_processor) as run:
