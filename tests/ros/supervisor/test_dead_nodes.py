@@ -16,13 +16,10 @@ from rclpy.node import Node
 
 from lifecycle.errors import ExitCode
 from lifecycle.middleware.process.shared_memory import leftovers, sweep
-from tests.ros.middleware.free_ports import free_ports
+from tests.ros.middleware.free_ports import first_port
 from tests.ros.supervisor.running import ENOUGH, Up, pair, up, verb
 
 pytestmark = pytest.mark.thorough
-
-_PORTS = 20
-"""More than a planner gives out to two nodes from `first_port` on."""
 
 AT_ONCE_S = 8.0
 """Less than the lease of 10 s, on a machine that runs something else meanwhile."""
@@ -203,7 +200,7 @@ def test_where_ports_are_fixed_a_killed_node_is_gone_and_comes_back_at_once(
     mode: str, tmp_path: Path, fresh_domain: int
 ) -> None:
     """The supervisor knows better than DDS, which has it until its lease is over."""
-    how = {"domain_id": fresh_domain, "mode": mode, "first_port": free_ports(_PORTS)[0]}
+    how = {"domain_id": fresh_domain, "mode": mode, "first_port": first_port()}
     manifest = pair(tmp_path, fresh_domain, edit={"discovery": how})
     with up(manifest, "--keep-going", runtime=tmp_path) as run:
         run.until("system", reached="active")

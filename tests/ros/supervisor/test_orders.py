@@ -28,8 +28,6 @@ from tests.ros.supervisor.running import BOUND_S, ENOUGH, Up, pair, up, verb
 from tests.ros.supervisor.test_parameters import ARM
 
 Intruders = Callable[[int], Callable[[], None]]
-_PORTS = 20
-"""More than a planner gives out to two nodes from `first_port` on."""
 
 
 def requests(run: Up, since: int) -> list[tuple[str, str]]:

@@ -23,7 +23,7 @@ import yaml
 from lifecycle.errors import ExitCode
 from lifecycle.middleware.versions import KNOWN_FAST_DDS, KNOWN_RCL
 from lifecycle.network.ports import participant_ports
-from tests.ros.middleware.free_ports import free_ports
+from tests.ros.middleware.free_ports import first_port
 from tests.ros.supervisor.running import (
     BOUND_S,
     ROOT,
@@ -778,7 +778,7 @@ def test_a_publisher_serves_one_by_tcp_and_another_by_shared_memory(
     tmp_path: Path, fresh_domain: int
 ) -> None:
     """What moves to a connection is still discovered by who stays on its own participant."""
-    (port, *_) = free_ports(20)
+    port = first_port()
     manifest = pair(tmp_path, fresh_domain, edit={"discovery/first_port": port})
     document = yaml.safe_load(manifest.read_text())
     document["nodes"]["beside"] = document["nodes"]["listener"]
