@@ -353,22 +353,6 @@ def test_a_profile_of_the_users_holds_for_every_participant_before_during_and_af
     assert all(3411 <= int(port) < 3500 for _, port in lines)
 
 
-def test_a_profile_of_the_users_that_chooses_transports_is_kept_and_ours_refused(
-    fresh_domain: int, tmp_path: Path
-) -> None:
-    profiles = tmp_path / "mine.xml"
-    chosen = "<builtinTransports>UDPv4</builtinTransports>"
-    profiles.write_text(_USERS.format(base=3400, extra=chosen))
-    before, refused, after = ports_with(fresh_domain, profiles)
-    assert refused == (
-        f"cannot make a participant for /_p in domain {fresh_domain}: cannot give a participant "
-        f"udpv4: the default participant profile 'mine' of '{profiles}' already chooses its "
-        "transports (<builtinTransports>); take <builtinTransports> out of it, or what needs udpv4 "
-        "out of the manifest"
-    )
-    assert before.split()[1] <= after.split()[1]
-
-
 def test_a_context_that_has_its_participant_is_not_changed(
     context: rclpy.Context, make_node: MakeNode
 ) -> None:
