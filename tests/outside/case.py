@@ -33,6 +33,7 @@ class Case:
         verdict: of the report (`--report`) of `up` and `verify`; None: there is none, or any.
         findings: ids of rules that the report must name.
         not_findings: ids of rules that it must not name.
+        violated: what messages of findings must name whose outcome is violated.
         activated: exactly these nodes ran `on_activate`; None: any. Empty: the gate never opened.
         received: exactly these payloads reached nodes of the system; None: any.
         says: what must be in the output, whatever its lines.
@@ -51,6 +52,7 @@ class Case:
     verdict: str | None = None
     findings: tuple[str, ...] = ()
     not_findings: tuple[str, ...] = ()
+    violated: tuple[str, ...] = ()
     activated: frozenset[str] | None = None
     received: frozenset[str] | None = None
     says: tuple[str, ...] = ()

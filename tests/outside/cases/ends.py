@@ -219,7 +219,6 @@ CASES = (
         story=_shell_is_killed,
         verdict=OK,
         says=("restarted: 'child' 1 time",),
-        quick=True,
     ),
     Case(
         attack="a shell is killed whose child has a session of its own and ignores signals",

@@ -98,7 +98,6 @@ CASES = (
         findings=("run.not-answering",),
         activated=NOBODY,
         within_s=30.0,
-        quick=True,
     ),
     Case(
         attack="a plain node of a command is never spun, and that is no reason to wait",

@@ -216,7 +216,6 @@ CASES = (
         exit_code=6,
         activated=NOBODY,
         says=("still configuring after 1.5 s", "on_configure (", "hanging.py:14"),
-        quick=True,
     ),
     Case(
         attack="a constructor takes longer than start_s",

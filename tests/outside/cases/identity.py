@@ -205,21 +205,21 @@ BRIEFLY = ("up", "--strict", "--stop-after", "2", "--timeout", "6")
 DOCK = "action_servers: [{name: /dock, type: test_msgs/action/Fibonacci}]"
 
 
-def _intruder(name: str, *does: str, manifest: str = RESET, quick: bool = False) -> Case:
+def _intruders(*strangers: tuple[str, str], manifest: str = RESET, quick: bool = False) -> Case:
+    """Strangers that are named as what is hidden, or as tools: each is found."""
     return Case(
-        attack=f"another process has a node {name}: {' '.join(does)}",
+        attack=f"another process has a node {', '.join(map(': '.join, strangers))}",
         manifest=manifest,
         verb=BRIEFLY,
-        strangers=((name, *does),),
+        strangers=strangers,
         received=NOBODY,
         quick=quick,
+        violated=tuple(f"/{name}" for name, _ in strangers),
         **REFUSED,
     )
 
 
-def _node(
-    attack: str, program: str, interface: str = "", *findings: str, quick: bool = False
-) -> Case:
+def _node(attack: str, program: str, interface: str = "", *findings: str) -> Case:
     return Case(
         attack=attack,
         manifest=ONE % (program, interface),
@@ -228,7 +228,6 @@ def _node(
         exit_code=4,
         verdict=VIOLATED,
         findings=findings,
-        quick=quick,
     )
 
 
@@ -241,14 +240,15 @@ SIM = "parameters: {use_sim_time: true}"
 PARAMETERS = {"p.yaml": "/**:\n  ros__parameters: {use_sim_time: true}\n"}
 
 CASES = (
-    _intruder("_server_x", "srv:/reset", quick=True),
-    _intruder("_server_flow_0", "srv:/reset"),
-    _intruder("_client_x", "cli:/reset"),
-    _intruder("_talker_x", "pub:/chatter", manifest=PAIR % ""),
-    _intruder("_talker_flow_0", "pub:/chatter", manifest=PAIR % OWN_FLOW),
-    _intruder("_listener_x", "sub:/chatter", manifest=PAIR % ""),
-    _intruder("_ros2cli_4711", "srv:/reset"),
-    _intruder("transform_listener_impl_5f", "srv:/reset"),
+    _intruders(("_server_x", "srv:/reset"), quick=True),
+    _intruders(
+        ("_server_flow_0", "srv:/reset"),
+        ("_client_x", "cli:/reset"),
+        ("_ros2cli_4711", "srv:/reset"),
+        ("transform_listener_impl_5f", "srv:/reset"),
+    ),
+    _intruders(("_talker_x", "pub:/chatter"), ("_listener_x", "sub:/chatter"), manifest=PAIR % ""),
+    _intruders(("_talker_flow_0", "pub:/chatter"), manifest=PAIR % OWN_FLOW),
     Case(
         attack="verify is asked while a hidden node of a stranger serves",
         manifest=RESET,
@@ -310,7 +310,6 @@ CASES = (
         "HalfStatus",
         DOCK,
         "graph.type-mismatch",
-        quick=True,
     ),
     Case(
         attack="an action is served as declared",
@@ -372,7 +371,6 @@ CASES = (
         verdict=UNVERIFIABLE,
         findings=("time.undeclared-clock",),
         says=("rosbag2_player",),
-        quick=True,
     ),
     Case(
         attack="two players publish the time",

@@ -190,7 +190,6 @@ CASES = (
         verb=("check",),
         exit_code=3,
         says=("system.lifecycle.yaml:3:1: on_supervisor_lost: cannot use",),
-        quick=True,
     ),
 )
 

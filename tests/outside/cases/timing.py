@@ -212,7 +212,6 @@ CASES = (
         story=lasting,
         exit_code=4,
         says=("violated meanwhile", "/stranger (graph.undeclared-node)"),
-        quick=True,
     ),
     Case(
         attack="a tolerated tool makes and destroys endpoints, and nothing is wrong",
@@ -280,7 +279,6 @@ CASES = (
         files=SLOW,
         verb=STRICT_12,
         story=still_before_the_gate,
-        quick=True,
         **NOTICED,
     ),
     Case(

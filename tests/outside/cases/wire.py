@@ -208,7 +208,6 @@ CASES = (
             manifest=PAIR,
             verb=("plan",),
             story=_under(limit, says, *words),
-            quick="800000" in limit,
         )
         for limit, says, words in (
             ("ulimit -n 24", "ulimit -n 52", _UP),

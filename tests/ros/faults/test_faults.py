@@ -30,7 +30,13 @@ def _assert_gate_held(run: Up, fault: Fault, markers: list[str]) -> None:
         assert not [line for line in markers if line.endswith((" activate", " active"))]
 
 
-@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
+@pytest.mark.parametrize(
+    "fault",
+    [
+        pytest.param(each, id=each.name, marks=() if each.quick else pytest.mark.thorough)
+        for each in FAULTS
+    ],
+)
 def test_a_broken_system_is_refused_named_and_cleared_away(fault: Fault, tmp_path: Path) -> None:
     with ended(fault, tmp_path) as (run, code):
         said = _everything_said(run)

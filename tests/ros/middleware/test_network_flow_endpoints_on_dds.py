@@ -132,6 +132,7 @@ def test_a_strictly_unique_publisher_is_refused_with_the_reason_of_the_rmw(
     assert node.count_publishers("/video") == 0
 
 
+@pytest.mark.thorough
 def test_two_hundred_unique_subscriptions_come_and_go_and_participants_take_all_along(
     domain_id: int, wait_until: WaitUntil
 ) -> None:

@@ -174,6 +174,7 @@ def test_inside_a_process_no_transport_carries_anything(
             assert carrying(loopback.until_now()) == []
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("range_", ["LOCALHOST", "SUBNET", "SYSTEM_DEFAULT"])
 @pytest.mark.parametrize("transports", [UDP, ("udpv6",), ("udpv4", "udpv6")])
 def test_chosen_transports_are_all_there_is_in_every_discovery_range(
@@ -350,22 +351,6 @@ def test_a_profile_of_the_users_holds_for_every_participant_before_during_and_af
     assert [shared for shared, _ in lines] == ["True", "False", "True"]
     # portBase + 11 + 2 × participant, where the default base would give 7411 and more
     assert all(3411 <= int(port) < 3500 for _, port in lines)
-
-
-def test_a_profile_of_the_users_that_chooses_transports_is_kept_and_ours_refused(
-    fresh_domain: int, tmp_path: Path
-) -> None:
-    profiles = tmp_path / "mine.xml"
-    chosen = "<builtinTransports>UDPv4</builtinTransports>"
-    profiles.write_text(_USERS.format(base=3400, extra=chosen))
-    before, refused, after = ports_with(fresh_domain, profiles)
-    assert refused == (
-        f"cannot make a participant for /_p in domain {fresh_domain}: cannot give a participant "
-        f"udpv4: the default participant profile 'mine' of '{profiles}' already chooses its "
-        "transports (<builtinTransports>); take <builtinTransports> out of it, or what needs udpv4 "
-        "out of the manifest"
-    )
-    assert before.split()[1] <= after.split()[1]
 
 
 def test_a_context_that_has_its_participant_is_not_changed(

@@ -23,7 +23,7 @@ import yaml
 from lifecycle.errors import ExitCode
 from lifecycle.middleware.versions import KNOWN_FAST_DDS, KNOWN_RCL
 from lifecycle.network.ports import participant_ports
-from tests.ros.middleware.free_ports import free_ports
+from tests.ros.middleware.free_ports import first_port
 from tests.ros.supervisor.running import (
     BOUND_S,
     ROOT,
@@ -34,6 +34,7 @@ from tests.ros.supervisor.running import (
     pair,
     up,
     verb,
+    write,
 )
 
 
@@ -81,6 +82,7 @@ ctypes.CDLL = Library
 """
 
 
+@pytest.mark.thorough
 def test_with_libraries_that_are_not_known_all_but_unique_flows_is_verified(
     tmp_path: Path, fresh_domain: int
 ) -> None:
@@ -105,6 +107,7 @@ def test_with_libraries_that_are_not_known_all_but_unique_flows_is_verified(
         run.assert_nothing_left()
 
 
+@pytest.mark.thorough
 def test_what_needs_libraries_that_are_known_is_refused_before_anything_is_started(
     tmp_path: Path, fresh_domain: int
 ) -> None:
@@ -124,18 +127,13 @@ def test_what_needs_libraries_that_are_known_is_refused_before_anything_is_start
             assert re.match(rf"{re.escape(str(manifest))}:\d+:\d+: cannot ", run.said())
 
 
+@pytest.mark.thorough
 def test_nodes_that_keep_each_other_from_the_processor_are_not_too_late(
     tmp_path: Path, fresh_domain: int
 ) -> None:
     node = {"run": {"python": "tests.ros.supervisor.systems:Quiet"}, "timeouts": {"start_s": 0.5}}
-    document = {
-        "manifest_version": 1,
-        "system": "crowd",
-        "discovery": {"domain_id": fresh_domain, "range": "localhost"},
-        "nodes": {f"node_{index}": node for index in range(12)},
-    }
-    manifest = tmp_path / "crowd.lifecycle.yaml"
-    manifest.write_text(json.dumps(document))
+    nodes = {f"node_{index}": node for index in range(12)}
+    manifest = write(tmp_path, fresh_domain, nodes, "crowd")
     one_processor = ("taskset", "--cpu-list", str(min(os.sched_getaffinity(0))))
     options = ("--until", "connected")
     with up(manifest, *options, runtime=tmp_path, through=one_processor) as run:
@@ -294,6 +292,7 @@ def test_a_run_that_cannot_hold_for_as_long_as_asked_is_no_success_and_its_repor
 _IMPORTING = "import time\nprint('importing', flush=True)\ntime.sleep(300)"
 
 
+@pytest.mark.thorough
 def test_every_import_that_fails_is_named_once_and_whoever_still_imports_is_not_waited_for(
     tmp_path: Path, fresh_domain: int
 ) -> None:
@@ -339,6 +338,7 @@ def test_every_import_that_fails_is_named_once_and_whoever_still_imports_is_not_
         assert log.read_text() == "importing\n"
 
 
+@pytest.mark.thorough
 def test_with_all_warnings_on_a_run_gives_none(tmp_path: Path, fresh_domain: int) -> None:
     warnings = {"PYTHONWARNINGS": "always"}
     manifest = str(pair(tmp_path, fresh_domain))
@@ -347,6 +347,7 @@ def test_with_all_warnings_on_a_run_gives_none(tmp_path: Path, fresh_domain: int
     assert "Warning" not in done.stdout
 
 
+@pytest.mark.thorough
 def test_that_nodes_are_found_by_a_server_of_the_user_s_is_said(
     tmp_path: Path, fresh_domain: int
 ) -> None:
@@ -384,6 +385,7 @@ def _logs_of_a_run_before(tmp_path: Path, system: str) -> Path:
     return folder
 
 
+@pytest.mark.thorough
 def test_logs_of_old_runs_go_once_the_system_is_active_or_is_not_going_to_be(
     tmp_path: Path, fresh_domain: int, wait_until: Callable[..., None]
 ) -> None:
@@ -549,6 +551,7 @@ raise SystemExit(program())
 """
 
 
+@pytest.mark.thorough
 def test_a_run_that_hangs_on_leaving_the_graph_ends_with_its_verdict_and_report(
     tmp_path: Path, fresh_domain: int
 ) -> None:
@@ -570,6 +573,7 @@ def test_a_run_that_hangs_on_leaving_the_graph_ends_with_its_verdict_and_report(
     assert left_of(mark) == []
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("range_", ["subnet", "localhost"])
 def test_where_something_else_has_the_port_of_discovery_a_system_is_not_begun_and_says_so(
     tmp_path: Path, fresh_domain: int, range_: str
@@ -603,6 +607,7 @@ _OTHER_PORTS = """<?xml version="1.0" encoding="UTF-8" ?>
 """
 
 
+@pytest.mark.thorough
 def test_a_system_whose_profile_chooses_other_ports_needs_no_port_of_others(
     tmp_path: Path, fresh_domain: int
 ) -> None:
@@ -665,7 +670,7 @@ def test_without_room_for_its_threads_a_system_is_not_begun_and_says_so(
         run.close()
 
 
-@pytest.mark.alone
+@pytest.mark.thorough
 @pytest.mark.parametrize("whom", ["supervisor", "all"])
 def test_at_the_limit_of_processes_a_system_is_taken_down_all_the_same(
     tmp_path: Path, fresh_domain: int, whom: str
@@ -708,6 +713,7 @@ _IN_PLACE: dict[str, Callable[[Path], None]] = {
 }
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("what", _IN_PLACE)
 def test_what_is_in_the_place_of_the_run_directory_is_named_and_left_alone(
     tmp_path: Path, fresh_domain: int, what: str
@@ -767,11 +773,12 @@ def test_systemd_is_notified_once_the_system_is_verified_and_active(
             run.close()
 
 
+@pytest.mark.thorough
 def test_a_publisher_serves_one_by_tcp_and_another_by_shared_memory(
     tmp_path: Path, fresh_domain: int
 ) -> None:
     """What moves to a connection is still discovered by who stays on its own participant."""
-    (port, *_) = free_ports(20)
+    port = first_port()
     manifest = pair(tmp_path, fresh_domain, edit={"discovery/first_port": port})
     document = yaml.safe_load(manifest.read_text())
     document["nodes"]["beside"] = document["nodes"]["listener"]

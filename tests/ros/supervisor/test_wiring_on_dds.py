@@ -21,13 +21,10 @@ from lifecycle.errors import ExitCode
 from lifecycle.middleware.rcl.graph import GraphObserver
 from lifecycle.middleware.services.clients import NodeClients
 from lifecycle.supervisor.core.gate import SETTLED_S
-from tests.ros.middleware.free_ports import free_ports
+from tests.ros.middleware.free_ports import first_port
 from tests.ros.supervisor.running import BOUND_S, ENOUGH, ROOT, Up, left_of, pair, up, verb
 
 pytestmark = pytest.mark.thorough
-
-_PORTS = 20
-"""More than a planner gives out to two nodes from `first_port` on."""
 
 GROWING = "examples.nine_systems.nodes"
 NET = {"urls": ["udpv4://127.0.0.1"]}
@@ -163,7 +160,7 @@ def test_a_node_that_nobody_declared_is_negotiated_with_wired_and_never_driven(
         "policy": {"unheard": "ignore", "undeclared_nodes": "open"},
         "nodes/talker/parameters": {"grow_after_s": 0.0},
         "nodes/talker/flows": {"publishers": {"chatter": {"transport": "tcpv4"}}},
-        "discovery/first_port": free_ports(_PORTS)[0],
+        "discovery/first_port": first_port(),
     }
     with up(pair(tmp_path, fresh_domain, edit=edit), runtime=tmp_path) as run:
         run.until("system", reached="active")
@@ -216,7 +213,7 @@ def served() -> dict[str, Any]:
     return {
         "discovery/mode": "server",
         "discovery/range": "system_default",
-        "discovery/first_port": free_ports(_PORTS)[0],
+        "discovery/first_port": first_port(),
     }
 
 
