@@ -20,17 +20,18 @@ from msgspec.structs import replace
 
 from lifecycle.manifest.building import (
     build_data_layer,
-    build_discovery,
     build_modes,
     build_node,
     build_on_violation,
     positions_of,
     quantities,
+    section,
 )
 from lifecycle.manifest.checks import check
 from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position, Severity
 from lifecycle.manifest.interface import Findings
 from lifecycle.manifest.model import (
+    Discovery,
     Link,
     Machine,
     Manifest,
@@ -68,7 +69,6 @@ def build_network(root: Cursor, *, base: Path, found: list[Diagnostic]) -> Netwo
         Network,
         transport_priority_mapping=_priority_mapping(cursor, found),
         five_qi_dscp=_dscp_mapping(cursor, base, found),
-        at=cursor.key_at,
     )
 
 
@@ -114,7 +114,9 @@ def _dscp_mapping(network: Cursor, base: Path, found: list[Diagnostic]) -> DscpM
 THIS_HOST = "local"
 """Name of the machine of nodes that name none; declared implicitly, without address."""
 
-_SEVERITIES = {"error": Severity.ERROR, "warning": Severity.WARNING, "ignore": None}
+
+_SECTIONS = ("discovery", "network", "data_layer", "on_violation")
+"""Sections of a document that findings may be about."""
 
 
 def build_manifest(
@@ -148,15 +150,18 @@ def build_manifest(
         system=root.text("system"),
         description=root.text("description"),
         machines=_machines(root, nodes, found),
-        discovery=build_discovery(root),
+        discovery=section(root, "discovery", Discovery),
         network=build_network(root, base=base, found=found),
         data_layer=build_data_layer(root, found),
-        policy=_policy(root),
+        policy=section(root, "policy", Policy),
         on_violation=build_on_violation(root),
         modes=build_modes(root, found),
         nodes=nodes,
         links=tuple(_link(each) for each in root.items("links")),
-        positions=positions_of(root, ("discovery", "data_layer", "on_violation")),
+        positions={
+            **positions_of(root, _SECTIONS),
+            **{key: each.key_at for key in _SECTIONS if (each := root.get(key)) is not None},
+        },
     )
 
 
@@ -175,19 +180,6 @@ def _machines(root: Cursor, nodes: tuple[Node, ...], found: Findings) -> tuple[M
         if here is not None:
             machines.append(Machine(name=THIS_HOST, at=here.at))
     return tuple(machines)
-
-
-def _policy(root: Cursor) -> Policy:
-    cursor = root.get("policy")
-    if cursor is None:
-        return Policy()
-    return cursor.build(
-        Policy,
-        unverifiable_blocks=cursor.text("unverifiable") == "block",
-        unpublished=_SEVERITIES[cursor.text("unpublished", "error")],
-        unheard=_SEVERITIES[cursor.text("unheard", "warning")],
-        ros_interface_required=cursor.get("ros_interface") is not None,
-    )
 
 
 def _link(cursor: Cursor) -> Link:
@@ -556,13 +548,8 @@ class _Loading:
             self._outermost = manifest
             return
         outer = self._outermost
-        for key in ("discovery", "network", "data_layer", "policy", "on_violation", "modes"):
-            mine, holds = getattr(manifest, key), getattr(outer, key)
-            if key == "network":
-                mine = replace(mine, at=holds.at)
-            elif key in ("discovery", "data_layer"):
-                mine = msgspec.structs.replace(mine, at=holds.at)
-            if key in root and mine != holds:
+        for key in (*_SECTIONS, "policy", "modes"):
+            if key in root and getattr(manifest, key) != getattr(outer, key):
                 message = f"cannot use the {key} of an included manifest; the including one's holds"
                 at = root.document.key_at((key,))
                 self.found.append(note("manifest.include-ignored", at, message))

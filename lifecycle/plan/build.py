@@ -229,12 +229,8 @@ def build_plan(
         flows=wired.flows,
         levels=dependency_levels(manifest.nodes),
         rmw=rmw,
-        flow_identification=manifest.network.flow_identification,
-        discovery_mode=manifest.discovery.mode,
-        max_datagram_bytes=manifest.network.max_datagram_bytes,
         server=wired.server,
         observers=wired.observers,
-        settle_s=manifest.discovery.settle_s,
     )
     return in_mode(plan, plan.modes[0].name) if plan.modes else plan
 

@@ -60,10 +60,10 @@ def check_counterparts(system: DeclaredSystem) -> Iterator[Diagnostic]:
 
 def _severity(system: DeclaredSystem, kind: EndpointKind) -> Severity | None:
     policy = system.manifest.policy
-    severity = policy.unheard if kind is EndpointKind.PUBLISHER else policy.unpublished
-    if severity is Severity.ERROR and system.is_open:
+    wanted = policy.unheard if kind is EndpointKind.PUBLISHER else policy.unpublished
+    if wanted == "error" and system.is_open:
         return Severity.WARNING  # the other end may be one that the manifest does not declare
-    return severity
+    return None if wanted == "ignore" else Severity(wanted)
 
 
 def _alone(

@@ -226,7 +226,7 @@ def _repurposed(system: DeclaredSystem, needs: FlowNeeds) -> Iterator[Diagnostic
                 f"({other.at.spelled})"
             )
             yield error("check.dscp-not-unique", need.need.at, message, _OWN)
-    at = system.manifest.network.at
+    at = system.manifest.positions.get("network")
     if asking and at is not None:
         message = (
             f"cannot be sure that the network takes {len(asking)} of {_DSCP_VALUES} DSCP values "

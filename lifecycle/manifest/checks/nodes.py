@@ -361,7 +361,7 @@ def check_ports(
         # One that is no domain is the environment's fault, and refused where it is used.
         domain = domain_of(environment.get("ROS_DOMAIN_ID", "")) or 0
     start = Position(file=system.manifest.path, line=1, column=1, path="discovery.domain_id")
-    at = discovery.at or start
+    at = system.manifest.where("discovery", start)
     if not 0 <= domain <= MAX_DOMAIN_ID:
         message = f"cannot use domain id {domain}; allowed: 0 to {MAX_DOMAIN_ID}"
         yield error("check.domain", at, message, "Fast DDS ends every process beyond it")
@@ -374,7 +374,9 @@ def check_ports(
         )
         yield note("check.domain", at, message, f"use domain {domains}")
     for host in system.hosts.values():
-        yield from _crowded(system, needs, host, domain, discovery.at or host[0].at)
+        yield from _crowded(
+            system, needs, host, domain, system.manifest.where("discovery", host[0].at)
+        )
         yield from _beyond_localhost(system, needs, host, environment)
 
 
@@ -463,7 +465,7 @@ def _beyond_localhost(
         f"{LOCALHOST_PEERS_RANGE - 1} of its host only"
     )
     hint = "use 'range: subnet', or give several nodes one 'process:'"
-    yield error("check.localhost", discovery.at or nodes[0].at, message, hint)
+    yield error("check.localhost", system.manifest.where("discovery", nodes[0].at), message, hint)
 
 
 def _participants(nodes: list[Node], needs: FlowNeeds) -> int:

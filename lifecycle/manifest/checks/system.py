@@ -205,7 +205,7 @@ def implicit_names(system: DeclaredSystem) -> frozenset[tuple[EndpointKind, str]
 
 def _of_supervisors(manifest: Manifest) -> Iterator[tuple[EndpointKind, str]]:
     """Yield what the supervisors of a system offer by its policy."""
-    access = manifest.policy.ros_interface
+    access = manifest.policy.access
     if access is RosInterfaceAccess.OFF:
         return
     yield EndpointKind.PUBLISHER, DIAGNOSTICS_TOPIC

@@ -48,12 +48,13 @@ _OTHERS = ("rmw_cyclonedds", "rmw_zenoh", "rmw_connextdds")
 def check_discovery(system: DeclaredSystem, environment: Mapping[str, str]) -> Iterator[Diagnostic]:
     """Yield findings about discovery and the data layer's authority."""
     discovery = system.manifest.discovery
-    if discovery.at is not None:
-        yield from _range(system, discovery.at)
-        yield from _addresses(system, discovery.at)
-        yield from _transport(system, discovery.at)
-        yield from _server(system, discovery.at)
-        yield from _rmws(system, environment, discovery.at)
+    section = system.manifest.positions.get("discovery")
+    if section is not None:
+        yield from _range(system, section)
+        yield from _addresses(system, section)
+        yield from _transport(system, section)
+        yield from _server(system, section)
+        yield from _rmws(system, environment, section)
         for node in system.manifest.nodes:
             yield from _foreign_rmws(discovery, node)
             yield from _unfound(system, environment, node)
@@ -247,7 +248,8 @@ def _unfound(
 
 def _authority(system: DeclaredSystem) -> Iterator[Diagnostic]:
     layer = system.manifest.data_layer
-    if layer.at is None:
+    section = system.manifest.positions.get("data_layer")
+    if section is None:
         return
     if layer.authority is Authority.NODES and layer.source is DataLayerSource.DYNAMIC:
         message = (
@@ -255,7 +257,7 @@ def _authority(system: DeclaredSystem) -> Iterator[Diagnostic]:
             "each node only follows what it was started with, and nobody would negotiate"
         )
         hint = "use 'authority: supervisor', or 'source: static'"
-        at = system.manifest.where("data_layer.source", layer.at)
+        at = system.manifest.where("data_layer.source", section)
         yield error("check.authority", at, message, hint)
     if layer.authority is not Authority.SUPERVISOR:
         return

@@ -346,7 +346,7 @@ def test_connections_that_a_class_of_rclpy_cannot_be_given_are_refused(folder: P
     net = ConnectionDeclaration(name="net", urls=(url,), map=mapped, at=at(1))
     run = Run(kind=RunKind.PYTHON, python="them:Managed")
     made = replace(node("talker", run=run), connections=(net,))
-    system = replace(manifest(made), data_layer=DataLayer(authority=Authority.SUPERVISOR, at=at(1)))
+    system = replace(manifest(made), data_layer=DataLayer(authority=Authority.SUPERVISOR))
     assert said(resolve_programs(system, environment={})) == [
         (
             "cannot leave the connections of 'talker' to the supervisor: Managed (them.py) is not "

@@ -34,8 +34,9 @@ def plan_of(*, transport: FlowTransport = FlowTransport.ANY, is_open: bool = Tru
         ),
         node("listener", subscription("chatter"), endpoints=EndpointPolicy.OPEN),
         data_layer=DataLayer(
-            authority=Authority.SUPERVISOR, source=DataLayerSource.DYNAMIC, events=True, at=at(4)
+            authority=Authority.SUPERVISOR, source=DataLayerSource.DYNAMIC, events=True
         ),
+        positions={"data_layer": at(4)},
         policy=Policy(undeclared_nodes=policy),
     )
 

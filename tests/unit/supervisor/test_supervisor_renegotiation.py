@@ -100,5 +100,5 @@ def test_what_cannot_be_connected_is_a_finding() -> None:
 
 
 def test_where_nothing_is_negotiated_the_plan_is_what_must_be() -> None:
-    plan: Plan = replace(plan_of(), data_layer=DataLayer(at=at(4)))
+    plan: Plan = replace(plan_of(), data_layer=DataLayer(), positions={"data_layer": at(4)})
     assert Expectation.of(plan, seen(known(TALKER, LISTENER))) == Expectation(plan=plan)
