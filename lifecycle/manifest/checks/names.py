@@ -237,3 +237,9 @@ def _rule_place(moved: Resolved) -> Position:
         if rule.match and _expanded(node, rule.match) == expanded:
             return _place(node, match)
     return moved.at
+
+
+CHECKS = (
+    check_names,
+    check_remaps,
+)

@@ -11,11 +11,14 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 
 import msgspec
 
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.diagnostics import Position
+from lifecycle.manifest.flows import FlowNeeds
+from lifecycle.manifest.installed_types import search_prefixes
 from lifecycle.manifest.model import (
     Endpoint,
     EndpointKind,
@@ -37,6 +40,7 @@ from lifecycle.manifest.names import (
     supervisor_services,
     supervisor_status_topic,
 )
+from lifecycle.manifest.parameter_files import ParameterFiles
 from lifecycle.network.medium import DEFAULT_RMW
 
 _RMW_VARIABLE = "RMW_IMPLEMENTATION"
@@ -73,14 +77,16 @@ class DeclaredSystem(msgspec.Struct, frozen=True, kw_only=True, dict=True):
     Attributes:
         endpoints: in the order of the manifest.
         unresolved: the endpoints that are missing from `endpoints`.
+        environment: of the process that will run the system.
     """
 
     manifest: Manifest
+    environment: Mapping[str, str]
     endpoints: tuple[Resolved, ...]
     unresolved: tuple[UnresolvedEndpoint, ...]
 
     @classmethod
-    def of(cls, manifest: Manifest) -> DeclaredSystem:
+    def of(cls, manifest: Manifest, environment: Mapping[str, str]) -> DeclaredSystem:
         """Resolve every endpoint of a manifest; rules that rcl refuses are left out."""
         resolved: list[Resolved] = []
         unresolved: list[UnresolvedEndpoint] = []
@@ -94,9 +100,30 @@ class DeclaredSystem(msgspec.Struct, frozen=True, kw_only=True, dict=True):
                     unresolved.append(outcome)
         return cls(
             manifest=manifest,
+            environment=environment,
             endpoints=tuple(resolved),
             unresolved=tuple(unresolved),
         )
+
+    @functools.cached_property
+    def prefixes(self) -> tuple[Path, ...]:
+        """Where packages are installed, in the order in which they are searched."""
+        return search_prefixes(self.environment)
+
+    @functools.cached_property
+    def files(self) -> ParameterFiles:
+        """The parameter files that nodes name."""
+        return ParameterFiles(self.manifest.path)
+
+    @functools.cached_property
+    def needs(self) -> FlowNeeds:
+        """What the endpoints of the system ask of their flows."""
+        return FlowNeeds(self.manifest, self.prefixes)
+
+    def rmw_of(self, node: Node) -> str:
+        """Return the RMW identifier that a node will run with."""
+        own = dict(node.run.environment).get(_RMW_VARIABLE, "")
+        return own or self.environment.get(_RMW_VARIABLE, "") or DEFAULT_RMW
 
     @functools.cached_property
     def nodes(self) -> dict[str, Node]:
@@ -214,9 +241,3 @@ def _of_supervisors(manifest: Manifest) -> Iterator[tuple[EndpointKind, str]]:
         yield EndpointKind.PUBLISHER, supervisor_status_topic(prefix)
         for name in supervisor_services(access, (each.name for each in manifest.modes)):
             yield EndpointKind.SERVICE_SERVER, f"{prefix}/{name}"
-
-
-def rmw_of(node: Node, environment: Mapping[str, str]) -> str:
-    """Return the RMW identifier that a node will run with."""
-    own = dict(node.run.environment).get(_RMW_VARIABLE, "")
-    return own or environment.get(_RMW_VARIABLE, "") or DEFAULT_RMW
