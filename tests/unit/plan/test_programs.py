@@ -267,7 +267,9 @@ def test_programs_are_found_as_exec_would_find_them(folder: Path) -> None:
     ]
 
 
-def test_executables_of_packages_are_looked_for_where_there_are_packages(folder: Path) -> None:
+def test_executables_of_packages_are_looked_for_where_there_are_packages(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (folder / "lib" / "demo").mkdir(parents=True)
     (folder / "lib" / "demo" / "talk").write_text("")
     (folder / "lib" / "demo" / "talk").chmod(0o755)
@@ -287,6 +289,8 @@ def test_executables_of_packages_are_looked_for_where_there_are_packages(folder:
             "file of its workspace"
         )
     ]
+    monkeypatch.setattr(sys, "prefix", str(folder))  # where wheels install them
+    assert package("talk", "") == []
 
 
 FOREIGN = """
