@@ -39,6 +39,7 @@ from lifecycle.manifest.model import (
     Node,
     Policy,
 )
+from lifecycle.manifest.parameter_files import ParameterFiles
 from lifecycle.manifest.schema import validate
 from lifecycle.manifest.shared import Shared, settle
 from lifecycle.manifest.yaml import include
@@ -200,10 +201,12 @@ class Loaded(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         warnings: what may be wrong with it, and notes, by position.
+        files: the parameter files that its nodes name, as they were read.
     """
 
     manifest: Manifest
     warnings: tuple[Diagnostic, ...]
+    files: ParameterFiles
 
 
 def load(
@@ -237,7 +240,8 @@ def load(
 
     if manifest is None or _has_errors(found):
         raise ManifestError(every())
-    manifest = settle(_without_left_out(manifest), found)
+    files = ParameterFiles(manifest.path)
+    manifest = settle(_without_left_out(manifest), files, found)
     if not manifest.nodes and manifest.left_out:
         at = Position(file=manifest.path, line=1, column=1)
         message = "cannot run a system without nodes: conditions leave out all of them"
@@ -250,12 +254,13 @@ def load(
             )
         )
     if not _has_errors(found):
-        found += check(manifest, environment=variables)
+        found += check(manifest, environment=variables, files=files)
     if _has_errors(found):
         raise ManifestError(every())
     warnings = every()
     unproven = tuple(each for each in warnings if each.is_unproven)
-    return Loaded(manifest=replace(manifest, unproven=unproven), warnings=warnings)
+    manifest = replace(manifest, unproven=unproven)
+    return Loaded(manifest=manifest, warnings=warnings, files=files)
 
 
 class ArgumentDeclaration(msgspec.Struct, frozen=True, kw_only=True):

@@ -22,6 +22,7 @@ from lifecycle.manifest.checks import (
 from lifecycle.manifest.checks.system import DeclaredSystem
 from lifecycle.manifest.diagnostics import Diagnostic
 from lifecycle.manifest.model import Manifest
+from lifecycle.manifest.parameter_files import ParameterFiles
 
 CHECKS: tuple[Callable[[DeclaredSystem], Iterator[Diagnostic]], ...] = (
     *names.CHECKS,
@@ -35,7 +36,10 @@ CHECKS: tuple[Callable[[DeclaredSystem], Iterator[Diagnostic]], ...] = (
 
 
 def check(
-    manifest: Manifest, *, environment: Mapping[str, str] | None = None
+    manifest: Manifest,
+    *,
+    environment: Mapping[str, str] | None = None,
+    files: ParameterFiles | None = None,
 ) -> tuple[Diagnostic, ...]:
     """Check a manifest that has been built; nothing stops at the first finding.
 
@@ -43,13 +47,18 @@ def check(
         manifest: what `load` or a test has built.
         environment: for AMENT_PREFIX_PATH, ROS_DOMAIN_ID, RMW_IMPLEMENTATION and
             FASTDDS_BUILTIN_TRANSPORTS; this process's if None.
+        files: parameter files of its nodes that were read already.
 
     Returns:
         Every error and warning, in the order of their places in each document.
     """
-    system = DeclaredSystem.of(manifest, os.environ if environment is None else environment)
+    system = DeclaredSystem.of(
+        manifest,
+        environment=os.environ if environment is None else environment,
+        files=files or ParameterFiles(manifest.path),
+    )
     found = [finding for each in CHECKS for finding in each(system)]
-    files = {each.at.file: None for each in found}
-    rank = {file: index for index, file in enumerate((manifest.path, *files))}
+    order = dict.fromkeys((manifest.path, *(each.at.file for each in found)))
+    rank = {file: index for index, file in enumerate(order)}
     found.sort(key=lambda each: (rank[each.at.file], each.at.line, each.at.column))
     return tuple(dict.fromkeys(found))

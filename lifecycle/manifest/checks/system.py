@@ -78,15 +78,19 @@ class DeclaredSystem(msgspec.Struct, frozen=True, kw_only=True, dict=True):
         endpoints: in the order of the manifest.
         unresolved: the endpoints that are missing from `endpoints`.
         environment: of the process that will run the system.
+        files: the parameter files that nodes name.
     """
 
     manifest: Manifest
     environment: Mapping[str, str]
+    files: ParameterFiles
     endpoints: tuple[Resolved, ...]
     unresolved: tuple[UnresolvedEndpoint, ...]
 
     @classmethod
-    def of(cls, manifest: Manifest, environment: Mapping[str, str]) -> DeclaredSystem:
+    def of(
+        cls, manifest: Manifest, *, environment: Mapping[str, str], files: ParameterFiles
+    ) -> DeclaredSystem:
         """Resolve every endpoint of a manifest; rules that rcl refuses are left out."""
         resolved: list[Resolved] = []
         unresolved: list[UnresolvedEndpoint] = []
@@ -101,6 +105,7 @@ class DeclaredSystem(msgspec.Struct, frozen=True, kw_only=True, dict=True):
         return cls(
             manifest=manifest,
             environment=environment,
+            files=files,
             endpoints=tuple(resolved),
             unresolved=tuple(unresolved),
         )
@@ -109,11 +114,6 @@ class DeclaredSystem(msgspec.Struct, frozen=True, kw_only=True, dict=True):
     def prefixes(self) -> tuple[Path, ...]:
         """Where packages are installed, in the order in which they are searched."""
         return search_prefixes(self.environment)
-
-    @functools.cached_property
-    def files(self) -> ParameterFiles:
-        """The parameter files that nodes name."""
-        return ParameterFiles(self.manifest.path)
 
     @functools.cached_property
     def needs(self) -> FlowNeeds:
