@@ -14,6 +14,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import msgspec
+from msgspec.structs import replace
 
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.diagnostics import Position
@@ -34,8 +35,8 @@ from lifecycle.manifest.names import (
     NODE_SERVICES,
     OUR_SERVICES,
     RemapRule,
+    name_in_graph,
     parse_rule,
-    resolve,
     supervisor_prefix,
     supervisor_services,
     supervisor_status_topic,
@@ -63,20 +64,12 @@ class Resolved(msgspec.Struct, frozen=True, kw_only=True):
         return f"{noun} {self.endpoint.name!r} of node {self.node.key!r} ({self.at.spelled})"
 
 
-class UnresolvedEndpoint(msgspec.Struct, frozen=True, kw_only=True):
-    """An endpoint whose name cannot be resolved, and why."""
-
-    node: Node
-    endpoint: Endpoint
-    problem: LifecycleError
-
-
 class DeclaredSystem(msgspec.Struct, frozen=True, kw_only=True, dict=True):
     """A manifest and what follows from it alone.
 
     Attributes:
         endpoints: in the order of the manifest.
-        unresolved: the endpoints that are missing from `endpoints`.
+        unresolved: those that have no name, and why.
         environment: of the process that will run the system.
         files: the parameter files that nodes name.
     """
@@ -85,7 +78,7 @@ class DeclaredSystem(msgspec.Struct, frozen=True, kw_only=True, dict=True):
     environment: Mapping[str, str]
     files: ParameterFiles
     endpoints: tuple[Resolved, ...]
-    unresolved: tuple[UnresolvedEndpoint, ...]
+    unresolved: tuple[tuple[Node, Endpoint, LifecycleError], ...]
 
     @classmethod
     def of(
@@ -93,15 +86,15 @@ class DeclaredSystem(msgspec.Struct, frozen=True, kw_only=True, dict=True):
     ) -> DeclaredSystem:
         """Resolve every endpoint of a manifest; rules that rcl refuses are left out."""
         resolved: list[Resolved] = []
-        unresolved: list[UnresolvedEndpoint] = []
+        unresolved: list[tuple[Node, Endpoint, LifecycleError]] = []
         for node in manifest.nodes:
-            rules = usable_rules(node)
+            as_read = replace(node, remap=usable_rules(node))
             for endpoint in node.interface.endpoints:
-                outcome = _resolve(node, endpoint, rules)
-                if isinstance(outcome, Resolved):
-                    resolved.append(outcome)
+                name = _name(as_read, endpoint)
+                if isinstance(name, str):
+                    resolved.append(Resolved(node=node, endpoint=endpoint, name=name))
                 else:
-                    unresolved.append(outcome)
+                    unresolved.append((node, endpoint, name))
         return cls(
             manifest=manifest,
             environment=environment,
@@ -171,20 +164,11 @@ class DeclaredSystem(msgspec.Struct, frozen=True, kw_only=True, dict=True):
         )
 
 
-def _resolve(
-    node: Node, endpoint: Endpoint, rules: tuple[tuple[str, str], ...]
-) -> Resolved | UnresolvedEndpoint:
+def _name(node: Node, endpoint: Endpoint) -> str | LifecycleError:
     try:
-        name = resolve(
-            endpoint.name,
-            node_name=node.name,
-            namespace=node.namespace,
-            remap=rules,
-            kind=endpoint.kind,
-        )
+        return name_in_graph(node, endpoint.name, endpoint.kind)
     except LifecycleError as problem:
-        return UnresolvedEndpoint(node=node, endpoint=endpoint, problem=problem)
-    return Resolved(node=node, endpoint=endpoint, name=name)
+        return problem
 
 
 def usable_rules(node: Node) -> tuple[tuple[str, str], ...]:
