@@ -510,7 +510,8 @@ def without_noise(
     return tuple(
         each
         for each in found
-        if but.looks_for(each.kind, each.name)
+        if (each.node, each.kind, each.name) in but.ends
+        or but.looks_for(each.kind, each.name)
         or not is_noise_endpoint(each.kind, each.node, each.name, each.type, ours=each.node in ours)
     )
 
