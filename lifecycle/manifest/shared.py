@@ -116,13 +116,14 @@ class Shared(msgspec.Struct, frozen=True, kw_only=True):
         )
 
 
-def settle(manifest: Manifest, found: Findings) -> Manifest:
+def settle(manifest: Manifest, files: ParameterFiles, found: Findings) -> Manifest:
     """Take from nodes the shared parameters that their files set, and those they do not declare.
 
     Nodes of one process get what any of them says of its supervision.
 
     Args:
         manifest: with all that it includes, so that each node has its full name.
+        files: that its nodes name.
         found: findings are appended here: shared parameters that no node declares.
     """
     found.extend(_for_no_node(manifest.nodes))
@@ -131,7 +132,6 @@ def settle(manifest: Manifest, found: Findings) -> Manifest:
         if node.process:
             for key, value in _own_supervision(node).items():
                 own.setdefault(node.process, {}).setdefault(key, value)
-    files = ParameterFiles(manifest.path)
     nodes = tuple(
         _settled(_as_its_process(node, own.get(node.process, {})), files) for node in manifest.nodes
     )

@@ -45,12 +45,12 @@ class NodeParameters:
     """What parameters the nodes of one manifest must have.
 
     Args:
-        manifest: path of the manifest, beside which files are named in messages.
+        files: that its nodes name.
         modes: of that manifest.
     """
 
-    def __init__(self, manifest: str, modes: tuple[Mode, ...] = ()) -> None:
-        self._files = ParameterFiles(manifest)
+    def __init__(self, files: ParameterFiles, modes: tuple[Mode, ...] = ()) -> None:
+        self._files = files
         self._modes = modes
 
     def expected(self, node: Node) -> tuple[ExpectedParameter, ...]:

@@ -287,7 +287,7 @@ def check(
         resolution = resolve(result.manifest, machine)
         diagnostics = (
             *result.warnings,
-            *check_plan(result.manifest),
+            *check_plan(result.manifest, files=result.files),
             *resolution.diagnostics,
         )
         if all(each.severity is not Severity.ERROR for each in diagnostics):

@@ -22,7 +22,6 @@ from lifecycle.manifest.model import ModeParameter, Node, ParameterValue, RunKin
 from lifecycle.manifest.nodl import nearest_file
 from lifecycle.manifest.parameter_files import (
     ParameterFile,
-    ParameterFiles,
     read_scalar,
     type_of,
 )
@@ -73,7 +72,7 @@ def _show(value: ParameterValue) -> str:
     return quote(value)
 
 
-def check_parameters(system: DeclaredSystem, files: ParameterFiles) -> Iterator[Diagnostic]:
+def check_parameters(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about the parameters of every node."""
     names: dict[str, set[str]] = {}
     for node in system.manifest.nodes:
@@ -82,7 +81,7 @@ def check_parameters(system: DeclaredSystem, files: ParameterFiles) -> Iterator[
         yield from _given(node)
         yield from _no_effect(node)
         yield from _for_no_node(node, names[node.process_name])
-        yield from _empty_arrays(node, files)
+        yield from _empty_arrays(node, system)
 
 
 def _given(node: Node) -> Iterator[Diagnostic]:
@@ -125,7 +124,7 @@ def _for_no_node(node: Node, names: Collection[str]) -> Iterator[Diagnostic]:
             yield warning("check.parameter-for-no-node", at, message, hint)
 
 
-def _empty_arrays(node: Node, files: ParameterFiles) -> Iterator[Diagnostic]:
+def _empty_arrays(node: Node, system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Warn of empty arrays whose type nothing declares: rcl reads none from `[]`."""
     if node.interface.parameters:
         return  # one that those do not declare is reported as such
@@ -140,7 +139,7 @@ def _empty_arrays(node: Node, files: ParameterFiles) -> Iterator[Diagnostic]:
     given += [
         each
         for path in node.parameter_files
-        for section in files.read(path).sections
+        for section in system.files.read(path).sections
         if section.matches(node.full_name)
         for each in section.parameters
     ]
@@ -151,7 +150,7 @@ def _empty_arrays(node: Node, files: ParameterFiles) -> Iterator[Diagnostic]:
             yield warning("check.parameter-empty-array", at, message, hint)
 
 
-def check_mode_parameters(system: DeclaredSystem, files: ParameterFiles) -> Iterator[Diagnostic]:
+def check_mode_parameters(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about parameters that modes cannot set, or not set back."""
     modes = system.manifest.modes
     for mode in modes:
@@ -163,7 +162,7 @@ def check_mode_parameters(system: DeclaredSystem, files: ParameterFiles) -> Iter
                 yield error("check.mode", each.at, f"{what}: no such node", hint)
             elif why := _never_set(node, each):
                 yield error("check.mode", each.at, f"{what}{why[0]}", why[1])
-            elif not _is_given(node, each.name, files):
+            elif not _is_given(node, each.name, system):
                 others = [
                     other.name
                     for other in modes
@@ -195,7 +194,7 @@ def _never_set(node: Node, given: ModeParameter) -> tuple[str, str] | None:
     return None
 
 
-def _is_given(node: Node, name: str, files: ParameterFiles) -> bool:
+def _is_given(node: Node, name: str, system: DeclaredSystem) -> bool:
     """Return whether it is known what a parameter is in a mode that says nothing of it."""
     if name in dict(node.parameters):
         return True
@@ -204,7 +203,7 @@ def _is_given(node: Node, name: str, files: ParameterFiles) -> bool:
     return any(
         name == found
         for path in node.parameter_files
-        for section in files.read(path).sections
+        for section in system.files.read(path).sections
         if section.matches(node.full_name)
         for found, _, _ in section.parameters
     )
@@ -278,18 +277,19 @@ def given_value(text: str) -> ParameterValue | None:
     return read_scalar(text, quoted=False)
 
 
-def check_parameter_files(system: DeclaredSystem, files: ParameterFiles) -> Iterator[Diagnostic]:
+def check_parameter_files(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about every parameter file that a node names."""
     readers: dict[str, list[Node]] = {}
     for node in system.manifest.nodes:
         for index, path in enumerate(node.parameter_files):
             if path not in readers:
-                yield from _flaws(path, files.read(path), node.where(f"parameter_files.{index}"))
+                at = node.where(f"parameter_files.{index}")
+                yield from _flaws(path, system.files.read(path), at)
             readers.setdefault(path, []).append(node)
     for node in system.manifest.nodes:
-        yield from _unmatched_file_of_command(node, system, files)
+        yield from _unmatched_file_of_command(node, system)
     for path, nodes in readers.items():
-        file = files.read(path)
+        file = system.files.read(path)
         for node in () if file.flaws else nodes:
             yield from _unmatched_node(path, file, node)
             yield from _values(file, node)
@@ -317,9 +317,7 @@ def _unmatched_node(path: str, file: ParameterFile, node: Node) -> Iterator[Diag
     yield warning("check.parameter-file-unmatched", at, message, hint)
 
 
-def _unmatched_file_of_command(
-    node: Node, system: DeclaredSystem, files: ParameterFiles
-) -> Iterator[Diagnostic]:
+def _unmatched_file_of_command(node: Node, system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Warn of sections of a command's `--params-file` that are for no node, or not for its own."""
     paths = [each.file for each in command_line_parameters(node) if each.file]
     if not paths:
@@ -327,7 +325,7 @@ def _unmatched_file_of_command(
     process = node.process_name
     every = [each.full_name for each in system.manifest.nodes]
     names = [e.full_name for e in system.manifest.nodes if process == e.process_name]
-    for file in map(files.read, paths):
+    for file in map(system.files.read, paths):
         at = node.where("run.command")
         mine = [each for each in file.sections if any(map(each.matches, names))]
         # One file for many processes has sections for the nodes of others.
@@ -387,3 +385,6 @@ def _unknown_to_all(file: ParameterFile, readers: list[Node]) -> Iterator[Diagno
             if name not in known and not is_implicit(name):
                 message = f"cannot set parameter {name!r}: no node that reads it declares it"
                 yield warning("check.parameter-undeclared", at, message, did_you_mean(name, known))
+
+
+CHECKS = (check_parameters, check_parameter_files, check_mode_parameters)

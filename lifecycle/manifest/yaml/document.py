@@ -98,6 +98,11 @@ class Document(msgspec.Struct, frozen=True, kw_only=True):
             value = child
         return value
 
+    def plain(self, place: Place) -> Any:
+        """Return the value at a place without positions; an empty mapping where there is none."""
+        value = self.find(place)
+        return {} if value is None else value.plain()
+
     def at(self, place: Place = ()) -> Position:
         """Return the position of the value at `place`, or of the nearest value around it."""
         value = self._nearest(place)

@@ -295,7 +295,8 @@ class _Composer:
         if _UNFIT.search(event.value):
             message = f"cannot use {_cut(event.value)}: it holds a NUL or half a character"
             self._note("yaml.character", mark, message, "remove the escape")
-        quoted = bool(event.style)  # libyaml has "" for a plain scalar, PyYAML None
+        # libyaml has "" for a plain scalar, PyYAML None; '!' makes a string (YAML 1.2.2 §6.9.1).
+        quoted = bool(event.style) or event.tag == "!"
         data: Scalar = event.value
         if not quoted:
             try:

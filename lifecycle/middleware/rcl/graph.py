@@ -238,7 +238,7 @@ class GraphObserver:
         self._ours = self._ours.intersection(shown).union(*map(our_nodes, shown.values()))
         endpoints: list[ObservedEndpoint] = []
         for name in sorted(shown):
-            but = NO_NAMES if name in declared else names
+            but = DeclaredNames(ends=names.ends) if name in declared else names
             judged = without_noise(shown[name], but=but, ours=self._ours)
             folded = fold_actions(self._hashed(name, judged, ends))
             endpoints += sorted(folded if name else self._located(folded), key=_order)
@@ -551,7 +551,9 @@ def _is_noise(endpoint: ObservedEndpoint, declared: Collection[str], names: Decl
     kind, node, name = endpoint.kind, endpoint.node, endpoint.name
     if name.startswith(RAW):
         return not node
-    wanted = node not in declared and names.looks_for(kind, name)
+    wanted = (node, kind, name) in names.ends or (
+        node not in declared and names.looks_for(kind, name)
+    )
     return not wanted and is_noise_endpoint(kind, node, name, endpoint.type, ours=False)
 
 

@@ -80,11 +80,11 @@ def check_installed(policy: Policy) -> None:
     Raises:
         MiddlewareError: a package is not installed.
     """
-    if not policy.ros_interface_required or policy.ros_interface is RosInterfaceAccess.OFF:
+    if policy.ros_interface in (None, RosInterfaceAccess.OFF):
         return
     if lacking := [name for name in _PACKAGES if find_spec(name) is None]:
         raise MiddlewareError(
-            f"cannot offer 'policy: {{ros_interface: {policy.ros_interface.value}}}': no Python "
+            f"cannot offer 'policy: {{ros_interface: {policy.access.value}}}': no Python "
             f"package {' or '.join(lacking)} is installed",
             hint="install it, or write 'policy: {ros_interface: off}'",
         )
@@ -117,7 +117,7 @@ class RosInterface:
     ) -> None:
         self._session = session
         self._plan = plan
-        self._access = plan.policy.ros_interface
+        self._access = plan.policy.access
         self._machine = machine
         self._modes = tuple(modes)
         self._participant = participant

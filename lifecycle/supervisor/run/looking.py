@@ -181,7 +181,7 @@ def _looking(plan: Plan) -> ObserverParticipant:
         plan.domain_id,
         onlooker_connections(plan, _reported_to_supervisors(plan)),
         unplanned=is_open and is_negotiated(plan),
-        settle_s=plan.settle_s,
+        settle_s=plan.discovery.settle_s,
     )
 
 

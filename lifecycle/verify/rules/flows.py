@@ -267,7 +267,7 @@ def _judge_transport(view: View, flow: FlowView) -> Iterator[Finding]:
 
 def _is_decided(view: View, flow: FlowView) -> bool:
     """Return whether the medium was asked for; else the plan only has what is expected."""
-    if view.plan.data_layer.at is not None:
+    if "data_layer" in view.plan.positions:
         return True
     return any(
         end.planned.transport not in (FlowTransport.ANY, FlowTransport.NETWORK)

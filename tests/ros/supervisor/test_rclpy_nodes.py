@@ -91,6 +91,29 @@ def test_plain_nodes_are_verified_completely_and_released(
         up.assert_nothing_left()
 
 
+def test_what_every_node_has_may_be_declared(fresh_domain: int, tmp_path: Path) -> None:
+    rosout = {"name": "/rosout", "type": "rcl_interfaces/msg/Log"}
+    events = {"name": "/parameter_events", "type": "rcl_interfaces/msg/ParameterEvent"}
+    said = {"name": "~/transition_event", "type": "lifecycle_msgs/msg/TransitionEvent"}
+    listed = {"name": "~/list_parameters", "type": "rcl_interfaces/srv/ListParameters"}
+    state = {"name": "~/get_state", "type": "lifecycle_msgs/srv/GetState"}
+    plain = {**TALKS, "publishers": [*TALKS["publishers"], rosout, events]}
+    managed = {"publishers": [rosout, said], "service_servers": [listed, state]}
+    manifest = running.write(
+        tmp_path,
+        fresh_domain,
+        {
+            "talker": node("Talker", managed=False, interface=plain),
+            "managed": node("rclpy.lifecycle:LifecycleNode", interface=managed),
+        },
+        policy={"unverifiable": "block", "unheard": "ignore"},
+    )
+    with running.up(manifest, "--stop-after", "0.5", runtime=tmp_path) as up:
+        up.until("system", reached="active")
+        assert is_proven(up)
+        assert up.finish() == 0
+
+
 def test_a_plain_node_does_nothing_while_the_gate_is_closed(
     fresh_domain: int, tmp_path: Path
 ) -> None:

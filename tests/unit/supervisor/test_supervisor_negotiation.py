@@ -36,8 +36,9 @@ def plan_of(*, transport: FlowTransport = FlowTransport.ANY, is_open: bool = Tru
         ),
         node("listener", subscription("chatter"), endpoints=EndpointPolicy.OPEN),
         data_layer=DataLayer(
-            authority=Authority.SUPERVISOR, source=DataLayerSource.DYNAMIC, events=True, at=at(4)
+            authority=Authority.SUPERVISOR, source=DataLayerSource.DYNAMIC, events=True
         ),
+        positions={"data_layer": at(4)},
         policy=Policy(undeclared_nodes=policy),
     )
 
@@ -232,5 +233,5 @@ def test_what_cannot_be_connected_is_a_finding() -> None:
 
 
 def test_where_nothing_is_negotiated_the_plan_is_what_must_be() -> None:
-    plan: Plan = replace(plan_of(), data_layer=DataLayer(at=at(4)))
+    plan: Plan = replace(plan_of(), data_layer=DataLayer(), positions={"data_layer": at(4)})
     assert Expectation.of(plan, seen(known(TALKER, LISTENER))) == Expectation(plan=plan)

@@ -95,7 +95,7 @@ def test_what_a_manifest_asks_for_must_be_installed(
     required: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "diagnostic_msgs", None)
-    policy = Policy(ros_interface=FULL, ros_interface_required=required)
+    policy = Policy(ros_interface=FULL if required else None)
     refused = pytest.raises(MiddlewareError) if required else contextlib.nullcontext()
     with refused as error:
         check_installed(policy)
