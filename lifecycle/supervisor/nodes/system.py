@@ -299,11 +299,6 @@ class System:
         """Number of the manifest in force; 1 for the one that the run began with."""
         return self.run.revision
 
-    def mode_by(self, plan: Plan) -> str:
-        """Return the mode that it would be in by another manifest: the same, if that has it."""
-        names = [each.name for each in plan.modes]
-        return self.mode if self.mode in names else next(iter(names), "")
-
     def touch(self) -> None:
         """Note that something may be other than it was judged."""
         self.on_change()

@@ -20,6 +20,7 @@ from msgspec.structs import replace
 
 from lifecycle.errors import BringUpError, ExitCode, UsageError
 from lifecycle.manifest.model import Authority
+from lifecycle.plan.comparison import changes, difference_lines
 from lifecycle.plan.model import Plan
 from lifecycle.run_directory import RunDirectory
 from lifecycle.supervisor.connections import discovery_server
@@ -28,13 +29,14 @@ from lifecycle.supervisor.connections.authority import (
     configured_before_any_connect,
 )
 from lifecycle.supervisor.connections.networks import Networks
-from lifecycle.supervisor.control.orders import Order, Revisions
+from lifecycle.supervisor.control.orders import check
 from lifecycle.supervisor.control.protocol import Answer, ControlRequest, SystemStatus
 from lifecycle.supervisor.control.ros_interface import RosInterface
 from lifecycle.supervisor.control.server import ControlServer, SupervisorSnapshot
 from lifecycle.supervisor.control.status import process_state, system_status
 from lifecycle.supervisor.core import advance, effects, gate, inputs
 from lifecycle.supervisor.core import state as core
+from lifecycle.supervisor.core.change import change_to, changed_nodes
 from lifecycle.supervisor.core.orders import refused_at_once
 from lifecycle.supervisor.core.reduce import take
 from lifecycle.supervisor.health import agreement
@@ -144,7 +146,6 @@ class Supervisor:
             looker=self.authority,
             agreement=self._agreement,
         )
-        self._revisions = Revisions(system, options)
         self._processes = Processes(self)
         self._requests = Requests(self)
         self._looks = Looks(self)
@@ -216,38 +217,29 @@ class Supervisor:
 
     def differences(self, plan: Plan) -> tuple[str, ...]:
         """Say how `plan` differs from what runs, one line each; empty if it does not."""
-        return self._revisions.differences(plan)
+        return difference_lines(changes(self.system.first, plan))
 
-    async def order(self, order: Order) -> Answer:
+    async def order(self, order: core.Order) -> Answer:
         """Take an order from outside, if it fits what the system is doing; return its outcome."""
-        applies = order.ask is ControlRequest.APPLY
-        change = None
         try:
-            self._revisions.check(order)
+            check(order, self.system, self._options.machine)
         except UsageError as error:
             return Answer(exit_code=error.exit_code, error=str(error))
-        if applies:
-            assert order.plan is not None
-            change = self._revisions.said(self._revisions.change(order.plan), order.plan)
+        run, change = self.system.run, None
+        if order.ask is ControlRequest.APPLY and order.plan is not None:
+            what = change_to(run, order.plan)
+            change = changed_nodes(what, run.first, order.plan, run.revision)
         number = len(self._answers)
-        ordered = core.Order(
-            id=number,
-            ask=order.ask,
-            node=order.node,
-            mode=order.mode,
-            plan=order.plan if applies else None,
-            timeout_s=order.timeout_s,
-            first=self.system.first,
-        )
+        order = replace(order, id=number, first=run.first)
         if change is not None and order.dry_run:
-            code, why = refused_at_once(self.system.run, ordered)
+            code, why = refused_at_once(run, order)
             differs = ExitCode.VIOLATED if change.differences else ExitCode.OK
             return Answer(exit_code=code if why else differs, error=why, change=change)
         answer = self._answers[number] = self._loop.create_future()
-        self.give(inputs.Ordered(order=ordered))
+        self.give(inputs.Ordered(order=order))
         done: Answer = await asyncio.shield(answer)
         if change is not None and done.exit_code == ExitCode.OK:
-            return replace(done, change=replace(change, revision=self.system.revision))
+            return replace(done, change=replace(change, revision=run.revision))
         return done
 
     # The loop
