@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 from msgspec.structs import replace
 
-from lifecycle.errors import BringUpError, ExitCode, UsageError
+from lifecycle.errors import BringUpError, ExitCode, LifecycleError
 from lifecycle.manifest.model import Authority
 from lifecycle.plan.comparison import changes, difference_lines
 from lifecycle.plan.model import Plan
@@ -49,6 +49,7 @@ from lifecycle.supervisor.nodes.adoption import adopt
 from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.processes.orphans import reap_adopted
 from lifecycle.supervisor.run.events import (
+    Event,
     LogLine,
     Notice,
     ProcessChanged,
@@ -150,14 +151,7 @@ class Supervisor:
         self._requests = Requests(self)
         self._looks = Looks(self)
         self._load = Load(system)
-        self._ros_interface = RosInterface(
-            self,
-            system.plan,
-            min(system.machines or ("",)),
-            means.participant,
-            emit=self._emit,
-            modes=() if system.remote else (each.name for each in system.plan.modes),
-        )
+        self._ros_interface = RosInterface(self)
         system.on_change = self._touch
         system.on_health = self._health
         system.liveliness.listen(self._silence)
@@ -223,7 +217,7 @@ class Supervisor:
         """Take an order from outside, if it fits what the system is doing; return its outcome."""
         try:
             check(order, self.system, self._options.machine)
-        except UsageError as error:
+        except LifecycleError as error:
             return Answer(exit_code=error.exit_code, error=str(error))
         run, change = self.system.run, None
         if order.ask is ControlRequest.APPLY and order.plan is not None:
@@ -503,8 +497,13 @@ class Supervisor:
         await server.open()
         self._peers.open()
         self._agreement.open()
-        self._emit.listen(lambda event: None if isinstance(event, LogLine) else server.changed())
-        self._emit.listen(self._ros_interface.on_event)
+
+        def changed(event: Event) -> None:
+            if not isinstance(event, LogLine):
+                server.changed()
+                self._ros_interface.on_event(event)
+
+        self._emit.listen(changed)
         self._ros_interface.begin()
         result = UpResult(exit_code=ExitCode.INTERNAL, verdict=NOT_JUDGED)
         beside = [
