@@ -393,7 +393,6 @@ class ConnectionAuthority:
                 self._making -= 1
                 if node is not None:
                     node.told = ""
-            wiring.actual = wiring.actual.after(step)
             if step.operation is Operation.CONNECT_TO and step.connection not in wiring.ours:
                 wiring.ours.append(step.connection)
             elif step.operation is Operation.DISCONNECT_FROM and step.connection in wiring.ours:
@@ -401,10 +400,11 @@ class ConnectionAuthority:
             if node is not None:
                 node.connections = tuple(wiring.ours)
             if configuration is not None:
-                if node is not None:
-                    node.learn(configuration)
-                else:
+                wiring.actual = wired(configuration)
+                if node is None:
                     self._others[configuration.name] = configuration
+                else:
+                    node.learn(configuration)
             self._system.emit(event)
         self._system.touch()
 
