@@ -141,7 +141,7 @@ class Requests:
                 permit = Permit(self._shell, node.core.key)
                 await permit.use()
             condition = await self._perform(node, _OPERATIONS[step], permit)
-        node.take(condition)
+        node.report(condition.state, connected=condition.connected)
         if step is Step.CONFIGURE:
             await self._give_what_is_missing(node)
         return condition
@@ -197,7 +197,7 @@ class Requests:
         driver = node.driver = ServiceDriver(self._means.participant.clients, planned)
         condition = await driver.start()
         self._say_found(node, condition.state)
-        node.take(condition)
+        node.report(condition.state, connected=condition.connected)
         if condition.state == ACTIVE and self._system.is_adopted(node):
             return Level.ACTIVE  # it is verified as it is: no gate has to let it in
         await self._give_what_is_missing(node)
@@ -249,7 +249,7 @@ class Requests:
         if reports and node.planned.managed and not _applies(step, node):
             return min(done, level_of(node))
         condition = await self._perform(node, _OPERATIONS[step])
-        node.take(condition)
+        node.report(condition.state, connected=condition.connected)
         if step is Step.DEACTIVATE and not node.planned.managed:
             return Level.STARTED
         return done
