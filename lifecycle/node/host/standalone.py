@@ -40,7 +40,7 @@ from lifecycle.node.author.managed import Managed
 from lifecycle.node.author.spec import Construction, Mode, constructing, parse_mode
 from lifecycle.node.host.foreign import Adoption, Hosted
 from lifecycle.node.host.loop import Heartbeat, NodeLoop, Watchdog, on_signal
-from lifecycle.node.lifecycle.machine import CallbackOutcome
+from lifecycle.node.lifecycle.steps import CallbackOutcome
 from lifecycle.plan.model import PlannedNode
 
 if TYPE_CHECKING:

@@ -247,7 +247,7 @@ class ConnectionAuthority:
             if self._following.done():
                 self._following.result()
             await ended(self._following)
-        for name, wiring in self._wirings.items():
+        for name, wiring in tuple(self._wirings.items()):  # nodes leave meanwhile
             if self._system.node_named(name) is not None or name not in self._others:
                 continue
             unmade = steps(Instructions(node=name), wiring.actual, ours=wiring.ours)

@@ -212,7 +212,7 @@ class SilenceMonitor:
         """Return one finding for each silent node, and one if we receive nothing ourselves."""
         return tuple(
             SILENT_NODE.finding(
-                Outcome.VIOLATED,
+                outcome=Outcome.VIOLATED,
                 subject=name,
                 expected="alive",
                 observed=", ".join(cause.value for cause in silence.causes),
@@ -262,7 +262,7 @@ def not_answering(node: str, after_s: float) -> Finding:
     """Return the finding of a node in no host of ours that answered no request for so long."""
     why = f"it has answered no request for {after_s:g} s: it hangs, or nobody spins it"
     return NOT_ANSWERING.finding(
-        Outcome.UNVERIFIABLE,
+        outcome=Outcome.UNVERIFIABLE,
         subject=node,
         expected="alive",
         observed="no answer",

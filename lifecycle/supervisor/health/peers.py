@@ -348,7 +348,7 @@ class Peers:
             who = _who(notice, self._system.plan.system)
             theirs = notice.checksum[: len(ours)]
             yield PLANS_DIFFER.finding(
-                Outcome.VIOLATED,
+                outcome=Outcome.VIOLATED,
                 subject=who,
                 expected=f"plan {ours}",
                 observed=f"plan {theirs}",
@@ -377,7 +377,7 @@ class Peers:
             assert self._said is not None
             who = _supervisor_of(machine)
             yield PLAN_UNKNOWN.finding(
-                Outcome.VIOLATED if left_s > 0 else Outcome.UNVERIFIABLE,
+                outcome=Outcome.VIOLATED if left_s > 0 else Outcome.UNVERIFIABLE,
                 subject=who,
                 expected=f"plan {self._said.checksum}",
                 observed="not announced yet" if left_s > 0 else "not announced",

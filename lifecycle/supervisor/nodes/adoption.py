@@ -55,8 +55,8 @@ def ran_before(
         return ()
     return (
         DUPLICATE_NODE.on_node(
-            Outcome.VIOLATED,
             node.planned,
+            outcome=Outcome.VIOLATED,
             expected="1 node of this name",
             observed=f"one more in {_where(older)}",
             message=f"cannot drive {node.name}: a node of this name ran before ({_where(older)}), "
@@ -108,8 +108,8 @@ async def adopt(
 
 def _runs_twice(node: NodeRun, count: int) -> Finding:
     return DUPLICATE_NODE.on_node(
-        Outcome.VIOLATED,
         node.planned,
+        outcome=Outcome.VIOLATED,
         expected="1 node of this name",
         observed=f"{count} nodes",
         message=f"cannot adopt {node.name}: {count} nodes are named so",

@@ -34,7 +34,6 @@ from lifecycle.plan.model import Plan
 from lifecycle.run_directory import is_held, run_name, running, runtime_root
 from lifecycle.supervisor.connections.negotiation import Expectation, is_negotiated
 from lifecycle.supervisor.control.client import look
-from lifecycle.supervisor.control.protocol import ProcessState, Reach
 from lifecycle.supervisor.control.server import SupervisorSnapshot, follow
 from lifecycle.supervisor.core.gate import closes
 from lifecycle.supervisor.health.answering import ANSWER_S, TRIES
@@ -323,8 +322,7 @@ def picture_of(seen: SupervisorSnapshot) -> Picture:
     supervised = {
         each.node: Supervised(
             pid=each.pid,
-            dead=each.process_state is ProcessState.BACKOFF
-            or (each.process_state is ProcessState.EXITED and each.reach is not Reach.STOPPED),
+            dead=bool(each.died),
             silent=bool(each.silent),
             doing=each.doing or each.silent,
         )

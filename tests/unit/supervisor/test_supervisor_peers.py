@@ -391,7 +391,7 @@ async def test_a_node_without_a_machine_or_attached_has_no_supervisor_to_wait_fo
 
 async def test_who_was_shut_down_is_the_reason_of_its_missing_nodes(tmp_path: Path) -> None:
     missing = MISSING_NODE.finding(
-        Outcome.VIOLATED,
+        outcome=Outcome.VIOLATED,
         subject="/viewer",
         expected="node in the graph",
         observed="no such node",
