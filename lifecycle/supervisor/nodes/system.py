@@ -62,7 +62,6 @@ class NodeRun:
         state: lifecycle_msgs/State label; empty for a node that is not managed.
         connected: its data layer is made.
         configuration: what it reports of itself; None before it does.
-        connections: names of what the authority connected it to, oldest first.
         unload: has its container unload a component; None for what is not loaded into one.
         told: the step of wiring that it is asked for just now; empty when none.
         health: what it, and /diagnostics of it, was seen to say of it in the graph.
@@ -80,7 +79,6 @@ class NodeRun:
         self.state = ""
         self.connected = False
         self.configuration: NodeConfiguration | None = None
-        self.connections: tuple[str, ...] = ()
         self.unload: Callable[[], Awaitable[None]] | None = None
         self.told = ""
         self.health: tuple[HealthReport | None, HealthReport | None] = (None, None)
