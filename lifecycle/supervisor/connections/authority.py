@@ -36,7 +36,7 @@ from lifecycle.supervisor.core.state import Level
 from lifecycle.supervisor.nodes.driver import ACTIVE, INACTIVE, NodeInterfaceClient
 from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.run.events import Notice, WiringChanged, WiringLost
-from lifecycle.supervisor.run.failure import ended
+from lifecycle.supervisor.run.failure import ended, within
 from lifecycle.verify.observation import NodeConfiguration, Observation
 from lifecycle.verify.verdict import Finding
 
@@ -210,6 +210,21 @@ class ConnectionAuthority:
         there = {connection for connection, _ in wiring.actual.connections}
         wiring.ours = [connection for connection in wiring.ours if connection in there]
         await self._make(wiring, node.driver, steps(wanted, wiring.actual), node)
+
+    async def unwire(self, node: NodeRun) -> None:
+        """Unmake what a node was connected to, the last connection first, each bounded."""
+        wiring, limit_s = self._wirings.get(node.name), node.planned.timeouts.cleanup_s
+        while wiring is not None and wiring.ours and node.driver is not None:
+            name = wiring.ours.pop()
+            step = Command(node=node.name, operation=Operation.DISCONNECT_FROM, connection=name)
+            try:
+                await within(limit_s, node.driver.wire(step))
+            except (BringUpError, asyncio.TimeoutError) as error:
+                text = str(error) or f"cannot {step} within {limit_s:g} s"
+                self._system.emit(Notice(message=text))
+            else:
+                done = WiringChanged(node=node.name, operation=step.operation, connection=name)
+                self._system.emit(done)
 
     def replan(self, plan: Plan, names: Collection[str]) -> None:
         """Forget what these nodes were instructed: they are started again, by this plan."""
@@ -393,18 +408,16 @@ class ConnectionAuthority:
                 self._making -= 1
                 if node is not None:
                     node.told = ""
-            wiring.actual = wiring.actual.after(step)
             if step.operation is Operation.CONNECT_TO and step.connection not in wiring.ours:
                 wiring.ours.append(step.connection)
             elif step.operation is Operation.DISCONNECT_FROM and step.connection in wiring.ours:
                 wiring.ours.remove(step.connection)
-            if node is not None:
-                node.connections = tuple(wiring.ours)
             if configuration is not None:
-                if node is not None:
-                    node.learn(configuration)
-                else:
+                wiring.actual = wired(configuration)
+                if node is None:
                     self._others[configuration.name] = configuration
+                else:
+                    node.learn(configuration)
             self._system.emit(event)
         self._system.touch()
 

@@ -116,7 +116,7 @@ def _state(node: NodeRun, verdict: Verdict | None) -> str:
     """Return a node's state; of one that others can drive unseen, what the last judgement saw."""
     judged = (
         each.observed
-        for each in (() if verdict is None or node.reports_changes else verdict.findings)
+        for each in (() if verdict is None or node.is_hosted else verdict.findings)
         if each.rule == WRONG_STATE.id and each.node == node.name
     )
     return next(judged, node.state)

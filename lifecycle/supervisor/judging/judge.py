@@ -193,7 +193,7 @@ class Judge:
         said of it may be from when the link was cut. Or a step of another supervisor's node.
         """
         others = {each.full_name for each in self._system.remote.values()}
-        reporting = {each.name for each in self._system.nodes.values() if each.reports_changes}
+        reporting = {each.name for each in self._system.nodes.values() if each.is_hosted}
         return any(
             (rule(each.rule).about is About.PROGRESS and each.node in others)
             or (

@@ -41,13 +41,11 @@ class NodeCondition(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         state: lifecycle_msgs/State label.
         connected: the data layer is made.
-        configuration: as the node reports it; None where it does not.
         already: nothing was asked of it: it was there before.
     """
 
     state: str
     connected: bool = False
-    configuration: NodeConfiguration | None = None
     already: bool = False
 
 
@@ -83,13 +81,11 @@ class ControlDriver:
             reason = reply.error or f"the node is {reply.state or 'in an unknown state'}"
             kind = ChangedError if reply.changed else BringUpError
             raise kind(f"cannot {operation.value} {self._node!r}: {reason}")
-        return NodeCondition(
-            state=reply.state, connected=reply.connected, configuration=reply.configuration
-        )
+        return NodeCondition(state=reply.state, connected=reply.connected)
 
     async def interface(self) -> NodeConfiguration | None:
         """Ask the host for the node's configuration, which says what it can be wired by."""
-        return (await self.perform(Operation.GET_CONFIGURATION)).configuration
+        return await self.wire(Command(node=self._node, operation=Operation.GET_CONFIGURATION))
 
     async def wire(self, step: Command) -> NodeConfiguration | None:
         """Send the step and wait for the reply.

@@ -28,7 +28,6 @@ from lifecycle.supervisor.nodes.driver import (
     ACTIVE,
     INACTIVE,
     ControlDriver,
-    NodeCondition,
     NodeDriver,
 )
 from lifecycle.supervisor.processes.fork_server_main import GRACE_S
@@ -63,8 +62,6 @@ class NodeRun:
         state: lifecycle_msgs/State label; empty for a node that is not managed.
         connected: its data layer is made.
         configuration: what it reports of itself; None before it does.
-        connections: names of what the authority connected it to, oldest first.
-        reports_changes: its host reports unasked when its configuration changes.
         unload: has its container unload a component; None for what is not loaded into one.
         told: the step of wiring that it is asked for just now; empty when none.
         health: what it, and /diagnostics of it, was seen to say of it in the graph.
@@ -82,8 +79,6 @@ class NodeRun:
         self.state = ""
         self.connected = False
         self.configuration: NodeConfiguration | None = None
-        self.connections: tuple[str, ...] = ()
-        self.reports_changes = False
         self.unload: Callable[[], Awaitable[None]] | None = None
         self.told = ""
         self.health: tuple[HealthReport | None, HealthReport | None] = (None, None)
@@ -189,18 +184,9 @@ class NodeRun:
         said = self._known_health.message
         return f": {said}" if said and self.core.level is Level.ACTIVE else ""
 
-    def take(self, condition: NodeCondition) -> None:
-        """Take what it said of itself in a reply."""
-        self.report(condition.state, connected=condition.connected)
-        self.learn(condition.configuration)
-
     def learn(self, configuration: NodeConfiguration | None) -> None:
-        """Take a configuration that was asked for; None is nothing to take.
-
-        Of a node whose host reports, every configuration has been taken in the order of its channel
-        by now (System.on_host_event): what a reply carried may be older than what came since.
-        """
-        if configuration is not None and not self.reports_changes:
+        """Take a configuration that was asked for; a host of ours reports its own, in order."""
+        if configuration is not None and not self.is_hosted:
             self.configuration = configuration
 
     def report(self, state: str, *, connected: bool) -> None:
@@ -392,8 +378,6 @@ class System:
             return
         if event.configuration is not None:
             node.configuration = event.configuration
-            reports = event.kind == "configuration" or event.reports
-            node.reports_changes = node.reports_changes or reports
         if event.kind != "reply" and event.state:
             node.report(event.state, connected=event.connected)
         self.on_health(node)
@@ -401,10 +385,11 @@ class System:
             self.touch()
 
     async def refresh(self, observer: Graph, *, marks: bool = False) -> None:
-        """Read the configuration of every reachable node and give it to the observer.
+        """Give the observer what every reachable node reports of itself.
 
-        One whose host reports every change by itself is not asked. A node that does not answer
-        keeps its last one: that it is gone is for the graph and its process to say.
+        A host reports every change by itself; one that has not begun to is asked, and does not
+        hold up a look for long. A node that does not answer keeps its last configuration: that it
+        is gone is for the graph and its process to say.
 
         Args:
             observer: see above.
@@ -420,10 +405,10 @@ class System:
         ]
         await asyncio.gather(
             *(
-                _refresh(node, node.driver)
+                _refresh(node.driver)
                 for node in nodes
-                if isinstance(node.driver, ControlDriver)  # any other is read from the graph
-                and (not node.reports_changes or (marks and node.is_marked))
+                if isinstance(node.driver, ControlDriver)
+                and (node.configuration is None or (marks and node.is_marked))
             )
         )
         for node in nodes:
@@ -431,9 +416,9 @@ class System:
                 observer.state.put_configuration(node.configuration)
 
 
-async def _refresh(node: NodeRun, driver: ControlDriver) -> None:
+async def _refresh(driver: ControlDriver) -> None:
     with contextlib.suppress(BringUpError, asyncio.TimeoutError):
-        node.learn(await asyncio.wait_for(driver.interface(), _REFRESH_S))
+        await asyncio.wait_for(driver.interface(), _REFRESH_S)
 
 
 def level_of(node: NodeRun) -> Level:

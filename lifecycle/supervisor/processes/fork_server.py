@@ -29,8 +29,6 @@ from lifecycle.supervisor.processes.fork_server_main import (
 from lifecycle.supervisor.processes.fork_server_process import CLOSE_S, ForkServerProcess
 from lifecycle.supervisor.processes.orphans import (
     Lineage,
-    children,
-    descendants,
     end,
     marked,
     reap_adopted,
@@ -130,7 +128,7 @@ class ForkServer:
         self._children: dict[int, ForkServerChild] = {}
         self._next = 0
         # Of a shell that became this process by exec: no part of the run.
-        self._foreign = children()
+        self._foreign = Lineage().children(os.getpid())
         self._lineage = Lineage()
         self.died: asyncio.Future[str] = self._loop.create_future()
         self._closed = False
@@ -153,11 +151,11 @@ class ForkServer:
 
     def family(self) -> frozenset[int]:
         """Return the pids of all that descends from what was started, but for the fork server."""
-        roots = {self.pid}
+        lineage, roots = Lineage(), {self.pid}
         if self.died.done():
             # What it had adopted, and what it had started, is ours now.
-            roots |= children() - self._foreign
-        return frozenset(roots.union(*map(descendants, roots)) - {self.pid})
+            roots |= lineage.children(os.getpid()) - self._foreign
+        return frozenset().union(*map(lineage.of, roots)) - {self.pid}
 
     async def ready(self) -> None:
         """Have the fork server answer, bounded.

@@ -46,7 +46,7 @@ def reap_adopted(spare: Iterable[int]) -> None:
         return
     try:
         spared = set(spare)
-        for pid in children() - spared:
+        for pid in Lineage().children(os.getpid()) - spared:
             with contextlib.suppress(ChildProcessError):
                 os.waitpid(pid, os.WNOHANG)
     finally:
@@ -59,29 +59,11 @@ def end_run(record: RunRecord) -> tuple[int, ...]:
         return ()
     pids = {child.pid for child in record.children if is_process(child.pid, child.start_ticks)}
     pids |= marked(record.run_id).keys()
+    lineage = Lineage()
     for pid in tuple(pids):
-        pids.update(descendants(pid))
+        pids |= lineage.of(pid)
     pids.discard(os.getpid())
     return asyncio.run(end(pids, GRACE_S))
-
-
-def children() -> frozenset[int]:
-    """Return the pids of the children of this process, adopted ones included."""
-    return frozenset(_children().get(os.getpid(), ()))
-
-
-def descendants(pid: int) -> tuple[int, ...]:
-    """Return the pids of everything that descends from a process; nothing once it has ended."""
-    return tuple(Lineage().of(pid) - {pid})
-
-
-def _children() -> dict[int, list[int]]:
-    """Return the pids of the children of every process that has any."""
-    found: dict[int, list[int]] = {}
-    for entry in os.listdir("/proc"):  # noqa: PTH208 - hot loop
-        if entry.isdigit() and (parent := parent_of(int(entry))) is not None:
-            found.setdefault(parent, []).append(int(entry))
-    return found
 
 
 class Lineage:
@@ -93,18 +75,23 @@ class Lineage:
         self._read_s = float("-inf")
         self._children: dict[int, list[int]] = {}
 
+    def children(self, pid: int) -> set[int]:
+        """Return the children of a process, adopted ones included."""
+        if time.monotonic() - self._read_s > self.FRESH_S:
+            self._children = {}
+            for entry in os.listdir("/proc"):  # noqa: PTH208 - hot loop
+                if entry.isdigit() and (parent := parent_of(int(entry))) is not None:
+                    self._children.setdefault(parent, []).append(int(entry))
+            self._read_s = time.monotonic()
+        return set(self._children.get(pid, ()))
+
     def of(self, pid: int) -> set[int]:
         """Return a process and all that descends from it."""
-        if time.monotonic() - self._read_s > self.FRESH_S:
-            self._children = _children()
-            self._read_s = time.monotonic()
         found: set[int] = set()
-        left = [pid]
+        left = {pid}
         while left:
-            each = left.pop()
-            if each not in found:
-                found.add(each)
-                left += self._children.get(each, ())
+            found |= left
+            left = set().union(*map(self.children, left)) - found
         return found
 
 

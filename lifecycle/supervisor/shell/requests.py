@@ -17,7 +17,7 @@ from msgspec.structs import replace
 from lifecycle.errors import BringUpError, MiddlewareError
 from lifecycle.graph.loop import set_within
 from lifecycle.manifest.model import RunKind
-from lifecycle.node.host.control import Command, Operation
+from lifecycle.node.host.control import Operation
 from lifecycle.plan.parameters import GIVEN
 from lifecycle.supervisor.core import effects, inputs
 from lifecycle.supervisor.core.gate import ACTIVATES_ITSELF, GUARD_TRIES
@@ -35,8 +35,7 @@ from lifecycle.supervisor.nodes.driver import (
 )
 from lifecycle.supervisor.nodes.system import level_of
 from lifecycle.supervisor.processes.control_channel import ChannelClosedError, HostFailedError
-from lifecycle.supervisor.run.events import Notice, RequestSent, WiringChanged
-from lifecycle.supervisor.run.failure import within
+from lifecycle.supervisor.run.events import Notice, RequestSent
 from lifecycle.supervisor.shell.permit import Permit
 from lifecycle.verify.judge import with_findings
 from lifecycle.verify.verdict import NOT_JUDGED
@@ -141,7 +140,7 @@ class Requests:
                 permit = Permit(self._shell, node.core.key)
                 await permit.use()
             condition = await self._perform(node, _OPERATIONS[step], permit)
-        node.take(condition)
+        node.report(condition.state, connected=condition.connected)
         if step is Step.CONFIGURE:
             await self._give_what_is_missing(node)
         return condition
@@ -197,7 +196,7 @@ class Requests:
         driver = node.driver = ServiceDriver(self._means.participant.clients, planned)
         condition = await driver.start()
         self._say_found(node, condition.state)
-        node.take(condition)
+        node.report(condition.state, connected=condition.connected)
         if condition.state == ACTIVE and self._system.is_adopted(node):
             return Level.ACTIVE  # it is verified as it is: no gate has to let it in
         await self._give_what_is_missing(node)
@@ -242,35 +241,17 @@ class Requests:
 
     async def _downwards(self, node: NodeRun, step: Step) -> Level:
         """Undo a step, unless the node is not as far any more; return where it is then."""
-        if step is Step.DISCONNECT:
-            await self._unwire(node)
+        if step is Step.DISCONNECT and self._shell.authority is not None:
+            await self._shell.authority.unwire(node)
         done = REACHES[step]
         reports = isinstance(node.driver, ControlDriver)  # others may have moved any other
         if reports and node.planned.managed and not _applies(step, node):
             return min(done, level_of(node))
         condition = await self._perform(node, _OPERATIONS[step])
-        node.take(condition)
+        node.report(condition.state, connected=condition.connected)
         if step is Step.DEACTIVATE and not node.planned.managed:
             return Level.STARTED
         return done
-
-    async def _unwire(self, node: NodeRun) -> None:
-        """Unmake what the authority connected the node to, the last connection first."""
-        for name in reversed(node.connections):
-            if node.driver is None:
-                break
-            step = Command(node=node.name, operation=Operation.DISCONNECT_FROM, connection=name)
-            limit_s = node.planned.timeouts.cleanup_s
-            try:
-                await within(limit_s, node.driver.wire(step))
-            except (BringUpError, asyncio.TimeoutError) as error:
-                text = str(error) or f"cannot {step} within {limit_s:g} s"
-                self._system.emit(Notice(message=text))
-                continue
-            self._system.emit(
-                WiringChanged(node=node.name, operation=step.operation, connection=name)
-            )
-        node.connections = ()
 
     # Parameters
 

@@ -17,7 +17,7 @@ from lifecycle.supervisor.nodes.driver import ActiveError, ChangedError, Service
 from lifecycle.supervisor.run.events import Notice
 from lifecycle.supervisor.run.failure import ended
 from tests.builders import plan_of, planned_node
-from tests.unit.supervisor.fakes import World, run
+from tests.unit.supervisor.fakes import World
 
 
 class _Node:
@@ -45,30 +45,25 @@ class _Node:
         return False if self.is_sure else None
 
 
-def _before_the_gate(
+async def _before_the_gate(
     tmp_path: Path, node: _Node, timeout_s: float = 60.0
 ) -> tuple[bool, float, list[str], list[str]]:
     """Ask once; return whether that took any time, how much, findings and notices."""
-
-    async def main() -> tuple[bool, float, list[str], list[str]]:
-        world = World(plan_of(planned_node("base", kind=RunKind.ATTACH, managed=False)), tmp_path)
-        system = world.system
-        system.present = frozenset({"/base"})
-        system.nodes["base"].core.level = Level.STARTED
-        answering = Answering(system, node)
-        asking = asyncio.ensure_future(answering.follow())
-        loop = asyncio.get_running_loop()
-        began_s = loop.time()
-        node.from_s += began_s
-        waited = await answering.asked(timeout_s)
-        took_s = loop.time() - began_s
-        found = [each.rule for each in system.liveliness.findings()]
-        if not found and await answering.asked(timeout_s):
-            raise AssertionError("it was asked again for nothing")
-        await ended(asking)
-        return waited, took_s, found, [each.message for each in world.heard(Notice)]
-
-    return run(main())
+    world = World(plan_of(planned_node("base", kind=RunKind.ATTACH, managed=False)), tmp_path)
+    system = world.system
+    system.present = frozenset({"/base"})
+    system.nodes["base"].core.level = Level.STARTED
+    answering = Answering(system, node)
+    asking = asyncio.ensure_future(answering.follow())
+    loop = asyncio.get_running_loop()
+    began_s = loop.time()
+    node.from_s += began_s
+    waited = await answering.asked(timeout_s)
+    took_s = loop.time() - began_s
+    found = [each.rule for each in system.liveliness.findings()]
+    assert found or not await answering.asked(timeout_s), "it was asked again for nothing"
+    await ended(asking)
+    return waited, took_s, found, [each.message for each in world.heard(Notice)]
 
 
 @pytest.mark.parametrize(
@@ -80,11 +75,11 @@ def _before_the_gate(
         (100.0, 2.0, 2.0, ["run.not-answering"]),
     ],
 )
-def test_a_node_is_waited_for_until_it_answers_within_two_requests_and_the_time(
+async def test_a_node_is_waited_for_until_it_answers_within_two_requests_and_the_time(
     tmp_path: Path, from_s: float, timeout_s: float, known_s: float, expected: list[str]
 ) -> None:
     node = _Node(from_s=from_s)
-    waited, took_s, found, notices = _before_the_gate(tmp_path, node, timeout_s)
+    waited, took_s, found, notices = await _before_the_gate(tmp_path, node, timeout_s)
     assert waited
     assert known_s <= took_s < known_s + 0.5
     assert found == expected
@@ -92,11 +87,11 @@ def test_a_node_is_waited_for_until_it_answers_within_two_requests_and_the_time(
 
 
 @pytest.mark.parametrize(("is_sure", "least_s"), [(True, 0.0), (False, SHOWN_S)])
-def test_a_node_that_serves_nothing_is_named_and_not_found(
+async def test_a_node_that_serves_nothing_is_named_and_not_found(
     tmp_path: Path, is_sure: bool, least_s: float
 ) -> None:
     node = _Node(shows=False, is_sure=is_sure)
-    _, took_s, found, notices = _before_the_gate(tmp_path, node)
+    _, took_s, found, notices = await _before_the_gate(tmp_path, node)
     assert least_s <= took_s < least_s + 0.5
     assert found == []
     assert notices == ["'/base' serves no parameters: whether it hangs is not seen"]
