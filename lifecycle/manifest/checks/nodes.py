@@ -38,11 +38,11 @@ from lifecycle.manifest.model import (
 from lifecycle.manifest.names import full_name_problem
 from lifecycle.manifest.yaml.document import error, note, warning
 from lifecycle.network.ports import (
+    LINUX,
     LOCALHOST_PARTICIPANTS,
     LOCALHOST_PEERS_RANGE,
     MAX_DOMAIN_ID,
     EphemeralRange,
-    Platform,
     describe_domains,
     domain_of,
     max_participants,
@@ -363,8 +363,8 @@ def check_ports(system: DeclaredSystem) -> Iterator[Diagnostic]:
         message = f"cannot use domain id {domain}; allowed: 0 to {MAX_DOMAIN_ID}"
         yield error("check.domain", at, message, "Fast DDS ends every process beyond it")
         return
-    if max_participants(domain, Platform.LINUX).participants == 0:
-        domains = describe_domains(safe_domains(Platform.LINUX))
+    if max_participants(domain, LINUX).participants == 0:
+        domains = describe_domains(safe_domains(LINUX))
         message = (
             f"cannot be sure of the ports of domain {domain}: Linux gives them to other sockets, "
             f"by default"
@@ -395,8 +395,8 @@ def _crowded(
         message, _, hint = each.partition("; ")
         yield error("check.ports", at, message, hint)
     # Where no participant at all is safe, check.domain has reported it.
-    if not refused and max_participants(domain, Platform.LINUX).participants:
-        for each in over(ephemeral=Platform.LINUX):
+    if not refused and max_participants(domain, LINUX).participants:
+        for each in over(ephemeral=LINUX):
             message, _, hint = each.partition("; ")
             yield note("check.ports", at, message, hint)
 
