@@ -58,6 +58,14 @@ class Finding(msgspec.Struct, frozen=True, kw_only=True):
         """Fully qualified names of the nodes it concerns: of a flow both ends."""
         return (self.node,) if self.node else self.ends
 
+    @property
+    def key(self) -> FindingKey:
+        """What makes it the same one in a later verdict."""
+        return self.rule, self.subject, self.node, self.endpoint
+
+
+FindingKey = tuple[str, str, str, "EndpointKind | None"]
+
 
 class FlowReport(msgspec.Struct, frozen=True, kw_only=True):
     """One publisher → subscription pair as it runs.

@@ -33,6 +33,9 @@ _SKIP_DEFAULT_FILE_VARIABLE = "SKIP_DEFAULT_XML"
 DEFAULT_LEASE_S = 20
 """Fast DDS drops a participant that ended without a word after so long, if no profile says."""
 
+FORGOTTEN_S = DEFAULT_LEASE_S + 1.0
+"""A participant that left without notice is in the graph no more, whoever made its profile."""
+
 PARTICIPANT_LEASE_S = 10
 """The same in what `up` starts: as long as a machine may be too busy for it to announce itself."""
 

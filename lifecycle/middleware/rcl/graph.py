@@ -32,7 +32,7 @@ from lifecycle.middleware.discovery.prefixes import PROCESS_DIGITS, is_of_host, 
 from lifecycle.middleware.discovery.prober import Settling
 from lifecycle.middleware.discovery.tcp import give_up_dead_connections, is_used
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
-from lifecycle.middleware.fastdds.profiles import DEFAULT_LEASE_S, DISCOVERY_SERVER_VARIABLE
+from lifecycle.middleware.fastdds.profiles import DISCOVERY_SERVER_VARIABLE, FORGOTTEN_S
 from lifecycle.middleware.fastdds.settings import observer_settings
 from lifecycle.middleware.process.hosted import is_vouched_for
 from lifecycle.middleware.rcl.graph_changes import GraphGuard
@@ -78,7 +78,6 @@ _AGREED_S = 5.0
 
 _NAMED_S = 0.2
 """Of a new participant endpoints are known first, and within so long of which nodes they are."""
-_FORGOTTEN_S = DEFAULT_LEASE_S + 1.0
 _LOOK_S = 0.005
 _CHANGE_STATE = "lifecycle_msgs/srv/ChangeState"
 _GET_STATE = "lifecycle_msgs/srv/GetState"
@@ -326,7 +325,9 @@ class GraphObserver:
         homes, own = self._homes()
         claimed = {*reported, *(prefix for name in nodes for prefix in homes.get(name, ()))}
         theirs = (each for each in claimed if own and is_of_process(each, pid, own))
-        self._ended_until_s[pid], self._own = time.monotonic() + _FORGOTTEN_S, own
+        now_s = time.monotonic()
+        lately = {each: at for each, at in self._ended_until_s.items() if at > now_s}
+        self._ended_until_s, self._own = {**lately, pid: now_s + FORGOTTEN_S}, own
         self._count_no_more(theirs, own)
         self._guard.notify()  # what it had made may be without a name yet
 

@@ -397,7 +397,7 @@ class ConnectionAuthority:
                 attempt=max(1, wiring.rounds),
             )
             if node is not None:
-                node.told = str(step)
+                node.wiring = str(step)
             self._making += 1
             try:
                 configuration = await interface.wire(step)
@@ -407,7 +407,7 @@ class ConnectionAuthority:
             finally:
                 self._making -= 1
                 if node is not None:
-                    node.told = ""
+                    node.wiring = ""
             if step.operation is Operation.CONNECT_TO and step.connection not in wiring.ours:
                 wiring.ours.append(step.connection)
             elif step.operation is Operation.DISCONNECT_FROM and step.connection in wiring.ours:

@@ -192,6 +192,13 @@ def away(run: Run) -> frozenset[str]:
     )
 
 
+def ahead(run: Run) -> frozenset[str]:
+    """Return the full names of the nodes that may be active before the gate opens for others."""
+    return frozenset(
+        each.name for each in run.nodes.values() if each.let_through or each.level is Level.ACTIVE
+    )
+
+
 def advance(run: Run) -> list[effects.Effect]:
     """Return what is to be done now, and note it in the state."""
     found: list[effects.Effect] = [
@@ -424,26 +431,26 @@ def _gate(run: Run) -> Iterator[effects.Effect]:
         passage.number = run.requests
         yield effects.Program(verdict=judged.verdict, number=run.requests)
     # A loop that looks while its nodes are on their way would look at each step of each.
-    active = frozenset(each.name for each in run.nodes.values() if each.level is Level.ACTIVE)
-    due = judged.mark != run.mark or judged.again_s <= run.now_s
+    active = any(each.level is Level.ACTIVE for each in run.nodes.values())
+    due = not gate.is_latest(run) or judged.again_s <= run.now_s
     watched = active and run.held_s is not None
     if due and not judged.looking and (watched or is_at_gate(run)):
-        stage = stage_of(run)
         judged.looking, judged.again_s = True, NEVER_S
-        yield effects.Look(
-            mark=run.mark,
-            stage=stage,
-            ahead=frozenset() if stage is Stage.ACTIVE else active,
-        )
+        yield effects.Look(mark=run.mark)
 
 
 # Time
 
 
-def late_at_s(request: Request) -> float:
-    """Return when a request is late: its process's time without a processor does not count."""
-    waited_s = min(request.waited_s, 9 * request.limit_s)
-    return request.since_s + request.limit_s + request.own_s + waited_s
+def late_at_s(request: Request, waited_s: float | None = None) -> float:
+    """Return when a request is late: its process's time without a processor does not count.
+
+    Args:
+        request: which.
+        waited_s: that time, seconds; what is known of it if left out.
+    """
+    waited_s = request.waited_s if waited_s is None else waited_s
+    return request.since_s + request.limit_s + request.own_s + min(waited_s, 9 * request.limit_s)
 
 
 def barks_at_s(process: Process) -> float:

@@ -17,7 +17,7 @@ from lifecycle.verify.judge import not_ok
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import rule
 from lifecycle.verify.rules.catalogue import About
-from lifecycle.verify.verdict import Finding
+from lifecycle.verify.verdict import Finding, FindingKey
 
 _ORDER = tuple(Consequence)
 
@@ -49,14 +49,14 @@ def settle_consequences(run: Run) -> list[Event]:
         return []
     if busy or run.options.until < Level.ACTIVE:
         return []
-    verdict = gate.of_those_there(run, gate.without(run, verdict, away(run)))
-    run.judged.tried &= {gate.key_of(each) for each in verdict.findings}
+    verdict = gate.of_those_there(run, gate.without(run, verdict, away(run) | run.judged.away))
+    run.judged.tried &= {each.key for each in verdict.findings}
     coming = _coming_elsewhere(run, verdict.findings)
-    asked: dict[gate.Key, tuple[Consequence, Finding, tuple[str, ...], str]] = {}
+    asked: dict[FindingKey, tuple[Consequence, Finding, tuple[str, ...], str]] = {}
     for each in verdict.findings:
         due = _asked(run, each)
         if each.outcome is Outcome.VIOLATED and due and coming.isdisjoint(each.nodes):
-            asked[gate.key_of(each)] = due
+            asked[each.key] = due
     run.judged.asked = {key: run.judged.asked.get(key, run.now_s) for key in asked}
     until_s = gate.holds_until_s(run)
     lasting = [
@@ -107,7 +107,7 @@ def _asked(run: Run, finding: Finding) -> tuple[Consequence, Finding, tuple[str,
     if what is Consequence.REPORT or (concerned and not own):
         return None  # its own supervisor has the same manifest
     if what is Consequence.MODE:
-        if run.mode == reaction.mode or gate.key_of(finding) in run.judged.tried:
+        if run.mode == reaction.mode or finding.key in run.judged.tried:
             return None
         return what, finding, (), reaction.mode
     if what is Consequence.DEACTIVATE:

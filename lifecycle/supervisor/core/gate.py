@@ -20,12 +20,8 @@ from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import rule
 from lifecycle.verify.rules.catalogue import Heals
 from lifecycle.verify.rules.nodes import UNATTRIBUTED_ENDPOINT
-from lifecycle.verify.rules.state import (
-    ACTIVATED_AT_CLOSED_GATE,
-    MISSING_REPORT,
-    WRONG_STATE,
-)
-from lifecycle.verify.verdict import Finding, Stage, Verdict
+from lifecycle.verify.rules.state import ACTIVATED_AT_CLOSED_GATE, MISSING_REPORT
+from lifecycle.verify.verdict import Finding, FindingKey, Stage, Verdict
 
 SETTLED_S = 0.5
 """A finding that time does not heal counts once it is unchanged for so long."""
@@ -58,8 +54,6 @@ _MOST = 1000
 
 _NAMED = 3
 
-Key = tuple[str, str, str, str]
-
 
 def closes(verdict: Verdict, *, strict: bool) -> bool:
     """Return whether a verdict keeps the gate closed; `strict` refuses what is unverifiable."""
@@ -76,7 +70,7 @@ def allows(run: Run) -> bool:
 
 def is_open(run: Run) -> bool:
     """Return whether an activate request may be sent now."""
-    return run.judged.mark == run.mark and not run.judged.waits and allows(run)
+    return is_latest(run) and not run.judged.waits and allows(run)
 
 
 def exit_code(verdict: Verdict) -> ExitCode:
@@ -153,6 +147,7 @@ def take_verdict(run: Run, given: Verified, away: Collection[str], stage: Stage)
         verdict = without(run, verdict, away)  # they are away because it was ordered
     judged.looking = False
     judged.mark, judged.waits = given.mark, given.waits
+    judged.away = given.away
     judged.seen_s = run.now_s
     judged.again_s = NEVER_S if given.again_s is None else run.now_s + given.again_s
     found = frozenset((each.rule, each.subject) for each in verdict.findings)
@@ -209,12 +204,6 @@ def of_those_there(run: Run, verdict: Verdict) -> Verdict:
     return with_only(verdict, known, run.plan.policy) if comes else verdict
 
 
-def key_of(finding: Finding) -> Key:
-    """Return what makes a finding the same one in a later verdict."""
-    kind = "" if finding.endpoint is None else finding.endpoint.value
-    return finding.rule, finding.subject, finding.node, kind
-
-
 def see_violations(run: Run, away: Collection[str]) -> None:
     """Note what is violated of the nodes that are to be as planned, and what of it counts.
 
@@ -227,11 +216,11 @@ def see_violations(run: Run, away: Collection[str]) -> None:
     if run.held_s is None or run.attempt is not None or run.change is not None or not active:
         judged.violated = {}  # what an order brings about is judged at its gate
         return
-    verdict = of_those_there(run, without(run, judged.verdict, {*away, *run.left}))
-    found = {key_of(each): each for each in verdict.findings if each.outcome is Outcome.VIOLATED}
+    verdict = of_those_there(run, without(run, judged.verdict, {*away, *run.left, *judged.away}))
+    found = {each.key: each for each in verdict.findings if each.outcome is Outcome.VIOLATED}
     keys = [*found]
     if verdict.verdict is Outcome.VIOLATED and not found:
-        keys = [("", verdict.verdict.value, "", "")]
+        keys = [("", verdict.verdict.value, "", None)]
     judged.violated = {key: judged.violated.get(key, run.now_s) for key in keys}
     until_s = holds_until_s(run)
     lasting = [key for key, since_s in judged.violated.items() if until_s - since_s >= LASTS_S]
@@ -240,9 +229,7 @@ def see_violations(run: Run, away: Collection[str]) -> None:
         text = not_ok(replace(verdict, findings=findings)) or _named(keys[0])
         judged.counted = judged.counted or text
     for key in keys:
-        # Endpoints are known before whose they are, and a look may have begun before who is active
-        # now was.
-        passes = key[0] != UNATTRIBUTED_ENDPOINT.id and (key[0] != WRONG_STATE.id or is_latest(run))
+        passes = key[0] != UNATTRIBUTED_ENDPOINT.id  # endpoints are known before whose they are
         if key in lasting or (passes and len(judged.passed) < _MOST):
             name = _named(key)
             judged.passed[name] = judged.passed.get(name, False) or key in lasting
@@ -264,5 +251,5 @@ def passed(judged: Judged) -> str:
     return f"violated for no longer than {LASTS_S:g} s, and not counted: {named}"
 
 
-def _named(key: Key) -> str:
+def _named(key: FindingKey) -> str:
     return f"{key[1]} ({key[0]})" if key[0] else key[1]

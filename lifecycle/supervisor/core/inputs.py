@@ -116,6 +116,7 @@ class Verified(msgspec.Struct, frozen=True, kw_only=True):
         again_s: look again after so long, as nobody says when what is missing is there.
         waits: something is awaited that may speak against it: it opens nothing.
         undiscovered: key of a node that others do not discover over TCP although it runs.
+        away: full names of the nodes that were not as far as they are to be when it began.
     """
 
     mark: int
@@ -123,6 +124,7 @@ class Verified(msgspec.Struct, frozen=True, kw_only=True):
     again_s: float | None = None
     waits: bool = False
     undiscovered: str = ""
+    away: frozenset[str] = frozenset()
 
 
 class Programmed(msgspec.Struct, frozen=True, kw_only=True):

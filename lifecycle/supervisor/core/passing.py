@@ -86,7 +86,7 @@ def _say_closed(run: Run) -> list[Event]:
         run.waits_s, judged.found, judged.since_s = run.now_s, frozenset(), run.now_s
         run.changed()
     until_s = run.waits_s + run.options.timeout_s
-    if run.said or verdict is None or judged.mark != run.mark:
+    if run.said or verdict is None or not gate.is_latest(run):
         return []
     if run.now_s < gate.refuses_at_s(run, until_s):
         return []

@@ -459,14 +459,14 @@ def _hold(run: Run) -> list[Event]:
     hold_s = run.options.hold_s
     if hold_s is None or run.now_s < run.held_s + hold_s or run.order is not None or run.failures:
         return []
-    judged, over_s = run.judged, run.held_s + hold_s
-    waits = judged.mark != run.mark and any(
+    over_s = run.held_s + hold_s
+    waits = not gate.is_latest(run) and any(
         each.level is Level.ACTIVE for each in run.nodes.values()
     )
     if run.now_s < over_s + advance.NOTICE_S and failure.only_elsewhere(run):
         return []  # who runs these may be about to say that it ends, too
     if run.options.until < Level.ACTIVE and not run.options.verifies:
-        waits = not (gate.allows(run) and judged.mark == run.mark)
+        waits = not (gate.allows(run) and gate.is_latest(run))
     waits = waits and run.now_s < over_s + advance.GLANCE_S
     return [] if waits else failure.end_done(run)
 

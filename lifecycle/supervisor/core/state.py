@@ -24,7 +24,7 @@ from lifecycle.supervisor.control.protocol import Failed, ProcessState, Question
 from lifecycle.supervisor.core.inputs import Exited
 from lifecycle.supervisor.core.restart import RestartPolicy
 from lifecycle.supervisor.run.events import Failure
-from lifecycle.verify.verdict import Verdict
+from lifecycle.verify.verdict import FindingKey, Verdict
 
 NEVER_S = float("inf")
 
@@ -404,6 +404,7 @@ class Judged(msgspec.Struct, kw_only=True):
         waits: something is awaited that may speak against it: it opens nothing.
         again_s: look again then, although nothing is known to have changed.
         seen_s: when it came.
+        away: full names of the nodes that were not as far as they are to be when its look began.
         since_s: since when its findings are the same, `found`.
         violated: since when each violation lasts.
         counted: the first that lasted, as text; it is in the exit code.
@@ -418,13 +419,14 @@ class Judged(msgspec.Struct, kw_only=True):
     looking: bool = False
     again_s: float = NEVER_S
     seen_s: float = 0.0
+    away: frozenset[str] = frozenset()
     since_s: float = 0.0
     found: frozenset[tuple[str, str]] = frozenset()
-    violated: dict[tuple[str, str, str, str], float] = {}
+    violated: dict[FindingKey, float] = {}
     counted: str = ""
     passed: dict[str, bool] = {}
-    asked: dict[tuple[str, str, str, str], float] = {}
-    tried: set[tuple[str, str, str, str]] = msgspec.field(default_factory=set)
+    asked: dict[FindingKey, float] = {}
+    tried: set[FindingKey] = msgspec.field(default_factory=set)
 
 
 class Ending(msgspec.Struct, kw_only=True):

@@ -18,13 +18,12 @@ from lifecycle.verify.rules.matching import SERVER_OF
 from lifecycle.verify.rules.nodes import UNATTRIBUTED_ENDPOINT, UNDECLARED_NODE
 from lifecycle.verify.rules.time import SILENT_CLOCK
 from lifecycle.verify.tool_filter import is_hidden_node
-from lifecycle.verify.verdict import Finding, Verdict
+from lifecycle.verify.verdict import Finding, FindingKey, Verdict
 
 PASSING_S = 1.0
 """Discovery shows a newcomer's endpoints before its name, measured 0.02–0.45 s earlier; what nodes
 have only just been asked for, or have just made in code, is seen 0.01–0.1 s later."""
 
-_Key = tuple[str, str, str, EndpointKind | None]
 _Place = tuple[object, ...]
 
 
@@ -40,7 +39,7 @@ class GracePeriod:
         self._plan: Plan | None = None
         self._demanded: dict[tuple[_Place, str], float] = {}
         self._latest: dict[_Place, float] = {}
-        self._unknown: dict[_Key, float] = {}
+        self._unknown: dict[FindingKey, float] = {}
 
     def after(
         self, last: Verdict | None, verdict: Verdict, expected: Plan, now_s: float
@@ -56,9 +55,9 @@ class GracePeriod:
             now_s: on any clock that only goes forward.
         """
         self._note(verdict, expected, now_s)
-        before = set() if last is None else {_key(each) for each in last.findings}
-        worse = [each for each in verdict.findings if _key(each) not in before]
-        healed = before - {_key(each) for each in verdict.findings}
+        before = set() if last is None else {each.key for each in last.findings}
+        worse = [each for each in verdict.findings if each.key not in before]
+        healed = before - {each.key for each in verdict.findings}
         if last is None or healed or not worse:
             return verdict, None
         left_s = [self._since(each) + PASSING_S - now_s for each in worse]
@@ -68,7 +67,7 @@ class GracePeriod:
 
     def _note(self, verdict: Verdict, expected: Plan, now_s: float) -> None:
         self._unknown = {
-            _key(each): self._unknown.get(_key(each), now_s)
+            each.key: self._unknown.get(each.key, now_s)
             for each in verdict.findings
             if _is_of_unknown_node(each)
         }
@@ -84,7 +83,7 @@ class GracePeriod:
     def _since(self, finding: Finding) -> float:
         """Return since when a finding may pass; -inf if it may not."""
         if _is_of_unknown_node(finding):
-            return self._unknown[_key(finding)]
+            return self._unknown[finding.key]
         places: set[_Place] = {
             (finding.subject,),
             (finding.node, finding.endpoint, finding.subject),
@@ -108,10 +107,6 @@ def _is_of_unknown_node(finding: Finding) -> bool:
         return is_hidden_node(finding.node)
     # Who publishes the time begins to once it is active.
     return finding.rule in (UNATTRIBUTED_ENDPOINT.id, SILENT_CLOCK.id)
-
-
-def _key(finding: Finding) -> _Key:
-    return finding.rule, finding.subject, finding.node, finding.endpoint
 
 
 def _demands(plan: Plan) -> Iterator[tuple[_Place, str]]:

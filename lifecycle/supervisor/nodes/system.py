@@ -63,7 +63,7 @@ class NodeRun:
         connected: its data layer is made.
         configuration: what it reports of itself; None before it does.
         unload: has its container unload a component; None for what is not loaded into one.
-        told: the step of wiring that it is asked for just now; empty when none.
+        wiring: the step of wiring that it is asked for just now; empty when none.
         health: what it, and /diagnostics of it, was seen to say of it in the graph.
     """
 
@@ -80,7 +80,7 @@ class NodeRun:
         self.connected = False
         self.configuration: NodeConfiguration | None = None
         self.unload: Callable[[], Awaitable[None]] | None = None
-        self.told = ""
+        self.wiring = ""
         self.health: tuple[HealthReport | None, HealthReport | None] = (None, None)
 
     @property
@@ -128,7 +128,7 @@ class NodeRun:
             keys = (each.node for each in self.planned.after if each.condition is Condition.HEALTHY)
             others = (self._system.nodes[key] for key in keys if key in self._system.nodes)
             what += next((each.unhealthy_reason for each in others if each.unhealthy_reason), "")
-        return f"told to {self.told}" if self.told else what
+        return f"asked to {self.wiring}" if self.wiring else what
 
     @property
     def is_up(self) -> bool:

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from lifecycle.supervisor.core.state import NEVER_S
+from lifecycle.supervisor.core.advance import late_at_s
+from lifecycle.supervisor.core.state import NEVER_S, Request
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -49,8 +50,7 @@ class Load:
             known = self._measured.get(key)
             if known is None or known.number != request.number:
                 self._measured.pop(key, None)
-                prompt_s = min(SLICE_S, request.limit_s / 10)
-                times.append(request.since_s + prompt_s)
+                times.append(_begins_s(request))
             else:
                 times.append(known.at_s + SLICE_S)
         return max(now_s, min(times, default=float("inf")))
@@ -63,7 +63,7 @@ class Load:
             request = node.core.request
             if request is None or request.limit_s == NEVER_S:
                 continue
-            begins_s = request.since_s + min(SLICE_S, request.limit_s / 10)
+            begins_s = _begins_s(request)
             if now_s < begins_s:
                 continue
             delay_s = node.run_delay_s()
@@ -79,13 +79,17 @@ class Load:
                 known.waited_s += min(max(delay_s - known.delay_s, 0.0), passed_s)
                 known.at_s, known.delay_s = now_s, delay_s
                 waited_s[key] = known.waited_s
-            waited = min(waited_s.get(key, 0.0), 9 * request.limit_s)
-            if now_s >= request.since_s + request.limit_s + request.own_s + waited:
+            if now_s >= late_at_s(request, waited_s[key]):
                 where[key] = self._where(key)
         return waited_s, {key: text for key, text in where.items() if text}
 
     def _where(self, key: str) -> str:
         node = self._system.nodes[key]
-        if node.told:
-            return f"told to {node.told}"
+        if node.wiring:
+            return f"its step {node.wiring}"
         return "" if node.process is None else node.process.where()
+
+
+def _begins_s(request: Request) -> float:
+    """Return from when on it is looked at: most requests are answered before."""
+    return request.since_s + min(SLICE_S, request.limit_s / 10)

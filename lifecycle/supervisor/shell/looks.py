@@ -99,18 +99,17 @@ class Looks:
         """Look and judge, once a burst of changes is over."""
         run, judge = self._system.run, self._shell.judge
         loop = asyncio.get_running_loop()
-        waits = run.held_s is not None or not gate.allows(run) or self._was_stale
-        if self._latest is not None and waits:
+        # While an open gate lets one level of nodes through after the other, each is looked at at
+        # once; what the last of them report is on the way.
+        passes = run.held_s is None and gate.allows(run) and not self._was_stale
+        if self._latest is not None and not (passes and advance.stage_of(run) is Stage.CONNECTED):
             await self._quiet()
         newcomers_until_s = loop.time() + gate.UNVERIFIABLE_S
         is_read_again = False
         while True:
             self._shell.catch_up()
-            mark, stage = run.mark, advance.stage_of(run)
-            active = frozenset(
-                each.name for each in run.nodes.values() if each.level is Level.ACTIVE
-            )
-            found = await judge.look(stage, frozenset() if stage is Stage.ACTIVE else active)
+            mark, stage, away = run.mark, advance.stage_of(run), advance.away(run)
+            found = await judge.look(stage)
             closes = gate.closes(found, strict=run.options.strict)
             if closes or stage is not Stage.CONNECTED or not self._is_waited_for():
                 break
@@ -125,7 +124,7 @@ class Looks:
                 break  # else the next look waits for them
         self._saw(judge.seen)
         self._was_stale = run.mark != mark
-        self._shell.give(self._verified(mark, stage, found))
+        self._shell.give(self._verified(mark, stage, away, found))
 
     def _is_waited_for(self) -> bool:
         run = self._system.run
@@ -137,7 +136,9 @@ class Looks:
         until_s = [each.until_s for each in (run.attempt, run.passage) if each is not None]
         return max(0.0, min(until_s, default=run.now_s) - self._shell.now_s())
 
-    def _verified(self, mark: int, stage: Stage, found: Verdict) -> inputs.Verified:
+    def _verified(
+        self, mark: int, stage: Stage, away: frozenset[str], found: Verdict
+    ) -> inputs.Verified:
         run, judge = self._system.run, self._shell.judge
         now_s = asyncio.get_running_loop().time()
         verdict, waits_s = found, [float("inf")]
@@ -171,6 +172,7 @@ class Looks:
             again_s=None if again_s == float("inf") else again_s,
             waits=waits,
             undiscovered=undiscovered,
+            away=away,
         )
 
     async def _quiet(self) -> None:

@@ -1,6 +1,6 @@
 """Starts processes, sends them signals, and ends what they left: Spawn, Signal and Sweep.
 
-Owns: what the core hears of a process: `Spawned`, `Exited`, `Swept`. When it is asked for is the
+Owns: the inputs about processes, `Spawned`, `Exited`, `Swept`. When it is asked for is the
 core's alone.
 """
 
@@ -13,13 +13,14 @@ from typing import TYPE_CHECKING
 from lifecycle.errors import BringUpError
 from lifecycle.graph.loop import set_within
 from lifecycle.manifest.model import RunKind
+from lifecycle.middleware.fastdds.profiles import FORGOTTEN_S
 from lifecycle.node.host.control import HostSpec
 from lifecycle.run_directory import start_ticks
 from lifecycle.supervisor.control.protocol import ProcessState
 from lifecycle.supervisor.core import effects, inputs
-from lifecycle.supervisor.judging.judge import FORGOTTEN_S
 from lifecycle.supervisor.processes.control_channel import ControlChannel
 from lifecycle.supervisor.run.events import Notice
+from lifecycle.verify.tool_filter import PREFIX_DIGITS
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -34,8 +35,6 @@ _WORDS_S = 0.1
 
 _AGAIN_S = 0.2
 """What ended processes left is forgotten bit by bit, and not all of it is a change of the graph."""
-
-_PREFIX_DIGITS = 24
 
 
 class Processes:
@@ -211,7 +210,7 @@ def _reported(node: NodeRun) -> Iterable[str]:
         return
     yield configuration.identity.node_id.rpartition("@")[2]
     for each in configuration.endpoints:
-        yield each.gid[:_PREFIX_DIGITS]
+        yield each.gid[:PREFIX_DIGITS]
 
 
 def manifest_folders(nodes: Iterable[PlannedNode]) -> tuple[str, ...]:

@@ -1,7 +1,7 @@
 """Asks nodes for steps, and gives them parameters: Ask and Give.
 
 Owns: how each step is carried out on each kind of node (in a host of ours, through its services,
-loaded into a container, only seen in the graph), and what the core hears of it: `Replied`, `Given`.
+loaded into a container, only seen in the graph), and the inputs about them, `Replied`, `Given`.
 Which step is due, and for how long, is the core's alone.
 """
 

@@ -62,6 +62,7 @@ from lifecycle.supervisor.shell.load import Load
 from lifecycle.supervisor.shell.looks import Looks
 from lifecycle.supervisor.shell.processes import Processes
 from lifecycle.supervisor.shell.requests import Requests
+from lifecycle.verify.judge import with_findings
 from lifecycle.verify.rules.run import PROCESS_DIED
 from lifecycle.verify.verdict import NOT_JUDGED
 
@@ -124,6 +125,7 @@ class Supervisor:
         self._said: dict[str, object] = {}
         self._answers: dict[int, asyncio.Future[Answer]] = {}
         self._plans: tuple[Plan, Plan] = (system.plan, system.first)
+        self._is_leaving = False
         self._ends: asyncio.Task[None] | None = None
         self._last = NOT_JUDGED
         self._programming: asyncio.Task[None] | None = None
@@ -154,7 +156,7 @@ class Supervisor:
         system.liveliness.listen(self._silence)
 
     def _begin(self, run: core.Run) -> None:
-        """Tell the core what the person asked for."""
+        """Give the core what the person asked for."""
         options, timeout_s = self._options, self._options.bring_up_s(len(run.processes))
         hold_s = options.stop_after_s
         if hold_s is None and options.until is not Until.ACTIVE:
@@ -262,9 +264,9 @@ class Supervisor:
         for event in events:
             self._emit(event)
         self._requests.drop()
-        effects_ = advance.advance(run)
+        wanted = advance.advance(run)
         self._say_states()
-        for effect in effects_:
+        for effect in wanted:
             self._perform(effect)
         self.moved.set()
         self.moved = asyncio.Event()
@@ -464,8 +466,6 @@ class Supervisor:
 
     async def _adopt(self) -> None:
         """Take what runs already as it is found, before anything is started."""
-        from lifecycle.verify.judge import with_findings
-
         try:
             plan, findings = await adopt(self.system, self.means.participant)
         except StepFailedError as failed:
@@ -562,8 +562,9 @@ class Supervisor:
 
     def _end(self, ending: core.Ending) -> None:
         """Begin to leave, once."""
-        if self._ends is not None:
+        if self._is_leaving:
             return
+        self._is_leaving = True
         latest = self.system.run.judged.verdict
         if latest is not None:
             self._last = self.system.liveliness.by_now(latest)
@@ -572,8 +573,8 @@ class Supervisor:
         self.means.participant.prepare_to_leave()
         if self._programming is not None:
             self._programming.cancel()  # nothing is programmed once all is removed
-        authority = self.authority
-        self._ends = self.start(_nothing() if authority is None else authority.close())
+        if self.authority is not None:
+            self._ends = self.start(self.authority.close())
 
     async def _leave_nothing(self) -> None:
         """Undo what is no process's: after the last message has left, and before strays end."""
@@ -613,7 +614,3 @@ class Supervisor:
 
     def _ended_by(self, number: int) -> None:
         self.stop(*ENDED_BY[number])
-
-
-async def _nothing() -> None:
-    """Nothing is to be left."""

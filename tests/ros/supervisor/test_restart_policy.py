@@ -81,7 +81,7 @@ def test_a_node_that_is_killed_before_its_name_is_known_does_not_haunt_the_gate(
         assert not run.until("failure", process="talker")["ends_run"]
         began = time.monotonic()
         run.until("system", reached="active")
-        # Its endpoints would be there for the rest of its lease, 20 s, and nobody's.
+        # Its endpoints would be there for the rest of its lease, 10 s, and nobody's.
         assert time.monotonic() - began < 8.0
         assert run.until("restarted")["process"] == "talker"
 

@@ -141,6 +141,17 @@ def test_nodes_that_keep_each_other_from_the_processor_are_not_too_late(
         run.assert_nothing_left()
 
 
+def test_no_node_that_is_being_activated_is_said_to_be_in_a_wrong_state(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    edit = {"nodes/listener/after": {"talker": "active"}}
+    with up(pair(tmp_path, fresh_domain, edit=edit), runtime=tmp_path) as run:
+        run.until("system", reached="active")
+        verdicts = [each["verdict"] for each in run.of_kind("verdict")]
+        rules = {each["rule"] for verdict in verdicts for each in verdict["findings"]}
+        assert "state.wrong-state" not in rules
+
+
 @pytest.mark.parametrize("until", ["connected", "verified"])
 def test_until_stops_short_of_activating(tmp_path: Path, fresh_domain: int, until: str) -> None:
     with up(pair(tmp_path, fresh_domain), "--until", until, runtime=tmp_path) as run:

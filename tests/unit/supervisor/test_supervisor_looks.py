@@ -38,8 +38,8 @@ class Judged(SessionWorld):
         judge = self.supervisor.judge
         really_look = judge.look
 
-        async def look(stage: Stage, ahead: frozenset[str]) -> Verdict:
-            await really_look(stage, ahead)  # which notes what it has seen
+        async def look(stage: Stage) -> Verdict:
+            await really_look(stage)  # which notes what it has seen
             self.looks.append(asyncio.get_running_loop().time())
             return self.found(self.looks[-1])
 

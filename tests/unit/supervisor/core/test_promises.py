@@ -31,7 +31,7 @@ PROMISES = {
 SOURCES = Path(lifecycle.supervisor.core.__file__).parent
 
 MUTANTS = [
-    ("gate", "gate.py", "run.judged.mark == run.mark and not", "not"),
+    ("gate", "gate.py", "is_latest(run) and not", "not"),
     ("gate", "gate.py", "run.judged.waits and allows(run)", "run.judged.waits"),
     ("gate", "gate.py", "judged.waits = given.mark,", "judged.waits = run.mark,"),
     ("gate", "advance.py", " or not gate.is_open(run):", ":"),
