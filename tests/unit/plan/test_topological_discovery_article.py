@@ -1,8 +1,8 @@
 """The design article *Topological Discovery and Communication Negotiation*, as it is applied.
 
 Its example, its declarative instructions, and what the planner, the authority and the negotiator
-make of them. docs/nine_systems.md lists every statement of the article with its test; most are
-proven where their code is.
+make of them. tests/articles/topological_discovery.md lists every statement of the article with its
+test; most are proven where their code is.
 """
 
 from __future__ import annotations
