@@ -55,8 +55,7 @@ from lifecycle.supervisor.run.events import (
     VerdictChanged,
 )
 from lifecycle.supervisor.run.failure import StepFailedError
-from lifecycle.supervisor.run.history import journal_files, read_run
-from lifecycle.supervisor.run.journal import Journal
+from lifecycle.supervisor.run.journal import Journal, journal_files, read_run
 from lifecycle.supervisor.run.options import UpOptions, UpResult
 from lifecycle.supervisor.run.records import Records
 from lifecycle.supervisor.run.signals import Ending

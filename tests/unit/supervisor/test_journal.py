@@ -18,10 +18,8 @@ from msgspec.structs import replace
 
 from lifecycle.cli.verbs import history
 from lifecycle.errors import UsageError
-from lifecycle.supervisor.run import journal as module
 from lifecycle.supervisor.run.events import Notice, RunStarted, Stopped, VerdictChanged
-from lifecycle.supervisor.run.history import journal_files, read_run
-from lifecycle.supervisor.run.journal import Journal
+from lifecycle.supervisor.run.journal import Journal, journal_files, read_run
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import Finding, Stage, Verdict
 
@@ -104,9 +102,9 @@ def test_every_line_is_as_the_schema_says(kept: Kept) -> None:
 
 
 def test_a_full_file_makes_room_and_each_says_of_which_run_it_is(
-    kept: Kept, monkeypatch: pytest.MonkeyPatch
+    kept: Kept,
 ) -> None:
-    monkeypatch.setattr(module, "LARGEST_JOURNAL", 2_000)
+    kept.journal._file.largest = 2_000
     for number in range(40):
         kept.say(f"{number}")
     older, newest = journal_files(kept.directory)
