@@ -500,7 +500,7 @@ class Supervisor:
                 self._ros_interface.on_event(event)
 
         self._emit.listen(changed)
-        self._ros_interface.begin()
+        self.start(self._ros_interface.follow())
         result = UpResult(exit_code=ExitCode.INTERNAL, verdict=NOT_JUDGED)
         beside = [
             asyncio.ensure_future(each)
