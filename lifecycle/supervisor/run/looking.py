@@ -116,49 +116,54 @@ def judge_running(
     Raises:
         MiddlewareError: no participant can be made.
     """
-    with _looking(plan) as observer_participant:
-        return asyncio.run(
-            _judge(
-                plan, observer_participant, timeout_s, strict=strict, empty_graph_s=empty_graph_s
-            )
-        )
 
-
-async def _following(
-    plan: Plan, of: Callable[[JudgedSystem], T], on_change: Callable[[T], None]
-) -> None:
-    """Look at every change and give what `of` says of it, where that differs, until cancelled.
-
-    What may pass by itself is given a moment to do so, see `GracePeriod`.
-    """
-    told: T | None = None
-    grace_period = GracePeriod()
-    last: Verdict | None = None
-    clock = asyncio.get_running_loop().time
-    pause_s = _ASK_AGAIN_S
-    with _looking(plan) as observer_participant:
+    async def judge(participant: ObserverParticipant) -> JudgedSystem:
+        loop = asyncio.get_running_loop()
+        began = loop.time()
         while True:
-            observation = await observer_participant.graph.observe(plan)
-            seen = _judged(plan, observation, observer_participant)
-            now, again_s = grace_period.after(last, seen.verdict, seen.plan, clock())
-            if now != last or again_s is not None:
-                pause_s = _ASK_AGAIN_S
-            last = now
-            said = of(replace(seen, verdict=last))
-            if said != told:
-                told = said
-                on_change(said)
-            if await _change(observer_participant, pause_s):
-                pause_s = _ASK_AGAIN_S
-            else:
-                pause_s = min(pause_s * 2, _ASK_AT_MOST_S)
+            observation = await participant.graph.observe(plan)
+            # One that is not there may be yet to come.
+            seen = _judged(plan, observation, participant, may_be_over=False)
+            limit_s = timeout_s
+            if empty_graph_s is not None and seen.where:
+                limit_s = min(empty_graph_s, timeout_s)
+            left_s = began + limit_s - loop.time()
+            if left_s <= 0 or not _worth_waiting(seen.verdict, strict=strict):
+                unanswered = await _unanswering(plan, observation, participant)
+                return _judged(plan, observation, participant, unanswered=unanswered)
+            await _change(participant, min(left_s, _ASK_AGAIN_S))
+
+    with _looking(plan) as participant:
+        return asyncio.run(judge(participant))
 
 
 def follow_running(
     plan: Plan, of: Callable[[JudgedSystem], T], on_change: Callable[[T], None]
 ) -> None:
-    """Judge what runs and give what `of` says of it whenever that differs, until interrupted."""
-    asyncio.run(_following(plan, of, on_change))
+    """Judge what runs and give what `of` says of it whenever that differs, until interrupted.
+
+    What may pass by itself is given a moment to do so, see `GracePeriod`.
+    """
+
+    async def follow(participant: ObserverParticipant) -> None:
+        said: T | None = None
+        grace_period, last = GracePeriod(), None
+        clock = asyncio.get_running_loop().time
+        pause_s = _ASK_AGAIN_S
+        while True:
+            seen = _judged(plan, await participant.graph.observe(plan), participant)
+            now, again_s = grace_period.after(last, seen.verdict, seen.plan, clock())
+            if now != last or again_s is not None:
+                pause_s = _ASK_AGAIN_S
+            last = now
+            before, said = said, of(replace(seen, verdict=last))
+            if said != before:
+                on_change(said)
+            changed = await _change(participant, pause_s)
+            pause_s = _ASK_AGAIN_S if changed else min(pause_s * 2, _ASK_AT_MOST_S)
+
+    with _looking(plan) as participant:
+        asyncio.run(follow(participant))
 
 
 def where(plan: Plan, rmw: str) -> str:
@@ -232,30 +237,6 @@ def _judged(
         rmw=observer_participant.rmw,
         limits=observer_participant.unknown_versions,
     )
-
-
-async def _judge(
-    plan: Plan,
-    observer_participant: ObserverParticipant,
-    timeout_s: float,
-    *,
-    strict: bool,
-    empty_graph_s: float | None,
-) -> JudgedSystem:
-    loop = asyncio.get_running_loop()
-    began = loop.time()
-    while True:
-        observation = await observer_participant.graph.observe(plan)
-        # One that is not there may be yet to come.
-        seen = _judged(plan, observation, observer_participant, may_be_over=False)
-        limit_s = timeout_s
-        if empty_graph_s is not None and seen.where:
-            limit_s = min(empty_graph_s, timeout_s)
-        left_s = began + limit_s - loop.time()
-        if left_s <= 0 or not _worth_waiting(seen.verdict, strict=strict):
-            unanswered = await _unanswering(plan, observation, observer_participant)
-            return _judged(plan, observation, observer_participant, unanswered=unanswered)
-        await _change(observer_participant, min(left_s, _ASK_AGAIN_S))
 
 
 async def _unanswering(

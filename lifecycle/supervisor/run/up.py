@@ -177,8 +177,7 @@ def up(
             leaving.enter_context(journal.writing(logs))
             fork_server = ForkServer(process)
             leaving.enter_context(_forgetting_runs(emit, logs, plan.system))
-            records = Records(directory, system, fork_server, emit)
-            leaving.callback(records.close)
+            records = Records(directory, system, fork_server)
             records.write()
             try:
                 # Before any participant: who asks a server that is not there waits to ask again.

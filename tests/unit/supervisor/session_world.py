@@ -550,7 +550,7 @@ class SessionWorld:
         with self.ending, self._run_directory() as directory, kept:
             means = Means(
                 directory=directory,
-                records=Records(directory, self.system, self.hosts, self._emit),
+                records=Records(directory, self.system, self.hosts),
                 fork_server=self.hosts,
                 participant=self.graph,
                 networks=self.networks,
