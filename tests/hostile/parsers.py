@@ -36,8 +36,8 @@ from lifecycle.programming.apply.targets.registry import settings_types
 from lifecycle.programming.apply.tool import HostTool, ToolOutput
 from lifecycle.programming.rules.nftables import parse_managed_comment
 from lifecycle.run_directory import read_record
-from lifecycle.supervisor.control.orders import Order
 from lifecycle.supervisor.control.server import LookAnswer
+from lifecycle.supervisor.core.state import Order
 from lifecycle.verify.observation import ConfigurationError, decode_configuration
 from lifecycle.verify.verdict import Stage
 from tests.hostile.attack import Attack, HostileClass, Place, mutated

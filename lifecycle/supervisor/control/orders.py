@@ -1,6 +1,6 @@
 """The manifest of a running system: is it still the one that runs, and can it be taken meanwhile?
 
-Owns: `Order`, and `Revisions`. An order with a plan that is not the one that runs is refused unless
+Owns: `Revisions`. An order with a plan that is not the one that runs is refused unless
 it says to take it, and so is, with the reason, what cannot be changed while the supervisor runs.
 Which orders fit what the system is doing, and what they do, is the core's, what differs
 `plan.comparison`'s. Must not import rclpy.
@@ -16,26 +16,11 @@ from lifecycle.plan.build import with_files_of_now
 from lifecycle.plan.change import PlanChange, change_between
 from lifecycle.plan.comparison import PlanDifference, changes, difference_lines
 from lifecycle.plan.model import Plan
-from lifecycle.supervisor.control.protocol import ChangedNodes, ControlRequest, Question
-from lifecycle.supervisor.core.orders import FITS, SAID, named
+from lifecycle.supervisor.control.protocol import ChangedNodes, ControlRequest
+from lifecycle.supervisor.core.orders import SAID, named
+from lifecycle.supervisor.core.state import Order
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.run.options import UpOptions, local_processes
-
-
-class Order(Question, frozen=True, kw_only=True):
-    """A question as a supervisor reads it.
-
-    Attributes:
-        plan: of the manifest that an order names, as it is now; None if it names none.
-    """
-
-    plan: Plan | None = None
-
-    @property
-    def is_order(self) -> bool:
-        """Whether the system is to do something."""
-        return self.ask in FITS
-
 
 _CHANGEABLE = ("nodes.", "links.", "policy.", "on_violation.", "modes.")
 """Parts of a manifest that a running supervisor can change: the rest made the supervisor's own

@@ -21,9 +21,9 @@ from lifecycle.errors import ExitCode, LifecycleError, MiddlewareError
 from lifecycle.manifest.model import Policy, RosInterfaceAccess
 from lifecycle.manifest.names import MODE_SERVICE, supervisor_prefix, supervisor_services
 from lifecycle.plan.model import Plan
-from lifecycle.supervisor.control.orders import Order
 from lifecycle.supervisor.control.protocol import ControlRequest, NodeStatus, SystemStatus
 from lifecycle.supervisor.core.orders import FITS
+from lifecycle.supervisor.core.state import Order
 from lifecycle.supervisor.run.events import (
     Emitter,
     Event,

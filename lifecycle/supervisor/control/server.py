@@ -31,7 +31,7 @@ from lifecycle.verify.observation import Observation
 from lifecycle.verify.verdict import Verdict
 
 if TYPE_CHECKING:
-    from lifecycle.supervisor.control.orders import Order
+    from lifecycle.supervisor.core.state import Order
     from lifecycle.supervisor.shell.supervisor import Supervisor
 
 _BURST_S = 0.05
@@ -100,7 +100,7 @@ class ControlServer:
         )
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        from lifecycle.supervisor.control.orders import Order  # clients do not need it
+        from lifecycle.supervisor.core.state import Order  # clients do not need it
 
         self._open.add(writer)
         try:
@@ -127,9 +127,11 @@ class ControlServer:
         self._changed = asyncio.Event()
 
     async def _answer(self, question: Order) -> Answer:
+        from lifecycle.supervisor.core.orders import FITS
+
         if question.ask is ControlRequest.LOOK:
             return LookAnswer(look=self._session.look())
-        if question.is_order:
+        if question.ask in FITS:
             return await self._session.order(question)
         if question.ask is ControlRequest.DIFFERENCES and question.plan is not None:
             return Answer(differences=self._session.differences(question.plan))

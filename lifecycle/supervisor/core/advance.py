@@ -165,7 +165,7 @@ def is_at_gate(run: Run) -> bool:
     """Return whether all nodes but those in backoff are where they can be without the gate."""
     return not any(
         is_walking(run, each) for each in run.nodes.values() if each.due_s <= run.now_s
-    ) and not any(each.is_alive and _is_to_end(run, each) for each in run.processes.values())
+    ) and not any(each.is_alive and is_to_end(run, each) for each in run.processes.values())
 
 
 def waiting(run: Run) -> tuple[str, ...]:
@@ -320,9 +320,9 @@ def _ask(run: Run, node: Node, step: Step) -> effects.Ask:
 # Processes
 
 
-def _is_to_end(run: Run, process: Process) -> bool:
-    members = [*run.nodes_of(process.name)]
-    return not any(wanted(run, each) for each in members)
+def is_to_end(run: Run, process: Process) -> bool:
+    """Return whether all nodes of a process are to be down."""
+    return not any(wanted(run, each) for each in run.nodes_of(process.name))
 
 
 def _process(run: Run, process: Process) -> Iterator[effects.Effect]:
@@ -338,13 +338,13 @@ def _process(run: Run, process: Process) -> Iterator[effects.Effect]:
     elif process.barks and SIGKILL not in process.sent:
         process.sent = [*process.sent, SIGKILL]
         yield effects.Signal(process=process.name, number=SIGKILL)
-    elif process.pid and _is_to_end(run, process):
+    elif process.pid and is_to_end(run, process):
         yield from _end(run, process)
 
 
 def _may_be_spawned(run: Run, process: Process) -> bool:
     members = [*run.nodes_of(process.name)]
-    if run.fails_s < NEVER_S or _is_to_end(run, process):
+    if run.fails_s < NEVER_S or is_to_end(run, process):
         return False
     return not any(holds_up(run, each, Level.STARTED) for each in members)
 
@@ -423,17 +423,10 @@ def _gate(run: Run) -> Iterator[effects.Effect]:
         passage.number = run.requests
         yield effects.Program(verdict=judged.verdict, number=run.requests)
     # A loop that looks while its nodes are on their way would look at each step of each.
-    active = frozenset(each.name for each in run.nodes.values() if each.level is Level.ACTIVE)
     due = judged.mark != run.mark or judged.again_s <= run.now_s
-    watched = active and run.held_s is not None
-    if due and not judged.looking and (watched or is_at_gate(run)):
-        stage = stage_of(run)
+    if due and not judged.looking and (run.is_watched or is_at_gate(run)):
         judged.looking, judged.again_s = True, NEVER_S
-        yield effects.Look(
-            mark=run.mark,
-            stage=stage,
-            ahead=frozenset() if stage is Stage.ACTIVE else active,
-        )
+        yield effects.Look(mark=run.mark)
 
 
 # Time
@@ -502,6 +495,14 @@ def phase_of(run: Run) -> str:
         (_is_whole(run), "active"),
     )
     return next((name for holds, name in found if holds), "held")
+
+
+def rests_as(run: Run) -> str:
+    """Return what a system that was up is, whatever its policy starts again meanwhile."""
+    if run.paused:
+        return "paused"
+    kept = any(each.withheld or each.refused for each in run.nodes.values())
+    return "held" if kept or waiting(run) else "active"
 
 
 def _is_whole(run: Run) -> bool:

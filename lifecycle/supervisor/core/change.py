@@ -15,7 +15,7 @@ from lifecycle.plan.build import attached_to
 from lifecycle.plan.change import change_between
 from lifecycle.plan.comparison import difference_lines
 from lifecycle.plan.model import Plan, PlannedNode, in_mode
-from lifecycle.supervisor.core.advance import is_settled_down, phase_of, waiting
+from lifecycle.supervisor.core.advance import is_settled_down, phase_of, rests_as
 from lifecycle.supervisor.core.state import (
     Attempt,
     Change,
@@ -266,8 +266,7 @@ def undone(run: Run, change: Change) -> str:
     if ends := [*change.ends, *run.failures]:
         why = "; ".join(each.message for each in ends)
         return f"{text}cannot go back to {before}: {why}; the system is taken down"
-    kept = any(each.withheld or each.refused for each in run.nodes.values())
-    now = "paused" if run.paused else "held" if kept or waiting(run) else "active"
+    now = rests_as(run)
     how = f"{now} and verified"
     if change.again:
         how = f"and what failed meanwhile is started again as its policy says: {change.again}"

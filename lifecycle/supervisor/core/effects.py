@@ -7,7 +7,7 @@ import msgspec
 from lifecycle.errors import ExitCode
 from lifecycle.plan.change import GivenParameters
 from lifecycle.supervisor.core.state import Step
-from lifecycle.verify.verdict import Stage, Verdict
+from lifecycle.verify.verdict import Verdict
 
 
 class Spawn(msgspec.Struct, frozen=True, kw_only=True):
@@ -44,15 +44,9 @@ class Ask(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Look(msgspec.Struct, frozen=True, kw_only=True):
-    """Observe and judge; `Verified` with the same mark.
-
-    Attributes:
-        ahead: full names of the nodes that are active, and may be so at this stage.
-    """
+    """Observe and judge; `Verified`, with the mark at which it began: this one, or a later one."""
 
     mark: int
-    stage: Stage
-    ahead: frozenset[str]
 
 
 class Program(msgspec.Struct, frozen=True, kw_only=True):

@@ -17,7 +17,7 @@ from lifecycle.supervisor.core import gate
 from lifecycle.supervisor.core.advance import holds_up, phase_of, wanted
 from lifecycle.supervisor.core.change import go_back, undone
 from lifecycle.supervisor.core.inputs import Exited
-from lifecycle.supervisor.core.restart import RestartPolicy, group_of
+from lifecycle.supervisor.core.restart import RestartPolicy, is_restarted
 from lifecycle.supervisor.core.state import (
     NEVER_S,
     UP,
@@ -102,7 +102,9 @@ def death(run: Run, process: Process, given: Exited) -> list[Failure]:
     while_ = doing(run, node) if node is not None else ""
     what = f"process {name!r}" if node is None else repr(name)
     while_ = f" while {while_}" if while_ else ""
-    why = f": {process.why}" if process.why else ""
+    hangs = next((each.hangs for each in members if each.hangs and process.barks), "")
+    after_s = process.supervision.watchdog_sec
+    why = f": its watchdog ended it after {after_s:g} s, because {hangs}" if hangs else ""
     words = f": {given.words}" if given.words else ""
     end = f"{given.text}{_not_run(process, given)}"
     text = f"cannot keep {what} running: pid {process.pid} died{while_}: {end}{words}{why}"
@@ -244,8 +246,7 @@ def _fails_in_change(run: Run, failure: Failure, end: Exited | None) -> list[Eve
 def _is_covered(process: Process | None, end: Exited | None) -> bool:
     if process is None or process.stays_down:
         return False
-    policy = RestartPolicy(process.supervision, 0.0)
-    return policy.takes(exit_status=None if end is None else end.status)
+    return is_restarted(process.supervision, None if end is None else end.status)
 
 
 def goes_on(failure: Failure) -> Failure:
@@ -271,7 +272,6 @@ def _cut_short(run: Run, failure: Failure) -> None:
 def _back_off(run: Run, process: Process, failure: Failure, end: Exited | None) -> list[Event]:
     """Have a process, and what goes down with it, started again later; or give it up."""
     process.failures = [*process.failures, _remembered(run, failure, end)][-_REMEMBERED:]
-    process.why = ""
     was_up = run.held_s is not None
     policy = process.policy = process.policy or RestartPolicy(process.supervision, run.now_s)
     due_s = policy.failed(run.now_s, was_up=was_up)
@@ -282,7 +282,7 @@ def _back_off(run: Run, process: Process, failure: Failure, end: Exited | None) 
         run.failures = [*run.failures, _given_up(process, failure, was_up=was_up)]
         run.fails_s = run.now_s
         return events
-    keys = group_of((each.planned for each in run.nodes.values()), process.name)
+    keys = run.group(process.name)
     for key in keys:
         node = run.nodes[key]
         node.renew, node.due_s = True, max(node.due_s, due_s)

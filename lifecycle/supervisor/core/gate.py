@@ -219,8 +219,7 @@ def see_violations(run: Run, away: Collection[str]) -> None:
     judged = run.judged
     if judged.verdict is None:
         return
-    active = any(each.level is Level.ACTIVE for each in run.nodes.values())
-    if run.held_s is None or run.attempt is not None or run.change is not None or not active:
+    if not run.is_watched or run.attempt is not None or run.change is not None:
         judged.violated = {}  # what an order brings about is judged at its gate
         return
     verdict = of_those_there(run, without(run, judged.verdict, {*away, *run.left}))

@@ -89,12 +89,10 @@ def _spawned(run: Run, given: inputs.Spawned) -> list[Event]:
         process.pid = given.pid or -1
         return []
     process.state = None
+    if run.ending is not None:
+        return []
     node = next(run.nodes_of(process.name))
-    return (
-        []
-        if run.ending
-        else failure.fail(run, failure.of_step(run, node, START_FAILED, given.error))
-    )
+    return failure.fail(run, failure.of_step(run, node, START_FAILED, given.error))
 
 
 def _exited(run: Run, given: inputs.Exited) -> list[Event]:
@@ -102,45 +100,36 @@ def _exited(run: Run, given: inputs.Exited) -> list[Event]:
     if process is None or not process.is_alive:
         return []
     failures = failure.death(run, process, given)
-    members = [*run.nodes_of(process.name)]
-    loaded = [each for each in run.nodes.values() if run.process_of(each) is process]
-    shut_down = all(each.level is Level.DOWN for each in members if each.planned.managed)
-    to_end = not any(advance.wanted(run, each) for each in members)
+    in_order = _ends_in_order(run, process, given)
+    asked = process.asked >= 0
+    expected = asked or run.ending is not None or advance.is_to_end(run, process)
     process.state, process.end = ProcessState.EXITED, given
-    for node in {each.key: each for each in (*members, *loaded)}.values():
-        _is_down(node)
+    for node in run.nodes.values():
+        if run.process_of(node) is process:
+            _is_down(node)
     run.changed()
-    if process.asked >= 0:
-        forced = [] if process.asked == 0 or run.hurry else [failure.forced(process)]
-        return [*forced, *_died_when_asked(run, process, given, failures)]
-    if process.is_over:
+    if process.is_over and not asked:
         process.stays_down = True
         return []
-    if run.ending is not None or to_end:
-        hosted = process.planned.run.kind is RunKind.PYTHON
-        in_order = given.clean and (shut_down or not hosted)
-        if in_order:
-            return []
-        if run.ending is not None:
-            run.deaths += failures
-        return [failure.goes_on(each) for each in failures]
-    return [event for each in failures for event in failure.fail(run, each, given)]
-
-
-def _died_when_asked(
-    run: Run, process: Process, given: inputs.Exited, failures: list[Failure]
-) -> list[Event]:
-    """Take the end of a process that was asked to end, and may have died instead."""
-    if given.signal:
-        crashed = given.signal not in process.sent and not given.clean
-    else:
-        hosted = process.planned.run.kind is RunKind.PYTHON
-        crashed = given.crash or (hosted and (given.status or 0) > 1)
-    if not crashed:
-        return []
+    if not expected:
+        return [event for each in failures for event in failure.fail(run, each, given)]
+    forced = [failure.forced(process)] if process.asked > 0 and not run.hurry else []
+    if in_order:
+        return [*forced]
     if run.ending is not None:
         run.deaths += failures
-    return [failure.goes_on(each) for each in failures]
+    return [*forced, *map(failure.goes_on, failures)]
+
+
+def _ends_in_order(run: Run, process: Process, given: inputs.Exited) -> bool:
+    """Return whether a process that is to end, or was asked to, has not died instead."""
+    hosted = process.planned.run.kind is RunKind.PYTHON
+    if process.asked < 0:
+        managed = [each for each in run.nodes_of(process.name) if each.planned.managed]
+        return given.clean and (not hosted or all(each.level is Level.DOWN for each in managed))
+    if given.signal:
+        return given.signal in process.sent or given.clean
+    return not (given.crash or (hosted and (given.status or 0) > 1))
 
 
 def _is_down(node: Node) -> None:
@@ -156,7 +145,7 @@ def _swept(run: Run, given: inputs.Swept) -> list[Event]:
         return []
     process.state, process.pid, process.asked, process.sent = None, 0, -1, []
     process.asked_until_s, process.hangs_s, process.sweeping = NEVER_S, None, False
-    process.barks, process.why = False, ""
+    process.barks = False
     run.changed()
     if run.ending is not None or run.change is not None:
         return []
@@ -181,14 +170,9 @@ def _silent(run: Run, given: inputs.Silent) -> list[Event]:
     node.hangs = given.why if given.hangs else ""
     process = run.process_of(node)
     if process is not None:
-        why = next((each.hangs for each in run.nodes_of(process.name) if each.hangs), "")
-        hangs = bool(why)
         since_s = run.now_s if process.hangs_s is None else process.hangs_s
+        hangs = any(each.hangs for each in run.nodes_of(process.name))
         process.hangs_s = since_s if hangs else None
-        how = process.supervision
-        process.why = (
-            f"its watchdog ended it after {how.watchdog_sec:g} s, because {why}" if hangs else ""
-        )
     return []
 
 

@@ -17,10 +17,10 @@ from collections.abc import Iterable, Iterator
 import msgspec
 
 from lifecycle.errors import ExitCode
-from lifecycle.manifest.model import Condition, RunKind, Supervision, TargetState
+from lifecycle.manifest.model import Condition, OnFailure, RunKind, Supervision, TargetState
 from lifecycle.plan.change import GivenParameters, PlanChange
 from lifecycle.plan.model import Plan, PlannedNode, PlannedProcess
-from lifecycle.supervisor.control.protocol import ControlRequest, Failed, ProcessState
+from lifecycle.supervisor.control.protocol import Failed, ProcessState, Question
 from lifecycle.supervisor.core.inputs import Exited
 from lifecycle.supervisor.core.restart import RestartPolicy
 from lifecycle.supervisor.run.events import Failure
@@ -124,7 +124,7 @@ class Node(msgspec.Struct, kw_only=True):
         wired: the authority has connected it as it is to be.
         stuck: a request to it was given up; a further one would wait behind it.
         silent: why it cannot be reached; empty while it can.
-        hangs: why its process's watchdog is to end it; empty if it is not.
+        hangs: why its process's watchdog is to end it, if it has one; empty while it does not hang.
         renew: it is to go down once, whatever it is wanted to be.
         due_s: it is not started before.
         withheld: why a consequence keeps it inactive until a person lets it through the gate.
@@ -214,7 +214,6 @@ class Process(msgspec.Struct, kw_only=True):
         stays_down: it is not started again: it ended as it may, or the run goes on without it.
         hangs_s: since when it is stopped or hangs; None while it does not.
         barks: its watchdog ends it.
-        why: said of its end: why its watchdog ended it.
     """
 
     planned: PlannedProcess
@@ -236,7 +235,6 @@ class Process(msgspec.Struct, kw_only=True):
     stays_down: bool = False
     hangs_s: float | None = None
     barks: bool = False
-    why: str = ""
 
     @property
     def name(self) -> str:
@@ -269,22 +267,17 @@ class Process(msgspec.Struct, kw_only=True):
         return self.may_end and self.end is not None and self.end.status == 0
 
 
-class Order(msgspec.Struct, kw_only=True, frozen=True):
-    """What a person, or a ROS client, has ordered.
+class Order(Question, kw_only=True, frozen=True):
+    """What a person, or a ROS client, has asked for.
 
     Attributes:
-        id: by which it is answered, once.
-        node: for RESTART, key or full name; empty for the whole system.
-        timeout_s: for APPLY; 0 is as long as a bring-up may take.
+        plan: of the manifest that it names, as it is now; None if it names none.
+        id: by which the supervisor answers it, once.
         first: the manifest that it was checked against; None if that is of no account.
     """
 
-    id: int
-    ask: ControlRequest
-    node: str = ""
-    mode: str = ""
     plan: Plan | None = None
-    timeout_s: float = 0.0
+    id: int = 0
     first: Plan | None = None
 
 
@@ -445,6 +438,11 @@ class Ending(msgspec.Struct, kw_only=True):
     failed: bool = False
     deaths: int = 0
 
+    @property
+    def why(self) -> str:
+        """What failed, as people read it; else the reason."""
+        return "; ".join(each.message for each in self.failures) or self.reason
+
 
 class Options(msgspec.Struct, kw_only=True, frozen=True):
     """What a person asked of the run.
@@ -549,6 +547,12 @@ class Run(msgspec.Struct, kw_only=True):
             )
         )
 
+    @property
+    def is_watched(self) -> bool:
+        """Whether it was up and some of it is active: then all that changes is looked at."""
+        active = any(each.level is Level.ACTIVE for each in self.nodes.values())
+        return active and self.held_s is not None
+
     def node_named(self, name: str) -> Node | None:
         """Return the node with this fully qualified name; None if it is not ours."""
         return next((each for each in self.nodes.values() if each.name == name), None)
@@ -579,15 +583,32 @@ class Run(msgspec.Struct, kw_only=True):
             self.outbox = [*self.outbox, (self.order.id, code, error)]
         self.order, self.ready, self.undone = None, None, None
 
-    def whole(self, keys: Iterable[str]) -> tuple[str, ...]:
-        """Return the keys with those of all that comes and goes with these nodes."""
+    def whole(self, keys: Iterable[str], *, dependents: bool = False) -> tuple[str, ...]:
+        """Return the keys with those of all that comes and goes with these nodes, in plan order.
+
+        A component goes with its container, and a node with all others of its process.
+
+        Args:
+            keys: of the nodes.
+            dependents: those that depend on them go, too.
+        """
         found, more = set[str](), set(keys)
         while more != found:
             found, processes = set(more), {self.nodes[key].process for key in more} - {""}
             for key, node in self.nodes.items():
-                if node.process in processes or node.planned.run.container in found:
+                depends = dependents and any(after.node in found for after in node.planned.after)
+                if depends or node.process in processes or node.planned.run.container in found:
                     more.add(key)
         return tuple(key for key in self.nodes if key in found)
+
+    def group(self, process: str) -> tuple[str, ...]:
+        """Return the keys of the nodes that go down and come again with a process that failed."""
+        members = [*self.nodes_of(process)]
+        how = {each.planned.supervision.on_failure for each in members}
+        if OnFailure.ALL in how:
+            return tuple(self.nodes)
+        keys = (each.key for each in members)
+        return self.whole(keys, dependents=OnFailure.DEPENDENTS in how)
 
     def changed(self) -> None:
         """Note that something may be other than the last verdict saw it."""

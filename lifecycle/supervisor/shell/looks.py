@@ -26,7 +26,7 @@ from lifecycle.manifest.model import Condition
 from lifecycle.plan.model import Plan, PlannedNode
 from lifecycle.plan.restart import moving_nodes
 from lifecycle.supervisor.control.protocol import ProcessState
-from lifecycle.supervisor.core import advance, gate, inputs
+from lifecycle.supervisor.core import advance, effects, gate, inputs
 from lifecycle.supervisor.core.state import Level
 from lifecycle.supervisor.judging.grace_period import GracePeriod
 from lifecycle.supervisor.nodes.driver import ACTIVE, INACTIVE
@@ -95,7 +95,7 @@ class Looks:
         self._found_s = 0.0
         self._tries: Counter[str] = Counter()
 
-    async def look(self) -> None:
+    async def look(self, _: effects.Look) -> None:
         """Look and judge, once a burst of changes is over."""
         run, judge = self._system.run, self._shell.judge
         loop = asyncio.get_running_loop()
@@ -244,9 +244,7 @@ class Looks:
 
     def _is_looked_at(self) -> bool:
         run = self._system.run
-        active = any(each.level is Level.ACTIVE for each in run.nodes.values())
-        watched = active and run.held_s is not None
-        return run.judged.looking or watched or advance.is_at_gate(run)
+        return run.judged.looking or run.is_watched or advance.is_at_gate(run)
 
     def _followed(self) -> Plan:
         run = self._system.run

@@ -66,7 +66,7 @@ MUTANTS = [
         "        if node.request is not None and at_s >= advance.late_at_s",
         "        if False and late_at_s",
     ),
-    ("processes", "advance.py", " or _is_to_end(run, process):", ":"),
+    ("processes", "advance.py", " or is_to_end(run, process):", ":"),
     (
         "processes",
         "reduce.py",
