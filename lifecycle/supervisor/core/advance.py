@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from lifecycle.manifest.model import Condition, RunKind, Supervision
+from lifecycle.manifest.model import Condition, Restart, RunKind, Supervision
 from lifecycle.supervisor.control.protocol import ControlRequest, ProcessState
 from lifecycle.supervisor.core import effects, gate
 from lifecycle.supervisor.core.state import (
@@ -60,7 +60,7 @@ def wanted(run: Run, node: Node) -> Level:
     if (
         run.ending is not None
         or node.renew
-        or node.due_s > run.now_s
+        or not run.is_past(node.due_s)
         or (process is not None and process.stays_down)
         or (change is not None and not change.taken and node.key in change.down)
     ):
@@ -164,7 +164,7 @@ def is_awaited(run: Run) -> bool:
 def is_at_gate(run: Run) -> bool:
     """Return whether all nodes but those in backoff are where they can be without the gate."""
     return not any(
-        is_walking(run, each) for each in run.nodes.values() if each.due_s <= run.now_s
+        is_walking(run, each) for each in run.nodes.values() if run.is_past(each.due_s)
     ) and not any(each.is_alive and is_to_end(run, each) for each in run.processes.values())
 
 
@@ -188,7 +188,7 @@ def away(run: Run) -> frozenset[str]:
     return frozenset(
         each.name
         for each in run.nodes.values()
-        if each.level < each.levels[-1] or each.renew or each.due_s > run.now_s
+        if each.level < each.levels[-1] or each.renew or not run.is_past(each.due_s)
     )
 
 
@@ -210,8 +210,11 @@ def advance(run: Run) -> list[effects.Effect]:
             found.append(_ask(run, node, step))
     found += _parameters(run)
     found += _gate(run)
-    if (at_s := wakes_at_s(run)) < NEVER_S:
-        found.append(effects.Wake(at_s=at_s))
+    for node in run.nodes.values():
+        if node.request is not None:  # if it is late now, only a tick says so
+            run.wake_s = min(run.wake_s, max(late_at_s(node.request), run.now_s))
+    if run.wake_s < NEVER_S:
+        found.append(effects.Wake(at_s=run.wake_s))
     return found
 
 
@@ -307,7 +310,6 @@ def _ask(run: Run, node: Node, step: Step) -> effects.Ask:
         step=step,
         since_s=run.now_s,
         limit_s=NEVER_S if appears else limit_s,
-        own_s=OWN_S if step in _THEIRS else 0.0,
     )
     if step is not Step.ACTIVATE:
         return effects.Ask(node=node.key, step=step, number=run.requests)
@@ -315,6 +317,12 @@ def _ask(run: Run, node: Node, step: Step) -> effects.Ask:
     run.passage.sent.add(node.key)
     node.let_through = True
     return effects.Ask(node=node.key, step=step, number=run.requests, mark=run.mark)
+
+
+def late_at_s(request: Request) -> float:
+    """Return when a request is late: its process's time without a processor does not count."""
+    own_s = OWN_S if request.step in _THEIRS else 0.0
+    return request.since_s + request.limit_s + own_s + min(request.waited_s, 9 * request.limit_s)
 
 
 # Processes
@@ -335,8 +343,8 @@ def _process(run: Run, process: Process) -> Iterator[effects.Effect]:
             process.state, process.end = ProcessState.STARTING, None
             process.started(run.now_s)
             yield effects.Spawn(process=process.name)
-    elif process.barks and SIGKILL not in process.sent:
-        process.sent = [*process.sent, SIGKILL]
+    elif SIGKILL not in process.sent and run.is_past(_barks_at_s(process)):
+        process.barks, process.sent = True, [*process.sent, SIGKILL]
         yield effects.Signal(process=process.name, number=SIGKILL)
     elif process.pid and is_to_end(run, process):
         yield from _end(run, process)
@@ -349,6 +357,14 @@ def _may_be_spawned(run: Run, process: Process) -> bool:
     return not any(holds_up(run, each, Level.STARTED) for each in members)
 
 
+def _barks_at_s(process: Process) -> float:
+    """Return when the watchdog of a process ends it; NEVER_S while it does not hang."""
+    how: Supervision = process.supervision
+    if process.hangs_s is None or not how.watchdog_sec or how.restart is Restart.NO:
+        return NEVER_S
+    return process.hangs_s + how.watchdog_sec
+
+
 def _end(run: Run, process: Process) -> Iterator[effects.Signal]:
     """End a process once nothing is left to undo in it, by ever stronger means."""
     members = [*run.nodes_of(process.name)]
@@ -359,7 +375,7 @@ def _end(run: Run, process: Process) -> Iterator[effects.Signal]:
         if busy or any(_waits_for_dependents(run, each, Level.DOWN) for each in members):
             return
     hurried = run.hurry and SIGKILL not in process.sent
-    if process.asked >= 0 and run.now_s < process.asked_until_s and not hurried:
+    if process.asked >= 0 and not hurried and not run.is_past(process.asked_until_s):
         return
     process.asked = min(process.asked + 1, len(escalation) - 1)
     if hurried:
@@ -423,58 +439,10 @@ def _gate(run: Run) -> Iterator[effects.Effect]:
         passage.number = run.requests
         yield effects.Program(verdict=judged.verdict, number=run.requests)
     # A loop that looks while its nodes are on their way would look at each step of each.
-    due = judged.mark != run.mark or judged.again_s <= run.now_s
+    due = judged.mark != run.mark or run.is_past(judged.again_s)
     if due and not judged.looking and (run.is_watched or is_at_gate(run)):
         judged.looking, judged.again_s = True, NEVER_S
         yield effects.Look(mark=run.mark)
-
-
-# Time
-
-
-def late_at_s(request: Request) -> float:
-    """Return when a request is late: its process's time without a processor does not count."""
-    waited_s = min(request.waited_s, 9 * request.limit_s)
-    return request.since_s + request.limit_s + request.own_s + waited_s
-
-
-def barks_at_s(process: Process) -> float:
-    """Return when the watchdog of a process ends it; NEVER_S while it does not hang."""
-    how: Supervision = process.supervision
-    watched = how.watchdog_sec and how.restart.value != "no" and process.is_alive
-    if process.hangs_s is None or not watched or process.barks:
-        return NEVER_S
-    return process.hangs_s + how.watchdog_sec
-
-
-def wakes_at_s(run: Run) -> float:
-    """Return when something is to be done although nothing happens; NEVER_S if nothing is."""
-    now_s = run.now_s
-    late = [late_at_s(each.request) for each in run.nodes.values() if each.request is not None]
-    if any(each <= now_s for each in late):
-        return now_s  # only a tick says so
-    times = [*late, *(each.due_s for each in run.nodes.values())]
-    times += [each.asked_until_s for each in run.processes.values() if each.is_alive]
-    times += map(barks_at_s, run.processes.values())
-    if run.ending is None:
-        times += [run.judged.again_s, run.fails_s, gate.counts_at_s(run.judged, now_s)]
-        times += (since_s + gate.SETTLED_S for since_s in run.judged.asked.values())
-        for each in (run.attempt, run.passage):
-            if each is not None:
-                times += [each.until_s, gate.refuses_at_s(run, each.until_s)]
-                times.append(each.until_s + gate.LEAST_S)
-        if run.attempt is not None and not run.attempt.said:
-            times.append(run.attempt.since_s + gate.SAY_S)
-        if run.passage is not None:
-            times.append(run.passage.late_s)
-        if run.waits_s is not None and not run.said:
-            times.append(gate.refuses_at_s(run, run.waits_s + run.options.timeout_s))
-        if run.change is not None:
-            times.append(run.change.until_s)
-        if run.held_s is not None and run.options.hold_s is not None:
-            over_s = run.held_s + run.options.hold_s
-            times += [over_s, over_s + NOTICE_S, over_s + GLANCE_S]
-    return min((each for each in times if each > now_s), default=NEVER_S)
 
 
 def phase_of(run: Run) -> str:

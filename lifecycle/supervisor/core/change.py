@@ -110,7 +110,7 @@ def apply(run: Run, order: Order) -> list[Event]:
     failed = {
         key
         for key, each in run.nodes.items()
-        if each.due_s > run.now_s or _stays_down(run.process_of(each))
+        if not run.is_past(each.due_s) or _stays_down(run.process_of(each))
     }
     again = {*change.removed, *change.restarted, *(failed & known)}
     down = run.whole(again)

@@ -58,9 +58,9 @@ def settle_consequences(run: Run) -> list[Event]:
         if each.outcome is Outcome.VIOLATED and due and coming.isdisjoint(each.nodes):
             asked[gate.key_of(each)] = due
     run.judged.asked = {key: run.judged.asked.get(key, run.now_s) for key in asked}
-    until_s = gate.holds_until_s(run)
+    since_s = run.judged.asked
     lasting = [
-        due for key, due in asked.items() if until_s - run.judged.asked[key] >= gate.SETTLED_S
+        due for key, due in asked.items() if gate.lasts_until(run, since_s[key] + gate.SETTLED_S)
     ]
     if not lasting:
         return []

@@ -106,9 +106,9 @@ def is_latest(run: Run) -> bool:
     return run.judged.mark == run.mark
 
 
-def holds_until_s(run: Run) -> float:
-    """Return until when what was found is known to be so: what changed since may have mended it."""
-    return run.now_s if is_latest(run) else run.judged.seen_s
+def lasts_until(run: Run, at_s: float) -> bool:
+    """Return whether what was found was so until then: what changed since may have mended it."""
+    return run.judged.seen_s >= at_s or (is_latest(run) and run.is_past(at_s))
 
 
 def refuses_at_s(run: Run, until_s: float) -> float:
@@ -125,7 +125,7 @@ def refuses_at_s(run: Run, until_s: float) -> float:
         return until_s  # what speaks against it is being mended
     if any(each.guarded > GUARD_TRIES for each in run.nodes.values()):
         return run.now_s
-    if any(each.due_s > run.now_s for each in run.nodes.values()):
+    if not all(run.is_past(each.due_s) for each in run.nodes.values()):
         return until_s  # what comes again may mend it
     over_s = judged.since_s + patience_s(judged.verdict)
     lasts = is_latest(run) or judged.seen_s >= over_s
@@ -228,8 +228,7 @@ def see_violations(run: Run, away: Collection[str]) -> None:
     if verdict.verdict is Outcome.VIOLATED and not found:
         keys = [("", verdict.verdict.value, "", "")]
     judged.violated = {key: judged.violated.get(key, run.now_s) for key in keys}
-    until_s = holds_until_s(run)
-    lasting = [key for key, since_s in judged.violated.items() if until_s - since_s >= LASTS_S]
+    lasting = [key for key, at_s in judged.violated.items() if lasts_until(run, at_s + LASTS_S)]
     if lasting:
         findings = tuple(found[key] for key in lasting if key in found)
         text = not_ok(replace(verdict, findings=findings)) or _named(keys[0])
@@ -238,12 +237,6 @@ def see_violations(run: Run, away: Collection[str]) -> None:
         name = _named(key)
         if key in lasting or len(judged.passed) < _MOST:
             judged.passed[name] = judged.passed.get(name, False) or key in lasting
-
-
-def counts_at_s(judged: Judged, now_s: float) -> float:
-    """Return when the next violation begins to count; NEVER_S if none would."""
-    ends_s = (since_s + LASTS_S for since_s in judged.violated.values())
-    return min((each for each in ends_s if each > now_s), default=NEVER_S)
 
 
 def passed(judged: Judged) -> str:

@@ -36,9 +36,9 @@ def _arrive(run: Run) -> list[Event]:
     if attempt is None or attempt.at_gate:
         return []
     change = run.change is not None and not run.change.taken
-    coming = run.held_s is None and any(each.due_s > run.now_s for each in run.nodes.values())
+    coming = run.held_s is None and not all(run.is_past(each.due_s) for each in run.nodes.values())
     if change or run.switch is not None or coming or not advance.is_at_gate(run):
-        return _late(run, failure.unfinished(run)) if run.now_s >= attempt.until_s else []
+        return _late(run, failure.unfinished(run)) if run.is_past(attempt.until_s) else []
     left_s = attempt.until_s - run.now_s
     fresh_s = run.options.timeout_s if run.held_s is not None else min(left_s, run.options.gate_s)
     if run.change is None:
@@ -55,11 +55,11 @@ def _arrive(run: Run) -> list[Event]:
 def _come(run: Run) -> list[Event]:
     """Say that all who came up are at the gate."""
     change = run.change is not None and not run.change.taken
-    coming = any(each.due_s > run.now_s or each.renew for each in run.nodes.values())
+    coming = any(not run.is_past(each.due_s) or each.renew for each in run.nodes.values())
     if not run.came or change or coming or not advance.is_at_gate(run):
         return []
     attempt = run.attempt
-    waited = attempt is not None and attempt.at_gate and run.now_s >= attempt.since_s + gate.SAY_S
+    waited = attempt is not None and attempt.at_gate and run.is_past(attempt.since_s + gate.SAY_S)
     if not waited and advance.is_awaited(run):
         return []
     run.came, run.again = False, run.held_s is not None
@@ -88,7 +88,7 @@ def _say_closed(run: Run) -> list[Event]:
     until_s = run.waits_s + run.options.timeout_s
     if run.said or verdict is None or judged.mark != run.mark:
         return []
-    if run.now_s < gate.refuses_at_s(run, until_s):
+    if not run.is_past(gate.refuses_at_s(run, until_s)):
         return []
     run.said = True
     return [Notice(message=gate.refusal(verdict))]
@@ -106,10 +106,10 @@ def _open(run: Run) -> list[Event]:
         else:
             run.attempt = None
         return [reached(run, "verified")]
-    if run.now_s >= gate.refuses_at_s(run, attempt.until_s):
+    if run.is_past(gate.refuses_at_s(run, attempt.until_s)):
         return _refused(run, again=False)
     # The verdict may allow it, and never be of a moment that lasts.
-    late = run.now_s >= attempt.until_s + gate.LEAST_S
+    late = run.is_past(attempt.until_s + gate.LEAST_S)
     return _late(run, "it changes all the time") if late else _say_waiting(run, attempt)
 
 
@@ -124,7 +124,7 @@ def _late(run: Run, why: str) -> list[Event]:
 
 def _say_waiting(run: Run, attempt: Attempt) -> list[Event]:
     verdict = run.judged.verdict
-    if attempt.said or run.now_s < attempt.since_s + gate.SAY_S or verdict is None:
+    if attempt.said or verdict is None or not run.is_past(attempt.since_s + gate.SAY_S):
         return []
     attempt.said = True
     if gate.allows(run):
@@ -171,9 +171,9 @@ def _go_on(run: Run) -> list[Event]:
             return []
         events = [] if passage.opened else _let_through(run, passage, verdict)
         return [*events, *(_passed(run) if done else [])]
-    if run.now_s >= gate.refuses_at_s(run, passage.until_s):
+    if run.is_past(gate.refuses_at_s(run, passage.until_s)):
         return _became_another(run) if done and passage.sent else _refused(run, again=True)
-    if run.now_s >= passage.late_s:
+    if run.is_past(passage.late_s):
         return failure.fail_late(run, run.options.timeout_s)
     return []
 
@@ -232,7 +232,7 @@ def _refused(run: Run, *, again: bool) -> list[Event]:
         stopping = CLOSED
         if again:
             stopping = "the system changed before every node was activated"
-        if attempt is not None and run.now_s >= attempt.until_s:
+        if attempt is not None and run.is_past(attempt.until_s):
             over = f"the {round(attempt.until_s, 1):g} s of the bring-up are over (--timeout)"
             stopping = f"{stopping}, and {over}"
         return failure.end_refused(run, verdict, stopping)

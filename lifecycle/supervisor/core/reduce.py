@@ -49,9 +49,9 @@ def take(run: Run, now_s: float, given: inputs.Input) -> list[Event]:
         now_s: of the input, on the run's clock, which begins at 0 and only goes forward.
         given: what happened.
     """
-    run.now_s = max(run.now_s, now_s)
+    run.now_s, run.wake_s = max(run.now_s, now_s), NEVER_S
     events = _HANDLERS[type(given)](run, given)
-    _see_time(run)
+    gate.see_violations(run, advance.away(run))
     quiet = 0
     while quiet < _PASSES:  # what moved without a word is looked at once more
         more = _settle(run)
@@ -370,16 +370,6 @@ _HANDLERS: dict[type, Callable[[Run, Any], list[Event]]] = {
 }
 
 
-# Time
-
-
-def _see_time(run: Run) -> None:
-    for process in run.processes.values():
-        if run.now_s >= advance.barks_at_s(process):
-            process.barks = True
-    gate.see_violations(run, advance.away(run))
-
-
 def _late(run: Run, node: Node, request: Request, where: str) -> list[Event]:
     goal = advance.goal_of(run, node)
     late = failure.too_late(run, node, request.limit_s, where)
@@ -397,7 +387,7 @@ def _late(run: Run, node: Node, request: Request, where: str) -> list[Event]:
 def _has_failed(run: Run) -> bool:
     """Return whether the run ends now: nothing is in a step, or a moment is over."""
     busy = any(each.request is not None for each in run.nodes.values())
-    return not busy or run.now_s >= run.fails_s
+    return not busy or run.is_past(run.fails_s)
 
 
 def _give_up_steps(run: Run) -> None:
@@ -440,19 +430,20 @@ def _hold(run: Run) -> list[Event]:
         if run.attempt is None and run.passage is None and not run.failures and run.furthest:
             run.held_s = run.now_s
         return []
-    hold_s = run.options.hold_s
-    if hold_s is None or run.now_s < run.held_s + hold_s or run.order is not None or run.failures:
+    judged, hold_s = run.judged, run.options.hold_s
+    over_s = NEVER_S if hold_s is None else run.held_s + hold_s
+    if not run.is_past(over_s) or run.order is not None or run.failures:
         return []
-    judged, over_s = run.judged, run.held_s + hold_s
     waits = judged.mark != run.mark and any(
         each.level is Level.ACTIVE for each in run.nodes.values()
     )
-    if run.now_s < over_s + advance.NOTICE_S and failure.only_elsewhere(run):
+    if failure.only_elsewhere(run) and not run.is_past(over_s + advance.NOTICE_S):
         return []  # who runs these may be about to say that it ends, too
     if run.options.until < Level.ACTIVE and not run.options.verifies:
         waits = not (gate.allows(run) and judged.mark == run.mark)
-    waits = waits and run.now_s < over_s + advance.GLANCE_S
-    return [] if waits else failure.end_done(run)
+    if waits and not run.is_past(over_s + advance.GLANCE_S):
+        return []
+    return failure.end_done(run)
 
 
 def _returned(run: Run) -> list[Event]:

@@ -95,7 +95,7 @@ class Request(msgspec.Struct, kw_only=True):
     """The one request to a node that is not answered yet.
 
     Attributes:
-        limit_s: that the manifest sets; `own_s` more for who keeps it itself and says why.
+        limit_s: that the manifest sets.
         waited_s: of the time since, without CPU: it does not count.
     """
 
@@ -103,7 +103,6 @@ class Request(msgspec.Struct, kw_only=True):
     step: Step
     since_s: float
     limit_s: float
-    own_s: float = 0.0
     waited_s: float = 0.0
 
 
@@ -491,6 +490,7 @@ class Run(msgspec.Struct, kw_only=True):
         fails_s: then it ends all the same.
         deaths: of processes that died while they were taken down, or that the run went on without.
         outbox: answers to orders that have not been sent.
+        wake_s: the next moment that something was asked about since the last input, see `is_past`.
     """
 
     options: Options
@@ -533,6 +533,7 @@ class Run(msgspec.Struct, kw_only=True):
     deaths: list[Failure] = []
     hurry: bool = False
     outbox: list[tuple[int, ExitCode, str]] = []
+    wake_s: float = NEVER_S
     trusted: str = ""
 
     @property
@@ -552,6 +553,16 @@ class Run(msgspec.Struct, kw_only=True):
         """Whether it was up and some of it is active: then all that changes is looked at."""
         active = any(each.level is Level.ACTIVE for each in self.nodes.values())
         return active and self.held_s is not None
+
+    def is_past(self, at_s: float) -> bool:
+        """Return whether a moment is over; one that is still to come wakes the run.
+
+        What is decided by time is decided by this: so it is decided again as soon as it may differ.
+        """
+        if self.now_s >= at_s:
+            return True
+        self.wake_s = min(self.wake_s, at_s)
+        return False
 
     def node_named(self, name: str) -> Node | None:
         """Return the node with this fully qualified name; None if it is not ours."""

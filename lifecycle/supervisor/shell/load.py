@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import msgspec
+from msgspec.structs import replace
 
+from lifecycle.supervisor.core.advance import late_at_s
 from lifecycle.supervisor.core.state import NEVER_S
 
 if TYPE_CHECKING:
@@ -79,8 +81,7 @@ class Load:
                 known.waited_s += min(max(delay_s - known.delay_s, 0.0), passed_s)
                 known.at_s, known.delay_s = now_s, delay_s
                 waited_s[key] = known.waited_s
-            waited = min(waited_s.get(key, 0.0), 9 * request.limit_s)
-            if now_s >= request.since_s + request.limit_s + request.own_s + waited:
+            if now_s >= late_at_s(replace(request, waited_s=waited_s.get(key, 0.0))):
                 where[key] = self._where(key)
         return waited_s, {key: text for key, text in where.items() if text}
 
