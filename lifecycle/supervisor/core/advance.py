@@ -183,15 +183,6 @@ def stage_of(run: Run) -> Stage:
     return Stage.ACTIVE if passed and not run.paused and _is_whole(run) else Stage.CONNECTED
 
 
-def away(run: Run) -> frozenset[str]:
-    """Return the full names of the nodes that are not as far as their manifest has them."""
-    return frozenset(
-        each.name
-        for each in run.nodes.values()
-        if each.level < each.levels[-1] or each.renew or not run.is_past(each.due_s)
-    )
-
-
 def advance(run: Run) -> list[effects.Effect]:
     """Return what is to be done now, and note it in the state."""
     found: list[effects.Effect] = [
@@ -432,11 +423,10 @@ def _gate(run: Run) -> Iterator[effects.Effect]:
     if run.ending is not None:
         return
     judged, passage = run.judged, run.passage
-    programs = passage is not None and not (passage.programmed or passage.programming)
+    programs = passage is not None and passage.flows is None
     if programs and gate.is_open(run) and passage and judged.verdict:
         run.requests += 1
-        passage.programming, passage.flows = True, judged.verdict.flows
-        passage.number = run.requests
+        passage.programming, passage.flows = run.requests, judged.verdict.flows
         yield effects.Program(verdict=judged.verdict, number=run.requests)
     # A loop that looks while its nodes are on their way would look at each step of each.
     due = judged.mark != run.mark or run.is_past(judged.again_s)

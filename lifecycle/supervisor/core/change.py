@@ -220,8 +220,7 @@ def _take(run: Run, change: Change) -> None:
     for key in change.touched & run.nodes.keys():
         process = run.processes.get(run.nodes[key].process)
         if process is not None and process.state is None:
-            process.by_hand, process.failed, process.away_s = True, False, None
-            process.stays_down = False
+            process.restarted_by_hand()
     change.taken, change.down = True, set()
     run.came = bool(change.touched)
     run.changed()
@@ -255,7 +254,7 @@ def _finish(run: Run, change: Change) -> list[Event]:
     run.change = None
     run.answer(change.code, text)
     if change.ends:
-        run.failures, run.fails_s = [*run.failures, *change.ends], run.now_s
+        run.fails_now(*change.ends)
     return events
 
 

@@ -8,7 +8,6 @@ from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import BY_DEFAULT, Consequence, OnViolation, Reaction, Restart
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.core import gate
-from lifecycle.supervisor.core.advance import away
 from lifecycle.supervisor.core.change import enter_mode
 from lifecycle.supervisor.core.failure import stop
 from lifecycle.supervisor.core.state import Level, Run
@@ -49,7 +48,7 @@ def settle_consequences(run: Run) -> list[Event]:
         return []
     if busy or run.options.until < Level.ACTIVE:
         return []
-    verdict = gate.of_those_there(run, gate.without(run, verdict, away(run)))
+    verdict = gate.of_those_there(run, gate.without(run, verdict, run.away))
     run.judged.tried &= {gate.key_of(each) for each in verdict.findings}
     coming = _coming_elsewhere(run, verdict.findings)
     asked: dict[gate.Key, tuple[Consequence, Finding, tuple[str, ...], str]] = {}

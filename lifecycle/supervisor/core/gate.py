@@ -14,14 +14,13 @@ from msgspec.structs import replace
 from lifecycle.errors import ExitCode
 from lifecycle.supervisor.core.inputs import Verified
 from lifecycle.supervisor.core.state import NEVER_S, Judged, Level, Node, Run
-from lifecycle.supervisor.run.events import Event, VerdictChanged
 from lifecycle.verify.judge import not_ok, with_findings, with_only
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import rule
 from lifecycle.verify.rules.catalogue import Heals
 from lifecycle.verify.rules.nodes import UNATTRIBUTED_ENDPOINT
 from lifecycle.verify.rules.state import ACTIVATED_AT_CLOSED_GATE, MISSING_REPORT
-from lifecycle.verify.verdict import Finding, Stage, Verdict
+from lifecycle.verify.verdict import Finding, Verdict
 
 SETTLED_S = 0.5
 """A finding that time does not heal counts once it is unchanged for so long."""
@@ -40,6 +39,8 @@ LASTS_S = 1.0
 
 SAY_S = 2.0
 """A gate that stays closed for so long says what it waits for, and until when."""
+
+BY_ITSELF = "was activated by its own code or another client while the gate is closed"
 
 ACTIVATES_ITSELF = (
     "leave its activation to the supervisor: remove trigger_activate or change_state from its "
@@ -132,31 +133,24 @@ def refuses_at_s(run: Run, until_s: float) -> float:
     return min(until_s, over_s) if lasts else until_s
 
 
-def take_verdict(run: Run, given: Verified, away: Collection[str], stage: Stage) -> list[Event]:
-    """Take the verdict of a look.
-
-    Args:
-        run: see above.
-        given: the result of the look.
-        away: full names of nodes that are not as far as they are to be: they violate nothing.
-        stage: that was looked at.
-    """
+def take_verdict(run: Run, given: Verified) -> Verdict | None:
+    """Take the verdict of a look; return it if it is another than the one before."""
     judged = run.judged
     guarded = tuple(_guarded(each) for each in run.nodes.values() if is_foreign_activation(each))
     verdict = with_findings(given.verdict, guarded, run.plan.policy)
     at_gate = run.attempt is not None and run.attempt.at_gate
     if run.held_s is not None and (run.attempt or run.change) and not at_gate:
-        verdict = without(run, verdict, away)  # they are away because it was ordered
+        verdict = without(run, verdict, run.away)  # they are away because it was ordered
     judged.looking = False
     judged.mark, judged.waits = given.mark, given.waits
     judged.seen_s = run.now_s
-    judged.again_s = NEVER_S if given.again_s is None else run.now_s + given.again_s
+    judged.again_s = run.now_s + given.again_s
     found = frozenset((each.rule, each.subject) for each in verdict.findings)
     if found != judged.found or judged.verdict is None:
         judged.found, judged.since_s = found, run.now_s
     is_new, judged.verdict = verdict != judged.verdict, verdict
-    see_violations(run, away)
-    return [VerdictChanged(stage=stage, verdict=verdict)] if is_new else []
+    see_violations(run)
+    return verdict if is_new else None
 
 
 def is_foreign_activation(node: Node) -> bool:
@@ -175,8 +169,7 @@ def _guarded(node: Node) -> Finding:
         node.planned,
         expected="inactive",
         observed="activated by its own code or another client",
-        message=f"cannot accept node {node.name}: it was activated by its own code or another "
-        f"client while the gate is closed; {what}",
+        message=f"cannot accept node {node.name}: it {BY_ITSELF}; {what}",
     )
 
 
@@ -211,7 +204,7 @@ def key_of(finding: Finding) -> Key:
     return finding.rule, finding.subject, finding.node, kind
 
 
-def see_violations(run: Run, away: Collection[str]) -> None:
+def see_violations(run: Run) -> None:
     """Note what is violated of the nodes that are to be as planned, and what of it counts.
 
     It is asked at each verdict and at each moment in which something begins to count.
@@ -222,7 +215,7 @@ def see_violations(run: Run, away: Collection[str]) -> None:
     if not run.is_watched or run.attempt is not None or run.change is not None:
         judged.violated = {}  # what an order brings about is judged at its gate
         return
-    verdict = of_those_there(run, without(run, judged.verdict, {*away, *run.left}))
+    verdict = of_those_there(run, without(run, judged.verdict, run.away | run.left))
     found = {key_of(each): each for each in verdict.findings if each.outcome is Outcome.VIOLATED}
     keys = [*found]
     if verdict.verdict is Outcome.VIOLATED and not found:

@@ -193,8 +193,7 @@ def _restart(run: Run, order: Order) -> None:
         each.renew = each.level > Level.DOWN or bool(each.process)
         process = run.processes.get(each.process)
         if process is not None:
-            process.by_hand, process.failed = True, False
-            process.away_s, process.stays_down = None, False
+            process.restarted_by_hand()
 
 
 def _gone_with(run: Run, keys: set[str]) -> set[str]:

@@ -147,14 +147,13 @@ def _begin(run: Run, keys: tuple[str, ...], until_s: float) -> None:
 def programmed(run: Run, given: Programmed) -> list[Event]:
     """Take it that networks are programmed: the gate opens for those that wait at it."""
     passage = run.passage
-    if passage is None or not passage.programming or passage.number != given.number:
+    if passage is None or passage.programming != given.number:
         return []  # that passage was given up
-    passage.programming = False
+    passage.programming = 0
     if given.error:
         run.passage = None
         found = Failure(rule=NOT_PROGRAMMED.id, subject=run.plan.system, message=given.error)
         return failure.fail(run, found)
-    passage.programmed = True
     return []
 
 
@@ -164,10 +163,10 @@ def _go_on(run: Run) -> list[Event]:
     assert verdict is not None
     nodes = [run.nodes[key] for key in passage.waiting if key in run.nodes]
     behind = [each for each in nodes if advance.wanted(run, each) is Level.ACTIVE]
-    done = passage.programmed and all(each.level is Level.ACTIVE for each in behind)
-    if gate.is_open(run) and passage.programmed:
+    done = passage.is_programmed and all(each.level is Level.ACTIVE for each in behind)
+    if gate.is_open(run) and passage.is_programmed:
         if not passage.sent and verdict.flows != passage.flows:
-            passage.programmed = False  # other flows are verified than were programmed
+            passage.flows = None  # other flows are verified than were programmed
             return []
         events = [] if passage.opened else _let_through(run, passage, verdict)
         return [*events, *(_passed(run) if done else [])]
@@ -218,6 +217,8 @@ def _withdraw(run: Run) -> list[Event]:
         node.let_through = False
     if passage is not None and passage.paused:
         run.paused = True
+    run.attempt = run.passage = None
+    run.again = False
     names = ", ".join(sorted(each.name for each in begun))
     return [Notice(message=f"the gate closed again: {names} is deactivated")] if begun else []
 
@@ -238,8 +239,6 @@ def _refused(run: Run, *, again: bool) -> list[Event]:
         return failure.end_refused(run, verdict, stopping)
     sent = () if run.passage is None else tuple(run.passage.sent)
     said = _withdraw(run)
-    run.attempt = run.passage = None
-    run.again = False
     change = run.change
     if change is not None and not change.back:
         return [*said, *go_back(run, text, code)]
@@ -265,7 +264,6 @@ def _became_another(run: Run) -> list[Event]:
     assert passage is not None
     if run.change is not None and not run.change.back:
         said = _withdraw(run)
-        run.attempt = run.passage = None
         return [*said, *go_back(run, gate.refusal(verdict), gate.exit_code(verdict))]
     if run.change is not None:
         run.attempt = run.passage = None

@@ -51,7 +51,7 @@ def take(run: Run, now_s: float, given: inputs.Input) -> list[Event]:
     """
     run.now_s, run.wake_s = max(run.now_s, now_s), NEVER_S
     events = _HANDLERS[type(given)](run, given)
-    gate.see_violations(run, advance.away(run))
+    gate.see_violations(run)
     quiet = 0
     while quiet < _PASSES:  # what moved without a word is looked at once more
         more = _settle(run)
@@ -224,9 +224,9 @@ def _step_failed(
 ) -> list[Event]:
     node.level = given.level
     is_up = step in _UPWARDS or (step is Step.DEACTIVATE and goal > Level.DOWN)
+    if not is_up:
+        node.level = node.after(step)  # the next step is tried all the same
     if not is_up or run.ending is not None:
-        if not is_up:
-            node.level = node.after(step)  # the next step is tried all the same
         return [Notice(message=given.error)]
     rules = {Step.START: START_FAILED, Step.WIRE: NOT_WIRED}
     what = rules.get(step, TRANSITION_FAILED)
@@ -252,6 +252,9 @@ def _saw(run: Run, given: inputs.Saw) -> list[Event]:
         if run.elsewhere.get(key) != conditions:
             run.elsewhere = {**run.elsewhere, key: conditions}
             run.changed()
+    if given.left is not None:
+        run.left = given.left
+        run.changed()
     return events
 
 
@@ -287,12 +290,14 @@ def _refused(run: Run, given: inputs.Refused) -> list[Event]:
 
 
 def _verified(run: Run, given: inputs.Verified) -> list[Event]:
-    events = gate.take_verdict(run, given, advance.away(run), advance.stage_of(run))
+    verdict, stage = gate.take_verdict(run, given), advance.stage_of(run)
     node = run.nodes.get(given.undiscovered)
     if node is not None and run.passage is None:
         for each in run.nodes_of(node.process):
             each.renew = True
-    return events
+    if verdict is None:
+        return []
+    return [VerdictChanged(stage=stage, verdict=verdict)]
 
 
 def _given(run: Run, given: inputs.Given) -> list[Event]:
@@ -329,18 +334,15 @@ def _stop(run: Run, given: inputs.Stop) -> list[Event]:
     return []
 
 
-def _left(run: Run, given: inputs.Left) -> list[Event]:
-    run.left = given.nodes
-    run.changed()
-    return []
-
-
 def _broken(run: Run, given: inputs.Broken) -> list[Event]:
     found = Failure(rule=given.rule, subject=given.subject, message=given.message)
     run.broken = run.broken or given.finds
     if run.ending is not None:
         return []
-    return failure.fail(run, found) if given.finds else failure.fail_for_good(run, found)
+    if given.finds:
+        return failure.fail(run, found)
+    run.fails_now(found)
+    return []
 
 
 def _changed(run: Run, _: inputs.Changed) -> list[Event]:
@@ -363,7 +365,6 @@ _HANDLERS: dict[type, Callable[[Run, Any], list[Event]]] = {
     inputs.Ordered: lambda run, given: orders.take_order(run, given.order),
     inputs.Stop: _stop,
     inputs.Silent: _silent,
-    inputs.Left: _left,
     inputs.Adopted: _adopted,
     inputs.Refused: _refused,
     inputs.Broken: _broken,

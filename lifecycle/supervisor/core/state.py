@@ -24,7 +24,7 @@ from lifecycle.supervisor.control.protocol import Failed, ProcessState, Question
 from lifecycle.supervisor.core.inputs import Exited
 from lifecycle.supervisor.core.restart import RestartPolicy
 from lifecycle.supervisor.run.events import Failure
-from lifecycle.verify.verdict import Verdict
+from lifecycle.verify.verdict import FlowReport, Verdict
 
 NEVER_S = float("inf")
 
@@ -255,6 +255,11 @@ class Process(msgspec.Struct, kw_only=True):
             self.policy.started(now_s, after_failure=self.failed)
         self.failed = self.by_hand = False
 
+    def restarted_by_hand(self) -> None:
+        """Note that a person starts it again: what failed before is forgotten."""
+        self.by_hand, self.failed = True, False
+        self.away_s, self.stays_down = None, False
+
     @property
     def is_alive(self) -> bool:
         """Whether it was started and has not ended."""
@@ -285,8 +290,8 @@ class Passage(msgspec.Struct, kw_only=True):
 
     Attributes:
         waiting: keys of the nodes; `sent`: of those that were sent their requests.
-        number: of the request that networks are programmed by.
-        programming: networks are being programmed with `flows`; `programmed`: they have them.
+        flows: that networks are to have; None until that is asked for.
+        programming: number of the request to program networks with them; 0 if none is open.
         opened: the gate is open for the nodes, as far as nothing changes.
         until_s: for so long what changes meanwhile may heal.
         late_s: then they must be active.
@@ -296,13 +301,16 @@ class Passage(msgspec.Struct, kw_only=True):
     waiting: tuple[str, ...]
     until_s: float
     late_s: float
-    flows: object = None
-    number: int = 0
+    flows: tuple[FlowReport, ...] | None = None
+    programming: int = 0
     paused: bool = False
     sent: set[str] = msgspec.field(default_factory=set)
-    programming: bool = False
-    programmed: bool = False
     opened: bool = False
+
+    @property
+    def is_programmed(self) -> bool:
+        """Whether networks have the flows."""
+        return self.flows is not None and not self.programming
 
 
 class Attempt(msgspec.Struct, kw_only=True):
@@ -549,6 +557,15 @@ class Run(msgspec.Struct, kw_only=True):
         )
 
     @property
+    def away(self) -> frozenset[str]:
+        """Full names of the nodes that are not as far as their manifest has them."""
+        return frozenset(
+            each.name
+            for each in self.nodes.values()
+            if each.level < each.levels[-1] or each.renew or not self.is_past(each.due_s)
+        )
+
+    @property
     def is_watched(self) -> bool:
         """Whether it was up and some of it is active: then all that changes is looked at."""
         active = any(each.level is Level.ACTIVE for each in self.nodes.values())
@@ -593,6 +610,10 @@ class Run(msgspec.Struct, kw_only=True):
             code, error = self.undone or (code, error)
             self.outbox = [*self.outbox, (self.order.id, code, error)]
         self.order, self.ready, self.undone = None, None, None
+
+    def fails_now(self, *failures: Failure) -> None:
+        """End at once for what failed, whatever is to be kept going."""
+        self.failures, self.fails_s = [*self.failures, *failures], self.now_s
 
     def whole(self, keys: Iterable[str], *, dependents: bool = False) -> tuple[str, ...]:
         """Return the keys with those of all that comes and goes with these nodes, in plan order.

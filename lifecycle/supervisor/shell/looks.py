@@ -164,11 +164,10 @@ class Looks:
             waits = True
             waits_s.append(ASK_AGAIN_AT_MOST_S)
         undiscovered = self._undiscovered(stage, found, now_s, waits_s)
-        again_s = min(waits_s)
         return inputs.Verified(
             mark=mark,
             verdict=verdict,
-            again_s=None if again_s == float("inf") else again_s,
+            again_s=min(waits_s),
             waits=waits,
             undiscovered=undiscovered,
         )

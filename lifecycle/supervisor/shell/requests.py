@@ -21,7 +21,7 @@ from lifecycle.manifest.model import RunKind
 from lifecycle.node.host.control import Command, Operation
 from lifecycle.plan.parameters import GIVEN
 from lifecycle.supervisor.core import effects, inputs
-from lifecycle.supervisor.core.gate import ACTIVATES_ITSELF, GUARD_TRIES
+from lifecycle.supervisor.core.gate import ACTIVATES_ITSELF, BY_ITSELF, GUARD_TRIES
 from lifecycle.supervisor.core.state import REACHES, Level, Step
 from lifecycle.supervisor.nodes.adoption import ran_before
 from lifecycle.supervisor.nodes.driver import (
@@ -50,18 +50,6 @@ _DEATH_S = 0.5
 
 _REOPENS_S = 1.0
 """What changes as others are activated is judged within milliseconds, on a loaded machine later."""
-
-BY_ITSELF = "was activated by its own code or another client while the gate is closed"
-
-_OPERATIONS = {
-    Step.CONFIGURE: Operation.CONFIGURE,
-    Step.CONNECT: Operation.CONNECT,
-    Step.ACTIVATE: Operation.ACTIVATE,
-    Step.DEACTIVATE: Operation.DEACTIVATE,
-    Step.DISCONNECT: Operation.DISCONNECT,
-    Step.CLEANUP: Operation.CLEANUP,
-    Step.SHUTDOWN: Operation.SHUTDOWN,
-}
 
 
 class Requests:
@@ -142,7 +130,7 @@ class Requests:
             if step is Step.ACTIVATE:
                 permit = functools.partial(self._permit, node.core.key)
                 await permit()
-            condition = await self._perform(node, _OPERATIONS[step], permit)
+            condition = await self._perform(node, Operation(step.value), permit)
         node.take(condition)
         if step is Step.CONFIGURE:
             await self._give_what_is_missing(node)
@@ -253,7 +241,7 @@ class Requests:
         reports = isinstance(node.driver, ControlDriver)  # others may have moved any other
         if reports and node.planned.managed and not _applies(step, node):
             return min(done, level_of(node))
-        condition = await self._perform(node, _OPERATIONS[step])
+        condition = await self._perform(node, Operation(step.value))
         node.take(condition)
         if step is Step.DEACTIVATE and not node.planned.managed:
             return Level.STARTED

@@ -297,7 +297,7 @@ class Supervisor:
             if run.is_over:
                 self._over.set()
         elif self.system.remote and (left := self._agreement.left()) != run.left:
-            self.give(inputs.Left(nodes=left))
+            self.give(inputs.Saw(left=left))
 
     def _answer(self, effect: effects.Answer) -> None:
         answer = self._answers[effect.order]
