@@ -104,7 +104,7 @@ class Uniqueness:
             self._unknown.add((entry.kind, entry.process))
             return
         for each in entry.judged:
-            if is_ip(each):
+            if is_ip(each.nfe):
                 owners = self._buckets.setdefault(_bucket(entry.kind, each), {})
                 if owners.setdefault(each, id(entry)) != id(entry):
                     owners[each] = _SEVERAL
@@ -128,7 +128,7 @@ class Uniqueness:
         if entry.judged is None:
             return None
         kind, me = entry.kind, id(entry)
-        own = [each for each in entry.judged if is_ip(each)]
+        own = [each for each in entry.judged if is_ip(each.nfe)]
         for each in own:
             owners = self._buckets[_bucket(kind, each)]
             if owners[each] == _SEVERAL or not all(

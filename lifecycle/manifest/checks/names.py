@@ -53,14 +53,13 @@ def _illegal_node(node: Node) -> Iterator[Diagnostic]:
 
 
 def _illegal_endpoints(system: DeclaredSystem) -> Iterator[Diagnostic]:
-    for each in system.unresolved:
-        node, endpoint = each.node, each.endpoint
+    for node, endpoint, unresolved in system.unresolved:
         noun = endpoint.kind.noun
         if problem := name_problem(endpoint.name):
             message = f"cannot use {endpoint.name!r} as the name of a {noun}: {problem}"
             yield error("check.name", endpoint.at, message)
         elif not node_name_problem(node.name) and not namespace_problem(node.namespace):
-            yield error("check.name", endpoint.at, each.problem.message, each.problem.hint)
+            yield error("check.name", endpoint.at, unresolved.message, unresolved.hint)
 
 
 def _duplicate_nodes(system: DeclaredSystem) -> Iterator[Diagnostic]:
@@ -237,3 +236,9 @@ def _rule_place(moved: Resolved) -> Position:
         if rule.match and _expanded(node, rule.match) == expanded:
             return _place(node, match)
     return moved.at
+
+
+CHECKS = (
+    check_names,
+    check_remaps,
+)

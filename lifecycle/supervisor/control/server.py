@@ -127,15 +127,14 @@ class ControlServer:
         self._changed = asyncio.Event()
 
     async def _answer(self, question: Order) -> Answer:
-        from lifecycle.supervisor.core.orders import FITS
-
+        if question.ask is ControlRequest.STATUS:
+            return Answer(status=self._session.status())
         if question.ask is ControlRequest.LOOK:
             return LookAnswer(look=self._session.look())
-        if question.ask in FITS:
-            return await self._session.order(question)
-        if question.ask is ControlRequest.DIFFERENCES and question.plan is not None:
-            return Answer(differences=self._session.differences(question.plan))
-        return Answer(status=self._session.status())
+        if question.ask is ControlRequest.DIFFERENCES:
+            plan = question.plan
+            return Answer(differences=() if plan is None else self._session.differences(plan))
+        return await self._session.order(question)
 
     async def _follow(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Send what is known now and after each change, until the client goes away."""

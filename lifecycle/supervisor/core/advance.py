@@ -295,12 +295,14 @@ def _ask(run: Run, node: Node, step: Step) -> effects.Ask:
         Step.SHUTDOWN: limits.shutdown_s,
     }.get(step, limits.cleanup_s)
     appears = step is Step.START and only_appears(node) and not node.planned.holds
+    theirs = step in _THEIRS or (step is Step.START and node.planned.run.component)
     run.requests += 1
     node.request = Request(
         number=run.requests,
         step=step,
         since_s=run.now_s,
         limit_s=NEVER_S if appears else limit_s,
+        own_s=OWN_S if theirs else 0.0,
     )
     if step is not Step.ACTIVATE:
         return effects.Ask(node=node.key, step=step, number=run.requests)
@@ -312,8 +314,8 @@ def _ask(run: Run, node: Node, step: Step) -> effects.Ask:
 
 def late_at_s(request: Request) -> float:
     """Return when a request is late: its process's time without a processor does not count."""
-    own_s = OWN_S if request.step in _THEIRS else 0.0
-    return request.since_s + request.limit_s + own_s + min(request.waited_s, 9 * request.limit_s)
+    waited_s = min(request.waited_s, 9 * request.limit_s)
+    return request.since_s + request.limit_s + request.own_s + waited_s
 
 
 # Processes

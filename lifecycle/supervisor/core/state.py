@@ -95,7 +95,7 @@ class Request(msgspec.Struct, kw_only=True):
     """The one request to a node that is not answered yet.
 
     Attributes:
-        limit_s: that the manifest sets.
+        limit_s: that the manifest sets; `own_s` more for who keeps it itself and says why.
         waited_s: of the time since, without CPU: it does not count.
     """
 
@@ -103,6 +103,7 @@ class Request(msgspec.Struct, kw_only=True):
     step: Step
     since_s: float
     limit_s: float
+    own_s: float = 0.0
     waited_s: float = 0.0
 
 
@@ -272,11 +273,11 @@ class Process(msgspec.Struct, kw_only=True):
 
 
 class Order(Question, kw_only=True, frozen=True):
-    """What a person, or a ROS client, has asked for.
+    """What a person, or a ROS client, has ordered.
 
     Attributes:
-        plan: of the manifest that it names, as it is now; None if it names none.
-        id: by which the supervisor answers it, once.
+        plan: of the manifest that an order names, as it is now; None if it names none.
+        id: by which it is answered, once.
         first: the manifest that it was checked against; None if that is of no account.
     """
 
@@ -580,6 +581,11 @@ class Run(msgspec.Struct, kw_only=True):
             return True
         self.wake_s = min(self.wake_s, at_s)
         return False
+
+    def mode_by(self, plan: Plan) -> str:
+        """Return the mode that it would be in by another manifest: the same, if that has it."""
+        names = [each.name for each in plan.modes]
+        return self.mode if self.mode in names else next(iter(names), "")
 
     def node_named(self, name: str) -> Node | None:
         """Return the node with this fully qualified name; None if it is not ours."""

@@ -478,7 +478,7 @@ def test_two_foreign_nodes_that_do_not_fit_are_none_of_our_business():
 def test_an_unverifiable_finding_blocks_only_where_the_policy_says_so():
     edit = change_report(SUB, STATUS, qos=None)
     for blocks in (False, True):
-        plan = with_policy(unverifiable_blocks=blocks)
+        plan = with_policy(unverifiable="block" if blocks else "allow")
         verdict = verify(plan, edit(perfect(plan)), stage=Stage.CONNECTED)
         assert (verdict.verdict, verdict.blocking) == (Outcome.UNVERIFIABLE, blocks)
 
@@ -492,7 +492,7 @@ def test_a_dscp_that_is_not_enforced_is_reported_and_never_blocks():
     marked = need(PUB, "a", dscp=46, enforce=False)
     plan = planned(
         node("one", publisher("a"), needs=[marked]),
-        policy=Policy(unverifiable_blocks=True),
+        policy=Policy(unverifiable="block"),
     )
     verdict = verify(plan, change_report(PUB, "/a", dscp=0)(perfect(plan)), stage=Stage.CONNECTED)
     assert len(verdict.findings) == 1
@@ -529,7 +529,7 @@ def test_all_flows_of_which_nothing_is_reported_are_one_finding():
 
 
 def test_what_a_manifest_trusts_is_reported_and_does_not_count():
-    plan = replace(foreign(), policy=Policy(trust=("flow.unreported",), unverifiable_blocks=True))
+    plan = replace(foreign(), policy=Policy(trust=("flow.unreported",), unverifiable="block"))
     verdict = verify(plan, perfect(plan), stage=Stage.CONNECTED)
     assert (verdict.verdict, verdict.blocking) == (Outcome.OK, False)
     assert [each.rule for each in verdict.findings] == ["flow.unreported"]
