@@ -203,7 +203,7 @@ def advance(run: Run) -> list[effects.Effect]:
     found += _gate(run)
     for node in run.nodes.values():
         if node.request is not None:  # if it is late now, only a tick says so
-            run.wake_s = min(run.wake_s, max(late_at_s(node.request), run.now_s))
+            run.wakes_at(late_at_s(node.request))
     if run.wake_s < NEVER_S:
         found.append(effects.Wake(at_s=run.wake_s))
     return found
@@ -376,6 +376,7 @@ def _end(run: Run, process: Process) -> Iterator[effects.Signal]:
     process.state = ProcessState.STOPPING
     number, wait_s = escalation[process.asked]
     process.asked_until_s = run.now_s + wait_s
+    run.wakes_at(process.asked_until_s)
     process.sent = [*process.sent, number]
     yield effects.Signal(process=process.name, number=number)
 

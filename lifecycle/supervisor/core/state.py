@@ -579,8 +579,12 @@ class Run(msgspec.Struct, kw_only=True):
         """
         if self.now_s >= at_s:
             return True
-        self.wake_s = min(self.wake_s, at_s)
+        self.wakes_at(at_s)
         return False
+
+    def wakes_at(self, at_s: float) -> None:
+        """Have a tick come then, or at once if that is over; before that anything else may."""
+        self.wake_s = min(self.wake_s, max(at_s, self.now_s))
 
     def mode_by(self, plan: Plan) -> str:
         """Return the mode that it would be in by another manifest: the same, if that has it."""

@@ -59,7 +59,7 @@ MUTANTS = [
     ("order", "advance.py", "    if holds_up(run, node, target):", "    if False:"),
     ("order", "advance.py", "    return not run.hurry and any(", "    return False and any("),
     ("ends", "advance.py", "process.asked = min(process.asked + 1, ", "process.asked = min(0, "),
-    ("ends", "state.py", "        self.wake_s = min(self.wake_s, at_s)\n", ""),
+    ("ends", "advance.py", "    run.wakes_at(process.asked_until_s)\n", ""),
     (
         "ends",
         "reduce.py",
