@@ -90,13 +90,11 @@ class Uniqueness:
         # Endpoints of one participant have the same NFEs, so each is kept once, with whose it is.
         self._buckets: dict[_Bucket, dict[LocatedNfe, int]] = {}
         self._unknown: set[tuple[EndpointKind, tuple[str, int]]] = set()
-        self._all: list[_Entry] = []
         for configuration in self._configurations:
             address = addresses.get(configuration.name, "")
             for report in configuration.endpoints:
                 if report.kind.is_topic and not report.error:
                     entry = self._entries[id(report)] = _entry(configuration, report, address)
-                    self._all.append(entry)
                     self._add(entry)
 
     def _add(self, entry: _Entry) -> None:

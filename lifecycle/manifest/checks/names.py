@@ -27,6 +27,7 @@ from lifecycle.manifest.names import (
     namespace_problem,
     node_name_problem,
     parse_rule,
+    remap_kind,
 )
 from lifecycle.manifest.yaml.document import error, note, warning
 
@@ -165,9 +166,9 @@ def _graph_names(node: Node) -> list[tuple[str, RemapKind]]:
     for endpoint in node.interface.endpoints:
         expanded = _expanded(node, endpoint.name)
         if endpoint.kind.is_action:
-            names += [(name, _remap_kind(hidden)) for name, hidden in hidden_names(expanded)]
+            names += [(name, remap_kind(hidden)) for name, hidden in hidden_names(expanded)]
         else:
-            names.append((expanded, _remap_kind(endpoint.kind)))
+            names.append((expanded, remap_kind(endpoint.kind)))
     return names
 
 
@@ -177,10 +178,6 @@ def _expanded(node: Node, name: str) -> str:
         return expand(name, node.name, node.namespace)
     except LifecycleError:
         return ""
-
-
-def _remap_kind(kind: EndpointKind) -> RemapKind:
-    return RemapKind.TOPIC if kind.is_topic else RemapKind.SERVICE
 
 
 def _never_matches(

@@ -19,7 +19,11 @@ from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import rule
 from lifecycle.verify.rules.catalogue import Heals
 from lifecycle.verify.rules.nodes import UNATTRIBUTED_ENDPOINT
-from lifecycle.verify.rules.state import ACTIVATED_AT_CLOSED_GATE, MISSING_REPORT
+from lifecycle.verify.rules.state import (
+    ACTIVATED_AT_CLOSED_GATE,
+    MISSING_REPORT,
+    WRONG_STATE,
+)
 from lifecycle.verify.verdict import Finding, Verdict
 
 SETTLED_S = 0.5
@@ -227,8 +231,11 @@ def see_violations(run: Run) -> None:
         text = not_ok(replace(verdict, findings=findings)) or _named(keys[0])
         judged.counted = judged.counted or text
     for key in keys:
-        name = _named(key)
-        if key in lasting or len(judged.passed) < _MOST:
+        # Endpoints are known before whose they are, and a look may have begun before who is active
+        # now was.
+        passes = key[0] != UNATTRIBUTED_ENDPOINT.id and (key[0] != WRONG_STATE.id or is_latest(run))
+        if key in lasting or (passes and len(judged.passed) < _MOST):
+            name = _named(key)
             judged.passed[name] = judged.passed.get(name, False) or key in lasting
 
 

@@ -31,7 +31,6 @@ from lifecycle.verify.view import (
     FlowView,
     SeenEndpoint,
     View,
-    actual_qos,
     brings_up,
 )
 
@@ -165,7 +164,7 @@ def _unknown_peers(view: View, topics: Mapping[str, _Ends]) -> Iterator[Finding]
         if not brings_up(actual.node, view.machines):
             continue
         publishers, subscriptions = topics.get(actual.planned.resolved, _NO_ENDS)
-        end = _end(actual)
+        end = actual.end
         publishes = end.kind is EndpointKind.PUBLISHER
         possible = len(_possible(end, subscriptions if publishes else publishers))
         other = EndpointKind.SUBSCRIPTION if publishes else EndpointKind.PUBLISHER
@@ -247,7 +246,7 @@ def _cause(flow: FlowView) -> str:
             return f"the {word} is missing"
     for publisher in flow.publishers:
         for subscription in flow.subscriptions:
-            if cause := obstacle(_end(publisher), _end(subscription)):
+            if cause := obstacle(publisher.end, subscription.end):
                 return cause
     return ""
 
@@ -255,7 +254,7 @@ def _cause(flow: FlowView) -> str:
 def _judge(flow: FlowView, ends: _Ends) -> Match:
     """Return the worst that is known of any of the flow's pairs, whose ends are all seen."""
     answers = [
-        match(_end(publisher), _end(subscription), *ends)
+        match(publisher.end, subscription.end, *ends)
         for publisher in flow.publishers
         for subscription in flow.subscriptions
     ]
@@ -298,19 +297,6 @@ def _possible(end: SeenEndpoint, others: Sequence[SeenEndpoint]) -> list[SeenEnd
         for other in others
         if not (obstacle(end, other) if publishes else obstacle(other, end))
     ]
-
-
-def _end(actual: Actual) -> SeenEndpoint:
-    """Return a declared end: as discovery shows it, else as its node says."""
-    shown, report = actual.observed, actual.report
-    return SeenEndpoint(
-        kind=actual.planned.kind,
-        node=actual.node.full_name,
-        name=actual.planned.resolved,
-        type=shown.type if shown else actual.planned.type,
-        qos=actual_qos(shown.qos if shown else None, report.qos if report else None),
-        report=report,
-    )
 
 
 UNMATCHED_CLIENT = Rule(

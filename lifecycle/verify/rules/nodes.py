@@ -8,9 +8,10 @@ policy names it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 from lifecycle.manifest.model import EndpointPolicy, RunKind
+from lifecycle.plan.model import PlannedProcess
 from lifecycle.verify.observation import ObservedEndpoint
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
@@ -56,13 +57,14 @@ RULES = (MISSING_NODE, ENDED_NODE, UNDECLARED_NODE, DUPLICATE_NODE)
 
 def check(view: View) -> Iterator[Finding]:
     """Judge node names."""
-    yield from _missing(view)
+    others = _other_names(view)
+    yield from _missing(view, others)
     yield from _duplicate(view)
     if view.plan.policy.undeclared_nodes is EndpointPolicy.DECLARED:
-        yield from _undeclared(view)
+        yield from _undeclared(view, others)
 
 
-def _missing(view: View) -> Iterator[Finding]:
+def _missing(view: View, others: Mapping[str, list[str]]) -> Iterator[Finding]:
     for name, node in view.planned.items():
         if name in view.observed:
             continue
@@ -81,6 +83,11 @@ def _missing(view: View) -> Iterator[Finding]:
             hint = f"look at the log of its container {node.run.container}"
         elif node.run.kind is RunKind.ATTACH:
             hint = "start it: the manifest attaches to it; compare domain, RMW and discovery range"
+        elif name in others:
+            hint = (
+                f"is it {' or '.join(others[name])}? its command chooses the name; a `name` in the"
+                " manifest is given to the command, or take the name that it has as the key"
+            )
         elif not brings_up(node, view.machines):
             machine = f" --machine {node.machine}" if node.machine else ""
             hint = f"its machine has a supervisor of its own: lifecycle up MANIFEST{machine}"
@@ -100,6 +107,34 @@ def _missing(view: View) -> Iterator[Finding]:
         )
 
 
+def _other_names(view: View) -> dict[str, list[str]]:
+    """Return what missing nodes may be called, where their names are their commands' to choose.
+
+    Those are the undeclared nodes of the namespace. What is given `__node:=` is renamed by rcl.
+    """
+    strangers: dict[str, list[str]] = {}
+    for name in view.observed:
+        if name not in view.planned:
+            strangers.setdefault(name.rpartition("/")[0], []).append(name)
+    if not strangers:
+        return {}
+    chooses = {each.name for each in view.plan.processes if each.argv and not _renames(each)}
+    return {
+        name: strangers[place][:_NAMED]
+        for name, node in view.planned.items()
+        if name not in view.observed
+        and node.process in chooses
+        and (place := name.rpartition("/")[0]) in strangers
+    }
+
+
+_NAMED = 3
+
+
+def _renames(process: PlannedProcess) -> bool:
+    return any(word.startswith("__node:=") for word in process.argv)
+
+
 def _duplicate(view: View) -> Iterator[Finding]:
     identities: dict[str, int] = {}
     for configuration in view.reported:
@@ -112,7 +147,15 @@ def _duplicate(view: View) -> Iterator[Finding]:
         # Before the gate one of them may have run before the supervisor did.
         started = node is not None and node.run.kind is not RunKind.ATTACH
         takes = started and view.stage is Stage.CONNECTED
-        hint = f"{DUPLICATE_NODE.fix}; have one that ran before adopted: lifecycle up --adopt"
+        hint = ""
+        process = node.process if node is not None else ""
+        if any(each.name == process and _renames(each) for each in view.plan.processes):
+            hint = (
+                f"`name` renames every node of process {process}: if they are in it, leave it out; "
+                "else stop the other one"
+            )
+        elif takes:
+            hint = f"{DUPLICATE_NODE.fix}; have one that ran before adopted: lifecycle up --adopt"
         yield DUPLICATE_NODE.finding(
             subject=name,
             expected="1 node of this name",
@@ -120,23 +163,28 @@ def _duplicate(view: View) -> Iterator[Finding]:
             message=f"cannot tell {count} nodes named {name} apart",
             at=node.at if node else None,
             node=name,
-            hint=hint if takes else "",
+            hint=hint,
         )
 
 
-def _undeclared(view: View) -> Iterator[Finding]:
+def _undeclared(view: View, others: Mapping[str, list[str]]) -> Iterator[Finding]:
     owned: dict[str, list[str]] = {}
     for endpoint in view.foreign:
         owned.setdefault(endpoint.node, []).append(f"{endpoint.kind.noun} of {endpoint.name}")
-    names = {name for name in view.observed if name not in view.planned} | set(owned)
-    for name in sorted(names):
+    undeclared = {name for name in view.observed if name not in view.planned} | set(owned)
+    for name in sorted(undeclared):
         endpoints = ", ".join(dict.fromkeys(owned.get(name, [])))
+        missing = [each for each, names in others.items() if name in names]
         yield UNDECLARED_NODE.finding(
             subject=name,
             expected="no such node",
             observed=f"node with {endpoints}" if endpoints else "node",
             message=f"cannot allow node {name}: the manifest does not declare it",
             node=name,
+            hint=f"if it is {' or '.join(missing)}, which is missing, write a `name` there; else"
+            f" {UNDECLARED_NODE.fix}"
+            if missing
+            else "",
         )
 
 

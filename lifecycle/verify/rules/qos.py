@@ -26,7 +26,6 @@ from lifecycle.verify.view import (
     NodeFacts,
     SeenEndpoint,
     View,
-    actual_qos,
 )
 
 QOS_DIFFERS = Rule(
@@ -84,10 +83,7 @@ def _against_declaration(actual: Actual, unknown: _Unknown) -> Iterator[Finding]
     planned, node = actual.planned, actual.node
     if planned.qos is None or _leaves_all(planned.qos):
         return
-    known = actual_qos(
-        actual.observed.qos if actual.observed else None,
-        actual.report.qos if actual.report else None,
-    )
+    known = actual.end.qos
     differing: list[tuple[str, str, str]] = []
     hidden: list[tuple[str, str]] = []
     for policy in _comparable(planned, planned.qos):

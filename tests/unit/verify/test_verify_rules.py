@@ -795,3 +795,25 @@ def test_an_open_system_tolerates_who_publishes_too_and_says_so():
 @pytest.mark.parametrize(("subject", "name"), [("/robot/camera", "/robot/camera"), ("host", "")])
 def test_a_subject_of_a_run_names_a_node_only_by_its_full_name(subject: str, name: str) -> None:
     assert node_of(subject) == name
+
+
+COMMAND = Run(kind=RunKind.COMMAND, command=("/bin/talker",))
+
+
+def test_a_command_that_has_another_name_is_looked_for_among_what_is_not_declared() -> None:
+    plan = planned(node("speaker", run=COMMAND, managed=False))
+    seen = Observation(nodes=(replace(perfect(plan).nodes[0], full_name="/talker"),))
+    missing, undeclared = verify(plan, seen, stage=Stage.ACTIVE).findings
+    assert (missing.rule, undeclared.rule) == ("graph.missing-node", "graph.undeclared-node")
+    assert missing.hint.startswith("is it /talker?")
+    assert undeclared.hint.startswith("if it is /speaker, which is missing, write a `name` there")
+
+
+def test_a_command_that_is_given_its_name_may_have_given_it_to_each_of_its_nodes() -> None:
+    plan = planned(node("talker", run=COMMAND, managed=False, positions={"name": at(4)}))
+    assert "__node:=talker" in plan.processes[0].argv
+    seen = change_node("/talker", count=2)(perfect(plan, Stage.ACTIVE))
+    (finding,) = verify(plan, seen, stage=Stage.ACTIVE).findings
+    assert finding.hint.startswith("`name` renames every node of process talker")
+    missing = verify(plan, add_node("/other")(Observation()), stage=Stage.ACTIVE).findings[0]
+    assert missing.hint.startswith("look at the node's process and its log; compare domain")
