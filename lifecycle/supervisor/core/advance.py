@@ -62,7 +62,7 @@ def wanted(run: Run, node: Node) -> Level:
         or node.renew
         or not run.is_past(node.due_s)
         or (process is not None and process.stays_down)
-        or (change is not None and not change.taken and node.key in change.down)
+        or (change is not None and node.key in change.down)
     ):
         return Level.DOWN
     top = node.levels[-1]
@@ -235,8 +235,7 @@ def _step_up(run: Run, node: Node) -> Step | None:
     if target is Level.ACTIVE:
         passage = run.passage
         passes = passage is not None and passage.opened and node.key in passage.waiting
-        change = run.change is not None and not run.change.taken
-        if not passes or change or run.switch is not None or not gate.is_open(run):
+        if not passes or run.is_changing or run.switch is not None or not gate.is_open(run):
             return None
     if target is Level.CONNECTED and run.options.wires and not node.wired:
         return Step.WIRE

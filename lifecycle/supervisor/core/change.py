@@ -42,7 +42,7 @@ def enter_mode(run: Run, mode: str, *, back: bool = False) -> list[Event]:
     """Have nodes be as a mode says: what it keeps inactive goes down first, without a gate."""
     active = frozenset(key for key, each in run.nodes.items() if each.is_gated)
     had = {key: each.planned.expected_parameters for key, each in run.nodes.items()}
-    run.switch = Switch(mode=mode, before=run.mode, active=active, back=back)
+    run.switch = Switch(before=run.mode, active=active, back=back)
     run.mode, run.plan = mode, in_mode(run.plan, mode)
     for key, node in run.nodes.items():
         node.planned = run.plan.node(key)
@@ -78,7 +78,7 @@ def settle_mode(run: Run) -> list[Event]:
     run.switch = None
     inactive = [each for each in run.plan.nodes if each.state is TargetState.INACTIVE]
     entered = ModeEntered(
-        mode=switch.mode,
+        mode=run.mode,
         before=switch.before,
         inactive=tuple(each.full_name for each in inactive if each.key in run.nodes),
         parameters=switch.given,

@@ -352,7 +352,7 @@ def end(
     """
     if run.ending is not None:
         return []
-    ending = run.ending = Ending(
+    run.ending = Ending(
         code=code,
         stopping=stopping,
         reason=_also(run, reason),
@@ -360,19 +360,16 @@ def end(
         failed=failed,
         deaths=len(run.deaths),
     )
-    change = run.change
+    change, run.undone = run.change, None
     run.attempt = run.passage = run.switch = run.change = None
-    open_ = [*([run.order] if run.order is not None else []), *run.orders]
     text = f"cannot go on: {run.plan.system!r} is being taken down"
-    said = "; ".join(each.message for each in ending.failures) or text
-    if change is not None and change.back and ending.failures:
+    said = "; ".join(each.message for each in failures) or text
+    if change is not None and change.back and failures:
         said = undone(run, change)
-    for order in open_:
-        own = order is run.order and bool(ending.failures)
-        run.outbox = [*run.outbox, (order.id, ExitCode.BRING_UP_FAILED, said if own else text)]
-    run.order, run.ready = None, None
+    run.answer(ExitCode.BRING_UP_FAILED, said)
+    run.outbox += [(each.id, ExitCode.BRING_UP_FAILED, text) for each in run.orders]
     run.orders.clear()
-    return [*ending.failures, Stopping(reason=ending.stopping)]
+    return [*failures, Stopping(reason=stopping)]
 
 
 def end_failed(run: Run) -> list[Event]:

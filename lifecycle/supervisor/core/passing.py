@@ -35,9 +35,8 @@ def _arrive(run: Run) -> list[Event]:
     attempt = run.attempt
     if attempt is None or attempt.at_gate:
         return []
-    change = run.change is not None and not run.change.taken
     coming = run.held_s is None and not all(run.is_past(each.due_s) for each in run.nodes.values())
-    if change or run.switch is not None or coming or not advance.is_at_gate(run):
+    if run.is_changing or run.switch is not None or coming or not advance.is_at_gate(run):
         return _late(run, failure.unfinished(run)) if run.is_past(attempt.until_s) else []
     left_s = attempt.until_s - run.now_s
     fresh_s = run.options.timeout_s if run.held_s is not None else min(left_s, run.options.gate_s)
@@ -54,9 +53,8 @@ def _arrive(run: Run) -> list[Event]:
 
 def _come(run: Run) -> list[Event]:
     """Say that all who came up are at the gate."""
-    change = run.change is not None and not run.change.taken
     coming = any(not run.is_past(each.due_s) or each.renew for each in run.nodes.values())
-    if not run.came or change or coming or not advance.is_at_gate(run):
+    if not run.came or run.is_changing or coming or not advance.is_at_gate(run):
         return []
     attempt = run.attempt
     waited = attempt is not None and attempt.at_gate and run.is_past(attempt.since_s + gate.SAY_S)

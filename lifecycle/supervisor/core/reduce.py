@@ -306,7 +306,7 @@ def _given(run: Run, given: inputs.Given) -> list[Event]:
     if switch is not None and given.node in switch.asked:
         switch.asked.discard(given.node)
         if given.error and not switch.back:
-            text = f"cannot enter mode {switch.mode!r}: {given.error}"
+            text = f"cannot enter mode {run.mode!r}: {given.error}"
             return leave_mode(run, switch.before, text, ExitCode.BRING_UP_FAILED)
     elif change is not None and given.node in change.giving:
         change.giving.discard(given.node)

@@ -348,12 +348,11 @@ class Switch(msgspec.Struct, kw_only=True):
 
     Attributes:
         active: keys of the nodes that were to be active before.
-        given: of those whose parameters are others in this mode.
+        given: names of those whose parameters are others in this mode.
         to_ask: keys of those that are to be given parameters; `asked`: that have not answered.
         back: the system goes back to the mode before.
     """
 
-    mode: str
     before: str
     active: frozenset[str]
     given: tuple[str, ...] = ()
@@ -565,6 +564,11 @@ class Run(msgspec.Struct, kw_only=True):
             for each in self.nodes.values()
             if each.level < each.levels[-1] or each.renew or not self.is_past(each.due_s)
         )
+
+    @property
+    def is_changing(self) -> bool:
+        """Whether a manifest is being changed to, or back to, and is not in force yet."""
+        return self.change is not None and not self.change.taken
 
     @property
     def is_watched(self) -> bool:
