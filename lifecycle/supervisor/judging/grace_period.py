@@ -10,6 +10,7 @@ from collections.abc import Iterator
 
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.plan.model import Plan
+from lifecycle.supervisor.core.gate import Key, key_of
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import rule
 from lifecycle.verify.rules.catalogue import About
@@ -24,7 +25,6 @@ PASSING_S = 1.0
 """Discovery shows a newcomer's endpoints before its name, measured 0.02–0.45 s earlier; what nodes
 have only just been asked for, or have just made in code, is seen 0.01–0.1 s later."""
 
-_Key = tuple[str, str, str, EndpointKind | None]
 _Place = tuple[object, ...]
 
 
@@ -40,7 +40,7 @@ class GracePeriod:
         self._plan: Plan | None = None
         self._demanded: dict[tuple[_Place, str], float] = {}
         self._latest: dict[_Place, float] = {}
-        self._unknown: dict[_Key, float] = {}
+        self._unknown: dict[Key, float] = {}
 
     def after(
         self, last: Verdict | None, verdict: Verdict, expected: Plan, now_s: float
@@ -56,9 +56,9 @@ class GracePeriod:
             now_s: on any clock that only goes forward.
         """
         self._note(verdict, expected, now_s)
-        before = set() if last is None else {_key(each) for each in last.findings}
-        worse = [each for each in verdict.findings if _key(each) not in before]
-        healed = before - {_key(each) for each in verdict.findings}
+        before = set() if last is None else {key_of(each) for each in last.findings}
+        worse = [each for each in verdict.findings if key_of(each) not in before]
+        healed = before - {key_of(each) for each in verdict.findings}
         if last is None or healed or not worse:
             return verdict, None
         left_s = [self._since(each) + PASSING_S - now_s for each in worse]
@@ -68,7 +68,7 @@ class GracePeriod:
 
     def _note(self, verdict: Verdict, expected: Plan, now_s: float) -> None:
         self._unknown = {
-            _key(each): self._unknown.get(_key(each), now_s)
+            key_of(each): self._unknown.get(key_of(each), now_s)
             for each in verdict.findings
             if _is_of_unknown_node(each)
         }
@@ -84,7 +84,7 @@ class GracePeriod:
     def _since(self, finding: Finding) -> float:
         """Return since when a finding may pass; -inf if it may not."""
         if _is_of_unknown_node(finding):
-            return self._unknown[_key(finding)]
+            return self._unknown[key_of(finding)]
         places: set[_Place] = {
             (finding.subject,),
             (finding.node, finding.endpoint, finding.subject),
@@ -108,10 +108,6 @@ def _is_of_unknown_node(finding: Finding) -> bool:
         return is_hidden_node(finding.node)
     # Who publishes the time begins to once it is active.
     return finding.rule in (UNATTRIBUTED_ENDPOINT.id, SILENT_CLOCK.id)
-
-
-def _key(finding: Finding) -> _Key:
-    return finding.rule, finding.subject, finding.node, finding.endpoint
 
 
 def _demands(plan: Plan) -> Iterator[tuple[_Place, str]]:

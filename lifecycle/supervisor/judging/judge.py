@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
-from lifecycle.manifest.model import EndpointKind
 from lifecycle.middleware.fastdds.profiles import DEFAULT_LEASE_S
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.connections import discovery_server
+from lifecycle.supervisor.core.gate import Key, key_of
 from lifecycle.supervisor.health.liveliness import NodeArrivals
 from lifecycle.supervisor.judging.standstill import Standstill
 from lifecycle.supervisor.processes.scope import unlimited
@@ -27,7 +27,7 @@ from lifecycle.verify.rules import rule
 from lifecycle.verify.rules.catalogue import About
 from lifecycle.verify.rules.health import UNHEALTHY
 from lifecycle.verify.rules.matching import UNKNOWN_PEER
-from lifecycle.verify.verdict import Finding, Stage, Verdict
+from lifecycle.verify.verdict import Stage, Verdict
 
 if TYPE_CHECKING:
     from lifecycle.graph.graph import Graph
@@ -45,8 +45,6 @@ default: a node of ours may be matched with it for so long before our participan
 HEALTH_S = 5.0
 """Who publishes its health does so within this time, or it counts as stale (graph/observer.py): a
 node that must be healthy, and has not said how it is, is waited for no longer."""
-
-_Key = tuple[str, str, str, EndpointKind | None]
 
 
 class Judge:
@@ -81,7 +79,7 @@ class Judge:
         self._unsaid: dict[str, float] = {}
         self._asked_of: tuple[Plan, frozenset[str], Plan] | None = None
         self._left: dict[str, float] = {}  # topics of processes that ended, and until when
-        self._unknown_peers: dict[_Key, float] = {}  # since when each is found
+        self._unknown_peers: dict[Key, float] = {}  # since when each is found
         self._again: asyncio.TimerHandle | None = None
 
     @property
@@ -154,7 +152,7 @@ class Judge:
         loop = asyncio.get_running_loop()
         now_s = loop.time()
         self._left = {topic: at for topic, at in self._left.items() if at > now_s}
-        found = {_key(each): each for each in verdict.findings if each.rule == UNKNOWN_PEER.id}
+        found = {key_of(each): each for each in verdict.findings if each.rule == UNKNOWN_PEER.id}
         self._unknown_peers = {key: self._unknown_peers.get(key, now_s) for key in found}
         until_s = {}
         for key, since_s in self._unknown_peers.items():
@@ -166,7 +164,7 @@ class Judge:
         if self._again is not None:
             self._again.cancel()
         self._again = loop.call_at(min(passing.values()), self._system.touch)
-        findings = tuple(each for each in verdict.findings if _key(each) not in passing)
+        findings = tuple(each for each in verdict.findings if key_of(each) not in passing)
         return with_only(verdict, findings, self._system.expected.policy)
 
     def unsaid_s(self, verdict: Verdict) -> float:
@@ -205,10 +203,6 @@ class Judge:
             )
             for each in verdict.findings
         )
-
-
-def _key(finding: Finding) -> _Key:
-    return finding.rule, finding.subject, finding.node, finding.endpoint
 
 
 def without(observation: Observation, dead: frozenset[str]) -> Observation:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import os
 import signal
 from collections import deque
 from collections.abc import Coroutine, Iterator
@@ -184,11 +183,7 @@ class Supervisor:
 
     def status(self) -> SystemStatus:
         """Return what is known now."""
-        run = self.system.run
-        ends = "" if run.ending is None else self._why(run.ending)
-        return system_status(
-            self.system, supervisor=os.getpid(), elapsed_s=self._emit.elapsed_s, ends=ends
-        )
+        return system_status(self.system)
 
     def look(self) -> SupervisorSnapshot:
         """Return all that is known now."""
@@ -438,11 +433,6 @@ class Supervisor:
                 )
         for node in self.system.nodes.values():
             node.say()
-
-    @staticmethod
-    def _why(ending: core.Ending) -> str:
-        said = "; ".join(each.message for each in ending.failures)
-        return said or ending.reason
 
     # What is done
 
