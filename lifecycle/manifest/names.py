@@ -443,6 +443,11 @@ def supervisor_alive_topic(system: str, machine: str) -> str:
     return f"/_lifecycle/{system.replace('-', '_')}/{machine}/alive"
 
 
+def node_alive_topic(full_name: str) -> str:
+    """Return the hidden topic on which a node without a supervisor asserts its liveliness."""
+    return f"{full_name}/_alive"
+
+
 def supervisor_services(access: RosInterfaceAccess, modes: Iterable[str] = ()) -> tuple[str, ...]:
     """Return the names, below its prefix, of the services that a supervisor offers.
 

@@ -15,7 +15,7 @@ import msgspec
 from msgspec.structs import replace
 
 from lifecycle.manifest.building import build_parameters
-from lifecycle.manifest.checks.parameters import ParameterFiles, is_implicit
+from lifecycle.manifest.checks.parameters import is_implicit
 from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.interface import Findings
 from lifecycle.manifest.model import (
@@ -26,6 +26,7 @@ from lifecycle.manifest.model import (
     RunKind,
     Supervision,
 )
+from lifecycle.manifest.parameter_files import ParameterFiles
 from lifecycle.manifest.yaml.document import Cursor, error, warning
 
 SIM_TIME = "use_sim_time"

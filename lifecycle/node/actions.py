@@ -22,7 +22,7 @@ from rclpy.node import Node
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.names import action_of, hidden_names
 from lifecycle.node.author.handlers import ActionHandler
-from lifecycle.node.lifecycle.execution import hint
+from lifecycle.node.lifecycle.steps import hint
 
 if TYPE_CHECKING:
     from rclpy.action.server import ServerGoalHandle

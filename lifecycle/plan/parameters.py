@@ -16,14 +16,13 @@ from typing import NamedTuple
 
 from lifecycle.manifest.checks.parameters import (
     CommandParameter,
-    ParameterFiles,
     command_line_parameters,
     given_value,
     misfit,
-    type_of,
 )
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import Mode, ModeParameter, Node, ParameterDeclaration, ParameterValue
+from lifecycle.manifest.parameter_files import ParameterFiles, type_of
 from lifecycle.plan.model import ExpectedParameter, ModeParameters
 
 GIVEN = "parameters"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from tests.outside.running import Run
@@ -38,7 +38,6 @@ class Case:
         says: what must be in the output, whatever its lines.
         not_says: what must not be in the output.
         within_s: the command ends within so many seconds.
-        before: how the installation before part 10 answered, in words; for the table only.
         quick: is in `make test`, too.
     """
 
@@ -57,7 +56,6 @@ class Case:
     says: tuple[str, ...] = ()
     not_says: tuple[str, ...] = ()
     within_s: float = 60.0
-    before: str = ""
     quick: bool = False
 
     @property
@@ -68,3 +66,6 @@ class Case:
 
 NOBODY: frozenset[str] = frozenset()
 """For `activated` and `received`."""
+
+REFUSED: Mapping[str, Any] = {"exit_code": 4, "verdict": VIOLATED, "activated": NOBODY}
+"""What a case expects whose gate must not open."""

@@ -39,7 +39,6 @@ from lifecycle.manifest.checks.nodes import (
     check_supervision,
 )
 from lifecycle.manifest.checks.parameters import (
-    ParameterFiles,
     check_mode_parameters,
     check_parameter_files,
     check_parameters,
@@ -50,6 +49,7 @@ from lifecycle.manifest.diagnostics import Diagnostic
 from lifecycle.manifest.flows import FlowNeeds
 from lifecycle.manifest.installed_types import search_prefixes
 from lifecycle.manifest.model import Manifest
+from lifecycle.manifest.parameter_files import ParameterFiles
 
 
 class Scope(msgspec.Struct, frozen=True, kw_only=True, dict=True):

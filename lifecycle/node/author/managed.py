@@ -9,6 +9,7 @@ that authors have every other attribute name to themselves.
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Callable, Collection
 from typing import TYPE_CHECKING, Any
 
@@ -32,18 +33,17 @@ from lifecycle.node.connections.connection_status import (
 )
 from lifecycle.node.connections.data_layer import NodeDataLayer, serve_interface
 from lifecycle.node.endpoints.mapping import wire_name
-from lifecycle.node.lifecycle.controller import Controller
-from lifecycle.node.lifecycle.execution import SUCCESS, Result
 from lifecycle.node.lifecycle.gate import NodeGate
 from lifecycle.node.lifecycle.health import HealthCheck
 from lifecycle.node.lifecycle.machine import (
-    CallbackOutcome,
+    Machine,
     NodeState,
     RefusedError,
     StateChange,
     TransitionRequest,
 )
 from lifecycle.node.lifecycle.services import LifecycleServices, Turns
+from lifecycle.node.lifecycle.steps import SUCCESS, CallbackOutcome, Result
 from lifecycle.plan.model import PlannedNode
 from lifecycle.verify.observation import NodeConfiguration
 
@@ -169,12 +169,12 @@ class Managed:
             notify=self.connection_events.notify,
         )
         self.declared = DeclaredInCode(node, spec, self.data_layer, lambda: self.state)
-        self._controller = Controller(self, spec.timeouts, self._changed)
+        self._machine = Machine(self, spec.timeouts)
         self._services: LifecycleServices | None = None
         if served:
             self._services = LifecycleServices(
                 node,
-                state_machine=self._controller.machine,
+                state_machine=self._machine,
                 change=self._change_by_service,
                 refuse=node.get_logger().warning,
                 group=self._turns.group,
@@ -197,7 +197,7 @@ class Managed:
     @property
     def state(self) -> NodeState:
         """The state, nested ones distinguished; `state.seen` is what other tools see."""
-        return self._controller.machine.state
+        return self._machine.state
 
     @property
     def interface(self) -> NodeDataLayer:
@@ -222,7 +222,7 @@ class Managed:
                 the node's supervisor is closed.
             LifecycleError: no such transition.
         """
-        return await self._change(_known(request))
+        return await self._machine.change(_known(request))
 
     async def change_for_supervisor(self, request: TransitionRequest | str) -> Result:
         """Run a transition that the supervisor asked for; its activate is the gate's permit.
@@ -240,14 +240,12 @@ class Managed:
             self._let_through = False
             if self.state is NodeState.INACTIVE_CONNECTED:
                 return SUCCESS
-        if (
-            self._supervisor
-            and known is TransitionRequest.ACTIVATE
-            and self.state is not NodeState.ACTIVE
-        ):
+        if known is not TransitionRequest.ACTIVATE:
+            return await self._machine.change(known)
+        if self._supervisor and self.state is not NodeState.ACTIVE:
             self._let_through = False  # an earlier permit does not outlast one that fails
-        result = await self._controller.change(known)
-        if known is TransitionRequest.ACTIVATE and result.outcome is CallbackOutcome.SUCCESS:
+        result = await self._machine.change(known, permitted=True)
+        if result.outcome is CallbackOutcome.SUCCESS:
             self._let_through = True
         return result
 
@@ -255,7 +253,7 @@ class Managed:
         """Configure, connect and activate; stops at the first that does not succeed."""
         result = SUCCESS
         for request in BRING_UP:
-            result = await self._change(request)
+            result = await self._machine.change(request)
             if result.outcome is not CallbackOutcome.SUCCESS:
                 break
         return result
@@ -285,7 +283,7 @@ class Managed:
 
     async def shut_down(self, reason: str) -> Result:
         """Bring the node to finalized from any state; a running async callback is cancelled."""
-        return await self._controller.shut_down(reason)
+        return await self._machine.shut_down(reason)
 
     @property
     def is_marked(self) -> bool:
@@ -310,7 +308,21 @@ class Managed:
             health=self._health.report,
         )
 
-    # What the controller asks for.
+    # What the rows of the machine's table run.
+
+    def may_activate(self) -> bool:
+        """Return True.
+
+        Raises:
+            RefusedError: the gate of its supervisor is closed.
+        """
+        if self._machine.is_permitted or self._let_through:
+            return True
+        raise RefusedError(
+            f"cannot activate {self.full_name}: the gate of its supervisor is closed",
+            hint=f"it is activated once {self._supervisor!r} is verified; a paused system: "
+            f"lifecycle resume {self._supervisor}",
+        )
 
     def prepare(self) -> None:
         """Declare parameters and endpoints, and make the timers of `@on_timer` methods."""
@@ -331,9 +343,32 @@ class Managed:
         """Make every endpoint or none."""
         self.data_layer.make(self.spec)
 
+    def undo_data_layer(self) -> None:
+        """Undo `make_data_layer`, if it has made them."""
+        if self.data_layer.is_made:
+            self.data_layer.remove()
+
     def remove_data_layer(self) -> None:
         """Remove every endpoint."""
         self.data_layer.remove()
+
+    def open_gate(self) -> None:
+        """Let data flow."""
+        self.gate.open()
+
+    def close_gate(self) -> None:
+        """Stop data; goals end."""
+        self.gate.close()
+
+    def take_down(self) -> None:
+        """Remove and undo everything; what of it fails is logged, for the node has to end."""
+        for step in (self.close_gate, self.remove_data_layer, self.unprepare):
+            try:
+                step()
+            except Exception:  # noqa: BLE001, PERF203 - a fault of ours
+                self._node.get_logger().error(traceback.format_exc())
+
+    # What the machine needs for the author's callbacks.
 
     def callback(self, name: str) -> Callable[..., Any]:
         """Return the author's `on_…` method."""
@@ -380,29 +415,16 @@ class Managed:
         else:
             self._reporter.report(checksum=now.checksum)
 
-    async def _change(self, request: TransitionRequest) -> Result:
-        if request is TransitionRequest.ACTIVATE and not self._let_through:
-            raise RefusedError(
-                f"cannot activate {self.full_name}: the gate of its supervisor is closed",
-                hint=f"it is activated once {self._supervisor!r} is verified; a paused system: "
-                f"lifecycle resume {self._supervisor}",
-            )
-        return await self._controller.change(request)
-
     async def _change_by_service(self, request: TransitionRequest) -> bool:
         try:
-            result = await self._change(request)
+            result = await self._machine.change(request)
         except RefusedError as refused:
             self._node.get_logger().warning(str(refused))
             return False
         return result.outcome is CallbackOutcome.SUCCESS
 
-    def _changed(self, change: StateChange) -> None:
-        """Follow a change of the machine: the gate first, then notify the others."""
-        if change.goal is NodeState.ACTIVE:
-            self.gate.open()
-        elif change.start is NodeState.ACTIVE:
-            self.gate.close()
+    def changed(self, change: StateChange) -> None:
+        """Notify others of a change of the state."""
         if self._supervisor and change.goal in _WITHOUT_DATA_LAYER:
             self._let_through = False
         if change.event is not None and self._services is not None:

@@ -90,6 +90,7 @@ class NodeDataLayer:
         endpoints: what is declared.
         connections: what endpoints may be mapped onto.
         status: which of them have peers.
+        is_made: connect has made all of it.
     """
 
     def __init__(
@@ -107,7 +108,7 @@ class NodeDataLayer:
         self._changed = changed
         self._maker = Maker(node, gate, turns)
         self._spec: PlannedNode | None = None  # before anything is declared
-        self._is_made = False
+        self.is_made = False
         self.endpoints = EndpointTable(node, gate, changed)
         self.connections = Connections(node)
         self.status = ConnectionStatus(self.connections, self.endpoints.mappings, notify)
@@ -156,7 +157,7 @@ class NodeDataLayer:
             LifecycleError: declared already, its type is not installed, or it cannot be made.
         """
         mapping = self.endpoints.add(endpoint, handler)
-        if not self._is_made or self._is_mapped_by_others:
+        if not self.is_made or self._is_mapped_by_others:
             return
         try:
             self._mapper.map(mapping, self._default(endpoint))
@@ -189,7 +190,7 @@ class NodeDataLayer:
         else:
             self._map_all(spec)
             self._changed()
-        self._is_made = True
+        self.is_made = True
 
     def remove(self) -> None:
         """Remove every endpoint and every connection but the node's own participant."""
@@ -200,7 +201,7 @@ class NodeDataLayer:
         for connection in reversed(self.connections.named):
             self._close(connection)
         self.connections.close_all()
-        self._is_made = False
+        self.is_made = False
         self._changed()
 
     @property

@@ -21,7 +21,7 @@ from lifecycle.middleware.fastdds.nfe import create_publisher, create_subscripti
 from lifecycle.middleware.rcl.qos import to_rclpy
 from lifecycle.node.actions import Goals, resolve_action_name
 from lifecycle.node.endpoints.mapping import Mapping, wire_name
-from lifecycle.node.lifecycle.execution import positional_count
+from lifecycle.node.lifecycle.steps import positional_count
 from lifecycle.plan.model import PlannedEndpoint
 
 if TYPE_CHECKING:

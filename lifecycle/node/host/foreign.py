@@ -52,9 +52,9 @@ from lifecycle.node.configuration import ConfigurationChanges
 from lifecycle.node.connections.connections import Connection, Connections
 from lifecycle.node.connections.data_layer import NodeDataLayer, serve_interface
 from lifecycle.node.endpoints.mapping import MatchWatch
-from lifecycle.node.lifecycle.execution import SUCCESS, Result
 from lifecycle.node.lifecycle.gate import GatedPublisher, NodeGate
-from lifecycle.node.lifecycle.machine import CallbackOutcome, RefusedError
+from lifecycle.node.lifecycle.machine import RefusedError
+from lifecycle.node.lifecycle.steps import SUCCESS, CallbackOutcome, Result
 from lifecycle.plan.model import PlannedEndpoint, PlannedNode
 from lifecycle.verify.observation import NodeConfiguration
 

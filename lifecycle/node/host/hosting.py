@@ -46,7 +46,7 @@ from lifecycle.node.host.control import (
 )
 from lifecycle.node.host.foreign import Adoption, ForeignNode, Hosted, refuse_unmanaged
 from lifecycle.node.host.loop import Heartbeat, NodeLoop, Watchdog, on_signal
-from lifecycle.node.lifecycle.machine import CallbackOutcome
+from lifecycle.node.lifecycle.steps import CallbackOutcome
 from lifecycle.plan.model import PlannedNode
 from lifecycle.verify.observation import NodeConfiguration
 

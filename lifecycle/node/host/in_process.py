@@ -30,8 +30,7 @@ from lifecycle.middleware.rcl.rclpy_nodes import Watching, follow_nodes
 from lifecycle.node.author.spec import Mode
 from lifecycle.node.host.foreign import Adoption, ForeignNode, Hosted
 from lifecycle.node.host.hosting import maker_of
-from lifecycle.node.lifecycle.execution import Result
-from lifecycle.node.lifecycle.machine import CallbackOutcome
+from lifecycle.node.lifecycle.steps import CallbackOutcome, Result
 from lifecycle.plan.model import PlannedNode
 
 WAIT_S = 10.0

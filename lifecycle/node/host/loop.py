@@ -47,7 +47,7 @@ from lifecycle.middleware.rcl.executor import NodeExecutor, described
 from lifecycle.middleware.rcl.hidden_node import hidden_nodes, republish_names
 from lifecycle.middleware.rcl.rclpy_nodes import Watching
 from lifecycle.node.author.node import LifecycleNode
-from lifecycle.node.lifecycle.execution import hint
+from lifecycle.node.lifecycle.steps import hint
 
 if TYPE_CHECKING:
     from lifecycle.node.host.foreign import Hosted

@@ -1,8 +1,9 @@
-"""The one state machine of a node: rcl_lifecycle's states, with connect nested inside inactive.
+"""The state machine of a node: one table of states and transitions, and what runs in each.
 
 Owns: states, transitions, their ids and labels (lifecycle_msgs/State, lifecycle_msgs/Transition,
-rcl_lifecycle's default_state_machine.c), what is allowed when, and the `transitions` machine
-behind typed methods. Pure: knows no rclpy, runs no callback, keeps no time.
+rcl_lifecycle's default_state_machine.c), with connect nested inside inactive; and `Machine`, which
+holds a node's state and runs its steps: whatever happens to a node happens in a row of `TABLE`, or
+in the author's callback between two of them. Knows no rclpy.
 
 A transition has two halves, as in rcl: a *request* moves a primary state into a transition state
 (`unconfigured` → `configuring`), and the callback's *outcome* moves it on. The data layer
@@ -12,12 +13,19 @@ A transition has two halves, as in rcl: a *request* moves a primary state into a
 from __future__ import annotations
 
 import enum
-from collections.abc import Callable
+import functools
+import threading
+import traceback
+from collections.abc import Callable, Generator, Iterable
+from typing import Any
 
 import msgspec
 import transitions
 
 from lifecycle.errors import LifecycleError
+from lifecycle.manifest.model import Timeouts
+from lifecycle.node.lifecycle import steps
+from lifecycle.node.lifecycle.steps import SUCCESS, CallbackOutcome, Interruptible, Result
 
 
 class State(msgspec.Struct, frozen=True, kw_only=True):
@@ -112,14 +120,6 @@ _STEADY = frozenset(
 )
 
 
-class CallbackOutcome(enum.Enum):
-    """The outcome of a transition callback; values are rcl_lifecycle's transition labels."""
-
-    SUCCESS = "transition_success"
-    FAILURE = "transition_failure"
-    ERROR = "transition_error"
-
-
 class TransitionRequest(enum.Enum):
     """What may be asked of a node; values are the labels that other tools use."""
 
@@ -141,90 +141,121 @@ class Transition(msgspec.Struct, frozen=True, kw_only=True):
     goal: State
 
 
-def _edges() -> tuple[Transition, ...]:
-    """Return rcl_lifecycle's transition map in its order, then connect and disconnect."""
-    ok, failure, error = (outcome.value for outcome in CallbackOutcome)
-    rows: tuple[tuple[int, str, State, State], ...] = (
-        (1, "configure", UNCONFIGURED, CONFIGURING),
-        (10, ok, CONFIGURING, INACTIVE),
-        (11, failure, CONFIGURING, UNCONFIGURED),
-        (12, error, CONFIGURING, ERRORPROCESSING),
-        (2, "cleanup", INACTIVE, CLEANINGUP),
-        (20, ok, CLEANINGUP, UNCONFIGURED),
-        (21, failure, CLEANINGUP, INACTIVE),
-        (22, error, CLEANINGUP, ERRORPROCESSING),
-        (3, "activate", INACTIVE, ACTIVATING),
-        (30, ok, ACTIVATING, ACTIVE),
-        (31, failure, ACTIVATING, INACTIVE),
-        (32, error, ACTIVATING, ERRORPROCESSING),
-        (4, "deactivate", ACTIVE, DEACTIVATING),
-        (40, ok, DEACTIVATING, INACTIVE),
-        (41, failure, DEACTIVATING, ACTIVE),
-        (42, error, DEACTIVATING, ERRORPROCESSING),
-        (5, "shutdown", UNCONFIGURED, SHUTTINGDOWN),
-        (6, "shutdown", INACTIVE, SHUTTINGDOWN),
-        (7, "shutdown", ACTIVE, SHUTTINGDOWN),
-        (50, ok, SHUTTINGDOWN, FINALIZED),
-        (51, failure, SHUTTINGDOWN, FINALIZED),
-        (52, error, SHUTTINGDOWN, ERRORPROCESSING),
-        (60, ok, ERRORPROCESSING, UNCONFIGURED),
-        (61, failure, ERRORPROCESSING, FINALIZED),
-        (62, error, ERRORPROCESSING, FINALIZED),
-        # Ours: seen from outside the node stays inactive. The ids are free in lifecycle_msgs.
-        (120, "connect", INACTIVE, INACTIVE),
-        (121, "disconnect", INACTIVE, INACTIVE),
-    )
-    return tuple(Transition(id=i, label=label, start=s, goal=g) for i, label, s, g in rows)
+class Row(msgspec.Struct, frozen=True):
+    """One line of the table.
 
+    Attributes:
+        id: of the edge that other tools see; 0 where they see none.
+        trigger: a request or an outcome.
+        condition: method of the node that must be true, or raises RefusedError.
+        before: method of the node that is called before the state changes.
+        after: method of the node that is called once it has changed.
+    """
 
-TRANSITION_GRAPH = _edges()
-"""In the order in which rcl_lifecycle answers get_transition_graph; connect and disconnect last."""
+    id: int
+    trigger: str
+    source: NodeState
+    goal: NodeState
+    condition: str = ""
+    before: str = ""
+    after: str = ""
+
 
 _S = NodeState
-_REQUESTS: tuple[tuple[TransitionRequest, NodeState, NodeState], ...] = (
-    (TransitionRequest.CONFIGURE, _S.UNCONFIGURED, _S.CONFIGURING),
-    (TransitionRequest.CONNECT, _S.INACTIVE_DISCONNECTED, _S.CONNECTING),
-    (TransitionRequest.DISCONNECT, _S.INACTIVE_CONNECTED, _S.DISCONNECTING),
-    (TransitionRequest.ACTIVATE, _S.INACTIVE_DISCONNECTED, _S.ACTIVATING_DISCONNECTED),
-    (TransitionRequest.ACTIVATE, _S.INACTIVE_CONNECTED, _S.ACTIVATING_CONNECTED),
-    (TransitionRequest.DEACTIVATE, _S.ACTIVE, _S.DEACTIVATING),
-    (TransitionRequest.CLEANUP, _S.INACTIVE_DISCONNECTED, _S.CLEANINGUP_DISCONNECTED),
-    (TransitionRequest.CLEANUP, _S.INACTIVE_CONNECTED, _S.CLEANINGUP_CONNECTED),
-    (TransitionRequest.SHUTDOWN, _S.UNCONFIGURED, _S.SHUTTINGDOWN),
-    (TransitionRequest.SHUTDOWN, _S.INACTIVE_DISCONNECTED, _S.SHUTTINGDOWN),
-    (TransitionRequest.SHUTDOWN, _S.INACTIVE_CONNECTED, _S.SHUTTINGDOWN),
-    (TransitionRequest.SHUTDOWN, _S.ACTIVE, _S.SHUTTINGDOWN),
-)
-_OUTCOMES: tuple[tuple[NodeState, NodeState, NodeState, NodeState], ...] = (
-    # in this state, goes on SUCCESS to, on FAILURE to, on ERROR to
-    (_S.CONFIGURING, _S.INACTIVE_DISCONNECTED, _S.UNCONFIGURED, _S.ERRORPROCESSING),
-    (_S.CONNECTING, _S.INACTIVE_CONNECTED, _S.INACTIVE_DISCONNECTED, _S.ERRORPROCESSING),
-    (_S.DISCONNECTING, _S.INACTIVE_DISCONNECTED, _S.INACTIVE_CONNECTED, _S.ERRORPROCESSING),
-    # SUCCESS while still disconnected has only made the data layer: the callback is yet to run.
-    (
+_OK, _FAILURE, _ERROR = (outcome.value for outcome in CallbackOutcome)
+
+TABLE = (
+    Row(1, "configure", _S.UNCONFIGURED, _S.CONFIGURING, after="prepare"),
+    Row(10, _OK, _S.CONFIGURING, _S.INACTIVE_DISCONNECTED),
+    Row(11, _FAILURE, _S.CONFIGURING, _S.UNCONFIGURED, before="unprepare"),
+    Row(12, _ERROR, _S.CONFIGURING, _S.ERRORPROCESSING),
+    Row(2, "cleanup", _S.INACTIVE_CONNECTED, _S.CLEANINGUP_CONNECTED),
+    Row(0, _OK, _S.CLEANINGUP_CONNECTED, _S.CLEANINGUP_DISCONNECTED, before="remove_data_layer"),
+    Row(2, "cleanup", _S.INACTIVE_DISCONNECTED, _S.CLEANINGUP_DISCONNECTED),
+    Row(20, _OK, _S.CLEANINGUP_DISCONNECTED, _S.UNCONFIGURED, before="unprepare"),
+    Row(21, _FAILURE, _S.CLEANINGUP_CONNECTED, _S.INACTIVE_CONNECTED),
+    Row(21, _FAILURE, _S.CLEANINGUP_DISCONNECTED, _S.INACTIVE_DISCONNECTED),
+    Row(22, _ERROR, _S.CLEANINGUP_CONNECTED, _S.ERRORPROCESSING),
+    Row(22, _ERROR, _S.CLEANINGUP_DISCONNECTED, _S.ERRORPROCESSING),
+    Row(
+        3,
+        "activate",
+        _S.INACTIVE_DISCONNECTED,
         _S.ACTIVATING_DISCONNECTED,
-        _S.ACTIVATING_CONNECTED,
-        _S.INACTIVE_DISCONNECTED,
-        _S.ERRORPROCESSING,
+        condition="may_activate",
+        after="make_data_layer",
     ),
-    (_S.ACTIVATING_CONNECTED, _S.ACTIVE, _S.INACTIVE_CONNECTED, _S.ERRORPROCESSING),
-    (_S.DEACTIVATING, _S.INACTIVE_CONNECTED, _S.ACTIVE, _S.ERRORPROCESSING),
-    # SUCCESS while still connected has only taken the data layer away, likewise.
-    (
-        _S.CLEANINGUP_CONNECTED,
-        _S.CLEANINGUP_DISCONNECTED,
+    Row(0, _OK, _S.ACTIVATING_DISCONNECTED, _S.ACTIVATING_CONNECTED),
+    Row(
+        3,
+        "activate",
         _S.INACTIVE_CONNECTED,
-        _S.ERRORPROCESSING,
+        _S.ACTIVATING_CONNECTED,
+        condition="may_activate",
     ),
-    (
-        _S.CLEANINGUP_DISCONNECTED,
-        _S.UNCONFIGURED,
+    Row(30, _OK, _S.ACTIVATING_CONNECTED, _S.ACTIVE, before="open_gate"),
+    Row(
+        31,
+        _FAILURE,
+        _S.ACTIVATING_DISCONNECTED,
         _S.INACTIVE_DISCONNECTED,
-        _S.ERRORPROCESSING,
+        before="undo_data_layer",
     ),
-    (_S.SHUTTINGDOWN, _S.FINALIZED, _S.FINALIZED, _S.ERRORPROCESSING),
-    (_S.ERRORPROCESSING, _S.UNCONFIGURED, _S.FINALIZED, _S.FINALIZED),
+    Row(31, _FAILURE, _S.ACTIVATING_CONNECTED, _S.INACTIVE_CONNECTED),
+    Row(32, _ERROR, _S.ACTIVATING_DISCONNECTED, _S.ERRORPROCESSING),
+    Row(32, _ERROR, _S.ACTIVATING_CONNECTED, _S.ERRORPROCESSING),
+    Row(4, "deactivate", _S.ACTIVE, _S.DEACTIVATING, before="close_gate"),
+    Row(40, _OK, _S.DEACTIVATING, _S.INACTIVE_CONNECTED),
+    Row(41, _FAILURE, _S.DEACTIVATING, _S.ACTIVE, before="open_gate"),
+    Row(42, _ERROR, _S.DEACTIVATING, _S.ERRORPROCESSING),
+    Row(5, "shutdown", _S.UNCONFIGURED, _S.SHUTTINGDOWN),
+    Row(6, "shutdown", _S.INACTIVE_DISCONNECTED, _S.SHUTTINGDOWN),
+    Row(6, "shutdown", _S.INACTIVE_CONNECTED, _S.SHUTTINGDOWN),
+    Row(7, "shutdown", _S.ACTIVE, _S.SHUTTINGDOWN, before="close_gate"),
+    Row(50, _OK, _S.SHUTTINGDOWN, _S.FINALIZED, before="take_down"),
+    Row(51, _FAILURE, _S.SHUTTINGDOWN, _S.FINALIZED, before="take_down"),
+    Row(52, _ERROR, _S.SHUTTINGDOWN, _S.ERRORPROCESSING),
+    # Whatever on_error says, the node ends with no endpoints.
+    Row(60, _OK, _S.ERRORPROCESSING, _S.UNCONFIGURED, before="take_down"),
+    Row(61, _FAILURE, _S.ERRORPROCESSING, _S.FINALIZED, before="take_down"),
+    Row(62, _ERROR, _S.ERRORPROCESSING, _S.FINALIZED, before="take_down"),
+    # Ours: seen from outside the node stays inactive. The ids are free in lifecycle_msgs.
+    Row(120, "connect", _S.INACTIVE_DISCONNECTED, _S.CONNECTING, after="make_data_layer"),
+    Row(120, _OK, _S.CONNECTING, _S.INACTIVE_CONNECTED),
+    Row(0, _FAILURE, _S.CONNECTING, _S.INACTIVE_DISCONNECTED, before="undo_data_layer"),
+    Row(0, _ERROR, _S.CONNECTING, _S.ERRORPROCESSING),
+    Row(121, "disconnect", _S.INACTIVE_CONNECTED, _S.DISCONNECTING),
+    Row(121, _OK, _S.DISCONNECTING, _S.INACTIVE_DISCONNECTED, before="remove_data_layer"),
+    Row(0, _FAILURE, _S.DISCONNECTING, _S.INACTIVE_CONNECTED),
+    Row(0, _ERROR, _S.DISCONNECTING, _S.ERRORPROCESSING),
 )
+"""Every transition of a node, in the order of rcl_lifecycle's map (default_state_machine.c).
+
+To activate from disconnected, or to clean up from connected, takes the callback of connect or
+disconnect first; others see one transition.
+"""
+
+CALLBACKS = {
+    _S.CONFIGURING: ("on_configure", "configure_s"),
+    _S.CONNECTING: ("on_connect", "connect_s"),
+    _S.ACTIVATING_DISCONNECTED: ("on_connect", "connect_s"),
+    _S.ACTIVATING_CONNECTED: ("on_activate", "activate_s"),
+    _S.DEACTIVATING: ("on_deactivate", "deactivate_s"),
+    _S.DISCONNECTING: ("on_disconnect", "connect_s"),
+    _S.CLEANINGUP_CONNECTED: ("on_disconnect", "connect_s"),
+    _S.CLEANINGUP_DISCONNECTED: ("on_cleanup", "cleanup_s"),
+    _S.SHUTTINGDOWN: ("on_shutdown", "shutdown_s"),
+    _S.ERRORPROCESSING: ("on_error", "cleanup_s"),
+}
+"""The author's method that each transition state runs, and its deadline."""
+
+_BY_ID = {
+    row.id: Transition(id=row.id, label=row.trigger, start=row.source.seen, goal=row.goal.seen)
+    for row in reversed(TABLE)  # of several rows the first one names the edge
+    if row.id
+}
+TRANSITION_GRAPH = tuple(_BY_ID[each] for each in dict.fromkeys(row.id for row in TABLE) if each)
+"""In the order in which rcl_lifecycle answers get_transition_graph; connect and disconnect last."""
 
 
 class StateChange(msgspec.Struct, frozen=True, kw_only=True):
@@ -244,58 +275,53 @@ class RefusedError(LifecycleError):
     """A request that is not allowed in this state; the node lives on unchanged."""
 
 
-def _make_machine() -> transitions.Machine:
-    # Not queued: nothing runs inside a transition, so none can begin in another.
-    machine = transitions.Machine(
-        model=None, states=NodeState, initial=NodeState.UNCONFIGURED, auto_transitions=False
-    )
-    for request, start, goal in _REQUESTS:
-        machine.add_transition(request.value, start, goal)
-    for start, *goals in _OUTCOMES:
-        for outcome, goal in zip(CallbackOutcome, goals, strict=True):
-            machine.add_transition(outcome.value, start, goal)
-    return machine
+class Machine:
+    """The state of one node, and its transitions, run one at a time.
 
+    Args:
+        node: has the methods that the table names, and what the author's callbacks need:
+            managed.Managed.
+        timeouts: deadlines of the callbacks.
+        table: TABLE; tests take lines out.
 
-_MACHINE = _make_machine()
-"""The one of all nodes, each of which is a model of it: 0.3 MiB that forked processes share."""
-
-
-class _Model:
-    """What `transitions` writes the state into."""
-
-    state = NodeState.UNCONFIGURED
-
-
-class LifecycleMachine:
-    """The state of one node.
-
-    Not thread-safe: the caller serialises. `on_change` is called after each change, in order.
+    Attributes:
+        state: the current state, written by `transitions` alone.
+        is_permitted: the request that is looked at comes through the supervisor's gate.
 
     Example:
-        >>> machine = LifecycleMachine()
-        >>> machine.request(TransitionRequest.CONFIGURE)
-        >>> machine.finish(CallbackOutcome.SUCCESS)
-        >>> machine.state.value
-        'inactive/disconnected'
+        >>> result = await machine.change(TransitionRequest.CONFIGURE)
+        >>> result.outcome, machine.state.value
+        (<CallbackOutcome.SUCCESS: 'transition_success'>, 'inactive/disconnected')
     """
 
-    def __init__(self, on_change: Callable[[StateChange], None] | None = None) -> None:
-        self._on_change = on_change
-        self._model = _Model()
+    def __init__(self, node: Any, timeouts: Timeouts, table: Iterable[Row] = TABLE) -> None:
+        self.state = NodeState.UNCONFIGURED
+        self.is_permitted = False
+        self._node = node
+        self._timeouts = timeouts
+        self._lock = threading.Lock()
+        self._running: Interruptible | None = None
+        self._machine = transitions.Machine(
+            model=None, states=NodeState, initial=self.state, auto_transitions=False
+        )
 
-    @property
-    def state(self) -> NodeState:
-        """The current state."""
-        return self._model.state
+        def methods(name: str) -> list[str | Callable[..., bool | None]]:
+            return [getattr(node, name)] if name else []
+
+        for row in table:
+            self._machine.add_transition(
+                row.trigger,
+                row.source,
+                row.goal,
+                conditions=methods(row.condition),
+                before=methods(row.before),
+                after=[functools.partial(self._announce, row), *methods(row.after)],
+            )
 
     def allowed(self) -> tuple[TransitionRequest, ...]:
         """Requests that are taken now, in the order of `TransitionRequest`."""
-        return tuple(
-            request
-            for request in TransitionRequest
-            if any(r is request and start is self.state for r, start, _ in _REQUESTS)
-        )
+        triggers = self._machine.get_triggers(self.state.name)
+        return tuple(each for each in TransitionRequest if each.value in triggers)
 
     def available_transitions(self) -> tuple[Transition, ...]:
         """What get_available_transitions answers: rcl's edges from the state that others see.
@@ -320,40 +346,103 @@ class LifecycleMachine:
                 return next((r for r in TransitionRequest if r.value == transition.label), None)
         return None
 
-    def request(self, request: TransitionRequest) -> None:
-        """Begin a transition.
+    async def change(self, request: TransitionRequest, *, permitted: bool = False) -> Result:
+        """Run a whole transition, with everything it takes on the way.
+
+        Args:
+            request: what is asked for.
+            permitted: by the supervisor, through its gate.
+
+        Returns:
+            SUCCESS, or the first step's result that was not: after an ERROR, on_error has run and
+            the node is unconfigured or finalized.
 
         Raises:
-            RefusedError: this state does not allow it, or a transition is running.
+            RefusedError: not allowed in this state, or another transition is running.
         """
-        if request not in self.allowed():
-            raise RefusedError(self._refusal(request))
-        before = self.state
-        _MACHINE.events[request.value].trigger(self._model)
-        connecting = request in {TransitionRequest.CONNECT, TransitionRequest.DISCONNECT}
-        self._announce(before, None if connecting else request.value)
+        with self._lock:
+            argument = self._node.callback_argument(self.state)
+            self.is_permitted = permitted
+            result = self._request(request)
+        returned = self._reported(result, SUCCESS)
+        while not self.state.steady:
+            if result.outcome is CallbackOutcome.SUCCESS:
+                result = await self._callback(argument)
+                returned = self._reported(result, returned)
+            with self._lock:
+                result = self._take(result.outcome.value)
+            returned = self._reported(result, returned)
+        self._node.wake()
+        return returned
 
-    def finish(self, outcome: CallbackOutcome) -> None:
-        """End the running step of a transition with the outcome of its callback.
+    async def shut_down(self, reason: str) -> Result:
+        """Bring the node to finalized from wherever it is, because its process must end.
 
-        Raises:
-            RefusedError: no transition is running.
+        A running async callback is cancelled first; each step keeps its own deadline.
         """
-        before = self.state
-        if before.steady:
-            raise RefusedError(
-                f"cannot finish a transition with {outcome.name}: none is running in state "
-                f"{before.value!r}"
+        if not self.state.steady:
+            if self._running is not None:
+                self._running.cancel(reason)
+            self._node.wake()  # which resumes the callback for the last time
+            await _Steady(self)
+        if self.state is NodeState.FINALIZED:
+            return SUCCESS
+        return await self.change(TransitionRequest.SHUTDOWN)
+
+    def _request(self, request: TransitionRequest) -> Result:
+        """Begin a transition; what its row cannot do is a failure, as if the callback said so."""
+        try:
+            return self._take(request.value)
+        except transitions.MachineError as error:
+            raise RefusedError(self._refusal(request)) from error
+
+    def _take(self, trigger: str) -> Result:
+        """Change the state by a row of the table, with what the row runs."""
+        state = self.state
+        try:
+            self._machine.events[trigger].trigger(self)
+        except (transitions.MachineError, RefusedError):
+            raise
+        except Exception as error:  # noqa: BLE001 - reported with its traceback, then ERROR
+            if state.steady and isinstance(error, LifecycleError):
+                return Result(outcome=CallbackOutcome.FAILURE, error=str(error))
+            name = self._node.full_name
+            return Result(
+                outcome=CallbackOutcome.ERROR,
+                error=f"cannot finish {self.state.value} of {name}: {error!r}",
+                trace=traceback.format_exc(),
             )
-        _MACHINE.events[outcome.value].trigger(self._model)
-        label: str | None = outcome.value
-        if before.seen == self.state.seen:
-            label = None
-            if outcome is CallbackOutcome.SUCCESS and before is NodeState.CONNECTING:
-                label = TransitionRequest.CONNECT.value
-            elif outcome is CallbackOutcome.SUCCESS and before is NodeState.DISCONNECTING:
-                label = TransitionRequest.DISCONNECT.value
-        self._announce(before, label)
+        return SUCCESS
+
+    def _reported(self, result: Result, returned: Result) -> Result:
+        """Log what did not succeed; return the first that did not."""
+        if result.outcome is CallbackOutcome.SUCCESS:
+            return returned
+        self._node.report(result)
+        return returned if returned.error else result
+
+    async def _callback(self, argument: object) -> Result:
+        """Run the author's callback of the present state."""
+        name, limit = CALLBACKS[self.state]
+        deadline_s: float = getattr(self._timeouts, limit)
+        call_off: list[Callable[[], None]] = []
+
+        def started(running: Interruptible) -> None:
+            self._running = running
+            call_off.append(self._node.wake_at_deadline(deadline_s))
+
+        try:
+            return await steps.call(
+                self._node.callback(name),
+                (argument,),
+                what=f"{self._node.full_name}: {name}",
+                deadline_s=deadline_s,
+                started=started,
+            )
+        finally:
+            self._running = None
+            for each in call_off:
+                each()
 
     def _refusal(self, request: TransitionRequest) -> str:
         if not self.state.steady:
@@ -364,14 +453,22 @@ class LifecycleMachine:
         allowed = ", ".join(each.value for each in self.allowed()) or "nothing"
         return f"cannot {request.value} in state {self.state.value!r}; allowed here: {allowed}"
 
-    def _announce(self, before: NodeState, label: str | None) -> None:
+    def _announce(self, row: Row) -> None:
+        """Say what was changed; connect and disconnect are seen once they have succeeded."""
+        start, goal = row.source.seen, row.goal.seen
         event = None
-        if label is not None:
-            start, goal = before.seen, self.state.seen
-            event = next(
-                (t for t in TRANSITION_GRAPH if t.label == label and t.start == start), None
-            )
-            if event is None:  # an error inside connect leaves inactive by no edge of rcl's
-                event = Transition(id=0, label="", start=start, goal=goal)
-        if self._on_change is not None:
-            self._on_change(StateChange(start=before, goal=self.state, event=event))
+        if start != goal or (row.id and row.trigger == _OK):
+            # An error inside connect leaves inactive by no edge of rcl's.
+            event = _BY_ID.get(row.id, Transition(id=0, label="", start=start, goal=goal))
+        self._node.changed(StateChange(start=row.source, goal=row.goal, event=event))
+
+
+class _Steady:
+    """Awaits the end of the running transition; looked at each time the executor wakes."""
+
+    def __init__(self, machine: Machine) -> None:
+        self._machine = machine
+
+    def __await__(self) -> Generator[None, None, None]:
+        while not self._machine.state.steady:
+            yield

@@ -20,7 +20,7 @@ from rclpy.node import Node
 from rclpy.timer import Timer
 
 from lifecycle.node.lifecycle import machine
-from lifecycle.node.lifecycle.machine import LifecycleMachine, TransitionRequest
+from lifecycle.node.lifecycle.machine import Machine, TransitionRequest
 
 if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup
@@ -36,7 +36,7 @@ class LifecycleServices:
         self,
         node: Node,
         *,
-        state_machine: LifecycleMachine,
+        state_machine: Machine,
         change: Callable[[TransitionRequest], Coroutine[Any, Any, bool]],
         refuse: Callable[[str], None],
         group: CallbackGroup,

@@ -139,7 +139,7 @@ def not_wired(subject: str, message: str) -> Finding:
         message: a whole sentence with the reason.
     """
     return NOT_WIRED.finding(
-        Outcome.VIOLATED,
+        outcome=Outcome.VIOLATED,
         subject=subject,
         expected="wired",
         observed="not wired",

@@ -104,7 +104,7 @@ def _check_apply(plan: Plan, system: System, machine: str) -> None:
             what, "a TCP port that was used is not connected to again by who used it"
         )
     for key in (*change.restarted, *change.removed):
-        if (name := system.nodes[key].name) in system.adopted:
+        if (name := system.nodes[key].name) in system.run.adopted:
             raise UsageError(
                 f"{what}: {name!r} would be taken down, and was adopted",
                 hint="who started it ends it; then lifecycle down, and lifecycle up",

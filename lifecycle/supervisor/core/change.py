@@ -202,11 +202,10 @@ def _is_down(run: Run, change: Change) -> bool:
 def _take(run: Run, change: Change) -> None:
     """Exchange the plan; what stays is connected as it is."""
     plan, before = (change.before, change.plan) if change.back else (change.plan, change.before)
-    modes = [each.name for each in plan.modes]
     if change.back:
         run.mode, run.revision = change.mode, change.revision
     else:
-        run.mode = run.mode if run.mode in modes else next(iter(modes), "")
+        run.mode = run.mode_by(plan)
         run.revisions += 1
         run.revision = run.revisions
     stays = {key: each.planned for key, each in run.nodes.items() if key not in change.down}
@@ -280,9 +279,7 @@ def undone(run: Run, change: Change) -> str:
 
 def change_to(run: Run, plan: Plan) -> PlanChange:
     """Return what another manifest is for what runs; it stays in its mode, if that has it."""
-    modes = [each.name for each in plan.modes]
-    then = run.mode if run.mode in modes else next(iter(modes), "")
-    return change_between(run.first, plan, modes=(run.mode, then))
+    return change_between(run.first, plan, modes=(run.mode, run.mode_by(plan)))
 
 
 def changed_nodes(change: PlanChange, running: Plan, plan: Plan, revision: int) -> ChangedNodes:

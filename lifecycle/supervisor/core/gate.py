@@ -171,8 +171,8 @@ def _guarded(node: Node) -> Finding:
     if given_up:
         what = f"it was deactivated {GUARD_TRIES} times; {ACTIVATES_ITSELF}"
     return ACTIVATED_AT_CLOSED_GATE.on_node(
-        Outcome.VIOLATED,
         node.planned,
+        outcome=Outcome.VIOLATED,
         expected="inactive",
         observed="activated by its own code or another client",
         message=f"cannot accept node {node.name}: it was activated by its own code or another "

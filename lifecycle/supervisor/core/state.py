@@ -544,6 +544,11 @@ class Run(msgspec.Struct, kw_only=True):
             )
         )
 
+    def mode_by(self, plan: Plan) -> str:
+        """Return the mode that it would be in by another manifest: the same, if that has it."""
+        names = [each.name for each in plan.modes]
+        return self.mode if self.mode in names else next(iter(names), "")
+
     def node_named(self, name: str) -> Node | None:
         """Return the node with this fully qualified name; None if it is not ours."""
         return next((each for each in self.nodes.values() if each.name == name), None)

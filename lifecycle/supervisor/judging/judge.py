@@ -17,7 +17,7 @@ from lifecycle.middleware.fastdds.profiles import DEFAULT_LEASE_S
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.core.gate import Key, key_of
-from lifecycle.supervisor.health.liveliness import NodeArrivals
+from lifecycle.supervisor.health.liveliness import arrivals
 from lifecycle.supervisor.judging.standstill import Standstill
 from lifecycle.supervisor.processes.scope import unlimited
 from lifecycle.verify.judge import verify, with_findings, with_only
@@ -32,7 +32,7 @@ from lifecycle.verify.verdict import Stage, Verdict
 if TYPE_CHECKING:
     from lifecycle.graph.graph import Graph
     from lifecycle.supervisor.connections.authority import ConnectionAuthority
-    from lifecycle.supervisor.health.agreement import Agreement
+    from lifecycle.supervisor.health.peers import Peers
     from lifecycle.supervisor.nodes.system import System
 
 FORGOTTEN_S = DEFAULT_LEASE_S + 1.0
@@ -54,7 +54,7 @@ class Judge:
         system: which.
         observer: sees the graph.
         looker: learns of each look how nodes are connected; None where nodes connect themselves.
-        agreement: of the supervisors of other hosts.
+        peers: the supervisors of other hosts.
 
     Attributes:
         seen: what was seen last.
@@ -66,16 +66,15 @@ class Judge:
         observer: Graph,
         *,
         looker: ConnectionAuthority | None,
-        agreement: Agreement,
+        peers: Peers,
     ) -> None:
         self._system = system
         self._observer = observer
         self._looker = looker
-        self._agreement = agreement
+        self._peers = peers
         self._standstill = Standstill()
         self._stills = 0
         self.seen = Observation()
-        self._presence = NodeArrivals(system.emit)
         self._unsaid: dict[str, float] = {}
         self._asked_of: tuple[Plan, frozenset[str], Plan] | None = None
         self._left: dict[str, float] = {}  # topics of processes that ended, and until when
@@ -113,8 +112,7 @@ class Judge:
         await system.refresh(self._observer, marks=stage is Stage.CONNECTED)
         observation = without(await self._observer.observe(self._asked()), system.dead())
         self.seen = observation
-        self._presence.see(observation)
-        system.present = self._presence.present
+        system.present = arrivals(system.present or (), observation, system.emit)
         if self._looker is not None:
             self._looker.look(observation)
         expected = system.expected
@@ -132,8 +130,8 @@ class Judge:
         verdict = with_findings(
             verdict, (*wiring, *system.liveliness.findings(), *limits), expected.policy
         )
-        verdict = self._agreement.explained(verdict)
-        more = (*self._agreement.findings(observation), *discovery_server.findings(system))
+        verdict = self._peers.explained(verdict)
+        more = (*self._peers.findings(observation), *discovery_server.findings(system))
         return with_findings(verdict, more, expected.policy)
 
     def _asked(self) -> Plan:

@@ -34,21 +34,7 @@ GRACE_S = 3.0
 KILL_S = 5.0
 """How long the kernel may take to end a killed process, before it is reported."""
 
-_TASKS = Path("/proc/self/task")
-
 _LOOK_S = 0.02
-
-
-class _Orphan:
-    """A process held by its pidfd, so that no signal can reach a later owner of the pid."""
-
-    def __init__(self, pid: int, pidfd: int) -> None:
-        self.pid = pid
-        self.pidfd = pidfd
-
-    def signal(self, number: int) -> None:
-        with contextlib.suppress(ProcessLookupError):
-            signal.pidfd_send_signal(self.pidfd, number)
 
 
 def reap_adopted(spare: Iterable[int]) -> None:
@@ -81,13 +67,7 @@ def end_run(record: RunRecord) -> tuple[int, ...]:
 
 def children() -> frozenset[int]:
     """Return the pids of the children of this process, adopted ones included."""
-    try:
-        found = [each.read_text(encoding="ascii") for each in _TASKS.glob("*/children")]
-    except OSError:
-        found = []  # a thread that has just ended
-    if not found:  # or a kernel without CONFIG_PROC_CHILDREN
-        return frozenset(_children().get(os.getpid(), ()))
-    return frozenset(int(pid) for text in found for pid in text.split())
+    return frozenset(_children().get(os.getpid(), ()))
 
 
 def descendants(pid: int) -> tuple[int, ...]:
@@ -146,30 +126,33 @@ def marked(run_id: str) -> dict[int, str]:
 
 async def end(pids: Iterable[int], grace_s: float) -> tuple[int, ...]:
     """End processes, killing what has not ended after `grace_s`; return those that lived."""
-    orphans = []
+    # Held by their pidfds, so that no signal can reach a later owner of a pid.
+    held: dict[int, int] = {}
     for pid in pids:
         with contextlib.suppress(ProcessLookupError):
-            orphans.append(_Orphan(pid, os.pidfd_open(pid)))
+            held[os.pidfd_open(pid)] = pid
     try:
-        left = _living(orphans)
-        ended = tuple(sorted(each.pid for each in left))
+        left = _living(held)
+        ended = tuple(sorted(held[each] for each in left))
         for number, wait_s in ((signal.SIGTERM, grace_s), (signal.SIGKILL, KILL_S)):
             for each in left:
-                each.signal(number)
-                each.signal(signal.SIGCONT)  # a stopped process ends only once it goes on
+                with contextlib.suppress(ProcessLookupError):
+                    signal.pidfd_send_signal(each, number)
+                    # A stopped process ends only once it goes on.
+                    signal.pidfd_send_signal(each, signal.SIGCONT)
             deadline = time.monotonic() + wait_s
             while (left := _living(left)) and time.monotonic() < deadline:  # noqa: ASYNC110
                 await asyncio.sleep(_LOOK_S)
         return ended
     finally:
-        for each in orphans:
-            os.close(each.pidfd)
+        for each in held:
+            os.close(each)
 
 
-def _living(orphans: list[_Orphan]) -> list[_Orphan]:
-    """Return those that have not ended: a pidfd can be read once its process has."""
+def _living(pidfds: Iterable[int]) -> list[int]:
+    """Return those whose processes have not ended: then a pidfd can be read."""
     poll = select.poll()
-    for each in orphans:
-        poll.register(each.pidfd, select.POLLIN)
+    for each in pidfds:
+        poll.register(each, select.POLLIN)
     ended = {pidfd for pidfd, _ in poll.poll(0)}
-    return [each for each in orphans if each.pidfd not in ended]
+    return [each for each in pidfds if each not in ended]

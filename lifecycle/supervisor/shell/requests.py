@@ -31,6 +31,7 @@ from lifecycle.supervisor.nodes.driver import (
     ChangedError,
     ControlDriver,
     NodeCondition,
+    ServiceDriver,
 )
 from lifecycle.supervisor.nodes.system import level_of
 from lifecycle.supervisor.processes.control_channel import ChannelClosedError, HostFailedError
@@ -72,6 +73,7 @@ class Requests:
         self._system = shell.system
         self._means = shell.means
         self._tasks: dict[str, tuple[int, asyncio.Task[None]]] = {}
+        self._found: set[str] = set()
 
     def ask(self, effect: effects.Ask) -> None:
         """Ask a node for a step."""
@@ -190,23 +192,33 @@ class Requests:
         if not planned.managed:
             if node.is_to_be_given and not planned.may_end:
                 await self._give_what_is_missing(node)
-            self._system.note_found(node, "running")
+            self._say_found(node, "running")
             return Level.STARTED
-        driver = node.driver = self._means.participant.driver(planned)
+        driver = node.driver = ServiceDriver(self._means.participant.clients, planned)
         condition = await driver.start()
-        self._system.note_found(node, condition.state)
+        self._say_found(node, condition.state)
         node.take(condition)
-        if node.found and condition.state == ACTIVE:
+        if condition.state == ACTIVE and self._system.is_adopted(node):
             return Level.ACTIVE  # it is verified as it is: no gate has to let it in
         await self._give_what_is_missing(node)
         return Level.STARTED
+
+    def _say_found(self, node: NodeRun, state: str) -> None:
+        """Say, once, how a node was found that others started and that is adopted."""
+        if self._system.is_adopted(node) and node.name not in self._found:
+            self._found.add(node.name)
+            where = (self._system.adopted or {}).get(node.name, "")
+            text = f"{node.name!r} is adopted, found {state}{where and f': {where}'}"
+            self._system.emit(Notice(message=text))
 
     async def _load(self, node: NodeRun) -> None:
         """Have its container load a component, which runs."""
         name = node.planned.run.container
         container = self._system.nodes.get(name)
         full_name = name if container is None else container.name
-        node.unload = await self._means.participant.load(node.planned, full_name)
+        node.unload = await self._means.participant.clients.load_component(
+            node.planned, full_name, timeout_s=node.planned.timeouts.start_s
+        )
 
     async def _appears(self, name: str) -> None:
         """Wait until discovery shows a node of this name; the core sets the limit."""
@@ -269,7 +281,9 @@ class Requests:
         if effect.values is None:
             planned = node.planned
             # All of them, also those that it has by default.
-            all_ = tuple(replace(each, source=GIVEN) for each in planned.in_mode(self._system.mode))
+            all_ = tuple(
+                replace(each, source=GIVEN) for each in planned.in_mode(self._system.run.mode)
+            )
             giving = clients.give_parameters(replace(planned, expected_parameters=all_))
         else:
             giving = clients.set_parameters(node.name, effect.values.now, effect.values.types)

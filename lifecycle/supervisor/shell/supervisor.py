@@ -38,11 +38,9 @@ from lifecycle.supervisor.core import state as core
 from lifecycle.supervisor.core.change import change_to, changed_nodes
 from lifecycle.supervisor.core.orders import refused_at_once
 from lifecycle.supervisor.core.reduce import take
-from lifecycle.supervisor.health import agreement
-from lifecycle.supervisor.health.agreement import Agreement
 from lifecycle.supervisor.health.answering import Answering
 from lifecycle.supervisor.health.liveliness import Cause
-from lifecycle.supervisor.health.peer_supervisors import PeerSupervisors
+from lifecycle.supervisor.health.peers import FAILED, Peers
 from lifecycle.supervisor.judging.judge import Judge
 from lifecycle.supervisor.nodes.adoption import adopt
 from lifecycle.supervisor.nodes.system import NodeRun, System
@@ -136,15 +134,14 @@ class Supervisor:
         self.changed = asyncio.Event()
         self.again: set[str] = set()
         self._begin(system.run)
-        self.authority = authority_of(system, self._emit, means.participant)
-        self._peers = PeerSupervisors(system, means.participant)
-        self._agreement = Agreement(system, means.participant, self._peers)
-        self.answering = Answering(system, means.participant)
+        self.authority = authority_of(system, means.participant)
+        self._peers = Peers(system, means.participant)
+        self.answering = Answering(system, means.participant.clients)
         self.judge = Judge(
             system,
             means.participant.graph,
             looker=self.authority,
-            agreement=self._agreement,
+            peers=self._peers,
         )
         self._processes = Processes(self)
         self._requests = Requests(self)
@@ -273,7 +270,7 @@ class Supervisor:
             self._end(run.ending)
             if run.is_over:
                 self._over.set()
-        elif self.system.remote and (left := self._agreement.left()) != run.left:
+        elif self.system.remote and (left := self._peers.left()) != run.left:
             self.give(inputs.Left(nodes=left))
 
     def _perform(self, effect: effects.Effect) -> None:
@@ -414,7 +411,7 @@ class Supervisor:
         self.means.networks.replan(run.plan)
         self._peers.renew()
         if run.first is not first:
-            self._agreement.announce(run.first)
+            self._peers.announce()
 
     # What is said
 
@@ -470,7 +467,7 @@ class Supervisor:
             verdict = with_findings(NOT_JUDGED, findings, self.system.plan.policy)
             self.give(inputs.Refused(verdict=verdict))
         else:
-            self.give(inputs.Adopted(plan=plan, nodes=frozenset(self.system.adopted)))
+            self.give(inputs.Adopted(plan=plan, nodes=frozenset(self.system.adopted or ())))
 
     async def _watch(self, died: asyncio.Future[Any], subject: str, rule: str) -> None:
         """Say that what others depend on has died."""
@@ -486,7 +483,6 @@ class Supervisor:
         server = ControlServer(self.means.directory.socket_path, self)
         await server.open()
         self._peers.open()
-        self._agreement.open()
 
         def changed(event: Event) -> None:
             if not isinstance(event, LogLine):
@@ -561,8 +557,8 @@ class Supervisor:
         latest = self.system.run.judged.verdict
         if latest is not None:
             self._last = self.system.liveliness.by_now(latest)
-        how = agreement.FAILED if ending.failed else ""
-        self._agreement.leave(f"{how}{ending.stopping}")
+        how = FAILED if ending.failed else ""
+        self._peers.leave(f"{how}{ending.stopping}")
         self.means.participant.prepare_to_leave()
         if self._programming is not None:
             self._programming.cancel()  # nothing is programmed once all is removed
@@ -587,7 +583,6 @@ class Supervisor:
     async def leave(self) -> None:
         """Leave the exchange with other supervisors, after `run`; Fast DDS can hang in it."""
         self.means.participant.prepare_to_leave()
-        self._agreement.close()
         await self._peers.close()
 
     @contextlib.contextmanager

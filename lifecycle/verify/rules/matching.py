@@ -173,7 +173,6 @@ def _unknown_peers(view: View, topics: Mapping[str, _Ends]) -> Iterator[Finding]
         if place in NOISE_TOPICS or report.matched <= possible + unseen[place]:
             continue
         yield UNKNOWN_PEER.on_endpoint(
-            Outcome.VIOLATED,
             actual,
             expected=f"at most {possible} {other.noun}{'s' * (possible != 1)}, as in the graph",
             observed=f"matched {report.matched}",
@@ -193,7 +192,6 @@ def _unreported_flows(view: View) -> Iterator[Finding]:
         f" and {len(names) - _NAMED} more" * (len(names) > _NAMED)
     )
     yield UNREPORTED_FLOW.finding(
-        Outcome.UNVERIFIABLE,
         subject=names[0] if len(names) == 1 else f"{len(names)} flows",
         ends=flows[0].ends if len(names) == 1 else (),
         expected="a report of one end",
@@ -225,7 +223,7 @@ def _judge_flow(flow: FlowView, ends: _Ends) -> Iterator[Finding]:
     violated = outcome is Outcome.VIOLATED
     pair = f"{flow.publisher} → {flow.subscription}"
     yield rule.finding(
-        outcome,
+        outcome=outcome,
         subject=flow.subject,
         ends=flow.ends,
         expected="matched",
@@ -382,7 +380,7 @@ def _judge_client(client: Actual, server: str, *, count: int) -> Iterator[Findin
     verb = "see" if outcome is Outcome.VIOLATED else "verify that"
     state = "matched" if outcome is Outcome.VIOLATED else "are matched"
     yield UNMATCHED_CLIENT.finding(
-        outcome,
+        outcome=outcome,
         subject=f"{name}: {node} → {server}",
         ends=(node, server),
         expected="matched",

@@ -68,7 +68,6 @@ def _missing(view: View) -> Iterator[Finding]:
             continue
         if name in view.over:
             yield ENDED_NODE.on_node(
-                Outcome.UNVERIFIABLE,
                 node,
                 expected="node in the graph, or ended by itself",
                 observed=view.over[name] or "no such node",
@@ -89,8 +88,8 @@ def _missing(view: View) -> Iterator[Finding]:
         if beyond:
             hint = f"the supervisor of machine {node.machine!r} verifies it"
         yield MISSING_NODE.on_node(
-            Outcome.UNVERIFIABLE if beyond else Outcome.VIOLATED,
             node,
+            outcome=Outcome.UNVERIFIABLE if beyond else Outcome.VIOLATED,
             expected="node in the graph",
             observed="out of reach" if beyond else "no such node",
             message=f"cannot verify node {name}: it talks by the shared memory of machine"
@@ -115,7 +114,6 @@ def _duplicate(view: View) -> Iterator[Finding]:
         takes = started and view.stage is Stage.CONNECTED
         hint = f"{DUPLICATE_NODE.fix}; have one that ran before adopted: lifecycle up --adopt"
         yield DUPLICATE_NODE.finding(
-            Outcome.VIOLATED,
             subject=name,
             expected="1 node of this name",
             observed=f"{count} nodes",
@@ -134,7 +132,6 @@ def _undeclared(view: View) -> Iterator[Finding]:
     for name in sorted(names):
         endpoints = ", ".join(dict.fromkeys(owned.get(name, [])))
         yield UNDECLARED_NODE.finding(
-            Outcome.VIOLATED,
             subject=name,
             expected="no such node",
             observed=f"node with {endpoints}" if endpoints else "node",
@@ -191,7 +188,6 @@ def _offered_by_tools(view: View) -> Iterator[Finding]:
         verb = "feeds" if endpoint.kind.is_topic else "serves"
         whom = "whoever asks for the supervisor" if of_supervisor else "the system"
         yield UNDECLARED[endpoint.kind].finding(
-            Outcome.VIOLATED,
             subject=endpoint.name,
             expected=f"no such {word} of {endpoint.node}",
             observed=f"{word} of type {endpoint.type}" if endpoint.type else word,
@@ -219,7 +215,7 @@ def _unattributed(view: View) -> Iterator[Finding]:
         feeds = feeds and not view.names.is_of_supervisors(endpoint.kind, endpoint.name)
         violated = feeds or view.stage is Stage.CONNECTED
         yield UNATTRIBUTED_ENDPOINT.finding(
-            Outcome.VIOLATED if violated else Outcome.UNVERIFIABLE,
+            outcome=Outcome.VIOLATED if violated else Outcome.UNVERIFIABLE,
             subject=endpoint.name,
             expected=f"{word} of a declared node",
             observed=f"{word} of an unknown node",

@@ -87,7 +87,6 @@ CASES = (
         exit_code=130,
         verdict=OK,
         activated=EVERYBODY,
-        before="the same",
         quick=True,
     ),
     Case(
@@ -98,7 +97,6 @@ CASES = (
         exit_code=130,
         verdict=OK,
         activated=EVERYBODY,
-        before="the same",
     ),
     Case(
         attack="ros2 lifecycle set deactivates a node of an active system",
@@ -107,7 +105,6 @@ CASES = (
         story=take_down_one,
         exit_code=130,
         activated=EVERYBODY,
-        before="the same",
     ),
     Case(
         attack="ros2 lifecycle set activates nodes before the gate",
@@ -117,7 +114,6 @@ CASES = (
         exit_code=130,
         activated=NOBODY,
         received=NOBODY,
-        before="refused as well",
         quick=True,
     ),
 )

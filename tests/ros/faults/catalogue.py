@@ -570,6 +570,16 @@ OUTSIDERS = (
         options=("--strict",),
     ),
     Fault(
+        name="a tool answers whoever would change the state of a declared node",
+        edits={},
+        intruder=("rviz2", "--answer", "/talker/change_state:lifecycle_msgs/srv/ChangeState"),
+        exit_code=ExitCode.VIOLATED,
+        rule="graph.undeclared-service-server",
+        subject="/talker/change_state",
+        message="/rviz2",
+        options=("--strict",),
+    ),
+    Fault(
         name="a tool has a server of a declared action",
         edits=_docked("--serve", "/dock:test_msgs/action/Fibonacci"),
         intruder=("rqt_action", "--serve", "/dock:test_msgs/action/Fibonacci"),

@@ -17,18 +17,15 @@ from rclpy.node import Node
 from std_msgs.msg import String
 
 from lifecycle import codec
-from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.fastdds.nfe import (
     SHARED_MEMORY,
-    get_network_flow_endpoints,
     senders_of,
 )
 from lifecycle.middleware.fastdds.participant import FlowParticipant
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.middleware.fastdds.settings import has_shared_memory, participant_settings
-from lifecycle.middleware.fastdds.sockets import own_sockets
-from lifecycle.network.nfe import NetworkFlowEndpoint, TransportProtocol
+from lifecycle.network.nfe import NetworkFlowEndpoint
 from lifecycle.verify.observation import Identity
 from lifecycle.verify.transport import carrier
 
@@ -257,22 +254,6 @@ def test_a_participant_of_small_datagrams_still_receives_large_ones(
     assert got == [10_000]
 
 
-@pytest.mark.parametrize("transports", [(), UDP, ("udpv4", "udpv6")])
-def test_sends_that_must_not_wait_go_by_sockets_that_do_not(
-    domain_id: int, transports: tuple[str, ...]
-) -> None:
-    with (
-        FlowParticipant(
-            "_hasty", "/", domain_id, transports=transports, non_blocking_send=True
-        ) as hasty,
-        FlowParticipant("_patient", "/", domain_id, transports=transports) as wait_under_load,
-    ):
-        for participant, waits in ((hasty, False), (wait_under_load, True)):
-            sockets = own_sockets(senders_of(participant.node))
-            assert {os.get_blocking(each.fileno()) for each in sockets} == {waits}
-        assert hasty.has_shared_memory is (not transports)
-
-
 @on_the_wire
 @pytest.mark.parametrize("transports", [UDP, ("udpv6",)])
 def test_every_datagram_of_a_user_carries_the_dscp_from_the_first_on(
@@ -320,42 +301,6 @@ def test_a_mark_that_was_lost_is_set_again_before_a_subscription_is_handed_out(
         set_dscp(senders_of(participant.node), 0)
         participant.create_subscription(String, "/flow", print, QOS)
         assert participant.read_dscp() == 46
-
-
-def test_whether_a_participant_has_shared_memory_is_seen_without_a_subscription(
-    domain_id: int, make_node: MakeNode
-) -> None:
-    """One that is made and removed while others discover it keeps later ones from some."""
-    with (
-        FlowParticipant("_plain", "/", domain_id) as plain,
-        FlowParticipant("_chosen", "/", domain_id, transports=UDP) as chosen,
-        FlowParticipant("_other", "/", domain_id) as other,
-    ):
-        found = [each.has_shared_memory for each in (plain, chosen, other)]
-    assert found == [True, False, True]
-    node = make_node("node", start_parameter_services=False)
-    assert has_shared_memory(node)
-    assert list(node.subscriptions) == []
-    subscription = node.create_subscription(String, "/flow", print, 10)
-    assert [nfe.transport_protocol for nfe in get_network_flow_endpoints(subscription)] == [
-        TransportProtocol.UNKNOWN,
-        *[TransportProtocol.UDP] * (len(get_network_flow_endpoints(subscription)) - 1),
-    ]
-
-
-def test_another_rmw_is_refused_in_words(domain_id: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        "lifecycle.middleware.fastdds.settings.get_rmw_implementation_identifier",
-        lambda: "rmw_cyclonedds_cpp",
-    )
-    with pytest.raises(MiddlewareError) as refused:
-        FlowParticipant("_flow", "/", domain_id, transports=UDP)
-    assert str(refused.value) == (
-        "cannot make a participant for /_flow in domain "
-        f"{domain_id}: cannot choose the transports of a participant with RMW "
-        "'rmw_cyclonedds_cpp'; set RMW_IMPLEMENTATION=rmw_fastrtps_cpp"
-    )
-    FlowParticipant("_flow", "/", domain_id).destroy()
 
 
 # Profiles are loaded once per process. Another portBase moves every port: it shows who has it.

@@ -331,16 +331,21 @@ def command(verb: str) -> Sequence[str]:
 
 
 def verb(
-    name: str, *arguments: str, runtime: Path, variables: Mapping[str, str] | None = None
+    name: str,
+    *arguments: str,
+    runtime: Path,
+    variables: Mapping[str, str] | None = None,
+    mark: str = "",
+    within_s: float = BOUND_S,
 ) -> subprocess.CompletedProcess[str]:
     """Run a verb to its end, with more variables in its environment."""
     return subprocess.run(
         [*command(name), *arguments],
         cwd=modules(),
-        env={**environment(runtime, ""), **(variables or {})},
+        env={**environment(runtime, mark), **(variables or {})},
         capture_output=True,
         text=True,
-        timeout=BOUND_S,
+        timeout=within_s,
         check=False,
     )
 

@@ -392,17 +392,6 @@ def test_what_becomes_active_again_must_be_what_was_verified(
         )
 
 
-def test_a_node_that_dies_while_it_restarts_ends_the_run(tmp_path: Path, fresh_domain: int) -> None:
-    with up(pair(tmp_path, fresh_domain, misbehave="deactivate:kill"), runtime=tmp_path) as run:
-        run.until("system", reached="active")
-        paused = verb("pause", "pair", runtime=tmp_path)
-        assert paused.returncode == ExitCode.BRING_UP_FAILED
-        assert "/talker" in paused.stderr
-        assert "killed by SIGKILL" in paused.stderr
-        assert run.finish() == ExitCode.BRING_UP_FAILED
-        run.assert_nothing_left()
-
-
 @pytest.fixture(scope="module")
 def active(tmp_path_factory: pytest.TempPathFactory, shared_domain: int) -> Iterator[Up]:
     """An active pair for tests that change nothing of it."""

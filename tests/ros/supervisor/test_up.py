@@ -18,14 +18,11 @@ from xml.etree import ElementTree as ET
 
 import psutil
 import pytest
-import rclpy
 import yaml
-from rclpy.node import Node
 
 from lifecycle.errors import ExitCode
 from lifecycle.middleware.versions import KNOWN_FAST_DDS, KNOWN_RCL
 from lifecycle.network.ports import participant_ports
-from lifecycle.supervisor.core.gate import SETTLED_S
 from tests.ros.middleware.free_ports import free_ports
 from tests.ros.supervisor.running import (
     BOUND_S,
@@ -155,66 +152,6 @@ def test_until_stops_short_of_activating(tmp_path: Path, fresh_domain: int, unti
         assert run.of_kind("gate") == []
         assert "activate" not in [each["operation"] for each in run.of_kind("request")]
         run.assert_nothing_left()
-
-
-MARKED = {"nodes/talker/flows": {"publishers": {"chatter": {"dscp": "EF"}}}}
-
-
-def test_a_mark_that_other_code_took_away_keeps_the_gate_closed(
-    tmp_path: Path, fresh_domain: int
-) -> None:
-    manifest = pair(tmp_path, fresh_domain, misbehave="connect:unmark", edit=MARKED)
-    with up(manifest, "--stop-after", "0", runtime=tmp_path) as run:
-        assert run.finish() == ExitCode.VIOLATED
-        (finding,) = [
-            each for each in run.verdict["findings"] if each["rule"] == "flow.dscp-not-applied"
-        ]
-        assert finding["message"] == (
-            "cannot accept the publisher of /chatter in /talker: its sockets carry DF = DSCP 0 = "
-            "TOS 0 (0x00) and not EF = DSCP 46 = TOS 184 (0xb8)"
-        )
-        assert run.of_kind("gate") == []
-        # What is reported is what was read, not what was planned.
-        (flow,) = run.verdict["flows"]
-        assert (flow["dscp"], flow["outcome"]) == (0, "violated")
-        run.assert_nothing_left()
-
-
-def test_what_became_active_must_be_what_was_verified(tmp_path: Path, fresh_domain: int) -> None:
-    manifest = pair(tmp_path, fresh_domain, misbehave="activate:unmark", edit=MARKED)
-    with up(manifest, "--stop-after", "0", runtime=tmp_path) as run:
-        assert run.finish() == ExitCode.VIOLATED
-        assert [each["reached"] for each in run.of_kind("system")] == ["connected", "verified"]
-        assert len(run.of_kind("gate")) == 1
-        assert "flow.dscp-not-applied" in [each["rule"] for each in run.verdict["findings"]]
-        assert run.verdict["run"]["reason"].startswith(
-            "what became active is not what was verified; "
-        )
-        run.assert_nothing_left()
-
-
-def test_a_violation_that_healed_while_the_system_was_held_still_counts(
-    tmp_path: Path, fresh_domain: int
-) -> None:
-    with up(pair(tmp_path, fresh_domain), "--stop-after", "8", runtime=tmp_path) as run:
-        run.until("system", reached="active")
-        begun = len(run.events)
-        context = rclpy.Context()
-        context.init(args=[], domain_id=fresh_domain)
-        intruder = Node("intruder", context=context, enable_rosout=False)
-        run.until_found("graph.undeclared-node", since=begun)
-        # It counts once it stood for so long without any change: there is no event to wait for.
-        time.sleep(3 * SETTLED_S)
-        before = run.catch_up()
-        intruder.destroy_node()
-        context.try_shutdown()
-        context.destroy()
-        run.until_not_found("graph.undeclared-node", since=before)
-        assert run.finish() == ExitCode.VIOLATED
-        assert run.verdict["verdict"] == "ok"
-        assert run.verdict["run"]["reason"].startswith("done, but violated meanwhile, ")
-        assert "graph.undeclared-node" in run.verdict["run"]["reason"]
-        assert run.verdict["run"]["reached"] == "active"
 
 
 def test_an_interrupt_takes_the_system_down_in_reverse_order(
@@ -352,21 +289,6 @@ def test_a_run_that_cannot_hold_for_as_long_as_asked_is_no_success_and_its_repor
         failed = [each for each, came in cases["invalid"].items() if came == "failure"]
         assert failed == ["manifest: the manifest is valid", "run: end"]
     assert list(cases["active"]) == list(cases["short"]) == list(cases["invalid"])
-
-
-def test_a_process_that_dies_while_a_run_must_hold_is_no_success_although_it_keeps_going(
-    tmp_path: Path, fresh_domain: int
-) -> None:
-    report = tmp_path / "report.json"
-    options = ("--keep-going", "--stop-after", "1", "--report", str(report))
-    with up(pair(tmp_path, fresh_domain), *options, runtime=tmp_path) as run:
-        run.until("system", reached="active")
-        run.note_segments()
-        os.kill(run.pid_of("talker"), signal.SIGKILL)
-        assert run.finish() == ExitCode.BRING_UP_FAILED
-        found = [each["rule"] for each in json.loads(report.read_text())["findings"]]
-        assert found.count("run.process-died") == 1
-        run.assert_nothing_left()
 
 
 _IMPORTING = "import time\nprint('importing', flush=True)\ntime.sleep(300)"
@@ -527,7 +449,8 @@ def test_keep_going_reports_the_death_and_the_verdict_and_goes_on_but_is_no_succ
         run.signal(signal.SIGTERM)
         assert run.finish() == ExitCode.BRING_UP_FAILED
         assert run.verdict["run"]["reason"] == "terminated; failed: /talker (run.process-died)"
-        assert run.verdict["findings"][0]["rule"] == "run.process-died"
+        rules = [each["rule"] for each in run.verdict["findings"]]
+        assert (rules[0], rules.count("run.process-died")) == ("run.process-died", 1)
         run.assert_nothing_left()
     history = verb("history", runtime=tmp_path).stdout
     assert "process talker: exited" in history

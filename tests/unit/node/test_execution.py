@@ -8,8 +8,7 @@ from typing import Any
 
 import pytest
 
-from lifecycle.node.lifecycle.execution import Interruptible, Result, call, judge
-from lifecycle.node.lifecycle.machine import CallbackOutcome
+from lifecycle.node.lifecycle.steps import CallbackOutcome, Interruptible, Result, call, judge
 
 WHAT = "/camera: on_configure"
 

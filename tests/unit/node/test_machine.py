@@ -1,20 +1,29 @@
-"""The state machine: rcl's graph outside, connect inside inactive, every pair on purpose."""
+"""The state machine: rcl's graph outside, connect inside inactive, and what each row runs."""
 
 from __future__ import annotations
+
+from collections.abc import Callable, Coroutine, Iterable
+from types import CoroutineType
+from typing import Any
 
 import pytest
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+from msgspec.structs import replace
 
+from lifecycle.errors import LifecycleError
+from lifecycle.manifest.model import Timeouts
 from lifecycle.node.lifecycle.machine import (
+    TABLE,
     TRANSITION_GRAPH,
-    CallbackOutcome,
-    LifecycleMachine,
+    Machine,
     NodeState,
     RefusedError,
+    Row,
     StateChange,
     TransitionRequest,
 )
+from lifecycle.node.lifecycle.steps import CallbackOutcome, Result
 
 OK, FAILURE, ERROR = CallbackOutcome.SUCCESS, CallbackOutcome.FAILURE, CallbackOutcome.ERROR
 
@@ -79,18 +88,141 @@ FINISHED: dict[tuple[NodeState, CallbackOutcome], NodeState] = {
 }
 
 
-def machine_in(state: NodeState, changes: list[StateChange] | None = None) -> LifecycleMachine:
-    """Return a machine that was brought to `state`; `changes` hears of what comes after."""
-    heard: list[StateChange] = [] if changes is None else changes
-    machine = LifecycleMachine(heard.append)
-    for step in PATHS[state].split():
-        if step in ("OK", "ERROR"):
-            machine.finish(OK if step == "OK" else ERROR)
-        else:
-            machine.request(TransitionRequest(step))
-    assert machine.state is state
-    heard.clear()
-    return machine
+class Answer:
+    """Awaits what a callback is to return."""
+
+    def __init__(self) -> None:
+        self.outcome: CallbackOutcome | None = None
+
+    def __await__(self) -> Any:
+        while self.outcome is None:
+            yield
+        outcome, self.outcome = self.outcome, None
+        return outcome
+
+
+class FakeNode:
+    """Writes down what it is asked; fails where the test says, and awaits each callback's end."""
+
+    full_name = "/camera"
+
+    def __init__(self, table: Iterable[Row] = TABLE) -> None:
+        self.did: list[str] = []
+        self.reports: list[Result] = []
+        self.changes: list[StateChange] = []
+        self.fail: dict[str, Exception] = {}
+        self.callbacks: dict[str, Callable[..., Any]] = {}
+        self.answer = Answer()
+        self.running: CoroutineType[Any, Any, Result] | None = None
+        self.result: Result | None = None
+        self.machine = Machine(self, Timeouts(), table)
+
+    def _do(self, what: str) -> None:
+        self.did.append(what)
+        if what in self.fail:
+            raise self.fail[what]
+
+    def prepare(self) -> None:
+        self._do("prepare")
+
+    def unprepare(self) -> None:
+        self._do("unprepare")
+
+    def make_data_layer(self) -> None:
+        self._do("make")
+
+    def undo_data_layer(self) -> None:
+        self._do("undo")
+
+    def remove_data_layer(self) -> None:
+        self._do("remove")
+
+    def take_down(self) -> None:
+        self._do("take-down")
+
+    def may_activate(self) -> bool:
+        self._do("may?")
+        return True
+
+    def open_gate(self) -> None:
+        self._do("open")
+
+    def close_gate(self) -> None:
+        self._do("close")
+
+    def changed(self, change: StateChange) -> None:
+        self.changes.append(change)
+
+    def callback(self, name: str) -> Callable[..., Any]:
+        self.did.append(name)
+        return self.callbacks.get(name, self._answered)
+
+    async def _answered(self) -> Any:
+        return await self.answer
+
+    def callback_argument(self, state: NodeState) -> object:
+        return state
+
+    def wake_at_deadline(self, deadline_s: float) -> Callable[[], None]:
+        del deadline_s
+        return lambda: None
+
+    def wake(self) -> None:
+        pass
+
+    def report(self, result: Result) -> None:
+        self.reports.append(result)
+
+    # What the tests do with it.
+
+    def request(self, request: TransitionRequest) -> None:
+        """Ask for a transition, and run it until its callback waits."""
+        running: Any = self.machine.change(request)
+        self._go_on(running)
+
+    def finish(self, outcome: CallbackOutcome) -> None:
+        """Have the callback that waits return."""
+        assert self.running is not None
+        self.answer.outcome = outcome
+        self._go_on(self.running)
+
+    def _go_on(self, running: CoroutineType[Any, Any, Result]) -> None:
+        try:
+            running.send(None)
+            self.running = running
+        except StopIteration as stop:
+            self.running, self.result = None, stop.value
+
+    def follow(self, story: str) -> None:
+        """Take requests and outcomes, in order."""
+        for step in story.split():
+            if step in OUTCOMES:
+                self.finish(OUTCOMES[step])
+            else:
+                self.request(TransitionRequest(step))
+
+
+OUTCOMES = {"OK": OK, "FAILURE": FAILURE, "ERROR": ERROR}
+
+
+def node_in(state: NodeState) -> FakeNode:
+    """Return a node that was brought to `state`."""
+    node = FakeNode()
+    node.follow(PATHS[state])
+    assert node.machine.state is state
+    node.did.clear()
+    node.changes.clear()
+    return node
+
+
+def ended(coroutine: Coroutine[Any, Any, Result], *, turns: int = 5) -> Result:
+    for _ in range(turns):
+        try:
+            coroutine.send(None)
+        except StopIteration as stop:  # noqa: PERF203
+            result: Result = stop.value
+            return result
+    raise AssertionError("still running")
 
 
 @pytest.mark.parametrize("state", NodeState)
@@ -98,46 +230,239 @@ def machine_in(state: NodeState, changes: list[StateChange] | None = None) -> Li
 def test_every_state_takes_or_refuses_every_request_as_the_table_says(
     state: NodeState, request_: TransitionRequest
 ) -> None:
-    machine = machine_in(state)
+    node = node_in(state)
     goal = TAKEN.get((state, request_))
     if goal is None:
         with pytest.raises(RefusedError, match=f"^cannot {request_.value} "):
-            machine.request(request_)
-        assert machine.state is state
+            node.request(request_)
+        assert node.machine.state is state
+        assert node.did == []
     else:
-        machine.request(request_)
-        assert machine.state is goal
+        node.request(request_)
+        assert node.machine.state is goal
 
 
-@pytest.mark.parametrize("state", NodeState)
+@pytest.mark.parametrize("state", [each for each in NodeState if not each.steady])
 @pytest.mark.parametrize("outcome", CallbackOutcome)
-def test_every_state_takes_or_refuses_every_outcome_as_the_table_says(
+def test_every_transition_state_goes_on_by_every_outcome_as_the_table_says(
     state: NodeState, outcome: CallbackOutcome
 ) -> None:
-    machine = machine_in(state)
-    if state.steady:
-        with pytest.raises(RefusedError, match="none is running"):
-            machine.finish(outcome)
-        assert machine.state is state
-    else:
-        machine.finish(outcome)
-        default = NodeState.ERRORPROCESSING
-        assert machine.state is FINISHED.get((state, outcome), default)
+    node = node_in(state)
+    node.finish(outcome)
+    assert node.machine.state is FINISHED.get((state, outcome), NodeState.ERRORPROCESSING)
+
+
+def trace(table: Iterable[Row], story: str) -> object:
+    """Return all that a node does in a story, up to what is not possible."""
+    node, stopped = FakeNode(table), ""
+    try:
+        node.follow(story)
+    except Exception as error:  # noqa: BLE001 - a table without a line may refuse anything
+        stopped = type(error).__name__
+    return node.did, [change.goal for change in node.changes], node.machine.state, stopped
+
+
+def story_of(row: Row) -> str:
+    """Return the shortest story in which a line is taken, and the step after it ends."""
+    by_value = {outcome.value: name for name, outcome in OUTCOMES.items()}
+    return f"{PATHS[row.source]} {by_value.get(row.trigger, row.trigger)}"
+
+
+@pytest.mark.parametrize("row", TABLE, ids=lambda row: f"{row.trigger} from {row.source.value}")
+def test_a_line_that_is_taken_out_of_the_table_changes_what_the_node_does(row: Row) -> None:
+    story = story_of(row)
+    node = FakeNode()
+    node.follow(story)
+    assert node.machine.state is row.goal
+    assert trace([each for each in TABLE if each is not row], story) != trace(TABLE, story)
+
+
+@pytest.mark.parametrize(
+    ("row", "field"),
+    [
+        pytest.param(row, field, id=f"{getattr(row, field)}: {row.trigger} from {row.source.value}")
+        for row in TABLE
+        for field in ("condition", "before", "after")
+        if getattr(row, field)
+    ],
+)
+def test_what_a_line_names_is_what_the_node_runs(row: Row, field: str) -> None:
+    without = replace(row, **{field: ""})
+    table = [without if each is row else each for each in TABLE]
+    assert trace(table, story_of(row)) != trace(TABLE, story_of(row))
+
+
+@pytest.mark.parametrize(
+    ("state", "asked", "did"),
+    [
+        (NodeState.UNCONFIGURED, "configure", "prepare on_configure"),
+        (NodeState.INACTIVE_DISCONNECTED, "connect", "make on_connect"),
+        (
+            NodeState.INACTIVE_DISCONNECTED,
+            "activate",
+            "may? make on_connect on_activate open",
+        ),
+        (NodeState.INACTIVE_CONNECTED, "activate", "may? on_activate open"),
+        (NodeState.ACTIVE, "deactivate", "close on_deactivate"),
+        (NodeState.INACTIVE_CONNECTED, "disconnect", "on_disconnect remove"),
+        (NodeState.INACTIVE_DISCONNECTED, "cleanup", "on_cleanup unprepare"),
+        (NodeState.INACTIVE_CONNECTED, "cleanup", "on_disconnect remove on_cleanup unprepare"),
+        (NodeState.UNCONFIGURED, "shutdown", "on_shutdown take-down"),
+        (NodeState.ACTIVE, "shutdown", "close on_shutdown take-down"),
+    ],
+)
+def test_a_transition_does_these_things_in_this_order(
+    state: NodeState, asked: str, did: str
+) -> None:
+    node = node_in(state)
+    node.request(TransitionRequest(asked))
+    while node.running is not None:
+        node.finish(OK)
+    assert node.result is not None
+    assert node.result.outcome is OK
+    assert node.did == did.split()
+
+
+@pytest.mark.parametrize(
+    ("state", "asked", "did", "goal"),
+    [
+        (
+            NodeState.UNCONFIGURED,
+            "configure",
+            "prepare on_configure unprepare",
+            NodeState.UNCONFIGURED,
+        ),
+        (
+            NodeState.INACTIVE_DISCONNECTED,
+            "connect",
+            "make on_connect undo",
+            NodeState.INACTIVE_DISCONNECTED,
+        ),
+        (
+            NodeState.INACTIVE_DISCONNECTED,
+            "activate",
+            "may? make on_connect on_activate",
+            NodeState.INACTIVE_CONNECTED,
+        ),
+        (NodeState.INACTIVE_CONNECTED, "disconnect", "on_disconnect", NodeState.INACTIVE_CONNECTED),
+        (
+            NodeState.INACTIVE_CONNECTED,
+            "cleanup",
+            "on_disconnect remove on_cleanup",
+            NodeState.INACTIVE_DISCONNECTED,
+        ),
+        (NodeState.ACTIVE, "deactivate", "close on_deactivate open", NodeState.ACTIVE),
+        (NodeState.ACTIVE, "shutdown", "close on_shutdown take-down", NodeState.FINALIZED),
+    ],
+)
+def test_a_failure_undoes_its_own_step_and_no_other(
+    state: NodeState, asked: str, did: str, goal: NodeState
+) -> None:
+    node = node_in(state)
+    node.callbacks[f"on_{asked}"] = lambda: FAILURE
+    node.request(TransitionRequest(asked))
+    while node.running is not None:
+        node.finish(OK)
+    assert node.result == Result(outcome=FAILURE, error=f"/camera: on_{asked} returned FAILURE")
+    assert node.did == did.split()
+    assert node.machine.state is goal
+
+
+@pytest.mark.parametrize("answer", CallbackOutcome)
+@pytest.mark.parametrize(
+    ("state", "request_"),
+    [
+        (NodeState.UNCONFIGURED, "configure"),
+        (NodeState.INACTIVE_DISCONNECTED, "connect"),
+        (NodeState.INACTIVE_CONNECTED, "activate"),
+    ],
+)
+def test_an_error_runs_on_error_and_takes_everything_down(
+    state: NodeState, request_: str, answer: CallbackOutcome
+) -> None:
+    node = node_in(state)
+    node.callbacks[f"on_{request_}"] = lambda: ERROR
+    node.request(TransitionRequest(request_))
+    node.finish(answer)
+    assert node.result is not None
+    assert node.result.error == f"/camera: on_{request_} returned ERROR"
+    assert node.did[-2:] == ["on_error", "take-down"]
+    ends = NodeState.UNCONFIGURED if answer is OK else NodeState.FINALIZED
+    assert node.machine.state is ends
+
+
+@pytest.mark.parametrize(
+    ("what", "state", "asked", "doing"),
+    [
+        ("prepare", NodeState.UNCONFIGURED, "configure", "configuring"),
+        ("make", NodeState.INACTIVE_DISCONNECTED, "connect", "inactive/connecting"),
+        ("open", NodeState.INACTIVE_CONNECTED, "activate", "activating/connected"),
+        ("remove", NodeState.INACTIVE_CONNECTED, "disconnect", "inactive/disconnecting"),
+        ("unprepare", NodeState.INACTIVE_DISCONNECTED, "cleanup", "cleaningup/disconnected"),
+    ],
+)
+def test_a_bug_of_ours_is_an_error_and_not_a_stuck_node(
+    what: str, state: NodeState, asked: str, doing: str
+) -> None:
+    node = node_in(state)
+    node.fail[what] = ZeroDivisionError("ours")
+    node.request(TransitionRequest(asked))
+    while node.running is not None:
+        node.finish(OK)
+    assert node.result is not None
+    assert node.result.outcome is ERROR
+    assert node.result.error == f"cannot finish {doing} of /camera: ZeroDivisionError('ours')"
+    assert node.machine.state is NodeState.UNCONFIGURED
+
+
+def test_what_cannot_be_made_is_a_failure_of_its_step_alone() -> None:
+    node = node_in(NodeState.INACTIVE_DISCONNECTED)
+    node.fail["make"] = LifecycleError("no such transport")
+    node.request(TransitionRequest.CONNECT)
+    assert node.result == Result(outcome=FAILURE, error="no such transport")
+    assert node.did == ["make", "undo"]
+    assert node.machine.state is NodeState.INACTIVE_DISCONNECTED
+
+
+def test_a_condition_that_refuses_leaves_the_node_as_it_is() -> None:
+    node = node_in(NodeState.INACTIVE_CONNECTED)
+    node.fail["may?"] = RefusedError("the gate is closed")
+    with pytest.raises(RefusedError, match="the gate is closed"):
+        node.request(TransitionRequest.ACTIVATE)
+    assert node.machine.state is NodeState.INACTIVE_CONNECTED
+    assert node.changes == []
+
+
+def test_shutting_down_cancels_what_runs_first() -> None:
+    node = node_in(NodeState.CONFIGURING)
+    node.callbacks["on_error"] = node.callbacks["on_shutdown"] = lambda: OK
+    ending = node.machine.shut_down("the supervisor has gone")
+    ending.send(None)
+    assert node.running is not None
+    assert ended(node.running).error == (
+        "cannot go on with /camera: on_configure: the supervisor has gone"
+    )
+    assert ended(ending).outcome is OK
+    assert node.machine.state is NodeState.FINALIZED
+
+
+def test_shutting_down_a_finalized_node_is_done_already() -> None:
+    node = node_in(NodeState.FINALIZED)
+    assert ended(node.machine.shut_down("again")).outcome is OK
+    assert node.did == []
 
 
 def test_a_refusal_says_what_is_allowed() -> None:
-    machine = machine_in(NodeState.ACTIVE)
     with pytest.raises(RefusedError) as refused:
-        machine.request(TransitionRequest.CONFIGURE)
+        node_in(NodeState.ACTIVE).request(TransitionRequest.CONFIGURE)
     assert str(refused.value) == (
         "cannot configure in state 'active'; allowed here: deactivate, shutdown"
     )
 
 
 def test_a_refusal_during_a_transition_says_to_wait() -> None:
-    machine = machine_in(NodeState.ACTIVATING_CONNECTED)
     with pytest.raises(RefusedError) as refused:
-        machine.request(TransitionRequest.SHUTDOWN)
+        node_in(NodeState.ACTIVATING_CONNECTED).request(TransitionRequest.SHUTDOWN)
     assert str(refused.value) == (
         "cannot shutdown while the node is 'activating/connected': "
         "one transition at a time; ask again when it has ended"
@@ -145,12 +470,9 @@ def test_a_refusal_during_a_transition_says_to_wait() -> None:
 
 
 def test_connect_and_disconnect_are_announced_once_and_leave_the_seen_state_inactive() -> None:
-    changes: list[StateChange] = []
-    machine = machine_in(NodeState.INACTIVE_DISCONNECTED, changes)
-    for request in (TransitionRequest.CONNECT, TransitionRequest.DISCONNECT):
-        machine.request(request)
-        machine.finish(OK)
-    events = [change.event for change in changes if change.event is not None]
+    node = node_in(NodeState.INACTIVE_DISCONNECTED)
+    node.follow("connect OK disconnect OK")
+    events = [change.event for change in node.changes if change.event is not None]
     assert [(e.id, e.label, e.start.label, e.goal.label) for e in events] == [
         (120, "connect", "inactive", "inactive"),
         (121, "disconnect", "inactive", "inactive"),
@@ -158,19 +480,15 @@ def test_connect_and_disconnect_are_announced_once_and_leave_the_seen_state_inac
 
 
 def test_a_connect_that_fails_is_not_announced() -> None:
-    changes: list[StateChange] = []
-    machine = machine_in(NodeState.CONNECTING, changes)
-    machine.finish(FAILURE)
-    assert [change.event for change in changes] == [None]
+    node = node_in(NodeState.CONNECTING)
+    node.finish(FAILURE)
+    assert [change.event for change in node.changes] == [None]
 
 
 def test_activating_from_disconnected_announces_what_rcl_announces_and_no_more() -> None:
-    changes: list[StateChange] = []
-    machine = machine_in(NodeState.INACTIVE_DISCONNECTED, changes)
-    machine.request(TransitionRequest.ACTIVATE)
-    machine.finish(OK)
-    machine.finish(OK)
-    events = [change.event for change in changes if change.event is not None]
+    node = node_in(NodeState.INACTIVE_DISCONNECTED)
+    node.follow("activate OK OK")
+    events = [change.event for change in node.changes if change.event is not None]
     assert [(e.start.label, e.goal.label) for e in events] == [
         ("inactive", "activating"),
         ("activating", "active"),
@@ -178,10 +496,9 @@ def test_activating_from_disconnected_announces_what_rcl_announces_and_no_more()
 
 
 def test_an_error_while_connecting_is_announced_from_inactive() -> None:
-    changes: list[StateChange] = []
-    machine = machine_in(NodeState.CONNECTING, changes)
-    machine.finish(ERROR)
-    event = changes[-1].event
+    node = node_in(NodeState.CONNECTING)
+    node.finish(ERROR)
+    event = node.changes[-1].event
     assert event is not None
     assert (event.start.label, event.goal.label) == ("inactive", "errorprocessing")
 
@@ -204,11 +521,11 @@ def test_an_error_while_connecting_is_announced_from_inactive() -> None:
 def test_available_transitions_are_what_can_be_asked_for_here(
     state: NodeState, labels: list[str]
 ) -> None:
-    assert [t.label for t in machine_in(state).available_transitions()] == labels
+    assert [t.label for t in node_in(state).machine.available_transitions()] == labels
 
 
 def test_nobody_outside_may_finish_a_transition() -> None:
-    machine = machine_in(NodeState.CONFIGURING)
+    machine = node_in(NodeState.CONFIGURING).machine
     assert machine.resolve(10) is None
     assert machine.resolve(0, "transition_success") is None
 
@@ -223,52 +540,56 @@ class Walk(RuleBasedStateMachine):
 
     def __init__(self) -> None:
         super().__init__()
-        self.changes: list[StateChange] = []
-        self.machine = LifecycleMachine(self.changes.append)
+        self.node = FakeNode()
+
+    @property
+    def state(self) -> NodeState:
+        return self.node.machine.state
 
     @rule(request=st.sampled_from(TransitionRequest))
     def ask(self, request: TransitionRequest) -> None:
-        before, heard = self.machine.state, len(self.changes)
+        before, count = self.state, len(self.node.changes)
         try:
-            self.machine.request(request)
+            self.node.request(request)
         except RefusedError:
             assert (before, request) not in TAKEN
-            assert self.machine.state is before
-            assert len(self.changes) == heard
+            assert self.state is before
+            assert len(self.node.changes) == count
         else:
-            assert self.machine.state is TAKEN[before, request]
+            assert self.state is TAKEN[before, request]
 
-    @precondition(lambda self: not self.machine.state.steady)
+    @precondition(lambda self: not self.state.steady)
     @rule(outcome=st.sampled_from(CallbackOutcome))
     def finish(self, outcome: CallbackOutcome) -> None:
-        before = self.machine.state
-        self.machine.finish(outcome)
-        assert self.machine.state is FINISHED.get((before, outcome), NodeState.ERRORPROCESSING)
+        before = self.state
+        self.node.finish(outcome)
+        assert self.state is FINISHED.get((before, outcome), NodeState.ERRORPROCESSING)
 
     @invariant()
     def changes_form_a_chain(self) -> None:
-        goals = [NodeState.UNCONFIGURED, *(change.goal for change in self.changes)]
-        assert [change.start for change in self.changes] == goals[:-1]
-        assert goals[-1] is self.machine.state
+        goals = [NodeState.UNCONFIGURED, *(change.goal for change in self.node.changes)]
+        assert [change.start for change in self.node.changes] == goals[:-1]
+        assert goals[-1] is self.state
 
     @invariant()
-    def events_tell_the_seen_state(self) -> None:
+    def events_follow_the_seen_state(self) -> None:
         seen = "unconfigured"
-        for change in self.changes:
+        for change in self.node.changes:
             if change.event is not None:
                 assert change.event.start.label == seen
                 seen = change.event.goal.label
-        assert seen == self.machine.state.seen.label
+        assert seen == self.state.seen.label
 
     @invariant()
-    def only_a_connected_node_is_active(self) -> None:
-        assert self.machine.state is not NodeState.ACTIVE or self.machine.state.connected
+    def the_gate_is_open_exactly_while_it_is_active(self) -> None:
+        gate = [each for each in self.node.did if each in ("open", "close")]
+        assert (gate[-1:] == ["open"]) == (self.state is NodeState.ACTIVE)
 
     @invariant()
     def what_is_available_is_what_is_taken(self) -> None:
-        if self.machine.state.steady:
-            offered = [t.label for t in self.machine.available_transitions()]
-            assert sorted(offered) == sorted(r.value for r in self.machine.allowed())
+        if self.state.steady:
+            offered = [t.label for t in self.node.machine.available_transitions()]
+            assert sorted(offered) == sorted(r.value for r in self.node.machine.allowed())
 
 
 TestWalk = Walk.TestCase

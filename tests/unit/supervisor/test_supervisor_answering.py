@@ -11,7 +11,6 @@ import pytest
 from lifecycle.errors import BringUpError
 from lifecycle.manifest.model import RunKind
 from lifecycle.node.host.control import Operation
-from lifecycle.plan.model import PlannedNode
 from lifecycle.supervisor.core.state import Level
 from lifecycle.supervisor.health.answering import ANSWER_S, SHOWN_S, TRIES, Answering
 from lifecycle.supervisor.nodes.driver import ActiveError, ChangedError, ServiceDriver
@@ -31,9 +30,9 @@ class _Node:
         self.asked_s: list[float] = []
 
     async def answers(
-        self, node: PlannedNode, *, timeout_s: float, repeat: bool = False
+        self, node: str, *, managed: bool, timeout_s: float, repeat: bool = False
     ) -> bool | None:
-        del node, repeat
+        del node, managed, repeat
         loop = asyncio.get_running_loop()
         self.asked_s.append(loop.time())
         if not self.shows:
@@ -41,9 +40,9 @@ class _Node:
         await asyncio.sleep(min(timeout_s, max(0.0, self.from_s - loop.time())))
         return loop.time() >= self.from_s
 
-    def serves_nothing(self, node: PlannedNode) -> bool:
+    def serves_parameters(self, node: str) -> bool | None:
         del node
-        return self.is_sure
+        return False if self.is_sure else None
 
 
 def _before_the_gate(
@@ -104,17 +103,20 @@ def test_a_node_that_serves_nothing_is_named_and_not_found(
 
 
 class ForeignNode:
-    """The lifecycle services of a managed node that others started; remembers the requests."""
+    """The lifecycle services of a managed node that others started, and may move meanwhile.
 
-    def __init__(self) -> None:
-        self.state = "inactive"
+    Attributes:
+        moved_to: states that somebody moves it to right after each of the first requests.
+        requests: so far.
+    """
+
+    def __init__(self, state: str, *moved_to: str) -> None:
+        self.state = state
+        self.moved_to = list(moved_to)
         self.requests: list[str] = []
 
     async def get_state(self, node: str, *, timeout_s: float) -> str:
         return self.state
-
-    async def get_available_transitions(self, node: str, *, timeout_s: float) -> tuple[str, ...]:
-        return ("activate", "cleanup", "shutdown")
 
     async def change_state(
         self,
@@ -127,8 +129,15 @@ class ForeignNode:
         if before is not None:
             await before()
         self.requests.append(transition)
-        self.state = "active"
+        self.state = "inactive" if transition == "deactivate" else "active"
+        if self.moved_to:
+            self.state = self.moved_to.pop(0)
         return True
+
+    async def perform(self, operation: Operation, permit: Permit | None = None) -> str:
+        """Have it driven; return its state."""
+        driver = ServiceDriver(self, planned_node("b"))  # type: ignore[arg-type]
+        return (await driver.perform(operation, permit)).state  # type: ignore[arg-type]
 
 
 class Permit:
@@ -143,58 +152,30 @@ class Permit:
 
 
 async def test_a_foreign_node_gets_no_activate_request_without_a_permit_that_holds() -> None:
-    node = ForeignNode()
-    driver = ServiceDriver(node, planned_node("b"))  # type: ignore[arg-type]
+    node = ForeignNode("inactive")
     with pytest.raises(BringUpError, match="cannot activate '/b' without a permit"):
-        await driver.perform(Operation.ACTIVATE)
+        await node.perform(Operation.ACTIVATE)
     with pytest.raises(ChangedError):
-        await driver.perform(Operation.ACTIVATE, Permit(holds=False))  # type: ignore[arg-type]
+        await node.perform(Operation.ACTIVATE, Permit(holds=False))
     assert node.requests == []
-    await driver.perform(Operation.ACTIVATE, Permit())  # type: ignore[arg-type]
+    await node.perform(Operation.ACTIVATE, Permit())
     assert node.requests == ["activate"]
 
 
-class _Moved(ForeignNode):
-    """Somebody moves it right after each of the first requests."""
-
-    def __init__(self, state: str, *moved_to: str) -> None:
-        super().__init__()
-        self.state = state
-        self.moved_to = list(moved_to)
-
-    async def change_state(
-        self,
-        node: str,
-        transition: str,
-        *,
-        timeout_s: float,
-        before: Callable[[], Awaitable[None]] | None = None,
-    ) -> bool:
-        await super().change_state(node, transition, timeout_s=timeout_s, before=before)
-        self.state = "inactive" if transition == "deactivate" else "active"
-        if self.moved_to:
-            self.state = self.moved_to.pop(0)
-        return True
-
-
 async def test_a_node_that_somebody_moves_meanwhile_is_asked_again() -> None:
-    node = _Moved("active", "active")
-    driver = ServiceDriver(node, planned_node("b"))  # type: ignore[arg-type]
-    assert (await driver.perform(Operation.DEACTIVATE)).state == "inactive"
+    node = ForeignNode("active", "active")
+    assert await node.perform(Operation.DEACTIVATE) == "inactive"
     assert node.requests == ["deactivate", "deactivate"]
-    node = _Moved("inactive", "inactive")
-    driver = ServiceDriver(node, planned_node("b"))  # type: ignore[arg-type]
-    assert (await driver.perform(Operation.ACTIVATE, Permit())).state == "active"
+    node = ForeignNode("inactive", "inactive")
+    assert await node.perform(Operation.ACTIVATE, Permit()) == "active"
     assert node.requests == ["activate", "activate"]
 
 
 async def test_whoever_moves_it_each_time_is_named_and_no_request_is_sent_that_cannot_be() -> None:
-    node = _Moved("active", *["active"] * 9)
-    driver = ServiceDriver(node, planned_node("b"))  # type: ignore[arg-type]
+    node = ForeignNode("active", *["active"] * 9)
     with pytest.raises(ActiveError, match="activated again by its own code or another client"):
-        await driver.perform(Operation.DEACTIVATE)
-    node = _Moved("active", "unconfigured")
-    driver = ServiceDriver(node, planned_node("b"))  # type: ignore[arg-type]
+        await node.perform(Operation.DEACTIVATE)
+    node = ForeignNode("active", "unconfigured")
     with pytest.raises(BringUpError, match="others moved it, and it is unconfigured"):
-        await driver.perform(Operation.DEACTIVATE)
+        await node.perform(Operation.DEACTIVATE)
     assert node.requests == ["deactivate"]

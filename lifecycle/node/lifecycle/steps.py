@@ -9,6 +9,7 @@ Python: it is judged when it returns, and a supervisor that lost patience ends t
 from __future__ import annotations
 
 import contextlib
+import enum
 import inspect
 import time
 import traceback
@@ -18,7 +19,14 @@ from typing import Any
 import msgspec
 
 from lifecycle.errors import LifecycleError
-from lifecycle.node.lifecycle.machine import CallbackOutcome
+
+
+class CallbackOutcome(enum.Enum):
+    """The outcome of a transition callback; values are rcl_lifecycle's transition labels."""
+
+    SUCCESS = "transition_success"
+    FAILURE = "transition_failure"
+    ERROR = "transition_error"
 
 
 class DeadlineError(LifecycleError):
