@@ -68,26 +68,14 @@ class Journal:
         system: its name.
         run_id: of the run.
         say: takes what a person should know.
-        wall: the host's clock, seconds since the epoch.
-        clock: seconds, on any clock that only goes forward.
     """
 
-    def __init__(
-        self,
-        system: str,
-        run_id: str,
-        *,
-        say: Callable[[str], None],
-        wall: Callable[[], float] = time.time,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
+    def __init__(self, system: str, run_id: str, *, say: Callable[[str], None]) -> None:
         self._run = JournaledRun(
             journal_version=1, system=system, run_id=run_id, supervisor=os.getpid()
         )
         self._say = say
-        self._wall = wall
-        self._clock = clock
-        self._began = clock()
+        self._began = time.monotonic()
         self._waiting: list[bytes] | None = []
         self._file: RotatedFile | None = None
         self._failed_s: float | None = None
@@ -120,19 +108,20 @@ class Journal:
             self._write(line)
 
     def _line(self, **content: object) -> bytes:
-        now = {"at": round(self._wall(), 6), "elapsed_s": round(self._clock() - self._began, 6)}
+        elapsed_s = round(time.monotonic() - self._began, 6)
+        now = {"at": round(time.time(), 6), "elapsed_s": elapsed_s}
         return codec.to_json({**now, **content}) + b"\n"
 
     def _write(self, line: bytes) -> None:
         if self._file is None:
             return  # the run is over
-        if self._failed_s is not None and self._clock() - self._failed_s < _TRIED_AGAIN_S:
+        if self._failed_s is not None and time.monotonic() - self._failed_s < _TRIED_AGAIN_S:
             return
         try:
             self._file.write(line, LARGEST_JOURNAL)
             self._failed_s = None
         except OSError as error:
-            first, self._failed_s = self._failed_s is None, self._clock()
+            first, self._failed_s = self._failed_s is None, time.monotonic()
             if first:
                 self._say(
                     f"cannot write {str(self._file.path)!r}: {error.strerror}; the run goes on, "

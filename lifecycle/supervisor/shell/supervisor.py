@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import os
 import signal
 from collections import deque
 from collections.abc import Callable, Coroutine, Iterator
@@ -193,13 +192,7 @@ class Supervisor:
 
     def status(self) -> SystemStatus:
         """Return what is known now."""
-        run = self.system.run
-        return system_status(
-            self.system,
-            supervisor=os.getpid(),
-            elapsed_s=self._emit.elapsed_s,
-            ends="" if run.ending is None else run.ending.why,
-        )
+        return system_status(self.system)
 
     def look(self) -> SupervisorSnapshot:
         """Return all that is known now."""
