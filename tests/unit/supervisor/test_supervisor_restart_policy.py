@@ -498,7 +498,8 @@ async def test_status_says_what_failed_and_when_it_is_started_again(tmp_path: Pa
         assert away.last_failure is not None
         assert away.last_failure.signal == "SIGSEGV"
         assert away.last_failure.stderr == ""
-        assert (viewer.restarts, viewer.uptime_s, viewer.last_failure) == (0, 1.25, None)
+        assert viewer.uptime_s == pytest.approx(1.25, abs=0.01)
+        assert (viewer.restarts, viewer.last_failure) == (0, None)
         world.hosts.ways.clear()
 
 
