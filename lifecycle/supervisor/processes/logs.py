@@ -30,7 +30,7 @@ LARGEST_LOG = 16 * 2**20
 _LARGEST_PIPE = 2**20
 """Bytes; /proc/sys/fs/pipe-max-size by default, pipe(7)."""
 
-_TRIED_AGAIN_S = 1.0
+TRIED_AGAIN_S = 1.0
 """How often a log is tried that could not be written."""
 
 _SAID_AGAIN_S = 60.0
@@ -320,7 +320,6 @@ class RotatedFile:
         largest: bytes that it has at most.
         mode: its permissions.
         head: returns the line that each file begins with.
-        clock: seconds, on any clock that only goes forward.
 
     Attributes:
         error: why the last line could not be written; None if it was.
@@ -333,14 +332,12 @@ class RotatedFile:
         *,
         mode: int = 0o666,
         head: Callable[[], bytes] = bytes,
-        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.path = path
         self.largest = largest
         self.error: OSError | None = None
         self._mode = mode
         self._head = head
-        self._clock = clock
         self._failed_s = 0.0
         self._file: int | None = None
         self._bytes = 0
@@ -348,8 +345,8 @@ class RotatedFile:
 
     def add(self, line: bytes) -> bool:
         """Append a line; False if that failed, now or within the last second."""
-        now_s = self._clock()
-        if self.error is not None and now_s - self._failed_s < _TRIED_AGAIN_S:
+        now_s = time.monotonic()
+        if self.error is not None and now_s - self._failed_s < TRIED_AGAIN_S:
             return False
         try:
             self._write(line)

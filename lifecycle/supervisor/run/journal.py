@@ -70,8 +70,6 @@ class Journal:
         system: its name.
         run_id: of the run.
         say: takes what a person should know.
-        wall: the host's clock, seconds since the epoch.
-        clock: seconds, on any clock that only goes forward.
     """
 
     def __init__(
@@ -80,16 +78,12 @@ class Journal:
         run_id: str,
         *,
         say: Callable[[str], None],
-        wall: Callable[[], float] = time.time,
-        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._run = JournaledRun(
             journal_version=1, system=system, run_id=run_id, supervisor=os.getpid()
         )
         self._say = say
-        self._wall = wall
-        self._clock = clock
-        self._began = clock()
+        self._began = time.monotonic()
         self._waiting: list[bytes] = []
         self._file: RotatedFile | None = None
 
@@ -101,7 +95,6 @@ class Journal:
             LARGEST_JOURNAL,
             mode=0o600,
             head=lambda: self._line(run=self._run),
-            clock=self._clock,
         )
         for line in self._waiting:
             self._write(self._file, line)
@@ -125,7 +118,8 @@ class Journal:
             self._write(self._file, line)
 
     def _line(self, **content: object) -> bytes:
-        now = {"at": round(self._wall(), 6), "elapsed_s": round(self._clock() - self._began, 6)}
+        elapsed_s = round(time.monotonic() - self._began, 6)
+        now = {"at": round(time.time(), 6), "elapsed_s": elapsed_s}
         return codec.to_json({**now, **content}) + b"\n"
 
     def _write(self, file: RotatedFile, line: bytes) -> None:

@@ -506,7 +506,7 @@ class SessionWorld:
         self._tmp_path = tmp_path
         self._emit = Emitter(loop.time)
         self._emit.listen(self._take)
-        self.journal = Journal("robot", "0", say=self.story.append, wall=loop.time, clock=loop.time)
+        self.journal = Journal("robot", "0", say=self.story.append)
         self._emit.listen(self.journal.on_event)
         self._options = UpOptions(**options)
         (tmp_path / "logs").mkdir()
