@@ -72,7 +72,7 @@ from lifecycle.supervisor.run.events import (
     Stopping,
     SystemReached,
 )
-from lifecycle.supervisor.run.failure import StepFailedError, never_connected, with_failure
+from lifecycle.supervisor.run.failure import StepFailedError, ended_early
 from lifecycle.supervisor.run.journal import Journal
 from lifecycle.supervisor.run.options import (
     Until,
@@ -87,7 +87,6 @@ from lifecycle.supervisor.run.records import Records
 from lifecycle.supervisor.run.service_manager import ServiceManager
 from lifecycle.supervisor.run.signals import Ending
 from lifecycle.supervisor.shell.supervisor import Means, Supervisor
-from lifecycle.verify.verdict import NOT_JUDGED
 
 LEAVE_S = 10.0
 """A participant leaves within 0.2 s, over connections that are not answered within 4 s.
@@ -177,8 +176,7 @@ def up(
             leaving.enter_context(journal.writing(logs))
             fork_server = ForkServer(process)
             leaving.enter_context(_forgetting_runs(emit, logs, plan.system))
-            records = Records(directory, system, fork_server, emit)
-            leaving.callback(records.close)
+            records = Records(directory, system, fork_server)
             records.write()
             try:
                 # Before any participant: who asks a server that is not there waits to ask again.
@@ -203,13 +201,9 @@ def up(
                 on_start(supervisor.status)
                 return await supervisor.run()
             except StepFailedError as failure:
-                emit(failure.event())
-                verdict = never_connected(
-                    with_failure(NOT_JUDGED, failure),
-                    f"failed: {failure.subject} ({failure.rule.id})",
-                    failure.exit_code,
-                )
-                return UpResult(exit_code=failure.exit_code, verdict=verdict)
+                emit(failed := failure.event())
+                reason = f"failed: {failed.subject} ({failed.rule})"
+                return ended_early(reason, failure.exit_code, failed)
             finally:
                 await discovery_server.end(system, asyncio.Event())
                 await fork_server.close()
