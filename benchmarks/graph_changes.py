@@ -36,7 +36,7 @@ from lifecycle.manifest.loading import load
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.plan.build import build_plan
 from lifecycle.plan.model import Plan
-from lifecycle.supervisor.health.agreement import Agreement
+from lifecycle.supervisor.health.peers import Peers
 from lifecycle.supervisor.judging.judge import Judge
 from lifecycle.verify.observation import (
     EndpointReport,
@@ -189,9 +189,9 @@ class Supervised:
         loop = GraphLoop(own_thread=False)
         self._graph = Observer(self.shown, None, loop)  # type: ignore[arg-type]
         system: Any = World(plan, folder).system
-        agreement: Any = Agreement(system, None, None)  # type: ignore[arg-type]
+        peers: Any = Peers(system, None)  # type: ignore[arg-type]
         self.state: Any = self
-        self.judge = Judge(system, self, looker=None, agreement=agreement)  # type: ignore[arg-type]
+        self.judge = Judge(system, self, looker=None, peers=peers)  # type: ignore[arg-type]
 
     async def observe(self, plan: Plan) -> Observation:
         """Give what nodes report, and look."""

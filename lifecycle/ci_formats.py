@@ -1,7 +1,8 @@
-"""JUnit XML and SARIF 2.1.0, as continuous integration and editors read them: one writer of each.
+"""JUnit XML, SARIF 2.1.0 and annotations of GitHub, as continuous integration reads them.
 
-Owns: the shape of both, for `check` and `verify`; what is in them is their callers'. Source of the
-latter: OASIS SARIF 2.1.0. Pure.
+Owns: one writer of each, for `check` and `verify` alike, and `Problem`, the one shape of what they
+have found; what is in them is their callers'. Sources: OASIS SARIF 2.1.0; "Workflow commands for
+GitHub Actions", setting an error message. Pure.
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ def junit(suites: Iterable[Suite], *, name: str = "") -> str:
 def _case(suite: ET.Element, case: Case) -> None:
     element = ET.SubElement(suite, "testcase", classname=case.classname, name=lines(case.name))
     if case.at:
-        file, line, _ = case.at.rsplit(":", 2)
+        file, line, _ = _place(case.at)
         element.set("file", lines(file))
         element.set("line", line)
     if case.failure is not None:
@@ -91,11 +92,13 @@ def _count(element: ET.Element, cases: Sequence[Case]) -> None:
     element.set("skipped", str(sum(bool(each.skipped) for each in cases)))
 
 
-class Result(msgspec.Struct, frozen=True, kw_only=True):
-    """One result of SARIF.
+class Problem(msgspec.Struct, frozen=True, kw_only=True):
+    """Something that `check` or `verify` has found.
 
     Attributes:
         level: "error", "warning", "note" or "none".
+        message: a sentence.
+        hint: what to do about it; empty for nothing.
         subject: what it is about, in words of the system; empty for none.
         at: `file:line:column` of a declaration; empty for none.
         properties: for readers of this tool.
@@ -103,14 +106,43 @@ class Result(msgspec.Struct, frozen=True, kw_only=True):
 
     rule: str
     level: str
-    text: str
+    message: str
+    hint: str = ""
     subject: str = ""
     at: str = ""
     properties: Json = {}
 
+    @property
+    def text(self) -> str:
+        """The message, with what to do behind it."""
+        return f"{self.message}; {self.hint}" if self.hint else self.message
+
+
+_ESCAPED = str.maketrans({"%": "%25", "\r": "%0D", "\n": "%0A"})
+_ESCAPED_IN_PROPERTIES = {**_ESCAPED, ord(":"): "%3A", ord(","): "%2C"}
+
+
+def github(problem: Problem) -> str:
+    """Return a workflow command that GitHub Actions shows beside the line of a file."""
+    file, line, column = _place(problem.at) if problem.at else ("", "", "")
+    values = {"file": file, "line": line, "col": column, "title": problem.rule}
+    named = ",".join(
+        f"{name}={value.translate(_ESCAPED_IN_PROPERTIES)}"
+        for name, value in values.items()
+        if value
+    )
+    level = "notice" if problem.level == "note" else problem.level
+    return f"::{level} {named}::{problem.text.translate(_ESCAPED)}"
+
+
+def _place(at: str) -> tuple[str, str, str]:
+    """Return file, line and column."""
+    file, line, column = at.rsplit(":", 2)
+    return file, line, column
+
 
 def sarif(
-    results: Iterable[Result],
+    problems: Iterable[Problem],
     rules: Sequence[Mapping[str, object]],
     *,
     properties: Json,
@@ -119,7 +151,7 @@ def sarif(
     """Return a SARIF log with one run.
 
     Args:
-        results: in their order.
+        problems: in their order.
         rules: each with its `id`.
         properties: of the run.
         invocation: how it ended; None if it did not yet.
@@ -128,7 +160,7 @@ def sarif(
     run: Json = {
         "tool": {"driver": {"name": "lifecycle", "rules": rules}},
         "columnKind": "unicodeCodePoints",
-        "results": [_result(each, index.get(each.rule)) for each in results],
+        "results": [_result(each, index.get(each.rule)) for each in problems],
         "properties": properties,
     }
     if invocation is not None:
@@ -141,12 +173,12 @@ def sarif(
     return json_text(json.dumps(log, ensure_ascii=False, indent=2)) + "\n"
 
 
-def _result(each: Result, rule_index: int | None) -> Json:
+def _result(each: Problem, rule_index: int | None) -> Json:
     location: Json = {}
     if each.subject:
         location["logicalLocations"] = [{"fullyQualifiedName": each.subject, "kind": "resource"}]
     if each.at:
-        file, line, column = each.at.rsplit(":", 2)
+        file, line, column = _place(each.at)
         location["physicalLocation"] = {
             "artifactLocation": {"uri": quote(file)},
             "region": {"startLine": int(line), "startColumn": int(column)},

@@ -155,8 +155,7 @@ def format_verdict(
         colour: mark outcomes of text with ANSI colours.
         strict: what cannot be verified counts as refused.
     """
-    from lifecycle.verify.outcome import Outcome
-    from lifecycle.verify.report import render_text, to_json, to_junit, to_sarif
+    from lifecycle.verify.report import render_text, to_github, to_json, to_junit, to_sarif
 
     if format_ == "json":
         return to_json(verdict)
@@ -164,44 +163,9 @@ def format_verdict(
         return to_junit(verdict, plan, strict=strict)
     if format_ == "sarif":
         return to_sarif(verdict)
-    text = render_text(verdict, colour=colour)
     if format_ == "github":
-        found = [
-            annotation(
-                "error" if each.outcome is Outcome.VIOLATED or strict else "warning",
-                each.rule,
-                f"{each.message}; {each.hint}" if each.hint else each.message,
-                at=each.at,
-            )
-            for each in verdict.findings
-        ]
-        return "\n".join([text.rstrip("\n"), *found])
-    return text
-
-
-_ESCAPED = str.maketrans({"%": "%25", "\r": "%0D", "\n": "%0A"})
-_ESCAPED_IN_PROPERTIES = {**_ESCAPED, ord(":"): "%3A", ord(","): "%2C"}
-
-
-def annotation(level: str, title: str, message: str, *, at: str) -> str:
-    """Return a workflow command that GitHub Actions shows beside the line of a file.
-
-    Args:
-        level: "error", "warning" or "notice".
-        title: what it begins with: a rule's id.
-        message: any text.
-        at: `file:line:column`; empty for none.
-
-    Source: "Workflow commands for GitHub Actions", setting an error message.
-    """
-    file, line, column = (at.rsplit(":", 2) if at.count(":") > 1 else ["", "", ""])[:3]
-    values = {"file": file, "line": line, "col": column, "title": title}
-    named = ",".join(
-        f"{name}={value.translate(_ESCAPED_IN_PROPERTIES)}"
-        for name, value in values.items()
-        if value
-    )
-    return f"::{level} {named}::{message.translate(_ESCAPED)}"
+        return to_github(verdict, strict=strict)
+    return render_text(verdict, colour=colour)
 
 
 class ReportFile:

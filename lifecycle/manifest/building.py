@@ -12,6 +12,7 @@ import os
 import shlex
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import TypeVar
 
 from lifecycle.manifest import written
 from lifecycle.manifest.diagnostics import Diagnostic, Position
@@ -23,7 +24,6 @@ from lifecycle.manifest.model import (
     ConnectionDeclaration,
     Consequence,
     DataLayer,
-    Discovery,
     EndpointKind,
     Executor,
     FlowNeed,
@@ -52,26 +52,24 @@ from lifecycle.network.connection_url import ConnectionUrl, ConnectionUrlError, 
 _KINDS = {kind.value: kind for kind in EndpointKind}
 
 
-def build_discovery(root: Cursor) -> Discovery:
-    """Build the discovery of a document; the defaults where it declares nothing."""
-    cursor = root.get("discovery")
-    return Discovery() if cursor is None else cursor.build(Discovery, at=cursor.key_at)
+T = TypeVar("T")
+
+
+def section(cursor: Cursor, key: str, type_: type[T]) -> T:
+    """Return a section that is kept as it is written; the defaults of its keys if it is missing."""
+    return written.read(cursor.document.plain((*cursor.place, key)), type_, strict=False)
 
 
 def build_data_layer(root: Cursor, found: list[Diagnostic]) -> DataLayer:
     """Build the data layer of a document; the defaults where it declares nothing."""
-    cursor = root.get("data_layer")
-    if cursor is None:
-        return DataLayer()
-    default = DataLayer()
-    group = cursor.text("multicast_group", default.multicast_group)
+    layer = section(root, "data_layer", DataLayer)
+    group = layer.multicast_group
     if not _is_ipv4_group(group):
-        at = root.document.at((*cursor.place, "multicast_group"))
+        at = root.document.at((*root.place, "data_layer", "multicast_group"))
         message = f"cannot use {quote(group)} as a multicast group; it must be IPv4"
         hint = "239.255.0.0 to 239.255.255.255 stay within an organisation (RFC 2365)"
         found.append(error("manifest.multicast-group", at, message, hint))
-        group = default.multicast_group
-    return cursor.build(DataLayer, multicast_group=group, at=cursor.key_at)
+    return layer
 
 
 def build_on_violation(cursor: Cursor) -> OnViolation:
@@ -243,7 +241,7 @@ def build_node(
             After(node=name, condition=Condition(each.scalar), at=each.key_at)
             for name, each in cursor.entries("after")
         ),
-        timeouts=_timeouts(cursor),
+        timeouts=section(cursor, "timeouts", Timeouts),
         supervision=cursor.build(Supervision),
         on_violation=build_on_violation(cursor),
         health=None if health is None else _health(health),
@@ -280,7 +278,6 @@ def _run(node: Cursor, base: Path, found: Findings) -> Run:
         _refuse(cursor, ("extra_arguments",), "what is no component", found)
     _check_python_keys(cursor, kind, found)
     folder = cursor.text("working_directory")
-    limits = cursor.get("limits")
     return cursor.build(
         Run,
         kind=kind,
@@ -289,7 +286,7 @@ def _run(node: Cursor, base: Path, found: Findings) -> Run:
         environment=tuple((name, each.value.text) for name, each in cursor.entries("environment")),
         working_directory=absolute(base, folder) if folder else "",
         prefix=_words(cursor, "prefix", found),
-        limits=None if limits is None else limits.build(Limits),
+        limits=section(cursor, "limits", Limits) if "limits" in cursor else None,
         resources=_resources(cursor, found),
     )
 
@@ -425,11 +422,6 @@ def _health(cursor: Cursor) -> Health:
     if patterns is None or isinstance(patterns.value.data, tuple):
         return cursor.build(Health)
     return cursor.build(Health, diagnostics=(patterns.value.text,))
-
-
-def _timeouts(node: Cursor) -> Timeouts:
-    cursor = node.get("timeouts")
-    return Timeouts() if cursor is None else cursor.build(Timeouts)
 
 
 def _flows(node: Cursor) -> list[FlowNeed]:

@@ -20,17 +20,18 @@ from msgspec.structs import replace
 
 from lifecycle.manifest.building import (
     build_data_layer,
-    build_discovery,
     build_modes,
     build_node,
     build_on_violation,
     positions_of,
     quantities,
+    section,
 )
 from lifecycle.manifest.checks import check
 from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position, Severity
 from lifecycle.manifest.interface import Findings
 from lifecycle.manifest.model import (
+    Discovery,
     Link,
     Machine,
     Manifest,
@@ -38,6 +39,7 @@ from lifecycle.manifest.model import (
     Node,
     Policy,
 )
+from lifecycle.manifest.parameter_files import ParameterFiles
 from lifecycle.manifest.schema import validate
 from lifecycle.manifest.shared import Shared, settle
 from lifecycle.manifest.yaml import include
@@ -68,7 +70,6 @@ def build_network(root: Cursor, *, base: Path, found: list[Diagnostic]) -> Netwo
         Network,
         transport_priority_mapping=_priority_mapping(cursor, found),
         five_qi_dscp=_dscp_mapping(cursor, base, found),
-        at=cursor.key_at,
     )
 
 
@@ -114,7 +115,9 @@ def _dscp_mapping(network: Cursor, base: Path, found: list[Diagnostic]) -> DscpM
 THIS_HOST = "local"
 """Name of the machine of nodes that name none; declared implicitly, without address."""
 
-_SEVERITIES = {"error": Severity.ERROR, "warning": Severity.WARNING, "ignore": None}
+
+_SECTIONS = ("discovery", "network", "data_layer", "on_violation")
+"""Sections of a document that findings may be about."""
 
 
 def build_manifest(
@@ -148,15 +151,18 @@ def build_manifest(
         system=root.text("system"),
         description=root.text("description"),
         machines=_machines(root, nodes, found),
-        discovery=build_discovery(root),
+        discovery=section(root, "discovery", Discovery),
         network=build_network(root, base=base, found=found),
         data_layer=build_data_layer(root, found),
-        policy=_policy(root),
+        policy=section(root, "policy", Policy),
         on_violation=build_on_violation(root),
         modes=build_modes(root, found),
         nodes=nodes,
         links=tuple(_link(each) for each in root.items("links")),
-        positions=positions_of(root, ("discovery", "data_layer", "on_violation")),
+        positions={
+            **positions_of(root, _SECTIONS),
+            **{key: each.key_at for key in _SECTIONS if (each := root.get(key)) is not None},
+        },
     )
 
 
@@ -177,19 +183,6 @@ def _machines(root: Cursor, nodes: tuple[Node, ...], found: Findings) -> tuple[M
     return tuple(machines)
 
 
-def _policy(root: Cursor) -> Policy:
-    cursor = root.get("policy")
-    if cursor is None:
-        return Policy()
-    return cursor.build(
-        Policy,
-        unverifiable_blocks=cursor.text("unverifiable") == "block",
-        unpublished=_SEVERITIES[cursor.text("unpublished", "error")],
-        unheard=_SEVERITIES[cursor.text("unheard", "warning")],
-        ros_interface_required=cursor.get("ros_interface") is not None,
-    )
-
-
 def _link(cursor: Cursor) -> Link:
     return cursor.build(
         Link,
@@ -208,10 +201,12 @@ class Loaded(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         warnings: what may be wrong with it, and notes, by position.
+        files: the parameter files that its nodes name, as they were read.
     """
 
     manifest: Manifest
     warnings: tuple[Diagnostic, ...]
+    files: ParameterFiles
 
 
 def load(
@@ -245,7 +240,8 @@ def load(
 
     if manifest is None or _has_errors(found):
         raise ManifestError(every())
-    manifest = settle(_without_left_out(manifest), found)
+    files = ParameterFiles(manifest.path)
+    manifest = settle(_without_left_out(manifest), files, found)
     if not manifest.nodes and manifest.left_out:
         at = Position(file=manifest.path, line=1, column=1)
         message = "cannot run a system without nodes: conditions leave out all of them"
@@ -258,12 +254,13 @@ def load(
             )
         )
     if not _has_errors(found):
-        found += check(manifest, environment=variables)
+        found += check(manifest, environment=variables, files=files)
     if _has_errors(found):
         raise ManifestError(every())
     warnings = every()
     unproven = tuple(each for each in warnings if each.is_unproven)
-    return Loaded(manifest=replace(manifest, unproven=unproven), warnings=warnings)
+    manifest = replace(manifest, unproven=unproven)
+    return Loaded(manifest=manifest, warnings=warnings, files=files)
 
 
 class ArgumentDeclaration(msgspec.Struct, frozen=True, kw_only=True):
@@ -556,13 +553,8 @@ class _Loading:
             self._outermost = manifest
             return
         outer = self._outermost
-        for key in ("discovery", "network", "data_layer", "policy", "on_violation", "modes"):
-            mine, holds = getattr(manifest, key), getattr(outer, key)
-            if key == "network":
-                mine = replace(mine, at=holds.at)
-            elif key in ("discovery", "data_layer"):
-                mine = msgspec.structs.replace(mine, at=holds.at)
-            if key in root and mine != holds:
+        for key in (*_SECTIONS, "policy", "modes"):
+            if key in root and getattr(manifest, key) != getattr(outer, key):
                 message = f"cannot use the {key} of an included manifest; the including one's holds"
                 at = root.document.key_at((key,))
                 self.found.append(note("manifest.include-ignored", at, message))

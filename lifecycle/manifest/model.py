@@ -14,7 +14,7 @@ import msgspec
 from msgspec import Meta
 
 from lifecycle.codec import says
-from lifecycle.manifest.diagnostics import Diagnostic, Position, Severity
+from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.qos import POLICIES, QosProfile
 from lifecycle.network.connection_url import ConnectionUrl
 from lifecycle.network.dscp import TransportPriorityMapping
@@ -221,6 +221,12 @@ class Special:
 
     def __init__(self, value: Any) -> None:
         self.value = value
+
+
+def require(condition: bool) -> None:
+    """Raise ValueError for keys of a section that do not fit each other."""
+    if not condition:
+        raise ValueError("a section whose keys do not fit each other")
 
 
 class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -732,7 +738,7 @@ DISCOVER_BY = tuple(
 """What participants may find each other by."""
 
 
-class DiscoveryKeys(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Discovery(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How DDS participants find each other.
 
     Attributes:
@@ -769,13 +775,7 @@ class DiscoveryKeys(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
             raise ValueError(f"no participant is found by {self.transport.value}")
 
 
-class Discovery(DiscoveryKeys, frozen=True, kw_only=True):
-    """How participants find each other, and where that is written."""
-
-    at: Position | None = None
-
-
-class DataLayerKeys(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class DataLayer(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How endpoints come onto connections; for the whole system.
 
     Attributes:
@@ -793,12 +793,6 @@ class DataLayerKeys(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     source: DataLayerSource = DataLayerSource.STATIC
     events: bool = False
     multicast_group: Text = "239.255.1.1"
-
-
-class DataLayer(DataLayerKeys, frozen=True, kw_only=True):
-    """How endpoints come onto connections, and where that is written."""
-
-    at: Position | None = None
 
 
 class NetworkKeys(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -823,10 +817,9 @@ class NetworkKeys(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
 
 class Network(NetworkKeys, frozen=True, kw_only=True):
-    """How flow needs become network resources, the mapping read, and where that is written."""
+    """How flow needs become network resources, with the mapping that is named."""
 
     five_qi_dscp: DscpMapping | None = None  # type: ignore[assignment]
-    at: Position | None = None
 
 
 TOLERATED_NODES = (
@@ -843,32 +836,87 @@ TOLERATED_NODES = (
 """Names of nodes that tools make, as the tools choose them: the default of `tolerated_nodes`."""
 
 
-class Policy(msgspec.Struct, frozen=True, kw_only=True):
+RULE_IDS = tuple(
+    f"{family}.{name}"
+    for family, names in (
+        ("graph", "missing-node ended-node undeclared-node duplicate-node missing-endpoint"),
+        ("graph", "unseen-endpoint undeclared-publisher undeclared-subscription"),
+        ("graph", "undeclared-service-server undeclared-service-client undeclared-action-server"),
+        ("graph", "undeclared-action-client type-mismatch type-definition-differs"),
+        ("graph", "unattributed-endpoint qos-differs qos-unverifiable qos-incompatible"),
+        ("graph", "unmatched-link unmatched-flow unknown-peer unmatched-client"),
+        ("endpoint", "error"),
+        ("flow", "unreported not-unique unverifiable broken-endpoint not-measured"),
+        ("flow", "wrong-transport wrong-medium dscp-not-applied dscp-unverifiable"),
+        ("state", "wrong-state unverifiable activated-at-closed-gate"),
+        ("node", "unhealthy without-health"),
+        ("config", "missing-report incomplete-report"),
+        ("param", "missing undeclared type-differs value-differs read-only-differs unverifiable"),
+        ("param", "reached-none"),
+        ("declaration", "unproven"),
+        ("time", "no-clock several-clocks undeclared-clock silent-clock"),
+        ("connection", "missing failed differs wrong-mapping"),
+        ("run", "process-died gave-up start-failed transition-failed deadline not-programmed"),
+        ("run", "not-wired silent-node not-answering plans-differ plan-unknown"),
+    )
+    for name in names.split()
+)
+"""The rules of docs/rules.md."""
+
+RULES_AND_FAMILIES = (
+    "default",
+    *dict.fromkeys(each.partition(".")[0] for each in RULE_IDS),
+    *RULE_IDS,
+)
+"""Keys of `on_violation:`."""
+
+RuleId = Annotated[str, Meta(extra_json_schema={"enum": [*RULE_IDS]})]
+
+
+class Policy(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How strict checks and verification are.
 
     Attributes:
-        undeclared_nodes: OPEN tolerates nodes of other systems in the graph.
-        tolerated_nodes: patterns of names of nodes that may exist without being declared,
-            as long as they only listen: `*` matches any characters, `?` for one; a pattern with
-            a slash is compared with the full name, any other with the base name.
-        unverifiable_blocks: an unverifiable finding closes the gate.
-        trust: ids of rules whose unverifiable findings count neither for the gate nor for a
-            verdict; they are still reported.
-        unpublished: severity of a subscription without publisher; None ignores it.
-        unheard: severity of a publisher without subscription; None ignores it.
-        ros_interface: what the supervisor publishes, and may be asked, in ROS.
-        ros_interface_required: the manifest asks for it; else the system runs without it where
-            the packages that it takes are not installed.
+        undeclared_nodes: Whether nodes that no manifest declares may be in the graph.
+        tolerated_nodes: Names of nodes that may be there although no manifest declares them, as
+            long as they only listen: tools. `*` stands for any characters, `?` for one; a pattern
+            with a slash is compared with the full name, any other with the base name.
+        unverifiable: Whether what cannot be observed keeps the gate closed (block), or is taken on
+            trust and named when it opens (allow).
+        trust: Ids of rules (docs/rules.md) of which what cannot be verified is taken on trust: it
+            is reported, and neither closes the gate nor counts for --strict. What is violated is
+            never trusted.
+        unpublished: A subscription that no declared node publishes to.
+        unheard: A publisher that no declared node subscribes to.
+        ros_interface: What the supervisor offers in ROS once the system is active, or is held up on
+            its way there: nothing (off), /diagnostics, a status topic and a service for it
+            (read_only), or also services that pause, resume, restart and end the system (full). If
+            left out read_only, where the packages that it takes are installed.
     """
 
     undeclared_nodes: EndpointPolicy = EndpointPolicy.DECLARED
-    tolerated_nodes: tuple[str, ...] = TOLERATED_NODES
-    unverifiable_blocks: bool = False
-    trust: tuple[str, ...] = ()
-    unpublished: Severity | None = Severity.ERROR
-    unheard: Severity | None = Severity.WARNING
-    ros_interface: RosInterfaceAccess = RosInterfaceAccess.READ_ONLY
-    ros_interface_required: bool = False
+    tolerated_nodes: tuple[Annotated[str, Meta(pattern=r"^[A-Za-z0-9_/*?]+\Z")], ...] = (
+        TOLERATED_NODES
+    )
+    unverifiable: Literal["allow", "block"] = "allow"
+    trust: Annotated[tuple[RuleId, ...], Meta(examples=[["flow.unreported"]])] = ()
+    unpublished: Literal["error", "warning", "ignore"] = "error"
+    unheard: Literal["error", "warning", "ignore"] = "warning"
+    ros_interface: RosInterfaceAccess | None = None
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a rule that there is not."""
+        require({*self.trust} <= {*RULE_IDS})
+
+    @property
+    def unverifiable_blocks(self) -> bool:
+        """Whether an unverifiable finding closes the gate."""
+        return self.unverifiable == "block"
+
+    @property
+    def access(self) -> RosInterfaceAccess:
+        """What the supervisor offers in ROS."""
+        return self.ros_interface or RosInterfaceAccess.READ_ONLY
 
 
 class LinkKeys(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -934,6 +982,7 @@ class SystemDeclaration(msgspec.Struct, frozen=True, kw_only=True):
         on_violation: what is done about violations for which nothing nearer says it.
         modes: the first is entered at the start; none: every node is as it is declared.
         unproven: warnings about what is declared and not proven, or in force for nothing.
+        positions: where sections and their values are, by path, `discovery`, `discovery.mode`.
     """
 
     system: str
@@ -945,6 +994,7 @@ class SystemDeclaration(msgspec.Struct, frozen=True, kw_only=True):
     policy: Policy = Policy()
     on_violation: OnViolation = ()
     modes: tuple[Mode, ...] = ()
+    positions: Mapping[str, Position] = msgspec.field(default_factory=dict)
 
     def address_of(self, machine: str) -> str:
         """Return the address of a machine; empty if it has none, or is not declared."""
@@ -957,7 +1007,6 @@ class Manifest(SystemDeclaration, frozen=True, kw_only=True):
     Attributes:
         path: the file it was read from, as the user wrote it.
         arguments: resolved values by name.
-        positions: where values of `discovery:` and `data_layer:` are, by path, `discovery.mode`.
         left_out: keys of the nodes that `if:` or `unless:` leaves out, as far as they are known;
             one that ends in `/` is the prefix of a group or include.
     """
@@ -967,7 +1016,6 @@ class Manifest(SystemDeclaration, frozen=True, kw_only=True):
     arguments: tuple[tuple[str, str], ...] = ()
     nodes: tuple[Node, ...] = ()
     links: tuple[Link, ...] = ()
-    positions: Mapping[str, Position] = msgspec.field(default_factory=dict)
     left_out: tuple[str, ...] = ()
 
     def where(self, path: str, section: Position) -> Position:

@@ -38,6 +38,11 @@ class RemapKind(enum.Flag):
     NAMESPACE = enum.auto()
 
 
+def remap_kind(kind: EndpointKind) -> RemapKind:
+    """Return which rules rename an endpoint of a topic or service."""
+    return RemapKind.TOPIC if kind.is_topic else RemapKind.SERVICE
+
+
 class RemapRuleError(LifecycleError):
     """A remap rule that rcl refuses; a process that is given one does not start."""
 
@@ -248,8 +253,7 @@ def resolve(
     expanded = expand(name, node_name, namespace)
     if kind.is_action:
         return _resolve_action(name, expanded, rules, node_name, namespace)
-    names = RemapKind.TOPIC if kind.is_topic else RemapKind.SERVICE
-    return _remap(expanded, rules, names, node_name, namespace)
+    return _remap(expanded, rules, remap_kind(kind), node_name, namespace)
 
 
 def name_in_graph(node: NodeDeclaration, name: str, kind: EndpointKind) -> str:
@@ -342,8 +346,7 @@ def _resolve_action(
 ) -> str:
     resolved = {}
     for hidden, kind in hidden_names(expanded):
-        names = RemapKind.TOPIC if kind.is_topic else RemapKind.SERVICE
-        resolved[hidden] = _remap(hidden, rules, names, node_name, namespace)
+        resolved[hidden] = _remap(hidden, rules, remap_kind(kind), node_name, namespace)
     return action_of(name, resolved)
 
 
@@ -441,6 +444,11 @@ def supervisor_alive_topic(system: str, machine: str) -> str:
     What it asserts is the liveliness of a second topic, of this name and `ALIVE_PULSE`.
     """
     return f"/_lifecycle/{system.replace('-', '_')}/{machine}/alive"
+
+
+def node_alive_topic(full_name: str) -> str:
+    """Return the hidden topic on which a node without a supervisor asserts its liveliness."""
+    return f"{full_name}/_alive"
 
 
 def supervisor_services(access: RosInterfaceAccess, modes: Iterable[str] = ()) -> tuple[str, ...]:

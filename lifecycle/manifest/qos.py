@@ -79,16 +79,7 @@ UNKNOWN_QOS = QosProfile(
 )
 """Nothing is known; compatible with nothing for certain."""
 
-POLICIES = (
-    "history",
-    "depth",
-    "reliability",
-    "durability",
-    "deadline_ns",
-    "lifespan_ns",
-    "liveliness",
-    "liveliness_lease_duration_ns",
-)
+POLICIES = QosProfile.__struct_fields__
 """Every policy, in the order of rmw_qos_profile_t."""
 
 

@@ -15,7 +15,7 @@ import msgspec
 from msgspec.structs import replace
 
 from lifecycle.manifest.building import build_parameters
-from lifecycle.manifest.checks.parameters import ParameterFiles, is_implicit
+from lifecycle.manifest.checks.parameters import is_implicit
 from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.interface import Findings
 from lifecycle.manifest.model import (
@@ -26,6 +26,7 @@ from lifecycle.manifest.model import (
     RunKind,
     Supervision,
 )
+from lifecycle.manifest.parameter_files import ParameterFiles
 from lifecycle.manifest.yaml.document import Cursor, error, warning
 
 SIM_TIME = "use_sim_time"
@@ -115,13 +116,14 @@ class Shared(msgspec.Struct, frozen=True, kw_only=True):
         )
 
 
-def settle(manifest: Manifest, found: Findings) -> Manifest:
+def settle(manifest: Manifest, files: ParameterFiles, found: Findings) -> Manifest:
     """Take from nodes the shared parameters that their files set, and those they do not declare.
 
     Nodes of one process get what any of them says of its supervision.
 
     Args:
         manifest: with all that it includes, so that each node has its full name.
+        files: that its nodes name.
         found: findings are appended here: shared parameters that no node declares.
     """
     found.extend(_for_no_node(manifest.nodes))
@@ -130,7 +132,6 @@ def settle(manifest: Manifest, found: Findings) -> Manifest:
         if node.process:
             for key, value in _own_supervision(node).items():
                 own.setdefault(node.process, {}).setdefault(key, value)
-    files = ParameterFiles(manifest.path)
     nodes = tuple(
         _settled(_as_its_process(node, own.get(node.process, {})), files) for node in manifest.nodes
     )

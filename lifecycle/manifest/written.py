@@ -13,11 +13,11 @@ import msgspec
 from msgspec import Meta, Struct, field
 
 from lifecycle.manifest.model import (
-    TOLERATED_NODES,
+    RULES_AND_FAMILIES,
     WORD,
     Condition,
-    DataLayerKeys,
-    DiscoveryKeys,
+    DataLayer,
+    Discovery,
     Dscp,
     EndpointPolicy,
     Executor,
@@ -26,16 +26,17 @@ from lifecycle.manifest.model import (
     NetworkKeys,
     NodeKey,
     Output,
+    Policy,
     PublisherFlow,
     ResourceLimits,
     RosArguments,
-    RosInterfaceAccess,
     Special,
     SubscriptionFlow,
     Supervision,
     TargetState,
     Text,
     Timeouts,
+    require,
     spelled,
 )
 from lifecycle.manifest.model import Health as NodeHealth
@@ -80,46 +81,6 @@ def _written(section: object, ways: Ways) -> int:
     return sum(all(getattr(section, key) is not None for key in way) for way in ways)
 
 
-def _require(condition: bool) -> None:
-    if not condition:
-        raise ValueError("a section whose keys do not fit each other")
-
-
-RULE_IDS = tuple(
-    f"{family}.{name}"
-    for family, names in (
-        ("graph", "missing-node ended-node undeclared-node duplicate-node missing-endpoint"),
-        ("graph", "unseen-endpoint undeclared-publisher undeclared-subscription"),
-        ("graph", "undeclared-service-server undeclared-service-client undeclared-action-server"),
-        ("graph", "undeclared-action-client type-mismatch type-definition-differs"),
-        ("graph", "unattributed-endpoint qos-differs qos-unverifiable qos-incompatible"),
-        ("graph", "unmatched-link unmatched-flow unknown-peer unmatched-client"),
-        ("endpoint", "error"),
-        ("flow", "unreported not-unique unverifiable broken-endpoint not-measured"),
-        ("flow", "wrong-transport wrong-medium dscp-not-applied dscp-unverifiable"),
-        ("state", "wrong-state unverifiable activated-at-closed-gate"),
-        ("node", "unhealthy without-health"),
-        ("config", "missing-report incomplete-report"),
-        ("param", "missing undeclared type-differs value-differs read-only-differs unverifiable"),
-        ("param", "reached-none"),
-        ("declaration", "unproven"),
-        ("time", "no-clock several-clocks undeclared-clock silent-clock"),
-        ("connection", "missing failed differs wrong-mapping"),
-        ("run", "process-died gave-up start-failed transition-failed deadline not-programmed"),
-        ("run", "not-wired silent-node not-answering plans-differ plan-unknown"),
-    )
-    for name in names.split()
-)
-"""The rules of docs/rules.md."""
-
-RULES_AND_FAMILIES = (
-    "default",
-    *dict.fromkeys(each.partition(".")[0] for each in RULE_IDS),
-    *RULE_IDS,
-)
-"""Keys of `on_violation:`."""
-
-RuleId = Annotated[str, Meta(extra_json_schema={"enum": [*RULE_IDS]})]
 RuleOrFamily = Annotated[
     str,
     Meta(
@@ -169,14 +130,14 @@ def read_special(type_: type, value: object) -> object:
     if type_ is Dscp:
         names = {name for each in code_points() for name in (each.name, *each.aliases)}
         if isinstance(value, str):
-            _require(value in names)
+            require(value in names)
             return Dscp(parse_dscp(value))
         return Dscp(parse_dscp(msgspec.convert(value, int, strict=isinstance(value, bool))))
     if not isinstance(value, dict):
         return OnViolation(msgspec.convert(value, Reaction))
     if [*value] == ["mode"]:
         return OnViolation(msgspec.convert(value, EnterMode))
-    _require(value.keys() <= {*RULES_AND_FAMILIES})
+    require(value.keys() <= {*RULES_AND_FAMILIES})
     return OnViolation(msgspec.convert(value, ForRules))
 
 
@@ -216,41 +177,6 @@ class Machine(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """
 
     address: Annotated[str, Meta(examples=["10.77.0.1", "fd00::1"])] = ""
-
-
-class Policy(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How strict checks and verification are.
-
-    Attributes:
-        undeclared_nodes: Whether nodes that no manifest declares may be in the graph.
-        tolerated_nodes: Names of nodes that may be there although no manifest declares them, as
-            long as they only listen: tools. `*` stands for any characters, `?` for one; a pattern
-            with a slash is compared with the full name, any other with the base name.
-        unverifiable: Whether what cannot be observed keeps the gate closed (block), or is taken on
-            trust and named when it opens (allow).
-        trust: Ids of rules (docs/rules.md) of which what cannot be verified is taken on trust: it
-            is reported, and neither closes the gate nor counts for --strict. What is violated is
-            never trusted.
-        unpublished: A subscription that no declared node publishes to.
-        unheard: A publisher that no declared node subscribes to.
-        ros_interface: What the supervisor offers in ROS once the system is active, or is held up on
-            its way there: nothing (off), /diagnostics, a status topic and a service for it
-            (read_only), or also services that pause, resume, restart and end the system (full).
-    """
-
-    undeclared_nodes: EndpointPolicy = EndpointPolicy.DECLARED
-    tolerated_nodes: tuple[Annotated[str, Meta(pattern=r"^[A-Za-z0-9_/*?]+\Z")], ...] = (
-        TOLERATED_NODES
-    )
-    unverifiable: Literal["allow", "block"] = "allow"
-    trust: Annotated[tuple[RuleId, ...], Meta(examples=[["flow.unreported"]])] = ()
-    unpublished: Literal["error", "warning", "ignore"] = "error"
-    unheard: Literal["error", "warning", "ignore"] = "warning"
-    ros_interface: RosInterfaceAccess = RosInterfaceAccess.READ_ONLY
-
-    def __post_init__(self) -> None:
-        """Raise ValueError for a rule that there is not."""
-        _require({*self.trust} <= {*RULE_IDS})
 
 
 class Mode(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -374,7 +300,7 @@ class Run(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         """Raise ValueError unless exactly one way to start is written."""
-        _require(self.attach is not False and _written(self, self.ONE_OF) == 1)
+        require(self.attach is not False and _written(self, self.ONE_OF) == 1)
 
 
 class TopicEndpoint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -565,7 +491,7 @@ class Health(NodeHealth, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         """Raise ValueError unless something shows it."""
-        _require(_written(self, self.ANY_OF) > 0)
+        require(_written(self, self.ANY_OF) > 0)
 
 
 class Flows(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -683,7 +609,7 @@ class Node(Supervision, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         """Raise ValueError unless it is said in one way how it is started."""
-        _require(self.attach is not False and _written(self, self.ONE_OF) == 1)
+        require(self.attach is not False and _written(self, self.ONE_OF) == 1)
 
 
 NodesByKey = Annotated[dict[Name, Node], Meta(min_length=1)]
@@ -736,7 +662,7 @@ class Shared(Supervision, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
     def __post_init__(self) -> None:
         """Raise ValueError where there can be no nodes."""
-        _require(_written(self, self.ANY_OF) > 0)
+        require(_written(self, self.ANY_OF) > 0)
 
 
 class Group(Shared, frozen=True, kw_only=True):
@@ -786,9 +712,9 @@ class Manifest(Shared, frozen=True, kw_only=True):
     description: str = ""
     arguments: dict[Name, Argument] = field(default_factory=dict)
     machines: dict[Name, Machine] = field(default_factory=dict)
-    discovery: DiscoveryKeys = DiscoveryKeys()
+    discovery: Discovery = Discovery()
     network: NetworkKeys = NetworkKeys()
-    data_layer: DataLayerKeys = DataLayerKeys()
+    data_layer: DataLayer = DataLayer()
     policy: Policy = Policy()
     on_violation: OnViolation | None = None
     modes: Annotated[dict[Name, Mode], Meta(min_length=1)] | None = None

@@ -17,24 +17,6 @@ from __future__ import annotations
 import enum
 import socket
 
-import msgspec
-
-
-class _Traits(msgspec.Struct, frozen=True, kw_only=True):
-    """What a medium is besides UDP or TCP over the version of IP that its value ends with.
-
-    Attributes:
-        meaning: see `Medium.meaning`; empty for its value.
-        stays_in: see `Medium.stays_in`.
-        is_group: see `Medium.is_group`.
-        connects: connection URLs have it as their scheme.
-    """
-
-    meaning: str = ""
-    stays_in: str = ""
-    is_group: bool = False
-    connects: bool = True
-
 
 class Medium(str, enum.Enum):
     """What carries data. A member is its value, wherever text is wanted.
@@ -42,26 +24,13 @@ class Medium(str, enum.Enum):
     In the order in which a connection is named after several.
     """
 
-    traits: _Traits
-
-    def __new__(cls, value: str, traits: _Traits | None = None) -> Medium:  # noqa: PYI034 - 3.10
-        """Make a member."""
-        member = str.__new__(cls, value)
-        member._value_ = value
-        member.traits = traits or _Traits()
-        return member
-
-    SHM = "shm", _Traits(meaning="shared memory", stays_in="shared memory")
-    # A multicast group, over IPv4 or IPv6 by its address.
-    UDPM = "udpm", _Traits(meaning="UDP multicast", is_group=True)
+    SHM = "shm"
+    UDPM = "udpm"  # a multicast group, over IPv4 or IPv6 by its address
     UDPV4 = "udpv4"
     UDPV6 = "udpv6"
     TCPV4 = "tcpv4"
-    TCPV6 = "tcpv6", _Traits(connects=False)  # seen at others; nothing of ours is connected by it
-    INTRAPROCESS = (
-        "intraprocess",
-        _Traits(meaning="handed over inside their process", stays_in="one process", connects=False),
-    )
+    TCPV6 = "tcpv6"  # seen at others; nothing of ours is connected by it
+    INTRAPROCESS = "intraprocess"
 
     def __str__(self) -> str:
         """Return the value; as StrEnum does, which Python 3.10 has not."""
@@ -89,7 +58,7 @@ class Medium(str, enum.Enum):
     @property
     def is_group(self) -> bool:
         """Whether it is multicast: its address and port belong to all that listen there."""
-        return self.traits.is_group
+        return self is Medium.UDPM
 
     @property
     def stays_on_host(self) -> bool:
@@ -99,12 +68,12 @@ class Medium(str, enum.Enum):
     @property
     def stays_in(self) -> str:
         """Where its data stay, if no network sees them, as people read it; empty of others."""
-        return self.traits.stays_in
+        return {Medium.SHM: "shared memory", Medium.INTRAPROCESS: "one process"}.get(self, "")
 
     @property
     def connects(self) -> bool:
-        """Whether connections are made of it."""
-        return self.traits.connects
+        """Whether connections are made of it, and connection URLs have it as their scheme."""
+        return self not in (Medium.TCPV6, Medium.INTRAPROCESS)
 
     @property
     def ip_version(self) -> int | None:
@@ -142,7 +111,12 @@ class Medium(str, enum.Enum):
     @property
     def meaning(self) -> str:
         """What people read; of an IP transport its value."""
-        return self.traits.meaning or self.value
+        meanings = {
+            Medium.SHM: "shared memory",
+            Medium.UDPM: "UDP multicast",
+            Medium.INTRAPROCESS: "handed over inside their process",
+        }
+        return meanings.get(self, self.value)
 
 
 def udp_to(address: str) -> Medium:

@@ -188,15 +188,12 @@ class LocatedNfe(msgspec.Struct, frozen=True, kw_only=True):
     """An NFE and the machine it is on, which defines what `0.0.0.0` and `127.0.0.1` mean.
 
     Attributes:
-        machine_id: any text that is equal on one machine only; empty when not known.
+        machine_id: any text that is equal on one machine only; empty when not known: then it may be
+            on any, and comparisons lean to "not dissimilar".
     """
 
     machine_id: str
     nfe: NetworkFlowEndpoint
-
-
-Nfe = NetworkFlowEndpoint | LocatedNfe
-"""An NFE without a machine may be on any: comparisons then lean to "not dissimilar"."""
 
 
 def located(
@@ -221,17 +218,16 @@ def located(
     )
 
 
-def is_ip(nfe: Nfe) -> bool:
+def is_ip(nfe: NetworkFlowEndpoint) -> bool:
     """Whether this is an end of an IP flow; shared memory has neither protocol nor address."""
-    plain = _plain(nfe)
     return (
-        plain.transport_protocol is not TransportProtocol.UNKNOWN
-        and plain.internet_protocol is not InternetProtocol.UNKNOWN
-        and bool(plain.internet_address)
+        nfe.transport_protocol is not TransportProtocol.UNKNOWN
+        and nfe.internet_protocol is not InternetProtocol.UNKNOWN
+        and bool(nfe.internet_address)
     )
 
 
-def dissimilar(a: Nfe, b: Nfe) -> bool:
+def dissimilar(a: LocatedNfe, b: LocatedNfe) -> bool:
     """Return whether one or more networking resources of two NFEs differ.
 
     Addresses differ unless packets of both can carry the same one: a publisher that sends from
@@ -241,23 +237,14 @@ def dissimilar(a: Nfe, b: Nfe) -> bool:
         a: one NFE.
         b: the other; both of publishers or both of subscriptions.
     """
-    one, other = _plain(a), _plain(b)
-    if _exact_resources(one) != _exact_resources(other):
+    if _exact_resources(a.nfe) != _exact_resources(b.nfe):
         return True
-    machines = _machine(a), _machine(b)
+    machines = a.machine_id, b.machine_id
     return not may_be_same(
-        one.internet_address,
-        other.internet_address,
+        a.nfe.internet_address,
+        b.nfe.internet_address,
         same_machine=machines[0] == machines[1] if all(machines) else None,
     )
-
-
-def _plain(nfe: Nfe) -> NetworkFlowEndpoint:
-    return nfe.nfe if isinstance(nfe, LocatedNfe) else nfe
-
-
-def _machine(nfe: Nfe) -> str:
-    return nfe.machine_id if isinstance(nfe, LocatedNfe) else ""
 
 
 def _exact_resources(nfe: NetworkFlowEndpoint) -> tuple[object, ...]:

@@ -10,7 +10,6 @@ ports of a running system are read from it, never inferred from here.
 
 from __future__ import annotations
 
-import enum
 from collections.abc import Callable
 
 import msgspec
@@ -57,14 +56,6 @@ def domain_of(text: str) -> int | None:
     return domain if (domain := int(text)) <= MAX_DOMAIN_ID else None
 
 
-class Platform(enum.Enum):
-    """Operating systems that the article gives numbers for."""
-
-    LINUX = "linux"
-    MACOS = "macos"
-    WINDOWS = "windows"
-
-
 class EphemeralRange(msgspec.Struct, frozen=True, kw_only=True):
     """Ports that an operating system gives to sockets bound to no port; both ends belong to it."""
 
@@ -84,12 +75,13 @@ class EphemeralRange(msgspec.Struct, frozen=True, kw_only=True):
         return f"{self.first}–{self.last}"
 
 
-DEFAULT_EPHEMERAL_RANGE: dict[Platform, EphemeralRange] = {
-    Platform.LINUX: EphemeralRange(first=32768, last=60999),
-    Platform.MACOS: EphemeralRange(first=49152, last=65535),
-    Platform.WINDOWS: EphemeralRange(first=49152, last=65535),
+PLATFORMS = {
+    "linux": EphemeralRange(first=32768, last=60999),
+    "macos": EphemeralRange(first=49152, last=65535),
+    "windows": EphemeralRange(first=49152, last=65535),
 }
 """Each platform's default, as the article gives it; all three can be configured."""
+LINUX = PLATFORMS["linux"]
 
 
 class ParticipantPorts(msgspec.Struct, frozen=True, kw_only=True):
@@ -215,23 +207,17 @@ def overlaps(domain_id: int, participant_id: int) -> tuple[PortUse, ...]:
     return tuple(each for each in uses if each is not None and each.domain_id != domain_id)
 
 
-def ephemeral_range(platform: Platform | EphemeralRange) -> EphemeralRange:
-    """Return a platform's default range; a range is returned as it is."""
-    return DEFAULT_EPHEMERAL_RANGE[platform] if isinstance(platform, Platform) else platform
-
-
-def max_participants(domain_id: int, ephemeral: Platform | EphemeralRange) -> Capacity:
+def max_participants(domain_id: int, ephemeral: EphemeralRange) -> Capacity:
     """Return how many participants of a domain fit on one host, each process being at least one.
 
     Args:
         domain_id: 0–232.
-        ephemeral: the host's ephemeral range, or a platform for its default.
+        ephemeral: the host's ephemeral range.
 
     Raises:
         ValueError: the domain is not 0–232.
     """
     base = domain_base(domain_id)
-    taken = ephemeral_range(ephemeral)
     found = [
         Capacity(
             participants=(MAX_PORT - base - D3) // PG + 1,
@@ -245,17 +231,17 @@ def max_participants(domain_id: int, ephemeral: Platform | EphemeralRange) -> Ca
                 limit=f"the ports of domain {domain_id + 1}, from {base + DG}",
             )
         )
-    inside = f"the ephemeral ports {taken}"
-    if base + D0 in taken or base + D2 in taken:
+    inside = f"the ephemeral ports {ephemeral}"
+    if base + D0 in ephemeral or base + D2 in ephemeral:
         found.append(Capacity(participants=0, limit=f"{inside}: they hold its multicast ports"))
-    elif taken.last >= base + D1:
+    elif ephemeral.last >= base + D1:
         # The first participant whose upper port is not below the range is the first inside it.
-        free = max(0, -(-(taken.first - base - D3) // PG))
+        free = max(0, -(-(ephemeral.first - base - D3) // PG))
         found.append(Capacity(participants=free, limit=inside))
     return min(found, key=lambda each: each.participants)
 
 
-def safe_domains(ephemeral: Platform | EphemeralRange) -> tuple[range, ...]:
+def safe_domains(ephemeral: EphemeralRange) -> tuple[range, ...]:
     """Return the domain ids whose first participant is clear of the ephemeral ports, as runs.
 
     0–101 and 215–232 on Linux, 0–166 on macOS and Windows, by their defaults.
@@ -302,7 +288,7 @@ def overflows(
     *,
     participants: int,
     unique_subscriptions: int = 0,
-    ephemeral: Platform | EphemeralRange = Platform.LINUX,
+    ephemeral: EphemeralRange = LINUX,
     host: str = "one host",
 ) -> tuple[str, ...]:
     """Return why so much does not fit on one host, one sentence per limit; empty if it fits.
@@ -312,7 +298,7 @@ def overflows(
         participants: of this domain on the host; each process has one and each unique publisher
             one more.
         unique_subscriptions: asked for on the host.
-        ephemeral: the host's ephemeral range, or a platform for its default.
+        ephemeral: the host's ephemeral range.
         host: what to call it, "machine 'robot'".
 
     Raises:

@@ -41,6 +41,7 @@ from lifecycle.manifest.model import (
     UniqueHow,
 )
 from lifecycle.manifest.names import name_in_graph
+from lifecycle.manifest.parameter_files import ParameterFiles
 from lifecycle.manifest.shared import SIM_TIME
 from lifecycle.manifest.yaml.document import error, warning
 from lifecycle.manifest.yaml.source import read_bytes
@@ -211,7 +212,8 @@ def build_plan(
     domain_id = effective_domain(manifest.discovery, variables)
     discovery_range = effective_range(manifest.discovery, variables)
     rmw = variables.get("RMW_IMPLEMENTATION", "") or DEFAULT_RMW
-    wired = _wired(manifest, variables, domain_id=domain_id, rmw=rmw)
+    parameters = NodeParameters(ParameterFiles(manifest.path), manifest.modes)
+    wired = _wired(manifest, variables, parameters, domain_id=domain_id, rmw=rmw)
     plan = Plan(
         **{**declared(SystemDeclaration, manifest), "modes": tuple(map(_portable, manifest.modes))},
         manifest_path=manifest.path,
@@ -229,12 +231,8 @@ def build_plan(
         flows=wired.flows,
         levels=dependency_levels(manifest.nodes),
         rmw=rmw,
-        flow_identification=manifest.network.flow_identification,
-        discovery_mode=manifest.discovery.mode,
-        max_datagram_bytes=manifest.network.max_datagram_bytes,
         server=wired.server,
         observers=wired.observers,
-        settle_s=manifest.discovery.settle_s,
     )
     return in_mode(plan, plan.modes[0].name) if plan.modes else plan
 
@@ -325,30 +323,35 @@ def _attached(run: Run) -> Run:
 
 
 def check_plan(
-    manifest: Manifest, *, environment: Mapping[str, str] | None = None
+    manifest: Manifest,
+    *,
+    environment: Mapping[str, str] | None = None,
+    files: ParameterFiles | None = None,
 ) -> tuple[Diagnostic, ...]:
     """Return why a manifest cannot be planned, as far as that does not depend on what is installed.
 
     Args:
         manifest: valid.
         environment: as for `build_plan`.
+        files: parameter files of its nodes that were read already.
     """
     variables = os.environ if environment is None else environment
     try:
         domain_id = effective_domain(manifest.discovery, variables)
     except UsageError:
         return ()  # the environment's fault, reported where it is used
+    parameters = NodeParameters(files or ParameterFiles(manifest.path), manifest.modes)
     try:
         rmw = variables.get("RMW_IMPLEMENTATION", "") or DEFAULT_RMW
-        _wired(manifest, variables, domain_id=domain_id, rmw=rmw)
+        _wired(manifest, variables, parameters, domain_id=domain_id, rmw=rmw)
     except PlanError as problem:
         at = problem.at or Position(file=manifest.path, line=1, column=1)
         alone = error("plan.impossible", at, problem.message, problem.hint)
         return problem.diagnostics or (alone,)
-    return tuple(_without_clock(manifest))
+    return tuple(_without_clock(manifest, parameters))
 
 
-def _without_clock(manifest: Manifest) -> Iterator[Diagnostic]:
+def _without_clock(manifest: Manifest, parameters: NodeParameters) -> Iterator[Diagnostic]:
     """Warn of simulated time that no node is declared to publish; others may, like a bag."""
     if any(
         each.kind is EndpointKind.PUBLISHER
@@ -357,11 +360,10 @@ def _without_clock(manifest: Manifest) -> Iterator[Diagnostic]:
         for each in node.interface.endpoints
     ):
         return
-    files = NodeParameters(manifest.path, manifest.modes)
     users = [
         (node, each)
         for node in manifest.nodes
-        for each in files.expected(node)
+        for each in parameters.expected(node)
         if each.name == SIM_TIME and each.value is True
     ]
     if users:
@@ -380,15 +382,21 @@ _NAMED = 4
 
 
 def _wired(
-    manifest: Manifest, variables: Mapping[str, str], *, domain_id: int, rmw: str
+    manifest: Manifest,
+    variables: Mapping[str, str],
+    parameters: NodeParameters,
+    *,
+    domain_id: int,
+    rmw: str,
 ) -> WiredSystem:
     """Plan nodes, flows and how they are connected."""
     prefixes = search_prefixes(variables)
     needs = FlowNeeds(manifest, prefixes)
-    files = NodeParameters(manifest.path, manifest.modes)
     hash_of = functools.cache(functools.partial(installed_hash, prefixes=prefixes))
     digest_of = functools.cache(_digest)
-    nodes = tuple(_planned_node(node, needs, files, hash_of, digest_of) for node in manifest.nodes)
+    nodes = tuple(
+        _planned_node(node, needs, parameters, hash_of, digest_of) for node in manifest.nodes
+    )
     return wire(
         manifest,
         nodes,
@@ -450,7 +458,7 @@ def effective_range(discovery: Discovery, environment: Mapping[str, str]) -> Dis
 def _planned_node(
     node: Node,
     needs: FlowNeeds,
-    files: NodeParameters,
+    parameters: NodeParameters,
     hash_of: Callable[[str], str],
     digest_of: Callable[[str], str],
 ) -> PlannedNode:
@@ -463,7 +471,7 @@ def _planned_node(
     groups: tuple[ParticipantGroup, ...] = needs.groups(node) if ours else ()
     endpoints, connected, groups = place_declared(node.name, endpoints, node.connections, groups)
     endpoints, participants = place_flows(node.name, endpoints, groups)
-    expected = files.expected(node)
+    expected = parameters.expected(node)
     given = tuple((name, portable(value)) for name, value in node.parameters)
     return PlannedNode(
         **{**declared(NodeDeclaration, node), "parameters": given},
@@ -475,10 +483,10 @@ def _planned_node(
             for each in node.interface.parameters
         ),
         expected_parameters=expected,
-        mode_parameters=files.in_modes(node, expected),
+        mode_parameters=parameters.in_modes(node, expected),
         has_all_parameters=node.interface.has_all_parameters
         and node.endpoints is EndpointPolicy.DECLARED,
-        unread_parameter_files=files.unread(node),
+        unread_parameter_files=parameters.unread(node),
         participants=(*connected, *participants),
         endpoint_policy=node.endpoints,
         transports=needs.node_transports(node) if ours else (),

@@ -30,7 +30,6 @@ _VALUE_CHARACTERS = 80
 _DECLARED = {
     "endpoint_policy": "endpoints",
     "enforce_dscp": "enforce",
-    "unverifiable_blocks": "unverifiable",
     "has_all_parameters": "interface.parameters",
     "default": "default_value",
 }
@@ -106,10 +105,10 @@ def _document(plan: Plan) -> _Tree:
     document: dict[str, object] = {
         "system": plan.system,
         "machines": {each.name: {"address": each.address} for each in plan.machines},
-        "discovery": _fields(plan.discovery, "at"),
-        "network": _fields(plan.network, "at"),
-        "data_layer": _fields(plan.data_layer, "at"),
-        "policy": _fields(plan.policy, "ros_interface_required"),
+        "discovery": _fields(plan.discovery),
+        "network": _fields(plan.network),
+        "data_layer": _fields(plan.data_layer),
+        "policy": {**_fields(plan.policy), "ros_interface": plan.policy.access.value},
         "on_violation": _consequences(plan.on_violation),
         "modes": {
             each.name: {

@@ -18,11 +18,9 @@ from lifecycle.errors import ExitCode, LifecycleError
 from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.model import (
     Authority,
-    DiscoveryMode,
     DiscoveryRange,
     Endpoint,
     EndpointPolicy,
-    FlowIdentification,
     FlowTransport,
     NodeDeclaration,
     ParameterDeclaration,
@@ -373,11 +371,7 @@ class Plan(SystemDeclaration, frozen=True, kw_only=True):
     Attributes:
         levels: node keys by dependency level; a level's nodes have no order among themselves.
         rmw: RMW identifier of processes that set none of their own, `rmw_fastrtps_cpp`.
-        flow_identification: how publishers that need a unique flow get one.
-        discovery_mode: how participants find each other.
-        max_datagram_bytes: UDP payload that the path carries unfragmented; None assumes Ethernet.
         server: the discovery server; None without.
-        settle_s: as the manifest has it.
         observers: (machine, how its supervisor's own participant is connected); machine is empty
             for this host. Machines without an entry leave it to the RMW.
     """
@@ -390,12 +384,8 @@ class Plan(SystemDeclaration, frozen=True, kw_only=True):
     flows: tuple[PlannedFlow, ...]
     levels: tuple[tuple[str, ...], ...]
     rmw: str = ""
-    flow_identification: FlowIdentification = FlowIdentification.PARTICIPANT
-    discovery_mode: DiscoveryMode = DiscoveryMode.DYNAMIC
-    max_datagram_bytes: Positive | None = None
     server: PlannedServer | None = None
     observers: tuple[tuple[str, ParticipantConnections], ...] = ()
-    settle_s: float | None = None
 
     def node(self, key: str) -> PlannedNode:
         """Return the node with this manifest key.

@@ -16,14 +16,13 @@ from typing import NamedTuple
 
 from lifecycle.manifest.checks.parameters import (
     CommandParameter,
-    ParameterFiles,
     command_line_parameters,
     given_value,
     misfit,
-    type_of,
 )
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import Mode, ModeParameter, Node, ParameterDeclaration, ParameterValue
+from lifecycle.manifest.parameter_files import ParameterFiles, type_of
 from lifecycle.plan.model import ExpectedParameter, ModeParameters
 
 GIVEN = "parameters"
@@ -46,12 +45,12 @@ class NodeParameters:
     """What parameters the nodes of one manifest must have.
 
     Args:
-        manifest: path of the manifest, beside which files are named in messages.
+        files: that its nodes name.
         modes: of that manifest.
     """
 
-    def __init__(self, manifest: str, modes: tuple[Mode, ...] = ()) -> None:
-        self._files = ParameterFiles(manifest)
+    def __init__(self, files: ParameterFiles, modes: tuple[Mode, ...] = ()) -> None:
+        self._files = files
         self._modes = modes
 
     def expected(self, node: Node) -> tuple[ExpectedParameter, ...]:

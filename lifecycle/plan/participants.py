@@ -14,12 +14,12 @@ import math
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 
 from msgspec.structs import replace
 
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.flows import ParticipantGroup
+from lifecycle.manifest.installed_types import search_prefixes
 from lifecycle.manifest.model import Node, ParameterValue, RosArguments, Run
 from lifecycle.network.dscp import describe
 from lifecycle.plan.model import PlanError, PlannedEndpoint, PlannedParticipant
@@ -133,22 +133,16 @@ _NODE_PREFIX = re.compile(r"\w+:(?!//)", re.ASCII)
 
 
 def find_executable(run: Run, environment: Mapping[str, str], *, at: Position) -> str:
-    """Find `lib/<package>/<executable>` under the first prefix of AMENT_PREFIX_PATH that has it.
+    """Find `lib/<package>/<executable>` under the first prefix that has it, where types are found.
 
     Raises:
-        PlanError: AMENT_PREFIX_PATH is empty, or no prefix holds the package or the executable.
+        PlanError: no prefix holds the package or the executable.
     """
-    prefixes = [prefix for prefix in environment.get("AMENT_PREFIX_PATH", "").split(":") if prefix]
+    prefixes = search_prefixes(environment)
     wanted = f"executable {run.executable!r} of package {run.package!r}"
-    if not prefixes:
-        raise PlanError(
-            f"cannot find {wanted}: AMENT_PREFIX_PATH is empty",
-            hint="source the setup file of a workspace that holds the package",
-            at=at,
-        )
     found: list[str] = []
     for prefix in prefixes:
-        folder = Path(prefix) / "lib" / run.package
+        folder = prefix / "lib" / run.package
         candidate = folder / run.executable
         if os.path.isfile(candidate) and os.access(candidate, os.X_OK):
             return str(candidate)
@@ -159,7 +153,8 @@ def find_executable(run: Run, environment: Mapping[str, str], *, at: Position) -
             f"cannot find {wanted}: the package has {', '.join(sorted(set(found)))}", at=at
         )
     raise PlanError(
-        f"cannot find {wanted}: no lib/{run.package} with executables under {', '.join(prefixes)}",
+        f"cannot find {wanted}: no lib/{run.package} with executables under "
+        f"{', '.join(map(str, prefixes))}",
         hint="build and source its workspace, or correct the package name",
         at=at,
     )

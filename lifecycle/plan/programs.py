@@ -142,18 +142,18 @@ def _look(
         if not run.command:
             part = "run.executable"
             subject = f"executable {run.executable!r} of package {run.package!r}"
-        if not run.command and not environment.get("AMENT_PREFIX_PATH"):
-            reason = "AMENT_PREFIX_PATH is empty; source the setup file of its workspace"
-            at = _at(node, "run.package")
-            yield UnresolvedProgram(at=at, subject=subject, reason=reason)
-            return
         try:
             if run.command:
                 _find_command(run, environment)
             else:
                 find_executable(run, environment, at=node.at)
         except (NotThereError, PlanError) as problem:
-            yield _missing(node, part, subject, problem, ours=ours)
+            if run.command or environment.get("AMENT_PREFIX_PATH"):
+                yield _missing(node, part, subject, problem, ours=ours)
+            else:
+                reason = "AMENT_PREFIX_PATH is empty; source the setup file of its workspace"
+                at = _at(node, "run.package")
+                yield UnresolvedProgram(at=at, subject=subject, reason=reason)
 
 
 def _missing(node: Node, part: str, subject: str, problem: LifecycleError, *, ours: bool) -> _Found:

@@ -38,12 +38,10 @@ RMW_CHOOSES = "as the RMW chooses"
 def data_layer(plan: Plan, width: int) -> list[str]:
     """Describe how participants find each other and who connects them; nothing if all is usual."""
     rows: list[tuple[str, str]] = []
-    if plan.discovery_mode is not DiscoveryMode.DYNAMIC or (
-        plan.discovery.transport is not FlowTransport.ANY
-    ):
-        transport = plan.discovery.transport
+    mode, transport = plan.discovery.mode, plan.discovery.transport
+    if mode is not DiscoveryMode.DYNAMIC or transport is not FlowTransport.ANY:
         told = "" if transport is FlowTransport.ANY else f", own participants by {transport.value}"
-        rows.append(("discovery", f"{plan.discovery_mode.value}{told}"))
+        rows.append(("discovery", f"{mode.value}{told}"))
     if plan.server is not None:
         protocol = "TCP" if plan.server.tcp else "UDP"
         where = f" on machine {plan.server.machine}" if plan.server.machine else ""

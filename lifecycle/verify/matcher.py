@@ -125,7 +125,7 @@ def lay_out(
         of_tools=of_tools,
         groups=groups,
         seen=_seen(groups, actual, tools),
-        seen_of_tools=tuple(_seen_endpoint(each, None) for each in _topical(of_tools)),
+        seen_of_tools=tuple(map(_not_declared, _topical(of_tools))),
         flows=_flows(plan, nodes),
         uniqueness=Uniqueness(reported, declared_addresses(plan)),
     )
@@ -294,6 +294,7 @@ def _match_node(
                 planned=planned,
                 observed=observed,
                 report=report,
+                end=_end(node, planned, observed, report, beyond=beyond),
                 unseen=unseen,
                 beyond=beyond,
             )
@@ -438,6 +439,44 @@ def _graph_nodes(
     return merged
 
 
+def _end(
+    node: PlannedNode,
+    planned: PlannedEndpoint,
+    observed: ObservedEndpoint | None,
+    report: EndpointReport | None,
+    *,
+    beyond: bool,
+) -> SeenEndpoint:
+    """Return a declared endpoint with all that is known of it."""
+    shown = observed.qos if observed else None
+    type_hash = observed.type_hash if observed else None
+    if not type_hash and report is not None and report.type_hash is not None:
+        # Discovery wins where it knows a hash; with static discovery only the node itself does.
+        type_hash = report.type_hash
+    return SeenEndpoint(
+        kind=planned.kind,
+        node=node.full_name,
+        name=planned.resolved,
+        type=observed.type if observed else planned.type,
+        qos=planned.qos if beyond else actual_qos(shown, report.qos if report else None),
+        report=report,
+        planned=planned,
+        type_hash=type_hash,
+    )
+
+
+def _not_declared(endpoint: ObservedEndpoint) -> SeenEndpoint:
+    return SeenEndpoint(
+        kind=endpoint.kind,
+        node=endpoint.node,
+        name=endpoint.name,
+        type=endpoint.type,
+        qos=endpoint.qos,
+        type_hash=endpoint.type_hash,
+        expected=False,
+    )
+
+
 def _seen(
     groups: Mapping[str, tuple[ObservedEndpoint, ...]],
     actual: Sequence[Actual],
@@ -446,53 +485,16 @@ def _seen(
     """Collect publishers and subscriptions with all that is known of them."""
     topical = [each for each in actual if each.planned.kind.is_topic]
     # Not visible here, but the endpoints that match them count them.
-    found = [_planned_endpoint(each) for each in topical if each.beyond]
-    declared = {id(each.observed): each for each in topical if each.observed is not None}
+    found = [each.end for each in topical if each.beyond]
+    declared = {id(each.observed): each.end for each in topical if each.observed is not None}
     found += [
-        _seen_endpoint(each, declared.get(id(each)))
+        declared.get(id(each)) or _not_declared(each)
         for name, group in groups.items()
         if name not in tools
         for each in _topical(group)
     ]
-    found += [
-        _seen_endpoint(each.observed, each)
-        for each in topical
-        if each.unseen and each.observed is not None
-    ]
+    found += [each.end for each in topical if each.unseen and each.observed is not None]
     return tuple(found)
-
-
-def _planned_endpoint(actual: Actual) -> SeenEndpoint:
-    return SeenEndpoint(
-        kind=actual.planned.kind,
-        node=actual.node.full_name,
-        name=actual.planned.resolved,
-        type=actual.planned.type,
-        qos=actual.planned.qos,
-        planned=actual.planned,
-    )
-
-
-def _seen_endpoint(endpoint: ObservedEndpoint, match: Actual | None) -> SeenEndpoint:
-    report = match.report if match else None
-    return SeenEndpoint(
-        kind=endpoint.kind,
-        node=endpoint.node,
-        name=endpoint.name,
-        type=endpoint.type,
-        qos=actual_qos(endpoint.qos, report.qos if report else None),
-        report=report,
-        planned=match.planned if match else None,
-        type_hash=_type_hash(endpoint, report),
-        expected=match is not None,
-    )
-
-
-def _type_hash(endpoint: ObservedEndpoint, report: EndpointReport | None) -> str | None:
-    """Discovery wins where it knows a hash; with static discovery only the node itself does."""
-    if endpoint.type_hash or report is None or report.type_hash is None:
-        return endpoint.type_hash
-    return report.type_hash
 
 
 def _flows(plan: Plan, nodes: Mapping[str, NodeFacts]) -> tuple[FlowView, ...]:

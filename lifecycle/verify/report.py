@@ -1,4 +1,4 @@
-"""Verification reports of a verdict: text, JUnit XML, SARIF 2.1.0 and JSON.
+"""Verification reports of a verdict: text, JUnit XML, SARIF 2.1.0, JSON and GitHub's annotations.
 
 Owns: layout and wording of the text (the findings' own sentences come from the rules); the JUnit
 test cases and their results; the SARIF log; the JSON document of schemas/verdict.v1.schema.json,
@@ -22,8 +22,10 @@ import json
 import textwrap
 from collections.abc import Iterable, Sequence
 
+from msgspec.structs import replace
+
 from lifecycle import codec
-from lifecycle.ci_formats import Case, Json, Result, Suite, junit, sarif
+from lifecycle.ci_formats import Case, Json, Problem, Suite, github, junit, sarif
 from lifecycle.manifest.model import UniqueHow
 from lifecycle.network.dscp import describe
 from lifecycle.network.medium import NETWORK_MEDIA
@@ -259,7 +261,7 @@ def to_sarif(verdict: Verdict) -> str:
         for rule in RULES
     ]
     return sarif(
-        [*map(_result, verdict.findings), *_end_result(verdict)],
+        [*map(_problem, verdict.findings), *_end_result(verdict)],
         rules,
         properties={"verdict": verdict.verdict.value},
         invocation=_invocation(verdict.run),
@@ -276,21 +278,22 @@ def _invocation(run: RunEnd | None) -> Json | None:
     }
 
 
-def _end_result(verdict: Verdict) -> list[Result]:
+def _end_result(verdict: Verdict) -> list[Problem]:
     """Return the error of a run that was no success, for a log that has none."""
     run = verdict.run
     if run is None or run.exit_code == 0:
         return []
     if any(each.outcome is Outcome.VIOLATED for each in verdict.findings):
         return []
-    return [Result(rule="run.end", level="error", text=run.describe())]
+    return [Problem(rule="run.end", level="error", message=run.describe())]
 
 
-def _result(finding: Finding) -> Result:
-    return Result(
+def _problem(finding: Finding) -> Problem:
+    return Problem(
         rule=finding.rule,
         level=_LEVELS[finding.outcome],
-        text=f"{finding.message}; {finding.hint}" if finding.hint else finding.message,
+        message=finding.message,
+        hint=finding.hint,
         subject=finding.subject,
         at=finding.at,
         properties={
@@ -299,6 +302,13 @@ def _result(finding: Finding) -> Result:
             "observed": finding.observed,
         },
     )
+
+
+def to_github(verdict: Verdict, *, strict: bool = False) -> str:
+    """Write the text, and an annotation for each finding; `strict` makes all of them errors."""
+    found = map(_problem, verdict.findings)
+    errors = (replace(each, level="error") if strict else each for each in found)
+    return "".join((render_text(verdict), *(f"{github(each)}\n" for each in errors)))
 
 
 def to_json(verdict: Verdict, *, indent: int | None = None) -> str:

@@ -282,7 +282,7 @@ def supervisor_prefixes(plan: Plan) -> frozenset[str]:
 
 def supervisor_endpoints(plan: Plan, machine: str = "") -> frozenset[tuple[EndpointKind, str]]:
     """Return what a supervisor makes by `policy.ros_interface`; see `supervisor_prefix`."""
-    access = plan.policy.ros_interface
+    access = plan.policy.access
     if access is RosInterfaceAccess.OFF:
         return frozenset()
     found = _below(supervisor_prefix(plan.system, machine), plan, access)
@@ -367,7 +367,7 @@ def of_supervisors(
         elif _is_alive(each) and (prefix := alive.get((each.name, each.type))) is not None:
             asserting.append(each)
             claims.setdefault(prefix, set()).add(_claim(each))
-    access = plan.policy.ros_interface
+    access = plan.policy.access
     known: dict[str, _Claim] = {}
     services: set[tuple[str, EndpointKind, str]] = set()
     for prefix, (claim, *others) in claims.items():
@@ -510,7 +510,8 @@ def without_noise(
     return tuple(
         each
         for each in found
-        if but.looks_for(each.kind, each.name)
+        if (each.node, each.kind, each.name) in but.ends
+        or but.looks_for(each.kind, each.name)
         or not is_noise_endpoint(each.kind, each.node, each.name, each.type, ours=each.node in ours)
     )
 

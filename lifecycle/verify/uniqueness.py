@@ -90,13 +90,11 @@ class Uniqueness:
         # Endpoints of one participant have the same NFEs, so each is kept once, with whose it is.
         self._buckets: dict[_Bucket, dict[LocatedNfe, int]] = {}
         self._unknown: set[tuple[EndpointKind, tuple[str, int]]] = set()
-        self._all: list[_Entry] = []
         for configuration in self._configurations:
             address = addresses.get(configuration.name, "")
             for report in configuration.endpoints:
                 if report.kind.is_topic and not report.error:
                     entry = self._entries[id(report)] = _entry(configuration, report, address)
-                    self._all.append(entry)
                     self._add(entry)
 
     def _add(self, entry: _Entry) -> None:
@@ -104,7 +102,7 @@ class Uniqueness:
             self._unknown.add((entry.kind, entry.process))
             return
         for each in entry.judged:
-            if is_ip(each):
+            if is_ip(each.nfe):
                 owners = self._buckets.setdefault(_bucket(entry.kind, each), {})
                 if owners.setdefault(each, id(entry)) != id(entry):
                     owners[each] = _SEVERAL
@@ -128,7 +126,7 @@ class Uniqueness:
         if entry.judged is None:
             return None
         kind, me = entry.kind, id(entry)
-        own = [each for each in entry.judged if is_ip(each)]
+        own = [each for each in entry.judged if is_ip(each.nfe)]
         for each in own:
             owners = self._buckets[_bucket(kind, each)]
             if owners[each] == _SEVERAL or not all(

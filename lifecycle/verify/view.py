@@ -41,25 +41,6 @@ _BY_STRENGTH = (
 )
 
 
-class Actual(msgspec.Struct, frozen=True, kw_only=True):
-    """A declared endpoint and what was seen of it.
-
-    Attributes:
-        observed: what discovery shows; None if it does not show the endpoint.
-        report: what the node itself says; None if it says nothing of it.
-        unseen: discovery cannot be expected to show it to this observer; `observed` is what its
-            node says then.
-        beyond: its whole node is out of this observer's reach, and so is its report.
-    """
-
-    node: PlannedNode
-    planned: PlannedEndpoint
-    observed: ObservedEndpoint | None
-    report: EndpointReport | None
-    unseen: bool = False
-    beyond: bool = False
-
-
 class SeenEndpoint(msgspec.Struct, frozen=True, kw_only=True):
     """An endpoint of the graph, declared or not, with all that is known of it.
 
@@ -69,7 +50,7 @@ class SeenEndpoint(msgspec.Struct, frozen=True, kw_only=True):
         qos: as announced or reported; None where neither is known.
         report: what its node says; None if it says nothing.
         planned: its declaration; None if there is none.
-        type_hash: as `ObservedEndpoint` has it.
+        type_hash: as `ObservedEndpoint` has it; as its node reports it where discovery does not.
         expected: it is one that the system has for good, so that whatever can match it must; a
             tool's may be matched or not.
     """
@@ -83,6 +64,28 @@ class SeenEndpoint(msgspec.Struct, frozen=True, kw_only=True):
     planned: PlannedEndpoint | None = None
     type_hash: str | None = None
     expected: bool = True
+
+
+class Actual(msgspec.Struct, frozen=True, kw_only=True):
+    """A declared endpoint and what was seen of it.
+
+    Attributes:
+        observed: what discovery shows; None if it does not show the endpoint.
+        report: what the node itself says; None if it says nothing of it.
+        end: what others can match with: as discovery shows it, else as its node says; as declared
+            where both are out of reach.
+        unseen: discovery cannot be expected to show it to this observer; `observed` is what its
+            node says then.
+        beyond: its whole node is out of this observer's reach, and so is its report.
+    """
+
+    node: PlannedNode
+    planned: PlannedEndpoint
+    observed: ObservedEndpoint | None
+    report: EndpointReport | None
+    end: SeenEndpoint
+    unseen: bool = False
+    beyond: bool = False
 
 
 class NodeFacts(msgspec.Struct, frozen=True, kw_only=True, eq=False):

@@ -33,9 +33,7 @@ NAMES = (
     "signals",
     "reports",
     "names",
-    "tools",
     "control",
-    "parsers",
 )
 """Modules of this package, the slow ones first; each has its HostileClass as `CLASS`."""
 

@@ -16,7 +16,6 @@ from pathlib import Path
 
 from lifecycle.errors import ExitCode
 from tests.hostile.attack import (
-    CODES,
     Attack,
     Attacks,
     HostileClass,
@@ -326,4 +325,3 @@ def attacks(rng: random.Random) -> list[Attack]:
 
 
 CLASS = HostileClass(name="files", attacks=attacks)
-assert CODES

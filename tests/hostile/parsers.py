@@ -1,17 +1,13 @@
-"""Every reader of data that others write, on a good document with pieces of it changed.
+"""Every reader of data that others write, each with a good document.
 
-Owns: `READERS`, the one list of them: property tests go through it too
+Owns: `READERS`, the one list of them, which property tests go through
 (tests/unit/test_foreign_data.py).
 """
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import functools
 import json
-import random
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -36,18 +32,14 @@ from lifecycle.programming.apply.targets.registry import settings_types
 from lifecycle.programming.apply.tool import HostTool, ToolOutput
 from lifecycle.programming.rules.nftables import parse_managed_comment
 from lifecycle.run_directory import read_record
-from lifecycle.supervisor.control.orders import Order
 from lifecycle.supervisor.control.server import LookAnswer
+from lifecycle.supervisor.core.state import Order
 from lifecycle.verify.observation import ConfigurationError, decode_configuration
 from lifecycle.verify.verdict import Stage
-from tests.hostile.attack import Attack, HostileClass, Place, mutated
 from tests.unit.programming.apply.fakes import FakeTool, failed
 from tests.unit.programming.apply.samples import nef_settings
 from tests.unit.verify.perfect import perfect
 from tests.unit.verify.test_verify_rules import PLAN
-
-SHARE = 25
-"""Attacks on each reader."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -214,23 +206,3 @@ READERS: dict[str, Reader] = {
         good=_MANIFEST, read=_file("m.lifecycle.yaml", load), errors=(ManifestError,)
     ),
 }
-
-
-def attacks(rng: random.Random) -> list[Attack]:
-    found = []
-    for name, reader in READERS.items():
-        for number in range(SHARE):
-            data = mutated(reader.good, rng)
-            found.append(
-                Attack(name=f"{name} {number}", run=functools.partial(_read, reader, data))
-            )
-    return found
-
-
-def _read(reader: Reader, data: bytes, place: Place) -> None:
-    del place
-    with tempfile.TemporaryDirectory() as folder, contextlib.suppress(*reader.errors):
-        reader.read(data, Path(folder))
-
-
-CLASS = HostileClass(name="parsers", attacks=attacks)

@@ -6,7 +6,6 @@ import sys
 import threading
 
 import rclpy
-from lifecycle_msgs.srv import ChangeState
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from std_msgs.msg import String
@@ -27,14 +26,6 @@ def _play(node: Node, way: str) -> None:
     match way:
         case "publish":
             node.create_publisher(String, "/chatter", 10)
-        case "listen":
-            node.create_subscription(String, "/chatter", lambda _: None, 10)
-        case "serve":
-            node.create_service(Trigger, "/listener/ping", lambda _, response: response)
-        case "call":
-            node.create_client(Trigger, "/listener/ping")
-        case "change_state":
-            node.create_service(ChangeState, "/talker/change_state", lambda _, response: response)
         case _:
             answer = ANSWERS[way]
             success = way != "no success"
@@ -84,7 +75,7 @@ def main() -> None:
         else:
             node = Node(name, enable_rosout=False)
             spinning.nodes.append(node)
-            _play(node, way if way == "change_state" else way.replace("_", " "))
+            _play(node, way.replace("_", " "))
             spinning.executor.add_node(node)
         print("done", flush=True)
 

@@ -11,6 +11,8 @@ import functools
 import random
 import re
 import signal
+import subprocess
+import sys
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -28,8 +30,7 @@ from tests.hostile.attack import (
     check_text,
     in_a_process,
 )
-from tests.hostile.tools import Players
-from tests.ros.supervisor.running import Up, pair
+from tests.ros.supervisor.running import ROOT, Up, pair
 
 VERBS = ("verify", "flows", "graph", "capture", "up")
 BOUND_S = 60.0
@@ -38,6 +39,32 @@ BOUND_S = 60.0
 def node_of(answer: str) -> str:
     """Return the name of the node that gives an answer."""
     return "liar_" + re.sub(r"[^a-z0-9]", "_", answer.lower())
+
+
+class Players:
+    """A process with nodes of any name that do one thing each."""
+
+    def __init__(self) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "tests.hostile.player"],
+            cwd=ROOT,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+
+    def do(self, *words: str) -> None:
+        """Have a node made (`publish NAME`) or all unmade (`leave`), and wait until it is."""
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self.process.stdin.write(" ".join(words) + "\n")
+        self.process.stdin.flush()
+        if self.process.stdout.readline() != "done\n":
+            raise Unhandled(f"the player died at {words}")
+
+    def close(self) -> None:
+        self.process.kill()
+        self.process.communicate()
 
 
 class Stage:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import json
 import random
 import signal
@@ -13,6 +12,7 @@ from lifecycle.errors import ExitCode
 from tests.hostile.attack import (
     BOUND_S,
     Attack,
+    Attacks,
     HostileClass,
     Place,
     Unhandled,
@@ -80,10 +80,10 @@ def _reach(process: subprocess.Popen[bytes], mark: bytes) -> None:
 
 
 def attacks(rng: random.Random) -> list[Attack]:
-    found = []
+    found = Attacks()
 
     def add(name: str, *arguments: object) -> None:
-        found.append(Attack(name=name, run=functools.partial(_signalled, *arguments)))
+        found.add(name, _signalled, *arguments)
 
     for stage, mark in STAGES.items():
         for number in (INT, TERM, HUP):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.net.hosts import Hosts, lacking
+from tests.net.hosts import Host, Hosts, lacking
 from tests.second_try import SECOND_TRY
 
 
@@ -16,6 +16,21 @@ def hosts() -> Iterator[Hosts]:
     """Hosts that end with the test."""
     with Hosts() as hosts:
         yield hosts
+
+
+@pytest.fixture
+def pair(hosts: Hosts) -> tuple[Host, Host]:
+    """Hosts A and B on one switch."""
+    one, other = hosts.bridged("A", "B")
+    return one, other
+
+
+@pytest.fixture(scope="module")
+def switched() -> Iterator[tuple[Host, Host]]:
+    """Two hosts on one switch, for the tests of a module."""
+    with Hosts() as made:
+        one, other = made.bridged("one", "other")
+        yield one, other
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

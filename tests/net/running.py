@@ -6,6 +6,8 @@ Owns: `article`, the example of *Unique Network Flows* on two machines, and `up_
 from __future__ import annotations
 
 import contextlib
+import subprocess
+import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -13,7 +15,7 @@ from typing import Any
 import yaml
 
 from tests.net.hosts import Host
-from tests.ros.supervisor.running import Up
+from tests.ros.supervisor.running import ROOT, Up
 
 DOMAIN = 7
 """Nobody else is in a network of our own."""
@@ -106,6 +108,19 @@ UNIQUE: Mapping[str, Any] = {
 def run_directory(runtime: Path, machine: str) -> Path:
     """Return where the supervisor of a machine can be asked, see supervisor.remote."""
     return runtime / "lifecycle" / f"article@{DOMAIN}.{machine}"
+
+
+def verb_on(host: Host, *words: str, runtime: Path) -> subprocess.CompletedProcess[str]:
+    """Run a verb on a host to its end."""
+    return subprocess.run(
+        host.command(sys.executable, "-m", "lifecycle.cli", *words),
+        cwd=ROOT,
+        env=host.environment(runtime),
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
 
 
 @contextlib.contextmanager

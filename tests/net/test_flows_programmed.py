@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import json
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -18,9 +16,9 @@ import pytest
 
 from lifecycle.errors import ExitCode
 from tests.net.hosts import Hosts
-from tests.net.running import UNIQUE, article, up_on_both
+from tests.net.running import UNIQUE, article, up_on_both, verb_on
 from tests.net.wire import Capture, Packet
-from tests.ros.supervisor.running import ROOT, Up
+from tests.ros.supervisor.running import Up
 
 _EF = 46
 _BOUND_S = 60
@@ -37,12 +35,6 @@ _ASKS: Mapping[str, Any] = {
     },
 }
 
-_VERB = """
-import sys
-from lifecycle.cli import main
-sys.exit(main(["flows", *sys.argv[1:]]))
-"""
-
 
 class Bench:
     """The article's example on two hosts, and `lifecycle flows` on the sender's."""
@@ -57,15 +49,8 @@ class Bench:
 
     def flows(self, verb: str, *options: str) -> tuple[int, str]:
         """Run `lifecycle flows VERB`; return its exit code and what it printed."""
-        done = subprocess.run(
-            self.one.command(sys.executable, "-c", _VERB, verb, str(self.manifest), *options),
-            cwd=ROOT,
-            env=self.one.environment(self.directory / "a"),
-            capture_output=True,
-            text=True,
-            timeout=_BOUND_S,
-            check=False,
-        )
+        words = ("flows", verb, str(self.manifest), *options)
+        done = verb_on(self.one, *words, runtime=self.directory / "a")
         return done.returncode, done.stdout + done.stderr
 
     def ledger(self) -> list[str]:

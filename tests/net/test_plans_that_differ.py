@@ -11,19 +11,12 @@ from typing import Any
 import pytest
 
 from lifecycle.errors import ExitCode
-from tests.net.hosts import Host, Hosts
+from tests.net.hosts import Host
 from tests.net.running import article, up_on, up_on_both
 from tests.ros.supervisor.running import Event, Up
 
 RULE = "run.plans-differ"
 _SOURCE = "tests.net.systems:Source"
-
-
-@pytest.fixture
-def pair(hosts: Hosts) -> tuple[Host, Host]:
-    """Hosts A and B on one switch."""
-    one, other = hosts.bridged("A", "B")
-    return one, other
 
 
 def write(directory: Path, pair: tuple[Host, Host], edit: Mapping[str, Any]) -> Path:

@@ -22,13 +22,6 @@ _TOPICS = [
 _NODE_OF = {"a": "/n1", "b": "/n2"}
 
 
-@pytest.fixture
-def pair(hosts: Hosts) -> tuple[Host, Host]:
-    """Hosts A and B on one switch."""
-    one, other = hosts.bridged("A", "B")
-    return one, other
-
-
 def _driven(up: Up) -> set[str]:
     return {each["node"] for each in up.of_kind("request")}
 
@@ -237,16 +230,6 @@ def test_without_a_machine_named_a_host_runs_those_that_have_its_address(
             up.signal(signal.SIGTERM)
         assert [up.finish() for up in ups] == [ExitCode.OK, ExitCode.OK]
     assert [_driven(up) for up in ups] == [{"/n1"}, {"/n2"}]
-
-
-def test_hosts_leave_nothing_behind(tmp_path: Path) -> None:
-    with Hosts() as hosts:
-        one, _ = hosts.bridged("A", "B")
-        sleeping = one.popen("sleep", "600")
-        network = Path(f"/proc/{one.pid}/ns/net").stat().st_ino
-    assert sleeping.wait(BOUND_S) == -signal.SIGKILL
-    alive = [int(each.name) for each in Path("/proc").iterdir() if each.name.isdigit()]
-    assert network not in {Host._network(pid) for pid in alive}
 
 
 def test_hosts_beyond_a_router_find_each_other_by_their_addresses(

@@ -6,8 +6,6 @@ import re
 import shutil
 import signal
 import socket
-import subprocess
-import sys
 from collections.abc import Mapping
 from collections.abc import Set as AbstractSet
 from pathlib import Path
@@ -17,9 +15,9 @@ import pytest
 
 from lifecycle.errors import ExitCode
 from tests.net.hosts import Host, Hosts
-from tests.net.running import UNIQUE, article, up_on
+from tests.net.running import UNIQUE, article, up_on, verb_on
 from tests.net.wire import Capture, Packet
-from tests.ros.supervisor.running import ROOT, Up
+from tests.ros.supervisor.running import Up
 
 pytestmark = pytest.mark.skipif(shutil.which("nft") is None, reason="nft is not installed")
 
@@ -126,17 +124,8 @@ def test_a_system_programs_its_host_while_it_is_active_follows_its_flows_and_cle
 
 def ask(host: Host, verb: str, manifest: Path, runtime: Path) -> None:
     """Run a verb that speaks to the supervisor of machine `a`, and see that it succeeds."""
-    done = subprocess.run(
-        host.command(sys.executable, "-m", "lifecycle.cli", verb, str(manifest), "--machine", "a"),
-        cwd=ROOT,
-        env=host.environment(runtime),
-        capture_output=True,
-        text=True,
-        timeout=_BOUND_S,
-        check=False,
-    )
-    assert done.returncode == ExitCode.OK, done.stderr
-    assert done.stderr == ""
+    done = verb_on(host, verb, str(manifest), "--machine", "a", runtime=runtime)
+    assert (done.returncode, done.stderr) == (ExitCode.OK, "")
 
 
 def of_new_writers(wire: Capture, known: AbstractSet[bytes]) -> list[Packet]:
@@ -223,18 +212,7 @@ def test_down_removes_what_a_killed_supervisor_programmed(
         near.signal(signal.SIGKILL)
         near.process.wait(_BOUND_S)
         assert tables(one) == _TABLE
-        done = subprocess.run(
-            one.command(
-                sys.executable, "-m", "lifecycle.cli", "down", str(manifest), "--machine", "a"
-            ),
-            cwd=ROOT,
-            env=one.environment(tmp_path / "a"),
-            capture_output=True,
-            text=True,
-            timeout=_BOUND_S,
-            check=False,
-        )
-        assert (done.returncode, done.stderr) == (ExitCode.OK, "")
+        ask(one, "down", manifest, tmp_path / "a")
         assert tables(one) == ""
 
 

@@ -8,7 +8,7 @@ import sys
 from tests.outside.case import Case
 from tests.outside.cases import BY_MODULE
 
-HEAD = ("kind", "attack", "command", "verdict", "exit", "activated", "before")
+HEAD = ("kind", "attack", "command", "verdict", "exit", "activated")
 
 
 def row(module: str, case: Case) -> tuple[str, ...]:
@@ -24,7 +24,6 @@ def row(module: str, case: Case) -> tuple[str, ...]:
         case.verdict or "any",
         " or ".join(map(str, case.exit_codes)),
         activated,
-        case.before,
     )
 
 

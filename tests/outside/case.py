@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from tests.outside.running import Run
@@ -33,12 +33,12 @@ class Case:
         verdict: of the report (`--report`) of `up` and `verify`; None: there is none, or any.
         findings: ids of rules that the report must name.
         not_findings: ids of rules that it must not name.
+        violated: what messages of findings must name whose outcome is violated.
         activated: exactly these nodes ran `on_activate`; None: any. Empty: the gate never opened.
         received: exactly these payloads reached nodes of the system; None: any.
         says: what must be in the output, whatever its lines.
         not_says: what must not be in the output.
         within_s: the command ends within so many seconds.
-        before: how the installation before part 10 answered, in words; for the table only.
         quick: is in `make test`, too.
     """
 
@@ -52,12 +52,12 @@ class Case:
     verdict: str | None = None
     findings: tuple[str, ...] = ()
     not_findings: tuple[str, ...] = ()
+    violated: tuple[str, ...] = ()
     activated: frozenset[str] | None = None
     received: frozenset[str] | None = None
     says: tuple[str, ...] = ()
     not_says: tuple[str, ...] = ()
     within_s: float = 60.0
-    before: str = ""
     quick: bool = False
 
     @property
@@ -68,3 +68,6 @@ class Case:
 
 NOBODY: frozenset[str] = frozenset()
 """For `activated` and `received`."""
+
+REFUSED: Mapping[str, Any] = {"exit_code": 4, "verdict": VIOLATED, "activated": NOBODY}
+"""What a case expects whose gate must not open."""

@@ -24,6 +24,9 @@ def _judge(case: Case, run: Run, exit_code: int) -> None:
         assert run.result.get("verdict") == case.verdict, said
     assert set(case.findings) <= _rules(run), f"findings {_rules(run)}{said}"
     assert not set(case.not_findings) & _rules(run), f"findings {_rules(run)}{said}"
+    violated = [f for f in run.result.get("findings", ()) if f["outcome"] == "violated"]
+    for name in case.violated:
+        assert any(name in each["message"] for each in violated), f"nothing names {name}{said}"
     if case.activated is not None:
         assert run.activated == case.activated, f"activated {set(run.activated)}{said}"
     if case.received is not None:

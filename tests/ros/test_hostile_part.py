@@ -12,11 +12,8 @@ import pytest
 pytestmark = pytest.mark.thorough
 
 ROOT = Path(__file__).parents[2]
-EVERY = {"files": 15, "names": 1, "servers": 16, "control": 5, "parsers": 10}
+EVERY = {"files": 15, "names": 1, "servers": 16, "control": 5}
 """Which of a class's attacks are tried here: each so manieth."""
-
-LATER = ("up and SIG", "flows apply and remove")
-"""Attacks that take too long for this test."""
 
 
 @pytest.mark.parametrize("name", EVERY)
@@ -33,5 +30,4 @@ def test_every_attack_is_handled(name: str) -> None:
     assert done.returncode == 0, done.stderr
     tried = [json.loads(line) for line in done.stdout.splitlines() if line.startswith('{"attack"')]
     assert len(tried) > 5
-    wrong = [each for each in tried if each["why"] and not any(e in each["attack"] for e in LATER)]
-    assert wrong == []
+    assert [each for each in tried if each["why"]] == []

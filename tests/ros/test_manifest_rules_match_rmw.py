@@ -18,7 +18,6 @@ from rclpy.impl.implementation_singleton import rclpy_implementation as rcl
 from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 from rclpy.validate_full_topic_name import validate_full_topic_name
 
-from lifecycle.manifest.checks.parameters import read_sections, type_of
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.names import (
     NameNotLegalError,
@@ -31,6 +30,7 @@ from lifecycle.manifest.names import (
     parse_rule,
     resolve,
 )
+from lifecycle.manifest.parameter_files import read_sections, type_of
 from lifecycle.manifest.qos import (
     INFINITE_NS,
     PRESETS,

@@ -1,6 +1,6 @@
 """`make soak`: rounds of faults against a supervised system of ten nodes, judged from outside.
 
-    python -m tests.soak [--seed N] [--rounds N] [--first N] [--only CONDITION] [--list] [--keep]
+    python -m tests.soak [--seed N] [--rounds N] [--first N] [--only CONDITION] [--list]
 
 A seed stands for a list of rounds, which `--list` prints. With root they run in network and mount
 namespaces of their own, so that links can be cut and disks filled; without, those rounds are
@@ -45,7 +45,6 @@ def main() -> int:
     )
     parser.add_argument("--list", action="store_true", help="print the rounds, and do nothing")
     parser.add_argument("--go-on", action="store_true", help="also after a round that failed")
-    parser.add_argument("--keep", action="store_true", help="keep the logs in any case")
     options = parser.parse_args()
     rounds = plan(options.seed, options.rounds)[options.first - 1 :]
     if options.only:
@@ -92,7 +91,6 @@ def _soak(options: argparse.Namespace, rounds: list, *, private: bool) -> int:
                 else:
                     soaking.round(done)
             except Exception:  # noqa: BLE001 - whatever it is, it is reported
-                soaking.keep_stacks()
                 failed += 1
                 print(f"FAILED: seed {options.seed}, {done or 'down'}")
                 traceback.print_exc(limit=-2, file=sys.stdout)
@@ -108,10 +106,6 @@ def _soak(options: argparse.Namespace, rounds: list, *, private: bool) -> int:
             else:
                 print(f"  as expected, {time.monotonic() - started_s:.1f} s", flush=True)
         print(soaking.measured())
-        if options.keep:
-            kept = Path(tempfile.mkdtemp(prefix=f"soak-kept-{options.seed}-")) / "kept"
-            shutil.copytree(directory, kept, ignore=_sockets)
-            print(f"kept: {kept}")
     if failed:
         print(f"seed {options.seed}: {failed} failed, {time.monotonic() - began_s:.0f} s")
         return 1

@@ -10,7 +10,6 @@ import contextlib
 import functools
 import json
 import os
-import socket
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -20,7 +19,6 @@ from typing import Any
 from lifecycle_msgs.msg import TransitionEvent
 from rclpy.executors import SingleThreadedExecutor
 
-from lifecycle.middleware.fastdds.sockets import socket_descriptors
 from lifecycle.middleware.rcl.graph import GraphObserver
 from lifecycle.plan.model import ParticipantConnections
 from lifecycle.supervisor.control.protocol import (
@@ -114,7 +112,6 @@ class Transitions:
 
     def __init__(self, domain_id: int, nodes: Iterable[str]) -> None:
         self.seen: list[tuple[float, str, str]] = []
-        before = set(socket_descriptors())
         connections = ParticipantConnections(urls=("udpv4://127.0.0.1",))
         self._observer = GraphObserver(domain_id, connections)
         if owned_by((os.getpid(),)):
@@ -129,7 +126,6 @@ class Transitions:
             )
             for name in nodes
         }
-        self._sockets = set(socket_descriptors()) - before
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
         self._thread = threading.Thread(target=self._executor.spin, name="transitions")
@@ -150,15 +146,6 @@ class Transitions:
             for at, node, state in tuple(self.seen)
             if state == ACTIVE and since <= at <= until
         ]
-
-    def abandon(self) -> None:
-        """Let go of what Fast DDS has locked up: nothing can be destroyed, and nothing is unread.
-
-        The numbers of its sockets stay taken, so that none of its threads reads another's.
-        """
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as nothing:
-            for each in self._sockets:
-                os.dup2(nothing.fileno(), each)
 
     def close(self) -> None:
         """Leave the graph."""

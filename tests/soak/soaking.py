@@ -24,7 +24,7 @@ from pathlib import Path
 import psutil
 
 from lifecycle.middleware.process.shared_memory import leftovers
-from tests.ros.supervisor.running import ROOT, command, environment, left_of
+from tests.ros.supervisor.running import ROOT, command, environment, left_of, verb
 from tests.shared_memory import owned_by
 from tests.soak.model import (
     DIES,
@@ -49,7 +49,6 @@ from tests.soak.running import (
     assert_activated_on_request,
     assert_gate_held,
 )
-from tests.soak.stacks import keep_stacks
 from tests.soak.system import ISSUED, NAME, PUBLISHES, SUBSCRIBES, TINTED, manifest
 from tests.stalls import Stalls
 
@@ -96,7 +95,6 @@ class Soaking:
         self.manifest = manifest(directory, domain_id, self.mark, Manifest())
         self.in_force = self.manifest
         self.transitions = _transitions(domain_id)
-        self._watched: Watched | None = None
         self.domain_id = domain_id
         self.stalls = Stalls()
         self.state = State()
@@ -123,7 +121,6 @@ class Soaking:
             for each in sorted((self.runtime / "log").glob("20*"))[:-1]:
                 shutil.rmtree(each)
             self.run = Watched(self.manifest, runtime=self.runtime)
-            self._watched = self.run
             self._until_as_it_was(self.run, UP_S)
             # What is compared with the requests must not be empty because nothing is received.
             deadline = time.monotonic() + DOWN_S
@@ -193,12 +190,6 @@ class Soaking:
         self.state = State()
         if run is not None:
             run.close()
-
-    def keep_stacks(self) -> None:
-        """Write what each process is doing into `stacks/`, beside manifest and logs."""
-        shutil.rmtree(self.directory / "stacks", ignore_errors=True)
-        if self._watched is not None:
-            keep_stacks(self._watched.process.pid, self.directory / "stacks")
 
     def measured(self) -> str:
         """Say how fast faults were reported, and how soon the system was as it was."""
@@ -431,7 +422,7 @@ class Soaking:
 
     @contextlib.contextmanager
     def _storm(self, done: Round) -> Iterator[None]:
-        orders = [self._start("restart", *((each,) if each else ())) for each in done.orders]
+        orders = [self._start("restart", NAME, *((each,) if each else ())) for each in done.orders]
         try:
             yield
             for each, node in zip(orders, done.orders, strict=True):
@@ -454,17 +445,7 @@ class Soaking:
         path = manifest(self.directory, self.domain_id, self.mark, done.manifest, name)
         words = ["apply", str(path), "--format", "json", "--timeout", f"{APPLY_S:g}"]
         since, asked_s = len(run.events), time.monotonic()
-        self._applied = (
-            path,
-            subprocess.Popen(
-                [*command(words[0]), *words[1:]],
-                cwd=ROOT,
-                env=environment(self.runtime, self.mark),
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                text=True,
-            ),
-        )
+        self._applied = path, self._start(*words)
         if done.manifest != self.state.manifest:
             begun = lambda each: each.get("event") == "apply" and each["stage"] == "begun"  # noqa: E731
             _, asked_s = run.wait(begun, since=since, within_s=15.0, what="beginning of apply")
@@ -519,7 +500,7 @@ class Soaking:
 
     def _start(self, name: str, *words: str) -> subprocess.Popen[str]:
         return subprocess.Popen(
-            [*command(name), NAME, *words],
+            [*command(name), *words],
             cwd=ROOT,
             env=environment(self.runtime, self.mark),
             stdout=subprocess.PIPE,
@@ -528,18 +509,13 @@ class Soaking:
         )
 
     def _verb(self, name: str, *words: str, within_s: float) -> tuple[int, str]:
-        asked = self._start(name, *words)
         try:
-            out, error = asked.communicate(timeout=within_s)
+            done = verb(name, NAME, *words, runtime=self.runtime, mark=self.mark, within_s=within_s)
         except subprocess.TimeoutExpired:
             raise NotAsPromisedError(
                 f"lifecycle {name} {words} did not end in {within_s:g} s"
             ) from None
-        finally:
-            if asked.poll() is None:
-                asked.kill()
-                asked.communicate()
-        return asked.returncode, out + error
+        return done.returncode, done.stdout + done.stderr
 
     def _insist(self, run: Watched, words: tuple[str, ...]) -> None:
         """Give an order until it is carried out: the system may be doing something else."""

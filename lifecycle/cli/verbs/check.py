@@ -13,7 +13,7 @@ from pathlib import Path
 import click
 import msgspec
 
-from lifecycle.ci_formats import Case, Result, Suite, junit, sarif
+from lifecycle.ci_formats import Case, Problem, Suite, github, junit, sarif
 from lifecycle.cli.common import (
     format_option,
     machine_option,
@@ -23,7 +23,6 @@ from lifecycle.cli.common import (
     run_commands_option,
 )
 from lifecycle.cli.report import (
-    annotation,
     report_format,
     report_option,
     write_report,
@@ -93,13 +92,7 @@ def write_check(report: CheckReport, format_: str, *, strict: bool) -> str:
     lines = [*map(str, report.diagnostics), *map(str, report.unresolved), summary(report)]
     if format_ == "github":
         lines += [
-            annotation(
-                "error" if strict and each.is_unproven else _LEVELS[each.severity],
-                each.rule,
-                f"{each.message}; {each.hint}" if each.hint else each.message,
-                at=each.at.spelled,
-            )
-            for each in report.diagnostics
+            github(_problem(each, fails=strict and each.is_unproven)) for each in report.diagnostics
         ]
     return "\n".join(lines)
 
@@ -123,8 +116,15 @@ def summary(report: CheckReport) -> str:
     return f"{report.system}: {', '.join(counts)}: {verdict}"
 
 
-_LEVELS = {Severity.ERROR: "error", Severity.WARNING: "warning", Severity.NOTE: "notice"}
-"""As annotations of GitHub call them."""
+def _problem(found: Diagnostic, *, fails: bool = False) -> Problem:
+    return Problem(
+        rule=found.rule,
+        level="error" if fails else found.severity.value,
+        message=found.message,
+        hint=found.hint,
+        subject=found.at.path,
+        at=found.at.spelled,
+    )
 
 
 def _junit(report: CheckReport, *, strict: bool) -> str:
@@ -156,21 +156,18 @@ def _test(rule: str) -> str:
 
 def _sarif(report: CheckReport) -> str:
     rules = sorted({each.rule for each in report.diagnostics} | {_UNRESOLVED})
-    found = [
-        _result(
-            each.rule,
-            each.severity.value,
-            f"{each.message}; {each.hint}" if each.hint else each.message,
-            each.at,
-        )
-        for each in report.diagnostics
-    ]
     unresolved = [
-        _result(_UNRESOLVED, "note", f"could not resolve {each.subject}: {each.reason}", each.at)
+        Problem(
+            rule=_UNRESOLVED,
+            level="note",
+            message=f"could not resolve {each.subject}: {each.reason}",
+            subject=each.at.path,
+            at=each.at.spelled,
+        )
         for each in report.unresolved
     ]
     return sarif(
-        [*found, *unresolved],
+        [*map(_problem, report.diagnostics), *unresolved],
         [{"id": each} for each in rules],
         properties={"ok": report.ok, "summary": summary(report)},
         invocation={"executionSuccessful": report.ok},
@@ -178,10 +175,6 @@ def _sarif(report: CheckReport) -> str:
 
 
 _UNRESOLVED = "program.unresolved"
-
-
-def _result(rule: str, level: str, text: str, at: Position) -> Result:
-    return Result(rule=rule, level=level, text=text, subject=at.path, at=at.spelled)
 
 
 @click.command()
@@ -294,7 +287,7 @@ def check(
         resolution = resolve(result.manifest, machine)
         diagnostics = (
             *result.warnings,
-            *check_plan(result.manifest),
+            *check_plan(result.manifest, files=result.files),
             *resolution.diagnostics,
         )
         if all(each.severity is not Severity.ERROR for each in diagnostics):

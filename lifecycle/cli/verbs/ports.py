@@ -19,13 +19,12 @@ from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest.model import Discovery
 from lifecycle.network.ports import (
     LOCALHOST_PARTICIPANTS,
+    PLATFORMS,
     Capacity,
     EphemeralRange,
     ParticipantPorts,
-    Platform,
     PortUse,
     describe_domains,
-    ephemeral_range,
     max_participants,
     overlaps,
     participant_ports,
@@ -64,7 +63,7 @@ class PortsReport(msgspec.Struct, frozen=True, kw_only=True):
 @click.option("--participant", type=int, default=0, show_default=True, help="Counts from 0.")
 @click.option(
     "--platform",
-    type=click.Choice([*(each.value for each in Platform), THIS]),
+    type=click.Choice([*PLATFORMS, THIS]),
     default=THIS,
     show_default=True,
     help="Whose ephemeral ports to keep clear of; `this` reads this machine's own.",
@@ -100,7 +99,7 @@ def command(*, domain: int | None, participant: int, platform: str, format_: str
 
 def _ephemeral(platform: str) -> EphemeralRange:
     if platform != THIS:
-        return ephemeral_range(Platform(platform))
+        return PLATFORMS[platform]
     try:
         return read_ephemeral_range(lambda path: Path(path).read_text(encoding="ascii"))
     except (OSError, ValueError) as error:

@@ -182,9 +182,7 @@ def _fork_server(program: tuple[TargetOptions, ...]) -> ForkServerProcess:
 
     tokens: frozenset[str] = frozenset()
     if program:  # their secrets, which nothing that is started shall have
-        from lifecycle.supervisor.connections.networks import token_variables
-
-        tokens = frozenset(token_variables(program))
+        tokens = frozenset().union(*(each.token_variables() for each in program))
     return ForkServerProcess(without=tokens, programs=bool(program))
 
 

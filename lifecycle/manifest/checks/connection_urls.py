@@ -277,3 +277,6 @@ def _together(node: Node, connection: ConnectionDeclaration) -> Iterator[Diagnos
             "has one TCP port"
         )
         yield error(rule, at, message, "make two connections of it")
+
+
+CHECKS = (check_urls,)

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 
 from lifecycle.errors import did_you_mean
 from lifecycle.manifest.checks.system import (
@@ -20,7 +19,7 @@ from lifecycle.manifest.checks.system import (
     implicit_names,
 )
 from lifecycle.manifest.diagnostics import Diagnostic, Position, Severity
-from lifecycle.manifest.flows import FlowNeeds, ResolvedNeed
+from lifecycle.manifest.flows import ResolvedNeed
 from lifecycle.manifest.installed_types import TypeLookup, TypeStatus, look_up
 from lifecycle.manifest.model import (
     Authority,
@@ -60,10 +59,10 @@ def check_counterparts(system: DeclaredSystem) -> Iterator[Diagnostic]:
 
 def _severity(system: DeclaredSystem, kind: EndpointKind) -> Severity | None:
     policy = system.manifest.policy
-    severity = policy.unheard if kind is EndpointKind.PUBLISHER else policy.unpublished
-    if severity is Severity.ERROR and system.is_open:
+    wanted = policy.unheard if kind is EndpointKind.PUBLISHER else policy.unpublished
+    if wanted == "error" and system.is_open:
         return Severity.WARNING  # the other end may be one that the manifest does not declare
-    return severity
+    return None if wanted == "ignore" else Severity(wanted)
 
 
 def _alone(
@@ -86,7 +85,7 @@ def _alone(
 _FLOW_NAME = re.compile(r"flow_[0-9]+\Z")
 
 
-def check_connections(system: DeclaredSystem, needs: FlowNeeds) -> Iterator[Diagnostic]:
+def check_connections(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about every declared connection, but for its URLs."""
     hidden: dict[str, tuple[Node, ConnectionDeclaration]] = {}
     for node in system.manifest.nodes:
@@ -95,7 +94,7 @@ def check_connections(system: DeclaredSystem, needs: FlowNeeds) -> Iterator[Diag
             yield from _foreign(system, node)
         for each in node.connections:
             yield from _name(system, node, each, hidden)
-            yield from _flows(node, each, needs)
+            yield from _flows(node, each, system)
 
 
 def _foreign(system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
@@ -176,13 +175,15 @@ def _name(
         yield error("check.connection-name", connection.at, message, "choose another name")
 
 
-def _flows(node: Node, connection: ConnectionDeclaration, needs: FlowNeeds) -> Iterator[Diagnostic]:
+def _flows(
+    node: Node, connection: ConnectionDeclaration, system: DeclaredSystem
+) -> Iterator[Diagnostic]:
     """Judge needs of flows against the connection that carries them."""
     transports = {url.transport for url in connection.urls}
     found = [
         (kind, each)
         for kind, name in connection.map
-        if (each := needs.of(node.key, kind, name)) is not None
+        if (each := system.needs.of(node.key, kind, name)) is not None
     ]
     for kind, each in found:
         yield from _carrier(connection, kind, each, transports)
@@ -190,9 +191,9 @@ def _flows(node: Node, connection: ConnectionDeclaration, needs: FlowNeeds) -> I
     publishers = [name for kind, name in connection.map if kind is publisher]
     for kind, each in found:
         if kind is publisher:
-            yield from _apart(node, connection, each, publishers, needs)
+            yield from _apart(node, connection, each, publishers, system)
         elif each.dscp is not None:
-            sharing = [(name, needs.of(node.key, publisher, name)) for name in publishers]
+            sharing = [(name, system.needs.of(node.key, publisher, name)) for name in publishers]
             sharing += [
                 (one.need.name, one)
                 for other, one in found
@@ -246,7 +247,7 @@ def _apart(
     connection: ConnectionDeclaration,
     each: ResolvedNeed,
     publishers: list[str],
-    needs: FlowNeeds,
+    system: DeclaredSystem,
 ) -> Iterator[Diagnostic]:
     """Judge whether a publisher may share the connection with those that it is shared with."""
     rule, name = "check.connection-flow", each.need.name
@@ -259,7 +260,7 @@ def _apart(
         )
         yield error(rule, each.need.at, message, "give it a connection of its own")
     if each.dscp is not None:
-        sharing = [(name, needs.of(node.key, each.need.kind, name)) for name in others]
+        sharing = [(name, system.needs.of(node.key, each.need.kind, name)) for name in others]
         yield from _marked_apart(connection, each, sharing)
 
 
@@ -367,9 +368,9 @@ def _remedy(each: Incompatibility) -> str:
     return f"offer {each.requested} there, or request {each.offered} here"
 
 
-def check_types(system: DeclaredSystem, prefixes: Sequence[Path]) -> Iterator[Diagnostic]:
+def check_types(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about types."""
-    yield from _missing(system, prefixes)
+    yield from _missing(system)
     for family in ("topic", "service", "action"):
         by_name: dict[str, list[Resolved]] = {}
         for each in system.endpoints:
@@ -379,14 +380,14 @@ def check_types(system: DeclaredSystem, prefixes: Sequence[Path]) -> Iterator[Di
             yield from _mismatches(family, name, ends)
 
 
-def _missing(system: DeclaredSystem, prefixes: Sequence[Path]) -> Iterator[Diagnostic]:
+def _missing(system: DeclaredSystem) -> Iterator[Diagnostic]:
     answers: dict[str, TypeLookup] = {}
     absent: set[str] = set()
     for node in system.manifest.nodes:
         for endpoint in node.interface.endpoints:
             type_ = endpoint.type
             if type_ not in answers:
-                answers[type_] = look_up(type_, prefixes)
+                answers[type_] = look_up(type_, system.prefixes)
             answer, package = answers[type_], type_.partition("/")[0]
             hint = f"did you mean {answer.nearest!r}?" if answer.nearest else ""
             if answer.status is TypeStatus.NO_SUCH_TYPE:
@@ -408,3 +409,6 @@ def _mismatches(family: str, name: str, ends: list[Resolved]) -> Iterator[Diagno
                 f"{first} uses {first.endpoint.type!r}"
             )
             yield error("check.type-mismatch", each.at, message, "use one type at all ends")
+
+
+CHECKS = (check_types, check_qos, check_counterparts, check_connections)

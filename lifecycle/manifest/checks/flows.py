@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from lifecycle.errors import did_you_mean
 from lifecycle.manifest.checks.system import DeclaredSystem, Resolved
 from lifecycle.manifest.diagnostics import Diagnostic
-from lifecycle.manifest.flows import FlowNeeds, ResolvedNeed
+from lifecycle.manifest.flows import ResolvedNeed
 from lifecycle.manifest.model import (
     EndpointKind,
     FlowIdentification,
@@ -36,10 +36,10 @@ _KEPT_BY_CLASS = ("max_delay_ms", "loss")
 """What a class promises whatever the rate; the others depend on what an operator configures."""
 
 
-def check_flows(system: DeclaredSystem, needs: FlowNeeds) -> Iterator[Diagnostic]:
+def check_flows(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about flow needs, but for transports."""
     for node in system.manifest.nodes:
-        for each in needs.of_node(node):
+        for each in system.needs.of_node(node):
             yield from _endpoint(node, each.need)
             yield from _marking(node, each)
             yield from _class(each)
@@ -179,35 +179,33 @@ _ASK = "ask for 'unique: strictly_required', or give each a DSCP of its own"
 _OWN = "give it another DSCP, or none: then it gets one that nobody has"
 
 
-def check_identifiers(system: DeclaredSystem, needs: FlowNeeds) -> Iterator[Diagnostic]:
+def check_identifiers(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about publishers that are identified by their DSCP.
 
     All nodes are counted. The article counts subscriptions too; here their ports distinguish them,
     and a DSCP that one acknowledges with must only not be an identifier of another's.
     """
     if system.manifest.network.flow_identification is FlowIdentification.DSCP:
-        yield from _repurposed(system, needs)
+        yield from _repurposed(system)
     else:
-        yield from _relied_on(system, needs)
+        yield from _relied_on(system)
 
 
-def _needy(
-    system: DeclaredSystem, needs: FlowNeeds, kind: EndpointKind
-) -> Iterator[tuple[Resolved, ResolvedNeed]]:
+def _needy(system: DeclaredSystem, kind: EndpointKind) -> Iterator[tuple[Resolved, ResolvedNeed]]:
     """Yield the endpoints of a kind that ask something of their flows."""
     for each in system.endpoints:
-        need = needs.of(each.node.key, each.endpoint.kind, each.endpoint.name)
+        need = system.needs.of(each.node.key, each.endpoint.kind, each.endpoint.name)
         if need is not None and each.endpoint.kind is kind:
             yield each, need
 
 
-def _repurposed(system: DeclaredSystem, needs: FlowNeeds) -> Iterator[Diagnostic]:
-    publishers = list(_needy(system, needs, EndpointKind.PUBLISHER))
-    relying = {id(need) for _, need in _relying(system, needs)}
+def _repurposed(system: DeclaredSystem) -> Iterator[Diagnostic]:
+    publishers = list(_needy(system, EndpointKind.PUBLISHER))
+    relying = {id(need) for _, need in _relying(system)}
     asking = [each for each in publishers if each[1].unique or id(each[1]) in relying]
     others = [
         *(each for each in publishers if not (each[1].unique or id(each[1]) in relying)),
-        *_needy(system, needs, EndpointKind.SUBSCRIPTION),
+        *_needy(system, EndpointKind.SUBSCRIPTION),
     ]
     for _, need in asking:
         message, hint = need.marking.problem
@@ -226,7 +224,7 @@ def _repurposed(system: DeclaredSystem, needs: FlowNeeds) -> Iterator[Diagnostic
                 f"({other.at.spelled})"
             )
             yield error("check.dscp-not-unique", need.need.at, message, _OWN)
-    at = system.manifest.network.at
+    at = system.manifest.positions.get("network")
     if asking and at is not None:
         message = (
             f"cannot be sure that the network takes {len(asking)} of {_DSCP_VALUES} DSCP values "
@@ -239,14 +237,14 @@ def _repurposed(system: DeclaredSystem, needs: FlowNeeds) -> Iterator[Diagnostic
         yield note("check.dscp-repurposed", at, message, hint)
 
 
-def _relied_on(system: DeclaredSystem, needs: FlowNeeds) -> Iterator[Diagnostic]:
+def _relied_on(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Judge publishers that only their DSCP distinguishes although that is declared nowhere.
 
     A link may demand a unique flow of a publisher that asks for none but is marked: then its DSCP
     is re-purposed as the identifier, and of those there are 64, all else in the NFE being equal.
     """
     holders: dict[int, Resolved] = {}
-    relying = list(_relying(system, needs))
+    relying = list(_relying(system))
     for number, (each, need) in enumerate(relying, start=1):
         assert need.dscp is not None
         other = holders.setdefault(need.dscp, each)
@@ -266,13 +264,13 @@ def _relied_on(system: DeclaredSystem, needs: FlowNeeds) -> Iterator[Diagnostic]
             yield error("check.dscp-not-unique", need.need.at, message, _ASK)
 
 
-def _relying(system: DeclaredSystem, needs: FlowNeeds) -> Iterator[tuple[Resolved, ResolvedNeed]]:
+def _relying(system: DeclaredSystem) -> Iterator[tuple[Resolved, ResolvedNeed]]:
     demanded = {
         (link.from_node, link.topic)
         for link in system.manifest.links
         if link.unique is not UniqueHow.NOT
     }
-    for each, need in _needy(system, needs, EndpointKind.PUBLISHER):
+    for each, need in _needy(system, EndpointKind.PUBLISHER):
         if need.dscp is None or need.need.unique is not UniqueRequirement.NOT_REQUIRED:
             continue
         if (each.node.key, each.name) in demanded and 0 <= need.dscp <= MAX_DSCP:
@@ -282,7 +280,7 @@ def _relying(system: DeclaredSystem, needs: FlowNeeds) -> Iterator[tuple[Resolve
 _VERBS = {EndpointKind.PUBLISHER: "publish", EndpointKind.SUBSCRIPTION: "subscribe to"}
 
 
-def check_links(system: DeclaredSystem, needs: FlowNeeds) -> Iterator[Diagnostic]:
+def check_links(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about the topic and the ends of every link, and what it demands of them."""
     for link in system.manifest.links:
         if problem := full_name_problem(link.topic):
@@ -296,7 +294,7 @@ def check_links(system: DeclaredSystem, needs: FlowNeeds) -> Iterator[Diagnostic
         ]
         problems = [each for each in ends if isinstance(each, Diagnostic)]
         resolved = [each for each in ends if isinstance(each, Resolved)]
-        yield from problems or _uniqueness(link, resolved, needs)
+        yield from problems or _uniqueness(link, resolved, system)
 
 
 def _end(
@@ -325,12 +323,12 @@ def _end(
     yield error("check.link-topic", link.at, message, hint)
 
 
-def _uniqueness(link: Link, ends: list[Resolved], needs: FlowNeeds) -> Iterator[Diagnostic]:
+def _uniqueness(link: Link, ends: list[Resolved], system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Compare what the link demands with what its ends ask for.
 
     *Unique Network Flows*: a flow is strongly unique if both NFEs are unique, weakly if one is.
     """
-    silent = [each for each in ends if not _asks(each, needs)]
+    silent = [each for each in ends if not _asks(each, system)]
     if link.unique is UniqueHow.STRONGLY:
         for each in silent:
             message = f"{_flow(link)}: {_end_name(each)} does not ask to be unique"
@@ -338,7 +336,7 @@ def _uniqueness(link: Link, ends: list[Resolved], needs: FlowNeeds) -> Iterator[
     # A DSCP of its own makes an NFE unique as well; `check_identifiers` judges whether it is its
     # own. That of a subscription is of its acknowledgements and distinguishes no data.
     marked = any(
-        _dscp(each, needs) is not None
+        _dscp(each, system) is not None
         for each in ends
         if each.endpoint.kind is EndpointKind.PUBLISHER
     )
@@ -363,11 +361,18 @@ def _remedy(each: Resolved) -> str:
     )
 
 
-def _asks(each: Resolved, needs: FlowNeeds) -> bool:
-    resolved = needs.of(each.node.key, each.endpoint.kind, each.endpoint.name)
+def _asks(each: Resolved, system: DeclaredSystem) -> bool:
+    resolved = system.needs.of(each.node.key, each.endpoint.kind, each.endpoint.name)
     return resolved is not None and resolved.need.unique is not UniqueRequirement.NOT_REQUIRED
 
 
-def _dscp(each: Resolved, needs: FlowNeeds) -> int | None:
-    resolved = needs.of(each.node.key, each.endpoint.kind, each.endpoint.name)
+def _dscp(each: Resolved, system: DeclaredSystem) -> int | None:
+    resolved = system.needs.of(each.node.key, each.endpoint.kind, each.endpoint.name)
     return None if resolved is None else resolved.dscp
+
+
+CHECKS = (
+    check_flows,
+    check_identifiers,
+    check_links,
+)

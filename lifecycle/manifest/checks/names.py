@@ -27,6 +27,7 @@ from lifecycle.manifest.names import (
     namespace_problem,
     node_name_problem,
     parse_rule,
+    remap_kind,
 )
 from lifecycle.manifest.yaml.document import error, note, warning
 
@@ -53,14 +54,13 @@ def _illegal_node(node: Node) -> Iterator[Diagnostic]:
 
 
 def _illegal_endpoints(system: DeclaredSystem) -> Iterator[Diagnostic]:
-    for each in system.unresolved:
-        node, endpoint = each.node, each.endpoint
+    for node, endpoint, unresolved in system.unresolved:
         noun = endpoint.kind.noun
         if problem := name_problem(endpoint.name):
             message = f"cannot use {endpoint.name!r} as the name of a {noun}: {problem}"
             yield error("check.name", endpoint.at, message)
         elif not node_name_problem(node.name) and not namespace_problem(node.namespace):
-            yield error("check.name", endpoint.at, each.problem.message, each.problem.hint)
+            yield error("check.name", endpoint.at, unresolved.message, unresolved.hint)
 
 
 def _duplicate_nodes(system: DeclaredSystem) -> Iterator[Diagnostic]:
@@ -166,9 +166,9 @@ def _graph_names(node: Node) -> list[tuple[str, RemapKind]]:
     for endpoint in node.interface.endpoints:
         expanded = _expanded(node, endpoint.name)
         if endpoint.kind.is_action:
-            names += [(name, _remap_kind(hidden)) for name, hidden in hidden_names(expanded)]
+            names += [(name, remap_kind(hidden)) for name, hidden in hidden_names(expanded)]
         else:
-            names.append((expanded, _remap_kind(endpoint.kind)))
+            names.append((expanded, remap_kind(endpoint.kind)))
     return names
 
 
@@ -178,10 +178,6 @@ def _expanded(node: Node, name: str) -> str:
         return expand(name, node.name, node.namespace)
     except LifecycleError:
         return ""
-
-
-def _remap_kind(kind: EndpointKind) -> RemapKind:
-    return RemapKind.TOPIC if kind.is_topic else RemapKind.SERVICE
 
 
 def _never_matches(
@@ -237,3 +233,9 @@ def _rule_place(moved: Resolved) -> Position:
         if rule.match and _expanded(node, rule.match) == expanded:
             return _place(node, match)
     return moved.at
+
+
+CHECKS = (
+    check_names,
+    check_remaps,
+)

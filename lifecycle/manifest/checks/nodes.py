@@ -15,9 +15,8 @@ import shlex
 from collections.abc import Iterator, Mapping
 
 from lifecycle.errors import did_you_mean
-from lifecycle.manifest.checks.system import DeclaredSystem, rmw_of
+from lifecycle.manifest.checks.system import DeclaredSystem
 from lifecycle.manifest.diagnostics import Diagnostic, Position
-from lifecycle.manifest.flows import FlowNeeds
 from lifecycle.manifest.model import (
     SUPERVISION_KEYS,
     After,
@@ -39,11 +38,11 @@ from lifecycle.manifest.model import (
 from lifecycle.manifest.names import full_name_problem
 from lifecycle.manifest.yaml.document import error, note, warning
 from lifecycle.network.ports import (
+    LINUX,
     LOCALHOST_PARTICIPANTS,
     LOCALHOST_PEERS_RANGE,
     MAX_DOMAIN_ID,
     EphemeralRange,
-    Platform,
     describe_domains,
     domain_of,
     max_participants,
@@ -347,49 +346,47 @@ def _container(node: Node, system: DeclaredSystem) -> Iterator[Diagnostic]:
         yield error("check.container", at, message, "put both on one machine")
 
 
-def check_ports(
-    system: DeclaredSystem, needs: FlowNeeds, environment: Mapping[str, str]
-) -> Iterator[Diagnostic]:
+def check_ports(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about the domain, and about room for all participants.
 
-    `environment` is asked for ROS_DOMAIN_ID, which holds where the manifest names no domain, and
+    The environment is asked for ROS_DOMAIN_ID, which holds where the manifest names no domain, and
     for ROS_AUTOMATIC_DISCOVERY_RANGE, which holds where it leaves the range to the system.
     """
     discovery = system.manifest.discovery
     domain = discovery.domain_id
     if domain is None:
         # One that is no domain is the environment's fault, and refused where it is used.
-        domain = domain_of(environment.get("ROS_DOMAIN_ID", "")) or 0
+        domain = domain_of(system.environment.get("ROS_DOMAIN_ID", "")) or 0
     start = Position(file=system.manifest.path, line=1, column=1, path="discovery.domain_id")
-    at = discovery.at or start
+    at = system.manifest.where("discovery", start)
     if not 0 <= domain <= MAX_DOMAIN_ID:
         message = f"cannot use domain id {domain}; allowed: 0 to {MAX_DOMAIN_ID}"
         yield error("check.domain", at, message, "Fast DDS ends every process beyond it")
         return
-    if max_participants(domain, Platform.LINUX).participants == 0:
-        domains = describe_domains(safe_domains(Platform.LINUX))
+    if max_participants(domain, LINUX).participants == 0:
+        domains = describe_domains(safe_domains(LINUX))
         message = (
             f"cannot be sure of the ports of domain {domain}: Linux gives them to other sockets, "
             f"by default"
         )
         yield note("check.domain", at, message, f"use domain {domains}")
     for host in system.hosts.values():
-        yield from _crowded(system, needs, host, domain, discovery.at or host[0].at)
-        yield from _beyond_localhost(system, needs, host, environment)
+        yield from _crowded(system, host, domain, system.manifest.where("discovery", host[0].at))
+        yield from _beyond_localhost(system, host)
 
 
 def _crowded(
-    system: DeclaredSystem, needs: FlowNeeds, host: list[Machine], domain: int, at: Position
+    system: DeclaredSystem, host: list[Machine], domain: int, at: Position
 ) -> Iterator[Diagnostic]:
     nodes = _nodes_on(system, host)
     over = functools.partial(
         overflows,
         domain,
-        participants=_SUPERVISOR + _participants(nodes, needs),
+        participants=_SUPERVISOR + _participants(nodes, system),
         unique_subscriptions=sum(
             each.unique and each.need.kind is EndpointKind.SUBSCRIPTION
             for node in nodes
-            for each in needs.of_node(node)
+            for each in system.needs.of_node(node)
         ),
         host=_spell_host(nodes),
     )
@@ -398,8 +395,8 @@ def _crowded(
         message, _, hint = each.partition("; ")
         yield error("check.ports", at, message, hint)
     # Where no participant at all is safe, check.domain has reported it.
-    if not refused and max_participants(domain, Platform.LINUX).participants:
-        for each in over(ephemeral=Platform.LINUX):
+    if not refused and max_participants(domain, LINUX).participants:
+        for each in over(ephemeral=LINUX):
             message, _, hint = each.partition("; ")
             yield note("check.ports", at, message, hint)
 
@@ -427,9 +424,7 @@ _OTHERWISE_FOUND = frozenset(
 """Variables of a process by which it may find others in another way than its system."""
 
 
-def _beyond_localhost(
-    system: DeclaredSystem, needs: FlowNeeds, host: list[Machine], environment: Mapping[str, str]
-) -> Iterator[Diagnostic]:
+def _beyond_localhost(system: DeclaredSystem, host: list[Machine]) -> Iterator[Diagnostic]:
     """Yield a finding where participants of a host could not all find each other on localhost.
 
     Counted is what certainly looks for others in the way of rmw_fastrtps: the supervisor's
@@ -440,8 +435,8 @@ def _beyond_localhost(
         return
     said = "'range: localhost'"
     if discovery.range is DiscoveryRange.SYSTEM_DEFAULT:
-        said = f"{_RANGE}={environment.get(_RANGE, '')}"
-        if environment.get(_RANGE, "") != DiscoveryRange.LOCALHOST.name:
+        said = f"{_RANGE}={system.environment.get(_RANGE, '')}"
+        if system.environment.get(_RANGE, "") != DiscoveryRange.LOCALHOST.name:
             return
     elif discovery.range is not DiscoveryRange.LOCALHOST:
         return
@@ -450,11 +445,11 @@ def _beyond_localhost(
         node
         for node in _nodes_on(system, host)
         if node.run.kind is not RunKind.ATTACH
-        and rmw_of(node, environment).startswith("rmw_fastrtps")
+        and system.rmw_of(node).startswith("rmw_fastrtps")
         and not _OTHERWISE_FOUND & {name for name, _ in node.run.environment}
-        and not any(environment.get(name) for name in profiles)
+        and not any(system.environment.get(name) for name in profiles)
     ]
-    participants = _SUPERVISOR + _participants(nodes, needs)
+    participants = _SUPERVISOR + _participants(nodes, system)
     if participants <= LOCALHOST_PARTICIPANTS:
         return
     message = (
@@ -463,15 +458,16 @@ def _beyond_localhost(
         f"{LOCALHOST_PEERS_RANGE - 1} of its host only"
     )
     hint = "use 'range: subnet', or give several nodes one 'process:'"
-    yield error("check.localhost", discovery.at or nodes[0].at, message, hint)
+    yield error("check.localhost", system.manifest.where("discovery", nodes[0].at), message, hint)
 
 
-def _participants(nodes: list[Node], needs: FlowNeeds) -> int:
+def _participants(nodes: list[Node], system: DeclaredSystem) -> int:
     """Count DDS participants as the planner makes them.
 
     One for each process and each choice of transports in it, and one more for each group of
     publishers that need their own.
     """
+    needs = system.needs
     shared = {(node.process or f"\0{node.key}", needs.node_transports(node)) for node in nodes}
     extra = 0
     for node in nodes:
@@ -566,3 +562,16 @@ def cycles(system: DeclaredSystem) -> Iterator[Diagnostic]:
                 yield error("check.after-cycle", after.at, message, "remove one of these 'after'")
             elif after.node not in done:
                 path[after.node] = iter(edges[after.node])
+
+
+CHECKS = (
+    check_order,
+    check_machines,
+    check_processes,
+    check_programs,
+    check_supervision,
+    check_health,
+    check_on_violation,
+    check_modes,
+    check_ports,
+)

@@ -11,11 +11,15 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 
 import msgspec
+from msgspec.structs import replace
 
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.diagnostics import Position
+from lifecycle.manifest.flows import FlowNeeds
+from lifecycle.manifest.installed_types import search_prefixes
 from lifecycle.manifest.model import (
     Endpoint,
     EndpointKind,
@@ -31,12 +35,13 @@ from lifecycle.manifest.names import (
     NODE_SERVICES,
     OUR_SERVICES,
     RemapRule,
+    name_in_graph,
     parse_rule,
-    resolve,
     supervisor_prefix,
     supervisor_services,
     supervisor_status_topic,
 )
+from lifecycle.manifest.parameter_files import ParameterFiles
 from lifecycle.network.medium import DEFAULT_RMW
 
 _RMW_VARIABLE = "RMW_IMPLEMENTATION"
@@ -59,44 +64,59 @@ class Resolved(msgspec.Struct, frozen=True, kw_only=True):
         return f"{noun} {self.endpoint.name!r} of node {self.node.key!r} ({self.at.spelled})"
 
 
-class UnresolvedEndpoint(msgspec.Struct, frozen=True, kw_only=True):
-    """An endpoint whose name cannot be resolved, and why."""
-
-    node: Node
-    endpoint: Endpoint
-    problem: LifecycleError
-
-
 class DeclaredSystem(msgspec.Struct, frozen=True, kw_only=True, dict=True):
     """A manifest and what follows from it alone.
 
     Attributes:
         endpoints: in the order of the manifest.
-        unresolved: the endpoints that are missing from `endpoints`.
+        unresolved: those that have no name, and why.
+        environment: of the process that will run the system.
+        files: the parameter files that nodes name.
     """
 
     manifest: Manifest
+    environment: Mapping[str, str]
+    files: ParameterFiles
     endpoints: tuple[Resolved, ...]
-    unresolved: tuple[UnresolvedEndpoint, ...]
+    unresolved: tuple[tuple[Node, Endpoint, LifecycleError], ...]
 
     @classmethod
-    def of(cls, manifest: Manifest) -> DeclaredSystem:
+    def of(
+        cls, manifest: Manifest, *, environment: Mapping[str, str], files: ParameterFiles
+    ) -> DeclaredSystem:
         """Resolve every endpoint of a manifest; rules that rcl refuses are left out."""
         resolved: list[Resolved] = []
-        unresolved: list[UnresolvedEndpoint] = []
+        unresolved: list[tuple[Node, Endpoint, LifecycleError]] = []
         for node in manifest.nodes:
-            rules = usable_rules(node)
+            as_read = replace(node, remap=usable_rules(node))
             for endpoint in node.interface.endpoints:
-                outcome = _resolve(node, endpoint, rules)
-                if isinstance(outcome, Resolved):
-                    resolved.append(outcome)
+                name = _name(as_read, endpoint)
+                if isinstance(name, str):
+                    resolved.append(Resolved(node=node, endpoint=endpoint, name=name))
                 else:
-                    unresolved.append(outcome)
+                    unresolved.append((node, endpoint, name))
         return cls(
             manifest=manifest,
+            environment=environment,
+            files=files,
             endpoints=tuple(resolved),
             unresolved=tuple(unresolved),
         )
+
+    @functools.cached_property
+    def prefixes(self) -> tuple[Path, ...]:
+        """Where packages are installed, in the order in which they are searched."""
+        return search_prefixes(self.environment)
+
+    @functools.cached_property
+    def needs(self) -> FlowNeeds:
+        """What the endpoints of the system ask of their flows."""
+        return FlowNeeds(self.manifest, self.prefixes)
+
+    def rmw_of(self, node: Node) -> str:
+        """Return the RMW identifier that a node will run with."""
+        own = dict(node.run.environment).get(_RMW_VARIABLE, "")
+        return own or self.environment.get(_RMW_VARIABLE, "") or DEFAULT_RMW
 
     @functools.cached_property
     def nodes(self) -> dict[str, Node]:
@@ -144,20 +164,11 @@ class DeclaredSystem(msgspec.Struct, frozen=True, kw_only=True, dict=True):
         )
 
 
-def _resolve(
-    node: Node, endpoint: Endpoint, rules: tuple[tuple[str, str], ...]
-) -> Resolved | UnresolvedEndpoint:
+def _name(node: Node, endpoint: Endpoint) -> str | LifecycleError:
     try:
-        name = resolve(
-            endpoint.name,
-            node_name=node.name,
-            namespace=node.namespace,
-            remap=rules,
-            kind=endpoint.kind,
-        )
+        return name_in_graph(node, endpoint.name, endpoint.kind)
     except LifecycleError as problem:
-        return UnresolvedEndpoint(node=node, endpoint=endpoint, problem=problem)
-    return Resolved(node=node, endpoint=endpoint, name=name)
+        return problem
 
 
 def usable_rules(node: Node) -> tuple[tuple[str, str], ...]:
@@ -205,7 +216,7 @@ def implicit_names(system: DeclaredSystem) -> frozenset[tuple[EndpointKind, str]
 
 def _of_supervisors(manifest: Manifest) -> Iterator[tuple[EndpointKind, str]]:
     """Yield what the supervisors of a system offer by its policy."""
-    access = manifest.policy.ros_interface
+    access = manifest.policy.access
     if access is RosInterfaceAccess.OFF:
         return
     yield EndpointKind.PUBLISHER, DIAGNOSTICS_TOPIC
@@ -214,9 +225,3 @@ def _of_supervisors(manifest: Manifest) -> Iterator[tuple[EndpointKind, str]]:
         yield EndpointKind.PUBLISHER, supervisor_status_topic(prefix)
         for name in supervisor_services(access, (each.name for each in manifest.modes)):
             yield EndpointKind.SERVICE_SERVER, f"{prefix}/{name}"
-
-
-def rmw_of(node: Node, environment: Mapping[str, str]) -> str:
-    """Return the RMW identifier that a node will run with."""
-    own = dict(node.run.environment).get(_RMW_VARIABLE, "")
-    return own or environment.get(_RMW_VARIABLE, "") or DEFAULT_RMW

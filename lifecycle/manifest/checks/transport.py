@@ -13,9 +13,9 @@ import ipaddress
 from collections.abc import Iterator, Mapping
 
 from lifecycle.errors import did_you_mean
-from lifecycle.manifest.checks.system import DeclaredSystem, rmw_of
+from lifecycle.manifest.checks.system import DeclaredSystem
 from lifecycle.manifest.diagnostics import Diagnostic, Position
-from lifecycle.manifest.flows import FlowNeeds, ResolvedNeed
+from lifecycle.manifest.flows import ResolvedNeed
 from lifecycle.manifest.model import (
     Authority,
     DataLayerSource,
@@ -45,18 +45,19 @@ _OTHERS = ("rmw_cyclonedds", "rmw_zenoh", "rmw_connextdds")
 """RMWs that are known to give no endpoint a network flow or a DSCP of its own."""
 
 
-def check_discovery(system: DeclaredSystem, environment: Mapping[str, str]) -> Iterator[Diagnostic]:
+def check_discovery(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about discovery and the data layer's authority."""
     discovery = system.manifest.discovery
-    if discovery.at is not None:
-        yield from _range(system, discovery.at)
-        yield from _addresses(system, discovery.at)
-        yield from _transport(system, discovery.at)
-        yield from _server(system, discovery.at)
-        yield from _rmws(system, environment, discovery.at)
+    section = system.manifest.positions.get("discovery")
+    if section is not None:
+        yield from _range(system, section)
+        yield from _addresses(system, section)
+        yield from _transport(system, section)
+        yield from _server(system, section)
+        yield from _rmws(system, section)
         for node in system.manifest.nodes:
             yield from _foreign_rmws(discovery, node)
-            yield from _unfound(system, environment, node)
+            yield from _unfound(system, node)
     yield from _authority(system)
 
 
@@ -165,9 +166,7 @@ def _server(system: DeclaredSystem, section: Position) -> Iterator[Diagnostic]:
         yield error("check.discovery-server", at, message, "choose a machine that runs a node")
 
 
-def _rmws(
-    system: DeclaredSystem, environment: Mapping[str, str], section: Position
-) -> Iterator[Diagnostic]:
+def _rmws(system: DeclaredSystem, section: Position) -> Iterator[Diagnostic]:
     """Only Fast DDS can be configured so; a server serves only its own kind."""
     discovery = system.manifest.discovery
     dynamic = discovery.mode is DiscoveryMode.DYNAMIC
@@ -176,7 +175,7 @@ def _rmws(
         return
     by_rmw: dict[str, list[str]] = {}
     for node in system.manifest.nodes:
-        by_rmw.setdefault(rmw_of(node, environment), []).append(node.key)
+        by_rmw.setdefault(system.rmw_of(node), []).append(node.key)
     if discovery.mode is DiscoveryMode.SERVER and len(by_rmw) > 1:
         spelled = "; ".join(f"{rmw}: {', '.join(keys)}" for rmw, keys in by_rmw.items())
         message = f"cannot serve more than one RMW by a discovery server ({spelled})"
@@ -219,9 +218,7 @@ def _foreign_rmws(discovery: Discovery, node: Node) -> Iterator[Diagnostic]:
     yield error("check.discovery-foreign", node.where("run"), message, hint)
 
 
-def _unfound(
-    system: DeclaredSystem, environment: Mapping[str, str], node: Node
-) -> Iterator[Diagnostic]:
+def _unfound(system: DeclaredSystem, node: Node) -> Iterator[Diagnostic]:
     """Judge a command that is configured to use IPv6 and to look on this host alone.
 
     rmw_fastrtps_cpp 8.4 does the latter by the peer 127.0.0.1, and no variable names another.
@@ -229,7 +226,7 @@ def _unfound(
     discovery = system.manifest.discovery
     reach = discovery.range.name
     if discovery.range is DiscoveryRange.SYSTEM_DEFAULT:
-        reach = environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE", reach)
+        reach = system.environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE", reach)
     if (
         node.run.kind is not RunKind.COMMAND
         or discovery.mode is not DiscoveryMode.DYNAMIC
@@ -247,7 +244,8 @@ def _unfound(
 
 def _authority(system: DeclaredSystem) -> Iterator[Diagnostic]:
     layer = system.manifest.data_layer
-    if layer.at is None:
+    section = system.manifest.positions.get("data_layer")
+    if section is None:
         return
     if layer.authority is Authority.NODES and layer.source is DataLayerSource.DYNAMIC:
         message = (
@@ -255,7 +253,7 @@ def _authority(system: DeclaredSystem) -> Iterator[Diagnostic]:
             "each node only follows what it was started with, and nobody would negotiate"
         )
         hint = "use 'authority: supervisor', or 'source: static'"
-        at = system.manifest.where("data_layer.source", layer.at)
+        at = system.manifest.where("data_layer.source", section)
         yield error("check.authority", at, message, hint)
     if layer.authority is not Authority.SUPERVISOR:
         return
@@ -269,19 +267,17 @@ def _authority(system: DeclaredSystem) -> Iterator[Diagnostic]:
             yield error("check.authority", node.at, message, hint)
 
 
-def check_middleware(
-    system: DeclaredSystem, needs: FlowNeeds, environment: Mapping[str, str]
-) -> Iterator[Diagnostic]:
+def check_middleware(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about what the RMW of a node cannot do; Fast DDS does all of it.
 
     An error where a need that must be met certainly is not, else a warning.
     """
     for node in system.manifest.nodes:
-        rmw = rmw_of(node, environment)
+        rmw = system.rmw_of(node)
         if rmw.startswith(FAST_DDS):
             continue
         why = f"{rmw} cannot" if rmw.startswith(_OTHERS) else f"it is not known whether {rmw} can"
-        for each in needs.of_node(node):
+        for each in system.needs.of_node(node):
             what = f"{each.need.kind.noun} {each.need.name!r} of {node.key!r}"
             strictly = each.need.unique is UniqueRequirement.STRICTLY_REQUIRED
             wishes = []
@@ -299,28 +295,24 @@ def check_middleware(
 _RULE = "check.flow-transport"
 
 
-def check_transport(
-    system: DeclaredSystem, needs: FlowNeeds, environment: Mapping[str, str]
-) -> Iterator[Diagnostic]:
+def check_transport(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Yield findings about transports and datagrams."""
     for node in system.manifest.nodes:
-        for each in needs.of_node(node):
+        for each in system.needs.of_node(node):
             if each.need.transport is not FlowTransport.ANY:
-                yield from _wish(system, node, each, environment)
+                yield from _wish(system, node, each)
             if each.need.kind is EndpointKind.PUBLISHER:
                 yield from _fragments(system, node, each)
     for link in system.manifest.links:
         if link.transport is not FlowTransport.ANY:
-            yield from _link(system, link, environment)
-    yield from _ipv6(system, environment)
+            yield from _link(system, link)
+    yield from _ipv6(system)
 
 
-def _wish(
-    system: DeclaredSystem, node: Node, each: ResolvedNeed, environment: Mapping[str, str]
-) -> Iterator[Diagnostic]:
+def _wish(system: DeclaredSystem, node: Node, each: ResolvedNeed) -> Iterator[Diagnostic]:
     need = each.need
     yield from _foreign(system, node, each)
-    yield from _rmw(node, need.transport, need.at, environment)
+    yield from _rmw(system, node, need.transport, need.at)
     if need.lossy is False and need.transport is FlowTransport.MULTICAST:
         message = (
             f"cannot send {need.name!r} of {node.key!r} by multicast: its data are declared not "
@@ -333,15 +325,13 @@ def _wish(
         yield from _pair(system, ends, each.topic, need.transport, need.at)
 
 
-def _link(
-    system: DeclaredSystem, link: Link, environment: Mapping[str, str]
-) -> Iterator[Diagnostic]:
+def _link(system: DeclaredSystem, link: Link) -> Iterator[Diagnostic]:
     ends = [system.nodes.get(key) for key in (link.from_node, link.to_node)]
     if ends[0] is None or ends[1] is None:
         return  # reported by check.link-unknown-node
     for node in ends:
         if node is not None:
-            yield from _rmw(node, link.transport, link.at, environment)
+            yield from _rmw(system, node, link.transport, link.at)
     yield from _pair(system, (ends[0], ends[1]), link.topic, link.transport, link.at)
 
 
@@ -374,9 +364,9 @@ def _foreign(system: DeclaredSystem, node: Node, each: ResolvedNeed) -> Iterator
 
 
 def _rmw(
-    node: Node, transport: FlowTransport, at: Position, environment: Mapping[str, str]
+    system: DeclaredSystem, node: Node, transport: FlowTransport, at: Position
 ) -> Iterator[Diagnostic]:
-    rmw = rmw_of(node, environment)
+    rmw = system.rmw_of(node)
     if transport is not FlowTransport.NETWORK and not rmw.startswith(FAST_DDS):
         message = f"cannot choose {transport.value} for {node.key!r} with {rmw}: only for Fast DDS"
         hint = "set RMW_IMPLEMENTATION=rmw_fastrtps_cpp"
@@ -455,7 +445,7 @@ def _fragments(system: DeclaredSystem, node: Node, each: ResolvedNeed) -> Iterat
     yield note("check.flow-fragments", each.need.at, message, hint)
 
 
-def _ipv6(system: DeclaredSystem, environment: Mapping[str, str]) -> Iterator[Diagnostic]:
+def _ipv6(system: DeclaredSystem) -> Iterator[Diagnostic]:
     """Warn of IPv6 machines under Fast DDS's default transports, which are IPv4 and shared memory.
 
     Without IPv6 in them, participants neither find nor reach each other over such addresses.
@@ -463,14 +453,12 @@ def _ipv6(system: DeclaredSystem, environment: Mapping[str, str]) -> Iterator[Di
     discovery = system.manifest.discovery
     if discovery.mode is not DiscoveryMode.DYNAMIC or discovery.transport is not FlowTransport.ANY:
         return  # the planner gives participants what the addresses need
-    if "v6" in environment.get(TRANSPORTS_VARIABLE, "").lower() or _profiles(environment):
+    if _has_ipv6(system.environment):
         return
     for machine in system.manifest.machines:
         nodes = [node for node in system.manifest.nodes if node.machine == machine.name]
         if ":" not in machine.address or all(
-            "v6" in dict(node.run.environment).get(TRANSPORTS_VARIABLE, "").lower()
-            or _profiles(dict(node.run.environment))
-            for node in nodes
+            _has_ipv6(dict(node.run.environment)) for node in nodes
         ):
             continue
         message = (
@@ -481,9 +469,12 @@ def _ipv6(system: DeclaredSystem, environment: Mapping[str, str]) -> Iterator[Di
         yield warning("check.ipv6-transports", machine.at, message, hint)
 
 
-def _profiles(environment: Mapping[str, str]) -> bool:
-    """Whether a profile file is loaded that may say anything."""
-    return any(
+def _has_ipv6(environment: Mapping[str, str]) -> bool:
+    """Whether variables give a process IPv6, or a profile file that may say anything."""
+    return "v6" in environment.get(TRANSPORTS_VARIABLE, "").lower() or any(
         environment.get(name)
         for name in ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
     )
+
+
+CHECKS = (check_discovery, check_transport, check_middleware)

@@ -53,7 +53,6 @@ class Value(msgspec.Struct, frozen=True, kw_only=True):
         key: line and column of the key that names it in a mapping; None elsewhere.
         text: a scalar as written, without its quotes.
         quoted: the scalar was in quotes or was a block scalar: it is a string whatever it holds.
-        alias: it is written elsewhere, and here only its name, `*anchor`.
     """
 
     data: Scalar | tuple[Value, ...] | Mapping[str, Value]
@@ -62,7 +61,6 @@ class Value(msgspec.Struct, frozen=True, kw_only=True):
     key: tuple[int, int] | None = None
     text: str = ""
     quoted: bool = False
-    alias: bool = False
 
     def plain(self, *, null: Any = None) -> Any:
         """Return the value without positions, as `Plain`; `null` is put for each null."""
@@ -99,6 +97,11 @@ class Document(msgspec.Struct, frozen=True, kw_only=True):
                 return None
             value = child
         return value
+
+    def plain(self, place: Place) -> Any:
+        """Return the value at a place without positions; an empty mapping where there is none."""
+        value = self.find(place)
+        return {} if value is None else value.plain()
 
     def at(self, place: Place = ()) -> Position:
         """Return the position of the value at `place`, or of the nearest value around it."""

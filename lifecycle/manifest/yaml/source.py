@@ -14,7 +14,7 @@ import stat
 from collections.abc import Mapping
 from pathlib import Path
 
-from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position
+from lifecycle.manifest.diagnostics import ManifestError, Position
 from lifecycle.manifest.yaml.document import Document, error
 from lifecycle.manifest.yaml.yaml_parser import EMPTY, compose, quote
 
@@ -27,36 +27,30 @@ _NOT_TEXT = re.compile(
 """Characters that YAML 1.2.2 §5.1 does not allow in a document; one set of all takes 3 ms."""
 
 
-def read_document(
-    path: str | Path, *, shown: str = "", found: list[Diagnostic] | None = None
-) -> Document:
+def read_document(path: str | Path, *, shown: str = "") -> Document:
     """Read one file as a YAML document whose root is a mapping.
 
     Args:
         path: the file.
         shown: how messages name the file; the path itself if empty.
-        found: where given, what is wrong with single keys and values is appended here and the
-            document returned all the same.
 
     Raises:
-        ManifestError: with the one reason why it cannot be read; without `found`, also with all
-            doubled keys, tags and impossible numbers at once.
+        ManifestError: with the one reason why it cannot be read, or all doubled keys, tags and
+            impossible numbers at once.
     """
     file = shown or str(path)
     text = decode(read_bytes(path, file=file), file=file)
-    return parse(text, file=file, found=found)
+    return parse(text, file=file)
 
 
-def parse(text: str, *, file: str, found: list[Diagnostic] | None = None) -> Document:
+def parse(text: str, *, file: str) -> Document:
     """Parse text as a YAML document whose root is a mapping.
 
     Raises:
         ManifestError: see `read_document`.
     """
     document, findings = compose(text, file=file)
-    if found is not None:
-        found.extend(findings)
-    elif findings:
+    if findings:
         raise ManifestError(findings)
     plain = document.root.data
     if not isinstance(plain, Mapping):

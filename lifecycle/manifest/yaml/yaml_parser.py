@@ -179,6 +179,25 @@ class _Anchored(msgspec.Struct, frozen=True):
     height: int
 
 
+def events(text: str, *, file: str) -> Iterator[yaml.Event]:
+    """Yield the parser's events.
+
+    Raises:
+        ManifestError: the text is no YAML.
+    """
+    import yaml  # others need no more of this module than how a value is spelled
+
+    try:
+        yield from yaml.parse(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+    except yaml.YAMLError as problem:
+        mark = getattr(problem, "problem_mark", None) or getattr(problem, "context_mark", None)
+        line, column = (mark.line + 1, mark.column + 1) if mark else (1, 1)
+        why = getattr(problem, "problem", None) or str(problem)
+        at = Position(file=file, line=line, column=column)
+        said = error("yaml.syntax", at, *_explain(why, text, line, column))
+        raise ManifestError([said]) from problem
+
+
 def compose(text: str, *, file: str) -> tuple[Document, tuple[Diagnostic, ...]]:
     """Read one YAML document.
 
@@ -210,7 +229,7 @@ class _Composer:
         self._root: Value | None = None
 
     def run(self, text: str) -> tuple[Document, tuple[Diagnostic, ...]]:
-        import yaml  # others need no more of this module than how a value is spelled
+        import yaml
 
         for event in self._events(text):
             start = event.start_mark
@@ -232,15 +251,10 @@ class _Composer:
         return Document(file=self._file, root=self._root), tuple(self._found)
 
     def _events(self, text: str) -> Iterator[yaml.Event]:
-        import yaml
-
         try:
-            yield from yaml.parse(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
-        except yaml.YAMLError as problem:
-            mark = getattr(problem, "problem_mark", None) or getattr(problem, "context_mark", None)
-            line, column = (mark.line + 1, mark.column + 1) if mark else (1, 1)
-            why = getattr(problem, "problem", None) or str(problem)
-            self._stop((line, column), *_explain(why, text, line, column), rule="yaml.syntax")
+            yield from events(text, file=self._file)
+        except ManifestError as problem:
+            raise ManifestError([*self._found, *problem.diagnostics]) from problem
 
     # -- events
 
@@ -281,7 +295,8 @@ class _Composer:
         if _UNFIT.search(event.value):
             message = f"cannot use {_cut(event.value)}: it holds a NUL or half a character"
             self._note("yaml.character", mark, message, "remove the escape")
-        quoted = bool(event.style)  # libyaml has "" for a plain scalar, PyYAML None
+        # libyaml has "" for a plain scalar, PyYAML None; '!' makes a string (YAML 1.2.2 §6.9.1).
+        quoted = bool(event.style) or event.tag == "!"
         data: Scalar = event.value
         if not quoted:
             try:
@@ -309,7 +324,7 @@ class _Composer:
         self._count(anchored.values, mark)
         if len(self._stack) + anchored.height > MAX_DEPTH:
             self._stop(mark, f"cannot read values nested deeper than {MAX_DEPTH} levels")
-        value = replace(anchored.value, line=mark[0], column=mark[1], alias=True)
+        value = replace(anchored.value, line=mark[0], column=mark[1])
         self._finish(value, None, anchored.values, anchored.height)
 
     def _key(self, data: Scalar, event: yaml.ScalarEvent, mark: tuple[int, int]) -> None:
@@ -412,13 +427,10 @@ class _Composer:
             self._stop(mark, f"cannot list more than {MAX_FINDINGS} findings", "fix these first")
         self._found.append(error(rule, self._position(mark, place), message, hint))
 
-    def _stop(
-        self, mark: tuple[int, int], message: str, hint: str = "", *, rule: str = "yaml.limit"
-    ) -> NoReturn:
+    def _stop(self, mark: tuple[int, int], message: str, hint: str = "") -> NoReturn:
         """Give up at once, with everything found so far."""
-        # After a syntax error it is unknown which value this would have been.
-        place = () if rule == "yaml.syntax" else self._next_place()[:_SHOWN_DEPTH]
-        raise ManifestError([*self._found, error(rule, self._position(mark, place), message, hint)])
+        at = self._position(mark, self._next_place()[:_SHOWN_DEPTH])
+        raise ManifestError([*self._found, error("yaml.limit", at, message, hint)])
 
 
 def _cut(text: str) -> str:

@@ -54,11 +54,6 @@ _LONGEST_NOTICE = 1 << 16
 _logger = logging.getLogger(__name__)
 
 
-def node_topic(full_name: str) -> str:
-    """Return the hidden topic on which a node without a supervisor asserts its liveliness."""
-    return f"{full_name}/_alive"
-
-
 _NOTICES = latched(1)
 _ASSERTED = QoSProfile(
     depth=1,

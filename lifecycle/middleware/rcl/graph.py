@@ -32,7 +32,7 @@ from lifecycle.middleware.discovery.prefixes import PROCESS_DIGITS, is_of_host, 
 from lifecycle.middleware.discovery.prober import Settling
 from lifecycle.middleware.discovery.tcp import give_up_dead_connections, is_used
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
-from lifecycle.middleware.fastdds.profiles import DISCOVERY_SERVER_VARIABLE
+from lifecycle.middleware.fastdds.profiles import DEFAULT_LEASE_S, DISCOVERY_SERVER_VARIABLE
 from lifecycle.middleware.fastdds.settings import observer_settings
 from lifecycle.middleware.process.hosted import is_vouched_for
 from lifecycle.middleware.rcl.graph_changes import GraphGuard
@@ -78,6 +78,7 @@ _AGREED_S = 5.0
 
 _NAMED_S = 0.2
 """Of a new participant endpoints are known first, and within so long of which nodes they are."""
+_FORGOTTEN_S = DEFAULT_LEASE_S + 1.0
 _LOOK_S = 0.005
 _CHANGE_STATE = "lifecycle_msgs/srv/ChangeState"
 _GET_STATE = "lifecycle_msgs/srv/GetState"
@@ -142,6 +143,8 @@ class GraphObserver:
         self._unwatch = self._guard.follow(node, lambda: None)  # it runs while one follows
         self._name = self.node.get_fully_qualified_name()
         self._dead: frozenset[str] = frozenset()
+        self._ended_until_s: dict[int, float] = {}  # by the pid of processes that ended lately
+        self._own = ""  # the observer's GUID prefix, once a process has ended
         self._topics_before: frozenset[str] = frozenset()
         self._named: frozenset[str] = frozenset()
 
@@ -235,7 +238,7 @@ class GraphObserver:
         self._ours = self._ours.intersection(shown).union(*map(our_nodes, shown.values()))
         endpoints: list[ObservedEndpoint] = []
         for name in sorted(shown):
-            but = NO_NAMES if name in declared else names
+            but = DeclaredNames(ends=names.ends) if name in declared else names
             judged = without_noise(shown[name], but=but, ours=self._ours)
             folded = fold_actions(self._hashed(name, judged, ends))
             endpoints += sorted(folded if name else self._located(folded), key=_order)
@@ -323,7 +326,9 @@ class GraphObserver:
         homes, own = self._homes()
         claimed = {*reported, *(prefix for name in nodes for prefix in homes.get(name, ()))}
         theirs = (each for each in claimed if own and is_of_process(each, pid, own))
+        self._ended_until_s[pid], self._own = time.monotonic() + _FORGOTTEN_S, own
         self._count_no_more(theirs, own)
+        self._guard.notify()  # what it had made may be without a name yet
 
     def ended_participant(self, prefix: str) -> None:
         """Count participants of an ended process no more.
@@ -340,7 +345,16 @@ class GraphObserver:
             self._guard.notify()
 
     def _is_dead(self, endpoint: ObservedEndpoint) -> bool:
-        return endpoint.gid[:PROCESS_DIGITS] in self._dead
+        if endpoint.gid[:PROCESS_DIGITS] in self._dead:
+            return True
+        if endpoint.node or not self._own:
+            return False
+        # A process that was killed before the name of its node was known has reported nothing.
+        now_s, prefix = time.monotonic(), endpoint.gid[:PREFIX_DIGITS]
+        return any(
+            now_s < until_s and is_of_process(prefix, pid, self._own)
+            for pid, until_s in self._ended_until_s.items()
+        )
 
     def _homes(self) -> tuple[dict[str, set[str]], str]:
         """Return by full name the prefixes of the participants that nodes are on, and our own."""
@@ -537,7 +551,9 @@ def _is_noise(endpoint: ObservedEndpoint, declared: Collection[str], names: Decl
     kind, node, name = endpoint.kind, endpoint.node, endpoint.name
     if name.startswith(RAW):
         return not node
-    wanted = node not in declared and names.looks_for(kind, name)
+    wanted = (node, kind, name) in names.ends or (
+        node not in declared and names.looks_for(kind, name)
+    )
     return not wanted and is_noise_endpoint(kind, node, name, endpoint.type, ours=False)
 
 

@@ -448,8 +448,9 @@ async def _reply(
                 await asyncio.wait((pending,), timeout=_REREAD_S)
                 return pending.result() if pending.done() else found
         return pending.result()
-    except ServiceUnansweredError:
-        if (found := await look()) is None:
+    except ServiceUnansweredError as error:
+        found = await look() if error.found else None
+        if found is None:
             raise
         return found
     finally:

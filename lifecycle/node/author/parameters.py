@@ -20,8 +20,8 @@ from rclpy.exceptions import (
 from rclpy.parameter import Parameter
 
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest.checks.parameters import type_of
 from lifecycle.manifest.model import ParameterDeclaration, ParameterValue
+from lifecycle.manifest.parameter_files import type_of
 from lifecycle.middleware.services.parameters import (
     TYPES,
     parameter_value,

@@ -28,7 +28,8 @@ from rclpy.signals import SignalHandlerOptions
 
 from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import Executor, Run, RunKind, Timeouts
-from lifecycle.middleware.discovery.liveliness import AlivePublisher, node_topic
+from lifecycle.manifest.names import node_alive_topic
+from lifecycle.middleware.discovery.liveliness import AlivePublisher
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.middleware.fastdds.settings import discovery_by_profile
 from lifecycle.middleware.process.busy_sign import BusySign, Overdue
@@ -81,7 +82,9 @@ class OwnLiveliness:
             republish_names: called when a subscriber is matched, which may have dropped the names.
         """
         self._name = node.lifecycle.full_name
-        self._publisher = AlivePublisher(node, node_topic(self._name), on_listener=republish_names)
+        self._publisher = AlivePublisher(
+            node, node_alive_topic(self._name), on_listener=republish_names
+        )
         threading.Thread(target=self._watch, name="watchdog", daemon=True).start()
 
     def _watch(self) -> None:

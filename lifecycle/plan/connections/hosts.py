@@ -255,7 +255,7 @@ def reached_hosts(plan: Plan, own: Collection[str]) -> Mapping[str, int]:
     """
     far = plan.discovery_range in (DiscoveryRange.SUBNET, DiscoveryRange.SYSTEM_DEFAULT)
     by_ipv4 = (plan.discovery.transport.medium or RMW_DISCOVERY) is RMW_DISCOVERY
-    if plan.discovery_mode is not DiscoveryMode.DYNAMIC or not far or not by_ipv4:
+    if plan.discovery.mode is not DiscoveryMode.DYNAMIC or not far or not by_ipv4:
         return {}
     hosts: dict[str, int] = {}
     for machine in plan.machines:

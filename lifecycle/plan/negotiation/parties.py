@@ -199,7 +199,7 @@ def terms_of(plan: Plan) -> Terms:
         observers=observers,
         server=plan.server,
         domain_id=plan.domain_id,
-        max_datagram_bytes=plan.max_datagram_bytes,
+        max_datagram_bytes=plan.network.max_datagram_bytes,
     )
 
 

@@ -12,7 +12,7 @@ what a negotiation asks before it waits: what it waits for must not in turn wait
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -20,9 +20,9 @@ from msgspec.structs import replace
 
 from lifecycle.errors import BringUpError
 from lifecycle.graph.loop import set_within
-from lifecycle.manifest.model import Authority, Condition, DataLayerSource
+from lifecycle.manifest.model import After, Authority, Condition, DataLayerSource
 from lifecycle.node.host.control import Command, Operation
-from lifecycle.plan.model import Plan
+from lifecycle.plan.model import Plan, PlannedNode
 from lifecycle.supervisor.connections.desired_state import (
     ActualState,
     Instructions,
@@ -32,15 +32,16 @@ from lifecycle.supervisor.connections.desired_state import (
     wired,
 )
 from lifecycle.supervisor.connections.negotiation import NegotiatedSource
-from lifecycle.supervisor.nodes.driver import ACTIVE, INACTIVE
+from lifecycle.supervisor.core.state import Level
+from lifecycle.supervisor.nodes.driver import ACTIVE, INACTIVE, NodeInterfaceClient
 from lifecycle.supervisor.nodes.system import NodeRun, System
-from lifecycle.supervisor.run.events import Emitter, Notice, WiringChanged, WiringLost
-from lifecycle.supervisor.run.failure import ended
+from lifecycle.supervisor.run.events import Notice, WiringChanged, WiringLost
+from lifecycle.supervisor.run.failure import ended, within
 from lifecycle.verify.observation import NodeConfiguration, Observation
 from lifecycle.verify.verdict import Finding
 
 if TYPE_CHECKING:
-    from lifecycle.supervisor.nodes.driver import NodeDriver, NodeInterfaceClient
+    from lifecycle.supervisor.nodes.driver import NodeDriver
     from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
 
 _BEYOND = (Condition.CONNECTED, Condition.ACTIVE, Condition.HEALTHY)
@@ -50,35 +51,29 @@ _BEYOND = (Condition.CONNECTED, Condition.ACTIVE, Condition.HEALTHY)
 def configured_before_any_connect(system: System) -> frozenset[str]:
     """Return the keys of this supervisor's managed nodes that no `after:` holds behind a connect.
 
-    None where nothing is negotiated.
+    Nothing where nothing is negotiated.
 
     A managed node's start waits for `started` alone and its configure for `configured`; but the
     start of a plain node waits for any condition, and a node that depends on it waits with it.
     """
     if system.plan.data_layer.source is not DataLayerSource.DYNAMIC:
         return frozenset()
-    held: dict[str, bool] = {}
+    planned = {key: node.planned for key, node in system.nodes.items()}
+    held: set[str] = set()
 
-    def is_held(key: str) -> bool:
-        if key in held or key not in system.nodes:
-            return held.get(key, False)
-        held[key] = False  # `after` has no cycles; a second visit ends here
-        planned = system.nodes[key].planned
-        for after in planned.after:
-            waits = not planned.managed or after.condition in (
-                Condition.STARTED,
-                Condition.CONFIGURED,
-            )
-            target = system.nodes.get(after.node)
-            managed = target is None or target.planned.managed
-            beyond = after.condition in _BEYOND and managed
-            if waits and (beyond or is_held(after.node)):
-                held[key] = True
-        return held[key]
+    def is_held(node: PlannedNode, after: After) -> bool:
+        if node.managed and after.condition not in (Condition.STARTED, Condition.CONFIGURED):
+            return False
+        connects = after.node not in planned or planned[after.node].managed
+        return after.node in held or (connects and after.condition in _BEYOND)
 
-    return frozenset(
-        key for key, node in system.nodes.items() if node.planned.managed and not is_held(key)
-    )
+    while more := {
+        key
+        for key, node in planned.items()
+        if key not in held and any(is_held(node, after) for after in node.after)
+    }:
+        held |= more
+    return frozenset(key for key, node in planned.items() if node.managed and key not in held)
 
 
 AGAIN_S = 0.1
@@ -97,16 +92,14 @@ CALM_S = 10.0
 """A node that stayed wired for so long has its tries back."""
 
 
-def authority_of(
-    system: System, emit: Emitter, reaching: ObserverParticipant
-) -> ConnectionAuthority | None:
+def authority_of(system: System, participant: ObserverParticipant) -> ConnectionAuthority | None:
     """Return who wires `system`; None if its nodes do it themselves."""
     layer = system.plan.data_layer
     if layer.authority is not Authority.SUPERVISOR:
         return None
     dynamic = layer.source is DataLayerSource.DYNAMIC
     source = NegotiatedSource(system.plan) if dynamic else PlannedSource(system.plan)
-    return ConnectionAuthority(system, source, emit, reaching)
+    return ConnectionAuthority(system, source, participant)
 
 
 class PlannedSource:
@@ -131,15 +124,32 @@ class PlannedSource:
 
 
 class _Wiring(msgspec.Struct):
-    """What the authority knows of one node that it wires."""
+    """What the authority knows of one node that it wires.
+
+    Attributes:
+        actual: what the node had at last.
+        ours: names of what it was connected to by us, oldest first.
+        rounds: tries to make what is missing; `last_s`: when the last one was.
+        error: why the last one failed; empty if it did not.
+        given_up: checksum of the configuration with which the tries were used up.
+    """
 
     actual: ActualState = msgspec.field(default_factory=ActualState)
     ours: list[str] = msgspec.field(default_factory=list)
-    settled: tuple[Instructions, str] | None = None  # with this configuration nothing was missing
     rounds: int = 0
     last_s: float = float("-inf")
     error: str = ""
-    given_up: str = ""  # checksum of the configuration with which the tries were used up
+    given_up: str | None = None
+
+
+class _Wirable(msgspec.Struct):
+    """A node that can be wired now; `node` is None if it joined without being declared."""
+
+    interface: NodeDriver | NodeInterfaceClient
+    node: NodeRun | None
+    configuration: NodeConfiguration
+    wanted: Instructions
+    wiring: _Wiring
 
 
 class ConnectionAuthority:
@@ -148,21 +158,18 @@ class ConnectionAuthority:
     Args:
         system: whose nodes.
         source: what they must have.
-        emit: where events go.
-        reaching: reaches nodes that are not declared.
+        participant: reaches nodes that are not declared.
     """
 
     def __init__(
         self,
         system: System,
         source: PlannedSource | NegotiatedSource,
-        emit: Emitter,
-        reaching: ObserverParticipant,
+        participant: ObserverParticipant,
     ) -> None:
         self._system = system
         self._source = source
-        self._emit = emit
-        self._reaching = reaching
+        self._participant = participant
         self._wirings: dict[str, _Wiring] = {}
         self._others: dict[str, NodeConfiguration] = {}
         self._instructions: Mapping[str, Instructions] = {}
@@ -171,8 +178,8 @@ class ConnectionAuthority:
         self._following: asyncio.Task[None] | None = None
         self._closed = False
         layer = system.plan.data_layer
-        self._dynamic = layer.source is DataLayerSource.DYNAMIC
         self._repairs = layer.events
+        self._follows = layer.events or layer.source is DataLayerSource.DYNAMIC
 
     async def wire(self, node: NodeRun) -> None:
         """Make everything that a configured node must have before it connects.
@@ -204,6 +211,21 @@ class ConnectionAuthority:
         wiring.ours = [connection for connection in wiring.ours if connection in there]
         await self._make(wiring, node.driver, steps(wanted, wiring.actual), node)
 
+    async def unwire(self, node: NodeRun) -> None:
+        """Unmake what a node was connected to, the last connection first, each bounded."""
+        wiring, limit_s = self._wirings.get(node.name), node.planned.timeouts.cleanup_s
+        while wiring is not None and wiring.ours and node.driver is not None:
+            name = wiring.ours.pop()
+            step = Command(node=node.name, operation=Operation.DISCONNECT_FROM, connection=name)
+            try:
+                await within(limit_s, node.driver.wire(step))
+            except (BringUpError, asyncio.TimeoutError) as error:
+                text = str(error) or f"cannot {step} within {limit_s:g} s"
+                self._system.emit(Notice(message=text))
+            else:
+                done = WiringChanged(node=node.name, operation=step.operation, connection=name)
+                self._system.emit(done)
+
     def replan(self, plan: Plan, names: Collection[str]) -> None:
         """Forget what these nodes were instructed: they are started again, by this plan."""
         self._source.replan(plan, names)
@@ -222,13 +244,13 @@ class ConnectionAuthority:
             node = self._system.node_named(each.name)
             if node is not None and not node.core.process:
                 node.configuration = each
-        if not (self._dynamic or self._repairs):
+        if not self._follows:
             return
         before = self._source.problems
         self._negotiate()
         for problem in self._source.problems:
             if problem not in before:
-                self._emit(Notice(message=problem))
+                self._system.emit(Notice(message=problem))
         self._wake.set()
         if self._following is None and not self._closed:
             self._following = asyncio.ensure_future(self._follow())
@@ -240,22 +262,12 @@ class ConnectionAuthority:
             if self._following.done():
                 self._following.result()
             await ended(self._following)
-            self._following = None
-        await self._release()
-
-    async def _follow(self) -> None:
-        """Make what is missing at every look."""
-        while True:
-            self._wake.clear()
-            again_s = await self._repair()
-            await set_within(self._wake, again_s)
-
-    async def _release(self) -> None:
-        for name, wiring in self._wirings.items():
+        for name, wiring in tuple(self._wirings.items()):  # nodes leave meanwhile
             if self._system.node_named(name) is not None or name not in self._others:
                 continue
             unmade = steps(Instructions(node=name), wiring.actual, ours=wiring.ours)
-            making = self._make(wiring, self._reaching.node_interface(name), unmade, None)
+            interface = NodeInterfaceClient(self._participant.clients, name)
+            making = self._make(wiring, interface, unmade, None)
             try:
                 await asyncio.wait_for(making, RELEASE_S)
             except (BringUpError, asyncio.TimeoutError):
@@ -266,7 +278,7 @@ class ConnectionAuthority:
         found = [
             not_wired(name, wiring.error)
             for name, wiring in self._wirings.items()
-            if wiring.error and wiring.rounds >= TRIES
+            if wiring.error and wiring.given_up is not None
         ]
         system = self._system.plan.system
         found += [not_wired(system, each) for each in self._source.problems]
@@ -278,17 +290,13 @@ class ConnectionAuthority:
         A node reports a mapping as soon as it has begun; the endpoint before it is there until its
         peers have found the new one, for seconds.
         """
-        if not (self._dynamic or self._repairs):
+        if not self._follows:
             return False
-        if self._making:
-            return True
-        for name, _, _, configuration in self._wirable():
-            wiring = self._wirings.get(name) or _Wiring()
-            given_up = wiring.rounds >= TRIES and configuration.checksum == wiring.given_up
-            wanted = self._instructions[name]
-            if not given_up and steps(wanted, wired(configuration), ours=wiring.ours):
-                return True
-        return False
+        return bool(self._making) or any(
+            steps(each.wanted, wired(each.configuration), ours=each.wiring.ours)
+            for each in self._wirable()
+            if each.wiring.given_up != each.configuration.checksum
+        )
 
     def _negotiate(self) -> Mapping[str, Instructions]:
         known = dict(self._others)
@@ -299,68 +307,57 @@ class ConnectionAuthority:
         self._system.expected = self._source.expected
         return self._instructions
 
-    async def _repair(self) -> float | None:
-        """Wire every node that lacks something; return after how many seconds to try again."""
-        waits = [
-            again
-            for name, interface, node, configuration in self._wirable()
-            if (again := await self._repair_node(name, interface, node, configuration)) is not None
-        ]
-        return min(waits, default=None)
+    async def _follow(self) -> None:
+        """Make what is missing at every look."""
+        while True:
+            self._wake.clear()
+            waits_s = [await self._repair(each) for each in self._wirable()]
+            await set_within(self._wake, min(filter(None, waits_s), default=None))
 
-    def _wirable(
-        self,
-    ) -> Iterable[tuple[str, NodeDriver | NodeInterfaceClient, NodeRun | None, NodeConfiguration]]:
+    def _wirable(self) -> Iterator[_Wirable]:
         dead = self._system.dead()
         remote = {each.full_name for each in self._system.remote.values()}
-        for name in self._instructions:
+        for name, wanted in self._instructions.items():
             node = self._system.node_named(name)
-            if node is not None:
-                configuration = node.configuration
-                if node.driver is None or node.core.stuck or name in dead or configuration is None:
+            configuration = self._others.get(name) if node is None else node.configuration
+            if configuration is None or configuration.state not in (INACTIVE, ACTIVE):
+                continue
+            interface: NodeDriver | NodeInterfaceClient
+            if node is None:
+                if name in remote:
                     continue
-                if node.found == ACTIVE:
-                    continue  # it is verified as it was found
-                if configuration.connected and configuration.state in (INACTIVE, ACTIVE):
-                    yield name, node.driver, node, configuration
-            elif name in self._others and name not in remote:
-                configuration = self._others[name]
-                if configuration.state in (INACTIVE, ACTIVE):
-                    yield name, self._reaching.node_interface(name), None, configuration
+                interface = NodeInterfaceClient(self._participant.clients, name)
+            else:
+                if node.driver is None or node.core.stuck or name in dead:
+                    continue
+                if not configuration.connected or node.core.base is Level.ACTIVE:
+                    continue  # the latter is verified as it was found
+                interface = node.driver
+            wiring = self._wirings.setdefault(name, _Wiring())
+            yield _Wirable(interface, node, configuration, wanted, wiring)
 
-    async def _repair_node(
-        self,
-        name: str,
-        interface: NodeDriver | NodeInterfaceClient,
-        node: NodeRun | None,
-        configuration: NodeConfiguration,
-    ) -> float | None:
-        wanted = self._instructions[name]
-        wiring = self._wirings.setdefault(name, _Wiring())
-        if wiring.settled == (wanted, configuration.checksum):
-            return None
-        has = wired(configuration) if self._repairs or node is None else wiring.actual
-        missing = steps(wanted, has, ours=wiring.ours)
+    async def _repair(self, one: _Wirable) -> float | None:
+        """Wire a node that lacks something; return after how many seconds to try again."""
+        wiring, configuration = one.wiring, one.configuration
+        has = wired(configuration) if self._repairs or one.node is None else wiring.actual
+        missing = steps(one.wanted, has, ours=wiring.ours)
         if not missing:
-            wiring.settled = (wanted, configuration.checksum)
             wiring.actual, wiring.error = has, ""
             return None
         now_s = asyncio.get_running_loop().time()
-        if wiring.rounds >= TRIES:
-            if configuration.checksum == wiring.given_up:
-                return None
-            wiring.rounds = 0
-        elif now_s - wiring.last_s > CALM_S:
-            wiring.rounds = 0
+        if wiring.given_up == configuration.checksum:
+            return None
+        if wiring.given_up is not None or now_s - wiring.last_s > CALM_S:
+            wiring.rounds, wiring.given_up = 0, None
         due_s = wiring.last_s + _backoff_s(wiring.rounds)
         if now_s < due_s:
             return due_s - now_s
-        self._tell_lost(wiring, has, name)
+        self._say_lost(one.wanted.node, wiring, has)
         wiring.rounds += 1
         wiring.last_s = now_s
         wiring.actual = has
         try:
-            await self._make(wiring, interface, missing, node)
+            await self._make(wiring, one.interface, missing, one.node)
         except BringUpError as error:
             wiring.error = error.message
         else:
@@ -371,16 +368,16 @@ class ConnectionAuthority:
         # Also after a success: one that does not show in the node's own report is none.
         return _backoff_s(wiring.rounds)
 
-    def _tell_lost(self, wiring: _Wiring, has: ActualState, name: str) -> None:
+    def _say_lost(self, name: str, wiring: _Wiring, has: ActualState) -> None:
         """Say what the node had been given and has no more."""
         there = {connection for connection, _ in has.connections}
         for connection, _ in wiring.actual.connections:
             if connection in wiring.ours and connection not in there:
-                self._emit(WiringLost(node=name, connection=connection))
+                self._system.emit(WiringLost(node=name, connection=connection))
         mapped = dict(has.mappings)
         for endpoint, connection in wiring.actual.mappings:
             if endpoint not in mapped and (connection in there or not connection):
-                self._emit(WiringLost(node=name, connection=connection, endpoint=endpoint))
+                self._system.emit(WiringLost(node=name, connection=connection, endpoint=endpoint))
 
     async def _make(
         self,
@@ -405,25 +402,23 @@ class ConnectionAuthority:
             try:
                 configuration = await interface.wire(step)
             except BringUpError as error:
-                self._emit(replace(event, error=error.message))
+                self._system.emit(replace(event, error=error.message))
                 raise
             finally:
                 self._making -= 1
                 if node is not None:
                     node.told = ""
-            wiring.actual = wiring.actual.after(step)
             if step.operation is Operation.CONNECT_TO and step.connection not in wiring.ours:
                 wiring.ours.append(step.connection)
             elif step.operation is Operation.DISCONNECT_FROM and step.connection in wiring.ours:
                 wiring.ours.remove(step.connection)
-            if node is not None:
-                node.connections = tuple(wiring.ours)
             if configuration is not None:
-                if node is not None:
-                    node.learn(configuration)
-                else:
+                wiring.actual = wired(configuration)
+                if node is None:
                     self._others[configuration.name] = configuration
-            self._emit(event)
+                else:
+                    node.learn(configuration)
+            self._system.emit(event)
         self._system.touch()
 
 

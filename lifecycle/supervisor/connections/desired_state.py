@@ -46,18 +46,6 @@ class ActualState(msgspec.Struct, frozen=True, kw_only=True):
     connections: tuple[tuple[str, tuple[str, ...]], ...] = ()
     mappings: tuple[tuple[str, str], ...] = ()
 
-    def after(self, step: Command) -> ActualState:
-        """Return what the node has once `step` was made."""
-        connections, mappings = dict(self.connections), dict(self.mappings)
-        if step.operation is Operation.CONNECT_TO:
-            connections[step.connection] = step.connections.urls
-        elif step.operation is Operation.MAP_TO:
-            mappings[step.endpoint] = step.connection
-        else:
-            connections.pop(step.connection, None)
-            mappings = {end: name for end, name in mappings.items() if name != step.connection}
-        return ActualState(connections=tuple(connections.items()), mappings=tuple(mappings.items()))
-
 
 def planned_instructions(node: PlannedNode) -> Instructions:
     """Return what the plan instructs a node to do.
@@ -139,7 +127,7 @@ def not_wired(subject: str, message: str) -> Finding:
         message: a whole sentence with the reason.
     """
     return NOT_WIRED.finding(
-        Outcome.VIOLATED,
+        outcome=Outcome.VIOLATED,
         subject=subject,
         expected="wired",
         observed="not wired",

@@ -12,7 +12,7 @@ from __future__ import annotations
 import asyncio
 import functools
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,7 +28,6 @@ from lifecycle.verify.verdict import FlowReport, Verdict
 
 if TYPE_CHECKING:
     from lifecycle.programming.apply.programmer import Programmer, Removal
-    from lifecycle.programming.apply.targets.registry import TargetOptions
 
 _AGAIN_S = (2.0, 60.0)
 """First and longest pause after a failure."""
@@ -109,22 +108,23 @@ class Networks:
         if self._programmer is not None:
             self._programmer.replan(plan)
 
-    async def close(self, hurry: asyncio.Event | None = None) -> None:
+    async def close(self, hurry: asyncio.Event) -> None:
         """Remove everything of the system from networks, bounded; failures become notices.
 
         Args:
             hurry: once set, no server is waited for any more.
         """
         self._begun = False
+        removes: Programmer | Removal | None = self._programmer
         try:
             await self._stop()
         finally:
-            if self._programmer is not None:
-                await self._remove(self._programmer, hurry or asyncio.Event())
-            elif (self._directory / LEDGER_NAME).is_file():
+            if removes is None and (self._directory / LEDGER_NAME).is_file():
                 from lifecycle.programming.apply.programmer import Removal
 
-                await self._remove(Removal(self._directory), hurry or asyncio.Event())
+                removes = Removal(self._directory)
+            if removes is not None:
+                await self._remove(removes, hurry)
 
     async def _remove(self, removes: Programmer | Removal, hurry: asyncio.Event) -> None:
         """Remove everything, in the thread and within CLOSE_S for all servers together."""
@@ -221,18 +221,6 @@ def _once(
     return programmer.renew(within_s=None if until_s is None else until_s - time.monotonic())
 
 
-def token_variables(program: Iterable[TargetOptions]) -> frozenset[str]:
-    """Return the environment variables that hold tokens, which no node has any use for.
-
-    Args:
-        program: what a run programs.
-
-    Raises:
-        SettingsError: a settings file cannot be used.
-    """
-    return frozenset().union(*(each.token_variables() for each in program))
-
-
 def open_networks(
     plan: Plan,
     options: UpOptions,
@@ -268,19 +256,17 @@ def open_networks(
     return Networks(plan.system, path, emit, programmer)
 
 
-def remove_programmed(directory: Path, within_s: float | None = None) -> tuple[str, ...]:
-    """Remove everything that a run has in networks, also what a person applied; say what was done.
+def remove_programmed(directory: Path, within_s: float) -> None:
+    """Remove everything that a run has in networks, also what a person applied.
 
     Args:
         directory: of the run.
-        within_s: for all that servers are asked; None for the patience with each request.
+        within_s: for all that servers are asked.
 
     Raises:
         ProgrammingError: something could not be removed; it stays listed.
     """
-    if not (directory / LEDGER_NAME).is_file():
-        return ()
-    from lifecycle.programming.apply.programmer import Removal
+    if (directory / LEDGER_NAME).is_file():
+        from lifecycle.programming.apply.programmer import Removal
 
-    done = Removal(directory).close(within_s=within_s)
-    return tuple(each.render(done=True) for each in done if each.changes)
+        Removal(directory).close(within_s=within_s)

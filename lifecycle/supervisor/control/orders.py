@@ -1,9 +1,9 @@
-"""The manifest of a running system: is it still the one that runs, and can it be taken meanwhile?
+"""Orders that name a manifest: is it the one that runs, and can it be taken meanwhile?
 
-Owns: `Order`, and `Revisions`. An order with a plan that is not the one that runs is refused unless
-it says to take it, and so is, with the reason, what cannot be changed while the supervisor runs.
-Which orders fit what the system is doing, and what they do, is the core's, what differs
-`plan.comparison`'s. Must not import rclpy.
+Owns: `check`. An order with a plan that is not the one that runs is refused unless it says to take
+it, and so is, with the reason, what cannot be changed while the supervisor runs. Which orders fit
+what the system is doing, and what they do, is the core's, what differs `plan.comparison`'s. Must
+not import rclpy.
 """
 
 from __future__ import annotations
@@ -13,29 +13,14 @@ from collections.abc import Collection, Iterable, Iterator
 from lifecycle.errors import UsageError
 from lifecycle.network.connection_url import parse
 from lifecycle.plan.build import with_files_of_now
-from lifecycle.plan.change import PlanChange, change_between
 from lifecycle.plan.comparison import PlanDifference, changes, difference_lines
 from lifecycle.plan.model import Plan
-from lifecycle.supervisor.control.protocol import ChangedNodes, ControlRequest, Question
-from lifecycle.supervisor.core.orders import FITS, SAID, named
+from lifecycle.supervisor.control.protocol import ControlRequest
+from lifecycle.supervisor.core.change import change_to
+from lifecycle.supervisor.core.orders import SAID, named
+from lifecycle.supervisor.core.state import Order
 from lifecycle.supervisor.nodes.system import System
-from lifecycle.supervisor.run.options import UpOptions, local_processes
-
-
-class Order(Question, frozen=True, kw_only=True):
-    """A question as a supervisor reads it.
-
-    Attributes:
-        plan: of the manifest that an order names, as it is now; None if it names none.
-    """
-
-    plan: Plan | None = None
-
-    @property
-    def is_order(self) -> bool:
-        """Whether the system is to do something."""
-        return self.ask in FITS
-
+from lifecycle.supervisor.run.options import local_processes
 
 _CHANGEABLE = ("nodes.", "links.", "policy.", "on_violation.", "modes.")
 """Parts of a manifest that a running supervisor can change: the rest made the supervisor's own
@@ -43,117 +28,106 @@ participant, its authority and the networks that it programs."""
 _NOT_CHANGEABLE = ("policy.ros_interface",)
 
 
-class Revisions:
-    """The manifest of one running system."""
+def check(order: Order, system: System, machine: str) -> None:
+    """Make sure that nothing but the manifest that an order means will run.
 
-    def __init__(self, system: System, options: UpOptions) -> None:
-        self._system = system
-        self._options = options
+    Args:
+        order: which.
+        system: what runs.
+        machine: of its supervisor, as it was given to `lifecycle up`.
 
-    def differences(self, plan: Plan) -> tuple[str, ...]:
-        """Say how `plan` differs from what runs, one line each; empty if it does not."""
-        return difference_lines(changes(self._system.first, plan))
+    Raises:
+        UsageError: the manifest has changed since the start, or cannot be taken.
+    """
+    running = system.first
+    if order.ask is ControlRequest.APPLY:
+        if order.plan is None or not order.timeout_s >= 0:
+            raise UsageError(
+                f"cannot apply a manifest to {running.system!r} without one, or within "
+                f"{order.timeout_s:g} s"
+            )
+        _check_apply(order.plan, system, machine)
+    elif order.plan is not None:
+        found = changes(running, order.plan)
+        if found and order.ask is not ControlRequest.PAUSE:
+            raise _refused(order, system, found)
+    elif order.ask is ControlRequest.RESTART:
+        keys = _restarted(order, system)
+        found = changes(running, with_files_of_now(running))
+        if found := tuple(each for each in found if each.node in keys):
+            raise _refused(order, system, found)
 
-    def change(self, plan: Plan) -> PlanChange:
-        """Return what `plan` is for the system that runs."""
-        system = self._system
-        return change_between(system.first, plan, modes=(system.mode, system.mode_by(plan)))
 
-    def said(self, change: PlanChange, plan: Plan) -> ChangedNodes:
-        """Return a change in the words of the control socket, with the revision in force."""
-        return said(change, self._system.first, plan, self._system.revision)
+def _restarted(order: Order, system: System) -> Collection[str]:
+    """Return the keys of all nodes that an order restarts."""
+    if not order.node:
+        return tuple(system.nodes)
+    node = named(system.run, order.node)
+    if node is None:
+        return ()
+    # A component has none of its own: its container loads it anew.
+    process = system.run.processes.get(node.process)
+    return (node.key,) if process is None else process.planned.nodes
 
-    def check(self, order: Order) -> None:
-        """Make sure that nothing but the manifest that the order means will run.
 
-        Raises:
-            UsageError: the manifest has changed since the start, or cannot be taken.
-        """
-        running = self._system.first
-        if order.ask is ControlRequest.APPLY:
-            if order.plan is None or not order.timeout_s >= 0:
-                raise UsageError(
-                    f"cannot apply a manifest to {running.system!r} without one, or within "
-                    f"{order.timeout_s:g} s"
-                )
-            self._check_apply(order.plan)
-        elif order.plan is not None:
-            found = changes(running, order.plan)
-            if found and order.ask is not ControlRequest.PAUSE:
-                raise self._refused(order, found)
-        elif order.ask is ControlRequest.RESTART:
-            keys = self._restarted(order)
-            found = changes(running, with_files_of_now(running))
-            if found := tuple(each for each in found if each.node in keys):
-                raise self._refused(order, found)
+def _refused(order: Order, system: System, found: Iterable[PlanDifference]) -> UsageError:
+    name = system.plan.system
+    what, said = order.ask.value, SAID.get(order.ask, order.ask.value)
+    listed = "\n".join(difference_lines(found))
+    path = (order.plan or system.first).manifest_path
+    take = f"lifecycle apply {path}"
+    same = f"; or keep what runs: lifecycle {what} {name}" if order.plan is not None else ""
+    same = f"{same} {order.mode}" if same and order.mode else same
+    return UsageError(
+        f"cannot {said} {name!r}: its manifest is not the one that runs:\n{listed}\n"
+        f"take the new one: {take}{same}"
+    )
 
-    def _restarted(self, order: Order) -> Collection[str]:
-        """Return the keys of all nodes that an order restarts."""
-        if not order.node:
-            return tuple(self._system.nodes)
-        node = named(self._system.run, order.node)
-        if node is None:
-            return ()
-        # A component has none of its own: its container loads it anew.
-        process = self._system.run.processes.get(node.process)
-        return (node.key,) if process is None else process.planned.nodes
 
-    def _refused(self, order: Order, found: Iterable[PlanDifference]) -> UsageError:
-        system = self._system.plan.system
-        what, said = order.ask.value, SAID.get(order.ask, order.ask.value)
-        listed = "\n".join(difference_lines(found))
-        path = (order.plan or self._system.first).manifest_path
-        take = f"lifecycle apply {path}"
-        same = f"; or keep what runs: lifecycle {what} {system}" if order.plan is not None else ""
-        same = f"{same} {order.mode}" if same and order.mode else same
-        return UsageError(
-            f"cannot {said} {system!r}: its manifest is not the one that runs:\n{listed}\n"
-            f"take the new one: {take}{same}"
+def _check_apply(plan: Plan, system: System, machine: str) -> None:
+    """Make sure that the running system can become that of another plan."""
+    running = system.first
+    what = f"cannot apply {plan.manifest_path} to {running.system!r} while it runs"
+    if not _is_whole(plan):
+        raise UsageError(f"{what}: it is no plan; its nodes and processes do not fit together")
+    change = change_to(system.run, plan)
+    # Whoever has other ports by that has other connections, too, and is started again.
+    found = tuple(each for each in change.differences if each.path != "order of nodes")
+    _check_surroundings(plan, running, found, what)
+    if system.remote or len(local_processes(plan, machine)) < len(plan.processes):
+        raise _refused_whole(
+            what, "nodes on other machines run by it, too:", difference_lines(found)
         )
-
-    def _check_apply(self, plan: Plan) -> None:
-        """Make sure that the running system can become that of another plan."""
-        system, running = self._system, self._system.first
-        what = f"cannot apply {plan.manifest_path} to {running.system!r} while it runs"
-        if not _is_whole(plan):
-            raise UsageError(f"{what}: it is no plan; its nodes and processes do not fit together")
-        change = self.change(plan)
-        # Whoever has other ports by that has other connections, too, and is started again.
-        found = tuple(each for each in change.differences if each.path != "order of nodes")
-        self._check_surroundings(plan, found, what)
-        urls = [*_urls(running), *_urls(plan)]
-        if change.ends_or_starts and any(parse(url).transport.is_tcp for url in urls):
-            raise _refused_whole(
-                what, "a TCP port that was used is not connected to again by who used it"
+    urls = [*_urls(running), *_urls(plan)]
+    if change.ends_or_starts and any(parse(url).transport.is_tcp for url in urls):
+        raise _refused_whole(
+            what, "a TCP port that was used is not connected to again by who used it"
+        )
+    for key in (*change.restarted, *change.removed):
+        if (name := system.nodes[key].name) in system.run.adopted:
+            raise UsageError(
+                f"{what}: {name!r} would be taken down, and was adopted",
+                hint="who started it ends it; then lifecycle down, and lifecycle up",
             )
-        for key in (*change.restarted, *change.removed):
-            if (name := system.nodes[key].name) in system.adopted:
-                raise UsageError(
-                    f"{what}: {name!r} would be taken down, and was adopted",
-                    hint="who started it ends it; then lifecycle down, and lifecycle up",
-                )
 
-    def _check_surroundings(self, plan: Plan, found: tuple[PlanDifference, ...], what: str) -> None:
-        """Make sure that another plan is for the same supervisor, in the same surroundings."""
-        running = self._system.first
-        elsewhere = any(each.path.startswith("discovery.") for each in found)
-        fixed = [
-            *difference_lines(
-                each
-                for each in found
-                if not f"{each.path}.".startswith(_CHANGEABLE) or each.path in _NOT_CHANGEABLE
-            ),
-            *(() if elsewhere else _places(running, plan)),
-        ]
-        if fixed:
-            raise _refused_whole(what, "a running supervisor cannot change this:", fixed)
-        if (running.observers, running.server) != (plan.observers, plan.server):
-            raise _refused_whole(what, "its supervisor would be connected otherwise")
-        own = local_processes(plan, self._options.machine)
-        if self._system.remote or len(own) < len(plan.processes):
-            raise _refused_whole(
-                what, "nodes on other machines run by it, too:", difference_lines(found)
-            )
+
+def _check_surroundings(
+    plan: Plan, running: Plan, found: tuple[PlanDifference, ...], what: str
+) -> None:
+    """Make sure that another plan is for the same supervisor, in the same surroundings."""
+    elsewhere = any(each.path.startswith("discovery.") for each in found)
+    fixed = [
+        *difference_lines(
+            each
+            for each in found
+            if not f"{each.path}.".startswith(_CHANGEABLE) or each.path in _NOT_CHANGEABLE
+        ),
+        *(() if elsewhere else _places(running, plan)),
+    ]
+    if fixed:
+        raise _refused_whole(what, "a running supervisor cannot change this:", fixed)
+    if (running.observers, running.server) != (plan.observers, plan.server):
+        raise _refused_whole(what, "its supervisor would be connected otherwise")
 
 
 def _is_whole(plan: Plan) -> bool:
@@ -192,25 +166,6 @@ def _places(running: Plan, plan: Plan) -> Iterator[str]:
     ):
         if old != new:
             yield f"{what}: was {old}, is {new}"
-
-
-def said(change: PlanChange, running: Plan, plan: Plan, revision: int) -> ChangedNodes:
-    """Return a change by the full names of nodes.
-
-    Args:
-        change: see above.
-        running: what runs, or ran.
-        plan: what it becomes.
-        revision: of the manifest in force.
-    """
-    return ChangedNodes(
-        differences=difference_lines(change.differences),
-        added=tuple(plan.node(key).full_name for key in change.added),
-        removed=tuple(running.node(key).full_name for key in change.removed),
-        restarted=tuple(plan.node(key).full_name for key in change.restarted),
-        parameters=tuple(plan.node(key).full_name for key in change.parameters),
-        revision=revision,
-    )
 
 
 def _urls(plan: Plan) -> Iterator[str]:

@@ -1,49 +1,33 @@
 """Diagnostics, status and orders over ROS topics and services, for those without a shell.
 
 Owns: when a supervisor publishes on /diagnostics and on its status topic, what it says there, and
-how a service call becomes the order that the control socket would give. None of it is there while
-a bring-up goes on: it is made a moment after the system is active, or once nothing goes on. Must
-not import rclpy.
+how a service call becomes the order that the control socket would give. It is made a moment after
+the system is active, or once bring-up takes long. Must not import rclpy.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
 from lifecycle.codec import to_json
-from lifecycle.errors import ExitCode, LifecycleError, MiddlewareError
+from lifecycle.errors import ExitCode, MiddlewareError
 from lifecycle.manifest.model import Policy, RosInterfaceAccess
-from lifecycle.manifest.names import MODE_SERVICE, supervisor_prefix, supervisor_services
-from lifecycle.plan.model import Plan
-from lifecycle.supervisor.control.orders import Order
+from lifecycle.manifest.names import supervisor_prefix, supervisor_services
 from lifecycle.supervisor.control.protocol import ControlRequest, NodeStatus, SystemStatus
-from lifecycle.supervisor.core.orders import FITS
-from lifecycle.supervisor.run.events import (
-    Emitter,
-    Event,
-    GateOpened,
-    NodeChanged,
-    NodeJoined,
-    Notice,
-    ProcessChanged,
-    RequestSent,
-    Stopping,
-    SystemReached,
-    WiringChanged,
-)
+from lifecycle.supervisor.core.state import Order
+from lifecycle.supervisor.run.events import Event, Notice, Stopping, SystemReached
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.tool_filter import supervisor_label, takes_diagnostics
 from lifecycle.verify.verdict import Verdict
 
 if TYPE_CHECKING:
     from lifecycle.middleware.services.ros_interface import RosInterface as RosEntities
-    from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
     from lifecycle.supervisor.shell.supervisor import Supervisor
 
 Entry = tuple[int, str, str, str, Sequence[tuple[str, str]]]
@@ -54,24 +38,13 @@ OK, WARN, ERROR, STALE = range(4)
 
 EACH_S = 1.0
 """How often diagnostics are published at least, as their aggregator expects it."""
-HELD_UP_S = 3.5
-"""A bring-up in which nothing happened for so long is held up, and says why. What discovery lost it
-sends again after 3 s (middleware/rcl/graph.py)."""
+BRINGS_UP_S = 3.5
+"""A bring-up that takes longer says why. What discovery lost it sends again after 3 s
+(middleware/rcl/graph.py)."""
 AFTER_ACTIVE_S = 0.25
 """What was to do for `active` is done first; who ends the system then pays nothing for this."""
 _BURST_S = 0.05
-_DOWN = "down"
 _PACKAGES = ("diagnostic_msgs", "std_msgs", "std_srvs")
-_ON_ITS_WAY = (
-    GateOpened,
-    NodeChanged,
-    NodeJoined,
-    ProcessChanged,
-    RequestSent,
-    SystemReached,
-    WiringChanged,
-)
-"""Events of a bring-up that goes on; another verdict may come for ever."""
 
 
 def check_installed(policy: Policy) -> None:
@@ -80,11 +53,11 @@ def check_installed(policy: Policy) -> None:
     Raises:
         MiddlewareError: a package is not installed.
     """
-    if not policy.ros_interface_required or policy.ros_interface is RosInterfaceAccess.OFF:
+    if policy.ros_interface in (None, RosInterfaceAccess.OFF):
         return
     if lacking := [name for name in _PACKAGES if find_spec(name) is None]:
         raise MiddlewareError(
-            f"cannot offer 'policy: {{ros_interface: {policy.ros_interface.value}}}': no Python "
+            f"cannot offer 'policy: {{ros_interface: {policy.access.value}}}': no Python "
             f"package {' or '.join(lacking)} is installed",
             hint="install it, or write 'policy: {ros_interface: off}'",
         )
@@ -97,44 +70,22 @@ class RosInterface:
     """What one run offers in ROS, from the moment that its system is active or held up.
 
     Args:
-        session: what is asked and ordered.
-        plan: whose policy says what is allowed.
-        machine: of this supervisor, where the system has several; else empty.
-        participant: makes topics and services.
-        emit: takes a notice, once, of why nothing can be offered.
-        modes: names of those that it may be asked to enter.
+        supervisor: what is asked and ordered.
     """
 
-    def __init__(
-        self,
-        session: Supervisor,
-        plan: Plan,
-        machine: str,
-        participant: ObserverParticipant,
-        *,
-        emit: Emitter,
-        modes: Iterable[str] = (),
-    ) -> None:
-        self._session = session
-        self._plan = plan
-        self._access = plan.policy.ros_interface
-        self._machine = machine
-        self._modes = tuple(modes)
-        self._participant = participant
-        self._emit = emit
+    def __init__(self, supervisor: Supervisor) -> None:
+        self._supervisor = supervisor
+        self._machine = min(supervisor.system.machines or ("",))
         self._offer: RosEntities | None = None
-        self._opens = self._access is not RosInterfaceAccess.OFF
-        self._was_active = False
         self._due: asyncio.TimerHandle | None = None
-        self._orders: set[asyncio.Task[None]] = set()
         self._rules: set[str] = set()
         self._published: SystemStatus | None = None
         self._hurries = False
 
     def begin(self) -> None:
-        """Wait from now on for the system to be active, or to be held up."""
-        if self._opens:
-            self._in(HELD_UP_S, self._open)
+        """Wait from now on for the system to be active, or its bring-up to take long."""
+        if self._supervisor.system.plan.policy.access is not RosInterfaceAccess.OFF:
+            self._in(BRINGS_UP_S, self._open)
 
     def on_event(self, event: Event) -> None:
         """Publish what changed; a listener of the run."""
@@ -144,9 +95,8 @@ class RosInterface:
                 self._in(_BURST_S, self._publish)
         elif isinstance(event, Stopping):
             self._stop()
-        elif self._opens and not self._was_active and isinstance(event, _ON_ITS_WAY):
-            self._was_active = isinstance(event, SystemReached) and event.reached == "active"
-            self._in(AFTER_ACTIVE_S if self._was_active else HELD_UP_S, self._open)
+        elif isinstance(event, SystemReached) and event.reached == "active" and self._due:
+            self._in(AFTER_ACTIVE_S, self._open)
 
     def close(self) -> None:
         """Publish a last time, and offer nothing any more; again is harmless."""
@@ -158,35 +108,36 @@ class RosInterface:
 
     def _in(self, wait_s: float, do: Callable[[], None]) -> None:
         """Do something later, in place of what was to be done."""
-        if self._due is not None:
-            self._due.cancel()
+        self._stop()
         self._due = asyncio.get_running_loop().call_later(wait_s, do)
 
     def _stop(self) -> None:
-        self._opens = False
         if self._due is not None:
             self._due.cancel()
+            self._due = None
 
     def _open(self) -> None:
-        self._opens = False
-        loop = asyncio.get_running_loop()
+        self._due = None
+        loop, system = asyncio.get_running_loop(), self._supervisor.system
 
         def called(name: str, answer: Answer) -> None:
             with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
                 loop.call_soon_threadsafe(self._called, name, answer)
 
-        prefix = supervisor_prefix(self._plan.system, self._machine)
-        services = supervisor_services(self._access, self._modes)
+        modes = () if system.remote else (each.name for each in system.plan.modes)
         try:
-            self._offer = self._participant.ros_interface(
-                prefix, services, called, diagnoses=takes_diagnostics(self._plan)
+            self._offer = self._supervisor.means.participant.ros_interface(
+                supervisor_prefix(system.plan.system, self._machine),
+                supervisor_services(system.plan.policy.access, modes),
+                called,
+                diagnoses=takes_diagnostics(system.plan),
             )
         except MiddlewareError as error:
             why = (
                 f"cannot offer diagnostics and status in ROS: {error}; the system runs without; "
                 "'policy: {ros_interface: off}' does not try"
             )
-            self._emit(Notice(message=why))
+            system.emit(Notice(message=why))
         else:
             self._publish()
 
@@ -197,7 +148,7 @@ class RosInterface:
             self._in(EACH_S, self._publish)
 
     def _say(self, offer: RosEntities) -> None:
-        seen = self._session.look()
+        seen = self._supervisor.look()
         status = seen.status
         if (timeless := _timeless(status)) != self._published:
             self._published = timeless
@@ -209,31 +160,23 @@ class RosInterface:
         )
 
     def _called(self, name: str, answer: Answer) -> None:
-        if name == _DOWN:
-            answer(True, "the system is being taken down")
-            self._session.stop("the down service", ExitCode.BRING_UP_FAILED)
-        elif name.startswith(MODE_SERVICE) or name in {each.value for each in FITS}:
-            mode = name.removeprefix(MODE_SERVICE)
-            order = (
-                Order(ask=ControlRequest(name))
-                if mode == name
-                else Order(ask=ControlRequest.MODE, mode=mode)
-            )
-            task = asyncio.ensure_future(self._ordered(order, answer))
-            self._orders.add(task)
-            task.add_done_callback(self._orders.discard)
-        else:
-            status = self._session.status()
+        if name == "get_status":
+            status = self._supervisor.status()
             answer(status.verdict is not Outcome.VIOLATED, to_json(status).decode())
+        elif name == ControlRequest.DOWN.value:
+            answer(True, "the system is being taken down")
+            self._supervisor.stop("the down service", ExitCode.BRING_UP_FAILED)
+        else:
+            ask, _, mode = name.partition("/")  # MODE_SERVICE is followed by a mode
+            order = Order(ask=ControlRequest(ask), mode=mode)
+            self._supervisor.start(self._ordered(order, answer))
 
     async def _ordered(self, order: Order, answer: Answer) -> None:
         error = "cannot do this: the supervisor ends"
         try:
-            error = (await self._session.order(order)).error
-        except LifecycleError as refused:
-            error = str(refused)
+            error = (await self._supervisor.order(order)).error
         finally:
-            answer(not error, error or self._session.status().phase)
+            answer(not error, error or self._supervisor.status().phase)
 
 
 def _timeless(status: SystemStatus) -> SystemStatus:

@@ -31,7 +31,7 @@ from lifecycle.verify.observation import Observation
 from lifecycle.verify.verdict import Verdict
 
 if TYPE_CHECKING:
-    from lifecycle.supervisor.control.orders import Order
+    from lifecycle.supervisor.core.state import Order
     from lifecycle.supervisor.shell.supervisor import Supervisor
 
 _BURST_S = 0.05
@@ -100,7 +100,7 @@ class ControlServer:
         )
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        from lifecycle.supervisor.control.orders import Order  # clients do not need it
+        from lifecycle.supervisor.core.state import Order  # clients do not need it
 
         self._open.add(writer)
         try:
@@ -127,13 +127,14 @@ class ControlServer:
         self._changed = asyncio.Event()
 
     async def _answer(self, question: Order) -> Answer:
+        if question.ask is ControlRequest.STATUS:
+            return Answer(status=self._session.status())
         if question.ask is ControlRequest.LOOK:
             return LookAnswer(look=self._session.look())
-        if question.is_order:
-            return await self._session.order(question)
-        if question.ask is ControlRequest.DIFFERENCES and question.plan is not None:
-            return Answer(differences=self._session.differences(question.plan))
-        return Answer(status=self._session.status())
+        if question.ask is ControlRequest.DIFFERENCES:
+            plan = question.plan
+            return Answer(differences=() if plan is None else self._session.differences(plan))
+        return await self._session.order(question)
 
     async def _follow(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Send what is known now and after each change, until the client goes away."""

@@ -116,7 +116,7 @@ def _state(node: NodeRun, verdict: Verdict | None) -> str:
     """Return a node's state; of one that others can drive unseen, what the last judgement saw."""
     judged = (
         each.observed
-        for each in (() if verdict is None or node.reports_changes else verdict.findings)
+        for each in (() if verdict is None or node.is_hosted else verdict.findings)
         if each.rule == WRONG_STATE.id and each.node == node.name
     )
     return next(judged, node.state)
@@ -172,8 +172,8 @@ def system_status(system: System, *, supervisor: int, elapsed_s: float, ends: st
             for node in system.nodes.values()
         ),
         not_ok="" if verdict is None else not_ok(verdict),
-        mode=system.mode,
+        mode=system.run.mode,
         manifest=system.first.manifest_path,
-        revision=system.revision,
+        revision=system.run.revision,
         ends=ends,
     )

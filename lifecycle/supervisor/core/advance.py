@@ -301,13 +301,14 @@ def _ask(run: Run, node: Node, step: Step) -> effects.Ask:
         Step.SHUTDOWN: limits.shutdown_s,
     }.get(step, limits.cleanup_s)
     appears = step is Step.START and only_appears(node) and not node.planned.holds
+    theirs = step in _THEIRS or (step is Step.START and node.planned.run.component)
     run.requests += 1
     node.request = Request(
         number=run.requests,
         step=step,
         since_s=run.now_s,
         limit_s=NEVER_S if appears else limit_s,
-        own_s=OWN_S if step in _THEIRS else 0.0,
+        own_s=OWN_S if theirs else 0.0,
     )
     if step is not Step.ACTIVATE:
         return effects.Ask(node=node.key, step=step, number=run.requests)

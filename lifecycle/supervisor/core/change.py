@@ -7,14 +7,15 @@ Pure.
 
 from __future__ import annotations
 
-from msgspec.structs import replace
+from msgspec.structs import asdict, replace
 
 from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import TargetState
 from lifecycle.plan.build import attached_to
-from lifecycle.plan.change import change_between
+from lifecycle.plan.change import PlanChange, change_between
 from lifecycle.plan.comparison import difference_lines
 from lifecycle.plan.model import Plan, PlannedNode, in_mode
+from lifecycle.supervisor.control.protocol import ChangedNodes
 from lifecycle.supervisor.core.advance import is_settled_down, phase_of, waiting
 from lifecycle.supervisor.core.state import (
     Attempt,
@@ -100,9 +101,7 @@ def apply(run: Run, order: Order) -> list[Event]:
     """Have the system run by another manifest; nothing is done where nothing differs."""
     plan = order.plan
     assert plan is not None
-    then = run.mode if run.mode in [each.name for each in plan.modes] else ""
-    then = then or next((each.name for each in plan.modes), "")
-    change = change_between(run.first, plan, modes=(run.mode, then))
+    change = change_to(run, plan)
     if not change.differences:
         run.answer(ExitCode.OK)
         return []
@@ -203,11 +202,10 @@ def _is_down(run: Run, change: Change) -> bool:
 def _take(run: Run, change: Change) -> None:
     """Exchange the plan; what stays is connected as it is."""
     plan, before = (change.before, change.plan) if change.back else (change.plan, change.before)
-    modes = [each.name for each in plan.modes]
     if change.back:
         run.mode, run.revision = change.mode, change.revision
     else:
-        run.mode = run.mode if run.mode in modes else next(iter(modes), "")
+        run.mode = run.mode_by(plan)
         run.revisions += 1
         run.revision = run.revisions
     stays = {key: each.planned for key, each in run.nodes.items() if key not in change.down}
@@ -279,25 +277,38 @@ def undone(run: Run, change: Change) -> str:
     return f"{text}{before} is in force again, revision {run.revision}, {how}"
 
 
+def change_to(run: Run, plan: Plan) -> PlanChange:
+    """Return what another manifest is for what runs; it stays in its mode, if that has it."""
+    modes = [each.name for each in plan.modes]
+    then = run.mode if run.mode in modes else next(iter(modes), "")
+    return change_between(run.first, plan, modes=(run.mode, then))
+
+
+def changed_nodes(change: PlanChange, running: Plan, plan: Plan, revision: int) -> ChangedNodes:
+    """Return a change by the full names of nodes.
+
+    Args:
+        change: from `running` to `plan`.
+        running: what runs, or ran.
+        plan: what it becomes.
+        revision: of the manifest in force.
+    """
+    return ChangedNodes(
+        differences=difference_lines(change.differences),
+        added=tuple(plan.node(key).full_name for key in change.added),
+        removed=tuple(running.node(key).full_name for key in change.removed),
+        restarted=tuple(plan.node(key).full_name for key in change.restarted),
+        parameters=tuple(plan.node(key).full_name for key in change.parameters),
+        revision=revision,
+    )
+
+
 def _said(run: Run, stage: str, reason: str = "") -> Event:
     change = run.change
     assert change is not None
-    event = ManifestApplied(
-        stage=stage, manifest=change.plan.manifest_path, revision=run.revision, reason=reason
-    )
-    if reason:
-        return event
-    names = {each.key: each.full_name for each in (*change.before.nodes, *change.plan.nodes)}
-
-    def named(keys: object) -> tuple[str, ...]:
-        return tuple(names[key] for key in keys)  # type: ignore[attr-defined]
-
-    what = change.change
-    return replace(
-        event,
-        differences=difference_lines(what.differences),
-        added=named(what.added),
-        removed=named(what.removed),
-        restarted=named(what.restarted),
-        parameters=named(what.parameters),
+    what = ChangedNodes(revision=run.revision)
+    if not reason:
+        what = changed_nodes(change.change, change.before, change.plan, run.revision)
+    return ManifestApplied(
+        stage=stage, manifest=change.plan.manifest_path, reason=reason, **asdict(what)
     )

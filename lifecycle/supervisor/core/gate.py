@@ -20,7 +20,11 @@ from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import rule
 from lifecycle.verify.rules.catalogue import Heals
 from lifecycle.verify.rules.nodes import UNATTRIBUTED_ENDPOINT
-from lifecycle.verify.rules.state import ACTIVATED_AT_CLOSED_GATE, MISSING_REPORT
+from lifecycle.verify.rules.state import (
+    ACTIVATED_AT_CLOSED_GATE,
+    MISSING_REPORT,
+    WRONG_STATE,
+)
 from lifecycle.verify.verdict import Finding, Stage, Verdict
 
 SETTLED_S = 0.5
@@ -171,8 +175,8 @@ def _guarded(node: Node) -> Finding:
     if given_up:
         what = f"it was deactivated {GUARD_TRIES} times; {ACTIVATES_ITSELF}"
     return ACTIVATED_AT_CLOSED_GATE.on_node(
-        Outcome.VIOLATED,
         node.planned,
+        outcome=Outcome.VIOLATED,
         expected="inactive",
         observed="activated by its own code or another client",
         message=f"cannot accept node {node.name}: it was activated by its own code or another "
@@ -236,8 +240,11 @@ def see_violations(run: Run, away: Collection[str]) -> None:
         text = not_ok(replace(verdict, findings=findings)) or _named(keys[0])
         judged.counted = judged.counted or text
     for key in keys:
-        name = _named(key)
-        if key in lasting or len(judged.passed) < _MOST:
+        # Endpoints are known before whose they are, and a look may have begun before who is active
+        # now was.
+        passes = key[0] != UNATTRIBUTED_ENDPOINT.id and (key[0] != WRONG_STATE.id or is_latest(run))
+        if key in lasting or (passes and len(judged.passed) < _MOST):
+            name = _named(key)
             judged.passed[name] = judged.passed.get(name, False) or key in lasting
 
 

@@ -20,7 +20,7 @@ from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import Condition, RunKind, Supervision, TargetState
 from lifecycle.plan.change import GivenParameters, PlanChange
 from lifecycle.plan.model import Plan, PlannedNode, PlannedProcess
-from lifecycle.supervisor.control.protocol import ControlRequest, Failed, ProcessState
+from lifecycle.supervisor.control.protocol import Failed, ProcessState, Question
 from lifecycle.supervisor.core.inputs import Exited
 from lifecycle.supervisor.core.restart import RestartPolicy
 from lifecycle.supervisor.run.events import Failure
@@ -269,22 +269,17 @@ class Process(msgspec.Struct, kw_only=True):
         return self.may_end and self.end is not None and self.end.status == 0
 
 
-class Order(msgspec.Struct, kw_only=True, frozen=True):
+class Order(Question, kw_only=True, frozen=True):
     """What a person, or a ROS client, has ordered.
 
     Attributes:
+        plan: of the manifest that an order names, as it is now; None if it names none.
         id: by which it is answered, once.
-        node: for RESTART, key or full name; empty for the whole system.
-        timeout_s: for APPLY; 0 is as long as a bring-up may take.
         first: the manifest that it was checked against; None if that is of no account.
     """
 
-    id: int
-    ask: ControlRequest
-    node: str = ""
-    mode: str = ""
     plan: Plan | None = None
-    timeout_s: float = 0.0
+    id: int = 0
     first: Plan | None = None
 
 
@@ -548,6 +543,11 @@ class Run(msgspec.Struct, kw_only=True):
                 for each in self.nodes.values()
             )
         )
+
+    def mode_by(self, plan: Plan) -> str:
+        """Return the mode that it would be in by another manifest: the same, if that has it."""
+        names = [each.name for each in plan.modes]
+        return self.mode if self.mode in names else next(iter(names), "")
 
     def node_named(self, name: str) -> Node | None:
         """Return the node with this fully qualified name; None if it is not ours."""

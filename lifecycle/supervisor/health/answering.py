@@ -20,7 +20,7 @@ from lifecycle.supervisor.run.events import Notice
 from lifecycle.supervisor.run.failure import ended
 
 if TYPE_CHECKING:
-    from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
+    from lifecycle.middleware.services.clients import NodeClients
 
 EVERY_S = 2.0
 """A node is asked again so long after it answered."""
@@ -47,9 +47,9 @@ _LEAST_S = 1.0
 class Answering:
     """Asks the nodes of others whether they answer, and has the system know who does not."""
 
-    def __init__(self, system: System, asking: ObserverParticipant) -> None:
+    def __init__(self, system: System, clients: NodeClients) -> None:
         self._system = system
-        self._asking = asking
+        self._clients = clients
         self._said: set[str] = set()
         self._known_s: dict[str, float] = {}  # when it was known last of a node how it is
         self._known = asyncio.Event()
@@ -140,7 +140,7 @@ class Answering:
             if answers is None:
                 unanswered = 0
                 liveliness.answered(node.name)
-                if loop.time() < shown_s and not self._asking.serves_nothing(node.planned):
+                if loop.time() < shown_s and not self._serves_nothing(node):
                     wait_s = _LOOK_S
                     continue
                 self._know(node)
@@ -170,9 +170,16 @@ class Answering:
             message = f"{node.name!r} serves no {what}: whether it hangs is not seen"
             self._system.emit(Notice(message=message))
 
+    def _serves_nothing(self, node: NodeRun) -> bool:
+        """Whether it is certain that a node has nothing that it can be asked by."""
+        serves = self._clients.serves_parameters(node.name)
+        return not node.planned.managed and serves is False
+
     async def _ask(self, node: NodeRun, *, repeat: bool) -> bool | None:
         try:
-            return await self._asking.answers(node.planned, timeout_s=ANSWER_S, repeat=repeat)
+            return await self._clients.answers(
+                node.name, managed=node.planned.managed, timeout_s=ANSWER_S, repeat=repeat
+            )
         except MiddlewareError:
             return None
 

@@ -212,7 +212,7 @@ class SilenceMonitor:
         """Return one finding for each silent node, and one if we receive nothing ourselves."""
         return tuple(
             SILENT_NODE.finding(
-                Outcome.VIOLATED,
+                outcome=Outcome.VIOLATED,
                 subject=name,
                 expected="alive",
                 observed=", ".join(cause.value for cause in silence.causes),
@@ -237,33 +237,21 @@ class SilenceMonitor:
         return replace(verdict, findings=tuple(found))
 
 
-class NodeArrivals:
-    """Reports which nodes joined and left the graph between two observations.
+def arrivals(before: Collection[str], observation: Observation, emit: Emitter) -> frozenset[str]:
+    """Say which nodes joined and left the graph since `before`; return those that are there.
 
     Hidden nodes, whose names begin with an underscore, are left out, as are tools: the one are
     participants of nodes that are reported anyway, the other are in the verdict.
     """
-
-    def __init__(self, emit: Emitter) -> None:
-        self._emit = emit
-        self._present: frozenset[str] = frozenset()
-
-    @property
-    def present(self) -> frozenset[str]:
-        """Names of the nodes that were in the graph when it was last looked at."""
-        return self._present
-
-    def see(self, observation: Observation) -> None:
-        """Compare with what was seen before."""
-        names = (each.full_name for each in observation.nodes)
-        present = frozenset(
-            each for each in names if not is_hidden_node(each) and not is_noise_node(each)
-        )
-        for name in sorted(present - self._present):
-            self._emit(NodeJoined(node=name))
-        for name in sorted(self._present - present):
-            self._emit(NodeLeft(node=name))
-        self._present = present
+    names = (each.full_name for each in observation.nodes)
+    present = frozenset(
+        each for each in names if not is_hidden_node(each) and not is_noise_node(each)
+    )
+    for name in sorted(present - set(before)):
+        emit(NodeJoined(node=name))
+    for name in sorted(set(before) - present):
+        emit(NodeLeft(node=name))
+    return present
 
 
 def _why(silence: _Silence) -> str:
@@ -274,7 +262,7 @@ def not_answering(node: str, after_s: float) -> Finding:
     """Return the finding of a node in no host of ours that answered no request for so long."""
     why = f"it has answered no request for {after_s:g} s: it hangs, or nobody spins it"
     return NOT_ANSWERING.finding(
-        Outcome.UNVERIFIABLE,
+        outcome=Outcome.UNVERIFIABLE,
         subject=node,
         expected="alive",
         observed="no answer",

@@ -17,7 +17,7 @@ from lifecycle.manifest.model import EndpointKind
 from lifecycle.middleware.fastdds.profiles import DEFAULT_LEASE_S
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.connections import discovery_server
-from lifecycle.supervisor.health.liveliness import NodeArrivals
+from lifecycle.supervisor.health.liveliness import arrivals
 from lifecycle.supervisor.judging.standstill import Standstill
 from lifecycle.supervisor.processes.scope import unlimited
 from lifecycle.verify.judge import verify, with_findings, with_only
@@ -32,7 +32,7 @@ from lifecycle.verify.verdict import Finding, Stage, Verdict
 if TYPE_CHECKING:
     from lifecycle.graph.graph import Graph
     from lifecycle.supervisor.connections.authority import ConnectionAuthority
-    from lifecycle.supervisor.health.agreement import Agreement
+    from lifecycle.supervisor.health.peers import Peers
     from lifecycle.supervisor.nodes.system import System
 
 FORGOTTEN_S = DEFAULT_LEASE_S + 1.0
@@ -56,7 +56,7 @@ class Judge:
         system: which.
         observer: sees the graph.
         looker: learns of each look how nodes are connected; None where nodes connect themselves.
-        agreement: of the supervisors of other hosts.
+        peers: the supervisors of other hosts.
 
     Attributes:
         seen: what was seen last.
@@ -68,16 +68,15 @@ class Judge:
         observer: Graph,
         *,
         looker: ConnectionAuthority | None,
-        agreement: Agreement,
+        peers: Peers,
     ) -> None:
         self._system = system
         self._observer = observer
         self._looker = looker
-        self._agreement = agreement
+        self._peers = peers
         self._standstill = Standstill()
         self._stills = 0
         self.seen = Observation()
-        self._presence = NodeArrivals(system.emit)
         self._unsaid: dict[str, float] = {}
         self._asked_of: tuple[Plan, frozenset[str], Plan] | None = None
         self._left: dict[str, float] = {}  # topics of processes that ended, and until when
@@ -115,8 +114,7 @@ class Judge:
         await system.refresh(self._observer, marks=stage is Stage.CONNECTED)
         observation = without(await self._observer.observe(self._asked()), system.dead())
         self.seen = observation
-        self._presence.see(observation)
-        system.present = self._presence.present
+        system.present = arrivals(system.present or (), observation, system.emit)
         if self._looker is not None:
             self._looker.look(observation)
         expected = system.expected
@@ -134,8 +132,8 @@ class Judge:
         verdict = with_findings(
             verdict, (*wiring, *system.liveliness.findings(), *limits), expected.policy
         )
-        verdict = self._agreement.explained(verdict)
-        more = (*self._agreement.findings(observation), *discovery_server.findings(system))
+        verdict = self._peers.explained(verdict)
+        more = (*self._peers.findings(observation), *discovery_server.findings(system))
         return with_findings(verdict, more, expected.policy)
 
     def _asked(self) -> Plan:
@@ -195,7 +193,7 @@ class Judge:
         said of it may be from when the link was cut. Or a step of another supervisor's node.
         """
         others = {each.full_name for each in self._system.remote.values()}
-        reporting = {each.name for each in self._system.nodes.values() if each.reports_changes}
+        reporting = {each.name for each in self._system.nodes.values() if each.is_hosted}
         return any(
             (rule(each.rule).about is About.PROGRESS and each.node in others)
             or (

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING
 
+from lifecycle.plan.build import attached_to
 from lifecycle.plan.model import Plan
 from lifecycle.printable import one_line
 from lifecycle.run_directory import start_ticks
@@ -54,8 +55,8 @@ def ran_before(
         return ()
     return (
         DUPLICATE_NODE.on_node(
-            Outcome.VIOLATED,
             node.planned,
+            outcome=Outcome.VIOLATED,
             expected="1 node of this name",
             observed=f"one more in {_where(older)}",
             message=f"cannot drive {node.name}: a node of this name ran before ({_where(older)}), "
@@ -101,14 +102,14 @@ async def adopt(
     if not found:
         system.emit(Notice(message="nothing is adopted: no node of the manifest runs yet"))
     processes = participant.processes()
-    where = {key: _where(processes.get(each.name, {})) for key, each in found.items()}
-    return system.adopt(where), ()
+    system.adopted = {each.name: _where(processes.get(each.name, {})) for each in found.values()}
+    return attached_to(system.plan, found), ()
 
 
 def _runs_twice(node: NodeRun, count: int) -> Finding:
     return DUPLICATE_NODE.on_node(
-        Outcome.VIOLATED,
         node.planned,
+        outcome=Outcome.VIOLATED,
         expected="1 node of this name",
         observed=f"{count} nodes",
         message=f"cannot adopt {node.name}: {count} nodes are named so",

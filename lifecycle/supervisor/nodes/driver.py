@@ -7,7 +7,8 @@ of operations is the core's. Must not import rclpy at run time.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable
+import contextlib
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -40,13 +41,11 @@ class NodeCondition(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         state: lifecycle_msgs/State label.
         connected: the data layer is made.
-        configuration: as the node reports it; None where it does not.
         already: nothing was asked of it: it was there before.
     """
 
     state: str
     connected: bool = False
-    configuration: NodeConfiguration | None = None
     already: bool = False
 
 
@@ -82,17 +81,11 @@ class ControlDriver:
             reason = reply.error or f"the node is {reply.state or 'in an unknown state'}"
             kind = ChangedError if reply.changed else BringUpError
             raise kind(f"cannot {operation.value} {self._node!r}: {reason}")
-        return NodeCondition(
-            state=reply.state, connected=reply.connected, configuration=reply.configuration
-        )
-
-    async def configuration(self) -> NodeConfiguration | None:
-        """Ask the host for its configuration."""
-        return (await self.perform(Operation.GET_CONFIGURATION)).configuration
+        return NodeCondition(state=reply.state, connected=reply.connected)
 
     async def interface(self) -> NodeConfiguration | None:
-        """Ask the host what the node can be wired by."""
-        return await self.configuration()
+        """Ask the host for the node's configuration, which says what it can be wired by."""
+        return await self.wire(Command(node=self._node, operation=Operation.GET_CONFIGURATION))
 
     async def wire(self, step: Command) -> NodeConfiguration | None:
         """Send the step and wait for the reply.
@@ -150,10 +143,8 @@ class NodeInterfaceClient:
         Raises:
             BringUpError: it has one, which does not answer or cannot be read.
         """
-        try:
+        with _failed_steps():
             return await self._services.get_configuration(self._node, timeout_s=self._timeout_s)
-        except MiddlewareError as error:
-            raise BringUpError(error.message, hint=error.hint) from error
 
     async def wire(self, step: Command) -> NodeConfiguration | None:
         """Call the node interface's service, and read what came of it.
@@ -166,10 +157,8 @@ class NodeInterfaceClient:
             asked = ("connect_to", step.connection, step.connections.urls)
         elif step.operation is Operation.MAP_TO:
             asked = ("map_to", step.endpoint, step.connection)
-        try:
+        with _failed_steps(f"cannot {step}: "):
             await self._services.wire(self._node, *asked, timeout_s=self._timeout_s)
-        except MiddlewareError as error:
-            raise BringUpError(f"cannot {step}: {error.message}", hint=error.hint) from error
         return await self.interface()
 
 
@@ -186,23 +175,18 @@ class ServiceDriver(NodeInterfaceClient):
 
     async def start(self) -> NodeCondition:
         """Wait until the services answer."""
-        return await self._reported(self._start())
+        with _failed_steps():
+            return _standing(await self._settled(self._timeouts.start_s))
 
     async def perform(self, operation: Operation, permit: Permit | None = None) -> NodeCondition:
         """Change the state unless the node is there already."""
-        return await self._reported(self._perform(operation, permit))
-
-    async def configuration(self) -> NodeConfiguration | None:
-        """Say None: observers read it from the graph where there is one."""
-        return None
-
-    async def _start(self) -> NodeCondition:
-        return _standing(await self._settled(self._timeouts.start_s))
+        with _failed_steps():
+            return await self._perform(operation, permit)
 
     async def _settled(self, limit_s: float) -> str:
         """Return its state; one in which somebody else's transition is under way passes."""
         while True:
-            state = await self._state(limit_s)
+            state = await self._services.get_state(self._node, timeout_s=limit_s)
             if state in _PRIMARY:
                 return state
             await asyncio.sleep(_PASSING_S)
@@ -213,7 +197,7 @@ class ServiceDriver(NodeInterfaceClient):
         if operation in _NESTED:
             offered = await self._services.get_available_transitions(self._node, timeout_s=limit_s)
             asked = operation.value in offered
-            if asked and not await self._change(operation, limit_s):
+            if asked and not await self._ask(operation, limit_s, permit):
                 raise BringUpError(f"cannot {operation.value} {self._node!r}: it refused")
             return _standing(state, already=not asked)
         wanted, reason, asked, accepted = _REACHED[operation], "it is", False, False
@@ -225,7 +209,11 @@ class ServiceDriver(NodeInterfaceClient):
             if state == wanted:
                 return _standing(state, already=not asked)
             if operation is Operation.CONFIGURE and state == ACTIVE:
-                raise self._active()
+                raise ActiveError(
+                    f"cannot configure {self._node!r}: it is active already, and nobody verified "
+                    "it; have it adopted as it is with 'lifecycle up --adopt', or deactivate it "
+                    f"first: ros2 lifecycle set {self._node} deactivate"
+                )
             if state not in _BEGINS_IN[operation]:
                 break  # rclpy's nodes end of a request that their state does not allow
             accepted = await self._ask(operation, limit_s, permit)
@@ -239,47 +227,23 @@ class ServiceDriver(NodeInterfaceClient):
                 break
             # Somebody has moved it meanwhile: it is looked at again.
         if operation is Operation.DEACTIVATE and state == ACTIVE and accepted:
-            raise self._active_again()
+            raise ActiveError(
+                f"cannot deactivate {self._node!r}: it was activated again by its own code or "
+                f"another client each of the {_TRIES} times"
+            )
         raise BringUpError(f"cannot {operation.value} {self._node!r}: {reason} {state}")
 
     async def _ask(self, operation: Operation, limit_s: float, permit: Permit | None) -> bool:
         """Ask for a transition; return whether it was accepted and completed."""
-        if operation is not Operation.ACTIVATE:
-            return await self._change(operation, limit_s)
-        if permit is None:
+        activates = operation is Operation.ACTIVATE
+        if activates and permit is None:
             raise BringUpError(f"cannot activate {self._node!r} without a permit from the gate")
         return await self._services.change_state(
             self._node,
             operation.value,
             timeout_s=limit_s,
-            before=permit.use,
+            before=permit.use if activates and permit is not None else None,
         )
-
-    def _active_again(self) -> ActiveError:
-        return ActiveError(
-            f"cannot deactivate {self._node!r}: it was activated again by its own code or another "
-            f"client each of the {_TRIES} times"
-        )
-
-    def _active(self) -> ActiveError:
-        return ActiveError(
-            f"cannot configure {self._node!r}: it is active already, and nobody verified it; "
-            f"have it adopted as it is with 'lifecycle up --adopt', or deactivate it first: "
-            f"ros2 lifecycle set {self._node} deactivate"
-        )
-
-    async def _change(self, operation: Operation, limit_s: float) -> bool:
-        return await self._services.change_state(self._node, operation.value, timeout_s=limit_s)
-
-    async def _state(self, limit_s: float) -> str:
-        return await self._services.get_state(self._node, timeout_s=limit_s)
-
-    async def _reported(self, doing: Awaitable[NodeCondition]) -> NodeCondition:
-        """Turn the middleware's errors into a failed step."""
-        try:
-            return await doing
-        except MiddlewareError as error:
-            raise BringUpError(error.message, hint=error.hint) from error
 
     def _limit_s(self, operation: Operation) -> float:
         limits = self._timeouts
@@ -297,3 +261,12 @@ NodeDriver = ControlDriver | ServiceDriver
 
 def _standing(state: str, *, already: bool = False) -> NodeCondition:
     return NodeCondition(state=state, connected=state in {INACTIVE, ACTIVE}, already=already)
+
+
+@contextlib.contextmanager
+def _failed_steps(before: str = "") -> Iterator[None]:
+    """Turn the middleware's errors into those of a failed step."""
+    try:
+        yield
+    except MiddlewareError as error:
+        raise BringUpError(f"{before}{error.message}", hint=error.hint) from error

@@ -1,4 +1,4 @@
-"""The supervisor's participant: it observes the graph and drives nodes that are not ours.
+"""The supervisor's participant: it observes the graph, and other supervisors see it.
 
 Owns: one `lifecycle.graph.Graph` and what else is on its participant; rclpy is imported here, late,
 and nowhere else in this room.
@@ -10,16 +10,13 @@ import asyncio
 import contextlib
 import os
 import shlex
-from collections.abc import Awaitable, Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import TYPE_CHECKING
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.graph.loop import set_within
-from lifecycle.manifest.names import supervisor_alive_topic
-from lifecycle.plan.model import ParticipantConnections, PlannedNode
+from lifecycle.plan.model import ParticipantConnections
 from lifecycle.supervisor.control.ros_interface import Answer
-from lifecycle.supervisor.health.peer_supervisors import Listener
-from lifecycle.supervisor.nodes.driver import NodeDriver, NodeInterfaceClient, ServiceDriver
 from lifecycle.verify.observation import ObservedEndpoint, ObservedNode
 from lifecycle.verify.tool_filter import known_node
 
@@ -94,27 +91,6 @@ class ObserverParticipant:
 
         return unknown_versions()
 
-    def driver(self, node: PlannedNode) -> NodeDriver:
-        """Return the driver of a managed node that is not hosted by us."""
-        return ServiceDriver(self.clients, node)
-
-    async def answers(
-        self, node: PlannedNode, *, timeout_s: float, repeat: bool = False
-    ) -> bool | None:
-        """Return whether a node answers a request, within seconds; None: it shows no service."""
-        return await self.clients.answers(
-            node.full_name, managed=node.managed, timeout_s=timeout_s, repeat=repeat
-        )
-
-    def serves_nothing(self, node: PlannedNode) -> bool:
-        """Return whether it is certain that a node has nothing that it can be asked by."""
-        serves = self.clients.serves_parameters(node.full_name)
-        return not node.managed and serves is False
-
-    def node_interface(self, node: str) -> NodeInterfaceClient:
-        """Return what drives the node interface of any node that has one, by full name."""
-        return NodeInterfaceClient(self.clients, node)
-
     async def running(self, wait_s: float) -> tuple[tuple[ObservedNode, ...], str]:
         """Return the nodes in the graph once discovery has settled, and what it lacked in the end.
 
@@ -131,30 +107,26 @@ class ObserverParticipant:
             for name, programs in self.discovery.programs(os.environ).items()
         }
 
-    async def load(self, node: PlannedNode, container: str) -> Callable[[], Awaitable[None]]:
-        """Have a component container load a node; return what unloads it.
-
-        Raises:
-            MiddlewareError: with the reason; so does what unloads.
-        """
-        limit_s = node.timeouts.start_s
-        return await self.clients.load_component(node, container, timeout_s=limit_s)
-
-    def announce_machine(self, system: str, machine: str) -> AlivePublisher:
-        """Announce ourselves as the supervisor of a machine, by DDS liveliness."""
+    def announce_alive(self, topic: str) -> AlivePublisher:
+        """Assert by DDS liveliness that we live."""
         from lifecycle.middleware.discovery.liveliness import AlivePublisher
 
-        return AlivePublisher(self._node, supervisor_alive_topic(system, machine))
+        return AlivePublisher(self._node, topic)
 
-    def watch_machine(self, system: str, machine: str, to: Listener) -> AliveSubscription:
-        """Watch the liveliness of the supervisor of a machine."""
-        return self._watch(supervisor_alive_topic(system, machine), to)
+    def watch_alive(
+        self,
+        topic: str,
+        *,
+        on_liveliness: Callable[[bool], None],
+        on_left: Callable[[], None],
+        on_notice: Callable[[Mapping[str, str]], None],
+    ) -> AliveSubscription:
+        """Watch the liveliness of another supervisor, or of a node that is attached."""
+        from lifecycle.middleware.discovery.liveliness import AliveSubscription
 
-    def watch_node(self, node: str, to: Listener) -> AliveSubscription:
-        """Watch the liveliness of a node that is attached."""
-        from lifecycle.middleware.discovery.liveliness import node_topic
-
-        return self._watch(node_topic(node), to)
+        return AliveSubscription(
+            self._node, topic, on_liveliness=on_liveliness, on_left=on_left, on_notice=on_notice
+        )
 
     def plan_notices(self, on_notice: Callable[[str], None]) -> PlanNotices:
         """Take part in the exchange of plans."""
@@ -193,13 +165,6 @@ class ObserverParticipant:
         from lifecycle.middleware.rcl.hidden_node import republish_names
 
         republish_names([self._node])
-
-    def _watch(self, topic: str, to: Listener) -> AliveSubscription:
-        from lifecycle.middleware.discovery.liveliness import AliveSubscription
-
-        return AliveSubscription(
-            self._node, topic, on_liveliness=to.alive, on_left=to.left, on_notice=to.silent
-        )
 
     def prepare_to_leave(self) -> None:
         """Let go of connections that do not answer: all that is sent would wait for their ends."""

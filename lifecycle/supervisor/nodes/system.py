@@ -8,23 +8,28 @@ only read. Must not import rclpy.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Iterable, Mapping
+import contextlib
+from collections.abc import Awaitable, Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
 from lifecycle.errors import BringUpError
-from lifecycle.manifest.model import Condition, RosArguments, RunKind, TargetState
+from lifecycle.manifest.model import Condition, RosArguments, RunKind
 from lifecycle.node.host.control import Event as HostEvent
-from lifecycle.plan.build import attached_to
 from lifecycle.plan.model import Plan, PlannedNode, PlannedProcess
 from lifecycle.plan.parameters import DEFAULT
-from lifecycle.supervisor.control.protocol import ProcessState, Reach
+from lifecycle.supervisor.control.protocol import Reach
 from lifecycle.supervisor.core import failure
 from lifecycle.supervisor.core.state import Level, Node, Options, Run, new_run
 from lifecycle.supervisor.health.liveliness import SilenceMonitor
-from lifecycle.supervisor.nodes.driver import ACTIVE, INACTIVE, NodeCondition, NodeDriver
+from lifecycle.supervisor.nodes.driver import (
+    ACTIVE,
+    INACTIVE,
+    ControlDriver,
+    NodeDriver,
+)
 from lifecycle.supervisor.processes.fork_server_main import GRACE_S
 from lifecycle.supervisor.processes.logs import LogDirectory
 from lifecycle.supervisor.processes.process import ManagedProcess, own_run_delay_s
@@ -57,10 +62,6 @@ class NodeRun:
         state: lifecycle_msgs/State label; empty for a node that is not managed.
         connected: its data layer is made.
         configuration: what it reports of itself; None before it does.
-        connections: names of what the authority connected it to, oldest first.
-        found: state in which it was adopted, `running` for one that is not managed; empty for one
-            that is not adopted.
-        reports_changes: its host reports unasked when its configuration changes.
         unload: has its container unload a component; None for what is not loaded into one.
         told: the step of wiring that it is asked for just now; empty when none.
         health: what it, and /diagnostics of it, was seen to say of it in the graph.
@@ -68,7 +69,6 @@ class NodeRun:
 
     def __init__(self, system: System, core: Node) -> None:
         self.core = core
-        self.found = ""
         self._system = system
         self._said = NodeChanged(node=core.name, reach=Reach.WAITING)
         self.begin()
@@ -79,8 +79,6 @@ class NodeRun:
         self.state = ""
         self.connected = False
         self.configuration: NodeConfiguration | None = None
-        self.connections: tuple[str, ...] = ()
-        self.reports_changes = False
         self.unload: Callable[[], Awaitable[None]] | None = None
         self.told = ""
         self.health: tuple[HealthReport | None, HealthReport | None] = (None, None)
@@ -137,11 +135,6 @@ class NodeRun:
         """Whether it was brought as far as its gate."""
         return self.core.level >= self.core.gate
 
-    @property
-    def is_to_be_active(self) -> bool:
-        """Whether the gate is to activate it."""
-        return self.planned.holds and self.planned.state is TargetState.ACTIVE
-
     def run_delay_s(self) -> float:
         """Return the run delay of its process and ours, seconds: ready to run, but without CPU."""
         return own_run_delay_s() if self.process is None else self.process.run_delay_s()
@@ -161,6 +154,11 @@ class NodeRun:
             return True  # it may come again in another mode; rcl reads no empty array
         shared = len(process.planned.nodes) > 1
         return shared and planned.namespace != "/" and bool(planned.parameters)
+
+    @property
+    def is_marked(self) -> bool:
+        """Whether the plan says what DSCP any of its endpoints sends with."""
+        return any(each.dscp is not None for each in self.planned.endpoints)
 
     @property
     def reports_health(self) -> bool:
@@ -186,18 +184,9 @@ class NodeRun:
         said = self._known_health.message
         return f": {said}" if said and self.core.level is Level.ACTIVE else ""
 
-    def take(self, condition: NodeCondition) -> None:
-        """Take what it said of itself in a reply."""
-        self.report(condition.state, connected=condition.connected)
-        self.learn(condition.configuration)
-
     def learn(self, configuration: NodeConfiguration | None) -> None:
-        """Take a configuration that was asked for; None is nothing to take.
-
-        Of a node whose host reports, every configuration has been taken in the order of its channel
-        by now (System.on_host_event): what a reply carried may be older than what came since.
-        """
-        if configuration is not None and not self.reports_changes:
+        """Take a configuration that was asked for; a host of ours reports its own, in order."""
+        if configuration is not None and not self.is_hosted:
             self.configuration = configuration
 
     def report(self, state: str, *, connected: bool) -> None:
@@ -238,9 +227,8 @@ class System:
         remote: the plan's other nodes, which another supervisor brings up, by key.
         machines: those whose nodes it brings up; None if that is all of them.
         logs: likewise, with what could not be written there.
-        adopts: takes nodes that others started as they are found, active ones too.
         adopted: the nodes that ran before it, by full name, with the process that each is in as
-            people read it; empty where that is not known.
+            people read it, empty where that is not known; None if none is to be adopted.
         on_change: called whenever something is not as it was judged: time to judge again.
         on_health: likewise with a node that may be as healthy as others wait for.
         liveliness: which nodes are silent.
@@ -271,8 +259,7 @@ class System:
         self.remote = {key: plan.node(key) for key in self.run.elsewhere}
         self.machines = frozenset(each.machine for each in own) if self.remote else None
         self._by_name: dict[str, NodeRun] = {}
-        self.adopts = False
-        self.adopted: dict[str, str] = {}
+        self.adopted: dict[str, str] | None = None
         self.on_change: Callable[[], None] = lambda: None
         self.on_health: Callable[[NodeRun], None] = lambda _: None
         self.present: frozenset[str] | None = None
@@ -288,21 +275,6 @@ class System:
     def first(self) -> Plan:
         """As it was made from the manifest in force, without what became of it since."""
         return self.run.first
-
-    @property
-    def mode(self) -> str:
-        """Name of the mode that it is in, or is on its way to; empty for a plan without modes."""
-        return self.run.mode
-
-    @property
-    def revision(self) -> int:
-        """Number of the manifest in force; 1 for the one that the run began with."""
-        return self.run.revision
-
-    def mode_by(self, plan: Plan) -> str:
-        """Return the mode that it would be in by another manifest: the same, if that has it."""
-        names = [each.name for each in plan.modes]
-        return self.mode if self.mode in names else next(iter(names), "")
 
     def touch(self) -> None:
         """Note that something may be other than it was judged."""
@@ -384,27 +356,10 @@ class System:
             return False
         return self.present is None or name in self.present
 
-    def adopt(self, running: Mapping[str, str]) -> Plan:
-        """Leave nodes to who started them; return the plan that attaches to them.
-
-        Args:
-            running: by key, the process that each is in as people read it; of the processes that
-                would have been started for them, all nodes.
-        """
-        self.adopts = True
-        for key, where in running.items():
-            self.adopted[self.nodes[key].name] = where
-        return attached_to(self.plan, running)
-
-    def note_found(self, node: NodeRun, state: str) -> None:
-        """Note, and say, how a node was found that others started and that is adopted."""
+    def is_adopted(self, node: NodeRun) -> bool:
+        """Whether a node that others started is taken as it is found, also where it is active."""
         others = not node.core.process and not node.planned.run.component
-        if not self.adopts or not others or node.found:
-            return
-        node.found = state
-        where = self.adopted.get(node.name)
-        message = f"{node.name!r} is adopted, found {state}" + (f": {where}" if where else "")
-        self.emit(Notice(message=message))
+        return others and self.adopted is not None
 
     @property
     def living(self) -> tuple[ManagedProcess, ...]:
@@ -423,8 +378,6 @@ class System:
             return
         if event.configuration is not None:
             node.configuration = event.configuration
-            reports = event.kind == "configuration" or event.reports
-            node.reports_changes = node.reports_changes or reports
         if event.kind != "reply" and event.state:
             node.report(event.state, connected=event.connected)
         self.on_health(node)
@@ -432,10 +385,11 @@ class System:
             self.touch()
 
     async def refresh(self, observer: Graph, *, marks: bool = False) -> None:
-        """Read the configuration of every reachable node and give it to the observer.
+        """Give the observer what every reachable node reports of itself.
 
-        One whose host reports every change by itself is not asked. A node that does not answer
-        keeps its last one: that it is gone is for the graph and its process to say.
+        A host reports every change by itself; one that has not begun to is asked, and does not
+        hold up a look for long. A node that does not answer keeps its last configuration: that it
+        is gone is for the graph and its process to say.
 
         Args:
             observer: see above.
@@ -451,24 +405,20 @@ class System:
         ]
         await asyncio.gather(
             *(
-                self._refresh(node)
+                _refresh(node.driver)
                 for node in nodes
-                if not node.reports_changes
-                or (marks and any(each.dscp is not None for each in node.planned.endpoints))
+                if isinstance(node.driver, ControlDriver)
+                and (node.configuration is None or (marks and node.is_marked))
             )
         )
         for node in nodes:
             if node.configuration is not None:
                 observer.state.put_configuration(node.configuration)
 
-    @staticmethod
-    async def _refresh(node: NodeRun) -> None:
-        assert node.driver is not None
-        try:
-            fresh = await asyncio.wait_for(node.driver.configuration(), _REFRESH_S)
-        except (BringUpError, asyncio.TimeoutError):
-            return
-        node.learn(fresh)
+
+async def _refresh(driver: ControlDriver) -> None:
+    with contextlib.suppress(BringUpError, asyncio.TimeoutError):
+        await asyncio.wait_for(driver.interface(), _REFRESH_S)
 
 
 def level_of(node: NodeRun) -> Level:
@@ -480,6 +430,3 @@ def level_of(node: NodeRun) -> Level:
     if node.state == INACTIVE:
         return Level.CONNECTED if node.connected else Level.CONFIGURED
     return Level.STARTED
-
-
-PROCESS_ENDED = (ProcessState.EXITED, ProcessState.BACKOFF)

@@ -13,7 +13,7 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 
 from lifecycle.codec import from_json, to_json
 from lifecycle.errors import BringUpError
@@ -29,8 +29,6 @@ from lifecycle.supervisor.processes.fork_server_main import (
 from lifecycle.supervisor.processes.fork_server_process import CLOSE_S, ForkServerProcess
 from lifecycle.supervisor.processes.orphans import (
     Lineage,
-    children,
-    descendants,
     end,
     marked,
     reap_adopted,
@@ -68,16 +66,14 @@ class ForkServerChild:
         self.process = process
         self.pid = pid
         self._lineage = lineage
-        self.exited: asyncio.Future[ProcessExit] = asyncio.get_running_loop().create_future()
-        self._pidfd: int | None = pidfd
-        self._has_ended = False
-        self._is_ours = False
         self._loop = asyncio.get_running_loop()
-        self._loop.add_reader(pidfd, self._ended)
+        self.exited: asyncio.Future[ProcessExit] = self._loop.create_future()
+        self._pidfd = pidfd
+        self._loop.add_reader(pidfd, self._ended, _STATUS_WAIT_S)
 
     def signal(self, number: int) -> None:
         """Send a signal to the child's group; harmless once it ended."""
-        if self._pidfd is None:
+        if self.exited.done():
             return
         try:
             os.killpg(self.pid, number)
@@ -90,39 +86,29 @@ class ForkServerChild:
         """Return how long its threads, and those of its descendants, waited for a processor."""
         return sum(map(run_delay_s, self._lineage.of(self.pid)))
 
-    def _ended(self) -> None:
+    def _ended(self, patience_s: float) -> None:
         """The pidfd is readable: it ended. The fork server reports how, unless it is gone."""
-        assert self._pidfd is not None
-        self._loop.remove_reader(self._pidfd)
-        self._has_ended = True
-        if self._is_ours:
-            self.settle(None)
-        else:
-            self._loop.call_later(_STATUS_WAIT_S, self.settle, None)
-
-    def orphaned(self) -> None:
-        """Learn by ourselves how it ends: the fork server has died, and we are the subreaper."""
-        self._is_ours = True
-        if self._has_ended:
-            self.settle(None)
-
-    def settle(self, raw: int | None) -> None:
-        """Take the wait status, or find it ourselves."""
         if self.exited.done():
             return
-        assert self._pidfd is not None
         self._loop.remove_reader(self._pidfd)
-        exit_ = ProcessExit() if raw is None else ProcessExit.from_wait(raw)
-        if raw is None:
-            with contextlib.suppress(ChildProcessError):
-                found = os.waitid(os.P_PIDFD, self._pidfd, os.WEXITED | os.WNOHANG)
-                if found is not None and found.si_code == os.CLD_EXITED:
-                    exit_ = ProcessExit(status=found.si_status)
-                elif found is not None:
-                    exit_ = ProcessExit(signal=found.si_status)
-        os.close(self._pidfd)
-        self._pidfd = None
-        self.exited.set_result(exit_)
+        found = None
+        with contextlib.suppress(ChildProcessError):  # else the fork server has left it to us
+            found = os.waitid(os.P_PIDFD, self._pidfd, os.WEXITED | os.WNOHANG)
+        if found is not None:
+            is_exit = found.si_code == os.CLD_EXITED
+            kind = {"status" if is_exit else "signal": found.si_status}
+            self.settle(ProcessExit(**kind))
+        elif patience_s > 0:
+            self._loop.call_later(patience_s, self._ended, 0.0)
+        else:
+            self.settle(ProcessExit())
+
+    def settle(self, how: ProcessExit) -> None:
+        """Take how it ended."""
+        if not self.exited.done():
+            self._loop.remove_reader(self._pidfd)
+            os.close(self._pidfd)
+            self.exited.set_result(how)
 
 
 class ForkServer:
@@ -136,17 +122,16 @@ class ForkServer:
     """
 
     def __init__(self, process: ForkServerProcess) -> None:
+        self._process = process
+        self._loop = asyncio.get_running_loop()
         self._pending: dict[int, tuple[asyncio.Future[ForkServerChild], ManagedProcess]] = {}
         self._children: dict[int, ForkServerChild] = {}
         self._next = 0
-        self._loop = asyncio.get_running_loop()
         # Of a shell that became this process by exec: no part of the run.
-        self._foreign = children()
+        self._foreign = Lineage().children(os.getpid())
         self._lineage = Lineage()
         self.died: asyncio.Future[str] = self._loop.create_future()
         self._closed = False
-        self._process = process
-        self._alive = True
         self._serves = asyncio.Event()
         self._gone = asyncio.Event()
         self._pidfd = os.pidfd_open(process.popen.pid)
@@ -166,11 +151,11 @@ class ForkServer:
 
     def family(self) -> frozenset[int]:
         """Return the pids of all that descends from what was started, but for the fork server."""
-        roots = {self.pid}
+        lineage, roots = Lineage(), {self.pid}
         if self.died.done():
             # What it had adopted, and what it had started, is ours now.
-            roots |= children() - self._foreign
-        return frozenset(roots.union(*map(descendants, roots)) - {self.pid})
+            roots |= lineage.children(os.getpid()) - self._foreign
+        return frozenset().union(*map(lineage.of, roots)) - {self.pid}
 
     async def ready(self) -> None:
         """Have the fork server answer, bounded.
@@ -179,26 +164,22 @@ class ForkServer:
             BringUpError: it does not, or has died.
         """
         self._serves.clear()
-        with self._asking():
-            self._process.socket.send(SERVES.encode())
+        self._ask(SERVES.encode())
         if not await set_within(self._serves, _READY_S):
             raise BringUpError(f"the fork server does not answer within {_READY_S:g} s")
-        self._check()
+        if self.died.done():
+            raise BringUpError(self.died.result())
 
-    @contextlib.contextmanager
-    def _asking(self) -> Iterator[None]:
-        """Raise BringUpError if it has died, or cannot be asked."""
-        self._check()
+    def _ask(self, message: bytes, descriptors: Sequence[int] = ()) -> None:
+        """Send a message; raises BringUpError if it has died, or cannot be asked."""
+        if self.died.done():
+            raise BringUpError(self.died.result())
         try:
-            yield
+            socket.send_fds(self._process.socket, [message], descriptors)
         except ConnectionError as error:  # it is dying: nothing was forked
             raise BringUpError("the fork server has died") from error
         except OSError as error:
             raise BringUpError(f"cannot ask the fork server: {error.strerror}") from error
-
-    def _check(self) -> None:
-        if not self._alive:
-            raise BringUpError(self.died.result() if self.died.done() else "the fork server ended")
 
     async def spawn(
         self, process: ManagedProcess, streams: Sequence[int], control: int | None
@@ -214,17 +195,6 @@ class ForkServer:
         Raises:
             BringUpError: the fork server is gone, or the system is out of processes.
         """
-        try:
-            return await self._forked(process, streams, control)
-        except (BringUpError, OSError) as error:
-            message = error.message if isinstance(error, BringUpError) else str(error)
-            raise BringUpError(f"cannot start process {process.name!r}: {message}") from error
-
-    async def _forked(
-        self, process: ManagedProcess, streams: Sequence[int], control: int | None
-    ) -> ForkServerChild:
-        """Have it fork; raises BringUpError if it cannot."""
-        self._next += 1
         planned, run = process.planned, process.planned.run
         descriptors = [*streams]
         scoped = scope(run.resources)
@@ -235,6 +205,7 @@ class ForkServer:
             if fresh or run.prefix or scoped:
                 host = (sys.executable, "-m", _HOST, "--control-fd", "{control}")
                 argv = (*scoped, *run.prefix, *host)
+        self._next += 1
         message = ForkRequest(
             id=self._next,
             argv=argv,
@@ -246,10 +217,12 @@ class ForkServer:
             grace_s=process.grace_s,
         )
         born: asyncio.Future[ForkServerChild] = self._loop.create_future()
-        with self._asking():
-            socket.send_fds(self._process.socket, [to_json(message)], descriptors)
-        self._pending[message.id] = (born, process)
-        return await born
+        try:
+            self._ask(to_json(message), descriptors)
+            self._pending[message.id] = (born, process)
+            return await born
+        except BringUpError as error:
+            raise BringUpError(f"cannot start process {process.name!r}: {error.message}") from error
 
     def belonging(self, processes: Mapping[int, str]) -> set[int]:
         """Return the pids of all that processes have started, whether they live or not.
@@ -297,35 +270,31 @@ class ForkServer:
         return {each.pid for each in self._children.values() if not each.exited.done()}
 
     def _reports(self) -> None:
-        """Take one report; at end of file it is about to end."""
-        if self._report() is False:
-            self._loop.remove_reader(self._process.socket)
+        """Take the reports that have come."""
+        while True:
+            try:
+                data, descriptors, _, _ = socket.recv_fds(
+                    self._process.socket, LARGEST_MESSAGE, 1, MSG_CMSG_CLOEXEC
+                )
+            except BlockingIOError:
+                return
+            except ConnectionError:
+                continue  # it died with requests unread; what it had sent before still comes
+            if not data:  # it is about to end
+                self._loop.remove_reader(self._process.socket)
+                return
+            self._take(from_json(data, ChildReport), descriptors)
 
-    def _report(self) -> bool | None:
-        """Take one report: True; False at end of file, None if there is nothing more now."""
-        try:
-            data, descriptors, _, _ = socket.recv_fds(
-                self._process.socket, LARGEST_MESSAGE, 1, MSG_CMSG_CLOEXEC
-            )
-        except BlockingIOError:
-            return None
-        except ConnectionError:
-            return True  # it died with requests unread; what it had sent before still comes
-        if not data:
-            return False
-        report = from_json(data, ChildReport)
+    def _take(self, report: ChildReport, descriptors: list[int]) -> None:
+        child = self._children.get(report.id)
         if report.id == 0:
             self._serves.set()
-        elif report.stopped is not None:
-            if report.id in self._children:
-                self._children[report.id].process.on_stop(report.stopped)
-        elif report.status is not None:
-            # On a loaded machine it may come later than we waited for it.
-            if report.id in self._children:
-                self._children.pop(report.id).settle(report.status)
-        else:
+        elif report.id in self._pending:
             self._born(report, descriptors)
-        return True
+        elif child is not None and report.stopped is not None:
+            child.process.on_stop(report.stopped)
+        elif child is not None and report.status is not None:
+            child.settle(ProcessExit.from_wait(report.status))
 
     def _born(self, report: ChildReport, descriptors: list[int]) -> None:
         born, process = self._pending.pop(report.id)
@@ -350,16 +319,10 @@ class ForkServer:
         self._gone.set()
         if self._closed:
             return
-        while self._report():
-            pass
-        self._loop.remove_reader(self._process.socket)
-        self._process.socket.close()
-        self._alive = False
+        self._reports()
         exit_ = ProcessExit(status=status) if status >= 0 else ProcessExit(signal=-status)
         self.died.set_result(f"the fork server (pid {self.pid}) ended unasked: {exit_}")
         self._serves.set()
-        for child in tuple(self._children.values()):
-            child.orphaned()
         for born, _ in self._pending.values():
             if not born.done():
                 born.set_exception(BringUpError(self.died.result()))
@@ -368,9 +331,6 @@ class ForkServer:
     async def close(self) -> None:
         """End the fork server; its children must have ended."""
         self._closed = True
-        if not self._alive:
-            return
-        self._alive = False
         self._loop.remove_reader(self._process.socket)
         self._process.socket.close()
         if not await set_within(self._gone, CLOSE_S):

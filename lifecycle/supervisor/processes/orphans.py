@@ -34,21 +34,7 @@ GRACE_S = 3.0
 KILL_S = 5.0
 """How long the kernel may take to end a killed process, before it is reported."""
 
-_TASKS = Path("/proc/self/task")
-
 _LOOK_S = 0.02
-
-
-class _Orphan:
-    """A process held by its pidfd, so that no signal can reach a later owner of the pid."""
-
-    def __init__(self, pid: int, pidfd: int) -> None:
-        self.pid = pid
-        self.pidfd = pidfd
-
-    def signal(self, number: int) -> None:
-        with contextlib.suppress(ProcessLookupError):
-            signal.pidfd_send_signal(self.pidfd, number)
 
 
 def reap_adopted(spare: Iterable[int]) -> None:
@@ -60,7 +46,7 @@ def reap_adopted(spare: Iterable[int]) -> None:
         return
     try:
         spared = set(spare)
-        for pid in children() - spared:
+        for pid in Lineage().children(os.getpid()) - spared:
             with contextlib.suppress(ChildProcessError):
                 os.waitpid(pid, os.WNOHANG)
     finally:
@@ -73,35 +59,11 @@ def end_run(record: RunRecord) -> tuple[int, ...]:
         return ()
     pids = {child.pid for child in record.children if is_process(child.pid, child.start_ticks)}
     pids |= marked(record.run_id).keys()
+    lineage = Lineage()
     for pid in tuple(pids):
-        pids.update(descendants(pid))
+        pids |= lineage.of(pid)
     pids.discard(os.getpid())
     return asyncio.run(end(pids, GRACE_S))
-
-
-def children() -> frozenset[int]:
-    """Return the pids of the children of this process, adopted ones included."""
-    try:
-        found = [each.read_text(encoding="ascii") for each in _TASKS.glob("*/children")]
-    except OSError:
-        found = []  # a thread that has just ended
-    if not found:  # or a kernel without CONFIG_PROC_CHILDREN
-        return frozenset(_children().get(os.getpid(), ()))
-    return frozenset(int(pid) for text in found for pid in text.split())
-
-
-def descendants(pid: int) -> tuple[int, ...]:
-    """Return the pids of everything that descends from a process; nothing once it has ended."""
-    return tuple(Lineage().of(pid) - {pid})
-
-
-def _children() -> dict[int, list[int]]:
-    """Return the pids of the children of every process that has any."""
-    found: dict[int, list[int]] = {}
-    for entry in os.listdir("/proc"):  # noqa: PTH208 - hot loop
-        if entry.isdigit() and (parent := parent_of(int(entry))) is not None:
-            found.setdefault(parent, []).append(int(entry))
-    return found
 
 
 class Lineage:
@@ -113,18 +75,23 @@ class Lineage:
         self._read_s = float("-inf")
         self._children: dict[int, list[int]] = {}
 
+    def children(self, pid: int) -> set[int]:
+        """Return the children of a process, adopted ones included."""
+        if time.monotonic() - self._read_s > self.FRESH_S:
+            self._children = {}
+            for entry in os.listdir("/proc"):  # noqa: PTH208 - hot loop
+                if entry.isdigit() and (parent := parent_of(int(entry))) is not None:
+                    self._children.setdefault(parent, []).append(int(entry))
+            self._read_s = time.monotonic()
+        return set(self._children.get(pid, ()))
+
     def of(self, pid: int) -> set[int]:
         """Return a process and all that descends from it."""
-        if time.monotonic() - self._read_s > self.FRESH_S:
-            self._children = _children()
-            self._read_s = time.monotonic()
         found: set[int] = set()
-        left = [pid]
+        left = {pid}
         while left:
-            each = left.pop()
-            if each not in found:
-                found.add(each)
-                left += self._children.get(each, ())
+            found |= left
+            left = set().union(*map(self.children, left)) - found
         return found
 
 
@@ -146,30 +113,33 @@ def marked(run_id: str) -> dict[int, str]:
 
 async def end(pids: Iterable[int], grace_s: float) -> tuple[int, ...]:
     """End processes, killing what has not ended after `grace_s`; return those that lived."""
-    orphans = []
+    # Held by their pidfds, so that no signal can reach a later owner of a pid.
+    held: dict[int, int] = {}
     for pid in pids:
         with contextlib.suppress(ProcessLookupError):
-            orphans.append(_Orphan(pid, os.pidfd_open(pid)))
+            held[os.pidfd_open(pid)] = pid
     try:
-        left = _living(orphans)
-        ended = tuple(sorted(each.pid for each in left))
+        left = _living(held)
+        ended = tuple(sorted(held[each] for each in left))
         for number, wait_s in ((signal.SIGTERM, grace_s), (signal.SIGKILL, KILL_S)):
             for each in left:
-                each.signal(number)
-                each.signal(signal.SIGCONT)  # a stopped process ends only once it goes on
+                with contextlib.suppress(ProcessLookupError):
+                    signal.pidfd_send_signal(each, number)
+                    # A stopped process ends only once it goes on.
+                    signal.pidfd_send_signal(each, signal.SIGCONT)
             deadline = time.monotonic() + wait_s
             while (left := _living(left)) and time.monotonic() < deadline:  # noqa: ASYNC110
                 await asyncio.sleep(_LOOK_S)
         return ended
     finally:
-        for each in orphans:
-            os.close(each.pidfd)
+        for each in held:
+            os.close(each)
 
 
-def _living(orphans: list[_Orphan]) -> list[_Orphan]:
-    """Return those that have not ended: a pidfd can be read once its process has."""
+def _living(pidfds: Iterable[int]) -> list[int]:
+    """Return those whose processes have not ended: then a pidfd can be read."""
     poll = select.poll()
-    for each in orphans:
-        poll.register(each.pidfd, select.POLLIN)
+    for each in pidfds:
+        poll.register(each, select.POLLIN)
     ended = {pidfd for pidfd, _ in poll.poll(0)}
-    return [each for each in orphans if each.pidfd not in ended]
+    return [each for each in pidfds if each not in ended]

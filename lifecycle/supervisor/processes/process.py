@@ -65,20 +65,12 @@ class ProcessExit(msgspec.Struct, frozen=True, kw_only=True):
         """Whether the program broke; shells say so of what they ran by 128 + the signal."""
         return self.signal in _CRASHES or (self.status or 0) - 128 in _CRASHES
 
-    @property
-    def signal_name(self) -> str:
-        """`SIGKILL`, or the number of one without a name; empty if no signal ended it."""
-        if self.signal is None:
-            return ""
-        try:
-            return signal.Signals(self.signal).name
-        except ValueError:
-            return str(self.signal)
-
     def __str__(self) -> str:
         if self.signal is not None:
-            name = self.signal_name
-            return f"killed by signal {name}" if name.isdigit() else f"killed by {name}"
+            try:
+                return f"killed by {signal.Signals(self.signal).name}"
+            except ValueError:
+                return f"killed by signal {self.signal}"
         if self.status is not None:
             return f"exit status {self.status}"
         return "ended, exit status unknown"

@@ -62,7 +62,7 @@ def unlimited(processes: Iterable[PlannedProcess]) -> tuple[Finding, ...]:
     why = why_unlimited() if limited else ""
     return tuple(
         rule("declaration.unproven").finding(
-            Outcome.UNVERIFIABLE,
+            outcome=Outcome.UNVERIFIABLE,
             subject=name,
             expected=f"limited: {', '.join(resources.properties())}",
             observed="run.resources",

@@ -57,7 +57,7 @@ def finding_of(failure: Failure) -> Finding:
     """Return the finding that a failure is."""
     found = rule(failure.rule)
     return found.finding(
-        Outcome.VIOLATED,
+        outcome=Outcome.VIOLATED,
         subject=failure.subject,
         expected="",
         observed="",

@@ -34,7 +34,6 @@ from lifecycle.plan.model import Plan
 from lifecycle.run_directory import is_held, run_name, running, runtime_root
 from lifecycle.supervisor.connections.negotiation import Expectation, is_negotiated
 from lifecycle.supervisor.control.client import look
-from lifecycle.supervisor.control.protocol import ProcessState, Reach
 from lifecycle.supervisor.control.server import SupervisorSnapshot, follow
 from lifecycle.supervisor.core.gate import closes
 from lifecycle.supervisor.health.answering import ANSWER_S, TRIES
@@ -182,7 +181,7 @@ def _looking(plan: Plan) -> ObserverParticipant:
         plan.domain_id,
         onlooker_connections(plan, _reported_to_supervisors(plan)),
         unplanned=is_open and is_negotiated(plan),
-        settle_s=plan.settle_s,
+        settle_s=plan.discovery.settle_s,
     )
 
 
@@ -268,7 +267,12 @@ async def _unanswering(
     nodes = tuple(each for each in plan.nodes if each.full_name in silent)
     for _ in range(TRIES):
         answers = await asyncio.gather(
-            *(observer_participant.answers(each, timeout_s=ANSWER_S) for each in nodes),
+            *(
+                observer_participant.clients.answers(
+                    each.full_name, managed=each.managed, timeout_s=ANSWER_S
+                )
+                for each in nodes
+            ),
             return_exceptions=True,  # who cannot be asked is in the verdict by other rules
         )
         nodes = tuple(node for node, answer in zip(nodes, answers, strict=True) if answer is False)
@@ -318,8 +322,7 @@ def picture_of(seen: SupervisorSnapshot) -> Picture:
     supervised = {
         each.node: Supervised(
             pid=each.pid,
-            dead=each.process_state is ProcessState.BACKOFF
-            or (each.process_state is ProcessState.EXITED and each.reach is not Reach.STOPPED),
+            dead=bool(each.died),
             silent=bool(each.silent),
             doing=each.doing or each.silent,
         )

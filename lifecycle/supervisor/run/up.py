@@ -356,7 +356,7 @@ async def _observer_participant(
                 connections,
                 unplanned=wires and dynamic and plan.policy.undeclared_nodes is EndpointPolicy.OPEN,
                 events=wires and (dynamic or layer.events),
-                settle_s=plan.settle_s,
+                settle_s=plan.discovery.settle_s,
             )
         if number + 1 == OBSERVER_TRIES or observer_participant.discovery.reaches_servers():
             break

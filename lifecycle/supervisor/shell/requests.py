@@ -17,7 +17,7 @@ from msgspec.structs import replace
 from lifecycle.errors import BringUpError, MiddlewareError
 from lifecycle.graph.loop import set_within
 from lifecycle.manifest.model import RunKind
-from lifecycle.node.host.control import Command, Operation
+from lifecycle.node.host.control import Operation
 from lifecycle.plan.parameters import GIVEN
 from lifecycle.supervisor.core import effects, inputs
 from lifecycle.supervisor.core.gate import ACTIVATES_ITSELF, GUARD_TRIES
@@ -31,11 +31,11 @@ from lifecycle.supervisor.nodes.driver import (
     ChangedError,
     ControlDriver,
     NodeCondition,
+    ServiceDriver,
 )
 from lifecycle.supervisor.nodes.system import level_of
 from lifecycle.supervisor.processes.control_channel import ChannelClosedError, HostFailedError
-from lifecycle.supervisor.run.events import Notice, RequestSent, WiringChanged
-from lifecycle.supervisor.run.failure import within
+from lifecycle.supervisor.run.events import Notice, RequestSent
 from lifecycle.supervisor.shell.permit import Permit
 from lifecycle.verify.judge import with_findings
 from lifecycle.verify.verdict import NOT_JUDGED
@@ -72,6 +72,7 @@ class Requests:
         self._system = shell.system
         self._means = shell.means
         self._tasks: dict[str, tuple[int, asyncio.Task[None]]] = {}
+        self._found: set[str] = set()
 
     def ask(self, effect: effects.Ask) -> None:
         """Ask a node for a step."""
@@ -139,7 +140,7 @@ class Requests:
                 permit = Permit(self._shell, node.core.key)
                 await permit.use()
             condition = await self._perform(node, _OPERATIONS[step], permit)
-        node.take(condition)
+        node.report(condition.state, connected=condition.connected)
         if step is Step.CONFIGURE:
             await self._give_what_is_missing(node)
         return condition
@@ -190,23 +191,33 @@ class Requests:
         if not planned.managed:
             if node.is_to_be_given and not planned.may_end:
                 await self._give_what_is_missing(node)
-            self._system.note_found(node, "running")
+            self._say_found(node, "running")
             return Level.STARTED
-        driver = node.driver = self._means.participant.driver(planned)
+        driver = node.driver = ServiceDriver(self._means.participant.clients, planned)
         condition = await driver.start()
-        self._system.note_found(node, condition.state)
-        node.take(condition)
-        if node.found and condition.state == ACTIVE:
+        self._say_found(node, condition.state)
+        node.report(condition.state, connected=condition.connected)
+        if condition.state == ACTIVE and self._system.is_adopted(node):
             return Level.ACTIVE  # it is verified as it is: no gate has to let it in
         await self._give_what_is_missing(node)
         return Level.STARTED
+
+    def _say_found(self, node: NodeRun, state: str) -> None:
+        """Say, once, how a node was found that others started and that is adopted."""
+        if self._system.is_adopted(node) and node.name not in self._found:
+            self._found.add(node.name)
+            where = (self._system.adopted or {}).get(node.name, "")
+            text = f"{node.name!r} is adopted, found {state}{where and f': {where}'}"
+            self._system.emit(Notice(message=text))
 
     async def _load(self, node: NodeRun) -> None:
         """Have its container load a component, which runs."""
         name = node.planned.run.container
         container = self._system.nodes.get(name)
         full_name = name if container is None else container.name
-        node.unload = await self._means.participant.load(node.planned, full_name)
+        node.unload = await self._means.participant.clients.load_component(
+            node.planned, full_name, timeout_s=node.planned.timeouts.start_s
+        )
 
     async def _appears(self, name: str) -> None:
         """Wait until discovery shows a node of this name; the core sets the limit."""
@@ -230,35 +241,17 @@ class Requests:
 
     async def _downwards(self, node: NodeRun, step: Step) -> Level:
         """Undo a step, unless the node is not as far any more; return where it is then."""
-        if step is Step.DISCONNECT:
-            await self._unwire(node)
+        if step is Step.DISCONNECT and self._shell.authority is not None:
+            await self._shell.authority.unwire(node)
         done = REACHES[step]
         reports = isinstance(node.driver, ControlDriver)  # others may have moved any other
         if reports and node.planned.managed and not _applies(step, node):
             return min(done, level_of(node))
         condition = await self._perform(node, _OPERATIONS[step])
-        node.take(condition)
+        node.report(condition.state, connected=condition.connected)
         if step is Step.DEACTIVATE and not node.planned.managed:
             return Level.STARTED
         return done
-
-    async def _unwire(self, node: NodeRun) -> None:
-        """Unmake what the authority connected the node to, the last connection first."""
-        for name in reversed(node.connections):
-            if node.driver is None:
-                break
-            step = Command(node=node.name, operation=Operation.DISCONNECT_FROM, connection=name)
-            limit_s = node.planned.timeouts.cleanup_s
-            try:
-                await within(limit_s, node.driver.wire(step))
-            except (BringUpError, asyncio.TimeoutError) as error:
-                text = str(error) or f"cannot {step} within {limit_s:g} s"
-                self._system.emit(Notice(message=text))
-                continue
-            self._system.emit(
-                WiringChanged(node=node.name, operation=step.operation, connection=name)
-            )
-        node.connections = ()
 
     # Parameters
 
@@ -269,7 +262,9 @@ class Requests:
         if effect.values is None:
             planned = node.planned
             # All of them, also those that it has by default.
-            all_ = tuple(replace(each, source=GIVEN) for each in planned.in_mode(self._system.mode))
+            all_ = tuple(
+                replace(each, source=GIVEN) for each in planned.in_mode(self._system.run.mode)
+            )
             giving = clients.give_parameters(replace(planned, expected_parameters=all_))
         else:
             giving = clients.set_parameters(node.name, effect.values.now, effect.values.types)

@@ -18,8 +18,9 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 from msgspec.structs import replace
 
-from lifecycle.errors import BringUpError, ExitCode, UsageError
+from lifecycle.errors import BringUpError, ExitCode, LifecycleError
 from lifecycle.manifest.model import Authority
+from lifecycle.plan.comparison import changes, difference_lines
 from lifecycle.plan.model import Plan
 from lifecycle.run_directory import RunDirectory
 from lifecycle.supervisor.connections import discovery_server
@@ -28,25 +29,25 @@ from lifecycle.supervisor.connections.authority import (
     configured_before_any_connect,
 )
 from lifecycle.supervisor.connections.networks import Networks
-from lifecycle.supervisor.control.orders import Order, Revisions
+from lifecycle.supervisor.control.orders import check
 from lifecycle.supervisor.control.protocol import Answer, ControlRequest, SystemStatus
 from lifecycle.supervisor.control.ros_interface import RosInterface
 from lifecycle.supervisor.control.server import ControlServer, SupervisorSnapshot
 from lifecycle.supervisor.control.status import process_state, system_status
 from lifecycle.supervisor.core import advance, effects, gate, inputs
 from lifecycle.supervisor.core import state as core
+from lifecycle.supervisor.core.change import change_to, changed_nodes
 from lifecycle.supervisor.core.orders import refused_at_once
 from lifecycle.supervisor.core.reduce import take
-from lifecycle.supervisor.health import agreement
-from lifecycle.supervisor.health.agreement import Agreement
 from lifecycle.supervisor.health.answering import Answering
 from lifecycle.supervisor.health.liveliness import Cause
-from lifecycle.supervisor.health.peer_supervisors import PeerSupervisors
+from lifecycle.supervisor.health.peers import FAILED, Peers
 from lifecycle.supervisor.judging.judge import Judge
 from lifecycle.supervisor.nodes.adoption import adopt
 from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.processes.orphans import reap_adopted
 from lifecycle.supervisor.run.events import (
+    Event,
     LogLine,
     Notice,
     ProcessChanged,
@@ -134,29 +135,20 @@ class Supervisor:
         self.changed = asyncio.Event()
         self.again: set[str] = set()
         self._begin(system.run)
-        self.authority = authority_of(system, self._emit, means.participant)
-        self._peers = PeerSupervisors(system, means.participant)
-        self._agreement = Agreement(system, means.participant, self._peers)
-        self.answering = Answering(system, means.participant)
+        self.authority = authority_of(system, means.participant)
+        self._peers = Peers(system, means.participant)
+        self.answering = Answering(system, means.participant.clients)
         self.judge = Judge(
             system,
             means.participant.graph,
             looker=self.authority,
-            agreement=self._agreement,
+            peers=self._peers,
         )
-        self._revisions = Revisions(system, options)
         self._processes = Processes(self)
         self._requests = Requests(self)
         self._looks = Looks(self)
         self._load = Load(system)
-        self._ros_interface = RosInterface(
-            self,
-            system.plan,
-            min(system.machines or ("",)),
-            means.participant,
-            emit=self._emit,
-            modes=() if system.remote else (each.name for each in system.plan.modes),
-        )
+        self._ros_interface = RosInterface(self)
         system.on_change = self._touch
         system.on_health = self._health
         system.liveliness.listen(self._silence)
@@ -216,38 +208,29 @@ class Supervisor:
 
     def differences(self, plan: Plan) -> tuple[str, ...]:
         """Say how `plan` differs from what runs, one line each; empty if it does not."""
-        return self._revisions.differences(plan)
+        return difference_lines(changes(self.system.first, plan))
 
-    async def order(self, order: Order) -> Answer:
+    async def order(self, order: core.Order) -> Answer:
         """Take an order from outside, if it fits what the system is doing; return its outcome."""
-        applies = order.ask is ControlRequest.APPLY
-        change = None
         try:
-            self._revisions.check(order)
-        except UsageError as error:
+            check(order, self.system, self._options.machine)
+        except LifecycleError as error:
             return Answer(exit_code=error.exit_code, error=str(error))
-        if applies:
-            assert order.plan is not None
-            change = self._revisions.said(self._revisions.change(order.plan), order.plan)
+        run, change = self.system.run, None
+        if order.ask is ControlRequest.APPLY and order.plan is not None:
+            what = change_to(run, order.plan)
+            change = changed_nodes(what, run.first, order.plan, run.revision)
         number = len(self._answers)
-        ordered = core.Order(
-            id=number,
-            ask=order.ask,
-            node=order.node,
-            mode=order.mode,
-            plan=order.plan if applies else None,
-            timeout_s=order.timeout_s,
-            first=self.system.first,
-        )
+        order = replace(order, id=number, first=run.first)
         if change is not None and order.dry_run:
-            code, why = refused_at_once(self.system.run, ordered)
+            code, why = refused_at_once(run, order)
             differs = ExitCode.VIOLATED if change.differences else ExitCode.OK
             return Answer(exit_code=code if why else differs, error=why, change=change)
         answer = self._answers[number] = self._loop.create_future()
-        self.give(inputs.Ordered(order=ordered))
+        self.give(inputs.Ordered(order=order))
         done: Answer = await asyncio.shield(answer)
         if change is not None and done.exit_code == ExitCode.OK:
-            return replace(done, change=replace(change, revision=self.system.revision))
+            return replace(done, change=replace(change, revision=run.revision))
         return done
 
     # The loop
@@ -292,7 +275,7 @@ class Supervisor:
             self._end(run.ending)
             if run.is_over:
                 self._over.set()
-        elif self.system.remote and (left := self._agreement.left()) != run.left:
+        elif self.system.remote and (left := self._peers.left()) != run.left:
             self.give(inputs.Left(nodes=left))
 
     def _perform(self, effect: effects.Effect) -> None:
@@ -433,7 +416,7 @@ class Supervisor:
         self.means.networks.replan(run.plan)
         self._peers.renew()
         if run.first is not first:
-            self._agreement.announce(run.first)
+            self._peers.announce()
 
     # What is said
 
@@ -494,7 +477,7 @@ class Supervisor:
             verdict = with_findings(NOT_JUDGED, findings, self.system.plan.policy)
             self.give(inputs.Refused(verdict=verdict))
         else:
-            self.give(inputs.Adopted(plan=plan, nodes=frozenset(self.system.adopted)))
+            self.give(inputs.Adopted(plan=plan, nodes=frozenset(self.system.adopted or ())))
 
     async def _watch(self, died: asyncio.Future[Any], subject: str, rule: str) -> None:
         """Say that what others depend on has died."""
@@ -510,9 +493,13 @@ class Supervisor:
         server = ControlServer(self.means.directory.socket_path, self)
         await server.open()
         self._peers.open()
-        self._agreement.open()
-        self._emit.listen(lambda event: None if isinstance(event, LogLine) else server.changed())
-        self._emit.listen(self._ros_interface.on_event)
+
+        def changed(event: Event) -> None:
+            if not isinstance(event, LogLine):
+                server.changed()
+                self._ros_interface.on_event(event)
+
+        self._emit.listen(changed)
         self._ros_interface.begin()
         result = UpResult(exit_code=ExitCode.INTERNAL, verdict=NOT_JUDGED)
         beside = [
@@ -580,8 +567,8 @@ class Supervisor:
         latest = self.system.run.judged.verdict
         if latest is not None:
             self._last = self.system.liveliness.by_now(latest)
-        how = agreement.FAILED if ending.failed else ""
-        self._agreement.leave(f"{how}{ending.stopping}")
+        how = FAILED if ending.failed else ""
+        self._peers.leave(f"{how}{ending.stopping}")
         self.means.participant.prepare_to_leave()
         if self._programming is not None:
             self._programming.cancel()  # nothing is programmed once all is removed
@@ -606,7 +593,6 @@ class Supervisor:
     async def leave(self) -> None:
         """Leave the exchange with other supervisors, after `run`; Fast DDS can hang in it."""
         self.means.participant.prepare_to_leave()
-        self._agreement.close()
         await self._peers.close()
 
     @contextlib.contextmanager

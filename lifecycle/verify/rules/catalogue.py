@@ -78,23 +78,27 @@ class Rule(msgspec.Struct, frozen=True, kw_only=True):
 
     def finding(
         self,
-        outcome: Outcome,
         *,
         subject: str,
         expected: str,
         observed: str,
         message: str,
+        outcome: Outcome | None = None,
         at: Position | None = None,
         node: str = "",
         endpoint: EndpointKind | None = None,
         hint: str = "",
         ends: tuple[str, ...] = (),
     ) -> Finding:
-        """Make a finding of this rule; `hint` defaults to the rule's fix.
+        """Make a finding of this rule, with the only outcome that it has where none is given.
+
+        `hint` defaults to the rule's fix.
 
         Raises:
-            ValueError: the rule is not documented to have this outcome.
+            ValueError: the rule is not documented to have this outcome, or has several.
         """
+        if outcome is None:
+            (outcome,) = self.outcomes
         if outcome not in self.outcomes:
             raise ValueError(f"cannot give rule {self.id} the outcome {outcome.value}")
         return Finding(
@@ -113,44 +117,45 @@ class Rule(msgspec.Struct, frozen=True, kw_only=True):
 
     def on_endpoint(
         self,
-        outcome: Outcome,
         actual: Actual,
         *,
         expected: str,
         observed: str,
         message: str,
+        outcome: Outcome | None = None,
         hint: str = "",
     ) -> Finding:
         """Make a finding on a declared endpoint, at its declaration; as `finding`."""
+        planned = actual.planned
         return self.finding(
-            outcome,
-            subject=actual.planned.resolved,
+            subject=planned.resolved,
             expected=expected,
             observed=observed,
             message=message,
-            at=actual.planned.at,
+            outcome=outcome,
+            at=planned.at,
             node=actual.node.full_name,
-            endpoint=actual.planned.kind,
+            endpoint=planned.kind,
             hint=hint,
         )
 
     def on_node(
         self,
-        outcome: Outcome,
         node: PlannedNode,
         *,
         expected: str,
         observed: str,
         message: str,
+        outcome: Outcome | None = None,
         hint: str = "",
     ) -> Finding:
         """Make a finding on a declared node, at its declaration; as `finding`."""
         return self.finding(
-            outcome,
             subject=node.full_name,
             expected=expected,
             observed=observed,
             message=message,
+            outcome=outcome,
             at=node.at,
             node=node.full_name,
             hint=hint,

@@ -91,8 +91,8 @@ def _connection(
         if facts.is_ours:
             return  # that it does not report is said
         yield MISSING.on_node(
-            Outcome.UNVERIFIABLE,
             node,
+            outcome=Outcome.UNVERIFIABLE,
             expected=f"connection {name}",
             observed="unknown",
             message=f"cannot verify connection {name!r} of {node.full_name}: the node does not"
@@ -102,8 +102,8 @@ def _connection(
     report = next((each for each in configuration.connections if each.name == name), None)
     if report is None:
         yield MISSING.on_node(
-            Outcome.VIOLATED,
             node,
+            outcome=Outcome.VIOLATED,
             expected=f"connection {name}",
             observed=_listed(configuration.connections),
             message=f"cannot find connection {name!r} of {node.full_name};"
@@ -111,7 +111,6 @@ def _connection(
         )
     elif report.error:
         yield FAILED.on_node(
-            Outcome.VIOLATED,
             node,
             expected=f"connection {name}",
             observed=report.error,
@@ -129,7 +128,6 @@ def _urls(
         return
     what = f"connection {report.name!r}" if report.name else "the own participant"
     yield DIFFERS.on_node(
-        Outcome.VIOLATED,
         node,
         expected=", ".join(planned.urls),
         observed=", ".join(report.urls) or "no URL",
@@ -147,7 +145,6 @@ def _mapping(actual: Actual) -> Iterator[Finding]:
         return
     node, planned = actual.node, actual.planned
     yield WRONG_MAPPING.on_endpoint(
-        Outcome.VIOLATED,
         actual,
         expected=_spell(wanted),
         observed=_spell(report.connection),

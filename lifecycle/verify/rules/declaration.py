@@ -51,7 +51,7 @@ def check(view: View) -> Iterator[Finding]:
 def _finding(warning: Diagnostic) -> Finding:
     rule = REACHED_NONE if warning.rule in _NO_NODE else UNPROVEN
     return rule.finding(
-        Outcome.UNVERIFIABLE,
+        outcome=Outcome.UNVERIFIABLE,
         subject=warning.at.path or warning.at.file,
         expected="no warning",
         observed=warning.rule,

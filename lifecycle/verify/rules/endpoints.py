@@ -93,7 +93,6 @@ def _declared(actual: Actual, *, absent: bool) -> Iterator[Finding]:
     word = planned.kind.noun
     if actual.report is not None and actual.report.error:
         yield ENDPOINT_ERROR.on_endpoint(
-            Outcome.VIOLATED,
             actual,
             expected=f"{word} of {node.full_name}",
             observed=actual.report.error,
@@ -102,7 +101,6 @@ def _declared(actual: Actual, *, absent: bool) -> Iterator[Finding]:
         )
     elif actual.observed is None and not absent and not (actual.unseen and actual.report is None):
         yield MISSING_ENDPOINT.on_endpoint(
-            Outcome.VIOLATED,
             actual,
             expected=f"{word} of {node.full_name}",
             observed=f"no such {word}",
@@ -112,7 +110,6 @@ def _declared(actual: Actual, *, absent: bool) -> Iterator[Finding]:
     seen = actual.observed or actual.report
     if seen is not None and seen.type != planned.type:
         yield TYPE_MISMATCH.on_endpoint(
-            Outcome.VIOLATED,
             actual,
             expected=planned.type,
             observed=seen.type or "no type",
@@ -151,7 +148,6 @@ def _unseen(
             return
         reason = f"it is matched with {report.matched}, of which {known} are known here"
     yield UNSEEN_ENDPOINT.on_endpoint(
-        Outcome.UNVERIFIABLE,
         actual,
         expected=f"{word} of {node.full_name}",
         observed="not shown by discovery",
@@ -180,7 +176,6 @@ def _undeclared(view: View) -> Iterator[Finding]:
         if not hint and len(similar) == 1:
             hint = f"{similar[0].resolved} of the same type is missing: is a remap or a name wrong?"
         yield UNDECLARED[endpoint.kind].finding(
-            Outcome.VIOLATED,
             subject=endpoint.name,
             expected=f"no such {word} of {endpoint.node}",
             observed=f"{word} of type {endpoint.type}" if endpoint.type else word,
@@ -205,7 +200,6 @@ def _wrong_part(view: View, endpoint: ObservedEndpoint) -> Finding | None:
         expected = part_type(endpoint.name, planned.type)
         if endpoint.type != expected:
             return TYPE_MISMATCH.on_endpoint(
-                Outcome.VIOLATED,
                 actual,
                 expected=expected,
                 observed=endpoint.type or "no type",
@@ -249,7 +243,6 @@ def _conflicts(view: View) -> Iterator[Finding]:
         word = seen.kind.noun
         who = seen.node or "an unknown node"
         yield TYPE_MISMATCH.finding(
-            Outcome.VIOLATED,
             subject=seen.name,
             expected=" or ".join(declared),
             observed=seen.type or "no type",
@@ -352,7 +345,7 @@ def _differs(place: _Place, end: _End, expected: str, source: str) -> Finding:
     what, name, type_ = place
     node = end.node or "an unknown node"
     return DEFINITION_DIFFERS.finding(
-        Outcome.VIOLATED,
+        outcome=Outcome.VIOLATED,
         subject=name,
         expected=f"{type_} as {expected}",
         observed=f"{type_} as {end.type_hash}",
@@ -370,7 +363,7 @@ def _unverifiable(node: str, ends: list[tuple[_Place, _End]]) -> Finding:
     who = node or "an unknown node"
     listed = ", ".join(dict.fromkeys(f"{name} ({end.kind.noun})" for (_, name, _), end in ends))
     return DEFINITION_DIFFERS.finding(
-        Outcome.UNVERIFIABLE,
+        outcome=Outcome.UNVERIFIABLE,
         subject=who,
         expected="a type hash",
         observed="none announced",

@@ -121,7 +121,6 @@ def _unmeasured(
     ends: tuple[str, ...] = (),
 ) -> Finding:
     return NOT_MEASURED.finding(
-        Outcome.UNVERIFIABLE,
         subject=subject,
         expected=str(quantity),
         observed="not measured",
@@ -139,7 +138,6 @@ def _broken(actual: Actual) -> Iterator[Finding]:
         return
     if report.nfes == ():
         yield BROKEN_ENDPOINT.on_endpoint(
-            Outcome.VIOLATED,
             actual,
             expected="at least one network flow endpoint",
             observed="none",
@@ -159,7 +157,6 @@ def _strict(actual: Actual, uniqueness: Uniqueness) -> Iterator[Finding]:
     unique = uniqueness.is_unique(actual)
     if unique is None:
         yield UNVERIFIABLE.on_endpoint(
-            Outcome.VIOLATED,
             actual,
             expected=f"unique {word}",
             observed="network flow endpoints not reported",
@@ -169,7 +166,6 @@ def _strict(actual: Actual, uniqueness: Uniqueness) -> Iterator[Finding]:
     elif unique is False:
         shared = ", ".join(dict.fromkeys(map(_spell, uniqueness.nfes((actual,)))))
         yield NOT_UNIQUE.on_endpoint(
-            Outcome.VIOLATED,
             actual,
             expected=f"unique {word}",
             observed=f"shares {shared}",
@@ -193,7 +189,7 @@ def _demanded(flow: FlowView, uniqueness: Uniqueness) -> Iterator[Finding]:
     unproven = ", which cannot be proven" if met is None else ""
     rule = UNVERIFIABLE if met is None else NOT_UNIQUE
     yield rule.finding(
-        Outcome.VIOLATED,
+        outcome=Outcome.VIOLATED,
         subject=flow.subject,
         ends=flow.ends,
         expected=f"{how} unique flow",
@@ -271,7 +267,7 @@ def _judge_transport(view: View, flow: FlowView) -> Iterator[Finding]:
 
 def _is_decided(view: View, flow: FlowView) -> bool:
     """Return whether the medium was asked for; else the plan only has what is expected."""
-    if view.plan.data_layer.at is not None:
+    if "data_layer" in view.plan.positions:
         return True
     return any(
         end.planned.transport not in (FlowTransport.ANY, FlowTransport.NETWORK)
@@ -285,7 +281,7 @@ def _not_by_network(flow: FlowView, demanding: Actual, used: str) -> Finding:
     unknown = used == UNKNOWN
     why = "nothing shows what carries it" if unknown else f"what carries it is {_WORDS[used]}"
     return WRONG_TRANSPORT.finding(
-        Outcome.UNVERIFIABLE if unknown else Outcome.VIOLATED,
+        outcome=Outcome.UNVERIFIABLE if unknown else Outcome.VIOLATED,
         subject=flow.subject,
         ends=flow.ends,
         expected="an IP transport",
@@ -301,7 +297,7 @@ def _otherwise(flow: FlowView, used: str) -> Finding:
     planned = _WORDS.get(flow.planned.medium, flow.planned.medium)
     word = _WORDS[used]
     return WRONG_MEDIUM.finding(
-        Outcome.UNVERIFIABLE if unknown else Outcome.VIOLATED,
+        outcome=Outcome.UNVERIFIABLE if unknown else Outcome.VIOLATED,
         subject=flow.subject,
         ends=flow.ends,
         expected=planned,
@@ -347,7 +343,6 @@ def check_dscp(view: View) -> Iterator[Finding]:
         read = report.dscp if report else None
         if read is None:
             yield DSCP_UNVERIFIABLE.on_endpoint(
-                Outcome.UNVERIFIABLE,
                 actual,
                 expected=describe(wanted),
                 observed="not read back",
@@ -356,8 +351,8 @@ def check_dscp(view: View) -> Iterator[Finding]:
         elif read != wanted:
             waived = "" if planned.enforce_dscp else "; the manifest does not enforce it"
             yield DSCP_NOT_APPLIED.on_endpoint(
-                Outcome.VIOLATED if planned.enforce_dscp else Outcome.UNVERIFIABLE,
                 actual,
+                outcome=Outcome.VIOLATED if planned.enforce_dscp else Outcome.UNVERIFIABLE,
                 expected=describe(wanted),
                 observed=describe(read),
                 message=f"cannot accept {where}: its sockets carry {describe(read)}"

@@ -74,7 +74,6 @@ def _judge(view: View, facts: NodeFacts) -> Iterator[Finding]:
     lacks = report is not None and report.connected and report.health is None
     if node.health.check and lacks:
         yield NOT_ASKED.on_node(
-            Outcome.VIOLATED,
             node,
             expected="a method 'health'",
             observed="none",
@@ -97,16 +96,16 @@ def _judge(view: View, facts: NodeFacts) -> Iterator[Finding]:
     )
     if health.ok is False:
         yield UNHEALTHY.on_node(
-            Outcome.VIOLATED,
             node,
+            outcome=Outcome.VIOLATED,
             expected=_HEALTHY,
             observed=health.message,
             message=f"cannot accept node {node.full_name}: it is not healthy: {health.message}",
         )
     elif health.ok is None:
         yield UNHEALTHY.on_node(
-            Outcome.UNVERIFIABLE,
             node,
+            outcome=Outcome.UNVERIFIABLE,
             expected=_HEALTHY,
             observed="unknown",
             message=f"cannot verify that node {node.full_name} is healthy: {health.message}",

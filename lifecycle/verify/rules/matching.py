@@ -31,7 +31,6 @@ from lifecycle.verify.view import (
     FlowView,
     SeenEndpoint,
     View,
-    actual_qos,
     brings_up,
 )
 
@@ -165,7 +164,7 @@ def _unknown_peers(view: View, topics: Mapping[str, _Ends]) -> Iterator[Finding]
         if not brings_up(actual.node, view.machines):
             continue
         publishers, subscriptions = topics.get(actual.planned.resolved, _NO_ENDS)
-        end = _end(actual)
+        end = actual.end
         publishes = end.kind is EndpointKind.PUBLISHER
         possible = len(_possible(end, subscriptions if publishes else publishers))
         other = EndpointKind.SUBSCRIPTION if publishes else EndpointKind.PUBLISHER
@@ -173,7 +172,6 @@ def _unknown_peers(view: View, topics: Mapping[str, _Ends]) -> Iterator[Finding]
         if place in NOISE_TOPICS or report.matched <= possible + unseen[place]:
             continue
         yield UNKNOWN_PEER.on_endpoint(
-            Outcome.VIOLATED,
             actual,
             expected=f"at most {possible} {other.noun}{'s' * (possible != 1)}, as in the graph",
             observed=f"matched {report.matched}",
@@ -193,7 +191,6 @@ def _unreported_flows(view: View) -> Iterator[Finding]:
         f" and {len(names) - _NAMED} more" * (len(names) > _NAMED)
     )
     yield UNREPORTED_FLOW.finding(
-        Outcome.UNVERIFIABLE,
         subject=names[0] if len(names) == 1 else f"{len(names)} flows",
         ends=flows[0].ends if len(names) == 1 else (),
         expected="a report of one end",
@@ -225,7 +222,7 @@ def _judge_flow(flow: FlowView, ends: _Ends) -> Iterator[Finding]:
     violated = outcome is Outcome.VIOLATED
     pair = f"{flow.publisher} → {flow.subscription}"
     yield rule.finding(
-        outcome,
+        outcome=outcome,
         subject=flow.subject,
         ends=flow.ends,
         expected="matched",
@@ -249,7 +246,7 @@ def _cause(flow: FlowView) -> str:
             return f"the {word} is missing"
     for publisher in flow.publishers:
         for subscription in flow.subscriptions:
-            if cause := obstacle(_end(publisher), _end(subscription)):
+            if cause := obstacle(publisher.end, subscription.end):
                 return cause
     return ""
 
@@ -257,7 +254,7 @@ def _cause(flow: FlowView) -> str:
 def _judge(flow: FlowView, ends: _Ends) -> Match:
     """Return the worst that is known of any of the flow's pairs, whose ends are all seen."""
     answers = [
-        match(_end(publisher), _end(subscription), *ends)
+        match(publisher.end, subscription.end, *ends)
         for publisher in flow.publishers
         for subscription in flow.subscriptions
     ]
@@ -300,19 +297,6 @@ def _possible(end: SeenEndpoint, others: Sequence[SeenEndpoint]) -> list[SeenEnd
         for other in others
         if not (obstacle(end, other) if publishes else obstacle(other, end))
     ]
-
-
-def _end(actual: Actual) -> SeenEndpoint:
-    """Return a declared end: as discovery shows it, else as its node says."""
-    shown, report = actual.observed, actual.report
-    return SeenEndpoint(
-        kind=actual.planned.kind,
-        node=actual.node.full_name,
-        name=actual.planned.resolved,
-        type=shown.type if shown else actual.planned.type,
-        qos=actual_qos(shown.qos if shown else None, report.qos if report else None),
-        report=report,
-    )
 
 
 UNMATCHED_CLIENT = Rule(
@@ -382,7 +366,7 @@ def _judge_client(client: Actual, server: str, *, count: int) -> Iterator[Findin
     verb = "see" if outcome is Outcome.VIOLATED else "verify that"
     state = "matched" if outcome is Outcome.VIOLATED else "are matched"
     yield UNMATCHED_CLIENT.finding(
-        outcome,
+        outcome=outcome,
         subject=f"{name}: {node} → {server}",
         ends=(node, server),
         expected="matched",

@@ -8,9 +8,10 @@ policy names it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 from lifecycle.manifest.model import EndpointPolicy, RunKind
+from lifecycle.plan.model import PlannedProcess
 from lifecycle.verify.observation import ObservedEndpoint
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
@@ -56,19 +57,19 @@ RULES = (MISSING_NODE, ENDED_NODE, UNDECLARED_NODE, DUPLICATE_NODE)
 
 def check(view: View) -> Iterator[Finding]:
     """Judge node names."""
-    yield from _missing(view)
+    others = _other_names(view)
+    yield from _missing(view, others)
     yield from _duplicate(view)
     if view.plan.policy.undeclared_nodes is EndpointPolicy.DECLARED:
-        yield from _undeclared(view)
+        yield from _undeclared(view, others)
 
 
-def _missing(view: View) -> Iterator[Finding]:
+def _missing(view: View, others: Mapping[str, list[str]]) -> Iterator[Finding]:
     for name, node in view.planned.items():
         if name in view.observed:
             continue
         if name in view.over:
             yield ENDED_NODE.on_node(
-                Outcome.UNVERIFIABLE,
                 node,
                 expected="node in the graph, or ended by itself",
                 observed=view.over[name] or "no such node",
@@ -82,6 +83,11 @@ def _missing(view: View) -> Iterator[Finding]:
             hint = f"look at the log of its container {node.run.container}"
         elif node.run.kind is RunKind.ATTACH:
             hint = "start it: the manifest attaches to it; compare domain, RMW and discovery range"
+        elif name in others:
+            hint = (
+                f"is it {' or '.join(others[name])}? its command chooses the name; a `name` in the"
+                " manifest is given to the command, or take the name that it has as the key"
+            )
         elif not brings_up(node, view.machines):
             machine = f" --machine {node.machine}" if node.machine else ""
             hint = f"its machine has a supervisor of its own: lifecycle up MANIFEST{machine}"
@@ -89,8 +95,8 @@ def _missing(view: View) -> Iterator[Finding]:
         if beyond:
             hint = f"the supervisor of machine {node.machine!r} verifies it"
         yield MISSING_NODE.on_node(
-            Outcome.UNVERIFIABLE if beyond else Outcome.VIOLATED,
             node,
+            outcome=Outcome.UNVERIFIABLE if beyond else Outcome.VIOLATED,
             expected="node in the graph",
             observed="out of reach" if beyond else "no such node",
             message=f"cannot verify node {name}: it talks by the shared memory of machine"
@@ -99,6 +105,34 @@ def _missing(view: View) -> Iterator[Finding]:
             else f"cannot find node {name} in domain {view.plan.domain_id}",
             hint=hint,
         )
+
+
+def _other_names(view: View) -> dict[str, list[str]]:
+    """Return what missing nodes may be called, where their names are their commands' to choose.
+
+    Those are the undeclared nodes of the namespace. What is given `__node:=` is renamed by rcl.
+    """
+    strangers: dict[str, list[str]] = {}
+    for name in view.observed:
+        if name not in view.planned:
+            strangers.setdefault(name.rpartition("/")[0], []).append(name)
+    if not strangers:
+        return {}
+    chooses = {each.name for each in view.plan.processes if each.argv and not _renames(each)}
+    return {
+        name: strangers[place][:_NAMED]
+        for name, node in view.planned.items()
+        if name not in view.observed
+        and node.process in chooses
+        and (place := name.rpartition("/")[0]) in strangers
+    }
+
+
+_NAMED = 3
+
+
+def _renames(process: PlannedProcess) -> bool:
+    return any(word.startswith("__node:=") for word in process.argv)
 
 
 def _duplicate(view: View) -> Iterator[Finding]:
@@ -113,33 +147,44 @@ def _duplicate(view: View) -> Iterator[Finding]:
         # Before the gate one of them may have run before the supervisor did.
         started = node is not None and node.run.kind is not RunKind.ATTACH
         takes = started and view.stage is Stage.CONNECTED
-        hint = f"{DUPLICATE_NODE.fix}; have one that ran before adopted: lifecycle up --adopt"
+        hint = ""
+        process = node.process if node is not None else ""
+        if any(each.name == process and _renames(each) for each in view.plan.processes):
+            hint = (
+                f"`name` renames every node of process {process}: if they are in it, leave it out; "
+                "else stop the other one"
+            )
+        elif takes:
+            hint = f"{DUPLICATE_NODE.fix}; have one that ran before adopted: lifecycle up --adopt"
         yield DUPLICATE_NODE.finding(
-            Outcome.VIOLATED,
             subject=name,
             expected="1 node of this name",
             observed=f"{count} nodes",
             message=f"cannot tell {count} nodes named {name} apart",
             at=node.at if node else None,
             node=name,
-            hint=hint if takes else "",
+            hint=hint,
         )
 
 
-def _undeclared(view: View) -> Iterator[Finding]:
+def _undeclared(view: View, others: Mapping[str, list[str]]) -> Iterator[Finding]:
     owned: dict[str, list[str]] = {}
     for endpoint in view.foreign:
         owned.setdefault(endpoint.node, []).append(f"{endpoint.kind.noun} of {endpoint.name}")
-    names = {name for name in view.observed if name not in view.planned} | set(owned)
-    for name in sorted(names):
+    undeclared = {name for name in view.observed if name not in view.planned} | set(owned)
+    for name in sorted(undeclared):
         endpoints = ", ".join(dict.fromkeys(owned.get(name, [])))
+        missing = [each for each, names in others.items() if name in names]
         yield UNDECLARED_NODE.finding(
-            Outcome.VIOLATED,
             subject=name,
             expected="no such node",
             observed=f"node with {endpoints}" if endpoints else "node",
             message=f"cannot allow node {name}: the manifest does not declare it",
             node=name,
+            hint=f"if it is {' or '.join(missing)}, which is missing, write a `name` there; else"
+            f" {UNDECLARED_NODE.fix}"
+            if missing
+            else "",
         )
 
 
@@ -191,7 +236,6 @@ def _offered_by_tools(view: View) -> Iterator[Finding]:
         verb = "feeds" if endpoint.kind.is_topic else "serves"
         whom = "whoever asks for the supervisor" if of_supervisor else "the system"
         yield UNDECLARED[endpoint.kind].finding(
-            Outcome.VIOLATED,
             subject=endpoint.name,
             expected=f"no such {word} of {endpoint.node}",
             observed=f"{word} of type {endpoint.type}" if endpoint.type else word,
@@ -219,7 +263,7 @@ def _unattributed(view: View) -> Iterator[Finding]:
         feeds = feeds and not view.names.is_of_supervisors(endpoint.kind, endpoint.name)
         violated = feeds or view.stage is Stage.CONNECTED
         yield UNATTRIBUTED_ENDPOINT.finding(
-            Outcome.VIOLATED if violated else Outcome.UNVERIFIABLE,
+            outcome=Outcome.VIOLATED if violated else Outcome.UNVERIFIABLE,
             subject=endpoint.name,
             expected=f"{word} of a declared node",
             observed=f"{word} of an unknown node",

@@ -118,7 +118,6 @@ def _reached_none(view: View) -> Iterator[Finding]:
                 found.setdefault(each.at, (each, []))[1].append(facts.name)
     for at, (each, nodes) in found.items():
         yield REACHED_NONE.finding(
-            Outcome.UNVERIFIABLE,
             subject=each.name,
             expected=_wanted(each),
             observed="no such parameter",
@@ -202,7 +201,6 @@ def _undeclared(node: PlannedNode, known: Mapping[str, ParameterReport]) -> Iter
     )
     if names:
         yield UNDECLARED.on_node(
-            Outcome.VIOLATED,
             node,
             expected="no such parameter",
             observed=", ".join(f"{name} ({known[name].type})" for name in names[:_NAMED]),
@@ -222,7 +220,7 @@ def _finding(
     hint: str = "",
 ) -> Finding:
     return rule.finding(
-        Outcome.VIOLATED,
+        outcome=Outcome.VIOLATED,
         subject=f"{node.full_name}: {expected.name}",
         expected=wanted,
         observed=observed,
@@ -237,7 +235,6 @@ def _unknown(node: PlannedNode, why: str) -> Finding:
     names = [each.name for each in node.expected_parameters]
     what = _listed(names) if names else "that there are no parameters"
     return UNVERIFIABLE.on_node(
-        Outcome.UNVERIFIABLE,
         node,
         expected=", ".join(names) or "no parameters",
         observed="unknown",
@@ -247,7 +244,6 @@ def _unknown(node: PlannedNode, why: str) -> Finding:
 
 def _unread(node: PlannedNode, file: str) -> Finding:
     return UNVERIFIABLE.finding(
-        Outcome.UNVERIFIABLE,
         subject=f"{node.full_name}: {file}",
         expected=f"values of {file}",
         observed="unknown",

@@ -26,7 +26,6 @@ from lifecycle.verify.view import (
     NodeFacts,
     SeenEndpoint,
     View,
-    actual_qos,
 )
 
 QOS_DIFFERS = Rule(
@@ -84,10 +83,7 @@ def _against_declaration(actual: Actual, unknown: _Unknown) -> Iterator[Finding]
     planned, node = actual.planned, actual.node
     if planned.qos is None or _leaves_all(planned.qos):
         return
-    known = actual_qos(
-        actual.observed.qos if actual.observed else None,
-        actual.report.qos if actual.report else None,
-    )
+    known = actual.end.qos
     differing: list[tuple[str, str, str]] = []
     hidden: list[tuple[str, str]] = []
     for policy in _comparable(planned, planned.qos):
@@ -101,7 +97,6 @@ def _against_declaration(actual: Actual, unknown: _Unknown) -> Iterator[Finding]
     where = f"the {word} of {planned.resolved} in {node.full_name}"
     for policy, want, have in differing:
         yield QOS_DIFFERS.on_endpoint(
-            Outcome.VIOLATED,
             actual,
             expected=f"{policy} {want}",
             observed=f"{policy} {have}",
@@ -117,7 +112,6 @@ def _unverifiable(node: PlannedNode, unknown: _Unknown) -> Finding:
     listed = ", ".join(_spell_end(each) for each, _ in unknown)
     of = listed if len(unknown) == 1 else f"{len(unknown)} endpoints: {listed}"
     return QOS_UNVERIFIABLE.finding(
-        Outcome.UNVERIFIABLE,
         subject=node.full_name,
         expected="; ".join(
             f"{_spell_end(each)}: " + ", ".join(f"{policy} {want}" for policy, want in hidden)
@@ -212,7 +206,7 @@ def _incompatible(
     declared = publisher.planned or subscription.planned
     verb = "cannot match" if certain else "cannot verify that these match:"
     return QOS_INCOMPATIBLE.finding(
-        Outcome.VIOLATED if certain else Outcome.UNVERIFIABLE,
+        outcome=Outcome.VIOLATED if certain else Outcome.UNVERIFIABLE,
         subject=f"{publisher.name}: {offers} → {requests}",
         ends=tuple(filter(None, (publisher.node, subscription.node))),
         expected=f"{found.policy} of at least {found.requested} offered",

@@ -85,7 +85,6 @@ def _judge(view: View, facts: NodeFacts) -> Iterator[Finding]:
     expected = " or ".join([expected, *sorted(allowed - {wanted})])
     if wrong:
         yield WRONG_STATE.on_node(
-            Outcome.VIOLATED,
             node,
             expected=expected,
             observed=wrong[0],
@@ -93,7 +92,6 @@ def _judge(view: View, facts: NodeFacts) -> Iterator[Finding]:
         )
     elif observed is not None and observed.managed is False and not _reports_state(facts):
         yield WRONG_STATE.on_node(
-            Outcome.VIOLATED,
             node,
             expected=f"managed node, {expected}",
             observed="not a managed node",
@@ -102,7 +100,6 @@ def _judge(view: View, facts: NodeFacts) -> Iterator[Finding]:
         )
     elif not states:
         yield STATE_UNVERIFIABLE.on_node(
-            Outcome.UNVERIFIABLE,
             node,
             expected=expected,
             observed="unknown",
@@ -155,7 +152,6 @@ def _judge_report(facts: NodeFacts) -> Iterator[Finding]:
         return
     if facts.configuration is None:
         yield MISSING_REPORT.on_node(
-            Outcome.VIOLATED,
             facts.node,
             expected="node configuration",
             observed="no report",
@@ -168,7 +164,6 @@ def _judge_report(facts: NodeFacts) -> Iterator[Finding]:
         planned = actual.planned
         word = planned.kind.noun
         yield INCOMPLETE_REPORT.on_endpoint(
-            Outcome.VIOLATED,
             actual,
             expected=f"{word} in the report of {name}",
             observed="not mentioned",

@@ -134,7 +134,7 @@ def _finding(
         users[0].at,
     )
     return rule.finding(
-        Outcome.VIOLATED if Outcome.VIOLATED in rule.outcomes else Outcome.UNVERIFIABLE,
+        outcome=Outcome.VIOLATED if Outcome.VIOLATED in rule.outcomes else Outcome.UNVERIFIABLE,
         subject=CLOCK[0],
         expected=expected,
         observed=observed,

@@ -13,6 +13,7 @@ from tests.outside.case import OK, VIOLATED, Case
 from tests.outside.running import Run
 
 DIED = "run.process-died"
+FELL = {"exit_code": 6, "verdict": VIOLATED, "findings": (DIED,)}
 
 CHILD = """\
 import rclpy, signal, sys
@@ -218,8 +219,6 @@ CASES = (
         story=_shell_is_killed,
         verdict=OK,
         says=("restarted: 'child' 1 time",),
-        before="21 s in starting, then two /child; one ended 0.2 s later: ok, exit 0",
-        quick=True,
     ),
     Case(
         attack="a shell is killed whose child has a session of its own and ignores signals",
@@ -228,7 +227,6 @@ CASES = (
         verb=RESTARTED,
         story=_shell_is_killed,
         verdict=OK,
-        before="the child runs on beside its successor",
     ),
     Case(
         attack="a shell is killed whose child writes all the time",
@@ -240,7 +238,6 @@ CASES = (
         verb=RESTARTED,
         story=_shell_is_killed,
         verdict=OK,
-        before="21 s in starting",
     ),
     Case(
         attack="a shell whose child has a session of its own is restarted by order",
@@ -249,7 +246,6 @@ CASES = (
         verb=RESTARTED,
         story=_shell_is_restarted,
         verdict=OK,
-        before="the child runs on beside its successor",
     ),
     Case(
         attack="a shell whose child has neither its session nor its variables is restarted",
@@ -258,7 +254,6 @@ CASES = (
         verb=RESTARTED,
         story=_shell_is_restarted,
         verdict=OK,
-        before="the child runs on beside its successor",
     ),
     Case(
         attack="a hosted node is killed that had started a helper, and restarted",
@@ -267,19 +262,15 @@ CASES = (
         verb=RESTARTED,
         story=_host_is_killed,
         verdict=OK,
-        before="the helper runs on beside its successor's",
     ),
     Case(
         attack="a node aborts in on_deactivate at the end of a run",
         manifest=PAIR,
         files=_dies("on_deactivate", "os.abort()"),
         verb=("up", "--stop-after", "1"),
-        exit_code=6,
-        verdict=VIOLATED,
-        findings=(DIED,),
         says=("/one", "SIGABRT"),
-        before="5 s of waiting for a dead process, ok, exit 0",
         quick=True,
+        **FELL,
     ),
     *(
         Case(
@@ -287,11 +278,8 @@ CASES = (
             manifest=PAIR,
             files=_dies(handler, how),
             verb=("up", "--stop-after", "1"),
-            exit_code=6,
-            verdict=VIOLATED,
-            findings=(DIED,),
             within_s=20.0,
-            before="ok, exit 0",
+            **FELL,
         )
         for handler, how in (
             ("on_disconnect", "os.kill(os.getpid(), signal.SIGKILL)"),
@@ -308,11 +296,8 @@ CASES = (
             "class Two(LifecycleNode):\n    def on_cleanup(self): os._exit(3)\n",
         ),
         verb=("up", "--stop-after", "1"),
-        exit_code=6,
-        verdict=VIOLATED,
-        findings=(DIED,),
         says=("/one (run.process-died)", "/two (run.process-died)"),
-        before="ok, exit 0",
+        **FELL,
     ),
     Case(
         attack="a node aborts on the way down after Ctrl-C",
@@ -323,7 +308,6 @@ CASES = (
         exit_code=130,
         verdict=VIOLATED,
         findings=(DIED,),
-        before="verdict ok",
     ),
     Case(
         attack="a node aborts on the way down after lifecycle down",
@@ -331,10 +315,7 @@ CASES = (
         files=_dies("on_cleanup", "os.abort()"),
         verb=("up",),
         story=_is_ended,
-        exit_code=6,
-        verdict=VIOLATED,
-        findings=(DIED,),
-        before="ok, exit 0",
+        **FELL,
     ),
     Case(
         attack="a node aborts while the system is paused",
@@ -342,10 +323,8 @@ CASES = (
         files=_dies("on_deactivate", "os.abort()"),
         verb=("up",),
         story=_is_paused,
-        exit_code=6,
-        verdict=VIOLATED,
-        findings=(DIED,),
         not_findings=("graph.missing-node",),
+        **FELL,
     ),
     Case(
         attack="a command segfaults when it is asked to end",
@@ -360,11 +339,8 @@ CASES = (
             )
         },
         verb=("up", "--stop-after", "1"),
-        exit_code=6,
-        verdict=VIOLATED,
-        findings=(DIED,),
         says=("SIGSEGV",),
-        before="ok, exit 0",
+        **FELL,
     ),
     Case(
         attack="a command that ends with a traceback on Ctrl-C is healthy",
@@ -407,13 +383,10 @@ CASES = (
             )
         },
         verb=("up", "--stop-after", "20"),
-        exit_code=6,
-        verdict=VIOLATED,
-        findings=(DIED,),
         not_findings=("graph.missing-node", "state.not-active"),
         says=("ZeroDivisionError: division by zero", "ending.py:6)"),
-        before="names a log file, and adds graph.missing-node … compare domain, RMW",
         quick=True,
+        **FELL,
     ),
     Case(
         attack="a command dies of an exception with control characters in it",
@@ -430,13 +403,10 @@ CASES = (
             )
         },
         verb=("up", "--stop-after", "20"),
-        exit_code=6,
-        verdict=VIOLATED,
-        findings=(DIED,),
         not_findings=("graph.missing-node", "graph.missing-endpoint", "graph.unmatched"),
         says=("Key: \\\\x1b[2Jxxx",),
         not_says=("x" * 400 + " (",),
-        before="names a log file, and adds graph.missing-node",
+        **FELL,
     ),
     Case(
         attack="a node fails later than start_limit_interval_sec at each start",
@@ -451,7 +421,6 @@ CASES = (
         verdict=VIOLATED,
         findings=("run.gave-up",),
         within_s=30.0,
-        before="started again for ever",
     ),
     Case(
         attack="lifecycle down comes while the run only starts",
@@ -461,7 +430,6 @@ CASES = (
         story=_down_while_starting,
         exit_code=(6, 143),
         within_s=30.0,
-        before="cannot bring up …: another supervisor runs it; end it first: lifecycle down",
     ),
     Case(
         attack="nobody reads what the supervisor prints, and a node is killed",
@@ -469,9 +437,6 @@ CASES = (
         files=TALKATIVE,
         verb=("up", "--strict"),
         story=nobody_reads,
-        exit_code=6,
-        verdict=VIOLATED,
-        findings=(DIED,),
-        before="exit code 6",
+        **FELL,
     ),
 )

@@ -98,8 +98,6 @@ CASES = (
         findings=("run.not-answering",),
         activated=NOBODY,
         within_s=30.0,
-        before="ok",
-        quick=True,
     ),
     Case(
         attack="a plain node of a command is never spun, and that is no reason to wait",
@@ -110,7 +108,6 @@ CASES = (
         findings=("run.not-answering",),
         activated=LISTENER,
         within_s=30.0,
-        before="ok",
     ),
     Case(
         attack="a plain node of a command is never spun, and its hang is taken on trust",
@@ -120,7 +117,6 @@ CASES = (
         findings=("run.not-answering",),
         activated=LISTENER,
         within_s=30.0,
-        before="ok",
     ),
     Case(
         attack="a plain node of a command is never spun and serves no parameters",
@@ -132,7 +128,6 @@ CASES = (
         says=(NOT_SEEN,),
         activated=LISTENER,
         within_s=20.0,
-        before="ok, without a word",
     ),
     Case(
         attack="a plain node of a command is spun 2 s after it was made",
@@ -141,7 +136,6 @@ CASES = (
         verdict=OK,
         not_says=("run.not-answering",),
         activated=LISTENER,
-        before="ok",
     ),
     Case(
         attack="a managed node of a command is never spun",
@@ -150,7 +144,6 @@ CASES = (
         exit_code=6,
         activated=NOBODY,
         within_s=30.0,
-        before="exit code 6",
     ),
     Case(
         attack="a managed node of a command hangs once it is configured",
@@ -160,6 +153,5 @@ CASES = (
         says=("/base",),
         activated=NOBODY,
         within_s=40.0,
-        before="the others are activated, and it ends with exit code 6",
     ),
 )

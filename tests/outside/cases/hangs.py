@@ -143,7 +143,6 @@ def stop_the_supervisor(run: Run) -> None:
 
 HANG = frozenset({"sleeper"})
 FILES = {"hanging.py": NODES}
-BEFORE = "violated, 'has been running for 0.8 s', without where"
 
 CASES = (
     Case(
@@ -157,7 +156,6 @@ CASES = (
         findings=("run.silent-node",),
         activated=HANG,
         says=("of a timer of 1 s", "read_sensor (", "hanging.py:14", "wait_for_the_sensor ("),
-        before=BEFORE,
         quick=True,
     ),
     Case(
@@ -177,7 +175,6 @@ CASES = (
         verdict=VIOLATED,
         findings=("run.silent-node",),
         says=("of the subscription of /chatter", "take (", "hanging.py:14"),
-        before=BEFORE,
     ),
     Case(
         attack="a callback hangs in a library with the interpreter's lock",
@@ -189,7 +186,6 @@ CASES = (
         verdict=VIOLATED,
         findings=("run.silent-node",),
         says=("call_library (", "hanging.py:26"),
-        before=BEFORE,
     ),
     Case(
         attack="a callback of a plain rclpy node hangs",
@@ -201,7 +197,6 @@ CASES = (
         verdict=VIOLATED,
         findings=("run.silent-node",),
         says=("poll_hardware (", "hanging.py:14"),
-        before=BEFORE,
     ),
     Case(
         attack="a callback of a multi-threaded executor hangs",
@@ -213,7 +208,6 @@ CASES = (
         verdict=VIOLATED,
         findings=("run.silent-node",),
         says=("read_sensor (", "hanging.py:14"),
-        before=BEFORE,
     ),
     Case(
         attack="on_configure takes longer than configure_s",
@@ -222,8 +216,6 @@ CASES = (
         exit_code=6,
         activated=NOBODY,
         says=("still configuring after 1.5 s", "on_configure (", "hanging.py:14"),
-        before="still configuring after 1.5 s, without where",
-        quick=True,
     ),
     Case(
         attack="a constructor takes longer than start_s",
@@ -232,14 +224,12 @@ CASES = (
         exit_code=6,
         activated=NOBODY,
         says=("still starting after 2 s", "__init__ (", "hanging.py:14"),
-        before="still starting after 2 s, without where",
     ),
     Case(
         attack="callbacks are slow, and within silent_s",
         manifest=one("Short"),
         files=FILES,
         verb=("up", "--strict", "--stop-after", "3"),
-        exit_code=0,
         verdict=OK,
         not_findings=("run.silent-node",),
         activated=HANG,
@@ -253,6 +243,5 @@ CASES = (
         exit_code=(4, 130),
         activated=HANG,
         within_s=90.0,
-        before="the node's callbacks stop with the supervisor",
     ),
 )

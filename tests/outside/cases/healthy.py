@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tests.outside.case import NOBODY, OK, VIOLATED, Case
+from tests.outside.case import NOBODY, OK, REFUSED, Case
 
 PAIR = """\
 manifest_version: 1
@@ -21,7 +21,6 @@ CASES = (
     Case(
         attack="nothing is wrong",
         manifest=PAIR,
-        exit_code=0,
         verdict=OK,
         activated=frozenset({"talker", "listener"}),
         received=frozenset({"hello"}),
@@ -32,11 +31,9 @@ CASES = (
         manifest=PAIR,
         verb=("up", "--strict", "--stop-after", "2", "--timeout", "6"),
         strangers=(("stranger", "pub:/chatter"),),
-        exit_code=4,
-        verdict=VIOLATED,
         findings=("graph.undeclared-node",),
-        activated=NOBODY,
         received=NOBODY,
         quick=True,
+        **REFUSED,
     ),
 )

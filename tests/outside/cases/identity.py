@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tests.outside.case import NOBODY, OK, UNVERIFIABLE, VIOLATED, Case
+from tests.outside.case import NOBODY, OK, REFUSED, UNVERIFIABLE, VIOLATED, Case
 from tests.outside.running import Run
 
 RESET = """\
@@ -176,38 +176,58 @@ class TwoServers(Node):
 '''
 }
 
-REFUSED = ("up", "--strict", "--stop-after", "2", "--timeout", "6")
+ANSWERING = """
+import rclpy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from std_srvs.srv import Trigger
+
+
+def answer(_, response):
+    response.message = "real"
+    return response
+
+
+rclpy.init()
+node = rclpy.create_node("server")
+qos = QoSProfile(depth=10, reliability=ReliabilityPolicy.%s)
+node.create_service(Trigger, "/reset", answer, qos_profile=qos)
+try:
+    rclpy.spin(node)
+except BaseException:
+    node.destroy_node()
+    rclpy.try_shutdown()
+"""
+ANSWERED = RESET.replace('{python: "nodes:Server"}', "{command: [python3, answering.py]}").replace(
+    "    interface: {service_servers", "    managed: false\n    interface: {service_servers"
+)
+
+BRIEFLY = ("up", "--strict", "--stop-after", "2", "--timeout", "6")
 DOCK = "action_servers: [{name: /dock, type: test_msgs/action/Fibonacci}]"
 
 
-def _intruder(name: str, *does: str, manifest: str = RESET, quick: bool = False) -> Case:
+def _intruders(*strangers: tuple[str, str], manifest: str = RESET, quick: bool = False) -> Case:
+    """Strangers that are named as what is hidden, or as tools: each is found."""
     return Case(
-        attack=f"another process has a node {name}: {' '.join(does)}",
+        attack=f"another process has a node {', '.join(map(': '.join, strangers))}",
         manifest=manifest,
-        verb=REFUSED,
-        strangers=((name, *does),),
-        exit_code=4,
-        verdict=VIOLATED,
-        activated=NOBODY,
+        verb=BRIEFLY,
+        strangers=strangers,
         received=NOBODY,
-        before="ok, and most answers were the stranger's",
         quick=quick,
+        violated=tuple(f"/{name}" for name, _ in strangers),
+        **REFUSED,
     )
 
 
-def _node(
-    attack: str, program: str, interface: str = "", *findings: str, quick: bool = False
-) -> Case:
+def _node(attack: str, program: str, interface: str = "", *findings: str) -> Case:
     return Case(
         attack=attack,
         manifest=ONE % (program, interface),
         files=MORE,
-        verb=REFUSED,
+        verb=BRIEFLY,
         exit_code=4,
         verdict=VIOLATED,
         findings=findings,
-        before="ok",
-        quick=quick,
     )
 
 
@@ -220,14 +240,15 @@ SIM = "parameters: {use_sim_time: true}"
 PARAMETERS = {"p.yaml": "/**:\n  ros__parameters: {use_sim_time: true}\n"}
 
 CASES = (
-    _intruder("_server_x", "srv:/reset", quick=True),
-    _intruder("_server_flow_0", "srv:/reset"),
-    _intruder("_client_x", "cli:/reset"),
-    _intruder("_talker_x", "pub:/chatter", manifest=PAIR % ""),
-    _intruder("_talker_flow_0", "pub:/chatter", manifest=PAIR % OWN_FLOW),
-    _intruder("_listener_x", "sub:/chatter", manifest=PAIR % ""),
-    _intruder("_ros2cli_4711", "srv:/reset"),
-    _intruder("transform_listener_impl_5f", "srv:/reset"),
+    _intruders(("_server_x", "srv:/reset"), quick=True),
+    _intruders(
+        ("_server_flow_0", "srv:/reset"),
+        ("_client_x", "cli:/reset"),
+        ("_ros2cli_4711", "srv:/reset"),
+        ("transform_listener_impl_5f", "srv:/reset"),
+    ),
+    _intruders(("_talker_x", "pub:/chatter"), ("_listener_x", "sub:/chatter"), manifest=PAIR % ""),
+    _intruders(("_talker_flow_0", "pub:/chatter"), manifest=PAIR % OWN_FLOW),
     Case(
         attack="verify is asked while a hidden node of a stranger serves",
         manifest=RESET,
@@ -242,6 +263,22 @@ CASES = (
         manifest=RESET,
         verdict=OK,
         received=frozenset({"real"}),
+    ),
+    Case(
+        attack="a service is served by another program as declared",
+        manifest=ANSWERED,
+        files={"answering.py": ANSWERING % "RELIABLE"},
+        verb=("up", "--stop-after", "2"),
+        received=frozenset({"real"}),
+    ),
+    Case(
+        attack="a server of a declared service is none that DDS matches with its client",
+        manifest=ANSWERED,
+        files={"answering.py": ANSWERING % "BEST_EFFORT"},
+        verb=BRIEFLY,
+        findings=("graph.unmatched-client",),
+        says=("matched on service /reset: the client counts no server as available",),
+        **REFUSED,
     ),
     Case(
         attack="a publisher has a participant of its own",
@@ -273,7 +310,6 @@ CASES = (
         "HalfStatus",
         DOCK,
         "graph.type-mismatch",
-        quick=True,
     ),
     Case(
         attack="an action is served as declared",
@@ -281,7 +317,6 @@ CASES = (
         files=MORE,
         verb=("up", "--stop-after", "2"),
         not_findings=("graph.type-mismatch", "graph.undeclared-action-server"),
-        exit_code=0,
     ),
     _node(
         "a node publishes strings on its transition_event",
@@ -294,12 +329,11 @@ CASES = (
         attack="another program's node publishes on a topic of DDS without the prefix of ROS",
         manifest=FOREIGN,
         files={"raw.py": RAW},
-        verb=REFUSED,
+        verb=BRIEFLY,
         exit_code=4,
         verdict=VIOLATED,
         findings=("graph.undeclared-publisher",),
         says=("dds:",),
-        before="ok: it was seen by nobody",
     ),
     Case(
         attack="a plain node has only what rclpy gives it",
@@ -313,12 +347,9 @@ CASES = (
             attack=f"nobody publishes the time of a node: {how}",
             manifest=SIMULATED % (document, node, ""),
             files=PARAMETERS,
-            verb=REFUSED,
-            exit_code=4,
-            verdict=VIOLATED,
+            verb=BRIEFLY,
             findings=("time.no-clock",),
-            activated=NOBODY,
-            before="ok",
+            **REFUSED,
         )
         for how, document, node in (
             ("in line", "", SIM),
@@ -331,7 +362,6 @@ CASES = (
         manifest=SIMULATED % ("", SIM, ""),
         verb=("check",),
         says=("no node declares a publisher of '/clock'",),
-        before="no word of it",
     ),
     Case(
         attack="an undeclared player publishes the time",
@@ -341,19 +371,14 @@ CASES = (
         verdict=UNVERIFIABLE,
         findings=("time.undeclared-clock",),
         says=("rosbag2_player",),
-        before="ok, and not listed",
-        quick=True,
     ),
     Case(
         attack="two players publish the time",
         manifest=SIMULATED % ("", SIM, ""),
         strangers=(("rosbag2_player", "clock"), ("rqt_clock", "clock")),
-        verb=REFUSED,
-        exit_code=4,
-        verdict=VIOLATED,
+        verb=BRIEFLY,
         findings=("time.several-clocks",),
-        activated=NOBODY,
-        before="ok",
+        **REFUSED,
     ),
     Case(
         attack="the player begins late",
@@ -377,6 +402,5 @@ CASES = (
         verb=("up", "--stop-after", "4"),
         verdict=UNVERIFIABLE,
         findings=("time.silent-clock",),
-        before="ok",
     ),
 )

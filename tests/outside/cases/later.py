@@ -7,7 +7,7 @@ import signal
 import time
 from collections.abc import Callable
 
-from tests.outside.case import NOBODY, VIOLATED, Case
+from tests.outside.case import NOBODY, REFUSED, VIOLATED, Case
 from tests.outside.cases.identity import PAIR as TWO
 from tests.outside.running import Run
 
@@ -144,15 +144,14 @@ CASES = (
     ),
     Case(
         attack="a node sets a declared parameter in on_configure",
+        findings=("param.value-differs",),
         manifest=TWO.replace("nodes:Listener", "changes:SetsAtOnce").replace(
             "    interface: {sub", "    parameters: {gain: 1.0}\n    interface: {sub"
         )
         % "",
         files=CHANGES,
         verb=("up", "--strict", "--stop-after", "2", "--timeout", "6"),
-        exit_code=4,
-        verdict=VIOLATED,
-        activated=NOBODY,
+        **REFUSED,
     ),
     Case(
         attack="a stranger has the name of a declared node",

@@ -27,18 +27,21 @@ def system(
     run: str, *, given: str = "", interface: str = INTERFACE, more: str = "", name: str = "values"
 ) -> str:
     """Return a manifest of one node `values`."""
+    return HEAD + node(run, given, interface, name) + (f"{more}\n" if more else "")
+
+
+HEAD = "manifest_version: 1\nsystem: values\ndiscovery: {range: localhost}\nnodes:\n"
+
+
+def node(run: str, given: str, interface: str = INTERFACE, name: str = "values") -> str:
+    """Return what a manifest says of one node."""
     managed = "values:" in run and "Plain" not in run
     lines = [
-        "manifest_version: 1",
-        "system: values",
-        "discovery: {range: localhost}",
-        "nodes:",
         f"  {name}:",
         f"    run: {run}",
         *([] if managed else ["    managed: false", f"    name: {name}"]),
         *([f"    {given}"] if given else []),
         *([f"    interface: {interface}"] if interface else []),
-        *([more] if more else []),
     ]
     return "\n".join(lines) + "\n"
 
@@ -50,14 +53,15 @@ def in_file(values: str, name: str = "/**") -> dict[str, str]:
 EMPTY = ("names=[] STRING_ARRAY", "counts=[] INTEGER_ARRAY")
 
 
-def has(*wanted: str) -> Callable[[Run], None]:
+def has(*wanted: str, node: str = "") -> Callable[[Run], None]:
     """Return a story: the node notes these."""
 
     def story(run: Run) -> None:
         def noted() -> set[str]:
-            return {what.removeprefix("received ") for _, _, what in run.marks(what="received ")}
+            marks = run.marks(node, "received ")
+            return {what.removeprefix("received ") for _, _, what in marks}
 
-        run.wait(lambda: set(wanted) <= noted(), f"notes {wanted}")
+        run.wait(lambda: set(wanted) <= noted(), f"{node} notes {wanted}")
 
     return story
 
@@ -94,38 +98,40 @@ def plan_is_json(run: Run) -> None:
 
 
 SPECIAL = "gains=[nan, -inf, 1.5] DOUBLE_ARRAY"
-WAYS = (
-    ("a node of the host", MANAGED, ".INF", "inf"),
-    ("a node of the host that declares its parameters", CODED, ".Inf", "inf"),
-    ("a plain node of the host", PLAIN, "-.INF", "-inf"),
-    ("a program", COMMAND, ".NAN", "nan"),
-)
+WAYS = {
+    "managed": (MANAGED, ".INF", "inf"),
+    "coded": (CODED, ".Inf", "inf"),
+    "plain": (PLAIN, "-.INF", "-inf"),
+    "program": (COMMAND, ".NAN", "nan"),
+}
+"""Nodes of the host, of which one declares its parameters in code, and a program."""
 
 
-def _arrives(who: str, run: str, how: str, spelled: str, is_: str, quick: bool) -> Case:
-    values = GIVEN % spelled
+def all_have(run: Run) -> None:
+    for name, (_, _, is_) in WAYS.items():
+        has(f"gain={is_} DOUBLE", SPECIAL, *EMPTY, node=name)(run)
+
+
+def _arrive(how: str) -> Case:
+    given = {name: GIVEN % spelled for name, (_, spelled, _) in WAYS.items()}
+    says = {
+        name: f"parameters: {values}" if how == "inline" else f"parameter_files: [{name}.yaml]"
+        for name, values in given.items()
+    }
+    files = {f"{name}.yaml": in_file(values)["values.yaml"] for name, values in given.items()}
     return Case(
-        attack=f"{spelled}, NaN and empty arrays reach {who}, {how}",
-        manifest=system(
-            run,
-            given=f"parameters: {values}" if how == "inline" else "parameter_files: [values.yaml]",
-        ),
-        files={} if how == "inline" else in_file(values),
+        attack=f"infinity, NaN and empty arrays reach nodes of the host and a program, {how}",
+        manifest=HEAD + "".join(node(WAYS[name][0], says[name], name=name) for name in WAYS),
+        files={} if how == "inline" else files,
         verb=("up", "--strict", "--stop-after", "1"),
-        story=has(f"gain={is_} DOUBLE", SPECIAL, *EMPTY),
-        exit_code=0,
+        story=all_have,
         verdict=OK,
-        before="exit 70, or never arrived",
-        quick=quick,
     )
 
 
 CASES = (
-    *(
-        _arrives(who, run, how, spelled, is_, quick=run == MANAGED and how == "in a file")
-        for who, run, spelled, is_ in WAYS
-        for how in ("inline", "in a file")
-    ),
+    _arrive("inline"),
+    _arrive("in a file"),
     Case(
         attack="values behind -p: infinity and an empty array",
         manifest=system(
@@ -135,7 +141,6 @@ CASES = (
         verb=("up", "--strict", "--stop-after", "1"),
         story=has("gain=-inf DOUBLE", *EMPTY),
         verdict=OK,
-        before="exit 70",
     ),
     Case(
         attack="a file of the command line itself: NaN and an empty array",
@@ -146,7 +151,6 @@ CASES = (
         verb=("up", "--strict", "--stop-after", "1"),
         story=has("gain=nan DOUBLE", "names=[] STRING_ARRAY"),
         verdict=OK,
-        before="violated: names is not set",
     ),
     Case(
         attack="an empty array whose type nothing declares gets that of the node",
@@ -155,7 +159,6 @@ CASES = (
         story=has("names=[] STRING_ARRAY"),
         verdict=OK,
         says=("cannot tell the type of 'names'",),
-        before="never arrived",
     ),
     Case(
         attack="check says that nothing declares the type of an empty array",
@@ -163,7 +166,6 @@ CASES = (
         verb=("check", "--strict"),
         exit_code=5,
         says=("cannot tell the type of 'names'",),
-        before="exit 0, nothing said",
     ),
     Case(
         attack="NaN in the first mode is what the node has, and equals itself",
@@ -175,7 +177,6 @@ CASES = (
         verb=("up", "--strict", "--stop-after", "1"),
         story=has("gain=nan DOUBLE"),
         verdict=OK,
-        before="exit 3",
     ),
     Case(
         attack="empty arrays and infinities in modes",
@@ -187,14 +188,12 @@ CASES = (
         verb=("up", "--strict", "--stop-after", "4"),
         story=in_modes,
         verdict=OK,
-        before="exit 3",
     ),
     Case(
         attack="a plan with values that JSON has no numbers for",
         manifest=system(MANAGED, given=f"parameters: {GIVEN % '-.inf'}"),
         verb=("plan",),
         story=plan_is_json,
-        before="exit 3",
     ),
     Case(
         attack="a number that must be finite is not",
@@ -202,7 +201,6 @@ CASES = (
         verb=("check",),
         exit_code=3,
         says=("a number must be finite",),
-        before="the same",
     ),
     Case(
         attack="an integer that does not fit into 64 bits",
@@ -210,7 +208,6 @@ CASES = (
         verb=("check",),
         exit_code=3,
         says=("an integer must fit into 64 bits",),
-        before="the same",
     ),
     Case(
         attack="what rcl reads as a string is no double",
@@ -219,7 +216,6 @@ CASES = (
         verb=("check",),
         exit_code=3,
         says=("it is a string, declared is double",),
-        before="exit 70",
     ),
     Case(
         attack="a section of a parameter file for a node that is not there",
@@ -233,20 +229,16 @@ CASES = (
         verdict=UNVERIFIABLE,
         findings=("param.reached-none",),
         activated=NOBODY,
-        before="exit 0, a warning on stderr",
-        quick=True,
     ),
     Case(
         attack="the gate opens on a value that reached nobody, and says so",
         manifest=system(MANAGED, given="parameter_files: [values.yaml]"),
         files=in_file("{gain: 2.0}", "/valeus"),
         verb=("up", "--stop-after", "1"),
-        exit_code=0,
         verdict=UNVERIFIABLE,
         findings=("param.reached-none",),
         activated=frozenset({"values"}),
         says=("trusted", "param.reached-none"),
-        before="exit 0, verdict ok",
     ),
     Case(
         attack="a misspelt parameter below /** of a node without declared parameters",
@@ -256,7 +248,6 @@ CASES = (
         exit_code=5,
         verdict=UNVERIFIABLE,
         findings=("param.reached-none",),
-        before="exit 0, nothing said",
     ),
     Case(
         attack="a misspelt parameter that all nodes share",
@@ -266,7 +257,6 @@ CASES = (
         verdict=UNVERIFIABLE,
         findings=("param.reached-none",),
         activated=NOBODY,
-        before="exit 0, nothing said",
     ),
     Case(
         attack="-p for a node that its process does not have",
@@ -275,7 +265,6 @@ CASES = (
         exit_code=5,
         verdict=UNVERIFIABLE,
         findings=("param.reached-none",),
-        before="exit 0, nothing said",
     ),
     Case(
         attack="check refuses under --strict what up refuses: a value that reaches nobody",
@@ -284,7 +273,6 @@ CASES = (
         verb=("check", "--strict"),
         exit_code=5,
         says=("cannot find node '/values'",),
-        before="exit 3",
     ),
     Case(
         attack="advice of check is no reason to refuse",
@@ -295,11 +283,9 @@ CASES = (
             "    restart_sec: 1",
         ),
         verb=("up", "--strict", "--stop-after", "1"),
-        exit_code=0,
         verdict=OK,
         says=("note: ", "never given up"),
         activated=frozenset({"values"}),
-        before="exit 0",
     ),
     Case(
         attack="check finds advice, and is content under --strict",
@@ -309,9 +295,7 @@ CASES = (
             "    restart_sec: 1",
         ),
         verb=("check", "--strict"),
-        exit_code=0,
         says=("note: ", "(1 note)"),
-        before="exit 3",
     ),
     Case(
         attack="a value below /** that one of two nodes has reached somebody",
@@ -321,6 +305,5 @@ CASES = (
         verb=("up", "--strict", "--stop-after", "1"),
         story=has("gain=2.0 DOUBLE"),
         verdict=OK,
-        before="the same",
     ),
 )

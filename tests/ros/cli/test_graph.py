@@ -6,7 +6,7 @@ import json
 import re
 import signal
 import subprocess
-import time
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -129,12 +129,16 @@ def watching(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
 def until(process: subprocess.Popen[str], holds: Callable[[dict[str, Any]], bool]) -> None:
     """Read pictures until one is as wanted."""
     assert process.stdout is not None
-    deadline = time.monotonic() + BOUND_S
-    for line in process.stdout:
-        if holds(json.loads(line)):
-            return
-        assert time.monotonic() < deadline
-    raise AssertionError("it ended")
+    late = threading.Timer(BOUND_S, process.send_signal, [signal.SIGINT])
+    late.start()
+    last = ""
+    try:
+        for last in process.stdout:
+            if holds(json.loads(last)):
+                return
+    finally:
+        late.cancel()
+    raise AssertionError(f"it never came; the last picture was {last}")
 
 
 def test_a_watched_supervisor_shows_each_change_until_it_ends(

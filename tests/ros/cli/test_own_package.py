@@ -57,6 +57,7 @@ def test_a_new_package_passes_its_tests_side_by_side_as_it_is(package: Path) -> 
     assert "3 passed" in done.stdout
 
 
+@pytest.mark.thorough
 def test_a_test_that_fails_shows_the_verdict_and_the_logs(package: Path) -> None:
     manifest = package / "manifests/pair_of_nodes.lifecycle.yaml"
     sound = manifest.read_text()

@@ -94,6 +94,7 @@ def _is_left_alone(events: list[dict[str, Any]], processes: list[subprocess.Pope
     assert [each.poll() for each in processes] == [None] * len(processes)
 
 
+@pytest.mark.thorough
 def test_programs_started_by_hand_are_adopted_and_come_up_again_from_what_was_captured(
     tmp_path: Path, domain_id: int
 ) -> None:

@@ -43,16 +43,11 @@ def _run(node: str, name: str) -> dict[str, object]:
 STATIC = (
     Fault(
         name="two types on one topic",
+        quick=True,
         edits={f"{LISTENER}/interface/subscriptions/0/type": "std_msgs/msg/Int32"},
         exit_code=ExitCode.MANIFEST_INVALID,
         subject="/chatter",
         message="std_msgs/msg/Int32",
-    ),
-    Fault(
-        name="a remap leads the subscription to a topic that nobody publishes",
-        edits={f"{LISTENER}/remap": {"chatter": "/chattter"}, "links": []},
-        exit_code=ExitCode.MANIFEST_INVALID,
-        subject="/chattter",
     ),
     Fault(
         name="the declared QoS profiles are incompatible",
@@ -63,46 +58,6 @@ STATIC = (
         exit_code=ExitCode.MANIFEST_INVALID,
         subject="/chatter",
         message="reliability",
-    ),
-    Fault(
-        name="a link names a topic that its node does not publish",
-        edits={"links/0/topic": "/chat"},
-        exit_code=ExitCode.MANIFEST_INVALID,
-        subject="/chat",
-    ),
-    Fault(
-        name="two nodes are declared under one name",
-        edits={f"{LISTENER}/name": "talker"},
-        exit_code=ExitCode.MANIFEST_INVALID,
-        subject="/talker",
-    ),
-    Fault(
-        name="two nodes wait for each other",
-        edits={
-            f"{LISTENER}/after": {"talker": "active"},
-            f"{TALKER}/after": {"listener": "active"},
-        },
-        exit_code=ExitCode.MANIFEST_INVALID,
-        subject="talker",
-        message="listener",
-    ),
-    Fault(
-        name="a parameter is set that the interface does not declare",
-        edits={f"{TALKER}/parameters": {"misbehav": ""}},
-        exit_code=ExitCode.MANIFEST_INVALID,
-        subject="misbehav",
-    ),
-    Fault(
-        name="a flow is asked of an endpoint that does not exist",
-        edits={f"{TALKER}/flows": {"publishers": {"chat": {"unique": "strictly_required"}}}},
-        exit_code=ExitCode.MANIFEST_INVALID,
-        subject="chat",
-    ),
-    Fault(
-        name="a link demands a unique flow that no endpoint asks for",
-        edits={"links/0/unique": "strongly"},
-        exit_code=ExitCode.MANIFEST_INVALID,
-        subject="/chatter",
     ),
     Fault(
         name="a strictly unique publisher is asked of a command",
@@ -147,6 +102,7 @@ START = (
     ),
     Fault(
         name="the constructor raises",
+        quick=True,
         edits=_run("talker", "RaisesInConstructor"),
         exit_code=ExitCode.BRING_UP_FAILED,
         subject="talker",
@@ -154,6 +110,7 @@ START = (
     ),
     Fault(
         name="the process dies while the node is constructed",
+        quick=True,
         edits=_run("talker", "DiesInConstructor"),
         exit_code=ExitCode.BRING_UP_FAILED,
         subject="talker",
@@ -182,6 +139,7 @@ START = (
     ),
     Fault(
         name="a node that somebody else should start is not there",
+        quick=True,
         edits={f"{LISTENER}/run": {"attach": True}, f"{LISTENER}/timeouts/start_s": 1.0},
         exit_code=ExitCode.BRING_UP_FAILED,
         subject="/listener",
@@ -206,6 +164,7 @@ TRANSITIONS = (
     *(
         Fault(
             name=f"on_{step} raises",
+            quick=step == "activate",
             edits=_misbehave("talker", f"{step}:raise"),
             exit_code=ExitCode.BRING_UP_FAILED,
             subject="/talker",
@@ -257,6 +216,7 @@ TRANSITIONS = (
     *(
         Fault(
             name=f"on_{step} hangs",
+            quick=step == "connect",
             edits=_misbehave("listener", f"{step}:hang", **{f"{step}_s": 0.4}),
             exit_code=ExitCode.BRING_UP_FAILED,
             subject="/listener",
@@ -267,6 +227,7 @@ TRANSITIONS = (
     ),
     Fault(
         name="an async on_configure awaits for ever",
+        quick=True,
         edits={
             **_run("talker", "HangsAsync"),
             **_misbehave("talker", "configure:await", configure_s=0.4),
@@ -288,6 +249,7 @@ TRANSITIONS = (
 GRAPH = (
     Fault(
         name="a node makes a publisher that it does not declare",
+        quick=True,
         edits=_misbehave("talker", "configure:publisher"),
         exit_code=ExitCode.VIOLATED,
         rule="graph.undeclared-publisher",
@@ -304,6 +266,7 @@ GRAPH = (
     ),
     Fault(
         name="a command publishes with another QoS than declared",
+        quick=True,
         edits=_command("talker", "--publish", "/chatter:std_msgs/msg/String:BEST_EFFORT"),
         exit_code=ExitCode.VIOLATED,
         rule="graph.qos-incompatible",
@@ -372,6 +335,7 @@ GRAPH = (
     ),
     Fault(
         name="a foreign node has the name of one of ours",
+        quick=True,
         edits={},
         intruder=("talker",),
         exit_code=ExitCode.VIOLATED,
@@ -383,6 +347,7 @@ GRAPH = (
 DEFINITIONS = (
     Fault(
         name="a publisher was built from another definition of its type",
+        quick=True,
         edits=_command(
             *("talker", "--publish", "/chatter:std_msgs/msg/String:RELIABLE"),
             *("--redefine", "std_msgs/msg/String"),
@@ -485,6 +450,7 @@ FLOWS = (
 ACTIVE = (
     Fault(
         name="a process dies after the system is active",
+        quick=True,
         edits=_misbehave("talker", "active:kill"),
         exit_code=ExitCode.BRING_UP_FAILED,
         subject="talker",
@@ -570,7 +536,18 @@ OUTSIDERS = (
         options=("--strict",),
     ),
     Fault(
+        name="a tool answers whoever would change the state of a declared node",
+        edits={},
+        intruder=("rviz2", "--answer", "/talker/change_state:lifecycle_msgs/srv/ChangeState"),
+        exit_code=ExitCode.VIOLATED,
+        rule="graph.undeclared-service-server",
+        subject="/talker/change_state",
+        message="/rviz2",
+        options=("--strict",),
+    ),
+    Fault(
         name="a tool has a server of a declared action",
+        quick=True,
         edits=_docked("--serve", "/dock:test_msgs/action/Fibonacci"),
         intruder=("rqt_action", "--serve", "/dock:test_msgs/action/Fibonacci"),
         exit_code=ExitCode.VIOLATED,
@@ -588,6 +565,7 @@ OUTSIDERS = (
     ),
     Fault(
         name="a plain DDS program may write a declared topic",
+        quick=True,
         edits={},
         intruder=("--write", "rt/chatter:std_msgs::msg::dds_::String_"),
         intruder_is=BARE_DDS,

@@ -101,6 +101,7 @@ class Fault:
         intruder: a foreign process that runs beside the system: arguments of `intruder_is`.
         intruder_is: the program, foreign.py or bare_dds.py.
         activates: the fault strikes after a verdict ok, so activation is right.
+        quick: is in `make test`, too.
     """
 
     name: str
@@ -113,6 +114,7 @@ class Fault:
     intruder: tuple[str, ...] = ()
     intruder_is: str = FOREIGN
     activates: bool = False
+    quick: bool = False
 
     @property
     def manifest(self) -> str:

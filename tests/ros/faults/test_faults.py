@@ -8,65 +8,52 @@ from pathlib import Path
 import pytest
 
 from tests.ros.faults.catalogue import FAULTS
-from tests.ros.faults.running import UpRun, processes_of, run_up
+from tests.ros.faults.running import ended
 from tests.ros.faults.system import ExitCode, Fault
+from tests.ros.supervisor.running import Up
 
 pytestmark = pytest.mark.ros
 
 
-def _of_kind(run: UpRun, kind: str) -> list[dict[str, object]]:
-    return [event for event in run.events if event.get("event") == kind]
-
-
-def _everything_said(run: UpRun) -> str:
-    said = [json.dumps(event, ensure_ascii=False) for event in run.events if _is_told(event)]
-    return "\n".join([*said, run.errors])
-
-
-def _is_told(event: dict[str, object]) -> bool:
+def _everything_said(run: Up) -> str:
     """Only what states a cause counts: any event may name a node, and a log holds everything."""
-    return event.get("event") in {"failure", "verdict", None}
+    causes = [each for each in run.events if each.get("event") in {"failure", "verdict", None}]
+    return "\n".join([*(json.dumps(each, ensure_ascii=False) for each in causes), run.said()])
 
 
-def _assert_gate_held(run: UpRun, fault: Fault) -> None:
-    kinds = [event.get("event") for event in run.events]
-    activations = [
-        index
-        for index, event in enumerate(run.events)
-        if event.get("event") == "request" and event.get("operation") == "activate"
-    ]
-    if activations:
-        assert fault.activates, f"activated a system with a fault: {fault.name}"
-        opened = kinds.index("gate")
-        assert opened < min(activations)
-        judged = [event["verdict"] for event in run.events[:opened] if event["event"] == "verdict"]
-        assert not judged[-1]["blocking"]  # type: ignore[index]
+def _assert_gate_held(run: Up, fault: Fault, markers: list[str]) -> None:
+    run.assert_gate_held()
+    activated = [e for e in run.of_kind("request") if e["operation"] == "activate"]
+    assert fault.activates or not activated, f"activated a system with a fault: {fault.name}"
     if not fault.activates:
-        assert "gate" not in kinds
-        assert not [line for line in run.markers if line.endswith((" activate", " active"))]
+        assert run.of_kind("gate") == []
+        assert not [line for line in markers if line.endswith((" activate", " active"))]
 
 
-@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
+@pytest.mark.parametrize(
+    "fault",
+    [
+        pytest.param(each, id=each.name, marks=() if each.quick else pytest.mark.thorough)
+        for each in FAULTS
+    ],
+)
 def test_a_broken_system_is_refused_named_and_cleared_away(fault: Fault, tmp_path: Path) -> None:
-    run = run_up(fault, tmp_path)
+    with ended(fault, tmp_path) as (run, code):
+        said = _everything_said(run)
+        assert code == fault.exit_code, said
+        assert fault.subject in said
+        assert fault.message in said
+        if run.events:
+            assert run.verdict["run"]["exit_code"] == fault.exit_code
+            assert fault.subject in run.verdict["run"]["reason"]
+        if fault.rule:
+            named = [(each["rule"], each["subject"]) for each in run.verdict["findings"]]
+            assert any(each == fault.rule and fault.subject in subject for each, subject in named)
+        _assert_gate_held(run, fault, _markers(tmp_path))
 
-    said = _everything_said(run)
-    assert run.exit_code == fault.exit_code, said
-    assert fault.subject in said
-    assert fault.message in said
-    if run.events:
-        end = run.events[-1]["run"]
-        assert isinstance(end, dict)
-        assert end["exit_code"] == fault.exit_code
-        assert fault.subject in end["reason"]
-    if fault.rule:
-        findings = run.events[-1]["findings"]
-        assert isinstance(findings, list)
-        named = [(finding["rule"], finding["subject"]) for finding in findings]
-        assert any(rule == fault.rule and fault.subject in subject for rule, subject in named), said
-    _assert_gate_held(run, fault)
-    assert processes_of(run.token) == []
-    assert run.shared_memory == ()
+
+def _markers(directory: Path) -> list[str]:
+    return (directory / "markers").read_text().splitlines()
 
 
 def test_the_healthy_system_passes(tmp_path: Path) -> None:
@@ -79,16 +66,15 @@ def test_the_healthy_system_passes(tmp_path: Path) -> None:
         activates=True,
         options=("--stop-after", "2"),
     )
-    run = run_up(healthy, tmp_path)
-    assert run.exit_code == ExitCode.OK, _everything_said(run)
-    assert run.events[-1]["verdict"] == "ok"
-    assert len([each for each in _of_kind(run, "request") if each["operation"] == "activate"]) == 2
-    _assert_gate_held(run, healthy)
-    activated = run.markers.index("listener activate")
-    assert "listener message" in run.markers[activated:]
-    assert "listener message" not in run.markers[:activated]
-    assert processes_of(run.token) == []
-    assert run.shared_memory == ()
+    with ended(healthy, tmp_path) as (run, code):
+        assert code == ExitCode.OK, _everything_said(run)
+        assert run.verdict["verdict"] == "ok"
+        assert len([e for e in run.of_kind("request") if e["operation"] == "activate"]) == 2
+        markers = _markers(tmp_path)
+        _assert_gate_held(run, healthy, markers)
+        activated = markers.index("listener activate")
+        assert "listener message" in markers[activated:]
+        assert "listener message" not in markers[:activated]
 
 
 def test_a_tool_that_only_listens_is_tolerated_and_listed(tmp_path: Path) -> None:
@@ -102,20 +88,13 @@ def test_a_tool_that_only_listens_is_tolerated_and_listed(tmp_path: Path) -> Non
         intruder=("_ros2cli_4711", "--subscribe", "/chatter:std_msgs/msg/String:RELIABLE"),
         options=("--strict", "--stop-after", "1"),
     )
-    run = run_up(echo, tmp_path)
-    assert run.exit_code == ExitCode.OK, _everything_said(run)
-    assert run.events[-1]["verdict"] == "ok"
-    assert run.events[-1]["tolerated"] == [
-        {
-            "node": "/_ros2cli_4711",
-            "because": "tolerated_nodes: _ros2cli_*",
-            "endpoints": [
-                {
-                    "kind": "subscriptions",
-                    "node": "/_ros2cli_4711",
-                    "name": "/chatter",
-                    "type": "std_msgs/msg/String",
-                }
-            ],
-        }
-    ]
+    with ended(echo, tmp_path) as (run, code):
+        assert code == ExitCode.OK, _everything_said(run)
+        assert run.verdict["verdict"] == "ok"
+        (tolerated,) = run.verdict["tolerated"]
+        assert (tolerated["node"], tolerated["because"]) == (
+            "/_ros2cli_4711",
+            "tolerated_nodes: _ros2cli_*",
+        )
+        (endpoint,) = tolerated["endpoints"]
+        assert (endpoint["kind"], endpoint["name"]) == ("subscriptions", "/chatter")

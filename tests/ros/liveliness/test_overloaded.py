@@ -10,10 +10,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-import yaml
 
 from tests.ros.liveliness.nodes import WORKS_S
-from tests.ros.supervisor.running import up
+from tests.ros.supervisor.running import up, write
 
 pytestmark = pytest.mark.alone
 
@@ -60,15 +59,8 @@ def waited_s(pid: int) -> float:
 def test_a_callback_that_gets_no_processor_is_not_called_hung(
     tmp_path: Path, fresh_domain: int
 ) -> None:
-    file = tmp_path / "busy.lifecycle.yaml"
     run = {"python": "tests.ros.liveliness.nodes:Working"}
-    document = {
-        "manifest_version": 1,
-        "system": "busy",
-        "discovery": {"domain_id": fresh_domain, "range": "localhost"},
-        "nodes": {"working": {"run": run}},
-    }
-    file.write_text(yaml.safe_dump(document))
+    file = write(tmp_path, fresh_domain, {"working": {"run": run}}, "busy")
     with up(file, runtime=tmp_path) as running:
         running.until("system", reached="active")
         pid = running.pid_of("working")

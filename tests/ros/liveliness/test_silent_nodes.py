@@ -14,13 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 
-from lifecycle.middleware.rcl.hidden_node import republish_names
-from tests.ros.supervisor.running import ROOT, Event, Up, environment, up, verb
+from tests.ros.supervisor.running import ROOT, Event, Up, environment, up, verb, write
 from tests.stalls import Stalls, assert_in_time, noted_stalls
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.thorough
 
 NODES = "benchmarks.liveliness_nodes"
 WITHIN_S = 1.0
@@ -47,44 +45,16 @@ def stalls() -> Iterator[Stalls]:
 
 
 @pytest.fixture
-def system(tmp_path: Path, fresh_domain: int) -> Callable[..., Path]:
-    """Write the manifest of a node that hangs when told to, and a quiet one."""
-
-    def write(hanging: Mapping[str, Any] | None = None) -> Path:
-        file = tmp_path / "silence.lifecycle.yaml"
-        run = {
-            "python": f"{NODES}:Hanging",
-            "environment": {"HANG_FILE": str(tmp_path / "hang")},
-        }
-        file.write_text(
-            yaml.safe_dump(
-                {
-                    "manifest_version": 1,
-                    "system": "silence",
-                    "discovery": {"domain_id": fresh_domain, "range": "localhost"},
-                    "nodes": {
-                        "hanging": hanging or {"run": run},
-                        "quiet": {"run": {"python": f"{NODES}:Quiet"}},
-                    },
-                }
-            )
-        )
-        return file
-
-    return write
-
-
-@pytest.fixture
-def start(tmp_path: Path, system: Callable[..., Path]) -> Iterator[Callable[..., Up]]:
-    """Bring such a system up: `start(timeouts={...})`; it ends with the test."""
+def start(tmp_path: Path, fresh_domain: int) -> Iterator[Callable[..., Up]]:
+    """Bring a node that hangs when told to and a quiet one up: `start(timeouts={...})`."""
+    environment = {"HANG_FILE": str(tmp_path / "hang")}
+    run = {"python": f"{NODES}:Hanging", "environment": environment}
     with contextlib.ExitStack() as stack:
 
         def begin(*options: str, hanging: Mapping[str, Any] | None = None, **keys: Any) -> Up:
-            file = system(hanging)
-            if keys:
-                document = yaml.safe_load(file.read_text())
-                document["nodes"]["hanging"].update(keys)
-                file.write_text(yaml.safe_dump(document))
+            quiet = {"run": {"python": f"{NODES}:Quiet"}}
+            nodes = {"hanging": {**(hanging or {"run": run}), **keys}, "quiet": quiet}
+            file = write(tmp_path, fresh_domain, nodes, "silence")
             return stack.enter_context(up(file, *options, runtime=tmp_path))
 
         yield begin
@@ -147,6 +117,7 @@ def silences(running: Up, node: str) -> list[Event]:
     return [event for event in running.of_kind("silent") if event["node"] == node]
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("way", ["sleep", "busy", "locked"])
 def test_a_hung_executor_is_noticed_within_a_second_and_so_is_its_end(
     start: Callable[..., Up], tmp_path: Path, way: str, stalls: Stalls
@@ -186,6 +157,7 @@ def test_a_hung_executor_is_noticed_within_a_second_and_so_is_its_end(
     assert_in_time(late_s)
 
 
+@pytest.mark.alone
 def test_a_stopped_process_is_noticed_at_once_and_so_is_its_continuation(
     start: Callable[..., Up], stalls: Stalls
 ) -> None:
@@ -240,6 +212,7 @@ def test_a_system_with_a_stopped_node_is_taken_down_without_waiting_for_it(
     running.assert_nothing_left()
 
 
+@pytest.mark.alone
 def test_a_killed_node_is_dead_and_not_silent(start: Callable[..., Up], stalls: Stalls) -> None:
     running = start("--keep-going")
     running.until("system", reached="active")
@@ -253,6 +226,7 @@ def test_a_killed_node_is_dead_and_not_silent(start: Callable[..., Up], stalls: 
     assert silences(running, "/quiet") == []
 
 
+@pytest.mark.alone
 def test_a_callback_may_take_as_long_as_the_manifest_allows(
     start: Callable[..., Up], tmp_path: Path
 ) -> None:
@@ -265,6 +239,7 @@ def test_a_callback_may_take_as_long_as_the_manifest_allows(
     assert silences(running, "/hanging") == []
 
 
+@pytest.mark.alone
 def test_a_transition_that_takes_long_is_not_a_hang(start: Callable[..., Up]) -> None:
     slow = {"run": {"python": "tests.ros.liveliness.nodes:Slow"}}
     running = start("--stop-after", "0", hanging=slow)
@@ -281,6 +256,7 @@ def test_nodes_join_and_leave_the_graph_as_events(start: Callable[..., Up]) -> N
     running.until("left", node="/quiet")
 
 
+@pytest.mark.alone
 def test_a_node_that_somebody_else_runs_is_heard_by_whoever_attaches_to_it(
     start: Callable[..., Up], tmp_path: Path, stalls: Stalls
 ) -> None:
@@ -318,14 +294,3 @@ def test_a_node_that_somebody_else_runs_is_heard_by_whoever_attaches_to_it(
     finally:
         node.kill()
         node.wait(10)
-
-
-def test_telling_names_anew_adds_nothing_to_the_graph(
-    make_node: Callable[..., Any], wait_until: Callable[..., None]
-) -> None:
-    node, other = make_node("teller"), make_node("listener")
-    wait_until(lambda: ("teller", "/") in other.get_node_names_and_namespaces())
-    before = sorted(node.get_topic_names_and_types())
-    republish_names([node])
-    wait_until(lambda: sorted(other.get_topic_names_and_types()) == before)
-    assert node.count_publishers("/parameter_events") == 2

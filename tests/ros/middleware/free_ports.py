@@ -31,3 +31,8 @@ def free_ports(count: int) -> list[int]:
             if len(found) == count:
                 return found
     raise AssertionError(f"fewer than {count} ports of domain {os.environ['ROS_DOMAIN_ID']} free")
+
+
+def first_port() -> int:
+    """Return the first of more free ports than a planner gives out to two nodes."""
+    return free_ports(20)[0]

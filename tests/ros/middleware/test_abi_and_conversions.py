@@ -11,7 +11,6 @@ from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data, qos_profile_services_default
 from std_msgs.msg import String
-from std_srvs.srv import Trigger
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.qos import Durability, History, Liveliness, QosProfile, Reliability
@@ -148,14 +147,6 @@ def test_an_endpoint_that_listens_nowhere_is_refused(
     assert "strictly_required: the RMW lists no network flow endpoint for it;" in str(refused.value)
 
 
-def test_errors_lose_the_places_in_c_files_and_are_used_up() -> None:
-    rcl = abi.load()
-    assert rcl.wait_set_fini(None) != abi.RCL_RET_OK
-    reason = rcl.take_error()
-    assert reason == "wait_set argument is null"
-    assert rcl.take_error() == "error not set"
-
-
 @pytest.mark.parametrize(
     ("ours", "theirs"),
     [
@@ -198,11 +189,6 @@ def test_infinite_reads_as_none_however_rmw_spells_it() -> None:
     assert profile.deadline.nanoseconds == 0
     profile.deadline = type(profile.deadline)(nanoseconds=2**63 - 1)
     assert from_rclpy(profile).deadline_ns is None
-
-
-def test_interfaces_are_found_by_their_ros_names() -> None:
-    assert import_interface("std_msgs/msg/String") is String
-    assert import_interface("std_srvs/srv/Trigger") is Trigger
 
 
 @pytest.mark.parametrize(

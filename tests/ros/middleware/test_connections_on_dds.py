@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import socket
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -14,13 +13,10 @@ import psutil
 import pytest
 import rclpy
 from free_ports import free_ports
-from loopback import Datagram, on_the_wire, watching
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from std_msgs.msg import String
-from std_srvs.srv import Trigger
 
-from lifecycle import codec
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.discovery.discovery_server import (
@@ -40,8 +36,6 @@ from lifecycle.network.connection_url import parse
 from lifecycle.plan.model import (
     ParticipantConnections,
     PlannedServer,
-    StaticEndpoint,
-    StaticParticipant,
 )
 
 QOS = QosProfile()
@@ -189,27 +183,6 @@ def test_readers_of_a_group_listen_on_it(
         assert {address for address, _ in listened} == {"239.255.7.9", "127.0.0.1"}
 
 
-@on_the_wire
-def test_urls_that_govern_discovery_send_nothing_to_anybody_else(
-    fresh_domain: int, monkeypatch: pytest.MonkeyPatch, wait_until: WaitUntil, ports: list[int]
-) -> None:
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    monkeypatch.setenv("ROS_STATIC_PEERS", "127.0.0.1")
-    one = fixed("udpv4", "127.0.0.1", ports[0:3], ports[4])
-    with (
-        watching() as loopback,
-        FlowParticipant("_one", "/", fresh_domain, connections=connect(one)),
-    ):
-        sent: list[Datagram] = []
-
-        def announced() -> bool:
-            sent.extend(each for each in loopback.until_now() if each.source == ports[2])
-            return bool(sent)
-
-        wait_until(announced)
-        assert {each.destination for each in sent} == {ports[4]}
-
-
 def test_a_fixed_port_that_is_taken_is_an_error_that_names_it(
     fresh_domain: int, ports: list[int], capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -249,67 +222,6 @@ def test_ports_are_free_again_when_destroy_returns(
     assert not {each.port for each in open_sockets()} & set(ports[0:3])
 
 
-def test_services_and_clients_answer_in_the_executor_of_the_node_they_serve(
-    fresh_domain: int, spun: Node, wait_until: WaitUntil
-) -> None:
-    threads: list[int] = []
-
-    def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        threads.append(threading.get_ident())
-        response.message = MARK
-        return response
-
-    with (
-        FlowParticipant(
-            "_server", "/", fresh_domain, connections=connect("shm://"), served=spun
-        ) as serving,
-        FlowParticipant(
-            "_client", "/", fresh_domain, connections=connect("shm://"), served=spun
-        ) as asking,
-    ):
-        group = spun.default_callback_group
-        serving.create(
-            lambda node: node.create_service(Trigger, "/ask", answer, callback_group=group),
-            *("service server", "/ask"),
-        )
-        client = asking.create(
-            lambda node: node.create_client(Trigger, "/ask", callback_group=group),
-            *("service client", "/ask"),
-        )
-        wait_until(client.service_is_ready)
-        answers = []
-
-        def answered() -> bool:
-            # An answer is lost if the server does not know yet where its client listens.
-            if time.monotonic() > since + 2.0 * len(answers):
-                answers.append(client.call_async(Trigger.Request()))
-            return any(each.done() for each in answers)
-
-        since = time.monotonic()
-        wait_until(answered)
-        assert next(each for each in answers if each.done()).result().message == MARK
-        asking.destroy_endpoint(client)
-        assert list(spun.clients) == []
-    assert list(spun.services) == [] or all(s.srv_name != "/ask" for s in spun.services)
-    assert threads != [threading.get_ident()]
-
-
-def test_a_guest_is_gated_by_the_callback_groups_of_its_host(
-    fresh_domain: int, make_node: MakeNode
-) -> None:
-    host = make_node("host")
-    with FlowParticipant(
-        "_guest", "/", fresh_domain, connections=connect("shm://"), served=host
-    ) as participant:
-        subscription = participant.create_subscription(String, "/flow", print, QOS)
-        assert subscription.callback_group is host.default_callback_group
-        assert subscription in list(host.subscriptions)
-        assert subscription not in list(participant.node.subscriptions)
-        # The host's own participant is asked, not the guest's.
-        assert has_shared_memory(host) is True
-    assert subscription not in list(host.subscriptions)
-
-
 def test_an_idle_connection_costs_no_thread_of_ours_and_no_time(
     fresh_domain: int, spun: Node, ports: list[int], wait_until: WaitUntil
 ) -> None:
@@ -331,89 +243,6 @@ def test_an_idle_connection_costs_no_thread_of_ours_and_no_time(
 
 
 # Static endpoint discovery ------------------------------------------------------------------------
-
-_GRAPH = ("ros_discovery_info", "rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_")
-_STRING = "std_msgs::msg::dds_::String_"
-
-
-def static(name: str, first: int, *, writer: bool) -> StaticParticipant:
-    own = StaticEndpoint(
-        writer=writer, topic="rt/flow", type=_STRING, profile="/flow", user_id=first
-    )
-    graph = tuple(
-        StaticEndpoint(
-            writer=each,
-            topic=_GRAPH[0],
-            type=_GRAPH[1],
-            profile=_GRAPH[0],
-            user_id=first + 1 + index,
-            transient_local=True,
-        )
-        for index, each in enumerate((True, False))
-    )
-    return StaticParticipant(name=name, endpoints=(own, *graph))
-
-
-_SENDS = """
-import sys, time
-from std_msgs.msg import String
-from lifecycle import codec
-from lifecycle.manifest.qos import QosProfile
-from lifecycle.middleware.fastdds.participant import FlowParticipant
-from lifecycle.plan.model import ParticipantConnections
-
-connections = codec.from_json(sys.argv[2].encode(), ParticipantConnections)
-with FlowParticipant("_out", "/", int(sys.argv[1]), connections=connections) as sending:
-    publisher = sending.create_publisher(String, "/flow", QosProfile())
-    while True:
-        publisher.publish(String(data=sys.argv[3]))
-        time.sleep(0.05)
-"""
-
-
-_SEDP_WRITERS = (bytes.fromhex("000003c2"), bytes.fromhex("000004c2"))
-
-
-@on_the_wire
-def test_static_endpoints_find_each_other_without_being_announced(
-    fresh_domain: int, spun: Node, wait_until: WaitUntil, ports: list[int]
-) -> None:
-    table = (static("/out", 1, writer=True), static("/in", 11, writer=False))
-    one = fixed("udpv4", "127.0.0.1", ports[0:3], ports[4])
-    other = ParticipantConnections(
-        urls=(fixed("udpv4", "127.0.0.1", ports[3:6], ports[1]),),
-        static_name="/out",
-        static_participants=table,
-    )
-    command = [sys.executable, "-c", _SENDS, str(fresh_domain), codec.to_json(other).decode(), MARK]
-    got: list[str] = []
-    with (
-        watching() as loopback,
-        FlowParticipant(
-            "_in",
-            "/",
-            fresh_domain,
-            connections=ParticipantConnections(
-                urls=(one,), static_name="/in", static_participants=table
-            ),
-            served=spun,
-        ) as receiving,
-        subprocess.Popen(command) as sending,
-    ):
-        try:
-            receiving.create_subscription(String, "/flow", lambda m: got.append(m.data), QOS)
-            wait_until(lambda: got)
-        finally:
-            sending.kill()
-        assert set(got) == {MARK}
-        mine = [each for each in loopback.until_now() if each.source in (ports[2], ports[5])]
-        assert mine, "they announce themselves"
-        assert not [each for each in mine if any(w in each.payload for w in _SEDP_WRITERS)]
-        with pytest.raises(MiddlewareError, match="cannot make a writer of '/other'"):
-            receiving.create_publisher(String, "/other", QOS)
-        with pytest.raises(MiddlewareError, match="this process has it with id 12 already, not 2"):
-            FlowParticipant("_out", "/", fresh_domain, connections=other)
-
 
 # Discovery server ---------------------------------------------------------------------------------
 
@@ -456,26 +285,6 @@ def test_clients_of_a_discovery_server_find_each_other_and_a_super_client_sees_t
     finally:
         process.terminate()
         assert process.wait(30) == 0
-
-
-@pytest.mark.parametrize("how", ["shm", "peer"])
-def test_an_observer_sees_by_url_what_is_there_before_it(
-    fresh_domain: int, wait_until: WaitUntil, ports: list[int], how: str
-) -> None:
-    urls = ("shm://", "shm://")
-    if how == "peer":
-        urls = (
-            fixed("udpv4", "127.0.0.1", ports[0:3], ports[4]),
-            fixed("udpv4", "127.0.0.1", ports[3:6], ports[1]),
-        )
-    with FlowParticipant("_there", "/", fresh_domain, connections=connect(urls[0])) as there:
-        there.create_publisher(String, "/flow", QOS)
-        with GraphObserver(fresh_domain, connect(urls[1])) as observer:
-            wait_until(
-                lambda: [
-                    e for e in observer.snapshot(declared=("/_there",))[1] if e.node == "/_there"
-                ]
-            )
 
 
 def test_a_second_context_of_the_process_is_left_alone(

@@ -16,6 +16,8 @@ import pytest
 from lifecycle.middleware.discovery.environment import chosen_otherwise
 from tests.ros.middleware.free_ports import free_ports
 
+pytestmark = pytest.mark.thorough
+
 _LIMIT_S = 60.0
 _OBSERVERS = 3
 """Before, each missed it in two of five tries."""

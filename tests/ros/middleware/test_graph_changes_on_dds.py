@@ -53,20 +53,6 @@ def guards() -> int:
     return sum(each.name == "graph-guard" for each in threading.enumerate())
 
 
-def test_each_follower_of_a_participant_hears_each_change(nodes: tuple[Node, Node]) -> None:
-    one, two = nodes
-    first, second = Counted(), Counted()
-    before = guards()
-    with followed(one, first), followed(two, second):
-        assert guards() == before + 1
-        for topic in range(20):
-            counts = first.calls, second.calls
-            one.create_publisher(String, f"/topic_{topic}", 1)
-            assert first.until(lambda calls, was=counts[0]: calls > was)
-            assert second.until(lambda calls, was=counts[1]: calls > was)
-    assert guards() == before
-
-
 def test_who_stays_goes_on_hearing_when_the_first_one_leaves(nodes: tuple[Node, Node]) -> None:
     one, two = nodes
     first, second = Counted(), Counted()

@@ -21,7 +21,6 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from test_msgs.action import Fibonacci
 
-from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import Durability, History, QosProfile, Reliability
 from lifecycle.middleware.discovery.prober import ANSWER_S
@@ -391,15 +390,6 @@ def test_watching_a_still_graph_costs_nothing(
         return not calls and used_s() == before
 
     wait_until(still_and_idle)
-
-
-def test_an_observer_that_lost_its_guard_says_so(
-    observer: GraphObserver, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    failure = MiddlewareError("cannot wait for graph changes: out of memory")
-    monkeypatch.setattr(observer._guard, "failure", failure)
-    with pytest.raises(MiddlewareError, match="cannot wait for graph changes: out of memory"):
-        observer.snapshot()
 
 
 def test_destroying_twice_is_harmless(domain_id: int) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import gc
 import os
-import socket
 import subprocess
 import sys
 from collections.abc import Callable
@@ -19,12 +18,10 @@ from std_msgs.msg import String
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.qos import QosProfile
-from lifecycle.middleware.fastdds import nfe
 from lifecycle.middleware.fastdds.nfe import (
     create_publisher,
     create_subscription,
     get_network_flow_endpoints,
-    senders_of,
 )
 from lifecycle.middleware.fastdds.participant import FlowParticipant
 from lifecycle.middleware.fastdds.sockets import get_dscps
@@ -135,6 +132,7 @@ def test_a_strictly_unique_publisher_is_refused_with_the_reason_of_the_rmw(
     assert node.count_publishers("/video") == 0
 
 
+@pytest.mark.thorough
 def test_two_hundred_unique_subscriptions_come_and_go_and_participants_take_all_along(
     domain_id: int, wait_until: WaitUntil
 ) -> None:
@@ -179,38 +177,6 @@ def test_a_unique_subscription_on_a_participant_gives_its_port_back(
     wait_until(lambda: descriptors() <= before)
 
 
-def test_ports_used_up_are_named_as_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
-        taken.bind(("127.0.0.1", 0))
-        port = taken.getsockname()[1]
-        monkeypatch.setattr(nfe, "_UNIQUE_PORTS", range(port, port + 1))
-        assert nfe._subscription_hint() == (
-            f"all 1 ports {port}–{port} of this host are taken; Fast DDS frees one only when the "
-            "participant that used it ends: restart the processes whose nodes were disconnected "
-            "and connected again"
-        )
-    assert nfe._subscription_hint() == (
-        "ask for optionally_required, or set RMW_IMPLEMENTATION=rmw_fastrtps_cpp"
-    )
-
-
-def test_a_publisher_on_its_own_participant_shares_no_port_with_the_node(
-    make_node: MakeNode, spin_until: SpinUntil, domain_id: int
-) -> None:
-    node, got = make_node("camera", namespace="/robot"), []
-    shared = node.create_publisher(String, "/robot/battery", 10)
-    node.create_subscription(String, "/robot/video", got.append, 10)
-    with FlowParticipant("_camera_flow_0", "/robot", domain_id) as participant:
-        unique = participant.create_publisher(String, "/robot/video", QOS)
-        assert not ports(unique) & ports(shared)
-        assert get_network_flow_endpoints(unique) == senders_of(participant.node)
-        assert [each.topic_name for each in participant.node.publishers] == ["/robot/video"]
-        spin_until(unique.get_subscription_count, node)
-        unique.publish(String(data="frame"))
-        spin_until(lambda: got, node)
-    assert got == [String(data="frame")]
-
-
 def test_the_dscp_of_a_participant_is_read_back_from_every_sender_socket(
     make_node: MakeNode, domain_id: int
 ) -> None:
@@ -226,31 +192,6 @@ def test_the_dscp_of_a_participant_is_read_back_from_every_sender_socket(
         sockets_in_use = sockets()
         marked.read_dscp()
         assert sockets() == sockets_in_use
-
-
-def test_a_marked_participant_sends_with_its_mark_over_udp(
-    domain_id: int,
-) -> None:
-    """What a receiver sees (IP_RECVTOS) of a datagram that leaves by the participant's socket."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
-        listener.setsockopt(socket.IPPROTO_IP, socket.IP_RECVTOS, 1)
-        listener.bind(("127.0.0.1", 0))
-        listener.settimeout(10)
-        with FlowParticipant("_node_flow_0", "/", domain_id, dscp=46) as participant:
-            sender = next(iter(senders_of(participant.node))).transport_port
-            marks = []
-            for number in (int(each.name) for each in Path("/proc/self/fd").iterdir()):
-                try:
-                    duplicate = socket.socket(fileno=os.dup(number))
-                except OSError:
-                    continue
-                with duplicate:
-                    bound = duplicate.family == socket.AF_INET and duplicate.getsockname()[1]
-                    if bound == sender:
-                        duplicate.sendto(b"x", listener.getsockname())
-                        marks.append(listener.recvmsg(16, 64)[1][0][2][0])
-    assert marks
-    assert set(marks) == {46 << 2}
 
 
 # Transports are chosen once per process, and under LOCALHOST by rmw_fastrtps alone.

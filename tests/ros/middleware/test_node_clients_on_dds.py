@@ -12,13 +12,11 @@ import pytest
 import rclpy
 from lifecycle_msgs.srv import ChangeState, GetState
 from managed_node import ManagedNode
-from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import State, TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rclpy.waitable import NumberOfEntities, Waitable
 from std_srvs.srv import Trigger
 
 from lifecycle.codec import to_json
@@ -340,36 +338,3 @@ def test_a_question_that_waits_ends_with_the_clients(clients: NodeClients) -> No
 
     with pytest.raises(ServiceUnansweredError):
         asyncio.run(ask())
-
-
-class _Vanishes(Waitable):
-    """What is destroyed by another thread while the executor makes its wait set of it."""
-
-    def __init__(self) -> None:
-        super().__init__(ReentrantCallbackGroup())
-        self.met = 0
-
-    def get_num_entities(self) -> NumberOfEntities:
-        return NumberOfEntities()
-
-    def add_to_wait_set(self, wait_set: Any) -> None:
-        self.met += 1
-        if self.met == 1:
-            raise InvalidHandle("cannot use Destroyable because destruction was requested")
-
-    def is_ready(self, wait_set: Any) -> bool:
-        return False
-
-
-def test_what_is_destroyed_while_it_is_waited_for_ends_no_call(
-    observer: GraphObserver, clients: NodeClients, context: rclpy.Context, serve: Serve
-) -> None:
-    vanishes = _Vanishes()
-    observer.node.add_waitable(vanishes)
-    try:
-        node = ManagedNode("served", context=context)
-        serve(node)
-        assert run(clients.get_state("/served", timeout_s=BOUND_S)) == "unconfigured"
-        assert vanishes.met > 1
-    finally:
-        observer.node.remove_waitable(vanishes)

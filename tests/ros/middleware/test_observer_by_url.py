@@ -15,6 +15,8 @@ from lifecycle.middleware.fastdds.sockets import open_sockets
 from lifecycle.middleware.rcl.graph import GraphObserver
 from lifecycle.plan.model import ParticipantConnections
 
+pytestmark = pytest.mark.thorough
+
 WaitUntil = Callable[..., None]
 
 

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.thorough
+
 _OBSERVES = """
 import sys
 from lifecycle.middleware.rcl.graph import GraphObserver

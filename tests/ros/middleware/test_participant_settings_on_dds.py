@@ -17,18 +17,15 @@ from rclpy.node import Node
 from std_msgs.msg import String
 
 from lifecycle import codec
-from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.fastdds.nfe import (
     SHARED_MEMORY,
-    get_network_flow_endpoints,
     senders_of,
 )
 from lifecycle.middleware.fastdds.participant import FlowParticipant
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.middleware.fastdds.settings import has_shared_memory, participant_settings
-from lifecycle.middleware.fastdds.sockets import own_sockets
-from lifecycle.network.nfe import NetworkFlowEndpoint, TransportProtocol
+from lifecycle.network.nfe import NetworkFlowEndpoint
 from lifecycle.verify.observation import Identity
 from lifecycle.verify.transport import carrier
 
@@ -177,6 +174,7 @@ def test_inside_a_process_no_transport_carries_anything(
             assert carrying(loopback.until_now()) == []
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("range_", ["LOCALHOST", "SUBNET", "SYSTEM_DEFAULT"])
 @pytest.mark.parametrize("transports", [UDP, ("udpv6",), ("udpv4", "udpv6")])
 def test_chosen_transports_are_all_there_is_in_every_discovery_range(
@@ -257,22 +255,6 @@ def test_a_participant_of_small_datagrams_still_receives_large_ones(
     assert got == [10_000]
 
 
-@pytest.mark.parametrize("transports", [(), UDP, ("udpv4", "udpv6")])
-def test_sends_that_must_not_wait_go_by_sockets_that_do_not(
-    domain_id: int, transports: tuple[str, ...]
-) -> None:
-    with (
-        FlowParticipant(
-            "_hasty", "/", domain_id, transports=transports, non_blocking_send=True
-        ) as hasty,
-        FlowParticipant("_patient", "/", domain_id, transports=transports) as wait_under_load,
-    ):
-        for participant, waits in ((hasty, False), (wait_under_load, True)):
-            sockets = own_sockets(senders_of(participant.node))
-            assert {os.get_blocking(each.fileno()) for each in sockets} == {waits}
-        assert hasty.has_shared_memory is (not transports)
-
-
 @on_the_wire
 @pytest.mark.parametrize("transports", [UDP, ("udpv6",)])
 def test_every_datagram_of_a_user_carries_the_dscp_from_the_first_on(
@@ -322,42 +304,6 @@ def test_a_mark_that_was_lost_is_set_again_before_a_subscription_is_handed_out(
         assert participant.read_dscp() == 46
 
 
-def test_whether_a_participant_has_shared_memory_is_seen_without_a_subscription(
-    domain_id: int, make_node: MakeNode
-) -> None:
-    """One that is made and removed while others discover it keeps later ones from some."""
-    with (
-        FlowParticipant("_plain", "/", domain_id) as plain,
-        FlowParticipant("_chosen", "/", domain_id, transports=UDP) as chosen,
-        FlowParticipant("_other", "/", domain_id) as other,
-    ):
-        found = [each.has_shared_memory for each in (plain, chosen, other)]
-    assert found == [True, False, True]
-    node = make_node("node", start_parameter_services=False)
-    assert has_shared_memory(node)
-    assert list(node.subscriptions) == []
-    subscription = node.create_subscription(String, "/flow", print, 10)
-    assert [nfe.transport_protocol for nfe in get_network_flow_endpoints(subscription)] == [
-        TransportProtocol.UNKNOWN,
-        *[TransportProtocol.UDP] * (len(get_network_flow_endpoints(subscription)) - 1),
-    ]
-
-
-def test_another_rmw_is_refused_in_words(domain_id: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        "lifecycle.middleware.fastdds.settings.get_rmw_implementation_identifier",
-        lambda: "rmw_cyclonedds_cpp",
-    )
-    with pytest.raises(MiddlewareError) as refused:
-        FlowParticipant("_flow", "/", domain_id, transports=UDP)
-    assert str(refused.value) == (
-        "cannot make a participant for /_flow in domain "
-        f"{domain_id}: cannot choose the transports of a participant with RMW "
-        "'rmw_cyclonedds_cpp'; set RMW_IMPLEMENTATION=rmw_fastrtps_cpp"
-    )
-    FlowParticipant("_flow", "/", domain_id).destroy()
-
-
 # Profiles are loaded once per process. Another portBase moves every port: it shows who has it.
 _USERS = """
 <dds xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles"><profiles>
@@ -405,22 +351,6 @@ def test_a_profile_of_the_users_holds_for_every_participant_before_during_and_af
     assert [shared for shared, _ in lines] == ["True", "False", "True"]
     # portBase + 11 + 2 × participant, where the default base would give 7411 and more
     assert all(3411 <= int(port) < 3500 for _, port in lines)
-
-
-def test_a_profile_of_the_users_that_chooses_transports_is_kept_and_ours_refused(
-    fresh_domain: int, tmp_path: Path
-) -> None:
-    profiles = tmp_path / "mine.xml"
-    chosen = "<builtinTransports>UDPv4</builtinTransports>"
-    profiles.write_text(_USERS.format(base=3400, extra=chosen))
-    before, refused, after = ports_with(fresh_domain, profiles)
-    assert refused == (
-        f"cannot make a participant for /_p in domain {fresh_domain}: cannot give a participant "
-        f"udpv4: the default participant profile 'mine' of '{profiles}' already chooses its "
-        "transports (<builtinTransports>); take <builtinTransports> out of it, or what needs udpv4 "
-        "out of the manifest"
-    )
-    assert before.split()[1] <= after.split()[1]
 
 
 def test_a_context_that_has_its_participant_is_not_changed(

@@ -40,13 +40,6 @@ class Stuck(LifecycleNode):
         await self.create_client(Trigger, "/nobody").call_async(Trigger.Request())
 
 
-class Deadlocked(LifecycleNode):
-    """Waits in on_configure for what only its own executor could bring."""
-
-    def on_configure(self) -> None:
-        self.create_client(Trigger, "/nobody").call(Trigger.Request())
-
-
 class Blocking(LifecycleNode):
     """Blocks the executor for ever in on_configure."""
 
@@ -64,14 +57,6 @@ class BlockingConstructor(LifecycleNode):
 class Failing(LifecycleNode):
     def on_configure(self) -> None:
         raise OSError("no such camera")
-
-
-class Touchy(LifecycleNode):
-    """Raises on its first message."""
-
-    @on_message("in")
-    def receive(self, message: String) -> None:
-        raise ValueError(f"cannot stand {message.data}")
 
 
 class Plain(Node):

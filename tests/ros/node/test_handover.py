@@ -1,8 +1,6 @@
-"""How long an endpoint lives on two connections, and what is left of the old one."""
+"""What is left of an endpoint whose connection was changed."""
 
 from __future__ import annotations
-
-from collections.abc import Callable
 
 import rclpy
 from lifecycle_driver import Driver
@@ -10,55 +8,6 @@ from planning import built_with, planned, server
 from std_srvs.srv import Trigger
 
 from lifecycle import LifecycleNode, on_service
-from lifecycle.node.endpoints.handover import PATIENCE_S, SETTLE_S, Handover
-
-
-class Clock:
-    """Timers that fire when the test says so."""
-
-    def __init__(self) -> None:
-        self.timers: dict[float, Callable[[], None]] = {}
-
-    def after(self, delay_s: float, callback: Callable[[], None]) -> Callable[[], None]:
-        self.timers[delay_s] = callback
-        return lambda: self.timers.pop(delay_s, None)
-
-    def fire(self, delay_s: float) -> None:
-        self.timers.pop(delay_s)()
-
-
-def begin(clock: Clock, *, peers_before: int) -> tuple[Handover, list[str]]:
-    finished: list[str] = []
-    handover = Handover(
-        peers_before=peers_before, after=clock.after, finish=lambda: finished.append("finished")
-    )
-    return handover, finished
-
-
-def test_the_old_one_goes_a_little_after_the_new_one_has_as_many_peers() -> None:
-    clock = Clock()
-    handover, finished = begin(clock, peers_before=2)
-    handover.peers_changed(1)
-    assert list(clock.timers) == [PATIENCE_S]
-    handover.peers_changed(2)
-    handover.peers_changed(3)
-    assert list(clock.timers) == [SETTLE_S]
-    assert not handover.done.done()
-    clock.fire(SETTLE_S)
-    assert handover.done.done()
-    assert finished == ["finished"]
-    handover.end()
-    handover.peers_changed(2)
-    assert finished == ["finished"]
-
-
-def test_the_old_one_goes_when_patience_ends_without_peers() -> None:
-    clock = Clock()
-    handover, finished = begin(clock, peers_before=1)
-    clock.fire(PATIENCE_S)
-    assert handover.done.done()
-    assert finished == ["finished"]
-    assert clock.timers == {}
 
 
 def test_an_answer_that_comes_after_its_server_was_unmade_is_lost_and_the_node_lives(

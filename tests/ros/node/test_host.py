@@ -11,16 +11,13 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-import psutil
 import pytest
 from host_process import HostProcess, driver_in, hosted
 from msgspec.structs import replace
 from planning import publisher, subscription
-from std_msgs.msg import String
 
-from lifecycle import codec
-from lifecycle.manifest.model import DiscoveryRange, Executor, Run, RunKind, Timeouts
-from lifecycle.node.host.control import Event, HostSpec, Operation
+from lifecycle.manifest.model import Executor, Run, RunKind, Timeouts
+from lifecycle.node.host.control import Event, Operation
 
 HERE = Path(__file__).parent
 CONFIGURE, CONNECT, ACTIVATE = Operation.CONFIGURE, Operation.CONNECT, Operation.ACTIVATE
@@ -125,15 +122,6 @@ def test_an_exception_in_a_callback_is_told_and_its_traceback_is_in_the_log(star
     assert 'raise OSError("no such camera")' in host.log.read_text()
 
 
-def test_a_blocking_call_in_a_hosted_callback_is_an_error_and_not_a_deadlock(start: Start) -> None:
-    host = start(hosted("one", "Deadlocked"))
-    host.until("ready")
-    assert host.do("/one", CONFIGURE).error == (
-        "cannot wait for service '/nobody' in a callback: the answer comes by the executor that "
-        "waits for this callback; write `async def` and `await client.call_async(request)`"
-    )
-
-
 @pytest.mark.parametrize(
     ("class_", "reason"),
     [
@@ -222,22 +210,6 @@ def test_a_callback_that_blocks_does_not_keep_the_process_beyond_its_bound(
         assert "a callback blocks; the process ends without it" in host.log.read_text()
 
 
-def test_an_exception_in_a_message_handler_ends_the_process_with_its_traceback(
-    start: Start, fresh_domain: int
-) -> None:
-    host = start(hosted("one", "Touchy", subscription("in")))
-    host.until("ready")
-    for operation in (CONFIGURE, CONNECT, ACTIVATE):
-        assert host.do("/one", operation).ok
-    with driver_in(fresh_domain) as driver:
-        sender = driver.node.create_publisher(String, "/in", 10)
-        driver.spin_until(lambda: sender.get_subscription_count() == 1)
-        sender.publish(String(data="this"))
-        driver.spin_until(lambda: host.process.poll() is not None)
-        assert host.wait() == 1
-    assert "ValueError: cannot stand this" in host.log.read_text()
-
-
 def test_a_plain_node_gets_its_planned_name_when_alone(start: Start, fresh_domain: int) -> None:
     plain = hosted("one", "Plain", managed=False, namespace="/robot", remap=(("out", "there"),))
     host = start(replace(plain, parameters=(("label", "1: left"),)))
@@ -276,38 +248,6 @@ links = [os.readlink(file) for file in files if os.path.lexists(file)]
 assert not [link for link in links if link.startswith("socket")], links
 """
     subprocess.run([sys.executable, "-c", code], check=True, timeout=30)
-
-
-def test_a_fork_of_a_preloaded_process_can_host(fresh_domain: int, tmp_path: Path) -> None:
-    ours, theirs = socket.socketpair()
-    ours.settimeout(20)
-    code = f"""
-import gc, os
-from lifecycle.node.host import host
-host.preload()
-gc.freeze()
-if os.fork() == 0:
-    host.main({theirs.fileno()})
-os._exit(os.waitstatus_to_exitcode(os.wait()[1]))
-"""
-    with theirs:
-        process = subprocess.Popen(
-            [sys.executable, "-c", code], pass_fds=[theirs.fileno()], cwd=HERE
-        )
-    spec = HostSpec(
-        system="test",
-        process="p",
-        domain_id=fresh_domain,
-        discovery_range=DiscoveryRange.LOCALHOST,
-        nodes=(hosted("one", "Good"),),
-    )
-    with ours, ours.makefile("rb") as reader:
-        ours.sendall(codec.to_json(spec) + b"\n")
-        assert codec.from_json(reader.readline(), Event) == Event(kind="ready")
-        children = psutil.Process(process.pid).children()
-        assert len(children) == 1
-        ours.shutdown(socket.SHUT_RDWR)
-    assert process.wait(30) == 0
 
 
 def test_what_hosts_are_forked_from_imports_only_what_every_node_needs() -> None:

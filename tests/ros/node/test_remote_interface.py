@@ -166,29 +166,6 @@ def test_one_wrong_request_of_several_does_not_spoil_the_others(
     assert [each.name for each in node.connections] == ["", "net"]
 
 
-def test_a_fault_of_ours_is_answered_too(
-    driver: Driver, node: LifecycleNode, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def broken(endpoint: str, name: str) -> None:
-        raise OSError("no such thing")
-
-    monkeypatch.setattr(node.lifecycle.data_layer, "remap", broken)
-    assert ask(driver, "remap", ("out", text("x"))) == [
-        (False, "cannot do this: OSError('no such thing')")
-    ]
-
-
-def test_a_node_that_is_not_configured_refuses(driver: Driver, context: rclpy.Context) -> None:
-    with built_with(planned("it", publisher("out")), context):
-        driver.add(LifecycleNode())
-    ((ok, reason),) = ask(driver, "connect_to", ("net", text(UDP)))
-    assert not ok
-    assert reason == (
-        f"cannot connect /it to {UDP}: it is 'unconfigured'; "
-        "endpoints are declared from configure until cleanup; configure it first"
-    )
-
-
 # The control channel.
 
 Start = Callable[..., HostProcess]

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-import rclpy
+from host_process import driver_in
 from lifecycle_driver import Driver
 from std_msgs.msg import Int32, String
 
@@ -54,13 +54,8 @@ def start(fresh_domain: int) -> Iterator[Start]:
 @pytest.fixture
 def neighbour(fresh_domain: int) -> Iterator[Driver]:
     """A driver in that domain."""
-    context = rclpy.Context()
-    context.init(args=[], domain_id=fresh_domain)
-    driver = Driver(context)
-    yield driver
-    driver.close()
-    context.try_shutdown()
-    context.destroy()
+    with driver_in(fresh_domain) as driver:
+        yield driver
 
 
 def lifecycle_run(start: Start, *arguments: str) -> subprocess.Popen[str]:

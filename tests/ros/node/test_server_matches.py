@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
 from typing import Any
 
 from counting import client as action_client
 from lifecycle_driver import Driver
-from planning import client, publisher
+from planning import client
 from rclpy.action import ActionServer
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -42,10 +41,6 @@ def telling(node: LifecycleNode) -> list[list[bool | None]]:
 
 def serve(node: Node, **options: Any) -> Any:
     return node.create_service(Trigger, "/ask", lambda _, response: response, **options)
-
-
-def guards() -> list[threading.Thread]:
-    return [each for each in threading.enumerate() if each.name == "graph-guard"]
 
 
 def test_a_client_tells_when_its_server_is_matched_and_when_it_is_not_any_more(
@@ -94,21 +89,3 @@ def test_a_client_on_a_connection_tells_of_matches_there(driver: Driver, active:
     server = ActionServer(driver.node, Fibonacci, "/count", lambda _: Fibonacci.Result())
     driver.spin_until(lambda: told[-1:] == [[True, True]])
     server.destroy()
-
-
-def test_who_is_no_client_says_nothing_of_servers(active: Active) -> None:
-    before = guards()
-    node = active(Silent, publisher("out"))
-    assert reported(node) == [None]
-    assert guards() == before
-
-
-def test_one_thread_follows_the_graph_for_all_clients_and_goes_with_them(
-    driver: Driver, active: Active
-) -> None:
-    before = len(guards())
-    active(Silent, client("ask"), client("other"), action_client())
-    assert len(guards()) == before + 1
-    assert driver.set("/it", "deactivate")
-    assert driver.set("/it", "disconnect")
-    assert len(guards()) == before

@@ -43,12 +43,30 @@ _SHARED = re.compile(r"port7[0-3]\d\d")
 Event = dict[str, Any]
 
 
+LIMITS = {"start_s": 8, "configure_s": 8, "connect_s": 8, "activate_s": 8, "silent_s": 8}
+"""`timeouts` of a node that is neither late nor silent if the machine stands still for a moment."""
+
+
+def write(
+    directory: Path, domain_id: int, nodes: Mapping[str, Any], system: str = "system", **keys: Any
+) -> Path:
+    """Write the manifest of a system; return its path."""
+    document = {
+        "manifest_version": 1,
+        "system": system,
+        "discovery": {"domain_id": domain_id, "range": "localhost"},
+        "nodes": nodes,
+        **keys,
+    }
+    file = directory / f"{system}.lifecycle.yaml"
+    file.write_text(yaml.safe_dump(document))
+    return file
+
+
 def pair(
     directory: Path, domain_id: int, *, misbehave: str = "", edit: Mapping[str, Any] | None = None
 ) -> Path:
     """Write the manifest of a talker, which may misbehave, and a listener; return its path."""
-    # A machine that stands still for a moment makes no node silent here.
-    limits = {"start_s": 8, "configure_s": 8, "connect_s": 8, "activate_s": 8, "silent_s": 8}
     document: dict[str, Any] = {
         "manifest_version": 1,
         "system": "pair",
@@ -56,12 +74,12 @@ def pair(
         "nodes": {
             "talker": {
                 "run": {"python": f"{_NODES}:Talker", "environment": {"MISBEHAVE": misbehave}},
-                "timeouts": limits,
+                "timeouts": LIMITS,
                 "interface": {"publishers": [{"name": "chatter", "type": "std_msgs/msg/String"}]},
             },
             "listener": {
                 "run": {"python": f"{_NODES}:Listener"},
-                "timeouts": limits,
+                "timeouts": LIMITS,
                 "after": {"talker": "configured"},
                 "interface": {
                     "subscriptions": [{"name": "chatter", "type": "std_msgs/msg/String"}]
@@ -331,16 +349,21 @@ def command(verb: str) -> Sequence[str]:
 
 
 def verb(
-    name: str, *arguments: str, runtime: Path, variables: Mapping[str, str] | None = None
+    name: str,
+    *arguments: str,
+    runtime: Path,
+    variables: Mapping[str, str] | None = None,
+    mark: str = "",
+    within_s: float = BOUND_S,
 ) -> subprocess.CompletedProcess[str]:
     """Run a verb to its end, with more variables in its environment."""
     return subprocess.run(
         [*command(name), *arguments],
         cwd=modules(),
-        env={**environment(runtime, ""), **(variables or {})},
+        env={**environment(runtime, mark), **(variables or {})},
         capture_output=True,
         text=True,
-        timeout=BOUND_S,
+        timeout=within_s,
         check=False,
     )
 

@@ -177,14 +177,6 @@ class Quiet(LifecycleNode):
     """Has what its manifest declares, and does nothing with it."""
 
 
-class Stubborn(Talker):
-    """Declares a parameter itself, with another value than its manifest says."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.declare_parameter("rate", 99.0)
-
-
 class Eager(Talker):
     """Once it is connected its own code activates it: from a timer and from a thread."""
 

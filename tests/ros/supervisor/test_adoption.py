@@ -11,14 +11,13 @@ from pathlib import Path
 import pytest
 
 from lifecycle.errors import ExitCode
-from tests.ros.supervisor.running import BOUND_S, Up, pair, up, verb
+from tests.ros.supervisor.running import BOUND_S, LIMITS, Up, pair, up, verb
 
 _ELSEWHERE = str(Path(__file__).with_name("managed_elsewhere.py"))
-_LIMITS = {"start_s": 8, "configure_s": 8, "connect_s": 8, "activate_s": 8, "silent_s": 8}
 _EDIT = {
     "nodes": {
-        "base": {"run": {"command": [sys.executable, _ELSEWHERE]}, "timeouts": _LIMITS},
-        "talker": {"run": {"python": "tests.ros.supervisor.systems:Talker"}, "timeouts": _LIMITS},
+        "base": {"run": {"command": [sys.executable, _ELSEWHERE]}, "timeouts": LIMITS},
+        "talker": {"run": {"python": "tests.ros.supervisor.systems:Talker"}, "timeouts": LIMITS},
     },
     "nodes/talker/interface": {"publishers": [{"name": "chatter", "type": "std_msgs/msg/String"}]},
     "links": [],

@@ -14,10 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 
 from lifecycle.errors import ExitCode
-from tests.ros.supervisor.running import BOUND_S, ENOUGH, ROOT, Up, verb
+from tests.ros.supervisor.running import BOUND_S, ENOUGH, ROOT, Up, verb, write
 
 FOLDER = ROOT / "tests" / "ros" / "supervisor" / "composition"
 VARIABLES = {"PYTHONPATH": str(FOLDER)}
@@ -33,15 +32,7 @@ def component(plugin: str, container: str, *, managed: bool = False, **rest: Any
 
 
 def system(folder: Path, domain_id: int, **nodes: Any) -> Path:
-    document = {
-        "manifest_version": 1,
-        "system": "composed",
-        "discovery": {"domain_id": domain_id, "range": "localhost"},
-        "nodes": nodes,
-    }
-    file = folder / "composed.lifecycle.yaml"
-    file.write_text(yaml.safe_dump(document))
-    return file
+    return write(folder, domain_id, nodes, "composed")
 
 
 def talker_and_hearer(container: str, values: Path) -> dict[str, Any]:
@@ -120,6 +111,7 @@ def test_components_in_a_container_of_others_come_and_go(
         run.close()
 
 
+@pytest.mark.thorough
 def test_what_a_container_did_counts_where_its_reply_is_lost(
     tmp_path: Path, fresh_domain: int
 ) -> None:

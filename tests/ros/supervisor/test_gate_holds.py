@@ -24,14 +24,23 @@ from lifecycle.errors import ExitCode
 from lifecycle.middleware.rcl.graph import GraphObserver
 from lifecycle.middleware.services.clients import NodeClients
 from tests.ros.faults.system import BARE_DDS, FOREIGN
-from tests.ros.supervisor.running import BOUND_S, ROOT, Up, command, environment, pair, up, verb
+from tests.ros.supervisor.running import (
+    BOUND_S,
+    LIMITS,
+    ROOT,
+    Up,
+    command,
+    environment,
+    pair,
+    up,
+    verb,
+)
 
 _ELSEWHERE = str(Path(__file__).with_name("managed_elsewhere.py"))
 _CHATTER = "/chatter:std_msgs/msg/String:RELIABLE"
 _UNATTRIBUTED = "graph.unattributed-endpoint"
-_LIMITS = {"start_s": 8, "configure_s": 8, "connect_s": 8, "activate_s": 8, "silent_s": 8}
 _BASE = {
-    "nodes/base": {"run": {"command": [sys.executable, _ELSEWHERE]}, "timeouts": _LIMITS},
+    "nodes/base": {"run": {"command": [sys.executable, _ELSEWHERE]}, "timeouts": LIMITS},
 }
 
 

@@ -8,7 +8,6 @@ import json
 import socket
 import subprocess
 from pathlib import Path
-from xml.etree import ElementTree as ET
 
 import pytest
 
@@ -100,19 +99,3 @@ def test_an_empty_graph_says_where_it_looked(tmp_path: Path, fresh_domain: int) 
         assert (shown.returncode, shown.stderr) == (ExitCode.VIOLATED, judged.stderr)
         assert waits.poll() is None, "--timeout 5 was over first, though both began together"
         waits.kill()
-
-
-def test_the_report_of_a_failed_run_names_the_failure(tmp_path: Path, fresh_domain: int) -> None:
-    report = tmp_path / "report.xml"
-    manifest = pair(tmp_path, fresh_domain, misbehave="configure:raise")
-    with up(manifest, "--report", str(report), runtime=tmp_path) as run:
-        assert run.finish() == ExitCode.BRING_UP_FAILED
-        finding = run.verdict["findings"][0]
-        assert finding["rule"] == "run.transition-failed"
-        assert "the sensor is on fire" in finding["message"]
-    failed = [
-        (case.get("classname"), "/talker" in "".join(case.itertext()))
-        for case in ET.parse(report).getroot().iter("testcase")
-        if case.find("failure") is not None
-    ]
-    assert failed == [("run.transition-failed", True), ("run", True)]

@@ -184,23 +184,6 @@ def test_the_gate_stays_closed_over_parameters_that_are_not_what_is_declared(
         }
 
 
-def test_a_node_of_ours_that_declares_another_value_is_not_activated(
-    tmp_path: Path, fresh_domain: int
-) -> None:
-    manifest = pair(
-        tmp_path,
-        fresh_domain,
-        edit={
-            "nodes/talker/run/python": "tests.ros.supervisor.systems:Stubborn",
-            "nodes/talker/interface/parameters": {"rate": {"type": "double", "default_value": 1.5}},
-        },
-    )
-    with up(manifest, runtime=tmp_path) as run:
-        assert run.finish() == ExitCode.VIOLATED
-        run.assert_gate_held()
-        assert found(run) == {("param.value-differs", "/talker: rate")}
-
-
 def test_a_parameter_that_is_declared_late_is_waited_for(tmp_path: Path, fresh_domain: int) -> None:
     now = tmp_path / "now"
     manifest = system(tmp_path, fresh_domain, arm("--late", str(now)))

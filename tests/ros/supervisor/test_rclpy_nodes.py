@@ -8,15 +8,13 @@ from typing import Any
 import pytest
 import rclpy_nodes
 import running
-import yaml
-from running import Up, verb
+from running import LIMITS, Up, verb
 
 from lifecycle.errors import UsageError
 
 _NODES = "tests.ros.supervisor.rclpy_nodes"
 _STRING = "std_msgs/msg/String"
 _LATCHED = {"depth": 1, "durability": "TRANSIENT_LOCAL"}
-LIMITS = {"start_s": 8, "configure_s": 8, "connect_s": 8, "activate_s": 8, "silent_s": 8}
 
 
 def node(reference: str, *, interface: dict[str, Any] | None = None, **keys: Any) -> dict[str, Any]:
@@ -42,19 +40,6 @@ HEARS = {
 }
 
 
-def write(directory: Path, domain_id: int, nodes: dict[str, Any], **keys: Any) -> Path:
-    document = {
-        "manifest_version": 1,
-        "system": "foreign",
-        "discovery": {"domain_id": domain_id, "range": "localhost"},
-        "nodes": nodes,
-        **keys,
-    }
-    file = directory / "foreign.lifecycle.yaml"
-    file.write_text(yaml.safe_dump(document))
-    return file
-
-
 def log_of(up: Up, process: str) -> str:
     (path,) = (up.runtime / "log").glob(f"20*/{process}.log")
     return path.read_text(encoding="utf-8")
@@ -68,7 +53,7 @@ def is_proven(up: Up) -> bool:
 def test_plain_nodes_are_verified_completely_and_released(
     fresh_domain: int, tmp_path: Path, wait_until: Any
 ) -> None:
-    manifest = write(
+    manifest = running.write(
         tmp_path,
         fresh_domain,
         {
@@ -106,11 +91,34 @@ def test_plain_nodes_are_verified_completely_and_released(
         up.assert_nothing_left()
 
 
+def test_what_every_node_has_may_be_declared(fresh_domain: int, tmp_path: Path) -> None:
+    rosout = {"name": "/rosout", "type": "rcl_interfaces/msg/Log"}
+    events = {"name": "/parameter_events", "type": "rcl_interfaces/msg/ParameterEvent"}
+    said = {"name": "~/transition_event", "type": "lifecycle_msgs/msg/TransitionEvent"}
+    listed = {"name": "~/list_parameters", "type": "rcl_interfaces/srv/ListParameters"}
+    state = {"name": "~/get_state", "type": "lifecycle_msgs/srv/GetState"}
+    plain = {**TALKS, "publishers": [*TALKS["publishers"], rosout, events]}
+    managed = {"publishers": [rosout, said], "service_servers": [listed, state]}
+    manifest = running.write(
+        tmp_path,
+        fresh_domain,
+        {
+            "talker": node("Talker", managed=False, interface=plain),
+            "managed": node("rclpy.lifecycle:LifecycleNode", interface=managed),
+        },
+        policy={"unverifiable": "block", "unheard": "ignore"},
+    )
+    with running.up(manifest, "--stop-after", "0.5", runtime=tmp_path) as up:
+        up.until("system", reached="active")
+        assert is_proven(up)
+        assert up.finish() == 0
+
+
 def test_a_plain_node_does_nothing_while_the_gate_is_closed(
     fresh_domain: int, tmp_path: Path
 ) -> None:
     more = {"publishers": [*TALKS["publishers"], {"name": "shouts", "type": _STRING}]}
-    manifest = write(
+    manifest = running.write(
         tmp_path,
         fresh_domain,
         {
@@ -137,7 +145,7 @@ def test_a_node_of_rclpy_lifecycle_is_driven_by_its_own_state_machine(
         {"name": "status", "type": _STRING, "qos": {"depth": 1}},
     ]
     hears = [{"name": "words", "type": _STRING, "qos": {"depth": 10}}]
-    manifest = write(
+    manifest = running.write(
         tmp_path,
         fresh_domain,
         {
@@ -167,13 +175,14 @@ def test_a_node_of_rclpy_lifecycle_is_driven_by_its_own_state_machine(
         up.assert_gate_held()
 
 
+@pytest.mark.thorough
 def test_a_function_may_return_several_nodes_of_one_process(
     fresh_domain: int, tmp_path: Path, wait_until: Any
 ) -> None:
     # Beside the manifest, and not where `up` was started.
     (tmp_path / "beside.py").write_text(f"from {_NODES} import pair")
     shared = {"process": "both", "managed": False, "arguments": {"word": "pair"}}
-    manifest = write(
+    manifest = running.write(
         tmp_path,
         fresh_domain,
         {
@@ -188,6 +197,7 @@ def test_a_function_may_return_several_nodes_of_one_process(
         assert is_proven(up)
 
 
+@pytest.mark.thorough
 def test_callbacks_run_in_several_threads_where_the_executor_has_them(
     fresh_domain: int, tmp_path: Path
 ) -> None:
@@ -197,7 +207,7 @@ def test_callbacks_run_in_several_threads_where_the_executor_has_them(
         "action_servers": [{"name": "count", "type": "test_msgs/action/Fibonacci"}],
     }
     calls = {"service_clients": [{"name": "outer", "type": "std_srvs/srv/SetBool"}]}
-    manifest = write(
+    manifest = running.write(
         tmp_path,
         fresh_domain,
         {
@@ -227,7 +237,7 @@ def test_a_hung_callback_is_noticed_whatever_the_executor_unless_others_go_on_be
         made = node("Sleeper", managed=False, executor=executor, arguments=arguments)
         return {**made, "timeouts": limits}
 
-    manifest = write(
+    manifest = running.write(
         tmp_path,
         fresh_domain,
         {
@@ -246,6 +256,7 @@ def test_a_hung_callback_is_noticed_whatever_the_executor_unless_others_go_on_be
         assert {each["node"] for each in up.of_kind("silent")} == {"/many", "/events"}
 
 
+@pytest.mark.thorough
 def test_what_a_callback_of_rclpy_lifecycle_raises_is_logged_and_ends_the_bring_up(
     fresh_domain: int, tmp_path: Path
 ) -> None:
@@ -253,7 +264,7 @@ def test_what_a_callback_of_rclpy_lifecycle_raises_is_logged_and_ends_the_bring_
     (tmp_path / "src" / "elsewhere.py").write_text(f"from {_NODES} import Broken")
     environment = {"PYTHONPATH": str(tmp_path / "src")}
     broken = node("elsewhere:Broken", environment=environment)
-    manifest = write(tmp_path, fresh_domain, {"broken": broken})
+    manifest = running.write(tmp_path, fresh_domain, {"broken": broken})
     with running.up(manifest, runtime=tmp_path) as up:
         assert up.finish() == 6
         assert [each["message"] for each in up.verdict["findings"]] == [
@@ -262,11 +273,12 @@ def test_what_a_callback_of_rclpy_lifecycle_raises_is_logged_and_ends_the_bring_
         assert "OSError: no such camera" in log_of(up, "broken")
 
 
+@pytest.mark.thorough
 def test_flows_of_plain_nodes_are_unique_and_marked_as_the_manifest_asks(
     fresh_domain: int, tmp_path: Path, wait_until: Any
 ) -> None:
     alone = {"unique": "strictly_required"}
-    manifest = write(
+    manifest = running.write(
         tmp_path,
         fresh_domain,
         {
@@ -299,10 +311,11 @@ def test_flows_of_plain_nodes_are_unique_and_marked_as_the_manifest_asks(
         up.assert_nothing_left()
 
 
+@pytest.mark.thorough
 def test_nodes_of_rclpy_run_in_a_test_as_ours_do(lifecycle_node: Any, tmp_path: Path) -> None:
     says = [{"name": "words", "type": _STRING, "qos": {"depth": 7}}]
     shared = {"managed": False, "process": "both", "arguments": {"word": "pair"}}
-    manifest = write(
+    manifest = running.write(
         tmp_path,
         0,
         {

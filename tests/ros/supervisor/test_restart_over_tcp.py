@@ -10,19 +10,15 @@ from typing import Any
 import pytest
 
 from lifecycle.errors import ExitCode
-from tests.ros.middleware.free_ports import free_ports
+from tests.ros.middleware.free_ports import first_port
 from tests.ros.supervisor.running import Up, pair, up, verb
 
 pytestmark = pytest.mark.thorough
 
-_PORTS = 20
-"""More than a planner gives out to two nodes from `first_port` on."""
-
 
 def by_tcp(directory: Path, domain_id: int, **discovery: str) -> Path:
     """Write the manifest of the pair, connected by TCP on ports that nobody has."""
-    first_port = free_ports(_PORTS)[0]
-    how: dict[str, Any] = {"domain_id": domain_id, "first_port": first_port, **discovery}
+    how: dict[str, Any] = {"domain_id": domain_id, "first_port": first_port(), **discovery}
     return pair(directory, domain_id, edit={"discovery": how})
 
 

@@ -66,6 +66,7 @@ def test_a_killed_node_of_three_is_active_and_verified_again_and_the_others_go_o
         run.assert_nothing_left()
 
 
+@pytest.mark.thorough
 def test_a_node_that_is_killed_before_its_name_is_known_does_not_haunt_the_gate(
     tmp_path: Path, fresh_domain: int
 ) -> None:

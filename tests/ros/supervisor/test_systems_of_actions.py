@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 
 from lifecycle.errors import ExitCode
-from tests.ros.supervisor.running import up, verb
+from tests.ros.supervisor.running import up, verb, write
 
 pytestmark = pytest.mark.thorough
 
@@ -38,15 +37,7 @@ def acting(directory: Path, domain_id: int) -> Path:
             "interface": {"action_clients": [{"name": "count", "type": TYPE}]},
         },
     }
-    document = {
-        "manifest_version": 1,
-        "system": "acting",
-        "discovery": {"domain_id": domain_id, "range": "localhost"},
-        "nodes": nodes,
-    }
-    file = directory / "acting.lifecycle.yaml"
-    file.write_text(yaml.safe_dump(document))
-    return file
+    return write(directory, domain_id, nodes, "acting")
 
 
 def test_a_remapped_action_on_a_connection_is_brought_up_judged_drawn_and_ended(

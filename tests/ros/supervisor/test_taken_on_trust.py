@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 
 from lifecycle.errors import ExitCode
-from tests.ros.supervisor.running import ENOUGH, ROOT, pair, up, verb
+from tests.ros.supervisor.running import ENOUGH, ROOT, pair, up, verb, write
 
 pytestmark = pytest.mark.thorough
 
@@ -32,29 +31,23 @@ def test_ordinary_ros_2_nodes_whose_qos_nobody_wrote_pass_the_strict_gate(
     ask = {"name": "/ask", "type": "std_srvs/srv/Trigger"}
     dock = {"name": "/dock", "type": "test_msgs/action/Fibonacci"}
     best_effort = "/chatter:std_msgs/msg/String:BEST_EFFORT"
-    document = {
-        "manifest_version": 1,
-        "system": "ordinary",
-        "discovery": {"domain_id": fresh_domain, "range": "localhost"},
-        "nodes": {
-            "talker": _ordinary(
-                *("talker", "--publish", best_effort, "--answer", "/ask:std_srvs/srv/Trigger"),
-                *("--serve", "/dock:test_msgs/action/Fibonacci"),
-                publishers=[chatter],
-                service_servers=[ask],
-                action_servers=[dock],
-            ),
-            "listener": _ordinary(
-                *("listener", "--subscribe", best_effort, "--call", "/ask:std_srvs/srv/Trigger"),
-                subscriptions=[chatter],
-                service_clients=[ask],
-            ),
-        },
+    nodes = {
+        "talker": _ordinary(
+            *("talker", "--publish", best_effort, "--answer", "/ask:std_srvs/srv/Trigger"),
+            *("--serve", "/dock:test_msgs/action/Fibonacci"),
+            publishers=[chatter],
+            service_servers=[ask],
+            action_servers=[dock],
+        ),
+        "listener": _ordinary(
+            *("listener", "--subscribe", best_effort, "--call", "/ask:std_srvs/srv/Trigger"),
+            subscriptions=[chatter],
+            service_clients=[ask],
+        ),
     }
     # Nothing proves that data flow between two that report nothing, so that has to be trusted.
-    document["policy"] = {"trust": ["flow.unreported"]}
-    manifest = tmp_path / "ordinary.lifecycle.yaml"
-    manifest.write_text(yaml.safe_dump(document))
+    trust = {"trust": ["flow.unreported"]}
+    manifest = write(tmp_path, fresh_domain, nodes, "ordinary", policy=trust)
     with up(manifest, "--strict", "--stop-after", "0.2", runtime=tmp_path) as run:
         assert run.finish() == ExitCode.OK, run.verdict
         assert run.verdict["verdict"] == "ok"

@@ -243,7 +243,7 @@ def test_a_run_that_took_another_manifest_is_reported_by_that_one(tmp_path: Path
     verdict = replace(
         violated(), verdict=Outcome.UNVERIFIABLE, findings=tuple(found), blocking=False
     )
-    policy = replace(PLAN.policy, unverifiable_blocks=True)
+    policy = replace(PLAN.policy, unverifiable="block")
     result = UpResult(
         exit_code=ExitCode.UNVERIFIABLE,
         verdict=verdict,

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 import yaml
 
+from lifecycle.ci_formats import Problem, github
 from lifecycle.cli import main
-from lifecycle.cli.report import annotation
 from lifecycle.cli.verbs.init import package_files, schema_reference
 
 
@@ -110,9 +110,11 @@ def test_the_package_is_a_program() -> None:
 
 
 def test_an_annotation_is_one_line_whatever_is_in_it() -> None:
-    text = annotation("error", "a:b", "100% wrong\nfix it", at="dir,x/a.yaml:3:7")
+    text = github(
+        Problem(rule="a:b", level="error", message="100% wrong\nfix it", at="dir,x/a.yaml:3:7")
+    )
     assert text == "::error file=dir%2Cx/a.yaml,line=3,col=7,title=a%3Ab::100%25 wrong%0Afix it"
-    assert annotation("warning", "r", "m", at="") == "::warning title=r::m"
+    assert github(Problem(rule="r", level="warning", message="m")) == "::warning title=r::m"
 
 
 def test_a_captured_manifest_names_the_schema_that_is_there(

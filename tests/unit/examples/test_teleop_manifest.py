@@ -45,48 +45,6 @@ def test_machines_get_their_addresses_from_arguments() -> None:
     }
 
 
-def test_every_publisher_is_heard_and_every_subscription_published() -> None:
-    plan = build_plan(load(MANIFEST).manifest)
-    flows = {(flow.topic, flow.publisher, flow.subscription) for flow in plan.flows}
-    assert flows == {
-        ("/robot/video", "camera", "health"),
-        ("/robot/video", "camera", "operator"),
-        ("/robot/battery", "battery", "health"),
-        ("/robot/battery", "battery", "operator"),
-        ("/robot/scan", "lidar", "base"),
-        ("/robot/scan", "lidar", "health"),
-        ("/robot/odometry", "base", "camera"),
-        ("/robot/odometry", "base", "battery"),
-        ("/robot/odometry", "base", "lidar"),
-        ("/robot/odometry", "base", "health"),
-        ("/robot/odometry", "base", "operator"),
-        ("/robot/cmd_vel", "operator", "base"),
-        ("/robot/cmd_vel", "operator", "health"),
-        ("/diagnostics", "health", "operator"),
-    }
-
-
-def test_camera_and_battery_share_a_process_but_their_publishers_share_no_participant() -> None:
-    plan = build_plan(load(MANIFEST).manifest)
-    assert [each.nodes for each in plan.processes if len(each.nodes) > 1] == [("camera", "battery")]
-    carriers = {
-        endpoint.resolved: endpoint.participant
-        for node in plan.nodes
-        for endpoint in node.endpoints
-        if endpoint.participant
-    }
-    assert carriers == {
-        "/robot/video": "_camera_flow_0",
-        "/robot/battery": "_battery_flow_0",
-        "/robot/cmd_vel": "_station_flow_0",
-    }
-
-
-def test_the_frame_rate_is_an_argument() -> None:
-    camera = load(MANIFEST, {"video_hz": "30.0"}).manifest.nodes[0]
-    assert dict(camera.parameters) == {"rate_hz": 30.0}
-
-
 @pytest.mark.parametrize(
     ("old", "new", "named"),
     [

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.manifest.diagnostics import Position, Severity
+from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.loading import load
 from lifecycle.manifest.model import (
     Condition,
@@ -81,8 +81,7 @@ def test_discovery_and_policy(every_key: Manifest) -> None:
     assert discovery.range is DiscoveryRange.LOCALHOST
     assert policy.undeclared_nodes is EndpointPolicy.OPEN
     assert policy.unverifiable_blocks
-    assert policy.unpublished is Severity.WARNING
-    assert policy.unheard is None
+    assert (policy.unpublished, policy.unheard) == ("warning", "ignore")
     assert policy.tolerated_nodes == ("rviz*", "/tools/*")
 
 
@@ -95,7 +94,7 @@ def test_supervisors_of_one_machine_and_of_several_may_be_read_in_ros(
         "manifest_version: 1\nsystem: pair\nmachines: {far: {address: 192.0.2.1}}\n"
         f"nodes:\n  a:\n    run: {{command: [a]}}\n  b:\n    run: {{command: [b]}}\n{machine}"
     )
-    assert load(path).manifest.policy.ros_interface.value == "read_only"
+    assert load(path).manifest.policy.access.value == "read_only"
 
 
 def test_machines_with_this_host_added_for_nodes_that_name_none(every_key: Manifest) -> None:
@@ -390,7 +389,7 @@ def test_discovery_and_policy_are_those_of_the_outermost_manifest(
 ) -> None:
     manifest = _corpus("include_only", monkeypatch)
     assert manifest.discovery.domain_id == 3
-    assert manifest.policy.unheard is Severity.WARNING
+    assert manifest.policy.unheard == "warning"
     assert [node.key for node in manifest.nodes] == ["talker", "inner/one/listener"]
 
 

@@ -6,15 +6,10 @@ from collections.abc import Callable
 
 import pytest
 
-from lifecycle.manifest.checks.parameters import (
-    Section,
-    misfit,
-    read_scalar,
-    suggestion,
-    type_of,
-)
+from lifecycle.manifest.checks.parameters import misfit, suggestion
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import ParameterValue
+from lifecycle.manifest.parameter_files import Section, read_scalar, type_of
 
 Findings = Callable[..., list[str]]
 
@@ -188,22 +183,36 @@ nodes:
         (
             "- 1",
             (
-                "yaml.root p.yaml:1:1: cannot use a list as a whole document; it must be a "
-                "mapping of keys; write 'NODE: {ros__parameters: {NAME: VALUE}}'"
+                "check.parameter-file p.yaml:1:1: cannot use a list here: it is no key, and holds "
+                "no lists; write 'NODE: {ros__parameters: {NAME: VALUE}}'"
             ),
         ),
         (
             "camera: {ros__parameters: 5}",
             (
                 "check.parameter-file p.yaml:1:10: camera.ros__parameters: "
-                "cannot use 5 as parameters"
+                "cannot use 5 as parameters; write 'NODE: {ros__parameters: {NAME: VALUE}}'"
             ),
         ),
         (
-            "camera: {ros__parameters: {frame: !!str 5}}",
+            "camera: {ros__parameters: {rate: !!str 5}}",
             (
-                "yaml.tag p.yaml:1:35: warning: camera.ros__parameters.frame: cannot check the "
-                "parameters of this file: it holds a YAML tag"
+                "check.parameter-type p.yaml:1:28: camera.ros__parameters.rate: cannot set "
+                "parameter 'rate' of '/camera' to '5': it is a string, declared is double"
+            ),
+        ),
+        (
+            "camera: {ros__parameters: {rate: 1, rate: 2.0}}",
+            (
+                "check.parameter-type p.yaml:1:28: camera.ros__parameters.rate: cannot set "
+                "parameter 'rate' of '/camera' to 1: it is an int, declared is double; write 1.0"
+            ),
+        ),
+        (
+            "'.+!': {ros__parameters: {rate: 1.0}}",
+            (
+                "check.parameter-file p.yaml:1:9: [\".+!\"].ros__parameters: cannot use '.+!' as "
+                "the name of a node: a node name holds letters, digits and '_' only, not '.'"
             ),
         ),
     ],

@@ -203,3 +203,9 @@ def test_a_file_that_the_kernel_makes_up_is_refused_unread(path: str) -> None:
         f"{path}:1:1: cannot read a file that the kernel makes up (/proc, /sys) as a manifest; "
         "name a regular file"
     )
+
+
+def test_a_scalar_with_the_tag_of_no_type_is_a_string() -> None:
+    value = parse("a: ! 12", file="f").find(("a",))
+    assert value is not None
+    assert value.data == "12"

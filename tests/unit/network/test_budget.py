@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lifecycle.network.ports import (
+    PLATFORMS,
     EphemeralRange,
-    Platform,
     describe_domains,
     max_participants,
     overflows,
@@ -35,7 +35,7 @@ def test_no_participant_fits_an_unsafe_domain() -> None:
         "cannot run 1 participant in domain 120 on one host: none fits before the ephemeral ports "
         f"32768–60999: they hold its multicast ports; {HINT}"
     )
-    assert overflows(120, participants=1, ephemeral=Platform.MACOS) == ()
+    assert overflows(120, participants=1, ephemeral=PLATFORMS["macos"]) == ()
 
 
 def test_400_unique_ports_are_shared_with_one_per_participant() -> None:
@@ -60,11 +60,12 @@ def test_runs_of_domains_are_read_by_people(runs: tuple[range, ...], text: str) 
     assert describe_domains(runs) == text
 
 
-@given(domain_id=st.integers(0, 232), platform=st.sampled_from(Platform))
-def test_exactly_as_many_fit_as_the_arithmetic_says(domain_id: int, platform: Platform) -> None:
-    count = max_participants(domain_id, platform).participants
-    assert overflows(domain_id, participants=count, ephemeral=platform) == ()
-    assert len(overflows(domain_id, participants=count + 1, ephemeral=platform)) == 1
+@given(domain_id=st.integers(0, 232), platform=st.sampled_from(sorted(PLATFORMS)))
+def test_exactly_as_many_fit_as_the_arithmetic_says(domain_id: int, platform: str) -> None:
+    ephemeral = PLATFORMS[platform]
+    count = max_participants(domain_id, ephemeral).participants
+    assert overflows(domain_id, participants=count, ephemeral=ephemeral) == ()
+    assert len(overflows(domain_id, participants=count + 1, ephemeral=ephemeral)) == 1
 
 
 def test_negative_numbers_are_refused() -> None:

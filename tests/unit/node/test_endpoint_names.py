@@ -50,19 +50,6 @@ def test_a_topic_that_is_called_like_a_spelling_is_found_by_it() -> None:
             ),
         ),
         (
-            "subscriptions/video",
-            (VIDEO,),
-            (
-                "cannot find endpoint 'subscriptions/video' of /camera; "
-                "did you mean 'publishers/video'? declared: 'publishers/video'"
-            ),
-        ),
-        (
-            "x",
-            (VIDEO,),
-            "cannot find endpoint 'x' of /camera; declared: 'publishers/video'",
-        ),
-        (
             "video",
             (),
             (

@@ -8,8 +8,6 @@ from typing import Any
 
 import pytest
 
-from lifecycle.errors import LifecycleError
-from lifecycle.node.endpoints.publisher import DeclaredPublisher
 from lifecycle.node.lifecycle.gate import GatedPublisher, GatedSubscription, GatedTimer, NodeGate
 
 
@@ -110,22 +108,6 @@ def test_a_callback_with_message_info_is_replaced_by_one_that_takes_it_too() -> 
         subscription.callback("message")
 
 
-def test_the_last_transient_local_samples_wait_for_activation() -> None:
-    received: list[object] = []
-    gate = NodeGate()
-    subscription = FakeSubscription(received.append, durability="TRANSIENT_LOCAL", depth=2)
-    gate.add_subscription(subscription, at_once)
-    for sample in ("map 1", "map 2", "map 3"):
-        subscription.callback(sample)
-    assert received == []
-    gate.open()
-    subscription.callback("map 4")
-    gate.close()
-    subscription.callback("map 5")
-    gate.open()
-    assert received == ["map 2", "map 3", "map 4", "map 5"]
-
-
 def test_kept_samples_wait_on_if_the_gate_closes_before_they_are_delivered() -> None:
     received: list[object] = []
     gate = NodeGate()
@@ -161,32 +143,3 @@ def test_a_timer_that_the_user_starts_while_closed_starts_when_open() -> None:
     assert not timer.running
     gate.open()
     assert timer.running
-
-
-def test_a_declared_publisher_follows_connect_and_the_gate() -> None:
-    gate, entity, warnings = NodeGate(), FakePublisher(), list[str]()
-    handle = DeclaredPublisher("video", warnings.append)
-    handle.publish("before connect")
-    handle.attach(entity)
-    gate.add(handle, handle)
-    handle.publish("inactive")
-    gate.open()
-    handle.publish("active")
-    assert handle.publish == entity.publish
-    gate.close()
-    handle.publish("inactive again")
-    gate.remove(handle)
-    handle.detach()
-    gate.open()
-    handle.publish("after disconnect")
-    assert entity.sent == ["active"]
-    assert len(warnings) == 3
-
-
-def test_a_declared_publisher_that_is_not_connected_has_no_entity() -> None:
-    with pytest.raises(LifecycleError) as error:
-        _ = DeclaredPublisher("video", pytest.fail).entity
-    assert str(error.value) == (
-        "cannot reach publisher 'video': the node is not connected; endpoints exist from connect "
-        "until disconnect"
-    )

@@ -35,13 +35,6 @@ class Base:
     def tick(self) -> None: ...
 
 
-def test_each_endpoint_finds_its_method() -> None:
-    handlers = match(Base, [SCAN, RESET, DOCK, VIDEO], node="/base")
-    assert [handlers.bound(Base, each) for each in (SCAN, RESET)] == [Base.see, Base.reset]
-    assert handlers.bound(Base, DOCK).execute is Base.dock
-    assert [(timer.method, timer.period_s) for timer in handlers.timers] == [("tick", 0.5)]
-
-
 def test_an_override_without_the_decorator_still_handles() -> None:
     class Special(Base):
         def see(self, message: object) -> None: ...
@@ -60,46 +53,6 @@ def test_one_method_may_handle_two_subscriptions() -> None:
     rear = planned_endpoint(EndpointKind.SUBSCRIPTION, "rear")
     handlers = match(Both, [front, rear], node="/both")
     assert [handlers.bound(Both, each) for each in (front, rear)] == [Both.see, Both.see]
-
-
-def test_a_misspelt_handler_is_told_from_both_sides_with_the_nearest_spelling() -> None:
-    class Typo:
-        @on_message("scam")
-        def see(self, message: object) -> None: ...
-
-    with pytest.raises(LifecycleError) as error:
-        match(Typo, [SCAN], node="/base")
-    assert str(error.value).splitlines() == [
-        (
-            "cannot use handler Typo.see: @on_message('scam') names no subscription that /base "
-            "declares; did you mean 'scan'? declared: 'scan'"
-        ),
-        (
-            "cannot serve subscription 'scan' of /base: no method of Typo is decorated with "
-            "@on_message('scan'); did you mean it where @on_message('scam') stands?"
-        ),
-    ]
-
-
-def test_endpoints_without_handlers_are_all_told_at_once() -> None:
-    class Nothing: ...
-
-    with pytest.raises(LifecycleError) as error:
-        match(Nothing, [SCAN, RESET, DOCK, VIDEO], node="/base")
-    assert str(error.value).splitlines() == [
-        (
-            "cannot serve subscription 'scan' of /base: no method of Nothing is decorated with "
-            "@on_message('scan')"
-        ),
-        (
-            "cannot serve service server 'reset' of /base: no method of Nothing is decorated with "
-            "@on_service('reset')"
-        ),
-        (
-            "cannot serve action server 'dock' of /base: no method of Nothing is decorated with "
-            "@on_action('dock')"
-        ),
-    ]
 
 
 def test_a_handler_of_another_kind_does_not_count() -> None:

@@ -146,26 +146,3 @@ def test_a_change_while_the_configuration_is_collected_is_told() -> None:
     changes.give(heard.append)
     executor.turn()
     assert len(heard) == 2
-
-
-def test_each_change_is_notified_though_the_executor_is_faster_than_who_asks_it() -> None:
-    seen: list[Any] = []
-
-    def at_once(task: Callable[[], Any]) -> object:
-        task()
-        return True
-
-    changes = ConfigurationChanges(at_once, lambda: "now", failed=seen.append)  # type: ignore[arg-type,return-value]
-    changes.listen(seen.append)
-    for _ in range(3):
-        changes.touch()
-    assert seen == ["now"] * 3
-
-
-def test_a_process_that_left_and_came_back_is_asked_again() -> None:
-    asked: list[object] = []
-    changes = ConfigurationChanges(asked.append, lambda: None, failed=print)  # type: ignore[arg-type,return-value]
-    changes.listen(lambda _: None)
-    changes.touch()
-    changes.touch()
-    assert len(asked) == 2

@@ -71,22 +71,6 @@ def added(dog: Watchdog, name: str) -> Node:
     return node
 
 
-def test_the_sign_says_busy_exactly_while_a_callback_runs(dog: Watchdog, sign: Sign) -> None:
-    dog.begin(None)
-    assert sign.busy
-    dog.end()
-    assert not sign.busy
-
-
-def test_a_transition_inside_a_callback_is_not_held_against_it(dog: Watchdog, sign: Sign) -> None:
-    node = added(dog, "/camera")
-    dog.begin(None)
-    node.become(NodeState.CONFIGURING)
-    assert not sign.busy
-    node.become(NodeState.INACTIVE_DISCONNECTED)
-    assert sign.busy  # what comes after it in the same callback is
-
-
 def test_callbacks_are_not_watched_while_an_async_transition_is_under_way(
     dog: Watchdog, sign: Sign
 ) -> None:

@@ -10,6 +10,7 @@ import pytest
 from msgspec.structs import replace
 
 from lifecycle import codec
+from lifecycle.manifest.loading import load
 from lifecycle.manifest.model import (
     Interface,
     Node,
@@ -18,7 +19,8 @@ from lifecycle.manifest.model import (
     Run,
     RunKind,
 )
-from lifecycle.plan.build import build_plan
+from lifecycle.manifest.parameter_files import read_sections
+from lifecycle.plan.build import build_plan, check_plan
 from lifecycle.plan.model import Plan
 from lifecycle.plan.parameters import portable
 from tests.builders import at, manifest, node
@@ -106,8 +108,8 @@ def test_what_only_a_section_for_many_gives_is_optional(tmp_path: Path):
 
 
 def test_a_file_that_cannot_be_read_here_is_named(tmp_path: Path):
-    tagged = "/**: {ros__parameters: {rate: !!str 5}}"
-    (planned,) = plan_of(camera(parameter_files=files(tmp_path, tagged, NAMED))).nodes
+    refused = "/**: 5"
+    (planned,) = plan_of(camera(parameter_files=files(tmp_path, refused, NAMED))).nodes
     assert [Path(each).name for each in planned.unread_parameter_files] == ["0.yaml"]
     assert [each.name for each in planned.expected_parameters] == ["rate"]
 
@@ -166,3 +168,23 @@ def test_a_file_that_a_command_line_names_is_read(tmp_path: Path):
     (planned,) = plan_of(camera(run=run)).nodes
     assert [(each.name, each.value) for each in planned.expected_parameters] == [("rate", 1.0)]
     assert [Path(each).name for each in planned.unread_parameter_files] == ["gone.yaml"]
+
+
+def test_a_check_reads_each_file_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    read: list[str] = []
+
+    def counted(path: str, *, shown: str) -> object:
+        read.append(shown)
+        return read_sections(path, shown=shown)
+
+    monkeypatch.setattr("lifecycle.manifest.parameter_files.read_sections", counted)
+    (tmp_path / "p.yaml").write_text("/**: {ros__parameters: {rate: 1.0, use_sim_time: true}}")
+    run = "{run: {command: [a]}, managed: false, endpoints: open, parameter_files: [p.yaml]}"
+    path = tmp_path / "a.lifecycle.yaml"
+    path.write_text(
+        "manifest_version: 1\nsystem: a\nparameters: {rate: 2.0}\n"
+        f"nodes:\n  a: {run}\n  b: {run}\n"
+    )
+    loaded = load(path)
+    check_plan(loaded.manifest, files=loaded.files)
+    assert len(read) == 1

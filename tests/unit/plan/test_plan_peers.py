@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from msgspec.structs import replace
 
-from lifecycle.manifest.model import DiscoveryMode, DiscoveryRange, Machine
+from lifecycle.manifest.model import Discovery, DiscoveryMode, DiscoveryRange, Machine
 from lifecycle.middleware.discovery.environment import discovery_peers, peers_environment
 from lifecycle.middleware.fastdds.profiles import discovery_profile
 from lifecycle.plan.connections.hosts import reached_hosts
@@ -35,8 +35,8 @@ def test_hosts_with_nodes_are_looked_for_by_address_and_nobody_else() -> None:
     [
         {"discovery_range": DiscoveryRange.LOCALHOST},
         {"discovery_range": DiscoveryRange.OFF},
-        {"discovery_mode": DiscoveryMode.STATIC},
-        {"discovery_mode": DiscoveryMode.SERVER},
+        {"discovery": Discovery(mode=DiscoveryMode.STATIC)},
+        {"discovery": Discovery(mode=DiscoveryMode.SERVER)},
     ],
 )
 def test_where_discovery_ends_at_this_host_or_is_planned_nobody_is(

@@ -267,7 +267,9 @@ def test_programs_are_found_as_exec_would_find_them(folder: Path) -> None:
     ]
 
 
-def test_executables_of_packages_are_looked_for_where_there_are_packages(folder: Path) -> None:
+def test_executables_of_packages_are_looked_for_where_there_are_packages(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (folder / "lib" / "demo").mkdir(parents=True)
     (folder / "lib" / "demo" / "talk").write_text("")
     (folder / "lib" / "demo" / "talk").chmod(0o755)
@@ -287,6 +289,8 @@ def test_executables_of_packages_are_looked_for_where_there_are_packages(folder:
             "file of its workspace"
         )
     ]
+    monkeypatch.setattr(sys, "prefix", str(folder))  # where wheels install them
+    assert package("talk", "") == []
 
 
 FOREIGN = """
@@ -346,7 +350,7 @@ def test_connections_that_a_class_of_rclpy_cannot_be_given_are_refused(folder: P
     net = ConnectionDeclaration(name="net", urls=(url,), map=mapped, at=at(1))
     run = Run(kind=RunKind.PYTHON, python="them:Managed")
     made = replace(node("talker", run=run), connections=(net,))
-    system = replace(manifest(made), data_layer=DataLayer(authority=Authority.SUPERVISOR, at=at(1)))
+    system = replace(manifest(made), data_layer=DataLayer(authority=Authority.SUPERVISOR))
     assert said(resolve_programs(system, environment={})) == [
         (
             "cannot leave the connections of 'talker' to the supervisor: Managed (them.py) is not "

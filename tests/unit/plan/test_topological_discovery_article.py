@@ -354,7 +354,8 @@ def intelligent(**data_layer: object) -> Plan:
         node("far", subscription("t"), machine="m2"),
         machines=MACHINES,
         discovery=Discovery(mode=DiscoveryMode.STATIC, transport=FlowTransport.TCPV4),
-        data_layer=DataLayer(at=at(4), **data_layer),
+        data_layer=DataLayer(**data_layer),
+        positions={"data_layer": at(4)},
     )
 
 

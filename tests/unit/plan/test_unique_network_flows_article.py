@@ -221,7 +221,8 @@ def identified(count: int, **rest: object) -> Manifest:
             Machine(name=f"m{index}", address=f"10.0.0.{index + 1}", at=at(1))
             for index in range(count)
         ),
-        network=Network(flow_identification=FlowIdentification.DSCP, at=at(2)),
+        network=Network(flow_identification=FlowIdentification.DSCP),
+        positions={"network": at(2)},
         **rest,
     )
 

@@ -12,7 +12,7 @@ import os
 import selectors
 import signal
 import socket
-from collections.abc import Callable, Collection, Coroutine, Mapping, Sequence
+from collections.abc import Callable, Collection, Coroutine, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -21,12 +21,12 @@ from msgspec.structs import replace
 from lifecycle.codec import from_json, to_json
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.node.host.control import Command, Event, HostSpec, Operation
-from lifecycle.plan.model import Plan
+from lifecycle.plan.model import Plan, PlannedProcess
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.process import ManagedProcess, ProcessExit
 from lifecycle.supervisor.run.events import Emitter
 from lifecycle.supervisor.run.events import Event as SupervisorEvent
-from lifecycle.verify.observation import NodeConfiguration, Observation
+from lifecycle.verify.observation import NodeConfiguration
 from lifecycle.verify.outcome import ConnectionReport, Outcome
 from lifecycle.verify.verdict import Finding, Verdict
 from tests.builders import configuration, reported
@@ -174,7 +174,6 @@ class FakeProcess:
             self.end(ProcessExit(signal=number))
 
     def run_delay_s(self) -> float:
-        self._spawner.looked_at.append(self._name)
         share = self._spawner.starves.get(self._name, 0.0)
         return share * asyncio.get_running_loop().time()
 
@@ -291,7 +290,6 @@ class FakeSpawner:
         takes_s: how long such a line takes.
         unhosted: by process, nodes that cannot be constructed and why, reported 0.1 s apart.
         starves: by process, for how much of the time its threads wait for a processor, added up.
-        looked_at: processes of which it was read how long they waited for a processor.
         ends_at: processes that do not end by themselves, and the signal that ends them.
         processes: by name.
         interfaces: what a node reports, by full name; steps of wiring change it.
@@ -306,7 +304,6 @@ class FakeSpawner:
         self.takes_s: dict[str, float] = {}
         self.unhosted: dict[str, dict[str, str]] = {}
         self.starves: dict[str, float] = {}
-        self.looked_at: list[str] = []
         self.ends_at: dict[str, int] = {}
         self.strays: tuple[int, ...] = ()
         self.processes: dict[str, FakeProcess] = {}
@@ -387,40 +384,6 @@ class FakeSpawner:
         """Nothing to close."""
 
 
-class FakeGraph:
-    """An observer that sees a list of node names, and tells of changes when told to."""
-
-    def __init__(self) -> None:
-        self.state = self
-        self.observation = Observation()
-        self.changed = asyncio.Event()
-        self.put: list[NodeConfiguration] = []
-        self._count = 0
-
-    @property
-    def changes(self) -> int:
-        return self._count + self.changed.is_set()
-
-    def reread_parameters(self) -> bool:
-        return False
-
-    def expect_newcomers(self, *, everybody: bool = False) -> bool:
-        del everybody
-        return False
-
-    async def observe(self, plan: Plan) -> Observation:
-        del plan
-        return self.observation
-
-    async def wait_change(self) -> None:
-        await self.changed.wait()
-        self.changed.clear()
-        self._count += 1
-
-    def put_configuration(self, configuration: NodeConfiguration) -> None:
-        self.put.append(configuration)
-
-
 def verdict_of(outcome: Outcome, *rules: str, blocking: bool | None = None) -> Verdict:
     """A verdict with one finding for each rule."""
     return Verdict(
@@ -444,12 +407,15 @@ def verdict_of(outcome: Outcome, *rules: str, blocking: bool | None = None) -> V
 class World:
     """A system of fakes with everything recorded."""
 
-    def __init__(self, plan: Plan, directory: Path) -> None:
+    def __init__(
+        self, plan: Plan, directory: Path, processes: Iterable[PlannedProcess] | None = None
+    ) -> None:
         self.spawner = FakeSpawner()
         self.events: list[SupervisorEvent] = []
         self.emit = Emitter()
         self.emit.listen(self.events.append)
-        self.system = System(plan, emit=self.emit, logs=directory, processes=plan.processes)
+        own = plan.processes if processes is None else processes
+        self.system = System(plan, emit=self.emit, logs=directory, processes=own)
 
     @property
     def log(self) -> list[str]:
@@ -459,6 +425,3 @@ class World:
     def heard(self, kind: type[T]) -> list[T]:
         """Events of one kind."""
         return [event for event in self.events if isinstance(event, kind)]
-
-
-Check = Callable[[Path], Coroutine[Any, Any, None]]

@@ -30,8 +30,6 @@ from lifecycle.supervisor.control.protocol import (
     SystemStatus,
 )
 from lifecycle.supervisor.control.ros_interface import Entry
-from lifecycle.supervisor.health.peer_supervisors import Listener
-from lifecycle.supervisor.nodes.driver import NodeDriver, NodeInterfaceClient, ServiceDriver
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.process import ProcessExit
 from lifecycle.supervisor.run.events import (
@@ -118,9 +116,6 @@ class _Connection:
     def announce(self, text: str) -> None:
         """Nobody reads it."""
 
-    def tell(self, silent: Mapping[str, str]) -> None:
-        """Nobody reads it."""
-
 
 class FakeRosInterface:
     """What ROS programs see of a supervisor.
@@ -187,7 +182,7 @@ class FakeParticipant:
         self.twice: set[str] = set()
         self.unseen: set[str] = set()
         self.mute: set[str] = set()
-        self.services = FakeServices(self, hosts.log)
+        self.services = FakeServices(self, hosts)
         self.changes = 0
         self.dropped: list[str] = []
         self.while_looking: Callable[[], None] | None = None
@@ -195,7 +190,8 @@ class FakeParticipant:
         self.no_ros = ""
         self.refuses = ""
         self.refuses_live: dict[str, str] = {}
-        self.graph = self.discovery = self.clients = self.state = self
+        self.graph = self.discovery = self.state = self
+        self.clients = self.services
         self._hosts = hosts
         self._reports: dict[str, NodeConfiguration] = {}
         self._changed = asyncio.Event()
@@ -209,14 +205,6 @@ class FakeParticipant:
     async def wait_change(self) -> None:
         await self._changed.wait()
         self._changed.clear()
-
-    async def answers(
-        self, node: PlannedNode, *, timeout_s: float, repeat: bool = False
-    ) -> bool | None:
-        return True
-
-    def serves_nothing(self, node: PlannedNode) -> bool:
-        return False
 
     def reread_parameters(self) -> bool:
         return False
@@ -262,42 +250,11 @@ class FakeParticipant:
         self.dropped.append(node)
         self._reports.pop(node, None)
 
-    async def load(self, node: PlannedNode, container: str) -> None:
-        """No container is in this world."""
-
-    async def give_parameters(self, node: PlannedNode) -> None:
-        """Note what is set; a node may refuse."""
-        given = " ".join(f"{each.name}={each.value}" for each in node.expected_parameters)
-        self._hosts.log.append(f"{node.full_name} given {given}")
-        if self.refuses in given.split():
-            raise MiddlewareError(f"cannot set {self.refuses!r}")
-
-    async def set_parameters(
-        self, node: str, values: Mapping[str, Any], types: Mapping[str, str]
-    ) -> None:
-        assert values.keys() == types.keys()
-        self._hosts.log.append(f"{node} set {values}")
-        await asyncio.sleep(self._hosts.takes_s.get(f"{node} set", 0.0))
-        if node in self.refuses_live:
-            raise MiddlewareError(self.refuses_live[node])
-
-    def driver(self, node: PlannedNode) -> NodeDriver:
-        return ServiceDriver(self.services, node)
-
-    def node_interface(self, node: str) -> NodeInterfaceClient:
-        return NodeInterfaceClient(self.services, node)
-
     def ended(self, pid: int, *, nodes: Iterable[str], reported: Iterable[str]) -> None:
         """Nothing is left in this graph."""
 
-    def announce_machine(self, system: str, machine: str) -> _Connection:
-        raise AssertionError(f"{system} has no other machine than {machine}")
-
-    def watch_machine(self, system: str, machine: str, to: Listener) -> _Connection:
-        raise AssertionError(f"{system} has no machine {machine}: {to}")
-
-    def watch_node(self, node: str, to: Listener) -> _Connection:
-        del node, to
+    def watch_alive(self, topic: str, **callbacks: object) -> _Connection:
+        del topic, callbacks
         return _Connection()
 
     def plan_notices(self, on_notice: Callable[[str], None]) -> _Connection:
@@ -345,10 +302,34 @@ class FakeServices:
         matched_after_s: of a request, as `/base activate`: seconds before it can leave.
     """
 
-    def __init__(self, graph: FakeParticipant, log: list[str]) -> None:
+    def __init__(self, graph: FakeParticipant, hosts: FakeForkServer) -> None:
         self.matched_after_s: dict[str, float] = {}
         self._graph = graph
-        self._log = log
+        self._hosts = hosts
+
+    async def answers(
+        self, node: str, *, managed: bool, timeout_s: float, repeat: bool = False
+    ) -> bool | None:
+        return True
+
+    def serves_parameters(self, node: str) -> bool | None:
+        return True
+
+    async def give_parameters(self, node: PlannedNode) -> None:
+        """Note what is set; a node may refuse."""
+        given = " ".join(f"{each.name}={each.value}" for each in node.expected_parameters)
+        self._hosts.log.append(f"{node.full_name} given {given}")
+        if self._graph.refuses in given.split():
+            raise MiddlewareError(f"cannot set {self._graph.refuses!r}")
+
+    async def set_parameters(
+        self, node: str, values: Mapping[str, Any], types: Mapping[str, str]
+    ) -> None:
+        assert values.keys() == types.keys()
+        self._hosts.log.append(f"{node} set {values}")
+        await asyncio.sleep(self._hosts.takes_s.get(f"{node} set", 0.0))
+        if node in self._graph.refuses_live:
+            raise MiddlewareError(self._graph.refuses_live[node])
 
     async def get_state(self, node: str, *, timeout_s: float) -> str:
         del timeout_s
@@ -370,7 +351,7 @@ class FakeServices:
         await asyncio.sleep(self.matched_after_s.get(f"{node} {transition}", 0.0))
         if before is not None:
             await before()
-        self._log.append(f"{node} {transition}")
+        self._hosts.log.append(f"{node} {transition}")
         self._graph.others[node] = _REACHED[transition]
         self._graph.note()
         return True
@@ -406,7 +387,7 @@ class FakeNetworks(Networks):
         if self.fails:
             raise StepFailedError(self.fails, rule=rule("run.not-programmed"), subject="robot")
 
-    async def close(self, hurry: asyncio.Event | None = None) -> None:
+    async def close(self, hurry: asyncio.Event) -> None:
         del hurry
         self._log.append("networks restored")
 

@@ -18,7 +18,6 @@ from lifecycle.plan.model import Plan
 from lifecycle.supervisor.control.server import ControlRequest
 from lifecycle.supervisor.run.options import Until
 from tests.builders import plan_of, planned_node
-from tests.unit.supervisor.fakes import run
 from tests.unit.supervisor.session_world import INTRUDED, SessionWorld, over
 
 ROBOT = plan_of(
@@ -144,29 +143,21 @@ async def test_what_is_found_active_and_must_not_be_is_violated_and_left_active(
     assert requests(world, "/lidar") == []
 
 
-def test_an_attached_node_that_is_active_is_refused_but_for_adopt(tmp_path: Path) -> None:
-    async def main(folder: Path, *, adopt: bool) -> None:
-        plan = plan_of(planned_node("lidar", kind=RunKind.ATTACH))
-        world = SessionWorld(plan, folder, adopt=adopt, stop_after_s=0.0)
-        world.graph.others["/lidar"] = "active"
-        await world.run()
-        assert world.graph.others == {"/lidar": "active"}
-        assert world.messages == (
-            []
-            if adopt
-            else [
-                (
-                    "cannot configure '/lidar': it is active already, and nobody verified it; "
-                    "have it adopted as it is with 'lifecycle up --adopt', or deactivate it first: "
-                    "ros2 lifecycle set /lidar deactivate"
-                )
-            ]
-        )
-
-    for adopt in (False, True):
-        folder = tmp_path / str(adopt)
-        folder.mkdir()
-        run(main(folder, adopt=adopt))
+@pytest.mark.parametrize("adopt", [False, True])
+async def test_an_attached_node_that_is_active_is_refused_but_for_adopt(
+    tmp_path: Path, adopt: bool
+) -> None:
+    plan = plan_of(planned_node("lidar", kind=RunKind.ATTACH))
+    world = SessionWorld(plan, tmp_path, adopt=adopt, stop_after_s=0.0)
+    world.graph.others["/lidar"] = "active"
+    await world.run()
+    assert world.graph.others == {"/lidar": "active"}
+    refused = (
+        "cannot configure '/lidar': it is active already, and nobody verified it; "
+        "have it adopted as it is with 'lifecycle up --adopt', or deactivate it first: "
+        "ros2 lifecycle set /lidar deactivate"
+    )
+    assert world.messages == ([] if adopt else [refused])
 
 
 async def test_a_pause_deactivates_what_was_found_active_and_a_resume_leaves_it_so(

@@ -11,14 +11,13 @@ import pytest
 from lifecycle.errors import BringUpError
 from lifecycle.manifest.model import RunKind
 from lifecycle.node.host.control import Operation
-from lifecycle.plan.model import PlannedNode
 from lifecycle.supervisor.core.state import Level
 from lifecycle.supervisor.health.answering import ANSWER_S, SHOWN_S, TRIES, Answering
 from lifecycle.supervisor.nodes.driver import ActiveError, ChangedError, ServiceDriver
 from lifecycle.supervisor.run.events import Notice
 from lifecycle.supervisor.run.failure import ended
 from tests.builders import plan_of, planned_node
-from tests.unit.supervisor.fakes import World, run
+from tests.unit.supervisor.fakes import World
 
 
 class _Node:
@@ -31,9 +30,9 @@ class _Node:
         self.asked_s: list[float] = []
 
     async def answers(
-        self, node: PlannedNode, *, timeout_s: float, repeat: bool = False
+        self, node: str, *, managed: bool, timeout_s: float, repeat: bool = False
     ) -> bool | None:
-        del node, repeat
+        del node, managed, repeat
         loop = asyncio.get_running_loop()
         self.asked_s.append(loop.time())
         if not self.shows:
@@ -41,35 +40,30 @@ class _Node:
         await asyncio.sleep(min(timeout_s, max(0.0, self.from_s - loop.time())))
         return loop.time() >= self.from_s
 
-    def serves_nothing(self, node: PlannedNode) -> bool:
+    def serves_parameters(self, node: str) -> bool | None:
         del node
-        return self.is_sure
+        return False if self.is_sure else None
 
 
-def _before_the_gate(
+async def _before_the_gate(
     tmp_path: Path, node: _Node, timeout_s: float = 60.0
 ) -> tuple[bool, float, list[str], list[str]]:
     """Ask once; return whether that took any time, how much, findings and notices."""
-
-    async def main() -> tuple[bool, float, list[str], list[str]]:
-        world = World(plan_of(planned_node("base", kind=RunKind.ATTACH, managed=False)), tmp_path)
-        system = world.system
-        system.present = frozenset({"/base"})
-        system.nodes["base"].core.level = Level.STARTED
-        answering = Answering(system, node)
-        asking = asyncio.ensure_future(answering.follow())
-        loop = asyncio.get_running_loop()
-        began_s = loop.time()
-        node.from_s += began_s
-        waited = await answering.asked(timeout_s)
-        took_s = loop.time() - began_s
-        found = [each.rule for each in system.liveliness.findings()]
-        if not found and await answering.asked(timeout_s):
-            raise AssertionError("it was asked again for nothing")
-        await ended(asking)
-        return waited, took_s, found, [each.message for each in world.heard(Notice)]
-
-    return run(main())
+    world = World(plan_of(planned_node("base", kind=RunKind.ATTACH, managed=False)), tmp_path)
+    system = world.system
+    system.present = frozenset({"/base"})
+    system.nodes["base"].core.level = Level.STARTED
+    answering = Answering(system, node)
+    asking = asyncio.ensure_future(answering.follow())
+    loop = asyncio.get_running_loop()
+    began_s = loop.time()
+    node.from_s += began_s
+    waited = await answering.asked(timeout_s)
+    took_s = loop.time() - began_s
+    found = [each.rule for each in system.liveliness.findings()]
+    assert found or not await answering.asked(timeout_s), "it was asked again for nothing"
+    await ended(asking)
+    return waited, took_s, found, [each.message for each in world.heard(Notice)]
 
 
 @pytest.mark.parametrize(
@@ -81,11 +75,11 @@ def _before_the_gate(
         (100.0, 2.0, 2.0, ["run.not-answering"]),
     ],
 )
-def test_a_node_is_waited_for_until_it_answers_within_two_requests_and_the_time(
+async def test_a_node_is_waited_for_until_it_answers_within_two_requests_and_the_time(
     tmp_path: Path, from_s: float, timeout_s: float, known_s: float, expected: list[str]
 ) -> None:
     node = _Node(from_s=from_s)
-    waited, took_s, found, notices = _before_the_gate(tmp_path, node, timeout_s)
+    waited, took_s, found, notices = await _before_the_gate(tmp_path, node, timeout_s)
     assert waited
     assert known_s <= took_s < known_s + 0.5
     assert found == expected
@@ -93,28 +87,31 @@ def test_a_node_is_waited_for_until_it_answers_within_two_requests_and_the_time(
 
 
 @pytest.mark.parametrize(("is_sure", "least_s"), [(True, 0.0), (False, SHOWN_S)])
-def test_a_node_that_serves_nothing_is_named_and_not_found(
+async def test_a_node_that_serves_nothing_is_named_and_not_found(
     tmp_path: Path, is_sure: bool, least_s: float
 ) -> None:
     node = _Node(shows=False, is_sure=is_sure)
-    _, took_s, found, notices = _before_the_gate(tmp_path, node)
+    _, took_s, found, notices = await _before_the_gate(tmp_path, node)
     assert least_s <= took_s < least_s + 0.5
     assert found == []
     assert notices == ["'/base' serves no parameters: whether it hangs is not seen"]
 
 
 class ForeignNode:
-    """The lifecycle services of a managed node that others started; remembers the requests."""
+    """The lifecycle services of a managed node that others started, and may move meanwhile.
 
-    def __init__(self) -> None:
-        self.state = "inactive"
+    Attributes:
+        moved_to: states that somebody moves it to right after each of the first requests.
+        requests: so far.
+    """
+
+    def __init__(self, state: str, *moved_to: str) -> None:
+        self.state = state
+        self.moved_to = list(moved_to)
         self.requests: list[str] = []
 
     async def get_state(self, node: str, *, timeout_s: float) -> str:
         return self.state
-
-    async def get_available_transitions(self, node: str, *, timeout_s: float) -> tuple[str, ...]:
-        return ("activate", "cleanup", "shutdown")
 
     async def change_state(
         self,
@@ -127,8 +124,15 @@ class ForeignNode:
         if before is not None:
             await before()
         self.requests.append(transition)
-        self.state = "active"
+        self.state = "inactive" if transition == "deactivate" else "active"
+        if self.moved_to:
+            self.state = self.moved_to.pop(0)
         return True
+
+    async def perform(self, operation: Operation, permit: Permit | None = None) -> str:
+        """Have it driven; return its state."""
+        driver = ServiceDriver(self, planned_node("b"))  # type: ignore[arg-type]
+        return (await driver.perform(operation, permit)).state  # type: ignore[arg-type]
 
 
 class Permit:
@@ -143,58 +147,30 @@ class Permit:
 
 
 async def test_a_foreign_node_gets_no_activate_request_without_a_permit_that_holds() -> None:
-    node = ForeignNode()
-    driver = ServiceDriver(node, planned_node("b"))  # type: ignore[arg-type]
+    node = ForeignNode("inactive")
     with pytest.raises(BringUpError, match="cannot activate '/b' without a permit"):
-        await driver.perform(Operation.ACTIVATE)
+        await node.perform(Operation.ACTIVATE)
     with pytest.raises(ChangedError):
-        await driver.perform(Operation.ACTIVATE, Permit(holds=False))  # type: ignore[arg-type]
+        await node.perform(Operation.ACTIVATE, Permit(holds=False))
     assert node.requests == []
-    await driver.perform(Operation.ACTIVATE, Permit())  # type: ignore[arg-type]
+    await node.perform(Operation.ACTIVATE, Permit())
     assert node.requests == ["activate"]
 
 
-class _Moved(ForeignNode):
-    """Somebody moves it right after each of the first requests."""
-
-    def __init__(self, state: str, *moved_to: str) -> None:
-        super().__init__()
-        self.state = state
-        self.moved_to = list(moved_to)
-
-    async def change_state(
-        self,
-        node: str,
-        transition: str,
-        *,
-        timeout_s: float,
-        before: Callable[[], Awaitable[None]] | None = None,
-    ) -> bool:
-        await super().change_state(node, transition, timeout_s=timeout_s, before=before)
-        self.state = "inactive" if transition == "deactivate" else "active"
-        if self.moved_to:
-            self.state = self.moved_to.pop(0)
-        return True
-
-
 async def test_a_node_that_somebody_moves_meanwhile_is_asked_again() -> None:
-    node = _Moved("active", "active")
-    driver = ServiceDriver(node, planned_node("b"))  # type: ignore[arg-type]
-    assert (await driver.perform(Operation.DEACTIVATE)).state == "inactive"
+    node = ForeignNode("active", "active")
+    assert await node.perform(Operation.DEACTIVATE) == "inactive"
     assert node.requests == ["deactivate", "deactivate"]
-    node = _Moved("inactive", "inactive")
-    driver = ServiceDriver(node, planned_node("b"))  # type: ignore[arg-type]
-    assert (await driver.perform(Operation.ACTIVATE, Permit())).state == "active"
+    node = ForeignNode("inactive", "inactive")
+    assert await node.perform(Operation.ACTIVATE, Permit()) == "active"
     assert node.requests == ["activate", "activate"]
 
 
 async def test_whoever_moves_it_each_time_is_named_and_no_request_is_sent_that_cannot_be() -> None:
-    node = _Moved("active", *["active"] * 9)
-    driver = ServiceDriver(node, planned_node("b"))  # type: ignore[arg-type]
+    node = ForeignNode("active", *["active"] * 9)
     with pytest.raises(ActiveError, match="activated again by its own code or another client"):
-        await driver.perform(Operation.DEACTIVATE)
-    node = _Moved("active", "unconfigured")
-    driver = ServiceDriver(node, planned_node("b"))  # type: ignore[arg-type]
+        await node.perform(Operation.DEACTIVATE)
+    node = ForeignNode("active", "unconfigured")
     with pytest.raises(BringUpError, match="others moved it, and it is unconfigured"):
-        await driver.perform(Operation.DEACTIVATE)
+        await node.perform(Operation.DEACTIVATE)
     assert node.requests == ["deactivate"]

@@ -617,6 +617,6 @@ async def test_whatever_fails_one_of_two_manifests_is_in_force_as_a_whole(
             status = world.status()
             # Parameters are not seen in this world.
             assert (status.phase, status.verdict) != ("active", Outcome.VIOLATED), status.not_ok
-            assert status.revision == world.system.revision
-            wanted = {each.name for each in world.system.nodes.values() if each.is_to_be_active}
+            assert status.revision == world.system.run.revision
+            wanted = {each.name for each in world.system.nodes.values() if each.core.is_gated}
             assert {each.node for each in status.nodes if each.state == "active"} == wanted

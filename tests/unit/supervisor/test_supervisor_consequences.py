@@ -26,7 +26,6 @@ from lifecycle.plan.model import Plan, in_mode
 from lifecycle.supervisor.control.server import ControlRequest
 from lifecycle.supervisor.core.consequences import reaction_of
 from lifecycle.supervisor.core.state import Level
-from lifecycle.supervisor.nodes.driver import NodeCondition
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.run.events import Emitter
 from lifecycle.verify.observation import HealthReport
@@ -260,13 +259,14 @@ async def test_what_a_node_said_of_its_health_while_it_was_inactive_is_no_answer
     plan = plan_of(replace(planned_node("camera"), health=Health(check=True)))
     node = System(plan, emit=Emitter(), logs=tmp_path, processes=plan.processes).nodes["camera"]
     well = configuration("/camera", health=HealthReport(ok=True))
-    node.take(NodeCondition(state="inactive", connected=True, configuration=well))
+    node.report("inactive", connected=True)
+    node.configuration = well
     assert node.is_healthy
     node.core.level = Level.ACTIVE
-    node.take(NodeCondition(state="active", connected=True))
+    node.report("active", connected=True)
     assert not node.is_healthy
     assert node.unhealthy_reason == ": it has not answered since its state changed"
-    node.learn(replace(well, state="active"))
+    node.configuration = replace(well, state="active")
     assert node.is_healthy
 
 

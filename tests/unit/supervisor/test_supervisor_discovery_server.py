@@ -20,6 +20,7 @@ from lifecycle.supervisor.run.options import observer_connections, onlooker_conn
 from tests.builders import plan_of, planned_node
 from tests.unit.supervisor.fakes import FakeProcess, FakeSpawner, World
 
+REAL_TIME = True
 PREFIX = "44.53.00.5f.45.50.52.4f.53.49.4d.41"
 
 
@@ -57,72 +58,60 @@ class _EndsAtOnce(FakeSpawner):
         return child
 
 
-def test_a_port_that_somebody_has_is_refused_before_the_server_seems_to_run(
+async def test_a_port_that_somebody_has_is_refused_before_the_server_seems_to_run(
     tmp_path: Path, listener: socket.socket
 ) -> None:
     listener.listen()
     port = listener.getsockname()[1]
 
-    async def main() -> None:
-        system, spawner = world(served(port), tmp_path)
-        with pytest.raises(StepFailedError) as caught:
-            await discovery_server.begin(system, spawner, ours=True)
-        assert system.server is None
-        assert caught.value.message == (
-            f"cannot start the discovery server at tcp 127.0.0.1:{port}: that port is not free on "
-            "this host; end who has it (`ss -lnp`), or choose another 'discovery: first_port'"
-        )
-
-    asyncio.run(main())
+    system, spawner = world(served(port), tmp_path)
+    with pytest.raises(StepFailedError) as caught:
+        await discovery_server.begin(system, spawner, ours=True)
+    assert system.server is None
+    assert caught.value.message == (
+        f"cannot start the discovery server at tcp 127.0.0.1:{port}: that port is not free on "
+        "this host; end who has it (`ss -lnp`), or choose another 'discovery: first_port'"
+    )
 
 
-def test_one_that_ends_at_once_says_how(tmp_path: Path, nobody: int) -> None:
-    async def main() -> None:
-        system, _ = world(served(nobody), tmp_path)
-        with pytest.raises(StepFailedError) as caught:
-            await discovery_server.begin(system, _EndsAtOnce(), ours=True)
-        await discovery_server.end(system, asyncio.Event())
-        assert (caught.value.rule.id, caught.value.subject) == (
-            "run.start-failed",
-            "discovery_server",
-        )
-        assert caught.value.message == (
-            f"cannot start the discovery server at tcp 127.0.0.1:{nobody}: exit status 1"
-        )
-
-    asyncio.run(main())
+async def test_one_that_ends_at_once_says_how(tmp_path: Path, nobody: int) -> None:
+    system, _ = world(served(nobody), tmp_path)
+    with pytest.raises(StepFailedError) as caught:
+        await discovery_server.begin(system, _EndsAtOnce(), ours=True)
+    await discovery_server.end(system, asyncio.Event())
+    assert (caught.value.rule.id, caught.value.subject) == (
+        "run.start-failed",
+        "discovery_server",
+    )
+    assert caught.value.message == (
+        f"cannot start the discovery server at tcp 127.0.0.1:{nobody}: exit status 1"
+    )
 
 
-def test_the_server_of_another_machine_is_waited_for_with_a_deadline(
+async def test_the_server_of_another_machine_is_waited_for_with_a_deadline(
     tmp_path: Path, nobody: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(discovery_server, "START_S", 0.1)
 
-    async def main() -> None:
-        system, spawner = world(served(nobody, "base"), tmp_path)
-        with pytest.raises(StepFailedError) as caught:
-            await discovery_server.begin(system, spawner, ours=False)
-        assert caught.value.rule.id == "run.deadline"
-        assert caught.value.message == (
-            "cannot reach the discovery server of machine 'base', whose supervisor starts it, at "
-            f"tcp 127.0.0.1:{nobody}: nobody listened for 0.1 s"
-        )
-        assert spawner.processes == {}
-
-    asyncio.run(main())
+    system, spawner = world(served(nobody, "base"), tmp_path)
+    with pytest.raises(StepFailedError) as caught:
+        await discovery_server.begin(system, spawner, ours=False)
+    assert caught.value.rule.id == "run.deadline"
+    assert caught.value.message == (
+        "cannot reach the discovery server of machine 'base', whose supervisor starts it, at "
+        f"tcp 127.0.0.1:{nobody}: nobody listened for 0.1 s"
+    )
+    assert spawner.processes == {}
 
 
-def test_the_server_of_another_machine_may_come_later(
+async def test_the_server_of_another_machine_may_come_later(
     tmp_path: Path, listener: socket.socket
 ) -> None:
-    async def main() -> None:
-        listener.listen()
-        system, spawner = world(served(listener.getsockname()[1], "base"), tmp_path)
-        await discovery_server.begin(system, spawner, ours=False)
-        assert system.server is None
-        assert spawner.processes == {}
-
-    asyncio.run(main())
+    listener.listen()
+    system, spawner = world(served(listener.getsockname()[1], "base"), tmp_path)
+    await discovery_server.begin(system, spawner, ours=False)
+    assert system.server is None
+    assert spawner.processes == {}
 
 
 def observed(*urls: str, nodes: tuple[str, ...] = ()) -> Plan:

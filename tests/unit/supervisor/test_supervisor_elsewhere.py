@@ -16,7 +16,6 @@ from lifecycle.supervisor.run.options import address_that_is_down
 from lifecycle.supervisor.shell.looks import conditions
 from lifecycle.verify.observation import Observation, ObservedNode
 from tests.builders import HERE, configuration, plan_of, planned_node
-from tests.unit.supervisor.fakes import run
 
 STARTED, CONFIGURED, CONNECTED, ACTIVE, HEALTHY = Condition
 
@@ -52,7 +51,7 @@ def test_a_remote_node_has_reached_what_is_seen_of_it(
     assert tuple(each for each in Condition if each in found) == reached
 
 
-def test_a_task_that_loses_a_cancellation_is_ended_all_the_same() -> None:
+async def test_a_task_that_loses_a_cancellation_is_ended_all_the_same() -> None:
     lost: list[None] = []
 
     async def deaf() -> None:
@@ -61,13 +60,10 @@ def test_a_task_that_loses_a_cancellation_is_ended_all_the_same() -> None:
         lost.append(None)
         await asyncio.sleep(1000)
 
-    async def main() -> bool:
-        task = asyncio.ensure_future(deaf())
-        await asyncio.sleep(0)
-        await ended(task)
-        return task.cancelled()
-
-    assert run(main())
+    task = asyncio.ensure_future(deaf())
+    await asyncio.sleep(0)
+    await ended(task)
+    assert task.cancelled()
     assert lost == [None]
 
 

@@ -35,12 +35,15 @@ class Judged(SessionWorld):
         self.prepare = self._prepare
 
     def _prepare(self) -> None:
+        judge = self.supervisor.judge
+        really_look = judge.look
+
         async def look(stage: Stage, ahead: frozenset[str]) -> Verdict:
-            del stage, ahead
+            await really_look(stage, ahead)  # which notes what it has seen
             self.looks.append(asyncio.get_running_loop().time())
             return self.found(self.looks[-1])
 
-        self.supervisor.judge.look = look  # type: ignore[method-assign]
+        judge.look = look  # type: ignore[method-assign]
 
 
 async def test_nodes_are_asked_for_a_match_at_growing_intervals_up_to_half_a_second(

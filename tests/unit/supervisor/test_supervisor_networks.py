@@ -22,7 +22,7 @@ from lifecycle.programming.apply.target import (
 )
 from lifecycle.programming.apply.targets.registry import target_kind
 from lifecycle.run_directory import OWN_CHILD, RunDirectory, new_run_id, run_name
-from lifecycle.supervisor.connections.networks import Networks, open_networks, remove_programmed
+from lifecycle.supervisor.connections.networks import Networks, open_networks
 from lifecycle.supervisor.control.client import down
 from lifecycle.supervisor.processes.orphans import reap_adopted
 from lifecycle.supervisor.run.events import Emitter, Notice, VerdictChanged
@@ -120,7 +120,7 @@ async def test_flows_are_programmed_at_the_gate_followed_afterwards_and_removed_
     programs.asked.clear()
     told.emit(heard("/later"))
     await programs.asked.wait()
-    await networks.close()
+    await networks.close(asyncio.Event())
     told.emit(heard("/after"))
     await asyncio.sleep(0)
     assert programs.seen == [("/gate",), ("/later",), ("closed",)]
@@ -133,7 +133,7 @@ async def test_a_first_failure_ends_the_run_and_names_the_privilege(tmp_path: Pa
     networks = Networks("s", tmp_path, Emitter(), programs)
     with pytest.raises(StepFailedError) as caught:
         await networks.begin(verdict("/gate"))
-    await networks.close()
+    await networks.close(asyncio.Event())
     error = caught.value
     assert error.exit_code is ExitCode.BRING_UP_FAILED
     assert (error.rule.id, error.subject) == ("run.not-programmed", "s")
@@ -157,7 +157,7 @@ async def test_a_later_failure_is_a_notice_and_tried_again(
     while programs.seen[-1:] != [("/later",)]:
         await programs.asked.wait()
         programs.asked.clear()
-    await networks.close()
+    await networks.close(asyncio.Event())
     said = [each.partition(":")[0] for each in told.notices]
     assert said[:2] == ["fake", "cannot write nft table inet flowqos_s"]
 
@@ -167,7 +167,7 @@ async def test_without_program_nothing_is_programmed(tmp_path: Path) -> None:
     networks = Networks("s", tmp_path, told.emit)
     await networks.begin(verdict("/gate"))
     told.emit(heard("/later"))
-    await networks.close()
+    await networks.close(asyncio.Event())
     assert told.notices == []
     assert list(tmp_path.iterdir()) == []  # noqa: ASYNC240
 
@@ -208,7 +208,11 @@ def test_what_somebody_applied_by_hand_goes_with_the_system_or_stays_listed(
     assert len(applied.server.subscriptions) == 1
     if not may:
         monkeypatch.delenv("TEST_TOKEN")
-    asyncio.run(Networks("s", directory, told.emit).close())
+
+    async def close() -> None:
+        await Networks("s", directory, told.emit).close(asyncio.Event())
+
+    asyncio.run(close())
     said = "1 deleted, 0 unchanged" if may else "TEST_TOKEN: it is empty or not set"
     assert said in told.notices[0]
     assert len(applied.server.subscriptions) == (not may)
@@ -219,7 +223,7 @@ def test_down_of_a_dead_supervisors_run_removes_what_it_programmed(applied: Appl
     directory = applied.apply(owned=True)
     assert down(directory, _BOUND_S) is ExitCode.OK
     assert applied.server.subscriptions == {}
-    assert remove_programmed(directory) == ()
+    assert not (directory / "programmed.json").exists()
 
 
 def test_before_it_programs_a_run_removes_what_dead_runs_left_even_its_own(

@@ -12,7 +12,6 @@ import pytest
 from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import Condition, RunKind
 from lifecycle.supervisor.control.client import look, order
-from lifecycle.supervisor.control.orders import Order as Asked
 from lifecycle.supervisor.control.protocol import Answer, ControlRequest, Question
 from lifecycle.supervisor.control.server import ControlServer, SupervisorSnapshot, follow
 from lifecycle.supervisor.core.orders import FITS, refusal
@@ -65,9 +64,9 @@ def test_a_node_that_is_not_ours_is_not_restarted(node: str, message: str) -> No
 
 def test_the_control_socket_looks_follows_and_orders(tmp_path: Path) -> None:
     seen = SupervisorSnapshot(plan=PLAN, status=STATUS, observation=Observation(), verdict=None)
-    asked: list[Asked] = []
+    asked: list[Order] = []
 
-    async def carry_out(given: Asked) -> Answer:
+    async def carry_out(given: Order) -> Answer:
         asked.append(given)
         return Answer(exit_code=ExitCode.VIOLATED, error="cannot activate: no")
 
@@ -81,7 +80,7 @@ def test_the_control_socket_looks_follows_and_orders(tmp_path: Path) -> None:
             None, lambda: order(tmp_path, Question(ask=ControlRequest.RESTART, node="camera"), 5.0)
         )
         assert (answer.exit_code, answer.error) == (ExitCode.VIOLATED, "cannot activate: no")
-        assert asked == [Asked(ask=ControlRequest.RESTART, node="camera")]
+        assert asked == [Order(ask=ControlRequest.RESTART, node="camera")]
 
         heard: list[SupervisorSnapshot] = []
         came = [threading.Event(), threading.Event()]

@@ -17,7 +17,7 @@ from lifecycle.cli.up_output import JsonLines, Narrator, PlainLines, Timings
 from lifecycle.cli.verbs.control import status_text
 from lifecycle.cli.verbs.flows import render_flows
 from lifecycle.errors import ExitCode
-from lifecycle.manifest.model import UniqueHow
+from lifecycle.manifest.model import Run, RunKind, UniqueHow
 from lifecycle.network.nfe import (
     TransportProtocol,
     UniqueRequirement,
@@ -442,6 +442,8 @@ async def test_a_command_is_shown_as_it_was_judged_and_matches_where_its_flows_a
     system = System(plan, emit=Emitter(), logs=tmp_path, processes=plan.processes)
     command = system.nodes["camera"]
     command.state = "active"
+    hosted = command.planned
+    command.core.planned = replace(hosted, run=Run(kind=RunKind.COMMAND))
     wrong = replace(
         verdict_of(Outcome.VIOLATED, "state.wrong-state").findings[0],
         node="/camera",
@@ -451,6 +453,6 @@ async def test_a_command_is_shown_as_it_was_judged_and_matches_where_its_flows_a
     system.run.judged.verdict = verdict
     (shown,) = system_status(system, supervisor=1, elapsed_s=0.0, ends="").nodes
     assert (shown.state, shown.matched, shown.unreported, shown.endpoints) == ("inactive", 1, 1, 2)
-    command.reports_changes = True
+    command.core.planned = hosted
     (shown,) = system_status(system, supervisor=1, elapsed_s=0.0, ends="").nodes
     assert shown.state == "active"

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import os
 import pwd
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Coroutine, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -47,15 +46,12 @@ BOUND_S = 20.0
 REAL_TIME = True
 
 
-def _run(test: Coroutine[Any, Any, None]) -> None:
-    asyncio.run(asyncio.wait_for(test, BOUND_S))
-
-
 class _Bench:
     """A fork server and processes of it."""
 
-    def __init__(self, tmp_path: Path, fork_server: ForkServer) -> None:
-        self.fork_server = fork_server
+    def __init__(self, tmp_path: Path) -> None:
+        self.server = ForkServerProcess(preload=False)
+        self.fork_server = ForkServer(self.server)
         self.lines: list[str] = []
         self.spoke = asyncio.Event()
         self.emit = Emitter()
@@ -69,7 +65,10 @@ class _Bench:
             self.lines.append(event.line)
             self.spoke.set()
 
-    async def close(self) -> None:
+    async def __aenter__(self) -> _Bench:  # noqa: PYI034 - typing.Self is not in Python 3.10
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
         for process in self._processes:
             process.signal(signal.SIGKILL)
             await process.release()
@@ -107,21 +106,11 @@ async def _ended(process: ManagedProcess) -> None:
     await process.release()
 
 
-@contextlib.asynccontextmanager
-async def _bench(tmp_path: Path) -> Any:
-    fork_server = ForkServer(ForkServerProcess(preload=False))
-    bench = _Bench(tmp_path, fork_server)
-    try:
-        yield bench
-    finally:
-        await bench.close()
-
-
 async def test_a_command_gets_its_arguments_environment_and_session_and_its_end_is_noticed(
     tmp_path: Path,
 ) -> None:
     code = "import os; print(os.environ['COLOUR'], os.getsid(0) == os.getpid()); exit(3)"
-    async with _bench(tmp_path) as bench:
+    async with _Bench(tmp_path) as bench:
         process = await bench.start(PYTHON, "-c", code, environment=(("COLOUR", "red"),))
         assert await process.ended == ProcessExit(status=3)
         await _ended(process)
@@ -131,7 +120,7 @@ async def test_a_command_gets_its_arguments_environment_and_session_and_its_end_
 
 async def test_a_killed_process_is_noticed_within_a_tenth_of_a_second(tmp_path: Path) -> None:
     took_s = []
-    async with _bench(tmp_path) as bench:
+    async with _Bench(tmp_path) as bench:
         for _ in range(5):
             process = await bench.start("sleep", "60")
             began = time.monotonic()
@@ -142,7 +131,7 @@ async def test_a_killed_process_is_noticed_within_a_tenth_of_a_second(tmp_path: 
 
 
 async def test_a_program_that_does_not_exist_says_so_in_its_output(tmp_path: Path) -> None:
-    async with _bench(tmp_path) as bench:
+    async with _Bench(tmp_path) as bench:
         process = await bench.start("/no/such/program")
         assert await process.ended == ProcessExit(status=127)
         await _ended(process)
@@ -159,7 +148,7 @@ async def test_a_process_that_ignores_sigint_and_sigterm_is_killed_with_its_grou
         "print(subprocess.Popen(['sleep', '60']).pid, flush=True)\n"
         "time.sleep(60)"
     )
-    async with _bench(tmp_path) as bench:
+    async with _Bench(tmp_path) as bench:
         process = await bench.start(PYTHON, "-c", code)
         await bench.spoke.wait()
         grandchild = psutil.Process(int(bench.lines[0]))
@@ -171,7 +160,7 @@ async def test_a_process_that_ignores_sigint_and_sigterm_is_killed_with_its_grou
 async def test_a_fork_server_that_is_killed_starts_nothing_more_and_its_children_are_ours(
     tmp_path: Path,
 ) -> None:
-    async with _bench(tmp_path) as bench:
+    async with _Bench(tmp_path) as bench:
         first = await bench.start("sleep", "60")
         server = bench.fork_server
         os.kill(server.pid, signal.SIGKILL)
@@ -188,15 +177,13 @@ async def test_a_fork_server_that_is_killed_starts_nothing_more_and_its_children
 async def test_when_the_supervisor_vanishes_the_fork_server_ends_what_it_forked(
     tmp_path: Path,
 ) -> None:
-    process = ForkServerProcess(preload=False)
-    fork_server = ForkServer(process)
-    bench = _Bench(tmp_path, fork_server)
-    child = await bench.start("sleep", "60")
-    process.socket.shutdown(2)
-    assert await asyncio.get_running_loop().run_in_executor(None, process.popen.wait) == 0
-    assert not psutil.pid_exists(child.pid)
-    await child.ended
-    await bench.close()
+    async with _Bench(tmp_path) as bench:
+        child = await bench.start("sleep", "60")
+        bench.server.socket.shutdown(2)
+        loop = asyncio.get_running_loop()
+        assert await loop.run_in_executor(None, bench.server.popen.wait) == 0
+        assert not psutil.pid_exists(child.pid)
+        await child.ended
 
 
 async def test_lines_are_split_and_a_line_without_end_cannot_fill_the_memory() -> None:
@@ -407,7 +394,7 @@ exec "$@"
 """
 
 
-def test_systemd_limits_a_process_in_a_scope_that_has_its_pid_and_descriptors(
+async def test_systemd_limits_a_process_in_a_scope_that_has_its_pid_and_descriptors(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As systemd-run(1): it makes the scope of itself, and becomes the command."""
@@ -419,15 +406,12 @@ def test_systemd_limits_a_process_in_a_scope_that_has_its_pid_and_descriptors(
     monkeypatch.setattr(scope, "why_unlimited", lambda: "")
     resources = Resources(at=Position(file="m", line=1, column=1), memory_max_mib=64, tasks_max=9)
 
-    async def test() -> None:
-        async with _bench(tmp_path) as bench:
-            process = await bench.start("sh", "-c", "echo $$", resources=resources)
-            assert await process.ended == ProcessExit(status=0)
-            process.signal(signal.SIGKILL)
-            await process.release()
-            assert bench.lines == [str(process.pid)]
-
-    _run(test())
+    async with _Bench(tmp_path) as bench:
+        process = await bench.start("sh", "-c", "echo $$", resources=resources)
+        assert await process.ended == ProcessExit(status=0)
+        process.signal(signal.SIGKILL)
+        await process.release()
+        assert bench.lines == [str(process.pid)]
     user = "--user " if os.geteuid() else ""
     assert log.read_text() == (
         f"--scope --quiet --collect {user}--property=MemoryMax=64M --property=TasksMax=9 -- "

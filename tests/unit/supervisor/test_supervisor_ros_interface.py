@@ -16,8 +16,8 @@ from lifecycle.errors import ExitCode, MiddlewareError
 from lifecycle.manifest.model import Policy, RosInterfaceAccess
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.control.ros_interface import (
+    BRINGS_UP_S,
     ERROR,
-    HELD_UP_S,
     OK,
     STALE,
     WARN,
@@ -52,7 +52,7 @@ async def test_a_bring_up_that_is_held_up_says_why_before_it_is_active(tmp_path:
     world = SessionWorld(CHAIN, tmp_path, stop_after_s=1.0)
     world.graph.unseen.add("/camera")
     async with world.running("[joined] /viewer"):
-        await asyncio.sleep(HELD_UP_S - 0.2)
+        await asyncio.sleep(BRINGS_UP_S - 0.2)
         assert world.graph.ros is None
         await asyncio.sleep(0.4)
         ros = world.graph.ros
@@ -95,7 +95,7 @@ def test_what_a_manifest_asks_for_must_be_installed(
     required: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "diagnostic_msgs", None)
-    policy = Policy(ros_interface=FULL, ros_interface_required=required)
+    policy = Policy(ros_interface=FULL if required else None)
     refused = pytest.raises(MiddlewareError) if required else contextlib.nullcontext()
     with refused as error:
         check_installed(policy)

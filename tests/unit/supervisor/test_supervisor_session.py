@@ -569,7 +569,7 @@ async def test_a_foreign_node_is_not_blamed_for_the_time_in_which_its_request_is
     base = planned_node("base", kind=RunKind.ATTACH, timeouts=limits)
     world = SessionWorld(plan_of(planned_node("camera"), base), tmp_path)
     world.graph.services.matched_after_s["/base activate"] = 1.0
-    world.story.in_the_moment["[request] /base activate"] = hiding(world)
+    world.story.in_the_moment["/camera activate"] = hiding(world)
     await world.run()
     assert world.since("[gate]")[:2] == ["[gate] ok: /camera, /base", "/camera activate"]
     # When is a matter of the load of this machine, see `wait_under_load`.

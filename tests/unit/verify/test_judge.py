@@ -277,7 +277,7 @@ def test_what_is_violated_blocks_and_what_is_unverifiable_where_rule_and_policy_
     plan = planned(
         node("one", publisher("a"), needs=[NOT_ENFORCED]),
         node("two", subscription("a")),
-        policy=Policy(unverifiable_blocks=asked),
+        policy=Policy(unverifiable="block" if asked else "allow"),
     )
     verdict = judged(plan, edit)
     assert (verdict.verdict, verdict.blocking) == (outcome, blocks)

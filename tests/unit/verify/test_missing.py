@@ -62,7 +62,7 @@ def test_a_report_is_waited_for_but_not_what_only_the_report_could_prove():
 def test_an_unverifiable_finding_is_waited_for_only_where_it_blocks():
     edit = change_report(SUB, "/robot/status", qos=None)
     assert line(edit) == ""
-    strict = replace(PLAN, policy=Policy(unverifiable_blocks=True))
+    strict = replace(PLAN, policy=Policy(unverifiable="block"))
     assert line(edit, strict) == "unknown: /viewer (graph.qos-unverifiable)"
 
 

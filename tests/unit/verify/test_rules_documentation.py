@@ -64,7 +64,9 @@ def test_a_rule_has_a_one_line_meaning_and_remedy_and_a_bad_outcome(rule: Rule):
 def test_a_rule_cannot_be_given_an_outcome_that_it_does_not_document():
     rule = next(each for each in RULES if each.id == "graph.undeclared-node")
     with pytest.raises(ValueError) as error:
-        rule.finding(Outcome.UNVERIFIABLE, subject="/a", expected="", observed="", message="")
+        rule.finding(
+            outcome=Outcome.UNVERIFIABLE, subject="/a", expected="", observed="", message=""
+        )
     assert str(error.value) == "cannot give rule graph.undeclared-node the outcome unverifiable"
 
 

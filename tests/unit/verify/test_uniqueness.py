@@ -231,8 +231,8 @@ def by_comparing(nfes, others) -> bool | None:
     """Compare each IP NFE with each of the others; None in `others` is what is not known."""
     if nfes is None:
         return None
-    known = [each for other in others for each in other or () if is_ip(each)]
-    own = [each for each in nfes if is_ip(each)]
+    known = [each for other in others for each in other or () if is_ip(each.nfe)]
+    own = [each for each in nfes if is_ip(each.nfe)]
     if not own or not all(dissimilar(one, other) for one in own for other in known):
         return False
     return None if None in others else True

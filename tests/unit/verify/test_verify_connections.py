@@ -9,7 +9,7 @@ import pytest
 from msgspec.structs import replace
 
 from lifecycle.manifest.model import (
-    DataLayer,
+    Discovery,
     DiscoveryMode,
     EndpointKind,
     EndpointPolicy,
@@ -313,7 +313,7 @@ def test_an_endpoint_on_a_participant_that_anybody_can_see_must_be_seen() -> Non
 
 BEYOND = replace(
     PLAN,
-    discovery_mode=DiscoveryMode.STATIC,
+    discovery=Discovery(mode=DiscoveryMode.STATIC),
     nodes=tuple(
         replace(each, connections=ParticipantConnections(urls=("shm://",))) for each in PLAN.nodes
     ),
@@ -368,7 +368,7 @@ def test_a_medium_that_nobody_asked_for_is_only_expected() -> None:
     plan = planned(node("camera", publisher("video")), node("viewer", subscription("video")))
     expected = replace(plan, flows=tuple(replace(each, medium="udpv4") for each in plan.flows))
     assert verify(expected, perfect(expected), stage=Stage.CONNECTED).verdict is Outcome.OK
-    asked = replace(expected, data_layer=DataLayer(at=at(5)))
+    asked = replace(expected, positions={"data_layer": at(5)})
     assert verify(asked, perfect(asked), stage=Stage.CONNECTED).verdict is Outcome.VIOLATED
 
 

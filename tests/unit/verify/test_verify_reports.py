@@ -443,7 +443,7 @@ def test_what_may_be_unverifiable_neither_fails_nor_skips_a_test():
     assert "cannot verify the DSCP" in to_junit(unverifiable, PLAN)
     failed = [name for name, came in cases(unverifiable, strict=True).items() if came == "failure"]
     assert [each.partition("/")[0] for each in failed] == ["flow.dscp-unverifiable"]
-    policy = replace(PLAN.policy, unverifiable_blocks=True)
+    policy = replace(PLAN.policy, unverifiable="block")
     blocking = replace(PLAN, policy=policy)
     assert list(cases(unverifiable, blocking).values()).count("failure") == 1
 
@@ -469,7 +469,7 @@ def test_what_may_not_block_is_refused_by_who_is_strict_alone(
 ):
     found = replace(VIOLATED, rule=rule, outcome=Outcome.UNVERIFIABLE)
     verdict = replace(WRITTEN, findings=(found,), run=None)
-    policy = replace(PLAN.policy, unverifiable_blocks=True)
+    policy = replace(PLAN.policy, unverifiable="block")
     blocking = replace(PLAN, policy=policy)
     came = tuple(
         "failure" in cases(verdict, blocking, strict=strict).values() for strict in (False, True)

@@ -478,7 +478,7 @@ def test_two_foreign_nodes_that_do_not_fit_are_none_of_our_business():
 def test_an_unverifiable_finding_blocks_only_where_the_policy_says_so():
     edit = change_report(SUB, STATUS, qos=None)
     for blocks in (False, True):
-        plan = with_policy(unverifiable_blocks=blocks)
+        plan = with_policy(unverifiable="block" if blocks else "allow")
         verdict = verify(plan, edit(perfect(plan)), stage=Stage.CONNECTED)
         assert (verdict.verdict, verdict.blocking) == (Outcome.UNVERIFIABLE, blocks)
 
@@ -492,7 +492,7 @@ def test_a_dscp_that_is_not_enforced_is_reported_and_never_blocks():
     marked = need(PUB, "a", dscp=46, enforce=False)
     plan = planned(
         node("one", publisher("a"), needs=[marked]),
-        policy=Policy(unverifiable_blocks=True),
+        policy=Policy(unverifiable="block"),
     )
     verdict = verify(plan, change_report(PUB, "/a", dscp=0)(perfect(plan)), stage=Stage.CONNECTED)
     assert len(verdict.findings) == 1
@@ -529,7 +529,7 @@ def test_all_flows_of_which_nothing_is_reported_are_one_finding():
 
 
 def test_what_a_manifest_trusts_is_reported_and_does_not_count():
-    plan = replace(foreign(), policy=Policy(trust=("flow.unreported",), unverifiable_blocks=True))
+    plan = replace(foreign(), policy=Policy(trust=("flow.unreported",), unverifiable="block"))
     verdict = verify(plan, perfect(plan), stage=Stage.CONNECTED)
     assert (verdict.verdict, verdict.blocking) == (Outcome.OK, False)
     assert [each.rule for each in verdict.findings] == ["flow.unreported"]
@@ -795,3 +795,25 @@ def test_an_open_system_tolerates_who_publishes_too_and_says_so():
 @pytest.mark.parametrize(("subject", "name"), [("/robot/camera", "/robot/camera"), ("host", "")])
 def test_a_subject_of_a_run_names_a_node_only_by_its_full_name(subject: str, name: str) -> None:
     assert node_of(subject) == name
+
+
+COMMAND = Run(kind=RunKind.COMMAND, command=("/bin/talker",))
+
+
+def test_a_command_that_has_another_name_is_looked_for_among_what_is_not_declared() -> None:
+    plan = planned(node("speaker", run=COMMAND, managed=False))
+    seen = Observation(nodes=(replace(perfect(plan).nodes[0], full_name="/talker"),))
+    missing, undeclared = verify(plan, seen, stage=Stage.ACTIVE).findings
+    assert (missing.rule, undeclared.rule) == ("graph.missing-node", "graph.undeclared-node")
+    assert missing.hint.startswith("is it /talker?")
+    assert undeclared.hint.startswith("if it is /speaker, which is missing, write a `name` there")
+
+
+def test_a_command_that_is_given_its_name_may_have_given_it_to_each_of_its_nodes() -> None:
+    plan = planned(node("talker", run=COMMAND, managed=False, positions={"name": at(4)}))
+    assert "__node:=talker" in plan.processes[0].argv
+    seen = change_node("/talker", count=2)(perfect(plan, Stage.ACTIVE))
+    (finding,) = verify(plan, seen, stage=Stage.ACTIVE).findings
+    assert finding.hint.startswith("`name` renames every node of process talker")
+    missing = verify(plan, add_node("/other")(Observation()), stage=Stage.ACTIVE).findings[0]
+    assert missing.hint.startswith("look at the node's process and its log; compare domain")

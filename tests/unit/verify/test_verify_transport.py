@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from msgspec.structs import replace
 
-from lifecycle.manifest.model import DataLayer, EndpointKind, FlowTransport, Machine
+from lifecycle.manifest.model import EndpointKind, FlowTransport, Machine
 from lifecycle.network.nfe import (
     InternetProtocol,
     NetworkFlowEndpoint,
@@ -324,7 +324,7 @@ def with_medium(medium: str, *, publishing: FlowTransport = FlowTransport.ANY) -
     plan = pair(publishing, FlowTransport.ANY)
     return replace(
         plan,
-        data_layer=DataLayer(at=at(5)),
+        positions={"data_layer": at(5)},
         flows=tuple(replace(each, medium=medium) for each in plan.flows),
     )
 
@@ -350,7 +350,7 @@ def test_a_flow_that_the_network_must_carry_is_found_wrong_once():
 def undecided() -> Plan:
     """A plan that only says which medium is expected."""
     plan = with_medium("shm")
-    return replace(plan, data_layer=DataLayer())
+    return replace(plan, positions={})
 
 
 def with_end(plan: Plan, index: int, **changes: object) -> Plan:

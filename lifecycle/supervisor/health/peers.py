@@ -1,0 +1,421 @@
+"""The other supervisors of a system, and the nodes that it attaches to: alive, lost, left, agreed.
+
+Owns: `Peers`: announcing ourselves and our plan, noticing who is found, lost or shut down, what
+they report of silent nodes, and comparing plans. A manifest with another node, another argument or
+another flow need on one of the hosts passes every check of the running graph there: only the plans
+show it. Nothing here polls. Must not import rclpy.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import os
+from collections.abc import Callable, Coroutine, Iterable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+from msgspec.structs import replace
+
+from lifecycle.errors import BringUpError
+from lifecycle.manifest.model import DiscoveryRange, RunKind
+from lifecycle.manifest.names import node_alive_topic, supervisor_alive_topic
+from lifecycle.middleware.process.control import machine_id
+from lifecycle.node.host.control import Command, Operation
+from lifecycle.plan.comparison import (
+    PlanNotice,
+    PlanNoticeError,
+    concerns,
+    decode,
+    encode,
+    notice_of,
+)
+from lifecycle.supervisor.health.liveliness import Cause
+from lifecycle.supervisor.nodes.system import System
+from lifecycle.supervisor.run.events import MachineConnection
+from lifecycle.supervisor.run.failure import ended
+from lifecycle.verify.observation import Observation
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.rules.nodes import MISSING_NODE
+from lifecycle.verify.rules.run import PLAN_UNKNOWN, PLANS_DIFFER
+from lifecycle.verify.verdict import Finding, Verdict
+
+if TYPE_CHECKING:
+    from lifecycle.middleware.discovery.liveliness import (
+        AlivePublisher,
+        AliveSubscription,
+        PlanNotices,
+    )
+    from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
+    from lifecycle.supervisor.processes.control_channel import ControlChannel
+
+ANNOUNCED_S = 5.0
+"""A supervisor that is there has announced its plan within so long: with its first matched
+endpoints, and where Fast DDS lost that, 3 s later."""
+
+SAID_AFTER_S = (0.0, 0.1, 0.4)
+"""Which nodes are silent is published again: Fast DDS repeats what was lost after up to 3 s."""
+
+FAILED = "failed: "
+"""How the reason of a supervisor begins whose run failed."""
+
+_MOST = 64
+"""Supervisors whose notices are kept."""
+
+_logger = logging.getLogger(__name__)
+
+
+class _Peer(msgspec.Struct):
+    """A supervisor or an attached node that should be alive.
+
+    Attributes:
+        what: for messages, "the supervisor of machine 'robot'".
+        machine: empty for an attached node.
+        nodes: fully qualified names of the nodes that are lost with it.
+        watch: None once it is not followed any more.
+        lost_at_s: when it was lost; None while it is not.
+    """
+
+    what: str
+    machine: str
+    nodes: tuple[str, ...]
+    watch: AliveSubscription | None = None
+    alive: bool = False
+    lost_at_s: float | None = None
+
+
+class Peers:
+    """What a system depends on beside its own processes; `open` it in a loop and `close` it.
+
+    Args:
+        system: ours.
+        participant: carries what is announced.
+    """
+
+    def __init__(self, system: System, participant: ObserverParticipant) -> None:
+        self._system = system
+        self._participant = participant
+        self._loop = asyncio.get_running_loop()
+        machines = dict.fromkeys(each.planned.machine for each in system.nodes.values())
+        self._own = tuple(filter(None, machines))
+        self._supervisors: list[_Peer] = []
+        self._attached: dict[str, _Peer] = {}
+        self._announcements: list[AlivePublisher] = []
+        self._silent: Mapping[str, str] = {}
+        self._notices: PlanNotices | None = None
+        self._run = os.urandom(8).hex()
+        self._said: PlanNotice | None = None
+        self._known: list[PlanNotice] = []
+        self._since: dict[str, float] = {}
+        self._again: asyncio.TimerHandle | None = None
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    def open(self) -> None:
+        """Begin to watch, and announce ourselves and our plan where another supervisor may be."""
+        system, plan = self._system.plan.system, self._system.plan
+        remote: dict[str, list[str]] = {}
+        for each in self._system.remote.values():
+            remote.setdefault(each.machine, []).append(each.full_name)
+        for machine in filter(None, remote):
+            what, topic = _supervisor_of(machine), supervisor_alive_topic(system, machine)
+            self._supervisors.append(self._watch(topic, what, machine, remote[machine]))
+        self.renew()
+        if remote:
+            self._announcements = [
+                self._participant.announce_alive(supervisor_alive_topic(system, each))
+                for each in self._own
+            ]
+            self._system.liveliness.listen(self._say)
+        if remote or plan.discovery_range not in (DiscoveryRange.LOCALHOST, DiscoveryRange.OFF):
+            self._notices = self._participant.plan_notices(self._in_loop(self._take))
+            self.announce()
+
+    def renew(self) -> None:
+        """Follow the attached nodes of the plan as it is now."""
+        names = [
+            node.name
+            for node in self._system.nodes.values()
+            if node.planned.run.kind is RunKind.ATTACH
+        ]
+        for name in self._attached.keys() - names:
+            peer = self._attached.pop(name)
+            _forget(peer)
+            for cause in (Cause.LOST, Cause.REPORTED):
+                self._system.liveliness.came_back(peer.nodes, cause)
+        for name in names:
+            if name not in self._attached:
+                peer = self._watch(node_alive_topic(name), repr(name), "", [name])
+                self._attached[name] = peer
+
+    def announce(self) -> None:
+        """Say what we plan from now on."""
+        if self._notices is not None:
+            plan = self._system.first
+            self._said = notice_of(plan, run=self._run, host=machine_id(), machines=self._own)
+            self._notices.announce(encode(self._said))
+
+    def leave(self, reason: str) -> None:
+        """Say that what comes is an orderly end, and why; begins with FAILED where a run failed."""
+        if self._notices is not None and self._said is not None:
+            notice = replace(self._said, left=True, reason=" ".join(reason.split()))
+            self._notices.announce(encode(notice))
+
+    async def close(self) -> None:
+        """Announce, watch and compare no more."""
+        if self._again is not None:
+            self._again.cancel()
+        if self._notices is not None:
+            self._notices.destroy()
+            self._notices = None
+        await ended(*self._tasks)
+        for peer in (*self._supervisors, *self._attached.values()):
+            _forget(peer)
+        for announcement in self._announcements:
+            announcement.destroy()
+        self._announcements.clear()
+
+    def _in_loop(self, do: Callable[..., None]) -> Callable[..., None]:
+        """Return what has the loop do something, from any thread."""
+
+        def call(*arguments: object) -> None:
+            with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
+                self._loop.call_soon_threadsafe(do, *arguments)
+
+        return call
+
+    # Who is alive
+
+    def _watch(self, topic: str, what: str, machine: str, nodes: Iterable[str]) -> _Peer:
+        peer = _Peer(what, machine, tuple(nodes))
+
+        def calls(do: Callable[..., None]) -> Callable[..., None]:
+            def unless_forgotten(*arguments: object) -> None:
+                if peer.watch is not None:  # else this was on its way
+                    do(peer, *arguments)
+
+            return self._in_loop(unless_forgotten)
+
+        peer.watch = self._participant.watch_alive(
+            topic,
+            on_liveliness=calls(self._alive),
+            on_left=calls(self._left),
+            on_notice=calls(self._reported),
+        )
+        return peer
+
+    def _alive(self, peer: _Peer, is_alive: bool) -> None:
+        if is_alive is peer.alive:
+            return
+        peer.alive = is_alive
+        if is_alive:
+            self._found(peer)
+        else:
+            self._lost(peer)
+
+    def _lost(self, peer: _Peer) -> None:
+        peer.lost_at_s = self._loop.time()
+        if peer.machine:
+            self._system.emit(MachineConnection(machine=peer.machine, established=False))
+        detail = f"{peer.what} is not heard any more"
+        self._system.liveliness.fell_silent(peer.nodes, Cause.LOST, detail)
+        self._participant.send_again_soon()
+        self._have_hosts(Operation.SEND_AGAIN_SOON)
+
+    def _found(self, peer: _Peer) -> None:
+        lost_s = 0.0
+        if peer.lost_at_s is not None:
+            lost_s = self._loop.time() - peer.lost_at_s
+            # DDS may have forgotten the node names of participants that it lost for long.
+            self._participant.republish_names()
+            self._have_hosts(Operation.REPUBLISH_NAMES)
+        peer.lost_at_s = None
+        if peer.machine:
+            self._system.emit(
+                MachineConnection(machine=peer.machine, established=True, lost_s=lost_s)
+            )
+        self._system.liveliness.came_back(peer.nodes, Cause.LOST)
+
+    def _left(self, peer: _Peer) -> None:
+        """It left properly, or DDS forgot it after it was lost."""
+        if not peer.alive:
+            return
+        peer.alive = False
+        if peer.machine:
+            self._system.emit(MachineConnection(machine=peer.machine, established=False, left=True))
+        self._system.liveliness.came_back(peer.nodes, Cause.REPORTED)
+
+    def _reported(self, peer: _Peer, silent: Mapping[str, str]) -> None:
+        for name in peer.nodes:
+            if name in silent:
+                self._system.liveliness.fell_silent((name,), Cause.REPORTED, silent[name])
+            else:
+                self._system.liveliness.came_back((name,), Cause.REPORTED)
+
+    def _say(self) -> None:
+        """Our own nodes fell silent or came back: say so."""
+        liveliness = self._system.liveliness
+        causes = (Cause.UNSERVED, Cause.HUNG, Cause.STOPPED)
+        silent = {name: why for cause in causes for name, why in liveliness.causes(cause).items()}
+        if silent == self._silent:
+            return
+        self._silent = silent
+
+        def say() -> None:
+            if silent is self._silent:
+                for each in self._announcements:
+                    each.notify(silent)
+
+        for wait_s in SAID_AFTER_S:
+            self._loop.call_later(wait_s, say)
+
+    def _have_hosts(self, operation: Operation) -> None:
+        """Have our hosts do something with all of their process; one that hangs holds up none."""
+        for each in self._system.processes.values():
+            if each.channel is not None and not each.ended.done():
+                node = self._system.nodes[each.planned.nodes[0]].name
+                self._start(_ask(each.channel, Command(node=node, operation=operation)))
+
+    def _start(self, doing: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.ensure_future(doing)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    # Who planned what, and who was shut down
+
+    def _take(self, text: str) -> None:
+        if self._notices is None:
+            return
+        try:
+            notice = decode(text)
+        except PlanNoticeError as error:
+            _logger.warning("passed over: %s", error)
+            return
+        if notice.run == self._run or notice in self._known:
+            return
+        if not concerns(self._system.first, frozenset(self._own), notice):
+            return
+        if notice.left and not any(each.run == notice.run for each in self._known):
+            return  # it left before we came
+        others = (each for each in self._known if not notice.replaces(each))
+        self._known = [*others, notice][-_MOST:]
+        self._system.touch()
+
+    def _shut_down(self) -> dict[str, str]:
+        """Return the machines of our plan whose supervisor has said that it ends, and why."""
+        system = self._system.plan.system
+        ours = (each for each in self._known if each.system == system and each.left)
+        return {machine: each.reason[:80] for each in ours for machine in each.machines}
+
+    def left(self) -> frozenset[str]:
+        """Return the full names of the nodes of machines that were shut down properly.
+
+        Not of those whose run failed: that is an end nobody asked for.
+        """
+        gone = self._shut_down().items()
+        machines = {machine for machine, why in gone if not why.startswith(FAILED)}
+        nodes = self._system.first.nodes
+        return frozenset(each.full_name for each in nodes if each.machine in machines)
+
+    def explained(self, verdict: Verdict) -> Verdict:
+        """Return `verdict` with the reason of nodes that are missing since their host ended."""
+        machines = {each.full_name: each.machine for each in self._system.first.nodes}
+        gone = self._shut_down()
+
+        def explain(finding: Finding) -> Finding:
+            machine = machines.get(finding.node)
+            if finding.rule != MISSING_NODE.id or machine not in gone:
+                return finding
+            why = f" ({gone[machine]})" if gone[machine] else ""
+            return replace(
+                finding,
+                observed=f"machine {machine!r} was shut down",
+                message=f"{finding.message}: machine {machine!r} was shut down by its supervisor"
+                f"{why}",
+            )
+
+        return replace(verdict, findings=tuple(map(explain, verdict.findings)))
+
+    def findings(self, observation: Observation) -> tuple[Finding, ...]:
+        """Return what is wrong with what others planned, and who did not say it."""
+        return (*self._different(), *self._unknown(observation))
+
+    def _different(self) -> Iterator[Finding]:
+        ours = "" if self._said is None else self._said.checksum
+        for notice in self._known:
+            if notice.checksum == ours:
+                continue
+            who = _who(notice, self._system.plan.system)
+            theirs = notice.checksum[: len(ours)]
+            yield PLANS_DIFFER.finding(
+                outcome=Outcome.VIOLATED,
+                subject=who,
+                expected=f"plan {ours}",
+                observed=f"plan {theirs}",
+                message=f"cannot rely on {who}: plans differ (checksums {ours} here, {theirs} "
+                "there); compare 'lifecycle plan MANIFEST' on both",
+            )
+
+    def _unknown(self, observation: Observation) -> Iterator[Finding]:
+        """Yield a finding for each machine that is there and has not said what it planned."""
+        seen = {each.full_name for each in observation.nodes}
+        there = {each.machine for each in self._supervisors if each.alive}
+        nodes: dict[str, set[str]] = {}
+        for each in self._system.remote.values():
+            nodes.setdefault(each.machine, set()).add(each.full_name)
+            if each.run.kind is not RunKind.ATTACH and each.full_name in seen:
+                there.add(each.machine)
+        waits_s: list[float] = []
+        for machine in filter(None, nodes):
+            if machine not in there or self._says(machine, nodes[machine]):
+                self._since.pop(machine, None)
+                continue
+            left_s = self._since.setdefault(machine, self._loop.time()) + ANNOUNCED_S
+            left_s -= self._loop.time()
+            if left_s > 0:
+                waits_s.append(left_s)
+            assert self._said is not None
+            who = _supervisor_of(machine)
+            yield PLAN_UNKNOWN.finding(
+                outcome=Outcome.VIOLATED if left_s > 0 else Outcome.UNVERIFIABLE,
+                subject=who,
+                expected=f"plan {self._said.checksum}",
+                observed="not announced yet" if left_s > 0 else "not announced",
+                message=f"cannot tell whether {who} planned the same system: it has not said"
+                + (" so yet" if left_s > 0 else f" what it planned within {ANNOUNCED_S:g} s"),
+            )
+        if waits_s:
+            if self._again is not None:
+                self._again.cancel()
+            self._again = self._loop.call_later(min(waits_s), self._system.touch)
+
+    def _says(self, machine: str, names: set[str]) -> bool:
+        """Whether some notice is of a supervisor that runs the machine, or its nodes."""
+        return any(
+            machine in each.machines
+            or (each.system != self._system.plan.system and not names.isdisjoint(each.nodes))
+            for each in self._known
+        )
+
+
+def _forget(peer: _Peer) -> None:
+    if peer.watch is not None:
+        peer.watch.destroy()
+        peer.watch = None
+
+
+async def _ask(channel: ControlChannel, command: Command) -> None:
+    with contextlib.suppress(BringUpError):  # one that ends meanwhile has nothing to do any more
+        await channel.request(command)
+
+
+def _supervisor_of(machine: str) -> str:
+    return f"the supervisor of machine {machine!r}"
+
+
+def _who(notice: PlanNotice, system: str) -> str:
+    machines = " and ".join(repr(each[:80]) for each in notice.machines[:3])
+    of = f"machine {machines}" if machines else f"host {notice.host[:40]!r}"
+    if notice.system == system:
+        return f"the supervisor of {of}"
+    return f"the supervisor of system {notice.system[:80]!r} on {of}"
