@@ -19,7 +19,7 @@ import os
 import threading
 import traceback
 import weakref
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from typing import TYPE_CHECKING, Any
 
 from msgspec.structs import replace
@@ -44,10 +44,8 @@ from lifecycle.network.nfe import NetworkFlowEndpoint
 from lifecycle.node.author import parameters
 from lifecycle.node.author.declaring import interface_name
 from lifecycle.node.connections.connections import Connection, Connections
-from lifecycle.node.connections.data_layer import NodeDataLayer
-from lifecycle.node.endpoints.making import CLIENTS
-from lifecycle.node.endpoints.mapping import Mapping, count_peers, wire_name
-from lifecycle.plan.model import PlannedEndpoint, PlannedNode
+from lifecycle.node.endpoints.endpoint import CLIENTS, Endpoint, count_peers, wire_name
+from lifecycle.plan.model import PlannedNode
 from lifecycle.plan.negotiation.data_layer import PARADIGMS, SERIALIZATIONS
 from lifecycle.verify.observation import (
     EndpointReport,
@@ -62,6 +60,7 @@ from lifecycle.verify.tool_filter import PREFIX_DIGITS
 if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup
 
+    from lifecycle.node.endpoints.data_layer import DataLayer
     from lifecycle.node.lifecycle.gate import Later
 
 
@@ -118,7 +117,7 @@ def checksum(configuration: NodeConfiguration) -> str:
 
 
 def endpoint_reports(
-    node: Node, data_layer: NodeDataLayer, undeclared: Iterable[tuple[EndpointKind, Any]]
+    node: Node, data_layer: DataLayer, undeclared: Iterable[tuple[EndpointKind, Any]]
 ) -> tuple[EndpointReport, ...]:
     """Return what the endpoints of one of our nodes are now.
 
@@ -127,9 +126,10 @@ def endpoint_reports(
         data_layer: its declared endpoints and their entities.
         undeclared: kind and rclpy object of endpoints that its code made by itself.
     """
+    unknown = Connection(name="")
     return (
-        *(_report(node, mapping) for mapping in data_layer.mappings),
-        *(_undeclared_report(node, kind, entity) for kind, entity in undeclared),
+        *(_declared_report(node, endpoint) for endpoint in data_layer.endpoints.values()),
+        *(_found_report(node, kind, each, unknown) for kind, each in undeclared),
     )
 
 
@@ -151,11 +151,16 @@ def foreign_reports(
     reports: list[EndpointReport] = []
     for kind, entity, connection in endpoints:
         try:
-            report = _undeclared_report(node, kind, entity, connection)
+            report = _found_report(node, kind, entity, connection)
+            if kind in CLIENTS:
+                report = replace(report, server_matched=is_server_matched(entity))
         except InvalidHandle:
             continue  # destroyed meanwhile
         planned = declared.pop((kind, report.resolved), None)
-        reports.append(report if planned is None else _named(report, planned, connection))
+        if planned is not None:
+            error = connection.warning if planned.enforce_dscp else ""
+            report = replace(report, name=planned.name, unique=planned.unique, error=error)
+        reports.append(report)
     reports += [
         EndpointReport(
             kind=each.kind,
@@ -167,30 +172,49 @@ def foreign_reports(
         )
         for each in declared.values()
     ]
-    return tuple(reports), tuple(
-        _foreign_connection(each, spec, reports) for each in (connections.own, *connections.named)
+
+    def connection_report(connection: Connection) -> ConnectionReport:
+        on = [each for each in reports if each.mapped and each.connection == connection.name]
+        return _connection_report(
+            connection,
+            spec,
+            established=all(each.matched for each in on if each.kind.is_topic),
+            mappings=tuple(each.kind.spell(each.name) for each in on if each.name),
+        )
+
+    made = (connections.own, *connections.named)
+    return tuple(reports), tuple(connection_report(each) for each in made)
+
+
+def connection_reports(spec: PlannedNode, data_layer: DataLayer) -> tuple[ConnectionReport, ...]:
+    """Return every connection that exists or was asked for, the node's own participant first."""
+    connections, status = data_layer.connections, data_layer.status
+    made = tuple(
+        _connection_report(
+            each,
+            spec,
+            established=status.established(each),
+            mappings=tuple(endpoint.spelling for endpoint in status.on(each)),
+        )
+        for each in (connections.own, *connections.named)
     )
+    failed = tuple(
+        ConnectionReport(name=each.name, urls=each.urls, error=each.error)
+        for each in connections.failed
+    )
+    return (*made, *failed)
 
 
-def _named(
-    report: EndpointReport, planned: PlannedEndpoint, connection: Connection
-) -> EndpointReport:
-    error = connection.warning if planned.enforce_dscp else ""
-    return replace(report, name=planned.name, unique=planned.unique, error=error)
-
-
-def _foreign_connection(
-    connection: Connection, spec: PlannedNode, reports: Iterable[EndpointReport]
+def _connection_report(
+    connection: Connection, spec: PlannedNode, *, established: bool, mappings: tuple[str, ...]
 ) -> ConnectionReport:
-    urls = connection.urls or (() if connection.name else spec.connections.urls)
-    on = [each for each in reports if each.mapped and each.connection == connection.name]
     return ConnectionReport(
         name=connection.name,
-        urls=urls,
+        urls=connection.urls or (() if connection.name else spec.connections.urls),
         node_name=connection.node_name,
         prefix=_prefix_of(connection),
-        established=all(each.matched for each in on if each.kind.is_topic),
-        mappings=tuple(each.kind.spell(each.name) for each in on if each.name),
+        established=established,
+        mappings=mappings,
     )
 
 
@@ -236,29 +260,6 @@ def collect(
     return replace(configuration, checksum=checksum(configuration))
 
 
-def connection_reports(
-    spec: PlannedNode, data_layer: NodeDataLayer
-) -> tuple[ConnectionReport, ...]:
-    """Return every connection that exists or was asked for, the node's own participant first."""
-    connections = data_layer.connections
-    made = tuple(
-        ConnectionReport(
-            name=each.name,
-            urls=each.urls or (spec.connections.urls if each is connections.own else ()),
-            node_name=each.node_name,
-            prefix=_prefix_of(each),
-            established=data_layer.status.established(each),
-            mappings=tuple(mapping.spelling for mapping in data_layer.status.on(each)),
-        )
-        for each in (connections.own, *connections.named)
-    )
-    failed = tuple(
-        ConnectionReport(name=each.name, urls=each.urls, error=each.error)
-        for each in connections.failed
-    )
-    return (*made, *failed)
-
-
 def serve(node: Node, collect: Callable[[], NodeConfiguration], group: CallbackGroup) -> None:
     """Offer `~/get_configuration`, which answers with the document as JSON, in every state."""
 
@@ -274,73 +275,60 @@ def serve(node: Node, collect: Callable[[], NodeConfiguration], group: CallbackG
     Node.create_service(node, Trigger, "~/get_configuration", describe, callback_group=group)
 
 
-def _report(node: Node, mapping: Mapping) -> EndpointReport:
-    endpoint, entity, connection = mapping.endpoint, mapping.entity, mapping.connection
-    carrier = connection.node_name if connection is not None else ""
+def _declared_report(node: Node, endpoint: Endpoint) -> EndpointReport:
+    planned, connection = endpoint.planned, endpoint.connection
     report = EndpointReport(
         kind=endpoint.kind,
         name=endpoint.name,
-        resolved=mapping.wire_name,
-        type=endpoint.type,
-        qos=endpoint.qos,
-        unique=endpoint.unique,
-        participant=carrier if connection is not None else endpoint.participant,
-        error=mapping.error,
-        connection=connection.name if connection is not None else "",
+        resolved=endpoint.wire_name,
+        type=planned.type,
+        qos=planned.qos,
+        unique=planned.unique,
+        participant=planned.participant if connection is None else connection.node_name,
+        error=endpoint.error,
+        connection="" if connection is None else connection.name,
         mapped=connection is not None,
-        lossy=mapping.lossy,
-        size_bytes=mapping.size_bytes,
-    )
-    if entity is None:
-        return report
-    if endpoint.kind in CLIENTS:
-        return replace(report, server_matched=is_server_matched(entity))
-    if not endpoint.kind.is_topic:
-        return report
-    # A participant knows its own endpoints; the node's own need not know those of another.
-    hidden = connection.participant if connection is not None else None
-    witness = node if hidden is None else hidden.node
-    report = _with_matches(report, witness, entity)
-    return replace(
-        report, nfes=_nfes(witness, endpoint.kind, entity, connection), dscp=_dscp(connection)
-    )
-
-
-def _undeclared_report(
-    node: Node, kind: EndpointKind, entity: Any, connection: Connection | None = None
-) -> EndpointReport:
-    """Report an endpoint that no interface declares; it has no name but the one on the wire."""
-    resolved = wire_name(entity)
-    interface = interface_of(entity)
-    report = EndpointReport(
-        kind=kind, name="", resolved=resolved, type=interface_name(interface), mapped=True
+        lossy=endpoint.lossy,
+        size_bytes=endpoint.size_bytes,
     )
     if connection is None:
-        connection = Connection(name="")
-    elif kind in CLIENTS:
-        return replace(report, server_matched=is_server_matched(entity))
-    if not kind.is_topic:
         return report
-    hidden = connection.participant
-    witness = node if hidden is None else hidden.node
-    report = _with_matches(report, witness, entity)
-    return replace(
-        report,
-        nfes=_nfes(witness, kind, entity, connection),
-        dscp=_dscp(connection),
+    if endpoint.kind in CLIENTS:
+        return replace(report, server_matched=is_server_matched(endpoint.entity))
+    return _with_matches(node, report, endpoint.entity, connection)
+
+
+def _found_report(
+    node: Node, kind: EndpointKind, entity: Any, connection: Connection
+) -> EndpointReport:
+    """Report an endpoint that no interface declares; it has no name but the one on the wire."""
+    report = EndpointReport(
+        kind=kind,
+        name="",
+        resolved=wire_name(entity),
+        type=interface_name(interface_of(entity)),
+        mapped=True,
         connection=connection.name,
         participant=connection.node_name,
     )
+    return _with_matches(node, report, entity, connection)
 
 
-def _with_matches(report: EndpointReport, witness: Node, entity: Any) -> EndpointReport:
-    """Add to the report on a publisher or subscription its GID, QoS, type hash and matches.
+def _with_matches(
+    node: Node, report: EndpointReport, entity: Any, connection: Connection
+) -> EndpointReport:
+    """Add to the report on a publisher or subscription its GID, QoS, type hash, NFEs and matches.
 
     Args:
-        report: the topic's name and the kind count.
-        witness: the node whose participant carries it.
+        node: whose it is.
+        report: the topic's name and the kind count; that on a service or action stays as it is.
         entity: its rclpy object.
+        connection: that it is on.
     """
+    if not report.kind.is_topic:
+        return report
+    # A participant knows its own endpoints; the node's own need not know those of another.
+    witness = connection.node or node
     info = _own_endpoint(witness, report.resolved, report.kind)
     return replace(
         report,
@@ -348,6 +336,8 @@ def _with_matches(report: EndpointReport, witness: Node, entity: Any) -> Endpoin
         gid=info.gid if info is not None else "",
         matched=count_peers(entity),
         type_hash=info.type_hash if info is not None else None,
+        nfes=_nfes(witness, report.kind, entity, connection),
+        dscp=_dscp(connection),
     )
 
 
@@ -388,9 +378,9 @@ def _prefix_of(connection: Connection) -> str:
     It has nothing but what is mapped onto it, of which this process's graph cache knows at once. Of
     another process that has a node of this name, it may know too.
     """
-    if connection.participant is None:
+    node = connection.node
+    if node is None:
         return ""
-    node = connection.participant.node
     name = node.get_fully_qualified_name()
     found: set[str] = set()
     for kind in (each for each in EndpointKind if not each.is_action):
@@ -401,7 +391,7 @@ def _prefix_of(connection: Connection) -> str:
 
 
 def _nfes(
-    witness: Node, kind: EndpointKind, entity: Any, connection: Connection | None
+    witness: Node, kind: EndpointKind, entity: Any, connection: Connection
 ) -> tuple[NetworkFlowEndpoint, ...] | None:
     """Return all NFEs of a connected endpoint, shared memory included.
 
@@ -413,16 +403,16 @@ def _nfes(
         nfes = senders_of(witness) if publishes else get_network_flow_endpoints(entity)
     except MiddlewareError:
         return None  # "unknown to the RMW" is a value here, and the verifier's to judge
-    if publishes and connection is not None and connection.has_shared_memory:
+    if publishes and connection.has_shared_memory:
         return (*nfes, SHARED_MEMORY)
     return nfes
 
 
-def _dscp(connection: Connection | None) -> int | None:
+def _dscp(connection: Connection) -> int | None:
     try:
-        return None if connection is None else connection.read_dscp()
+        return connection.read_dscp()
     except MiddlewareError:
-        return None  # likewise: sockets that cannot be read are "not read"
+        return None  # sockets that cannot be read are "not read"
 
 
 def _actual_qos(entity: Any, info: ObservedEndpoint | None) -> QosProfile:
@@ -436,6 +426,43 @@ def _actual_qos(entity: Any, info: ObservedEndpoint | None) -> QosProfile:
 def _transports(endpoints: tuple[EndpointReport, ...]) -> tuple[str, ...]:
     """Return what the node can be reached by, as far as its endpoints' NFEs show."""
     return tuple(sorted({nfe.medium for each in endpoints for nfe in each.nfes or ()}))
+
+
+class Undeclared:
+    """The endpoints that the code of one node made by itself.
+
+    Args:
+        changed: called when one is made or destroyed.
+    """
+
+    def __init__(self, changed: Callable[[], None]) -> None:
+        self._changed = changed
+        self._made: dict[int, tuple[EndpointKind, Any]] = {}
+
+    def add(self, kind: EndpointKind, entity: Any) -> None:
+        """Note one that rclpy's factory returned; those of the data layer are sorted out later."""
+        self._made[id(entity)] = (kind, entity)
+        self._changed()
+
+    def remove(self, entity: Any) -> None:
+        """Forget one that is being destroyed."""
+        if self._made.pop(id(entity), None) is not None:
+            self._changed()
+
+    def beside(self, declared: Collection[Any]) -> tuple[tuple[EndpointKind, Any], ...]:
+        """Return (kind, rclpy object) of those that belong to no declared endpoint."""
+        known = {id(each) for each in declared}
+        found = []
+        for key, (kind, entity) in tuple(self._made.items()):
+            if key in known:
+                continue
+            try:
+                wire_name(entity)
+            except InvalidHandle:
+                del self._made[key]  # destroyed behind its node's back
+                continue
+            found.append((kind, entity))
+        return tuple(found)
 
 
 Listener = Callable[["NodeConfiguration"], None]

@@ -19,8 +19,8 @@ from lifecycle.manifest.model import EndpointKind, EndpointPolicy
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.rcl.qos import from_rclpy
 from lifecycle.node.author.handlers import Handlers, match, needs_handler
-from lifecycle.node.connections.data_layer import CONFIGURED, NodeDataLayer
-from lifecycle.node.endpoints.mapping import EndpointOptions, Key, find_endpoint
+from lifecycle.node.endpoints.data_layer import CONFIGURED, DataLayer
+from lifecycle.node.endpoints.endpoint import EndpointOptions, Key, find_endpoint
 from lifecycle.node.lifecycle.machine import NodeState
 from lifecycle.plan.model import PlannedEndpoint, PlannedNode
 
@@ -72,7 +72,7 @@ class DeclaredInCode:
         self,
         node: Node,
         spec: PlannedNode,
-        data_layer: NodeDataLayer,
+        data_layer: DataLayer,
         state: Callable[[], NodeState],
     ) -> None:
         self.spec = spec
@@ -122,7 +122,7 @@ class DeclaredInCode:
                     hint=f"give one, {_METHODS[endpoint.kind]}({endpoint.name!r}, …, callback=…)",
                 )
             self._data_layer.add_now(endpoint, callback)
-        self._data_layer.endpoints.hint(key, *hints)
+        self._data_layer.hint(key, *hints)
 
     def _refuse(self, endpoint: PlannedEndpoint) -> None:
         state = self._state()
@@ -145,7 +145,7 @@ class DeclaredInCode:
 
     def _is_new(self, endpoint: PlannedEndpoint) -> bool:
         at = endpoint.at
-        later = (each.endpoint for each in self._data_layer.mappings)
+        later = (each.planned for each in self._data_layer.endpoints.values())
         for each in (*self.spec.endpoints, *later):
             if (each.kind, each.name) != (endpoint.kind, endpoint.name):
                 continue
@@ -164,8 +164,7 @@ class DeclaredInCode:
         if self._state() is NodeState.UNCONFIGURED:
             self._hints[self._find(spelling)] = (lossy, size_bytes)
         else:
-            table = self._data_layer.endpoints
-            table.hint(table.find(spelling).key, lossy, size_bytes)
+            self._data_layer.hint(self._data_layer.find(spelling).key, lossy, size_bytes)
 
     def set_options(self, spelling: str, options: EndpointOptions) -> None:
         """Keep how an endpoint is to be made.
@@ -179,14 +178,14 @@ class DeclaredInCode:
             options.refuse_unfit(key[0])
             self._options[key] = options
             return
-        mapping = self._data_layer.endpoints.find(spelling)
-        options.refuse_unfit(mapping.endpoint.kind)
-        if mapping.placement is not None:
+        endpoint = self._data_layer.find(spelling)
+        options.refuse_unfit(endpoint.kind)
+        if endpoint.placement is not None:
             raise LifecycleError(
-                f"cannot set options of {mapping.spelling} of {self._name}: it exists already",
+                f"cannot set options of {endpoint.spelling} of {self._name}: it exists already",
                 hint="call set_options in __init__ or in on_configure",
             )
-        mapping.options = options
+        endpoint.options = options
 
     def _find(self, spelling: str) -> Key:
         declared = [(each.kind, each.name) for each in self.spec.endpoints]
@@ -213,6 +212,6 @@ class DeclaredInCode:
 
         self._data_layer.declare(self.spec, handler)
         for key, hints in self._hints.items():
-            self._data_layer.endpoints.hint(key, *hints)
+            self._data_layer.hint(key, *hints)
         for key, options in self._options.items():
-            self._data_layer.endpoints.mappings[key].options = options
+            self._data_layer.endpoints[key].options = options

@@ -12,14 +12,13 @@ import collections
 import enum
 import functools
 import inspect
-from collections.abc import Callable
-from collections.abc import Mapping as AbstractMapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 
 from lifecycle.node.connections.connections import Connection, Connections
-from lifecycle.node.endpoints.mapping import Key, Mapping, count_peers
+from lifecycle.node.endpoints.endpoint import Endpoint, Key, count_peers
 
 if TYPE_CHECKING:
     from lifecycle.node.lifecycle.gate import Later
@@ -101,33 +100,33 @@ class ConnectionStatus:
 
     Args:
         connections: of the node.
-        mappings: every declared endpoint, as it is at any time.
+        endpoints: every declared endpoint, as it is at any time.
         notify: called with each event.
     """
 
     def __init__(
         self,
         connections: Connections,
-        mappings: AbstractMapping[Key, Mapping],
+        endpoints: Mapping[Key, Endpoint],
         notify: Callable[[ConnectionEvent], None],
     ) -> None:
         self._connections = connections
-        self._mappings = mappings
+        self._endpoints = endpoints
         self._notify = notify
         self._established: set[Connection] = set()
 
-    def on(self, connection: Connection) -> tuple[Mapping, ...]:
+    def on(self, connection: Connection) -> tuple[Endpoint, ...]:
         """Return what is mapped onto a connection; flows of their own are the node's own."""
         known = self._known(connection)
         return tuple(
-            mapping
-            for mapping in self._mappings.values()
-            if mapping.connection is not None and self._known(mapping.connection) is known
+            endpoint
+            for endpoint in self._endpoints.values()
+            if endpoint.connection is not None and self._known(endpoint.connection) is known
         )
 
     def established(self, connection: Connection) -> bool:
         """Return whether a connection exists and every topic endpoint on it has a peer."""
-        topics = (each for each in self.on(connection) if each.endpoint.kind.is_topic)
+        topics = (each for each in self.on(connection) if each.kind.is_topic)
         return not connection.error and all(each.peers for each in topics)
 
     def opened(self, connection: Connection) -> None:
@@ -139,43 +138,43 @@ class ConnectionStatus:
         self._established.discard(connection)
         self._report(ConnectionEventKind.CONNECTION_LOST, connection, unmade=True)
 
-    def mapped(self, mapping: Mapping) -> None:
+    def mapped(self, endpoint: Endpoint) -> None:
         """An endpoint was mapped."""
-        assert mapping.connection is not None
-        self._count(mapping)
-        self._report(ConnectionEventKind.MAPPING_ESTABLISHED, mapping.connection, mapping)
-        self._judge(mapping.connection, lost=False)
+        assert endpoint.connection is not None
+        self._count(endpoint)
+        self._report(ConnectionEventKind.MAPPING_ESTABLISHED, endpoint.connection, endpoint)
+        self._judge(endpoint.connection, lost=False)
 
-    def unmapped(self, mapping: Mapping, connection: Connection) -> None:
+    def unmapped(self, endpoint: Endpoint, connection: Connection) -> None:
         """An endpoint was taken off a connection."""
-        self._report(ConnectionEventKind.MAPPING_LOST, connection, mapping, unmade=True)
+        self._report(ConnectionEventKind.MAPPING_LOST, connection, endpoint, unmade=True)
 
-    def matched(self, mapping: Mapping) -> None:
+    def matched(self, endpoint: Endpoint) -> None:
         """Count the peers of a mapping again, and notify if they are more or fewer."""
-        before = mapping.peers or 0
-        self._count(mapping)
-        now = mapping.peers or 0
-        if mapping.connection is None or now == before:
+        before = endpoint.peers or 0
+        self._count(endpoint)
+        now = endpoint.peers or 0
+        if endpoint.connection is None or now == before:
             return
         kind = ConnectionEventKind.MAPPING_ESTABLISHED
         if now < before:
             kind = ConnectionEventKind.MAPPING_LOST
-        self._report(kind, mapping.connection, mapping)
-        self._judge(mapping.connection, lost=now < before)
+        self._report(kind, endpoint.connection, endpoint)
+        self._judge(endpoint.connection, lost=now < before)
 
     def _known(self, connection: Connection) -> Connection:
         """Return the connection as which others know it."""
         return connection if connection.name else self._connections.own
 
-    def _count(self, mapping: Mapping) -> None:
-        if mapping.endpoint.kind.is_topic and mapping.placement is not None:
-            mapping.peers = count_peers(mapping.placement.entity)
+    def _count(self, endpoint: Endpoint) -> None:
+        if endpoint.kind.is_topic and endpoint.placement is not None:
+            endpoint.peers = count_peers(endpoint.placement.entity)
 
     def _report(
         self,
         kind: ConnectionEventKind,
         connection: Connection,
-        mapping: Mapping | None = None,
+        endpoint: Endpoint | None = None,
         *,
         unmade: bool = False,
     ) -> None:
@@ -184,8 +183,8 @@ class ConnectionStatus:
                 kind=kind,
                 connection=connection.name,
                 urls=connection.urls,
-                endpoint="" if mapping is None else mapping.spelling,
-                peers=None if mapping is None or unmade else mapping.peers,
+                endpoint="" if endpoint is None else endpoint.spelling,
+                peers=None if endpoint is None or unmade else endpoint.peers,
                 unmade=unmade,
             )
         )

@@ -58,6 +58,11 @@ class Connection(msgspec.Struct, kw_only=True, eq=False):
     warning: str = ""
     error: str = ""
 
+    @property
+    def node(self) -> Node | None:
+        """The hidden node that owns the participant; None for the node's own."""
+        return None if self.participant is None else self.participant.node
+
     def read_dscp(self) -> int | None:
         """Return the DSCP on the participant's sender sockets, 0–63; None for the node's own."""
         return None if self.participant is None else self.participant.read_dscp()

@@ -17,7 +17,7 @@ import contextlib
 import inspect
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NoReturn, Protocol, cast
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.event_handler import (
@@ -45,13 +45,14 @@ from lifecycle.middleware.rcl.rclpy_nodes import (
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.node import configuration
 from lifecycle.node.author import parameters
-from lifecycle.node.author.managed import HostedState, Managed, Undeclared
+from lifecycle.node.author.managed import HostedState, Managed
 from lifecycle.node.author.node import LifecycleNode
 from lifecycle.node.author.spec import Construction, Mode, constructing, ros_arguments
-from lifecycle.node.configuration import ConfigurationChanges
+from lifecycle.node.configuration import ConfigurationChanges, Undeclared
 from lifecycle.node.connections.connections import Connection, Connections
-from lifecycle.node.connections.data_layer import NodeDataLayer, serve_interface
-from lifecycle.node.endpoints.mapping import MatchWatch
+from lifecycle.node.connections.node_interface import serve_interface
+from lifecycle.node.endpoints.data_layer import DataLayer
+from lifecycle.node.endpoints.endpoint import MatchWatch
 from lifecycle.node.lifecycle.gate import GatedPublisher, NodeGate
 from lifecycle.node.lifecycle.machine import RefusedError
 from lifecycle.node.lifecycle.steps import SUCCESS, CallbackOutcome, Result
@@ -224,7 +225,7 @@ class ForeignNode:
         self._is_ours = True
         configuration.serve(self._node, self.get_configuration, self._group)
         # With it a node is known to be one of ours.
-        serve_interface(self._node, cast("NodeDataLayer", self), self._group, "map_to")
+        serve_interface(self._node, {"map_to": lambda _: data_layer_of(self)}, self._group)
         self._is_ours = False
         services = tuple(each for each in self._node.services if each not in before)
         self._watching.take_services(self._node, services)
@@ -284,7 +285,7 @@ class ForeignNode:
                     forward=self._forward,
                 )
         sink: Any = self._watching
-        return MatchWatch(sink, entity, self._group, lambda _: touch())
+        return MatchWatch(sink, entity, self._group, touch)
 
     def _forward(self, callback: Callable[[Any], Any], status: Any) -> None:
         """Have a callback of its own called; while it is not spun, the last time once it is."""
@@ -404,11 +405,6 @@ class ForeignNode:
         )
 
     @property
-    def is_marked(self) -> bool:
-        """Whether the plan says what DSCP any of its endpoints sends with."""
-        return any(each.dscp is not None for each in self._spec.endpoints)
-
-    @property
     def marks(self) -> tuple[int | None, ...]:
         """DSCP on the sender sockets of its participants, as it is now."""
         return self._connections.marks
@@ -425,24 +421,6 @@ class ForeignNode:
         """The node was destroyed, in a process that goes on."""
         if self._machine is not None:
             self._machine.destroy()
-
-    @property
-    def interface(self) -> Any:
-        """Raise: it has no node interface; see `map_to`."""
-        self.map_to("", "")
-
-    def map_to(self, endpoint: str, connection: str) -> NoReturn:
-        """Raise: its own code makes its endpoints.
-
-        Raises:
-            LifecycleError: always.
-        """
-        del endpoint, connection
-        raise LifecycleError(
-            f"cannot move the endpoints of {self.full_name}: its class is not a "
-            "lifecycle.LifecycleNode, and makes them itself",
-            hint="subclass lifecycle.LifecycleNode, or write data_layer.authority: nodes",
-        )
 
     async def change_for_supervisor(self, operation: str) -> Result:
         """Do what the supervisor asked for; its activate is the gate's permit.
@@ -555,6 +533,22 @@ class ForeignNode:
 
 Hosted = Managed | ForeignNode
 """What a host knows of one of its nodes."""
+
+
+def data_layer_of(hosted: Hosted) -> DataLayer:
+    """Return what maps the endpoints of a node.
+
+    Raises:
+        LifecycleError: its own code makes its endpoints.
+    """
+    if isinstance(hosted, Managed):
+        return hosted.data_layer
+    raise LifecycleError(
+        f"cannot move the endpoints of {hosted.full_name}: its class is not a "
+        "lifecycle.LifecycleNode, and makes them itself",
+        hint="subclass lifecycle.LifecycleNode, or write data_layer.authority: nodes",
+    )
+
 
 Carrying = Callable[[PlannedNode], contextlib.AbstractContextManager[Any]]
 

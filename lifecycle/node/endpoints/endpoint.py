@@ -1,15 +1,13 @@
-"""One declared endpoint and where it is now: its mapping, its spellings, its matched peers.
+"""One declared endpoint: what it is, how code wants it made, and where it is now.
 
-Owns: the types of a mapping, without behaviour of their own; what code says of how an endpoint is
-made; the meaning of a spelling in requests
-and messages (`video`, or `publishers/video`), and the error when it names nothing or too much;
-rclpy's matched events on our executor. Such an event is handled in a group of the framework's: an
-author's callback that awaits something must not delay the event of a peer that appeared or left.
+Owns: `Endpoint`; the meaning of a spelling in requests and messages (`video`, or
+`publishers/video`), and the error when it names nothing or too much; rclpy's matched events on our
+executor. Such an event is handled in a group of the framework's: an author's callback that awaits
+something must not delay the event of a peer that appeared or left.
 """
 
 from __future__ import annotations
 
-import typing
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
@@ -39,6 +37,8 @@ if TYPE_CHECKING:
 
 Key = tuple[EndpointKind, str]
 """Kind and declared name: what identifies an endpoint within its node."""
+
+CLIENTS = frozenset({EndpointKind.SERVICE_CLIENT, EndpointKind.ACTION_CLIENT})
 
 
 class UnknownEndpointError(LifecycleError, KeyError):
@@ -86,6 +86,15 @@ def find_endpoint(spelling: str, declared: Iterable[Key], *, node: str) -> Key:
     )
 
 
+def wire_name(entity: Any) -> str:
+    """Return an entity's name on the wire, as rcl resolved it; empty if it is unknown."""
+    for attribute in ("topic_name", "service_name", "action_name"):
+        name = getattr(entity, attribute, None)
+        if name is not None:
+            return str(name)
+    return ""
+
+
 def count_peers(entity: Publisher | Subscription) -> int:
     """Return how many remote endpoints are matched with a publisher or subscription."""
     if isinstance(entity, Publisher):
@@ -93,15 +102,14 @@ def count_peers(entity: Publisher | Subscription) -> int:
     return int(entity.get_publisher_count())
 
 
-@typing.final
 class MatchWatch:
-    """Calls back with the number of matched peers each time it has changed.
+    """Calls back each time that peers of an endpoint were matched or unmatched.
 
     Args:
         node: whose executor calls; the endpoint may be on another participant.
         entity: what to watch.
         group: reentrant.
-        changed: takes the number of matched peers, >= 0.
+        changed: is called.
     """
 
     def __init__(
@@ -109,23 +117,21 @@ class MatchWatch:
         node: Node,
         entity: Publisher | Subscription,
         group: CallbackGroup,
-        changed: Callable[[int], None],
+        changed: Callable[[], None],
     ) -> None:
         self._node = node
         self._handler: EventHandler | None = None
-        publishes = isinstance(entity, Publisher)
         event = (
             QoSPublisherEventType.RCL_PUBLISHER_MATCHED
-            if publishes
+            if isinstance(entity, Publisher)
             else QoSSubscriptionEventType.RCL_SUBSCRIPTION_MATCHED
         )
-
-        def matched(status: Any) -> None:
-            changed(int(status.current_count))
-
         try:
             self._handler = EventHandler(
-                callback_group=group, callback=matched, event_type=event, parent_impl=entity.handle
+                callback_group=group,
+                callback=lambda _: changed(),
+                event_type=event,
+                parent_impl=entity.handle,
             )
         except UnsupportedEventTypeError:
             return  # an RMW without the event: counts are then read on request
@@ -158,16 +164,10 @@ class EndpointOptions(msgspec.Struct, frozen=True, kw_only=True):
 
     def refuse_unfit(self, kind: EndpointKind) -> None:
         """Raise LifecycleError for what endpoints of a kind cannot have."""
-        given = {
-            "raw": self.raw,
-            "content_filter": self.content_filter is not None,
-            "event_callbacks": self.event_callbacks is not None,
-            "introspection": self.introspection is not None,
-        }
-        for name, is_given in given.items():
-            if is_given and kind not in _FITTING[name]:
-                fitting = ", ".join(f"{each.noun}s" for each in _FITTING[name])
-                raise LifecycleError(f"cannot set {name} of a {kind.noun}; only of {fitting}")
+        for name, fitting in _FITTING.items():
+            if getattr(self, name) not in (None, False) and kind not in fitting:
+                nouns = ", ".join(f"{each.noun}s" for each in fitting)
+                raise LifecycleError(f"cannot set {name} of a {kind.noun}; only of {nouns}")
 
 
 _FITTING = {
@@ -176,16 +176,6 @@ _FITTING = {
     "event_callbacks": (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION),
     "introspection": (EndpointKind.SERVICE_SERVER, EndpointKind.SERVICE_CLIENT),
 }
-NO_OPTIONS = EndpointOptions()
-
-
-def wire_name(entity: Any) -> str:
-    """Return an entity's name on the wire, as rcl resolved it; empty if it is unknown."""
-    for attribute in ("topic_name", "service_name", "action_name"):
-        name = getattr(entity, attribute, None)
-        if name is not None:
-            return str(name)
-    return ""
 
 
 class Placement(msgspec.Struct, frozen=True, kw_only=True, eq=False):
@@ -200,49 +190,60 @@ class Placement(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     watch: MatchWatch | ServerWatch | None = None
 
 
-class Mapping(msgspec.Struct, kw_only=True, eq=False):
+class Endpoint(msgspec.Struct, kw_only=True, eq=False):
     """One declared endpoint and where it is now.
 
     Attributes:
+        planned: as it is declared.
         interface: the message, service or action class.
         handler: takes messages, requests or goals; None where the kind has no handler.
         handle: what authors publish by; None for other kinds.
         placement: where it is; None while it is mapped nowhere.
         error: why it could not be made as asked; empty if it was.
-        name: fully qualified, given by `remap`; empty for the name that was declared.
+        given_name: fully qualified, given by `remap`; empty for the name that was declared.
         peers: matched remote endpoints; None while mapped nowhere, and for services and actions.
         lossy: the author's hint: the data bear an unreliable transport; None without one.
         size_bytes: the author's hint: its largest serialized message; None without one.
         options: how it is made, as far as code says it.
     """
 
-    endpoint: PlannedEndpoint
+    planned: PlannedEndpoint
     interface: type[Any]
     handler: Callable[..., Any] | None = None
     handle: DeclaredPublisher | None = None
     placement: Placement | None = None
     error: str = ""
-    name: str = ""
+    given_name: str = ""
     peers: int | None = None
     lossy: bool | None = None
     size_bytes: int | None = None
-    options: EndpointOptions = NO_OPTIONS
+    options: EndpointOptions = EndpointOptions()
+
+    @property
+    def kind(self) -> EndpointKind:
+        """What it is: a publisher, a subscription."""
+        return self.planned.kind
+
+    @property
+    def name(self) -> str:
+        """As declared."""
+        return self.planned.name
 
     @property
     def key(self) -> Key:
         """Kind and declared name."""
-        return self.endpoint.kind, self.endpoint.name
+        return self.kind, self.name
 
     @property
     def spelling(self) -> str:
         """`publishers/video`."""
-        return self.endpoint.kind.spell(self.endpoint.name)
+        return self.kind.spell(self.name)
 
     @property
     def wire_name(self) -> str:
         """Fully qualified name as it is now, or will be once it is mapped."""
         made = "" if self.placement is None else wire_name(self.placement.entity)
-        return made or self.name or self.endpoint.resolved
+        return made or self.given_name or self.planned.resolved
 
     @property
     def entity(self) -> Any:
