@@ -316,6 +316,16 @@ def test_a_transition_does_these_things_in_this_order(
     assert node.did == did.split()
 
 
+@pytest.mark.parametrize("asked", ["deactivate", "shutdown"])
+def test_nothing_is_sent_any_more_once_the_end_of_being_active_is_announced(asked: str) -> None:
+    node = node_in(NodeState.ACTIVE)
+    announced: list[int] = []
+    node.gate.close = lambda: announced.append(len(node.changes))
+    node.machine = Machine(node, Timeouts())
+    node.follow(f"{PATHS[NodeState.ACTIVE]} {asked}")
+    assert announced == [len(node.changes) - 1]
+
+
 @pytest.mark.parametrize(
     ("state", "asked", "did", "goal"),
     [
