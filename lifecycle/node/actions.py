@@ -18,13 +18,13 @@ from rclpy.node import Node
 
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.names import action_of, hidden_names
-from lifecycle.node.author.handlers import ActionHandler
 from lifecycle.node.lifecycle.steps import Running, error_text
 
 if TYPE_CHECKING:
     from rclpy.action.server import ServerGoalHandle
 
     from lifecycle.middleware.services.actions import GoalServer
+    from lifecycle.node.endpoints.endpoint import Endpoint
 
 
 class GoalInterruptedError(LifecycleError):
@@ -40,10 +40,9 @@ class Goals:
 
     Args:
         node: whose it is.
-        action: as declared.
-        action_type: the action class.
-        handler: the author's methods.
+        endpoint: the declared action server; what its handler raises is its `fault`.
         is_open: the node is active.
+        changed: called when that fault is another one.
 
     Attributes:
         server: set by its maker, before it can have a goal.
@@ -52,20 +51,20 @@ class Goals:
     def __init__(
         self,
         node: Node,
-        action: str,
-        action_type: type[Any],
-        handler: Callable[..., Any],
+        endpoint: Endpoint,
         *,
         is_open: Callable[[], bool],
+        changed: Callable[[], None],
     ) -> None:
+        assert endpoint.handler is not None
         self._node = str(node.get_fully_qualified_name())
-        self._what = f"action server {action!r} of {self._node}"
-        self._error = node.get_logger().error
-        self._warn = node.get_logger().warning
-        self._handler = handler
-        self._accept = handler.accept if isinstance(handler, ActionHandler) else None
+        self._endpoint = endpoint
+        self._what = f"action server {endpoint.name!r} of {self._node}"
+        self._log = node.get_logger()
+        self._handler = endpoint.handler
+        self._accept = getattr(endpoint.handler, "accept", None)
         self._is_open = is_open
-        self._type = action_type
+        self._changed = changed
         self._runs: dict[bytes, Running] = {}
         self.server: GoalServer | None = None
 
@@ -106,14 +105,14 @@ class Goals:
                 if inspect.isawaitable(answer):
                     answer = await answer
             except Exception as error:  # noqa: BLE001 - the author's code: reported, and no
-                self._error(traceback.format_exc())
-                self._error(
+                self._log.error(traceback.format_exc())
+                self._log.error(
                     f"cannot decide on a goal of {self._what}, so it is rejected: "
                     f"{error_text(error)}"
                 )
                 return False
             if not isinstance(answer, bool):
-                self._error(
+                self._log.error(
                     f"cannot use {answer!r} as a decision on a goal of {self._what}, so "
                     "it is rejected: return True or False"
                 )
@@ -121,7 +120,7 @@ class Goals:
             if not answer:
                 return False
         if not self._is_open():
-            self._warn(f"cannot accept a goal of {self._what}: it is not active")
+            self._log.warning(f"cannot accept a goal of {self._what}: it is not active")
         return self._is_open()
 
     async def execute(self, goal: ServerGoalHandle) -> Any | None:
@@ -142,23 +141,26 @@ class Goals:
 
     def _outcome(self, goal: ServerGoalHandle, run: Running) -> Any | None:
         """Say what is wrong with what a handler did; return the result, None for none."""
-        if run.failure is not None:
-            if run.interruption is None or not isinstance(run.failure, GoalInterruptedError):
-                self._error(run.trace)
-                self._error(
-                    f"cannot go on with a goal of {self._what}: its handler raised "
-                    f"{error_text(run.failure)}"
-                )
+        failure = run.failure
+        if run.interruption is not None and isinstance(failure, GoalInterruptedError):
+            return None
+        fault = "" if failure is None else f"its handler raised {error_text(failure)}"
+        if fault != self._endpoint.fault:
+            self._endpoint.fault = fault
+            self._changed()
+        if fault:
+            self._log.error(run.trace)
+            self._log.error(f"cannot go on with a goal of {self._what}: {fault}")
             return None
         returned = run.returned
-        if returned is not None and not isinstance(returned, self._type.Result):
-            self._error(
+        if returned is not None and not isinstance(returned, self._endpoint.interface.Result):
+            self._log.error(
                 f"cannot send {returned!r} as a result of {self._what}: return a "
-                f"{self._type.__name__}.Result, or None for an empty one"
+                f"{self._endpoint.interface.__name__}.Result, or None for an empty one"
             )
             return None
         if goal.is_active and run.interruption is None:
-            self._error(
+            self._log.error(
                 f"cannot tell what a goal of {self._what} came to, so it is aborted: its "
                 "handler returned without succeed(), abort() or canceled()"
             )

@@ -13,6 +13,7 @@ Communication Negotiation*, "Node Configuration Interface".
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import os
@@ -22,6 +23,7 @@ import weakref
 from collections.abc import Callable, Collection, Iterable
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 from msgspec.structs import replace
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
@@ -38,13 +40,17 @@ from lifecycle.middleware.process.hosted import vouch_for
 from lifecycle.middleware.rcl.graph_changes import is_server_matched
 from lifecycle.middleware.rcl.graph_queries import endpoints_of, endpoints_of_node
 from lifecycle.middleware.rcl.qos import from_rclpy
-from lifecycle.middleware.rcl.rclpy_nodes import interface_of
 from lifecycle.network.medium import CONNECTABLE, Medium
 from lifecycle.network.nfe import NetworkFlowEndpoint
 from lifecycle.node.author import parameters
-from lifecycle.node.author.declaring import interface_name
 from lifecycle.node.connections.connections import Connection, Connections
-from lifecycle.node.endpoints.endpoint import CLIENTS, Endpoint, count_peers, wire_name
+from lifecycle.node.endpoints.endpoint import (
+    CLIENTS,
+    Endpoint,
+    Placement,
+    count_peers,
+    found_endpoint,
+)
 from lifecycle.plan.model import PlannedNode
 from lifecycle.plan.negotiation.data_layer import PARADIGMS, SERIALIZATIONS
 from lifecycle.verify.observation import (
@@ -60,8 +66,22 @@ from lifecycle.verify.tool_filter import PREFIX_DIGITS
 if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup
 
-    from lifecycle.node.endpoints.data_layer import DataLayer
+    from lifecycle.manifest.diagnostics import Position
     from lifecycle.node.lifecycle.gate import Later
+
+
+class HostedState(msgspec.Struct, frozen=True, kw_only=True):
+    """The state of a hosted node.
+
+    Attributes:
+        label: lifecycle_msgs/State label; empty for a node that is not managed.
+        connected: its data layer is made.
+        steady: no transition is running.
+    """
+
+    label: str
+    connected: bool
+    steady: bool
 
 
 _CONFIGURABLE_RMW = "rmw_fastrtps_cpp"
@@ -116,127 +136,56 @@ def checksum(configuration: NodeConfiguration) -> str:
     return hashlib.sha256(codec.to_json(stable)).hexdigest()[:_DIGITS]
 
 
-def endpoint_reports(
-    node: Node, data_layer: DataLayer, undeclared: Iterable[tuple[EndpointKind, Any]]
-) -> tuple[EndpointReport, ...]:
-    """Return what the endpoints of one of our nodes are now.
+def connection_reports(
+    spec: PlannedNode, connections: Connections, endpoints: Iterable[EndpointReport]
+) -> tuple[ConnectionReport, ...]:
+    """Return every connection that exists or was asked for, the node's own participant first.
 
     Args:
-        node: the node itself.
-        data_layer: its declared endpoints and their entities.
-        undeclared: kind and rclpy object of endpoints that its code made by itself.
+        spec: what the node was planned to be.
+        connections: of the node.
+        endpoints: what it reports of its endpoints.
     """
-    unknown = Connection(name="")
-    return (
-        *(_declared_report(node, endpoint) for endpoint in data_layer.endpoints.values()),
-        *(_found_report(node, kind, each, unknown) for kind, each in undeclared),
-    )
+    mapped = [each for each in endpoints if each.mapped]
 
-
-def foreign_reports(
-    node: Node,
-    spec: PlannedNode,
-    connections: Connections,
-    endpoints: Iterable[tuple[EndpointKind, Any, Connection]],
-) -> tuple[tuple[EndpointReport, ...], tuple[ConnectionReport, ...]]:
-    """Return what endpoints and connections of a node are now of which the class is not ours.
-
-    Args:
-        node: the node itself.
-        spec: what it was planned to be.
-        connections: its participant, and those that give endpoints flows of their own.
-        endpoints: kind, rclpy object and connection of what it has made.
-    """
-    declared = {(each.kind, each.resolved): each for each in spec.endpoints}
-    reports: list[EndpointReport] = []
-    for kind, entity, connection in endpoints:
-        try:
-            report = _found_report(node, kind, entity, connection)
-            if kind in CLIENTS:
-                report = replace(report, server_matched=is_server_matched(entity))
-        except InvalidHandle:
-            continue  # destroyed meanwhile
-        planned = declared.pop((kind, report.resolved), None)
-        if planned is not None:
-            error = connection.warning if planned.enforce_dscp else ""
-            report = replace(report, name=planned.name, unique=planned.unique, error=error)
-        reports.append(report)
-    reports += [
-        EndpointReport(
-            kind=each.kind,
-            name=each.name,
-            resolved=each.resolved,
-            type=each.type,
-            qos=each.qos,
-            mapped=False,
-        )
-        for each in declared.values()
-    ]
-
-    def connection_report(connection: Connection) -> ConnectionReport:
-        on = [each for each in reports if each.mapped and each.connection == connection.name]
-        return _connection_report(
-            connection,
-            spec,
+    def report(connection: Connection) -> ConnectionReport:
+        on = [each for each in mapped if each.connection == connection.name]
+        return ConnectionReport(
+            name=connection.name,
+            urls=connection.urls or (() if connection.name else spec.connections.urls),
+            node_name=connection.node_name,
+            prefix=_prefix_of(connection),
             established=all(each.matched for each in on if each.kind.is_topic),
             mappings=tuple(each.kind.spell(each.name) for each in on if each.name),
         )
 
-    made = (connections.own, *connections.named)
-    return tuple(reports), tuple(connection_report(each) for each in made)
-
-
-def connection_reports(spec: PlannedNode, data_layer: DataLayer) -> tuple[ConnectionReport, ...]:
-    """Return every connection that exists or was asked for, the node's own participant first."""
-    connections, status = data_layer.connections, data_layer.status
-    made = tuple(
-        _connection_report(
-            each,
-            spec,
-            established=status.established(each),
-            mappings=tuple(endpoint.spelling for endpoint in status.on(each)),
-        )
-        for each in (connections.own, *connections.named)
-    )
-    failed = tuple(
+    failed = (
         ConnectionReport(name=each.name, urls=each.urls, error=each.error)
         for each in connections.failed
     )
-    return (*made, *failed)
-
-
-def _connection_report(
-    connection: Connection, spec: PlannedNode, *, established: bool, mappings: tuple[str, ...]
-) -> ConnectionReport:
-    return ConnectionReport(
-        name=connection.name,
-        urls=connection.urls or (() if connection.name else spec.connections.urls),
-        node_name=connection.node_name,
-        prefix=_prefix_of(connection),
-        established=established,
-        mappings=mappings,
-    )
+    return (*map(report, (connections.own, *connections.named)), *failed)
 
 
 def collect(
     node: Node,
-    state: str,
+    spec: PlannedNode,
+    state: HostedState,
     *,
-    connected: bool,
-    endpoints: tuple[EndpointReport, ...],
-    connections: tuple[ConnectionReport, ...],
+    endpoints: Iterable[Endpoint],
+    connections: Connections,
     health: HealthReport | None = None,
 ) -> NodeConfiguration:
     """Return the configuration of `node` as it is now.
 
     Args:
         node: the node itself.
-        state: lifecycle_msgs/State label; empty for a plain node.
-        connected: its data layer is made.
-        endpoints: what they are now.
-        connections: what they are now, the node's own participant first.
+        spec: what it was planned to be.
+        state: its own.
+        endpoints: all that it has, declared ones that do not exist among them.
+        connections: that it has.
         health: what it says of itself; None if it says nothing.
     """
+    reports = endpoint_reports(node, endpoints)
     name, prefix = node.get_fully_qualified_name(), _gid_prefix(node)
     vouch_for(prefix)  # before it is answered with
     configuration = NodeConfiguration(
@@ -246,14 +195,14 @@ def collect(
             node_id=f"{name}@{prefix}",
         ),
         name=name,
-        state=state,
-        connected=connected,
+        state=state.label,
+        connected=state.connected,
         rmw=get_rmw_implementation_identifier(),
-        transports=transports() or _transports(endpoints),
+        transports=transports() or _transports(reports),
         serializations=SERIALIZATIONS,
         paradigms=PARADIGMS,
-        endpoints=endpoints,
-        connections=connections,
+        endpoints=reports,
+        connections=connection_reports(spec, connections, reports),
         parameters=parameters.reports(node),
         health=health,
     )
@@ -275,8 +224,17 @@ def serve(node: Node, collect: Callable[[], NodeConfiguration], group: CallbackG
     Node.create_service(node, Trigger, "~/get_configuration", describe, callback_group=group)
 
 
-def _declared_report(node: Node, endpoint: Endpoint) -> EndpointReport:
-    planned, connection = endpoint.planned, endpoint.connection
+def endpoint_reports(node: Node, endpoints: Iterable[Endpoint]) -> tuple[EndpointReport, ...]:
+    """Return what the endpoints of a node are now, without those that are being destroyed."""
+    reports: list[EndpointReport] = []
+    for each in endpoints:
+        with contextlib.suppress(InvalidHandle):
+            reports.append(_endpoint_report(node, each))
+    return tuple(reports)
+
+
+def _endpoint_report(node: Node, endpoint: Endpoint) -> EndpointReport:
+    planned, placement = endpoint.planned, endpoint.placement
     report = EndpointReport(
         kind=endpoint.kind,
         name=endpoint.name,
@@ -284,59 +242,36 @@ def _declared_report(node: Node, endpoint: Endpoint) -> EndpointReport:
         type=planned.type,
         qos=planned.qos,
         unique=planned.unique,
-        participant=planned.participant if connection is None else connection.node_name,
+        participant=planned.participant,
         error=endpoint.error,
-        connection="" if connection is None else connection.name,
-        mapped=connection is not None,
+        fault=endpoint.fault,
         lossy=endpoint.lossy,
         size_bytes=endpoint.size_bytes,
     )
-    if connection is None:
+    if placement is None:
         return report
-    if endpoint.kind in CLIENTS:
-        return replace(report, server_matched=is_server_matched(endpoint.entity))
-    return _with_matches(node, report, endpoint.entity, connection)
-
-
-def _found_report(
-    node: Node, kind: EndpointKind, entity: Any, connection: Connection
-) -> EndpointReport:
-    """Report an endpoint that no interface declares; it has no name but the one on the wire."""
-    report = EndpointReport(
-        kind=kind,
-        name="",
-        resolved=wire_name(entity),
-        type=interface_name(interface_of(entity)),
-        mapped=True,
-        connection=connection.name,
+    connection, entity = placement.connection, placement.entity
+    report = replace(
+        report,
         participant=connection.node_name,
+        error=report.error or (connection.warning if planned.enforce_dscp else ""),
+        connection=connection.name,
+        mapped=True,
     )
-    return _with_matches(node, report, entity, connection)
-
-
-def _with_matches(
-    node: Node, report: EndpointReport, entity: Any, connection: Connection
-) -> EndpointReport:
-    """Add to the report on a publisher or subscription its GID, QoS, type hash, NFEs and matches.
-
-    Args:
-        node: whose it is.
-        report: the topic's name and the kind count; that on a service or action stays as it is.
-        entity: its rclpy object.
-        connection: that it is on.
-    """
-    if not report.kind.is_topic:
+    if endpoint.kind in CLIENTS and placement.watch is not None:
+        return replace(report, server_matched=is_server_matched(entity))
+    if not endpoint.kind.is_topic:
         return report
     # A participant knows its own endpoints; the node's own need not know those of another.
     witness = connection.node or node
-    info = _own_endpoint(witness, report.resolved, report.kind)
+    info = _own_endpoint(witness, report.resolved, endpoint.kind)
     return replace(
         report,
         qos=_actual_qos(entity, info),
         gid=info.gid if info is not None else "",
         matched=count_peers(entity),
         type_hash=info.type_hash if info is not None else None,
-        nfes=_nfes(witness, report.kind, entity, connection),
+        nfes=_nfes(witness, endpoint.kind, entity, connection),
         dscp=_dscp(connection),
     )
 
@@ -428,41 +363,49 @@ def _transports(endpoints: tuple[EndpointReport, ...]) -> tuple[str, ...]:
     return tuple(sorted({nfe.medium for each in endpoints for nfe in each.nfes or ()}))
 
 
-class Undeclared:
-    """The endpoints that the code of one node made by itself.
+class Found:
+    """The endpoints that the code of one node makes by itself, with rclpy's factories.
 
     Args:
+        at: where the node is declared.
         changed: called when one is made or destroyed.
     """
 
-    def __init__(self, changed: Callable[[], None]) -> None:
+    def __init__(self, at: Position, changed: Callable[[], None]) -> None:
+        self._at = at
         self._changed = changed
-        self._made: dict[int, tuple[EndpointKind, Any]] = {}
+        self._made: dict[int, tuple[EndpointKind, Placement]] = {}
 
-    def add(self, kind: EndpointKind, entity: Any) -> None:
-        """Note one that rclpy's factory returned; those of the data layer are sorted out later."""
-        self._made[id(entity)] = (kind, entity)
+    def add(self, kind: EndpointKind, placement: Placement) -> None:
+        """Note one that a factory returned."""
+        self._made[id(placement.entity)] = (kind, placement)
         self._changed()
 
-    def remove(self, entity: Any) -> None:
-        """Forget one that is being destroyed."""
-        if self._made.pop(id(entity), None) is not None:
+    def remove(self, entity: Any) -> Placement | None:
+        """Forget one that is being destroyed, and return where it was; None if it is not known."""
+        _, placement = self._made.pop(id(entity), (None, None))
+        if placement is not None:
             self._changed()
+        return placement
 
-    def beside(self, declared: Collection[Any]) -> tuple[tuple[EndpointKind, Any], ...]:
-        """Return (kind, rclpy object) of those that belong to no declared endpoint."""
+    def beside(self, declared: Collection[Any] = ()) -> tuple[Endpoint, ...]:
+        """Return those of which the rclpy object belongs to no declared endpoint."""
         known = {id(each) for each in declared}
         found = []
-        for key, (kind, entity) in tuple(self._made.items()):
+        for key, (kind, placement) in tuple(self._made.items()):
             if key in known:
                 continue
             try:
-                wire_name(entity)
+                found.append(found_endpoint(kind, placement, self._at))
             except InvalidHandle:
-                del self._made[key]  # destroyed behind its node's back
-                continue
-            found.append((kind, entity))
+                self._made.pop(key, None)  # destroyed behind its node's back
         return tuple(found)
+
+    def close(self) -> None:
+        """Watch none of them any more: their node is being destroyed."""
+        for _, placement in self._made.values():
+            if placement.watch is not None:
+                placement.watch.stop()
 
 
 Listener = Callable[["NodeConfiguration"], None]

@@ -6,11 +6,11 @@ reached as `node.lifecycle`, so that authors have every other attribute name to 
 
 from __future__ import annotations
 
+import functools
 import traceback
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-import msgspec
 from rclpy.lifecycle import LifecycleState
 from rclpy.node import Node
 from rclpy.task import Future
@@ -20,11 +20,9 @@ from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import Health
 from lifecycle.node import configuration
 from lifecycle.node.author import parameters
-from lifecycle.node.author.declaring import DeclaredInCode
-from lifecycle.node.author.handlers import alternatives
+from lifecycle.node.author.handlers import alternatives, match
 from lifecycle.node.author.spec import Mode
-from lifecycle.node.configuration import ConfigurationChanges, Undeclared
-from lifecycle.node.connections.connection_status import ConnectionEvents
+from lifecycle.node.configuration import ConfigurationChanges, Found, HostedState
 from lifecycle.node.connections.node_interface import acts_of, serve_interface
 from lifecycle.node.endpoints.data_layer import DataLayer
 from lifecycle.node.lifecycle.gate import NodeGate
@@ -48,20 +46,6 @@ _WITHOUT_DATA_LAYER = (NodeState.INACTIVE_DISCONNECTED, NodeState.UNCONFIGURED, 
 """A node that enters one of these is not the one that was verified any more."""
 
 
-class HostedState(msgspec.Struct, frozen=True, kw_only=True):
-    """The state of a hosted node.
-
-    Attributes:
-        label: lifecycle_msgs/State label; empty for a node that is not managed.
-        connected: its data layer is made.
-        steady: no transition is running.
-    """
-
-    label: str
-    connected: bool
-    steady: bool
-
-
 BRING_UP = (TransitionRequest.CONFIGURE, TransitionRequest.CONNECT, TransitionRequest.ACTIVATE)
 
 
@@ -72,11 +56,10 @@ class Managed:
         mode: what drives the transitions.
         gate: holds back what the node was made to send, receive and time.
         turns: has things done in its executor.
+        spec: what the node was planned to be.
         data_layer: its endpoints.
-        declared: what its manifest and its code say of them.
-        connection_events: what becomes of its connections and mappings.
         configuration_changes: notifies of each change of its configuration.
-        undeclared: endpoints that its code made with rclpy's factories.
+        found: endpoints that its code made with rclpy's factories.
     """
 
     def __init__(
@@ -91,6 +74,7 @@ class Managed:
         health: Callable[[], Any] | None = None,
     ) -> None:
         self._node = node
+        self.spec = spec
         self._supervisor = supervisor
         # By its supervisor, through the gate; a node without one needs no permission.
         self._let_through = not supervisor
@@ -101,7 +85,6 @@ class Managed:
         self._method_timers: list[Timer] = []
         self._reporter: GraphReporter | None = None
         self._services: LifecycleServices | None = None
-        self.connection_events = ConnectionEvents(self.turns.call_soon)
         self.configuration_changes = ConfigurationChanges(
             self.turns.call_soon, self.get_configuration, failed=node.get_logger().error
         )
@@ -114,16 +97,10 @@ class Managed:
             failed=node.get_logger().error,
         )
         node.add_post_set_parameters_callback(lambda _: changed())
-        self.undeclared = Undeclared(changed)
+        self.found = Found(spec.at, changed)
         self.data_layer = DataLayer(
-            node,
-            gate,
-            self.turns,
-            state=lambda: self.state,
-            changed=changed,
-            notify=self.connection_events.notify,
+            node, spec, gate, self.turns, state=lambda: self.state, changed=changed
         )
-        self.declared = DeclaredInCode(node, spec, self.data_layer, lambda: self.state)
         self._machine = Machine(self, spec.timeouts)
         if served:
             self._services = LifecycleServices(node, self._machine, self.turns.group)
@@ -136,11 +113,6 @@ class Managed:
     def full_name(self) -> str:
         """Fully qualified node name."""
         return str(self._node.get_fully_qualified_name())
-
-    @property
-    def spec(self) -> PlannedNode:
-        """What the node was planned to be, with the endpoints that its code declares."""
-        return self.declared.spec
 
     @property
     def state(self) -> NodeState:
@@ -236,13 +208,13 @@ class Managed:
     def get_configuration(self) -> NodeConfiguration:
         """Return this node's identity and its endpoints as they are."""
         # Whatever the policy: what a node says of itself is known before discovery shows it.
-        undeclared = self.undeclared.beside(self.data_layer.entities)
+        found = self.found.beside(self.data_layer.entities)
         return configuration.collect(
             self._node,
-            self.state.seen.label,
-            connected=self.state.connected,
-            endpoints=configuration.endpoint_reports(self._node, self.data_layer, undeclared),
-            connections=configuration.connection_reports(self.spec, self.data_layer),
+            self.spec,
+            self.reported,
+            endpoints=(*self.data_layer.endpoints.values(), *found),
+            connections=self.data_layer.connections,
             health=self._health.report,
         )
 
@@ -250,9 +222,9 @@ class Managed:
 
     def prepare(self) -> None:
         """Declare parameters and endpoints, and make the timers of `@on_timer` methods."""
-        matched = self.declared.match()
+        matched = match(type(self._node), self.data_layer.unhandled, node=self.full_name)
         parameters.declare(self._node, self.spec)
-        self.declared.enact(matched)
+        self.data_layer.prepare(functools.partial(matched.bound, self._node))
         for timer in matched.timers:
             method = getattr(self._node, timer.method)
             self._method_timers.append(self._node.create_timer(timer.period_s, method))
@@ -261,7 +233,7 @@ class Managed:
         """Undo `prepare`; parameters stay declared."""
         while self._method_timers:
             self._node.destroy_timer(self._method_timers.pop())
-        self.data_layer.undeclare()
+        self.data_layer.unprepare()
 
     def may_activate(self) -> bool:
         """Return True.

@@ -8,7 +8,6 @@ managed.py.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -30,10 +29,9 @@ from rclpy.timer import Timer
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import QosProfile
+from lifecycle.middleware.rcl.qos import from_rclpy
 from lifecycle.network.connection_url import ConnectionUrl
-from lifecycle.node import configuration
-from lifecycle.node.actions import resolve_action_name
-from lifecycle.node.author import declaring, parameters
+from lifecycle.node.author import parameters
 from lifecycle.node.author.blocking import refuse_to_deadlock
 from lifecycle.node.author.handlers import ActionHandler
 from lifecycle.node.author.managed import Managed
@@ -48,7 +46,8 @@ from lifecycle.node.author.spec import (
 )
 from lifecycle.node.connections.connection_status import ConnectionEvent
 from lifecycle.node.connections.connections import Connection, connections_of
-from lifecycle.node.endpoints.endpoint import EndpointOptions
+from lifecycle.node.endpoints.endpoint import EndpointOptions, Placement, interface_name
+from lifecycle.node.endpoints.making import resolve_name
 from lifecycle.node.endpoints.publisher import DeclaredPublisher
 from lifecycle.node.lifecycle.gate import GatedPublisher, GatedTimer, NodeGate
 from lifecycle.node.lifecycle.machine import NodeState
@@ -326,9 +325,8 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         Raises:
             LifecycleError: declared already, or not allowed (any more).
         """
-        profile = declaring.profile(qos)
         hints = (lossy, size_bytes)
-        self._declare(EndpointKind.PUBLISHER, name, msg_type, profile, hints=hints)
+        self._declare(EndpointKind.PUBLISHER, name, msg_type, qos, hints=hints)
 
     def declare_subscription(
         self,
@@ -345,10 +343,9 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         One that is declared after configure needs its `callback` given here. Otherwise as
         `declare_publisher`.
         """
-        profile = declaring.profile(qos)
         hints = (lossy, size_bytes)
         self._declare(
-            EndpointKind.SUBSCRIPTION, name, msg_type, profile, callback=callback, hints=hints
+            EndpointKind.SUBSCRIPTION, name, msg_type, qos, callback=callback, hints=hints
         )
 
     def declare_service(
@@ -406,7 +403,8 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         Raises:
             UnknownEndpointError: nothing, or more than one thing, is declared so.
         """
-        self.lifecycle.declared.hint(endpoint, lossy=lossy, size_bytes=size_bytes)
+        data_layer = self.lifecycle.data_layer
+        data_layer.hint(data_layer.find(endpoint), lossy, size_bytes)
 
     def set_options(
         self,
@@ -438,7 +436,7 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         """
         if isinstance(content_filter, str):
             content_filter = (content_filter, ())
-        self.lifecycle.declared.set_options(
+        self.lifecycle.data_layer.set_options(
             endpoint,
             EndpointOptions(
                 callback_group=callback_group,
@@ -454,25 +452,23 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         kind: EndpointKind,
         name: str,
         interface: type[Any],
-        qos: QosProfile | None = None,
+        qos: QosProfile | QoSProfile | int | None = None,
         *,
         callback: Callable[..., Any] | None = None,
         hints: tuple[bool | None, int | None] = (None, None),
     ) -> None:
-        resolve: Callable[[str], str]
-        if kind.is_action:
-            resolve = functools.partial(resolve_action_name, self)
-        else:
-            resolve = self.resolve_topic_name if kind.is_topic else self.resolve_service_name
-        endpoint = PlannedEndpoint(
+        if isinstance(qos, int):
+            qos = QosProfile(depth=qos)
+        planned = PlannedEndpoint(
             kind=kind,
             name=name,
-            resolved=resolve(name),
-            type=declaring.interface_name(interface),
-            qos=qos,
+            resolved=resolve_name(self, kind, name),
+            type=interface_name(interface),
+            qos=from_rclpy(qos) if isinstance(qos, QoSProfile) else qos,
             at=calling_position(depth=2),
         )
-        self.lifecycle.declared.declare(endpoint, callback=callback, hints=hints)
+        data_layer = self.lifecycle.data_layer
+        data_layer.hint(data_layer.declare(planned, callback), *hints)
 
     # The node interface, in callbacks from on_configure to cleanup.
 
@@ -541,7 +537,7 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
     @property
     def connections(self) -> tuple[ConnectionReport, ...]:
         """Every connection as it is now, the node's own participant (with the empty name) first."""
-        return configuration.connection_reports(self.lifecycle.spec, self.lifecycle.data_layer)
+        return self.lifecycle.get_configuration().connections
 
     @property
     def mappings(self) -> tuple[tuple[str, str | None], ...]:
@@ -560,7 +556,7 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         Returns:
             What ends it.
         """
-        return self.lifecycle.connection_events.listen(callback)
+        return self.lifecycle.data_layer.events.listen(callback)
 
     # The factories of rclpy: what they make is gated.
 
@@ -570,7 +566,7 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         """As rclpy's; what is published while the node is not active is dropped."""
         publisher = super().create_publisher(msg_type, topic, qos_profile, **options)
         if self._gate is not None:
-            self.lifecycle.undeclared.add(EndpointKind.PUBLISHER, publisher)
+            self._found(EndpointKind.PUBLISHER, publisher)
             self._gate.add(publisher, GatedPublisher(publisher, self.get_logger().warning))
         return publisher
 
@@ -589,7 +585,7 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         # /clock belongs to rclpy: simulated time must pass in every state.
         is_clock = isinstance(getattr(callback, "__self__", None), TimeSource)
         if self._gate is not None and not is_clock:
-            self.lifecycle.undeclared.add(EndpointKind.SUBSCRIPTION, subscription)
+            self._found(EndpointKind.SUBSCRIPTION, subscription)
             self._gate.add_subscription(subscription, self.lifecycle.turns.call_soon)
         return subscription
 
@@ -614,7 +610,7 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
             options["callback_group"] = self.lifecycle.turns.group
         client = super().create_client(srv_type, srv_name, **options)
         refuse_to_deadlock(client)
-        self.lifecycle.undeclared.add(EndpointKind.SERVICE_CLIENT, client)
+        self._found(EndpointKind.SERVICE_CLIENT, client)
         return client
 
     def create_service(
@@ -623,7 +619,7 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         """As rclpy's."""
         service = super().create_service(srv_type, srv_name, callback, **options)
         if self._gate is not None:
-            self.lifecycle.undeclared.add(EndpointKind.SERVICE_SERVER, service)
+            self._found(EndpointKind.SERVICE_SERVER, service)
         return service
 
     def destroy_publisher(self, publisher: Publisher) -> bool:
@@ -651,7 +647,11 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         self._forget(timer)
         return bool(super().destroy_timer(timer))
 
+    def _found(self, kind: EndpointKind, entity: Any) -> None:
+        own = self.lifecycle.data_layer.connections.own
+        self.lifecycle.found.add(kind, Placement(connection=own, entity=entity))
+
     def _forget(self, entity: object) -> None:
         if self._gate is not None:
             self._gate.remove(entity)
-            self.lifecycle.undeclared.remove(entity)
+            self.lifecycle.found.remove(entity)

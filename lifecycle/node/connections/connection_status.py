@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from lifecycle.node.connections.connections import Connection, Connections
+from lifecycle.node.connections.connections import Connection
 from lifecycle.node.endpoints.endpoint import Endpoint, Key, count_peers
 
 if TYPE_CHECKING:
@@ -62,12 +62,19 @@ Listener = Callable[[ConnectionEvent], Any]
 
 
 class ConnectionEvents:
-    """The listeners of one node's connection events."""
+    """What becomes of one node's connections and mappings, and who is called then.
 
-    def __init__(self, later: Later) -> None:
+    Args:
+        later: runs a function, sync or async, in the node's executor.
+        endpoints: every declared endpoint, as it is at any time.
+    """
+
+    def __init__(self, later: Later, endpoints: Mapping[Key, Endpoint]) -> None:
         self._later = later
+        self._endpoints = endpoints
         self._listeners: dict[object, Listener] = {}
         self._waiting: collections.deque[ConnectionEvent] = collections.deque()
+        self._established: set[str] = set()
 
     def listen(self, listener: Listener) -> Callable[[], None]:
         """Call `listener`, sync or async, with each event from now on; returns what ends that."""
@@ -94,48 +101,13 @@ class ConnectionEvents:
                 else:
                     listener(event)
 
-
-class ConnectionStatus:
-    """The status of one node's connections and mappings.
-
-    Args:
-        connections: of the node.
-        endpoints: every declared endpoint, as it is at any time.
-        notify: called with each event.
-    """
-
-    def __init__(
-        self,
-        connections: Connections,
-        endpoints: Mapping[Key, Endpoint],
-        notify: Callable[[ConnectionEvent], None],
-    ) -> None:
-        self._connections = connections
-        self._endpoints = endpoints
-        self._notify = notify
-        self._established: set[Connection] = set()
-
-    def on(self, connection: Connection) -> tuple[Endpoint, ...]:
-        """Return what is mapped onto a connection; flows of their own are the node's own."""
-        known = self._known(connection)
-        return tuple(
-            endpoint
-            for endpoint in self._endpoints.values()
-            if endpoint.connection is not None and self._known(endpoint.connection) is known
-        )
-
-    def established(self, connection: Connection) -> bool:
-        """Return whether a connection exists and every topic endpoint on it has a peer."""
-        topics = (each for each in self.on(connection) if each.kind.is_topic)
-        return not connection.error and all(each.peers for each in topics)
-
     def opened(self, connection: Connection) -> None:
         """A connection was made, or is there already."""
         self._judge(connection, lost=False)
 
     def closed(self, connection: Connection) -> None:
         """A connection with a name was removed."""
-        self._established.discard(connection)
+        self._established.discard(connection.name)
         self._report(ConnectionEventKind.CONNECTION_LOST, connection, unmade=True)
 
     def mapped(self, endpoint: Endpoint) -> None:
@@ -153,18 +125,14 @@ class ConnectionStatus:
         """Count the peers of a mapping again, and notify if they are more or fewer."""
         before = endpoint.peers or 0
         self._count(endpoint)
-        now = endpoint.peers or 0
-        if endpoint.connection is None or now == before:
+        now, connection = endpoint.peers or 0, endpoint.connection
+        if connection is None or now == before:
             return
         kind = ConnectionEventKind.MAPPING_ESTABLISHED
         if now < before:
             kind = ConnectionEventKind.MAPPING_LOST
-        self._report(kind, endpoint.connection, endpoint)
-        self._judge(endpoint.connection, lost=now < before)
-
-    def _known(self, connection: Connection) -> Connection:
-        """Return the connection as which others know it."""
-        return connection if connection.name else self._connections.own
+        self._report(kind, connection, endpoint)
+        self._judge(connection, lost=now < before)
 
     def _count(self, endpoint: Endpoint) -> None:
         if endpoint.kind.is_topic and endpoint.placement is not None:
@@ -178,7 +146,7 @@ class ConnectionStatus:
         *,
         unmade: bool = False,
     ) -> None:
-        self._notify(
+        self.notify(
             ConnectionEvent(
                 kind=kind,
                 connection=connection.name,
@@ -192,18 +160,23 @@ class ConnectionStatus:
     def _judge(self, connection: Connection, *, lost: bool) -> None:
         """Notify that a connection is established, or no longer.
 
-        What is mapped onto it and has no peer yet is no loss, and is not reported.
+        What is mapped onto it and has no peer yet is no loss, and is not reported. The node's own
+        participant is no connection before something is mapped onto it.
         """
-        known = self._known(connection)
-        is_own_and_empty = known is self._connections.own and not self.on(known)
-        established = self.established(known) and not is_own_and_empty
-        if established == (known in self._established):
+        on = [
+            each
+            for each in self._endpoints.values()
+            if each.connection is not None and each.connection.name == connection.name
+        ]
+        established = bool(connection.name or on) and all(
+            each.peers for each in on if each.kind.is_topic
+        )
+        if established == (connection.name in self._established):
             return
-        kind = ConnectionEventKind.CONNECTION_ESTABLISHED
         if established:
-            self._established.add(known)
+            self._established.add(connection.name)
+            self._report(ConnectionEventKind.CONNECTION_ESTABLISHED, connection)
         else:
-            self._established.discard(known)
-            kind = ConnectionEventKind.CONNECTION_LOST
-        if established or lost:
-            self._report(kind, known)
+            self._established.discard(connection.name)
+            if lost:
+                self._report(ConnectionEventKind.CONNECTION_LOST, connection)

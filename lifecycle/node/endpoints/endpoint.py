@@ -1,4 +1,4 @@
-"""One declared endpoint: what it is, how code wants it made, and where it is now.
+"""One endpoint of a node: what it is, how code wants it made, and where it is now.
 
 Owns: `Endpoint`; the meaning of a spelling in requests and messages (`video`, or
 `publishers/video`), and the error when it names nothing or too much; rclpy's matched events on our
@@ -9,7 +9,7 @@ something must not delay the event of a peer that appeared or left.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import msgspec
 from rclpy.event_handler import (
@@ -21,7 +21,9 @@ from rclpy.event_handler import (
 from rclpy.publisher import Publisher
 
 from lifecycle.errors import LifecycleError, nearest
+from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import EndpointKind
+from lifecycle.middleware.rcl.rclpy_nodes import interface_of
 from lifecycle.node.connections.connections import Connection
 from lifecycle.plan.model import PlannedEndpoint
 
@@ -31,7 +33,6 @@ if TYPE_CHECKING:
     from rclpy.service_introspection import ServiceIntrospectionState
     from rclpy.subscription import Subscription
 
-    from lifecycle.middleware.rcl.graph_changes import ServerWatch
     from lifecycle.node.endpoints.publisher import DeclaredPublisher
 
 
@@ -178,28 +179,38 @@ _FITTING = {
 }
 
 
+class Watch(Protocol):
+    """What notifies of the peers or the server of an endpoint."""
+
+    def stop(self) -> None:
+        """End it, before the endpoint is destroyed; again is harmless."""
+
+
 class Placement(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     """The rclpy object of an endpoint on one connection.
 
     Attributes:
-        watch: notifies of its peers or its server; None for service and action servers.
+        watch: notifies of its peers or its server; None where nothing is watched.
     """
 
     connection: Connection
     entity: Any
-    watch: MatchWatch | ServerWatch | None = None
+    watch: Watch | None = None
 
 
 class Endpoint(msgspec.Struct, kw_only=True, eq=False):
-    """One declared endpoint and where it is now.
+    """One endpoint and where it is now.
 
     Attributes:
-        planned: as it is declared.
-        interface: the message, service or action class.
+        planned: as it is declared; without a name if only the code that made it knows of it.
+        callback: its handler, where code gave one with the declaration.
+        interface: the message, service or action class, once it is imported.
         handler: takes messages, requests or goals; None where the kind has no handler.
         handle: what authors publish by; None for other kinds.
         placement: where it is; None while it is mapped nowhere.
+        is_late: it was declared after configure, and goes with cleanup.
         error: why it could not be made as asked; empty if it was.
+        fault: what its handler raised at the last goal of an action; empty if it returned.
         given_name: fully qualified, given by `remap`; empty for the name that was declared.
         peers: matched remote endpoints; None while mapped nowhere, and for services and actions.
         lossy: the author's hint: the data bear an unreliable transport; None without one.
@@ -208,11 +219,14 @@ class Endpoint(msgspec.Struct, kw_only=True, eq=False):
     """
 
     planned: PlannedEndpoint
-    interface: type[Any]
+    callback: Callable[..., Any] | None = None
+    interface: Any = None
     handler: Callable[..., Any] | None = None
     handle: DeclaredPublisher | None = None
     placement: Placement | None = None
+    is_late: bool = False
     error: str = ""
+    fault: str = ""
     given_name: str = ""
     peers: int | None = None
     lossy: bool | None = None
@@ -254,3 +268,33 @@ class Endpoint(msgspec.Struct, kw_only=True, eq=False):
     def connection(self) -> Connection | None:
         """Where it is mapped; None while it is nowhere."""
         return None if self.placement is None else self.placement.connection
+
+
+def found_endpoint(kind: EndpointKind, placement: Placement, at: Position) -> Endpoint:
+    """Return an endpoint that only the code that made it knows of.
+
+    Args:
+        kind: what it is.
+        placement: its rclpy object.
+        at: where its node is declared.
+    """
+    type_ = interface_name(interface_of(placement.entity))
+    resolved = wire_name(placement.entity)
+    planned = PlannedEndpoint(kind=kind, name="", resolved=resolved, type=type_, qos=None, at=at)
+    return Endpoint(planned=planned, placement=placement)
+
+
+def interface_name(interface: type[Any]) -> str:
+    """Return `package/msg/Type` of a generated class.
+
+    Raises:
+        LifecycleError: not a generated message, service or action class.
+    """
+    package, _, rest = interface.__module__.partition(".")
+    kind = rest.partition(".")[0]
+    if kind not in {"msg", "srv", "action"}:
+        raise LifecycleError(
+            f"cannot declare an endpoint of type {interface!r}; "
+            "give a message, service or action class such as std_msgs.msg.String"
+        )
+    return f"{package}/{kind}/{interface.__name__}"

@@ -23,7 +23,6 @@ from lifecycle.node.actions import Goals, resolve_action_name
 from lifecycle.node.author.blocking import refuse_to_block, refuse_to_deadlock
 from lifecycle.node.endpoints.endpoint import CLIENTS, Endpoint, wire_name
 from lifecycle.node.lifecycle.steps import positional_count
-from lifecycle.plan.model import PlannedEndpoint
 
 if TYPE_CHECKING:
     from lifecycle.node.connections.connections import Connection
@@ -38,12 +37,16 @@ class Maker:
         node: whose endpoints they are, and whose executor runs their callbacks.
         gate: holds subscriptions back; publishers are held back by their handles.
         turns: of the node's executor.
+        changed: called when what the node reports of an endpoint has changed.
     """
 
-    def __init__(self, node: Node, gate: NodeGate, turns: Turns) -> None:
+    def __init__(
+        self, node: Node, gate: NodeGate, turns: Turns, changed: Callable[[], None]
+    ) -> None:
         self._node = node
         self._gate = gate
         self._turns = turns
+        self._changed = changed
         self._goals: dict[int, Goals] = {}  # by id of the action server
 
     def make(self, endpoint: Endpoint, connection: Connection) -> Any:
@@ -52,27 +55,20 @@ class Maker:
         Raises:
             LifecycleError: the RMW refused, with its reason; nothing is left.
         """
-        makes: dict[EndpointKind, Callable[[Endpoint, Connection, str], Any]] = {
-            EndpointKind.PUBLISHER: self._publisher,
-            EndpointKind.SUBSCRIPTION: self._subscription,
-            EndpointKind.SERVICE_SERVER: self._service,
-            EndpointKind.SERVICE_CLIENT: self._client,
-            EndpointKind.ACTION_SERVER: self._action_server,
-            EndpointKind.ACTION_CLIENT: self._action_client,
-        }
         kind, introspection = endpoint.kind, endpoint.options.introspection
-        entity = makes[kind](endpoint, connection, self._name(endpoint, connection))
-        if connection.participant is not None:
-            # The hidden node is not spun: its events are handled where the node's own are.
-            for event in getattr(entity, "event_handlers", ()):
-                self._node.add_waitable(event)
+        make = self._served
+        if kind is EndpointKind.PUBLISHER:
+            make = self._publisher
+        elif kind is EndpointKind.SUBSCRIPTION:
+            make = self._subscription
+        entity = make(endpoint, connection, self._name(endpoint, connection))
         if introspection is not None:
             entity.configure_introspection(
                 self._node.get_clock(), qos_profile_system_default, introspection
             )
         made = wire_name(entity)
         if endpoint.given_name and made and made != endpoint.given_name:
-            self.unmake(endpoint.planned, entity, connection)
+            self.unmake(endpoint, entity, connection)
             raise LifecycleError(
                 f"cannot call {kind.noun} {endpoint.name!r} {endpoint.given_name!r}: a remapping "
                 f"rule that the node was started with makes it {made!r}",
@@ -80,44 +76,40 @@ class Maker:
             )
         return entity
 
-    def unmake(self, planned: PlannedEndpoint, entity: Any, connection: Connection) -> None:
+    def unmake(self, endpoint: Endpoint, entity: Any, connection: Connection) -> None:
         """Destroy an entity that `make` returned for an endpoint on a connection."""
         goals = self._goals.pop(id(entity), None)
         if goals is not None:
             goals.interrupt("it was taken off where it was mapped")
-            self._gate.remove(entity)
+        self._gate.remove(entity)
         if connection.participant is not None:
-            self._gate.remove(entity)
-            for event in getattr(entity, "event_handlers", ()):
-                self._node.remove_waitable(event)
             connection.participant.destroy_endpoint(entity)
-            return
-        destroys: dict[EndpointKind, Callable[[Any], object]] = {
-            EndpointKind.PUBLISHER: self._node.destroy_publisher,
-            EndpointKind.SUBSCRIPTION: self._node.destroy_subscription,
-            EndpointKind.SERVICE_SERVER: self._node.destroy_service,
-            EndpointKind.SERVICE_CLIENT: self._node.destroy_client,
-        }
-        if planned.kind.is_action:
+        elif endpoint.kind.is_action:
             entity.destroy()
+        elif endpoint.kind is EndpointKind.PUBLISHER:
+            self._node.destroy_publisher(entity)
+        elif endpoint.kind is EndpointKind.SUBSCRIPTION:
+            self._node.destroy_subscription(entity)
+        elif endpoint.kind is EndpointKind.SERVICE_SERVER:
+            self._node.destroy_service(entity)
         else:
-            destroys[planned.kind](entity)
+            self._node.destroy_client(entity)
 
-    def expand(self, planned: PlannedEndpoint, name: str) -> str:
+    def expand(self, endpoint: Endpoint, name: str) -> str:
         """Return a new name for an endpoint fully qualified; no remapping rule applies.
 
         Raises:
             LifecycleError: it cannot be a name.
         """
         resolve = self._node.resolve_service_name
-        if planned.kind.is_topic:
+        if endpoint.kind.is_topic:
             resolve = self._node.resolve_topic_name
         try:
             return str(resolve(name, only_expand=True))
         except Exception as error:
             reason = str(error).splitlines()[0].partition(", at /")[0]  # rcl's source file
             raise LifecycleError(
-                f"cannot call {planned.kind.noun} {planned.name!r} {name!r}: {reason}"
+                f"cannot call {endpoint.kind.noun} {endpoint.name!r} {name!r}: {reason}"
             ) from error
 
     def _publisher(self, endpoint: Endpoint, connection: Connection, name: str) -> Any:
@@ -153,87 +145,73 @@ class Maker:
         self._gate.add_subscription(entity, self._turns.call_soon)
         return entity
 
-    def _service(self, endpoint: Endpoint, connection: Connection, name: str) -> Any:
+    def _served(self, endpoint: Endpoint, connection: Connection, name: str) -> Any:
+        """Make an end of a service or an action."""
+        kind = endpoint.kind
+        makes = {
+            EndpointKind.SERVICE_SERVER: self._service,
+            EndpointKind.SERVICE_CLIENT: self._client,
+            EndpointKind.ACTION_SERVER: self._action_server,
+            EndpointKind.ACTION_CLIENT: self._action_client,
+        }
+        # rcl applies rules to an action's hidden names itself; torn apart, it is not made.
+        is_torn = kind.is_action and connection.participant is None
+        resolved = resolve_action_name(self._node, name) if is_torn else name
+        make = functools.partial(makes[kind], endpoint, name=name)
+        if connection.participant is None:
+            entity = make(self._node)
+        else:
+            entity = connection.participant.create(make, kind.noun, name)
+        if kind.is_action:
+            entity.action_name = resolved
+        return entity
+
+    def _service(self, endpoint: Endpoint, node: Node, *, name: str) -> Any:
         assert endpoint.handler is not None
-        options = {**self._group(endpoint), **_qos(endpoint)}
         handler = _answering(endpoint.handler)
-        service = self._made(
-            endpoint,
-            connection,
-            lambda node: node.create_service(endpoint.interface, name, handler, **options),
-        )
+        options = {"callback_group": self._group(endpoint), **_qos(endpoint)}
+        service = node.create_service(endpoint.interface, name, handler, **options)
         self._survive_late_answers(service, endpoint.name)
         return service
 
-    def _client(self, endpoint: Endpoint, connection: Connection, name: str) -> Any:
-        options = {**self._group(endpoint), **_qos(endpoint)}
-        client = self._made(
-            endpoint,
-            connection,
-            lambda node: node.create_client(endpoint.interface, name, **options),
-        )
-        if connection.participant is not None:  # the node's own factory has done it
+    def _client(self, endpoint: Endpoint, node: Node, *, name: str) -> Any:
+        options = {"callback_group": self._group(endpoint), **_qos(endpoint)}
+        client = node.create_client(endpoint.interface, name, **options)
+        if node is not self._node:  # the node's own factory has done it
             refuse_to_deadlock(client)
         return client
 
-    def _action_server(self, endpoint: Endpoint, connection: Connection, name: str) -> Any:
+    def _action_server(self, endpoint: Endpoint, node: Node, *, name: str) -> Any:
         from lifecycle.middleware.services.actions import GoalServer  # late: numpy, 100 ms
 
-        assert endpoint.handler is not None
-        goals = Goals(
-            self._node,
-            endpoint.name,
+        is_open, changed = lambda: self._gate.is_open, self._changed
+        goals = Goals(self._node, endpoint, is_open=is_open, changed=changed)
+        server = goals.server = GoalServer(
+            node,
             endpoint.interface,
-            endpoint.handler,
-            is_open=lambda: self._gate.is_open,
+            name,
+            goals.execute,
+            accept=goals.accept,
+            group=self._group(endpoint),
         )
-        group = self._group(endpoint)["callback_group"]
-
-        def make(node: Node) -> Any:
-            return GoalServer(
-                node, endpoint.interface, name, goals.execute, accept=goals.accept, group=group
-            )
-
-        server = goals.server = self._action(endpoint, connection, name, make)
         self._goals[id(server)] = goals
         self._gate.add_worker(server, goals)
         return server
 
-    def _action_client(self, endpoint: Endpoint, connection: Connection, name: str) -> Any:
+    def _action_client(self, endpoint: Endpoint, node: Node, *, name: str) -> Any:
         from lifecycle.middleware.services.actions import GoalClient
 
-        group = self._group(endpoint)["callback_group"]
+        group = self._group(endpoint)
+        return GoalClient(
+            node, endpoint.interface, name, group=group, refuse_to_block=refuse_to_block
+        )
 
-        def make(node: Node) -> Any:
-            return GoalClient(
-                node, endpoint.interface, name, group=group, refuse_to_block=refuse_to_block
-            )
-
-        return self._action(endpoint, connection, name, make)
-
-    def _action(
-        self, endpoint: Endpoint, connection: Connection, name: str, make: Callable[[Node], Any]
-    ) -> Any:
-        """Make an action server or client where it belongs, and have it know its name."""
-        # rcl applies rules to the hidden names itself; torn apart, the action is not made.
-        resolved = name if connection.participant else resolve_action_name(self._node, name)
-        action = self._made(endpoint, connection, make)
-        action.action_name = resolved
-        return action
-
-    def _made(self, endpoint: Endpoint, connection: Connection, make: Callable[[Node], Any]) -> Any:
-        """Have an end of a service or action made where it belongs."""
-        if connection.participant is None:
-            return make(self._node)
-        name = self._name(endpoint, connection)
-        return connection.participant.create(make, endpoint.kind.noun, name)
-
-    def _group(self, endpoint: Endpoint) -> dict[str, Any]:
-        """Return the keyword for a callback group: clients' answers arrive while callbacks run."""
+    def _group(self, endpoint: Endpoint) -> Any:
+        """Return its callback group: answers of clients arrive while callbacks run."""
         own = self._turns.group
         if endpoint.kind not in CLIENTS:
             own = self._node.default_callback_group
-        return {"callback_group": endpoint.options.callback_group or own}
+        return endpoint.options.callback_group or own
 
     def _name(self, endpoint: Endpoint, connection: Connection) -> str:
         """Return what an endpoint is called where it is made.
@@ -242,11 +220,7 @@ class Maker:
         """
         if endpoint.given_name or connection.participant is None:
             return endpoint.given_name or endpoint.name
-        if endpoint.kind.is_topic:
-            return str(self._node.resolve_topic_name(endpoint.name))
-        if endpoint.kind.is_action:
-            return resolve_action_name(self._node, endpoint.name)
-        return str(self._node.resolve_service_name(endpoint.name))
+        return resolve_name(self._node, endpoint.kind, endpoint.name)
 
     def _survive_late_answers(self, service: Any, name: str) -> None:
         """Let an answer after its server was destroyed be lost, not end the process."""
@@ -264,6 +238,14 @@ class Maker:
                 )
 
         service.send_response = send_response
+
+
+def resolve_name(node: Node, kind: EndpointKind, name: str) -> str:
+    """Return the fully qualified name of an endpoint of `node`, after its remapping rules."""
+    if kind.is_action:
+        return resolve_action_name(node, name)
+    resolve = node.resolve_topic_name if kind.is_topic else node.resolve_service_name
+    return str(resolve(name))
 
 
 def _qos(endpoint: Endpoint) -> dict[str, Any]:
