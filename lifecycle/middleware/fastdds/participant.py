@@ -110,8 +110,8 @@ class FlowParticipant:
     ) -> Publisher:
         """Create a publisher on this participant; `topic` should be fully qualified.
 
-        Events (matched, deadline, …) are only handled if an executor spins `self.node`; without
-        `event_callbacks` none are set up.
+        Events (matched, deadline, …) are handled where the node served is spun, else where
+        `self.node` is; without `event_callbacks` none are set up.
 
         Args:
             type_: message class.
@@ -128,6 +128,9 @@ class FlowParticipant:
         except BaseException:
             self.node.destroy_publisher(publisher)
             raise
+        if self._served is not None:
+            for event in publisher.event_handlers:
+                self._served.add_waitable(event)
         return publisher
 
     def create_subscription(
@@ -186,6 +189,9 @@ class FlowParticipant:
     def destroy_endpoint(self, entity: Publisher | hidden_node.MovedEndpoint) -> None:
         """Destroy an endpoint that was made here; again is harmless."""
         if isinstance(entity, Publisher):
+            if self._served is not None and entity in self.node.publishers:
+                for event in entity.event_handlers:
+                    self._served.remove_waitable(event)
             self.node.destroy_publisher(entity)
             return
         hidden_node.dismiss(entity, self._served or self.node)
