@@ -11,7 +11,6 @@ One costs about 2.5 MB, 7 threads, 6 sockets and 6–10 ms.
 
 from __future__ import annotations
 
-import time
 import typing
 from collections.abc import Callable
 from typing import Any
@@ -35,9 +34,6 @@ from lifecycle.middleware.rcl.abi import is_known
 from lifecycle.middleware.rcl.hidden_node import forget_hidden, quiet_node
 from lifecycle.middleware.rcl.qos import to_rclpy
 from lifecycle.network.nfe import NetworkFlowEndpoint
-
-_RELEASE_S = 0.2
-"""An executor that waits for endpoints lets go of them within a millisecond of being woken."""
 
 
 @typing.final
@@ -86,11 +82,9 @@ class FlowParticipant:
         self._served = served
         self._moved: list[hidden_node.MovedEndpoint] = []
         self._nfes: tuple[NetworkFlowEndpoint, ...] = ()
-        before = self._on_fixed_ports()
         # Without ROS arguments: endpoint names come here resolved.
         self._context: rclpy.Context | None
         self._context, self.node = quiet_node(name, namespace, domain_id, settings=self.settings)
-        self._fixed = self._on_fixed_ports() - before
         self.has_shared_memory = has_shared_memory(self.node)
         try:
             # Every publisher of a participant lists the same sender sockets; rclpy's parameter
@@ -220,8 +214,8 @@ class FlowParticipant:
     def destroy(self) -> None:
         """Destroy its endpoints, the hidden node and the participant; again is harmless.
 
-        When it returns, its fixed ports are free, if no callback blocks the executor that waits
-        for its endpoints.
+        Its ports are free as soon as an executor of another thread no longer waits for its
+        endpoints.
         """
         self._nfes = ()  # its ports may belong to another process from now on
         for entity in tuple(self._moved):
@@ -232,22 +226,6 @@ class FlowParticipant:
             self._context.try_shutdown()
             self._context.destroy()
             self._context = None
-        # An executor of another thread may still hold what it waits for.
-        deadline = time.monotonic() + _RELEASE_S
-        while self._fixed & self._on_fixed_ports() and time.monotonic() < deadline:
-            time.sleep(0.001)
-        self._fixed = set()
-
-    def _on_fixed_ports(self) -> set[int]:
-        """Return this process's sockets that have a port which the URLs name, by their inodes."""
-        ports = {
-            port
-            for url in self.settings.urls
-            for port in (url.port, url.metatraffic_port, url.output_port)
-            if port is not None
-        }
-        found = sockets.open_sockets() if ports else ()
-        return {each.inode for each in found if each.port in ports}
 
     def _receive(self, entity: hidden_node.MovedEndpoint) -> None:
         if self._served is not None:
