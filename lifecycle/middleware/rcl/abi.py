@@ -26,15 +26,9 @@ _ERROR_LOCATION = re.compile(r", at [^,]+?:\d+(?=,|$)")
 
 
 class Allocator(ctypes.Structure):
-    """rcutils_allocator_t."""
+    """rcutils_allocator_t: four functions and their state, which nothing here looks into."""
 
-    _fields_ = (
-        ("allocate", ctypes.c_void_p),
-        ("deallocate", ctypes.c_void_p),
-        ("reallocate", ctypes.c_void_p),
-        ("zero_allocate", ctypes.c_void_p),
-        ("state", ctypes.c_void_p),
-    )
+    _fields_ = (("words", ctypes.c_void_p * 5),)
 
 
 class Nfe(ctypes.Structure):
@@ -103,34 +97,15 @@ class SubscriptionOptions(ctypes.Structure):
 
 
 class _ContentFilter(ctypes.Structure):
-    """rcl_subscription_content_filter_options_t."""
+    """rcl_subscription_content_filter_options_t: expression, parameters and their number."""
 
-    _fields_ = (
-        ("expression", ctypes.c_void_p),
-        ("count", ctypes.c_size_t),
-        ("parameters", ctypes.c_void_p),
-        ("allocator", Allocator),
-    )
+    _fields_ = (("words", ctypes.c_void_p * 3), ("allocator", Allocator))
 
 
 class WaitSet(ctypes.Structure):
-    """rcl_wait_set_t."""
+    """rcl_wait_set_t: six arrays, each with its size, and a pointer; rcl alone looks into it."""
 
-    _fields_ = (
-        ("subscriptions", ctypes.c_void_p),
-        ("size_of_subscriptions", ctypes.c_size_t),
-        ("guard_conditions", ctypes.POINTER(ctypes.c_void_p)),
-        ("size_of_guard_conditions", ctypes.c_size_t),
-        ("timers", ctypes.c_void_p),
-        ("size_of_timers", ctypes.c_size_t),
-        ("clients", ctypes.c_void_p),
-        ("size_of_clients", ctypes.c_size_t),
-        ("services", ctypes.c_void_p),
-        ("size_of_services", ctypes.c_size_t),
-        ("events", ctypes.c_void_p),
-        ("size_of_events", ctypes.c_size_t),
-        ("impl", ctypes.c_void_p),
-    )
+    _fields_ = (("words", ctypes.c_void_p * 13),)
 
 
 class _ErrorString(ctypes.Structure):
