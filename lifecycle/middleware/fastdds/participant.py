@@ -28,7 +28,7 @@ from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.fastdds import nfe, sockets
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.middleware.fastdds.settings import has_shared_memory
-from lifecycle.middleware.fastdds.static_edp import find_endpoint
+from lifecycle.middleware.fastdds.static_edp import check_endpoint
 from lifecycle.middleware.rcl import hidden_node
 from lifecycle.middleware.rcl.abi import is_known
 from lifecycle.middleware.rcl.hidden_node import forget_hidden, quiet_node
@@ -92,7 +92,9 @@ class FlowParticipant:
             probe = next(iter(self.node.publishers))
             if self._dscp is not None or is_known():
                 self._nfes = nfe.senders_of(self.node)
-            self.ensure_dscp()
+            # No socket of Fast DDS 2.14 opens later (see `sockets`).
+            if self._dscp is not None:
+                sockets.set_dscp(self._nfes, self._dscp)
             # It would share the sockets that are to be unique.
             self.node.destroy_publisher(probe)
         except BaseException:
@@ -116,13 +118,7 @@ class FlowParticipant:
         self._check_static(type_, topic, writer=True)
         if not options.get("event_callbacks"):
             options["event_callbacks"] = PublisherEventCallbacks(use_default_callbacks=False)
-        publisher = self.node.create_publisher(type_, topic, to_rclpy(qos), **options)
-        try:
-            self.ensure_dscp()
-        except BaseException:
-            self.node.destroy_publisher(publisher)
-            raise
-        return publisher
+        return self.node.create_publisher(type_, topic, to_rclpy(qos), **options)
 
     def create_subscription(
         self,
@@ -146,11 +142,6 @@ class FlowParticipant:
         subscription = nfe.create_subscription(
             self.node, type_, topic, callback, qos, callback_group=callback_group, **options
         )
-        try:
-            self.ensure_dscp()
-        except BaseException:
-            self.node.destroy_subscription(subscription)
-            raise
         self._receive(subscription)
         return subscription
 
@@ -185,19 +176,6 @@ class FlowParticipant:
         hidden_node.dismiss(entity, self._served or self.node)
         if entity in self._moved:
             self._moved.remove(entity)
-
-    def ensure_dscp(self) -> None:
-        """Mark sender sockets that are not, or not any more; before an endpoint is handed out.
-
-        No socket of Fast DDS 2.14 opens later (see `lifecycle.middleware.fastdds.sockets`).
-
-        Raises:
-            MiddlewareError: the mark cannot be set.
-        """
-        if self._context is None or self._dscp is None:
-            return
-        if sockets.get_dscps(self._nfes) != {self._dscp}:
-            sockets.set_dscp(self._nfes, self._dscp)
 
     def read_dscp(self) -> int:
         """Return the DSCP (0–63) the kernel puts on what this participant sends; marks nothing.
@@ -237,7 +215,7 @@ class FlowParticipant:
         if not self.settings.static_endpoints:
             return
         package, kind = type_.__module__.split(".")[:2]
-        find_endpoint(
+        check_endpoint(
             self.settings.static_endpoints,
             writer=writer,
             profile=self.node.resolve_topic_name(topic),
