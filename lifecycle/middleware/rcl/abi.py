@@ -96,12 +96,6 @@ class SubscriptionOptions(ctypes.Structure):
     )
 
 
-class _ContentFilter(ctypes.Structure):
-    """rcl_subscription_content_filter_options_t: expression, parameters and their number."""
-
-    _fields_ = (("words", ctypes.c_void_p * 3), ("allocator", Allocator))
-
-
 class WaitSet(ctypes.Structure):
     """rcl_wait_set_t: six arrays, each with its size, and a pointer; rcl alone looks into it."""
 
@@ -210,21 +204,6 @@ class Rcl:
             subscription, node, type_support(type_), topic.encode(), ctypes.byref(options)
         )
         return int(made)
-
-    def filter(self, subscription: int, expression: str, parameters: Sequence[str]) -> int:
-        """Have the middleware take only what a content filter lets through; return the code."""
-        values = (ctypes.c_char_p * len(parameters))(*(each.encode() for each in parameters))
-        options = _ContentFilter()
-        at, pointer, integer = ctypes.byref(options), ctypes.c_void_p, ctypes.c_int
-        prefix = "rcl_subscription_content_filter_options"
-        arguments = (pointer, ctypes.c_char_p, ctypes.c_size_t, pointer, pointer)
-        init = bind("rcl", f"{prefix}_init", integer, arguments)
-        apply = bind("rcl", "rcl_subscription_set_content_filter", integer, (pointer, pointer))
-        end = bind("rcl", f"{prefix}_fini", integer, (pointer, pointer))
-        code = init(subscription, expression.encode(), len(parameters), values, at)
-        code = code or apply(subscription, at)
-        end(subscription, at)
-        return int(code)
 
     def _check_layout(self, version: str) -> None:
         """Compare what the libraries put into our structs with what must be there.
