@@ -8,7 +8,7 @@ managed.py.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from rclpy.callback_groups import CallbackGroup
@@ -413,7 +413,6 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         callback_group: CallbackGroup | None = None,
         event_callbacks: PublisherEventCallbacks | SubscriptionEventCallbacks | None = None,
         raw: bool = False,
-        content_filter: str | tuple[str, Sequence[str]] | None = None,
         introspection: ServiceIntrospectionState | None = None,
     ) -> None:
         """Say how a declared endpoint is made, as the arguments of rclpy's factories do.
@@ -426,23 +425,18 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
             event_callbacks: of a publisher or subscription: deadline, liveliness, incompatible QoS,
                 matched, …
             raw: a subscription's handler is given serialized bytes instead of a message.
-            content_filter: of a subscription: `"data > 5"`, or an expression with parameters,
-                `("frame_id = %0", ["'map'"])` (DDS 1.4, annex B).
             introspection: of a service server or client: what it publishes of each call.
 
         Raises:
             UnknownEndpointError: nothing, or more than one thing, is declared so.
             LifecycleError: its kind cannot have one of them, or it exists already.
         """
-        if isinstance(content_filter, str):
-            content_filter = (content_filter, ())
         self.lifecycle.data_layer.set_options(
             endpoint,
             EndpointOptions(
                 callback_group=callback_group,
                 event_callbacks=event_callbacks,
                 raw=raw,
-                content_filter=content_filter and (content_filter[0], tuple(content_filter[1])),
                 introspection=introspection,
             ),
         )

@@ -153,14 +153,12 @@ class EndpointOptions(msgspec.Struct, frozen=True, kw_only=True):
         callback_group: of its callback and its events; None for the node's own choice.
         event_callbacks: rclpy's PublisherEventCallbacks or SubscriptionEventCallbacks.
         raw: a subscription's handler is given serialized bytes.
-        content_filter: expression of a subscription, and the values of its parameters.
         introspection: of a service server or client (REP-2012).
     """
 
     callback_group: CallbackGroup | None = None
     event_callbacks: Any = None
     raw: bool = False
-    content_filter: tuple[str, tuple[str, ...]] | None = None
     introspection: ServiceIntrospectionState | None = None
 
     def refuse_unfit(self, kind: EndpointKind) -> None:
@@ -173,7 +171,6 @@ class EndpointOptions(msgspec.Struct, frozen=True, kw_only=True):
 
 _FITTING = {
     "raw": (EndpointKind.SUBSCRIPTION,),
-    "content_filter": (EndpointKind.SUBSCRIPTION,),
     "event_callbacks": (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION),
     "introspection": (EndpointKind.SERVICE_SERVER, EndpointKind.SERVICE_CLIENT),
 }

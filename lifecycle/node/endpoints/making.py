@@ -140,7 +140,6 @@ class Maker:
             callback_group=options.callback_group,
             event_callbacks=options.event_callbacks,
             raw=options.raw,
-            content_filter=options.content_filter,
         )
         self._gate.add_subscription(entity, self._turns.call_soon)
         return entity

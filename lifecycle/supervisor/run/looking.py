@@ -24,7 +24,6 @@ from lifecycle.errors import MiddlewareError, UsageError
 from lifecycle.export.captured import CapturedParameter, CapturedSystem, Programs, capture
 from lifecycle.export.picture.build import Supervised, build_picture
 from lifecycle.export.picture.model import Picture
-from lifecycle.graph.state import Look
 from lifecycle.manifest.model import DiscoveryRange, EndpointPolicy
 from lifecycle.middleware.discovery.environment import peers_environment
 from lifecycle.middleware.process.control import check_memory
@@ -378,20 +377,15 @@ async def _look(
         *(_ask(graph.clients, node, parameters=node.full_name in serving) for node in nodes)
     )
     names = [node.full_name for node in nodes]
-    graph.state.put_look(
-        Look(
-            nodes=nodes,
-            endpoints=endpoints,
-            answers={
-                name: (state, configuration)
-                for name, (state, configuration, _) in zip(names, answers, strict=True)
-            },
-        )
-    )
+    said = {
+        name: (state, configuration)
+        for name, (state, configuration, _) in zip(names, answers, strict=True)
+    }
     parameters = {
         name: each for name, (_, _, each) in zip(names, answers, strict=True) if name in serving
     }
-    return graph.state.observation(), parameters, unsettled, note_ended(programs)
+    observation = graph.state.observation(nodes, endpoints, said)
+    return observation, parameters, unsettled, note_ended(programs)
 
 
 async def _ask(
