@@ -1,5 +1,5 @@
-"""Programs networks from verified flows: `rules` renders their rules, `apply` installs them.
+"""Programs networks from verified flows: nftables and tc on this host, NEF and CAMARA over HTTP.
 
-`rules` is pure: nftables, tc, a NEF, CAMARA, CSV. `apply` has the targets, the
-ledger of what is ours in each, and HTTP. Must not import rclpy.
+`rules` says purely what each flow is to get; a target is one module, named in `target`. Targets
+touch only what a mark of theirs or the ledger says is ours. Must not import rclpy.
 """

@@ -215,11 +215,10 @@ def _settings(make: Make, place: Place) -> None:
     words = ("flows", "remove", str(folder / "m.lifecycle.yaml"))
     check(in_process(*words, variables={"XDG_RUNTIME_DIR": str(folder)}))
     from lifecycle.errors import LifecycleError
-    from lifecycle.programming.apply.settings import load_settings
-    from lifecycle.programming.apply.targets.registry import settings_types
+    from lifecycle.programming.settings import load_settings
 
     try:
-        load_settings(folder / "targets.json", settings_types())
+        load_settings(folder / "targets.json")
     except LifecycleError as error:
         if "\n" in str(error) or not str(error).isprintable():
             raise Unhandled(repr(str(error))) from error

@@ -24,20 +24,18 @@ from lifecycle.node.host.control import Event
 from lifecycle.plan.comparison import PlanNoticeError, notice_of
 from lifecycle.plan.comparison import decode as decode_notice
 from lifecycle.plan.comparison import encode as encode_notice
-from lifecycle.programming.apply.ledger import Ledger
-from lifecycle.programming.apply.settings import load_settings
-from lifecycle.programming.apply.target import ProgrammingError
-from lifecycle.programming.apply.targets.nft import root_qdiscs
-from lifecycle.programming.apply.targets.registry import settings_types
-from lifecycle.programming.apply.tool import HostTool, ToolOutput
-from lifecycle.programming.rules.nftables import parse_managed_comment
+from lifecycle.programming.ledger import Ledger
+from lifecycle.programming.nft import digest_of, root_qdiscs
+from lifecycle.programming.settings import load_settings
+from lifecycle.programming.target import Means, ProgrammingError
+from lifecycle.programming.tool import HostTool, ToolOutput
 from lifecycle.run_directory import read_record
 from lifecycle.supervisor.control.server import LookAnswer
 from lifecycle.supervisor.core.state import Order
 from lifecycle.verify.observation import ConfigurationError, decode_configuration
 from lifecycle.verify.verdict import Stage
-from tests.unit.programming.apply.fakes import FakeTool, failed
-from tests.unit.programming.apply.samples import nef_settings
+from tests.unit.programming.fakes import FakeTool, failed
+from tests.unit.programming.samples import nef_settings
 from tests.unit.verify.perfect import perfect
 from tests.unit.verify.test_verify_rules import PLAN
 
@@ -96,15 +94,14 @@ def _printed(data: bytes, folder: Path) -> object:
 
 
 def _tc(data: bytes, folder: Path) -> object:
-    from lifecycle.programming.apply.targets.tc import TcTarget
-    from lifecycle.programming.rules.tc import TcSettings
+    from lifecycle.programming.tc import TcSettings, TcTarget
 
     tool = FakeTool(
         ("tc", ToolOutput(returncode=0, stdout=_text(data), stderr="")),
         ("nft list", failed("Error: No such file or directory")),
     )
     settings = TcSettings(device="eth0", link_kbit=20_000)
-    return TcTarget("robot", settings, Ledger(folder, "robot"), tool).plan([])
+    return TcTarget(settings, Means(Ledger(folder, "robot")), tool).plan([])
 
 
 _SEEN = perfect(PLAN, Stage.ACTIVE)
@@ -186,12 +183,12 @@ READERS: dict[str, Reader] = {
     ),
     "settings of a server": Reader(
         good=json.dumps({"nef": nef_settings("https://nef.test")}).encode(),
-        read=_file("targets.json", lambda path: load_settings(str(path), settings_types())),
+        read=_file("targets.json", lambda path: load_settings(str(path))),
         errors=(LifecycleError,),
     ),
     "nft listing": Reader(
         good=b'table inet flowqos_a {\n comment "managed by lifecycle digest 0123456789abcdef"\n}',
-        read=lambda data, _: parse_managed_comment(_text(data)),
+        read=lambda data, _: digest_of(_text(data)),
         errors=(),
     ),
     "qdiscs of tc": Reader(good=_QDISCS, read=_qdiscs, errors=(ProgrammingError,)),

@@ -15,7 +15,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from lifecycle.programming.apply.target import PartlyError
+from lifecycle.programming.target import PartlyError
 from tests.hostile.attack import (
     Attack,
     Attacks,
@@ -29,9 +29,9 @@ from tests.hostile.attack import (
     started,
 )
 from tests.ros.supervisor.running import Up, marked, pair
-from tests.unit.programming.apply.samples import nef_settings, rule, settings_file
-from tests.unit.programming.apply.servers import TOKEN
-from tests.unit.programming.apply.test_hostile_servers import (
+from tests.unit.programming.samples import nef_settings, rule, settings_file
+from tests.unit.programming.servers import TOKEN
+from tests.unit.programming.test_hostile_servers import (
     SESSION,
     Behave,
     HostileServer,

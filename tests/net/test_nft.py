@@ -10,13 +10,13 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.programming.apply.ledger import Ledger
-from lifecycle.programming.apply.target import ChangeKind, NotOursError, PrivilegeError
-from lifecycle.programming.apply.targets.nft import NftTarget
-from lifecycle.programming.apply.tool import HostTool
-from lifecycle.programming.rules.rules import FlowRule
+from lifecycle.programming.ledger import Ledger
+from lifecycle.programming.nft import NftTarget
+from lifecycle.programming.rules import FlowRule
+from lifecycle.programming.target import ChangeKind, Means, NotOursError, PrivilegeError
+from lifecycle.programming.tool import HostTool
 from tests.net.hosts import Host
-from tests.unit.programming.apply.samples import ledger_in, rule
+from tests.unit.programming.samples import ledger_in, rule
 
 pytestmark = pytest.mark.skipif(shutil.which("nft") is None, reason="nft is not installed")
 
@@ -57,7 +57,7 @@ def bench(switched: tuple[Host, Host], tmp_path: Path) -> Iterator[Bench]:
     """The hosts, without any table."""
     one, other = switched
     ledger = ledger_in(tmp_path)
-    yield Bench(one, other, ledger, NftTarget("robot", ledger, HostTool(one.command())))
+    yield Bench(one, other, ledger, NftTarget(None, Means(ledger), HostTool(one.command())))
     one.run("nft", "flush", "ruleset")
 
 
@@ -187,7 +187,7 @@ def test_without_privilege_a_dry_run_is_checked_all_the_same_and_an_apply_says_w
     nobody = ("setpriv", "--reuid=65534", "--regid=65534", "--clear-groups", "--")
     tool = HostTool(bench.one.command(*nobody))
     allowed = tool.run(["unshare", "-Urn", "true"]).returncode == 0
-    target = NftTarget("robot", bench.ledger, tool)
+    target = NftTarget(None, Means(bench.ledger), tool)
 
     text = target.dry_run([flow(bench)])
     with pytest.raises(PrivilegeError) as caught:

@@ -11,20 +11,20 @@ from pathlib import Path
 
 import pytest
 
-from lifecycle.programming.apply.ledger import Ledger
-from lifecycle.programming.apply.target import (
+from lifecycle.programming.ledger import Ledger
+from lifecycle.programming.rules import FlowRule
+from lifecycle.programming.target import (
     ChangeKind,
+    Means,
     NotOursError,
     PrivilegeError,
     ProgrammingError,
     TargetChanges,
 )
-from lifecycle.programming.apply.targets.tc import TcTarget
-from lifecycle.programming.apply.tool import HostTool, ToolOutput
-from lifecycle.programming.rules.rules import FlowRule
-from lifecycle.programming.rules.tc import TcSettings
+from lifecycle.programming.tc import TcSettings, TcTarget
+from lifecycle.programming.tool import HostTool, ToolOutput
 from tests.net.hosts import Host
-from tests.unit.programming.apply.samples import ledger_in, rule
+from tests.unit.programming.samples import ledger_in, rule
 
 pytestmark = pytest.mark.skipif(
     not all(map(shutil.which, ("tc", "nft"))), reason="tc or nft is not installed"
@@ -42,9 +42,9 @@ class Bench:
     other: Host
     ledger: Ledger
 
-    def target(self, device: str = "e0", system: str = "robot", **settings: object) -> TcTarget:
+    def target(self, device: str = "e0", **settings: object) -> TcTarget:
         chosen = TcSettings(device=device, **{"link_kbit": 20_000, **settings})
-        return TcTarget(system, chosen, self.ledger, HostTool(self.one.command()))
+        return TcTarget(chosen, Means(self.ledger), HostTool(self.one.command()))
 
     def rule(
         self, topic: str = "/video", port: int = 17900, dscp: int = 46, **ends: str
@@ -213,8 +213,8 @@ def test_two_systems_do_not_share_a_device(bench: Bench, tmp_path: Path) -> None
     other = Bench(bench.one, bench.other, ledger_in(tmp_path, "arm"))
 
     with pytest.raises(NotOursError, match="made by lifecycle, but not for system 'arm'"):
-        other.target(system="arm").apply([bench.rule()])
-    other.target(system="arm").remove()
+        other.target().apply([bench.rule()])
+    other.target().remove()
 
     assert bench.root() == "qdisc htb 1f10:"
 
@@ -239,7 +239,7 @@ def test_without_privilege_one_line_says_what_is_needed(
 ) -> None:
     settings = TcSettings(device="e0", link_kbit=20_000)
     tool = HostTool(bench.one.command("setpriv", *without, "--"))
-    target = TcTarget("robot", settings, bench.ledger, tool)
+    target = TcTarget(settings, Means(bench.ledger), tool)
 
     # Looking needs no privilege.
     assert kinds(target.plan([bench.rule()])) == ["create"]
@@ -294,7 +294,7 @@ def test_a_batch_that_stops_half_way_is_taken_back_and_leaves_no_entry(bench: Be
     tool = StopsAt(bench.one, "parent 1f10:1 classid 1f10:fff htb")
 
     with pytest.raises(ProgrammingError, match="cannot program tc on e0"):
-        TcTarget("robot", settings, bench.ledger, tool).apply([bench.rule()])
+        TcTarget(settings, Means(bench.ledger), tool).apply([bench.rule()])
 
     assert everything(bench.one) == before
     assert bench.ledger.read().targets == ()
@@ -310,7 +310,7 @@ def test_a_change_that_stops_half_way_leaves_nothing_and_is_made_the_next_time(
     rules = [bench.rule(), bench.rule("/lidar", 17901, dscp=10)]
 
     with pytest.raises(ProgrammingError):
-        TcTarget("robot", settings, bench.ledger, StopsAt(bench.one, line)).apply(rules)
+        TcTarget(settings, Means(bench.ledger), StopsAt(bench.one, line)).apply(rules)
 
     assert everything(bench.one) == before
     assert bench.ledger.read().targets == ()

@@ -19,8 +19,8 @@ def test_networks_are_programmed_without_ros_and_loaded_without_httpx() -> None:
     code = (
         "import sys\n"
         "sys.modules['rclpy'] = sys.modules['httpx'] = None\n"
-        "import lifecycle.programming.apply.programmer\n"
-        "from lifecycle.programming.apply.targets.registry import read_targets\n"
+        "import lifecycle.programming.programmer\n"
+        "from lifecycle.programming.target import read_targets\n"
         "assert read_targets(['nft'], {})\n"
     )
     result = subprocess.run(
@@ -103,7 +103,7 @@ def test_those_that_choose_or_name_a_medium_know_it_and_all_others_ask_it() -> N
         "verify/judge.py",
         "verify/transport.py",
         "verify/view.py",
-        "programming/rules/rules.py",
+        "programming/rules.py",
         "middleware/fastdds/url_profile.py",  # what Fast DDS calls it
         "plan/negotiation/media.py",  # which medium two ends get
         "plan/negotiation/connecting.py",

@@ -36,14 +36,13 @@ from lifecycle.manifest.model import UniqueHow
 from lifecycle.network.dscp import describe
 from lifecycle.network.nfe import NetworkFlowEndpoint
 from lifecycle.printable import columns, json_text, lines, one_line
-from lifecycle.programming.rules.flows_csv import flows_to_csv
+from lifecycle.programming.flows_csv import flows_to_csv
 from lifecycle.verify.verdict import FlowReport
 
 if TYPE_CHECKING:
     from lifecycle.plan.model import Plan
-    from lifecycle.programming.apply.programmer import Programmer, Treatment
-    from lifecycle.programming.apply.target import TargetChanges
-    from lifecycle.programming.apply.targets.registry import TargetOptions
+    from lifecycle.programming.programmer import Programmer, Treatment
+    from lifecycle.programming.target import Chosen, TargetChanges
     from lifecycle.verify.verdict import Verdict
 
 _HEADS = (
@@ -114,9 +113,7 @@ def _ends(nfes: Sequence[NetworkFlowEndpoint]) -> str:
     return " ".join(dict.fromkeys(each.describe() for each in nfes)) or "unknown"
 
 
-def export(
-    plan: Plan, flows: Sequence[FlowReport], network: TargetOptions, treatment: Treatment
-) -> None:
+def export(plan: Plan, flows: Sequence[FlowReport], network: Chosen, treatment: Treatment) -> None:
     """Print flows as a network takes them; those that are not in it, and why, go to stderr.
 
     Raises:
@@ -124,9 +121,9 @@ def export(
     """
     rules = _open(plan, (), treatment).rules(flows)
     try:
-        text = network.export(rules, plan.system)
+        text = network.target.export(network.settings, rules, plan.system)
     except ValueError as error:
-        raise UsageError(str(error), hint=network.hint) from error
+        raise UsageError(str(error), hint=network.target.hint) from error
     click.echo(text, nl=False)
     _show_left_out(rules.left_out)
 
@@ -230,7 +227,7 @@ def _plan_of(target: str, assignments: tuple[str, ...]) -> Plan:
 def apply(
     plan: Plan,
     flows: Sequence[FlowReport],
-    options: Sequence[TargetOptions],
+    options: Sequence[Chosen],
     *,
     dry_run: bool,
     treatment: Treatment | None = None,
@@ -239,7 +236,7 @@ def apply(
 
     What is made stays until `remove`, or until the system is brought down.
     """
-    from lifecycle.programming.apply.target import PartlyError
+    from lifecycle.programming.target import PartlyError
 
     programmer = _open(plan, options, treatment)
     if dry_run:
@@ -259,7 +256,7 @@ def apply(
 def diff(
     plan: Plan,
     flows: Sequence[FlowReport],
-    options: Sequence[TargetOptions],
+    options: Sequence[Chosen],
     *,
     treatment: Treatment | None = None,
 ) -> int:
@@ -341,10 +338,10 @@ def _remove(manifest: str, assignments: tuple[str, ...]) -> int:
 
 def _read(
     targets: tuple[str, ...], given: Mapping[str, Any], option: str = "--target"
-) -> tuple[tuple[TargetOptions, ...], Treatment]:
+) -> tuple[tuple[Chosen, ...], Treatment]:
     """Read the options of networks, and of what flows get, before anything is looked at."""
-    from lifecycle.programming.apply.programmer import read_treatment
-    from lifecycle.programming.apply.targets.registry import read_targets
+    from lifecycle.programming.programmer import read_treatment
+    from lifecycle.programming.target import read_targets
 
     given = dict(given)
     mapping, flow_labels = given.pop("mapping"), given.pop("flow_labels")
@@ -363,10 +360,8 @@ def _judged(manifest: str, assignments: tuple[str, ...], timeout_s: float) -> tu
     return seen.plan, seen.verdict
 
 
-def _open(
-    plan: Plan, options: Sequence[TargetOptions], treatment: Treatment | None = None
-) -> Programmer:
-    from lifecycle.programming.apply.programmer import open_programmer
+def _open(plan: Plan, options: Sequence[Chosen], treatment: Treatment | None = None) -> Programmer:
+    from lifecycle.programming.programmer import open_programmer
 
     return open_programmer(plan, options, environment=os.environ, treatment=treatment)
 

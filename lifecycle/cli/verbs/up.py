@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from lifecycle.cli.up_output import RunOutput
-    from lifecycle.programming.apply.programmer import Treatment
-    from lifecycle.programming.apply.targets.registry import TargetOptions
+    from lifecycle.programming.programmer import Treatment
+    from lifecycle.programming.target import Chosen
     from lifecycle.supervisor.processes.fork_server_process import ForkServerProcess
     from lifecycle.supervisor.run.options import UpResult
 
@@ -177,12 +177,14 @@ def command(
         return ended.exit_code
 
 
-def _fork_server(program: tuple[TargetOptions, ...]) -> ForkServerProcess:
+def _fork_server(program: tuple[Chosen, ...]) -> ForkServerProcess:
     from lifecycle.supervisor.processes.fork_server_process import ForkServerProcess
 
     tokens: frozenset[str] = frozenset()
     if program:  # their secrets, which nothing that is started shall have
-        tokens = frozenset().union(*(each.token_variables() for each in program))
+        tokens = frozenset().union(
+            *(each.target.token_variables(each.settings) for each in program)
+        )
     return ForkServerProcess(without=tokens, programs=bool(program))
 
 
@@ -193,18 +195,18 @@ def _finished(result: UpResult, listener: RunOutput, written: ReportFile) -> Exi
     return result.exit_code or unwritten
 
 
-def _networks(targets: tuple[str, ...], **given: Any) -> tuple[TargetOptions, ...]:
+def _networks(targets: tuple[str, ...], **given: Any) -> tuple[Chosen, ...]:
     """What programs networks takes long to import, so only where it is asked for."""
     if not targets and not any(given.values()):
         return ()
-    from lifecycle.programming.apply.targets.registry import read_targets
+    from lifecycle.programming.target import read_targets
 
     return read_targets(targets, given, option="--program")
 
 
 def _treatment(targets: tuple[str, ...], *, mapping: str, flow_labels: bool) -> Treatment | None:
     if targets:
-        from lifecycle.programming.apply.programmer import read_treatment
+        from lifecycle.programming.programmer import read_treatment
 
         return read_treatment(mapping, label_flows=flow_labels)
     if mapping or flow_labels:

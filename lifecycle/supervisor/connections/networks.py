@@ -27,7 +27,7 @@ from lifecycle.verify.rules.run import NOT_PROGRAMMED
 from lifecycle.verify.verdict import FlowReport, Verdict
 
 if TYPE_CHECKING:
-    from lifecycle.programming.apply.programmer import Programmer, Removal
+    from lifecycle.programming.programmer import Programmer, Removal
 
 _AGAIN_S = (2.0, 60.0)
 """First and longest pause after a failure."""
@@ -115,18 +115,18 @@ class Networks:
             hurry: once set, no server is waited for any more.
         """
         self._begun = False
-        removes: Programmer | Removal | None = self._programmer
+        removes: Removal | None = self._programmer
         try:
             await self._stop()
         finally:
             if removes is None and (self._directory / LEDGER_NAME).is_file():
-                from lifecycle.programming.apply.programmer import Removal
+                from lifecycle.programming.programmer import removal_of
 
-                removes = Removal(self._directory)
+                removes = removal_of(self._directory)
             if removes is not None:
                 await self._remove(removes, hurry)
 
-    async def _remove(self, removes: Programmer | Removal, hurry: asyncio.Event) -> None:
+    async def _remove(self, removes: Removal, hurry: asyncio.Event) -> None:
         """Remove everything, in the thread and within CLOSE_S for all servers together."""
         is_late = hurry.is_set()
         within_s = _HURRIED_S if is_late else CLOSE_S
@@ -238,7 +238,7 @@ def open_networks(
     path = directory.path
     if not options.program:
         return Networks(plan.system, path, emit)
-    from lifecycle.programming.apply.programmer import open_programmer, sweep_orphans
+    from lifecycle.programming.programmer import open_programmer, sweep_orphans
 
     programmer = open_programmer(
         plan,
@@ -267,6 +267,6 @@ def remove_programmed(directory: Path, within_s: float) -> None:
         ProgrammingError: something could not be removed; it stays listed.
     """
     if (directory / LEDGER_NAME).is_file():
-        from lifecycle.programming.apply.programmer import Removal
+        from lifecycle.programming.programmer import removal_of
 
-        Removal(directory).close(within_s=within_s)
+        removal_of(directory).close(within_s=within_s)

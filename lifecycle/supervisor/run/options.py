@@ -25,8 +25,8 @@ from lifecycle.verify.verdict import Verdict
 from lifecycle.verify.view import only_shared_memory
 
 if TYPE_CHECKING:
-    from lifecycle.programming.apply.programmer import Treatment
-    from lifecycle.programming.apply.targets.registry import TargetOptions
+    from lifecycle.programming.programmer import Treatment
+    from lifecycle.programming.target import Chosen
 
 
 TIMEOUT_S = 30.0
@@ -67,7 +67,7 @@ class UpOptions(msgspec.Struct, frozen=True, kw_only=True):
     strict: bool = False
     machine: str = ""
     keep_going: bool = False
-    program: tuple[TargetOptions, ...] = ()
+    program: tuple[Chosen, ...] = ()
     treatment: Treatment | None = None
     adopt: bool = False
 

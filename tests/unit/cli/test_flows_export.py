@@ -12,11 +12,11 @@ from lifecycle.cli.common import NETWORKS
 from lifecycle.cli.verbs import flows as verb
 from lifecycle.cli.verbs import up
 from lifecycle.errors import UsageError
-from lifecycle.programming.apply.programmer import read_treatment
-from lifecycle.programming.apply.targets.registry import TARGETS, read_targets
+from lifecycle.programming.programmer import read_treatment
+from lifecycle.programming.target import TARGETS, read_targets
 from lifecycle.verify.verdict import FlowReport
-from tests.unit.programming.apply.samples import camara_settings, nef_settings, settings_file
-from tests.unit.programming.rules.samples import plan, report
+from tests.unit.programming.flow_samples import plan, report
+from tests.unit.programming.samples import camara_settings, nef_settings, settings_file
 
 
 def export(name: str, *flows: FlowReport, **given: object) -> None:

@@ -10,17 +10,16 @@ from click.testing import CliRunner
 
 from lifecycle.cli.verbs import flows as flows_verb
 from lifecycle.errors import ExitCode, UsageError
-from lifecycle.programming.apply.programmer import read_treatment
-from lifecycle.programming.apply.target import MissingFeatureError
-from lifecycle.programming.apply.targets.registry import TargetOptions, read_targets, target_kind
+from lifecycle.programming.programmer import read_treatment
+from lifecycle.programming.target import Chosen, MissingFeatureError, read_targets
 from tests.builders import nfe
-from tests.unit.programming.apply.samples import nef_settings, settings_file
-from tests.unit.programming.apply.servers import TOKEN, NefServer
-from tests.unit.programming.rules.samples import plan, report
+from tests.unit.programming.flow_samples import plan, report
+from tests.unit.programming.samples import nef_settings, settings_file
+from tests.unit.programming.servers import TOKEN, NefServer
 
 
 @pytest.fixture
-def options(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[TargetOptions, ...]:
+def options(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Chosen, ...]:
     """A NEF that is named in the environment's own run directory; its server is not there."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     monkeypatch.setenv("TEST_TOKEN", TOKEN)
@@ -28,9 +27,9 @@ def options(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[TargetOpti
     return ()
 
 
-def nef_options(tmp_path: Path, url: str) -> tuple[TargetOptions, ...]:
+def nef_options(tmp_path: Path, url: str) -> tuple[Chosen, ...]:
     settings = nef_settings(url, devices=["10.77.0.1"])
-    return (target_kind("nef").read({"config": settings_file(tmp_path, nef=settings)}),)
+    return (read_targets(["nef"], {"config": settings_file(tmp_path, nef=settings)})[0],)
 
 
 def test_a_subcommand_is_a_subcommand_and_everything_else_is_shown() -> None:
@@ -101,7 +100,7 @@ def test_without_httpx_a_server_is_refused_by_the_name_of_the_extra(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     options = nef_options(tmp_path, "http://127.0.0.1:9")
-    monkeypatch.setattr("lifecycle.programming.apply.http.httpx", None)
+    monkeypatch.setattr("lifecycle.programming.http.httpx", None)
 
     with pytest.raises(MissingFeatureError) as caught:
         flows_verb.apply(plan(), [report()], options, dry_run=False)

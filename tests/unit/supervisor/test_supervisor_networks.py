@@ -13,14 +13,14 @@ import pytest
 
 from lifecycle.errors import ExitCode
 from lifecycle.plan.model import Plan
-from lifecycle.programming.apply.programmer import open_programmer
-from lifecycle.programming.apply.target import (
+from lifecycle.programming.programmer import open_programmer
+from lifecycle.programming.target import (
     ChangeKind,
     FlowChange,
     PrivilegeError,
     TargetChanges,
+    read_targets,
 )
-from lifecycle.programming.apply.targets.registry import target_kind
 from lifecycle.run_directory import OWN_CHILD, RunDirectory, new_run_id, run_name
 from lifecycle.supervisor.connections.networks import Networks, open_networks
 from lifecycle.supervisor.control.client import down
@@ -30,9 +30,9 @@ from lifecycle.supervisor.run.failure import StepFailedError
 from lifecycle.supervisor.run.options import UpOptions
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import FlowReport, Stage, Verdict
-from tests.unit.programming.apply.samples import nef_settings, settings_file
-from tests.unit.programming.apply.servers import TOKEN, NefServer
-from tests.unit.programming.rules.samples import plan, report
+from tests.unit.programming.flow_samples import plan, report
+from tests.unit.programming.samples import nef_settings, settings_file
+from tests.unit.programming.servers import TOKEN, NefServer
 
 _BOUND_S = 5.0
 REAL_TIME = True
@@ -178,7 +178,7 @@ class Applied:
     def __init__(self, directory: Path, server: NefServer) -> None:
         self.server = server
         settings = nef_settings(server.url, devices=["10.77.0.1"])
-        self.options = target_kind("nef").read({"config": settings_file(directory, nef=settings)})
+        self.options = read_targets(["nef"], {"config": settings_file(directory, nef=settings)})[0]
         self.root = directory / "lifecycle"
         self.environment = {"XDG_RUNTIME_DIR": str(directory)}
 

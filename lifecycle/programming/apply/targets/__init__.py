@@ -1,1 +1,0 @@
-"""Networks that can be programmed, one module each; registry.py lists them."""

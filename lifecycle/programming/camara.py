@@ -1,0 +1,264 @@
+"""CAMARA QualityOnDemand over HTTP: one session per flow and device, renewed before it expires.
+
+Owns: the paths of QualityOnDemand 1.1.0, its bodies, the states of a session and when it is
+prolonged.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import json
+import re
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec.structs import replace
+
+from lifecycle.errors import LifecycleError
+from lifecycle.programming.http import ID_PATTERN, text_of
+from lifecycle.programming.ledger import Entry
+from lifecycle.programming.rules import FlowRule
+from lifecycle.programming.server import Body, DeviceEnd, Made, ServerTarget, class_name
+from lifecycle.programming.settings import ServerSettings
+from lifecycle.programming.target import HttpError, Means, PartlyError
+
+_COMPARED = {
+    "applicationServer": "application_server",
+    "devicePorts": "device_ports",
+    "applicationServerPorts": "application_server_ports",
+    "qosProfile": "qos_profile",
+}
+
+_MARGIN = 0.2
+"""A session is prolonged when this part of what was asked for is left, …"""
+
+_MARGIN_S = (5.0, 300.0)
+"""… but at least and at most so many seconds before it expires."""
+
+_POLL_S = 0.25
+
+_SETTLED_S = 10.0
+"""How long a session may take to become available."""
+
+_LONGEST_S = 2**31 - 1
+"""Largest `duration`, an int32."""
+
+
+class CamaraSettings(ServerSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How to reach a CAMARA QualityOnDemand 1.1.0 interface and what to ask it for.
+
+    Attributes:
+        url: everything before `/sessions`.
+        qos_profiles: the provider's names of profiles, by 5QI.
+        default_qos_profile: for flows whose 5QI is not named; empty leaves them out.
+        duration_s: 1–2147483647; sessions are renewed, or they expire.
+        device_by_token: the access token names the device (three-legged), so that the body must
+            not: a server answers 422 UNNECESSARY_IDENTIFIER otherwise.
+    """
+
+    qos_profiles: dict[int, str] = msgspec.field(default_factory=dict)
+    default_qos_profile: str = ""
+    duration_s: int = 3600
+    device_by_token: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for profile in filter(None, (*self.qos_profiles.values(), self.default_qos_profile)):
+            if not re.fullmatch(r"[a-zA-Z0-9_.-]{3,256}", profile):
+                raise ValueError(
+                    f"cannot use qosProfile {profile!r}; "
+                    "use 3 to 256 letters, digits, '_', '.' and '-', such as QOS_E"
+                )
+        if not 1 <= self.duration_s <= _LONGEST_S:
+            raise ValueError(f"cannot use a duration of {self.duration_s} s; use 1 to {_LONGEST_S}")
+
+
+class _Session(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
+    """SessionInfo of QualityOnDemand 1.1.0, as far as it is read; None is not shown."""
+
+    session_id: Annotated[str, msgspec.Meta(pattern=ID_PATTERN)]
+    qos_status: Literal["REQUESTED", "AVAILABLE", "UNAVAILABLE"]
+    status_info: str | None = None
+    duration: Annotated[int, msgspec.Meta(ge=1, le=_LONGEST_S)] | None = None
+    expires_at: Annotated[dt.datetime, msgspec.Meta(tz=True)] | None = None
+    application_server: Any = None
+    device_ports: Any = None
+    application_server_ports: Any = None
+    qos_profile: Any = None
+
+    @property
+    def why(self) -> str:
+        """Why it ended."""
+        return text_of(self.status_info) or "no reason given"
+
+
+class CamaraTarget(ServerTarget):
+    """One QualityOnDemand interface."""
+
+    kind = "camara"
+    settings_type = CamaraSettings
+    collection = "/sessions"
+
+    def __init__(self, settings: str, means: Means) -> None:
+        super().__init__(settings, means)
+        self._expires: dict[str, tuple[float, float]] = {}
+        """By key, when a session expires: since the epoch, and on the clock that goes forward."""
+
+    @staticmethod
+    def body(rule: FlowRule, end: DeviceEnd, settings: CamaraSettings) -> Body:
+        """Return the body of a CreateSession (QualityOnDemand 1.1.0).
+
+        It has no protocol and no direction: it treats what goes between a device's ports and a
+        server's ports, both ways, UDP and TCP alike.
+        """
+        profile = class_name(
+            rule, settings.qos_profiles, settings.default_qos_profile, setting="qos_profiles"
+        )
+        address = {"publicAddress": end.device, "privateAddress": end.device}
+        device: Body = {"ipv4Address": address}
+        if end.is_ipv6:
+            device = {"ipv6Address": end.device}
+        return {
+            **({} if settings.device_by_token else {"device": device}),
+            "applicationServer": {"ipv6Address" if end.is_ipv6 else "ipv4Address": end.server},
+            "devicePorts": {"ports": [end.device_port]},
+            "applicationServerPorts": {"ports": [end.server_port]},
+            "qosProfile": profile,
+            "duration": settings.duration_s,
+        }
+
+    def create(self, body: Body) -> Made:
+        """POST it and wait a little until it is available.
+
+        Raises:
+            HttpError: refused, or the network cannot provide it.
+        """
+        reply = self._api.request("POST", self.collection, body)
+        session = reply.read(_Session)
+        id_ = session.session_id
+        try:
+            session = self._settled(session)
+            if session.qos_status != "UNAVAILABLE":
+                return self._made(session, body)
+            self.delete(id_)
+        except HttpError as error:
+            error.uncertain = True  # it was made, whatever became of asking for its state
+            raise
+        raise HttpError(
+            f"cannot get this QoS: the network made session {id_} unavailable ({session.why})",
+            status=reply.status,
+        )
+
+    def find(self, body: Body) -> Made | None:
+        """Look through the device's sessions for one that asks for the same."""
+        asked = {"device": body["device"]} if "device" in body else {}
+        reply = self._api.request("POST", "/retrieve-sessions", asked, may_be_gone=True)
+        for each in () if reply.gone else reply.read(tuple[_Session, ...]):
+            if not _differs(body, each, missing=True):
+                return self._made(each, body)
+        return None
+
+    def see(self, id_: str, body: Body) -> Made | None:
+        """GET it; one that has ended counts as different, for it has to be deleted first."""
+        reply = self._api.request("GET", self.path(id_), may_be_gone=True)
+        return None if reply.gone else self._made(reply.read(_Session), body)
+
+    def update(self, id_: str, before: Body, body: Body) -> Made:  # noqa: ARG002 - ServerTarget
+        """Delete and create: a session cannot be changed, and two for one flow are a conflict."""
+        self.delete(id_)
+        return self.create(body)
+
+    def renew(self) -> float | None:
+        """Prolong sessions that are due; return seconds until the next is.
+
+        Raises:
+            PartlyError: something could not be prolonged and will expire or has expired.
+        """
+        errors: list[tuple[str, LifecycleError]] = []
+        for entry in self._entries().values():
+            due_s = self._due_in_s(entry)
+            if not entry.id or due_s is None or due_s > 0:
+                continue
+            try:
+                made = self._prolonged(entry, json.loads(entry.body))
+            except LifecycleError as error:
+                errors.append((entry.key, error))
+            else:
+                self._note(replace(entry, id=made.id, expires_s=made.expires_s))
+        if errors:
+            raise PartlyError(self.name, len(self._entries()), errors)
+        due = [self._due_in_s(each) for each in self._entries().values()]
+        return min((each for each in due if each is not None), default=None)
+
+    def _prolonged(self, entry: Entry, body: Body) -> Made:
+        """Extend a session; make a new one where it cannot be extended any further."""
+        try:
+            reply = self._api.request(
+                "POST",
+                f"{self.path(entry.id)}/extend",
+                {"requestedAdditionalDuration": self._server.duration_s},
+                may_be_gone=True,
+            )
+        except HttpError as error:
+            # Not in a state to be extended, or over the profile's limit.
+            if error.status not in (400, 409):
+                raise
+        else:
+            if not reply.gone:
+                made = self._made(reply.read(_Session), body)
+                if made.expires_s is not None and made.expires_s > (entry.expires_s or 0.0) + 1:
+                    return made
+        return self.update(entry.id, body, body)
+
+    def _due_in_s(self, entry: Entry) -> float | None:
+        """Return seconds until a session must be prolonged; negative once it is late."""
+        if entry.expires_s is None:
+            return None
+        least, most = _MARGIN_S
+        margin_s: float = min(max(_MARGIN * self._server.duration_s, least), most)
+        clock = self._api.clock
+        left_s, now_s = entry.expires_s - clock.now_s(), clock.steady_s()
+        # A clock that is set back meanwhile makes no session last longer.
+        known = self._expires.get(entry.key)
+        if known is None or known[0] != entry.expires_s:
+            known = self._expires[entry.key] = entry.expires_s, now_s + left_s
+        return min(left_s, known[1] - now_s) - margin_s
+
+    def _settled(self, session: _Session) -> _Session:
+        """Ask until the session is more than requested, for a while."""
+        wait_s = _POLL_S
+        deadline_s = self._api.clock.steady_s() + _SETTLED_S
+        path = self.path(session.session_id)
+        while session.qos_status == "REQUESTED":
+            left_s = deadline_s - self._api.clock.steady_s()
+            if left_s <= 0:
+                break
+            self._api.pause(min(wait_s, left_s))
+            wait_s *= 2
+            session = self._api.request("GET", path).read(_Session)
+        return session
+
+    def _made(self, session: _Session, body: Body) -> Made:
+        id_, granted = session.session_id, session.duration
+        if session.qos_status == "UNAVAILABLE":
+            return Made(id=id_, differs=f"it ended: {session.why}")
+        detail = "requested, not yet available" if session.qos_status == "REQUESTED" else ""
+        if granted is not None and granted < self._server.duration_s:
+            detail = f"granted for {granted} s instead of {self._server.duration_s} s"
+        # The latest that it can end, if nothing says when.
+        expires_s = None if granted is None else self._api.clock.now_s() + granted
+        if session.expires_at is not None:
+            expires_s = session.expires_at.timestamp()
+        return Made(id=id_, expires_s=expires_s, detail=detail, differs=_differs(body, session))
+
+
+def _differs(asked: Body, seen: _Session, *, missing: bool = False) -> str:
+    """Why what the server shows is not what was asked for; empty if it is."""
+    for key, field in _COMPARED.items():
+        found = getattr(seen, field)
+        if (found is not None or missing) and found != asked.get(key):
+            return f"the server has {key} {text_of(str(found))!r}"
+    return ""
+
+
+TARGET = CamaraTarget

@@ -1,0 +1,398 @@
+"""HTTP to a network's exposure interface: one request at a time, with a deadline, retries, checks.
+
+Owns: which answers are tried again and when, that a token goes to one server only and into no log,
+that no server holds a request up past its deadline, and how a refusal and an answer that cannot be
+used read: every one of them is an `HttpError` that names the request and the field. Knows nothing
+of what is asked for.
+"""
+
+from __future__ import annotations
+
+import email.utils
+import os
+import re
+import zlib
+from collections.abc import Mapping
+from typing import Any, TypeVar
+from urllib.parse import quote, unquote, urlsplit
+
+import msgspec
+
+from lifecycle.codec import from_json, to_json
+from lifecycle.network.nfe import is_loopback
+from lifecycle.programming.patience import Clock, Deadline, Patience
+from lifecycle.programming.settings import Token, readable
+from lifecycle.programming.target import HttpError, MissingFeatureError, SettingsError
+
+try:
+    import httpx
+except ModuleNotFoundError:  # an extra: most systems program no network that is reached over HTTP
+    httpx = None  # type: ignore[assignment]
+
+MERGE_PATCH = "application/merge-patch+json"
+"""RFC 7396; what TS 29.122 wants of PATCH."""
+
+ID_PATTERN = r"^[!-~]{1,512}$"
+"""The id of a subscription or a session; CAMARA's are UUIDs."""
+
+_IDEMPOTENT = frozenset({"GET", "PUT", "DELETE", "PATCH"})
+"""RFC 9110 §9.2.2, and PATCH: a merge patch that is applied twice gives the same."""
+
+_ALWAYS_AGAIN = frozenset({409, 429, 503})
+_PASSING = frozenset({500, 502, 504})
+_MAX_QUOTED = 300
+_LARGEST_ANSWER = 4 * 1024 * 1024
+"""Bytes, unpacked: answers are a session or a subscription each, and a list of them all when one
+was lost."""
+
+_PACKED = {"gzip": 31, "x-gzip": 31, "deflate": 15}
+"""Content codings that are unpacked, though none is asked for, with zlib's name for each
+(RFC 9110 §8.4.1): one at most, as each multiplies the size by up to a thousand."""
+
+_T = TypeVar("_T")
+
+
+class Reply(msgspec.Struct, frozen=True, kw_only=True):
+    """An answer.
+
+    Attributes:
+        asked: the request, "GET http://nef.example.net/…".
+        reason: beside the status.
+        body: as far as it was read.
+        headers: by their names in lower case.
+    """
+
+    asked: str
+    status: int
+    reason: str
+    body: bytes
+    headers: Mapping[str, str]
+
+    @property
+    def is_success(self) -> bool:
+        """Whether it was done."""
+        return 200 <= self.status < 300
+
+    @property
+    def gone(self) -> bool:
+        """Whether there is no such thing (any more)."""
+        return self.status in (404, 410)
+
+    def read(self, type_: type[_T]) -> _T:
+        """Return the body, which must be JSON that fits a type.
+
+        Raises:
+            HttpError: it does not. The request may have taken effect.
+        """
+        try:
+            return from_json(self.body, type_, longest=_LARGEST_ANSWER)
+        except ValueError as error:
+            reason = readable(error)
+            at_field = reason != str(error)
+            raise self.unusable(reason if at_field else f"its body: {reason}") from error
+
+    def unusable(self, reason: str) -> HttpError:
+        """Return the error for an answer that is no use; `reason` names the field first."""
+        return HttpError(
+            f"cannot use the answer {self.status} to {self.asked}: {text_of(reason)}",
+            status=self.status,
+            # Whatever the answer is worth, the server has taken the request.
+            uncertain=True,
+            hint="check that the url is that of such a server",
+        )
+
+    def linked(self, url: str) -> str:
+        """Return the last path segment of an absolute or relative URL: the id of what it names.
+
+        Only the id is taken of a Location: behind a gateway its host is often one that cannot be
+        reached from here, and a token must not follow it.
+
+        Raises:
+            HttpError: it is no URL, or its end cannot be an id.
+        """
+        try:
+            segment = unquote(urlsplit(url).path.rstrip("/").rpartition("/")[2])
+        except ValueError:
+            segment = ""
+        if segment in (".", "..") or not re.match(ID_PATTERN, segment):
+            raise self.unusable(f"{url[:60]!r} is not a URL that ends in an id")
+        return segment
+
+
+class _Problem(msgspec.Struct, frozen=True):
+    """Problem+json (RFC 7807; `cause`: TS 29.122), and CAMARA's {status, code, message}."""
+
+    cause: Any = None
+    code: Any = None
+    detail: Any = None
+    message: Any = None
+    title: Any = None
+
+
+class Api:
+    """One server's interface.
+
+    Args:
+        url: what every path is appended to.
+        token: sent as a bearer token; None sends none.
+        timeout_s: of one attempt, from looking the name up to the last byte of the answer.
+        patience: see Patience.
+        clock: see Clock.
+        deadline: bounds all requests together; None does not.
+
+    Raises:
+        MissingFeatureError: httpx, the extra `networks`, is not installed.
+        SettingsError: a proxy that the environment names cannot be used.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        *,
+        token: Token | None = None,
+        timeout_s: float = 10.0,
+        patience: Patience | None = None,
+        clock: Clock | None = None,
+        deadline: Deadline | None = None,
+    ) -> None:
+        self.url = url.rstrip("/")
+        if httpx is None:
+            raise MissingFeatureError(
+                f"cannot reach {self.url}: httpx is not installed",
+                hint="install it: pip install 'ros-lifecycle-manifests[networks]'",
+            )
+        self.clock = clock or Clock()
+        self._token = token
+        self._timeout_s = timeout_s
+        self._patience = patience or Patience()
+        self._deadline = deadline or Deadline()
+        self._certificates = httpx.create_ssl_context()
+        self._client()  # so that a proxy that cannot be used is an error at once
+
+    def _client(self) -> httpx.AsyncClient:
+        host = urlsplit(self.url).hostname or ""
+        try:
+            return httpx.AsyncClient(
+                # A redirect could carry the token elsewhere, so none is followed.
+                follow_redirects=False,
+                timeout=None,  # an attempt is bounded as a whole
+                verify=self._certificates,
+                # What is for this host goes to no proxy: it would read the token, and cannot even
+                # reach what it is for.
+                trust_env=not (host == "localhost" or is_loopback(host)),
+            )
+        except (ValueError, ImportError, httpx.InvalidURL):
+            # Not quoted: it may hold a password.
+            raise SettingsError(
+                f"cannot reach {self.url} through the proxy that the environment names: it is not "
+                "http:// or https:// with a host",
+                hint="see HTTPS_PROXY, HTTP_PROXY, ALL_PROXY and NO_PROXY",
+            ) from None
+
+    def pause(self, seconds: float) -> None:
+        """Wait, unless the deadline comes first or is cancelled.
+
+        Raises:
+            HttpError: it does.
+        """
+        if seconds > self._deadline.left_s():
+            raise HttpError(f"cannot wait for {self.url}: {self._why_late()}", uncertain=True)
+        self.clock.sleep(seconds, self._deadline.cancelled)
+
+    def request(
+        self,
+        method: str,
+        path: str,
+        body: Mapping[str, object] | None = None,
+        *,
+        content_type: str = "application/json",
+        may_be_gone: bool = False,
+    ) -> Reply:
+        """Ask, and ask again where that is right; always back by the deadline.
+
+        429 and 503 are asked again after Retry-After; 409 too, because a server may still be
+        deleting what is in the way; other server errors and lost answers only where asking twice
+        is the same as asking once. A connection that could not be made is tried again.
+
+        Args:
+            method: HTTP method.
+            path: below `url`; starts with a slash.
+            body: sent as JSON.
+            content_type: of the body.
+            may_be_gone: 404 and 410 are answers, not errors.
+
+        Raises:
+            HttpError: refused, or still not done after all patience.
+        """
+        headers = {
+            "accept": "application/json, application/problem+json",
+            # A few bytes packed well may be as many gigabytes unpacked.
+            "accept-encoding": "identity",
+        }
+        if body is not None:
+            headers["content-type"] = content_type
+        content = None if body is None else to_json(body)
+        request = httpx.Request(method, f"{self.url}{path}", headers=headers, content=content)
+        wait_s = self._patience.first_s
+        with self._deadline.within(self._patience.total_s):
+            for attempt in range(1, self._patience.attempts + 1):
+                asked_s = None
+                try:
+                    reply = self._attempt(request)
+                except HttpError as error:
+                    failed, again = error, method in _IDEMPOTENT or not error.uncertain
+                else:
+                    if reply.is_success or (may_be_gone and reply.gone):
+                        return reply
+                    lost, twice = reply.status in _PASSING, method in _IDEMPOTENT
+                    failed = self._refusal(reply, uncertain=lost and not twice)
+                    again = reply.status in _ALWAYS_AGAIN or (lost and twice)
+                    asked_s = _retry_after_s(
+                        reply.headers.get("retry-after", ""), self.clock.now_s()
+                    )
+                pause_s = min(wait_s, self._patience.longest_s) if asked_s is None else asked_s
+                left_s = self._deadline.left_s()
+                if not again or attempt == self._patience.attempts:
+                    break
+                if pause_s >= left_s:
+                    # What has failed says more than that there is no time to try again.
+                    if asked_s is not None:
+                        failed.hint = (
+                            f"the server asks to wait {asked_s:g} s, more than the {left_s:.0f} s "
+                            "that this waits for; try again then"
+                        )
+                    break
+                self.pause(pause_s)
+                wait_s *= 2
+        raise failed
+
+    def _attempt(self, request: httpx.Request) -> Reply:
+        """Ask once.
+
+        Raises:
+            HttpError: there is no answer that can be read; `uncertain` if it was sent.
+        """
+        what = f"{request.method} {request.url}"
+        limit_s = min(self._timeout_s, self._deadline.left_s())
+        if limit_s <= 0:
+            raise HttpError(f"cannot {what}: {self._why_late()}")
+        sent = False
+
+        async def trace(event: str, _: Mapping[str, Any]) -> None:
+            """Note that the server may have taken the request, by httpx's extension `trace`."""
+            nonlocal sent
+            sent = sent or event.endswith("send_request_headers.started")
+
+        request.extensions = {"trace": trace}
+        # Revealed for this attempt only: a token that is changed meanwhile is taken up.
+        if self._token is not None:
+            request.headers["authorization"] = f"Bearer {self._token.reveal()}"
+        try:
+            return self._deadline.run(self._ask(request), limit_s)
+        except TimeoutError:
+            reason = f"no {'whole answer' if sent else 'connection'} in time"
+            if self._deadline.cancelled.is_set():
+                reason = self._why_late()
+            reason = f"{reason} ({limit_s:.3g} s)"
+        except httpx.TransportError as error:
+            reason = _why(error)
+        except Exception as error:  # noqa: BLE001 - whatever a library makes of unexpected bytes
+            # Never its own message, which may quote the request.
+            reason = f"its answer is no HTTP that can be read ({type(error).__name__})"
+        raise HttpError(f"cannot {what}: {reason}", uncertain=sent)
+
+    async def _ask(self, request: httpx.Request) -> Reply:
+        """Send a request and read its answer, of which no more than can be of use.
+
+        Raises:
+            httpx.HTTPError: there is none.
+            zlib.error: it is not packed as it says.
+        """
+        body = bytearray()
+        async with self._client() as client:
+            answer = await client.send(request, stream=True)
+            try:
+                coding = answer.headers.get("content-encoding", "identity").strip().lower()
+                if coding not in ("", "identity", *_PACKED):
+                    raise httpx.DecodingError(f"packed as {coding!r}")
+                unpacking = zlib.decompressobj(_PACKED[coding]) if coding in _PACKED else None
+                # Not aiter_bytes, which unpacks all that arrives at once: 64 kB may be 64 MB.
+                async for chunk in answer.aiter_raw():
+                    left = _LARGEST_ANSWER + 1 - len(body)
+                    body += unpacking.decompress(chunk, left) if unpacking else chunk
+                    if len(body) > _LARGEST_ANSWER:
+                        break
+            finally:
+                await answer.aclose()
+        return Reply(
+            asked=f"{request.method} {request.url}",
+            status=answer.status_code,
+            reason=answer.reason_phrase,
+            body=bytes(body),
+            headers=answer.headers,
+        )
+
+    def _why_late(self) -> str:
+        ended = self._deadline.cancelled.is_set()
+        return "it was ended before it was done" if ended else "no time left"
+
+    def _refusal(self, answer: Reply, *, uncertain: bool) -> HttpError:
+        try:
+            found = from_json(answer.body, _Problem, longest=_LARGEST_ANSWER)
+        except ValueError:
+            found = _Problem()
+        # Some servers quote the credentials that they refuse.
+        secret = "" if self._token is None else self._token.reveal()
+
+        def first(*values: object) -> str:
+            return next(filter(None, (text_of(each, secret) for each in values)), "")
+
+        words = [
+            f"{answer.status} {text_of(answer.reason, secret)}".strip(),
+            first(found.cause, found.code),
+            first(found.detail, found.message, found.title),
+        ]
+        forbidden = answer.status in (401, 403)
+        return HttpError(
+            f"cannot {answer.asked}: {': '.join(filter(None, words))}",
+            status=answer.status,
+            uncertain=uncertain,
+            hint="check the token and what it is allowed to do" if forbidden else "",
+        )
+
+
+def as_segment(identifier: str) -> str:
+    """Return an id as one path segment."""
+    return quote(identifier, safe="")
+
+
+def text_of(value: object, secret: str = "") -> str:
+    """A server's text on one line, printable and short, without `secret`."""
+    if not isinstance(value, str):
+        return ""
+    if secret:
+        value = value.replace(secret, "***")
+    plain = "".join(each if each.isprintable() else " " for each in value)
+    return plain[:_MAX_QUOTED].strip()
+
+
+def _retry_after_s(text: str, now_s: float) -> float | None:
+    """Retry-After as seconds from now (RFC 9110 §10.2.3); None if there is none to be read."""
+    text = text.strip()
+    if text.isascii() and text.isdigit():
+        return float(text[:9])
+    try:
+        ends_s = email.utils.parsedate_to_datetime(text).timestamp()
+    except (ValueError, TypeError, IndexError, OverflowError, OSError):  # whatever is no date
+        return None
+    return max(0.0, ends_s - now_s)
+
+
+def _why(error: httpx.TransportError) -> str:
+    """Return the kernel's reason where there is one: "Connection refused"."""
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, OSError) and (cause.errno or 0) > 0:
+            return os.strerror(cause.errno or 0)
+        cause = cause.__cause__ or cause.__context__
+    return text_of(str(error)) or type(error).__name__

@@ -1,0 +1,218 @@
+"""3GPP NEF AsSessionWithQoS over HTTP: one subscription per flow and device.
+
+Owns: the paths, methods and media types of TS 29.122 (release 17, API version 1.2.3) and how a
+server's view of a subscription is compared with ours; and our own model of the body, written from
+the specification's facts. Its schema does not look inside filter strings.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ipaddress
+import re
+from collections.abc import Iterable
+
+import msgspec
+
+from lifecycle.programming.http import MERGE_PATCH, Reply, as_segment, text_of
+from lifecycle.programming.rules import PROTOCOL_NUMBERS, FlowRule
+from lifecycle.programming.server import Body, DeviceEnd, Made, ServerTarget, class_name
+from lifecycle.programming.settings import ServerSettings
+from lifecycle.programming.target import HttpError
+
+_PATCHABLE = ("notificationDestination", "flowInfo", "qosReference")
+"""What AsSessionWithQoSSubscriptionPatch may hold; a device's address is not among it."""
+
+_COMPARED = {
+    "ueIpv4Addr": "ue_ipv4_addr",
+    "ueIpv6Addr": "ue_ipv6_addr",
+    "qosReference": "qos_reference",
+    "notificationDestination": "notification_destination",
+}
+
+_PROTOCOLS = {name: str(number) for name, number in PROTOCOL_NUMBERS.items()}
+
+_NO_PATCH = (404, 405, 415, 501)
+"""Statuses of servers without PATCH."""
+
+
+class NefSettings(ServerSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How to reach a 3GPP NEF and what to ask it for (TS 29.122, release 17).
+
+    Attributes:
+        url: API root, before `/3gpp-as-session-with-qos/v1`.
+        scs_as_id: who we are to the operator.
+        notification_destination: http or https URL that the network reports to.
+        qos_references: the operator's names of classes, by 5QI.
+        default_qos_reference: for flows whose 5QI is not named; empty leaves them out.
+        protocol_by_name: write `udp` instead of `17`, as some servers want it.
+    """
+
+    scs_as_id: str
+    notification_destination: str
+    qos_references: dict[int, str] = msgspec.field(default_factory=dict)
+    default_qos_reference: str = ""
+    protocol_by_name: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not re.fullmatch(r"[A-Za-z0-9._~-]+", self.scs_as_id):
+            raise ValueError(
+                f"cannot use scs_as_id {self.scs_as_id!r}; use letters, digits and . _ ~ -"
+            )
+        if not re.fullmatch(r"https?://[^\s/]+\S*", self.notification_destination):
+            raise ValueError(
+                f"cannot use notificationDestination {self.notification_destination!r}; "
+                "use an http or https URL that the network can reach"
+            )
+
+    @property
+    def scope(self) -> str:
+        """Our collection of subscriptions, without the last path segment."""
+        return f"{self.url.rstrip('/')}/3gpp-as-session-with-qos/v1/{as_segment(self.scs_as_id)}"
+
+
+def _filter(rule: FlowRule, end: DeviceEnd, settings: NefSettings) -> str:
+    """Return IPFilterRule text (RFC 6733 §4.3.1) in the shape of 3GPP TS 29.214 §5.3.8."""
+    device, server = f"{end.device} {end.device_port}", f"{end.server} {end.server_port}"
+    by_name = settings.protocol_by_name
+    protocol = rule.transport_protocol.value if by_name else rule.protocol_number
+    if end.sends:
+        return f"permit in {protocol} from {device} to {server}"
+    return f"permit out {protocol} from {server} to {device}"
+
+
+class _Flow(msgspec.Struct, frozen=True, rename="camel"):
+    """FlowInfo of TS 29.122 §5.2.1.2.14, as far as it is read."""
+
+    flow_descriptions: tuple[str, ...] = ()
+
+
+class _Subscription(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
+    """What a server shows of a subscription; None is not shown."""
+
+    link: str | None = msgspec.field(default=None, name="self")
+    applied_qos_ref: str | None = None
+    ue_ipv4_addr: str | None = None
+    ue_ipv6_addr: str | None = None
+    qos_reference: str | None = None
+    notification_destination: str | None = None
+    flow_info: tuple[_Flow, ...] | None = None
+
+
+class NefTarget(ServerTarget):
+    """One NEF."""
+
+    kind = "nef"
+    settings_type = NefSettings
+    collection = "/subscriptions"
+
+    @staticmethod
+    def body(rule: FlowRule, end: DeviceEnd, settings: NefSettings) -> Body:
+        """Return the body of an AsSessionWithQoSSubscription (3GPP TS 29.122 §5.14).
+
+        One flow each: a known open implementation passes on only the last of several.
+        """
+        reference = class_name(
+            rule, settings.qos_references, settings.default_qos_reference, setting="qos_references"
+        )
+        return {
+            "supportedFeatures": "0",  # hexadecimal, TS 29.571: none
+            "notificationDestination": settings.notification_destination,
+            "ueIpv6Addr" if end.is_ipv6 else "ueIpv4Addr": end.device,
+            "flowInfo": [{"flowId": 1, "flowDescriptions": [_filter(rule, end, settings)]}],
+            "qosReference": reference,
+        }
+
+    def create(self, body: Body) -> Made:
+        """POST it.
+
+        Raises:
+            HttpError: refused, or the answer does not say what was made.
+        """
+        reply = self._api.request("POST", self.collection, body)
+        shown = _shown(reply)
+        made = reply.headers.get("location") or shown.link
+        if not made:
+            raise reply.unusable("it has neither a Location nor a self")
+        return Made(id=reply.linked(made), detail=_refused(shown))
+
+    def find(self, body: Body) -> Made | None:
+        """Look through our subscriptions for one that asks for the same."""
+        reply = self._api.request("GET", self.collection, may_be_gone=True)
+        for each in () if reply.gone else reply.read(tuple[_Subscription, ...]):
+            if each.link and not _differs(body, each, missing=True):
+                return Made(id=reply.linked(each.link))
+        return None
+
+    def see(self, id_: str, body: Body) -> Made | None:
+        """GET it."""
+        reply = self._api.request("GET", self.path(id_), may_be_gone=True)
+        return None if reply.gone else Made(id=id_, differs=_differs(body, _shown(reply)))
+
+    def update(self, id_: str, before: Body, body: Body) -> Made:
+        """PATCH what may be patched, PUT where there is no PATCH; else delete and create."""
+        fixed = {key for key in {*before, *body} if before.get(key) != body.get(key)}
+        if fixed - {*_PATCHABLE}:
+            self.delete(id_)
+            return self.create(body)
+        patch = {key: body[key] for key in _PATCHABLE if key in body}
+        try:
+            reply = self._api.request("PATCH", self.path(id_), patch, content_type=MERGE_PATCH)
+        except HttpError as error:
+            if error.status not in _NO_PATCH:
+                raise
+            reply = self._api.request("PUT", self.path(id_), body, may_be_gone=True)
+        if reply.gone:
+            return self.create(body)
+        return Made(id=id_, detail=_refused(_shown(reply)))
+
+
+def _shown(reply: Reply) -> _Subscription:
+    """Return what an answer shows; it may be without a body.
+
+    Raises:
+        HttpError: a field is not what the interface has there.
+    """
+    return reply.read(_Subscription) if reply.body else _Subscription()
+
+
+def _refused(subscription: _Subscription) -> str:
+    """Note it if the server granted another reference than was asked for."""
+    granted = text_of(subscription.applied_qos_ref)
+    return f"granted as {granted}" if granted else ""
+
+
+def _differs(asked: Body, seen: _Subscription, *, missing: bool = False) -> str:
+    """Why what the server shows is not what was asked for; empty if it is.
+
+    Args:
+        asked: our body.
+        seen: the server's; it may add to it.
+        missing: something that the server does not show differs too.
+    """
+    for key, field in _COMPARED.items():
+        found = getattr(seen, field)
+        if (found is not None or missing) and found != asked.get(key):
+            return f"the server has {key} {text_of(found)!r}"
+    wanted = _filters(text for flow in asked["flowInfo"] for text in flow["flowDescriptions"])
+    shown = _filters(text for flow in seen.flow_info or () for text in flow.flow_descriptions)
+    if (seen.flow_info is not None or missing) and shown != wanted:
+        return "the server has other filters"
+    return ""
+
+
+def _filters(texts: Iterable[str]) -> list[str]:
+    """The filters in one spelling: servers write `17` and `udp`, and other spaces."""
+    return sorted(map(_spelled, texts))
+
+
+def _spelled(text: str) -> str:
+    words = [_PROTOCOLS.get(each.lower(), each) for each in text.split()]
+    for index, each in enumerate(words):
+        with contextlib.suppress(ValueError):
+            words[index] = str(ipaddress.ip_address(each))
+    return " ".join(words)
+
+
+TARGET = NefTarget

@@ -1,0 +1,394 @@
+"""Keeps networks in step with the verified flows of one system.
+
+Owns: `Programmer`: from flow reports to rules to targets, again whenever the reports change, and
+everything removed in the end; the address that this host sends from to a destination, as its
+routing decides; and the removal of what dead runs left. What was applied manually stays: `lifecycle
+flows remove` or `lifecycle down` ends it. Blocking: a supervisor has a thread for it.
+"""
+
+from __future__ import annotations
+
+import math
+import socket
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+import msgspec
+import psutil
+
+from lifecycle.errors import LifecycleError, UsageError
+from lifecycle.network.five_qi import DscpMapping, dscp_mapping, parse_mapping
+from lifecycle.network.nfe import canonical, is_loopback
+from lifecycle.plan.model import Plan, PlannedNode
+from lifecycle.programming.ledger import Ledger, TargetRecord, has_ledger, owner_is_dead
+from lifecycle.programming.rules import FlowRule, LeftOut, RuleSet, SourceAddress, flow_rules
+from lifecycle.programming.target import (
+    Chosen,
+    Means,
+    PartlyError,
+    Target,
+    TargetChanges,
+    target_kind,
+)
+from lifecycle.run_directory import is_held, run_name, runtime_root
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.verdict import FlowReport
+
+_DISCARD_PORT = 9
+"""RFC 863; connecting a UDP socket sends nothing."""
+
+
+class Treatment(msgspec.Struct, frozen=True, kw_only=True):
+    """What flows get beyond what the manifest says.
+
+    Attributes:
+        mapping: gives the DSCP of flows that have a 5QI and no DSCP; None gives none.
+        label_flows: each IPv6 flow gets a flow label of its own.
+    """
+
+    mapping: DscpMapping | None = None
+    label_flows: bool = False
+
+
+def read_treatment(mapping: str, *, label_flows: bool) -> Treatment:
+    """Return what a person asked for.
+
+    Args:
+        mapping: name or file of a mapping; empty for none.
+        label_flows: see Treatment.
+
+    Raises:
+        UsageError: no such mapping, or its file cannot be used.
+    """
+    if not mapping:
+        return Treatment(label_flows=label_flows)
+    try:
+        file = Path(mapping)
+        found = parse_mapping(file.read_bytes()) if file.is_file() else dscp_mapping(mapping)
+    except (OSError, ValueError) as error:
+        raise UsageError(str(error)) from error
+    return Treatment(mapping=found, label_flows=label_flows)
+
+
+class RouteSources:
+    """Observes source addresses, see rules.SourceAddress.
+
+    A publisher's socket is bound to `0.0.0.0`, so the source address of its packets is known only
+    by the route they take. For publishers on other machines this host cannot know it.
+
+    Args:
+        plan: says which machine a node is on.
+        machine: the machine that this host is; empty to determine it by its addresses.
+    """
+
+    def __init__(self, plan: Plan, machine: str = "") -> None:
+        own = {
+            canonical(each.address.partition("%")[0])
+            for addresses in psutil.net_if_addrs().values()
+            for each in addresses
+            if each.family in (socket.AF_INET, socket.AF_INET6)
+        }
+        self._local = {
+            each.name
+            for each in plan.machines
+            if each.name == machine or not each.address or canonical(each.address) in own
+        }
+        self._machines = {each.name for each in plan.machines}
+
+    def __call__(self, node: PlannedNode, destination: str) -> str:
+        """Return the address; empty for a node of another machine, or if there is no route."""
+        if node.machine in self._machines and node.machine not in self._local:
+            return ""
+        if is_loopback(destination):
+            # A packet to loopback comes from loopback, whatever the routing says.
+            return canonical(destination)
+        return route_source(destination)
+
+
+def route_source(destination: str) -> str:
+    """Return the address that this host sends from to `destination`; empty if it has no route."""
+    family = socket.AF_INET6 if ":" in destination else socket.AF_INET
+    with socket.socket(family, socket.SOCK_DGRAM) as sock:
+        try:
+            sock.connect((destination, _DISCARD_PORT))
+        except OSError:
+            return ""
+        return canonical(str(sock.getsockname()[0]))
+
+
+class Removal:
+    """Removes everything of one run in networks, also what was applied manually.
+
+    One thread removes, another cancels.
+
+    Args:
+        means: their ledger lists what is to be removed.
+    """
+
+    def __init__(self, means: Means) -> None:
+        self._ledger = means.ledger
+        self._deadline = means.deadline
+        self._means = means
+
+    def close(self, *, within_s: float | None = None) -> tuple[TargetChanges, ...]:
+        """Remove everything that the ledger lists, by whichever target it was made.
+
+        Args:
+            within_s: for all that servers are asked; None for the patience with each request.
+
+        Raises:
+            PartlyError: something could not be removed, or not in time; it stays listed.
+        """
+
+        def remove(record: TargetRecord) -> TargetChanges:
+            kind = target_kind(record.target)
+            return kind(kind.restore(record), self._means).remove()
+
+        with self._deadline.within(within_s), self._ledger.locked():
+            return _each(self._ledger.read().targets, remove)
+
+    def cancel(self) -> None:
+        """From another thread: have what servers are asked fail at once, until `resume`."""
+        self._deadline.cancelled.set()
+
+    def resume(self) -> None:
+        """Ask servers again after a `cancel`."""
+        self._deadline.cancelled.clear()
+
+
+class Programmer(Removal):
+    """Programs targets with the verified flows of one system.
+
+    Args:
+        plan: of the system.
+        targets: to keep in step.
+        means: what they were opened with.
+        source_address: observes where publishers send from; None believes the manifest only.
+        treatment: what flows get beyond what the manifest says.
+    """
+
+    def __init__(
+        self,
+        plan: Plan,
+        targets: Sequence[Target],
+        means: Means,
+        *,
+        source_address: SourceAddress | None = None,
+        treatment: Treatment | None = None,
+    ) -> None:
+        super().__init__(means)
+        self._plan = plan
+        self._targets = tuple(targets)
+        self._source_address = source_address
+        self._treatment = treatment or Treatment()
+        self._applied: tuple[FlowRule, ...] | None = None
+        # What targets have, as far as is known: all of it once every target was brought up to date.
+        self._programmed: dict[str, FlowRule] = {}
+        self.left_out: tuple[LeftOut, ...] = ()
+
+    def replan(self, plan: Plan) -> None:
+        """Take another plan of the same system and machines: its flows are programmed next."""
+        self._plan = plan
+
+    def rules(self, flows: Iterable[FlowReport]) -> RuleSet:
+        """Return what may be programmed of these flows, and what may not."""
+        return flow_rules(
+            flows,
+            self._plan,
+            source_address=self._source_address,
+            mapping=self._treatment.mapping,
+            label_flows=self._treatment.label_flows,
+        )
+
+    def diff(self, flows: Iterable[FlowReport]) -> tuple[TargetChanges, ...]:
+        """Return what `update` would do; changes no network."""
+        rules = self._take(flows)
+        with self._ledger.locked():
+            return tuple(each.plan(rules) for each in self._targets)
+
+    def dry_run(self, flows: Iterable[FlowReport]) -> str:
+        """Return what `update` would send if nothing were there, checked where that is possible."""
+        rules = self._take(flows)
+        return "\n".join(each.dry_run(rules) for each in self._targets)
+
+    def update(
+        self,
+        flows: Iterable[FlowReport],
+        *,
+        hold: bool = False,
+        within_s: float | None = None,
+    ) -> tuple[TargetChanges, ...]:
+        """Bring every target up to date with these flows.
+
+        Args:
+            flows: as last verified.
+            hold: a flow that was programmed and is not verified at this moment keeps its rule
+                until it is verified again or is no longer declared: while a node restarts, its old
+                rule does no harm, and a session of a mobile network is costly to make again.
+            within_s: for all that servers are asked; None for the patience with each request.
+
+        Returns:
+            What was done, per target; nothing if the rules are the same as last time.
+
+        Raises:
+            PartlyError: one target or several could not be brought up to date; others are.
+        """
+        reports = tuple(flows)
+        rules = self._take(reports)
+        if hold:
+            rules = _with_held(rules, self._programmed.values(), reports)
+        if rules == self._applied:
+            return ()
+        # Forgotten first: if a target fails, the next call must not take it for done. What was
+        # programmed is not: it is held whether or not the last call succeeded.
+        self._applied = None
+        by_key = {each.key: each for each in rules}
+
+        def apply(target: Target) -> TargetChanges:
+            changes = target.apply(rules)
+            self._programmed |= by_key
+            return changes
+
+        with self._deadline.within(within_s), self._ledger.locked():
+            try:
+                done = _each(self._targets, apply)
+            except LifecycleError:
+                listed = [entry for each in self._ledger.read().targets for entry in each.entries]
+                made = {each.key.rsplit(" ", 2)[0] for each in listed}  # without "to device"
+                self._programmed |= {key: each for key, each in by_key.items() if key in made}
+                raise
+        self._applied, self._programmed = rules, by_key
+        return done
+
+    def renew(self, *, within_s: float | None = None) -> float | None:
+        """Prolong what would expire; return seconds until the next time, None if never."""
+        with self._deadline.within(within_s), self._ledger.locked():
+            due = [each.renew() for each in self._targets]
+        return min((each for each in due if each is not None), default=None)
+
+    def close(self, *, within_s: float | None = None) -> tuple[TargetChanges, ...]:
+        """Remove everything, see Removal."""
+        self._applied, self._programmed = None, {}
+        return super().close(within_s=within_s)
+
+    def _take(self, flows: Iterable[FlowReport]) -> tuple[FlowRule, ...]:
+        found = self.rules(flows)
+        self.left_out = found.left_out
+        return found.rules
+
+
+def open_programmer(
+    plan: Plan,
+    chosen: Sequence[Chosen],
+    *,
+    environment: Mapping[str, str],
+    machine: str = "",
+    owned: bool = False,
+    treatment: Treatment | None = None,
+) -> Programmer:
+    """Return a programmer for this host.
+
+    Args:
+        plan: of the system.
+        chosen: the networks to program.
+        environment: says where run directories are.
+        machine: the machine that this host is; empty to determine it by its addresses.
+        owned: the caller is the supervisor whose end is to end what is made.
+        treatment: see Treatment.
+
+    Raises:
+        UsageError: options or settings cannot be used.
+    """
+    directory = runtime_root(environment) / run_name(plan, machine)
+    means = Means(Ledger(directory, plan.system, owned=owned))
+    return Programmer(
+        plan,
+        [each.open(means) for each in chosen],
+        means,
+        source_address=RouteSources(plan, machine),
+        treatment=treatment,
+    )
+
+
+def removal_of(directory: Path) -> Removal:
+    """Return what removes everything of the run in a directory.
+
+    Raises:
+        ProgrammingError: the ledger cannot be read.
+    """
+    # The name as the ledger has it: that of a directory is made safe.
+    system = Ledger(directory, "").read().system or directory.name.partition("@")[0]
+    return Removal(Means(Ledger(directory, system)))
+
+
+def sweep_orphans(
+    root: Path,
+    report: Callable[[str], None],
+    *,
+    own: str = "",
+    within_s: float | None = None,
+) -> None:
+    """Remove what the dead runs of this user left in networks.
+
+    Args:
+        root: directory of all run directories, see run_directory.runtime_root.
+        report: takes what was removed, and what could not be and stays listed, as text for people.
+        own: name of the caller's own run, whose directory it holds itself.
+        within_s: for all that servers are asked; None for the patience with each request.
+    """
+    until_s = math.inf if within_s is None else time.monotonic() + within_s
+    for directory in sorted(root.iterdir()) if root.is_dir() else ():
+        if not has_ledger(directory) or (directory.name != own and is_held(directory)):
+            continue
+        try:
+            if not owner_is_dead(Ledger(directory, "").read()):
+                continue
+            for each in removal_of(directory).close(within_s=until_s - time.monotonic()):
+                if each.changes:
+                    report(f"left by a killed supervisor: {each.render(done=True)}")
+        except LifecycleError as error:
+            report(str(error))
+
+
+def _with_held(
+    rules: tuple[FlowRule, ...], programmed: Iterable[FlowRule], reports: Sequence[FlowReport]
+) -> tuple[FlowRule, ...]:
+    unsure = {
+        (each.topic, each.publisher, each.subscription)
+        for each in reports
+        if each.outcome is not Outcome.OK or not each.source or not each.destination
+    }
+    keys = {each.key for each in rules}
+    held = tuple(
+        each
+        for each in programmed
+        if each.key not in keys and all(map(unsure.__contains__, each.names))
+    )
+    return tuple(sorted((*rules, *held), key=lambda each: each.key))
+
+
+_T = TypeVar("_T")
+
+
+def _each(things: Iterable[_T], do: Callable[[_T], TargetChanges]) -> tuple[TargetChanges, ...]:
+    """Do it to each, whatever becomes of the others."""
+    every = tuple(things)
+    done: list[TargetChanges] = []
+    errors: list[LifecycleError] = []
+    for each in every:
+        try:
+            done.append(do(each))
+        except LifecycleError as error:  # noqa: PERF203 - the other targets go on
+            errors.append(error)
+    if len(errors) == len(every) == 1:
+        raise errors[0]
+    if errors:
+        raise PartlyError(
+            "targets",
+            len(every),
+            [("", error) for error in errors],
+            done=[each.render(done=True) for each in done if each.changes],
+        )
+    return tuple(done)

@@ -1,0 +1,454 @@
+"""Turns verified flows into flow rules for networks, with the reason for each flow left out.
+
+Owns: `FlowRule`, the step from flow reports to rules, and how a rule reads in comments. A
+rule says only what was observed or declared: a flow whose verdict is not ok, shared memory, groups
+and tuples that two flows share in disagreement make no rule, and each is listed with its reason.
+Comments have DSCP and TOS always side by side, because products differ in which of the two they ask
+for. Pure.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
+
+import msgspec
+from msgspec.structs import replace
+
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.network.dscp import describe, parse_dscp
+from lifecycle.network.five_qi import DscpMapping
+from lifecycle.network.medium import Medium
+from lifecycle.network.nfe import (
+    FlowTuple,
+    InternetProtocol,
+    IpAddress,
+    TransportProtocol,
+    canonical,
+    is_ip,
+    is_loopback,
+    is_multicast,
+    is_wildcard,
+    parse_address,
+    socket_text,
+)
+from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedNode
+from lifecycle.verify.outcome import Outcome
+from lifecycle.verify.transport import UNKNOWN
+from lifecycle.verify.verdict import FlowReport
+
+PROTOCOL_NUMBERS = {"udp": 17, "tcp": 6}
+"""The two that carry flows here (IANA Assigned Internet Protocol Numbers)."""
+
+MAX_FLOW_LABEL = 0xFFFFF
+"""Twenty bits (RFC 6437)."""
+
+_UNSEEN = {
+    each.value: f"{each.stays_in}: no packet that a network could see"
+    for each in Medium
+    if each.stays_in
+}
+"""Why no network sees a flow, by its effective transport."""
+
+SourceAddress = Callable[[PlannedNode, str], str]
+"""Observes the address that a node's machine sends from to a destination; empty if unknown."""
+
+
+class FlowRule(msgspec.Struct, frozen=True, kw_only=True):
+    """One verified flow as a network can match it, and what it is to get.
+
+    Attributes:
+        key: names the flow for as long as its manifest does, whatever ports it has:
+            `/robot/video /robot/camera → /viewer udp 10.77.0.2`.
+        names: (topic, publisher, subscription) of every pair that this one flow carries.
+        source_address: empty where the sender's routing decides and it was not observed: the rule
+            then matches ports and destination only.
+        source_port: 1–65535.
+        destination_address: one unicast address.
+        destination_port: 1–65535.
+        flow_label: IPv6 flow label, 0–0xFFFFF; 0 if none is set.
+        dscp: 0–63 that its packets are to carry; None leaves them alone.
+        five_qi: the 5QI that was declared for it; None if none was.
+        max_delay_ms: the shortest delay that a link allows its pairs; None if none does.
+
+    Raises:
+        ValueError: something that a filter could not say, or would say differently.
+    """
+
+    key: str
+    names: tuple[tuple[str, str, str], ...]
+    transport_protocol: TransportProtocol
+    source_address: str
+    source_port: int
+    destination_address: str
+    destination_port: int
+    flow_label: int = 0
+    dscp: int | None = None
+    five_qi: int | None = None
+    max_delay_ms: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.transport_protocol.value not in PROTOCOL_NUMBERS:
+            raise ValueError(
+                f"cannot match protocol {self.transport_protocol.value!r}; use udp or tcp"
+            )
+        for port in (self.source_port, self.destination_port):
+            if not 1 <= port <= 65535:
+                raise ValueError(f"cannot use port {port}; use 1 to 65535")
+        to = _address(self.destination_address).version
+        if self.source_address and (of := _address(self.source_address).version) != to:
+            raise ValueError(
+                f"cannot filter packets from {self.source_address} to {self.destination_address}: "
+                f"one is IPv{of}, the other IPv{to}; use two addresses of one family"
+            )
+        if self.dscp is not None:
+            parse_dscp(self.dscp)
+        if not 0 <= self.flow_label <= MAX_FLOW_LABEL:
+            raise ValueError(
+                f"cannot use flow label {self.flow_label:#x}; use 0 to {MAX_FLOW_LABEL:#x}"
+            )
+        if self.flow_label and self.internet_protocol is InternetProtocol.IPV4:
+            raise ValueError(
+                f"cannot set flow label {self.flow_label:#x} on IPv4: only IPv6 has one (RFC 6437)"
+            )
+
+    @property
+    def internet_protocol(self) -> InternetProtocol:
+        """The family, which the destination decides."""
+        return InternetProtocol.IPV6 if ":" in self.destination_address else InternetProtocol.IPV4
+
+    @property
+    def protocol_number(self) -> int:
+        """IANA protocol number, 6 or 17."""
+        return PROTOCOL_NUMBERS[self.transport_protocol.value]
+
+    def left_out(self, reason: str) -> list[LeftOut]:
+        """Return each pair that this one flow carries as one that is left out."""
+        return [
+            LeftOut(topic=topic, publisher=publisher, subscription=subscription, reason=reason)
+            for topic, publisher, subscription in self.names
+        ]
+
+    def describe(self) -> str:
+        """Return the tuple for people: `udp 10.77.0.1:17900 → 10.77.0.2:17910`."""
+        source = socket_text(self.source_address or "*", self.source_port)
+        destination = socket_text(self.destination_address, self.destination_port)
+        return f"{self.transport_protocol.value} {source} → {destination}"
+
+
+def _address(text: str) -> IpAddress:
+    """Return the address that `text` spells.
+
+    Raises:
+        ValueError: not one unicast address: a name, a zone, a wildcard or a group.
+    """
+    address = parse_address(text)
+    # A zone means something on its own host only.
+    if address is None or "%" in text or address.is_unspecified or address.is_multicast:
+        raise ValueError(
+            f"cannot use address {text!r}; use one unicast address without a zone, such as "
+            "10.77.0.1"
+        )
+    return address
+
+
+class LeftOut(msgspec.Struct, frozen=True, kw_only=True):
+    """Something of a flow that makes no rule.
+
+    Attributes:
+        reason: one phrase, "shared memory: no packet that a network could see".
+    """
+
+    topic: str
+    publisher: str
+    subscription: str
+    reason: str
+
+    def __str__(self) -> str:
+        return f"{self.topic} {self.publisher} → {self.subscription}: {self.reason}"
+
+
+class RuleSet(msgspec.Struct, frozen=True, kw_only=True):
+    """What may be programmed, and what may not."""
+
+    rules: tuple[FlowRule, ...]
+    left_out: tuple[LeftOut, ...]
+
+
+class _Candidate(msgspec.Struct, frozen=True, kw_only=True):
+    """One tuple of one pair; `ask` is (DSCP, 5QI), both None where nothing is asked."""
+
+    report: FlowReport
+    flow: FlowTuple
+    source_address: str
+    ask: tuple[int | None, int | None]
+
+
+def flow_rules(
+    flows: Iterable[FlowReport],
+    plan: Plan,
+    *,
+    source_address: SourceAddress | None = None,
+    mapping: DscpMapping | None = None,
+    label_flows: bool = False,
+) -> RuleSet:
+    """Turn verified flows into rules.
+
+    What a flow is to get comes from the plan: the DSCP and 5QI of its publisher, else the 5QI of
+    its subscription; a DSCP that was read back from the sockets is used where none was planned.
+
+    A publisher sends from `0.0.0.0:port`. Its address is the one its machine was observed to send
+    from to that destination (`source_address`), else the machine's declared address if the
+    destination is the declared address of the other machine: another interface would send from
+    another address. Else it stays open, and port and destination have to do.
+
+    Args:
+        flows: as `verify` reports them.
+        plan: that they were judged against.
+        source_address: see SourceAddress; None if nothing was observed.
+        mapping: gives the DSCP of flows that have a 5QI and no DSCP.
+        label_flows: give each IPv6 flow a flow label of its own, so that the 3-tuple of addresses
+            and label distinguishes it from others too.
+    """
+    left_out: list[LeftOut] = []
+    by_tuple: dict[tuple[object, ...], list[_Candidate]] = {}
+    for report in flows:
+        for each in _candidates(report, plan, source_address, left_out):
+            flow = each.flow
+            place = (
+                flow.transport_protocol,
+                each.source_address,
+                flow.source_port,
+                flow.destination_address,
+                flow.destination_port,
+            )
+            by_tuple.setdefault(place, []).append(each)
+    rules: list[FlowRule] = []
+    for sharing in by_tuple.values():
+        asks = {each.ask for each in sharing}
+        if asks == {(None, None)}:
+            left_out += [_left(each.report, "neither a dscp nor a five_qi") for each in sharing]
+        elif len(asks) > 1:
+            left_out += _disagreement(sharing)
+        else:
+            try:
+                rules.append(_treated(_rule(sharing), mapping, label_flows=label_flows))
+            except ValueError as error:
+                left_out += [_left(each.report, str(error)) for each in sharing]
+    return RuleSet(rules=_distinct(rules), left_out=tuple(dict.fromkeys(left_out)))
+
+
+def _candidates(
+    report: FlowReport,
+    plan: Plan,
+    source_address: SourceAddress | None,
+    left_out: list[LeftOut],
+) -> Iterator[_Candidate]:
+    if report.outcome is not Outcome.OK:
+        left_out.append(_left(report, f"not verified: its verdict is {report.outcome.value}"))
+        return
+    if not report.source or not report.destination:
+        left_out.append(_left(report, "its network flow endpoints are not known"))
+        return
+    if report.effective_transport in _UNSEEN:
+        left_out.append(_left(report, _UNSEEN[report.effective_transport]))
+        return
+    unknown = report.effective_transport == UNKNOWN
+    if unknown and not all(map(is_ip, (*report.source, *report.destination))):
+        left_out.append(_left(report, _UNSEEN[Medium.SHM]))
+    publisher = _node(plan, report.publisher)
+    subscription = _node(plan, report.subscription)
+    remote = publisher is None or subscription is None or not _same_host(plan, report)
+    ask = _ask(report, publisher, subscription)
+    if not report.tuples and not unknown:
+        left_out.append(_left(report, "its two ends have no IP transport in common"))
+    for each in report.tuples:
+        # A zone (`fe80::1%eth0`) names an interface of its own host and is not in the packet.
+        flow = replace(
+            each,
+            source_address=each.source_address.partition("%")[0],
+            destination_address=each.destination_address.partition("%")[0],
+        )
+        if is_multicast(flow.destination_address):
+            group = flow.destination_address
+            left_out.append(_left(report, f"group {group}: no unicast 5-tuple"))
+        elif is_loopback(flow.destination_address) and remote:
+            left_out.append(_left(report, "loopback: never leaves the subscription's machine"))
+        else:
+            yield _Candidate(
+                report=report,
+                flow=flow,
+                source_address=_source(flow, plan, publisher, subscription, source_address),
+                ask=ask,
+            )
+
+
+def _source(
+    flow: FlowTuple,
+    plan: Plan,
+    publisher: PlannedNode | None,
+    subscription: PlannedNode | None,
+    observe: SourceAddress | None,
+) -> str:
+    """The address that the flow's packets come from; empty if it is not known."""
+    if not is_wildcard(flow.source_address):
+        return flow.source_address
+    if publisher is None:
+        return ""
+    v6 = flow.internet_protocol is InternetProtocol.IPV6
+    if observe is not None and (seen := observe(publisher, flow.destination_address)):
+        return canonical(seen) if (":" in seen) is v6 else ""
+    declared = {each.name: canonical(each.address) for each in plan.machines if each.address}
+    address = declared.get(publisher.machine, "")
+    other = "" if subscription is None else declared.get(subscription.machine, "")
+    if address and other == flow.destination_address and (":" in address) is v6:
+        return address
+    return ""
+
+
+def _ask(
+    report: FlowReport, publisher: PlannedNode | None, subscription: PlannedNode | None
+) -> tuple[int | None, int | None]:
+    sends = _endpoint(publisher, EndpointKind.PUBLISHER, report.topic)
+    takes = _endpoint(subscription, EndpointKind.SUBSCRIPTION, report.topic)
+    dscp = None if sends is None else sends.dscp
+    # 0 is what an unmarked socket reads back: it was not asked for.
+    dscp = dscp if dscp is not None else report.dscp or None
+    asked = [each.five_qi for each in (sends, takes) if each is not None]
+    return dscp, next((each for each in asked if each is not None), None)
+
+
+def _rule(sharing: Sequence[_Candidate]) -> FlowRule:
+    first = sharing[0]
+    flow = first.flow
+    names = sorted(
+        {(each.report.topic, each.report.publisher, each.report.subscription) for each in sharing}
+    )
+    topic, publisher, subscription = names[0]
+    where = f"{flow.transport_protocol.value} {flow.destination_address}"
+    return FlowRule(
+        key=f"{topic} {publisher} → {subscription} {where}",
+        names=tuple(names),
+        transport_protocol=flow.transport_protocol,
+        source_address=first.source_address,
+        source_port=flow.source_port,
+        destination_address=flow.destination_address,
+        destination_port=flow.destination_port,
+        flow_label=flow.flow_label,
+        dscp=first.ask[0],
+        five_qi=first.ask[1],
+        max_delay_ms=min(
+            (ms for each in sharing if (ms := each.report.max_delay_ms) is not None), default=None
+        ),
+    )
+
+
+def _treated(rule: FlowRule, mapping: DscpMapping | None, *, label_flows: bool) -> FlowRule:
+    """The rule with what follows from its 5QI and its 5-tuple."""
+    if mapping is not None and rule.dscp is None and rule.five_qi is not None:
+        rule = replace(rule, dscp=mapping.dscp_for(rule.five_qi))
+    if label_flows and rule.internet_protocol is InternetProtocol.IPV6 and not rule.flow_label:
+        # Equal for equal 5-tuples and evenly spread, as RFC 6437 §3 asks; never 0, which is none.
+        digest = hashlib.sha256(rule.describe().encode()).digest()
+        label = 1 + int.from_bytes(digest[:8], "big") % MAX_FLOW_LABEL
+        rule = replace(rule, flow_label=label)
+    return rule
+
+
+def _distinct(rules: Sequence[FlowRule]) -> tuple[FlowRule, ...]:
+    """Number the keys that occur again: several publishers of one node on one topic."""
+    seen: dict[str, int] = {}
+    distinct = []
+    for rule in sorted(rules, key=lambda each: (each.key, each.source_port, each.destination_port)):
+        seen[rule.key] = seen.get(rule.key, 0) + 1
+        number = seen[rule.key]
+        distinct.append(rule if number == 1 else replace(rule, key=f"{rule.key} #{number}"))
+    return tuple(distinct)
+
+
+def _disagreement(sharing: Sequence[_Candidate]) -> Iterator[LeftOut]:
+    """Two flows in one tuple that are to be treated differently: the network sees only one."""
+    for each in sharing:
+        other = next(candidate for candidate in sharing if candidate.ask != each.ask)
+        yield _left(
+            each.report,
+            f"shares its 5-tuple with {other.report.topic} {other.report.publisher} → "
+            f"{other.report.subscription}, which is to be treated differently; "
+            "make one of them unique",
+        )
+
+
+def _left(report: FlowReport, reason: str) -> LeftOut:
+    return LeftOut(
+        topic=report.topic,
+        publisher=report.publisher,
+        subscription=report.subscription,
+        reason=reason,
+    )
+
+
+def _node(plan: Plan, full_name: str) -> PlannedNode | None:
+    return next((each for each in plan.nodes if each.full_name == full_name), None)
+
+
+def _endpoint(node: PlannedNode | None, kind: EndpointKind, topic: str) -> PlannedEndpoint | None:
+    """The planned endpoint; of several on one topic the one that asks something of its data.
+
+    The DSCP of a subscription is of what it sends back, which no rule is about.
+    """
+    found = [
+        each
+        for each in (() if node is None else node.endpoints)
+        if each.kind is kind and each.resolved == topic
+    ]
+    publishes = kind is EndpointKind.PUBLISHER
+    asking = [
+        each for each in found if (publishes and each.dscp is not None) or each.five_qi is not None
+    ]
+    return next(iter((*asking, *found)), None)
+
+
+def _same_host(plan: Plan, report: FlowReport) -> bool:
+    """Whether both ends may be on one host: one machine, or machines of one address."""
+    addresses = {each.name: each.address for each in plan.machines}
+    ends = [_node(plan, name) for name in (report.publisher, report.subscription)]
+    places = {"" if end is None else addresses.get(end.machine, "") for end in ends}
+    return len(places) == 1
+
+
+def named(rule: FlowRule) -> str:
+    """Return the flows of a rule: `/robot/video /robot/camera → /viewer`, several with commas."""
+    return ", ".join(
+        f"{topic} {publisher} → {subscription}" for topic, publisher, subscription in rule.names
+    )
+
+
+def asks(rule: FlowRule) -> str:
+    """Return what a rule asks for: `EF = DSCP 46 = TOS 184 (0xb8), 5QI 85`."""
+    found = [] if rule.dscp is None else [describe(rule.dscp)]
+    if rule.five_qi is not None:
+        found.append(f"5QI {rule.five_qi}")
+    if rule.flow_label:
+        found.append(f"flow label {rule.flow_label:#07x}")
+    if rule.max_delay_ms is not None:
+        found.append(f"at most {rule.max_delay_ms:g} ms")
+    return ", ".join(found) or "nothing"
+
+
+def remarks(
+    rules: Sequence[FlowRule], left_out: Iterable[LeftOut], why_not: Callable[[FlowRule], str]
+) -> Iterator[str]:
+    """Return comment lines that say what an export has: its rules, and what is left out, and why.
+
+    Args:
+        rules: of verified flows.
+        left_out: flows without a rule.
+        why_not: why a rule is not expressed; empty if it is.
+    """
+    for rule in rules:
+        yield f"# {named(rule)}: {rule.describe()}: {asks(rule)}"
+    for each in left_out:
+        yield f"# left out: {each}"
+    for rule in rules:
+        if why := why_not(rule):
+            yield f"# left out: {named(rule)}: {why}"

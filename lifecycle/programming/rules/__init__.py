@@ -1,1 +1,0 @@
-"""Verified flows as rules, settings and request bodies of other systems, and as tables. Pure."""

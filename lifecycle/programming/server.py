@@ -1,0 +1,426 @@
+"""A target that keeps one thing per flow and device at a server: subscriptions, sessions.
+
+Owns: what NEF and CAMARA have in common: which ends of a flow are devices of the mobile network,
+each of which is asked for; the difference between rules, ledger and server, and the order in which
+it is made up for. A request is written down before it is sent, so that what was made is found again
+even if the answer was lost. What a thing is and how it is asked for is the target's.
+"""
+
+from __future__ import annotations
+
+import abc
+import ipaddress
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple
+
+import msgspec
+from msgspec.structs import replace
+
+from lifecycle.codec import to_json
+from lifecycle.errors import LifecycleError, UsageError
+from lifecycle.programming.http import Api, as_segment
+from lifecycle.programming.ledger import Entry, TargetRecord
+from lifecycle.programming.rules import FlowRule, LeftOut, RuleSet, asks
+from lifecycle.programming.settings import ServerSettings, device_networks, load_settings
+from lifecycle.programming.target import (
+    ChangeKind,
+    FlowChange,
+    HttpError,
+    Means,
+    PartlyError,
+    SettingsError,
+    Target,
+    TargetChanges,
+    describe_rule,
+)
+
+Body = dict[str, Any]
+"""Of a request, JSON-able."""
+
+
+class DeviceEnd(NamedTuple):
+    """One end of a flow that is a device of the mobile network, and the other end.
+
+    Attributes:
+        sends: the device is the sender.
+        device: address of the device.
+        device_port: 1–65535.
+        server: address of the other end, a device or not.
+        server_port: 1–65535.
+    """
+
+    sends: bool
+    device: str
+    device_port: int
+    server: str
+    server_port: int
+
+    @property
+    def is_ipv6(self) -> bool:
+        """Whether its addresses are of IPv6."""
+        return ":" in self.device
+
+
+def device_ends(rule: FlowRule, devices: Sequence[str]) -> tuple[DeviceEnd, ...]:
+    """Return the ends of a flow that are devices: one or both.
+
+    Raises:
+        ValueError: none is, or an end that has to be known is not.
+    """
+    if ipaddress.ip_address(rule.destination_address).is_loopback:
+        raise ValueError("it never leaves its machine")
+    if not rule.source_address:
+        raise ValueError(
+            "the address it is sent from is not known; give its machine an address in the manifest"
+        )
+    source = (rule.source_address, rule.source_port)
+    destination = (rule.destination_address, rule.destination_port)
+    networks = device_networks(devices)
+    found = tuple(
+        end
+        for name, end in (
+            ("destination", DeviceEnd(False, *destination, *source)),
+            ("source", DeviceEnd(True, *source, *destination)),
+        )
+        if name in devices or any(ipaddress.ip_address(end.device) in each for each in networks)
+    )
+    if not found:
+        text = ", ".join(map(str, networks))
+        raise ValueError(f"neither end is a device of the mobile network ({text})")
+    return found
+
+
+def class_name(rule: FlowRule, names: Mapping[int, str], default: str, *, setting: str) -> str:
+    """Return what the operator calls the class that a flow asks for.
+
+    Args:
+        rule: of the flow.
+        names: by 5QI.
+        default: for flows whose 5QI has no name or that ask for none; empty leaves them out.
+        setting: name of `names` in the settings, for the message.
+
+    Raises:
+        ValueError: there is no name.
+    """
+    if rule.five_qi is not None and rule.five_qi in names:
+        return names[rule.five_qi]
+    if default:
+        return default
+    if rule.five_qi is None:
+        raise ValueError(f"it asks for no 5QI ({asks(rule)}), and there is no default class")
+    raise ValueError(
+        f"the operator's name for 5QI {rule.five_qi} is not known; add it to {setting}"
+    )
+
+
+class Wanted(msgspec.Struct, frozen=True, kw_only=True):
+    """What to ask the network for one flow and one of its ends.
+
+    Attributes:
+        key: of the FlowRule, with the direction behind it: unique, and as stable.
+        rule: that it is made from.
+    """
+
+    key: str
+    rule: FlowRule
+    body: Body
+
+
+class Made(msgspec.Struct, frozen=True, kw_only=True):
+    """One thing as the server has it.
+
+    Attributes:
+        id: what the server calls it.
+        expires_s: seconds since the epoch; None if it does not expire.
+        detail: for people: "granted for 600 s instead of 3600 s".
+        differs: why it is not what was asked for; empty if it is.
+    """
+
+    id: str
+    expires_s: float | None = None
+    detail: str = ""
+    differs: str = ""
+
+
+class ServerTarget(Target):
+    """One kind of thing at one server.
+
+    Args:
+        settings: path of the settings file, so that a later run can remove what this one leaves.
+        means: see Means.
+
+    Attributes:
+        collection: path of all things, "/sessions"; without the slash, what an export calls them.
+    """
+
+    hint = "give --config FILE"
+    collection: ClassVar[str]
+    settings_type: ClassVar[type[ServerSettings]]
+
+    def __init__(self, settings: str, means: Means) -> None:
+        super().__init__(settings, means)
+        self._server: Any = self._of_file(settings)
+        self._api = Api(
+            self._server.scope,
+            token=self._server.token,
+            timeout_s=self._server.timeout_s,
+            patience=means.patience,
+            clock=means.clock,
+            deadline=means.deadline,
+        )
+        path = str(Path(settings).absolute())
+        self._record = TargetRecord(target=self.kind, scope=self._api.url, settings=path)
+        self.name = f"{self.kind} at {self._api.url}"
+
+    @classmethod
+    def read(cls, given: Mapping[str, Any]) -> str:
+        """Take the path of the settings file, in which the kind of the server is a key."""
+        if not given.get("config"):
+            raise UsageError(
+                f"cannot program {cls.kind} without settings: where it is and who we are",
+                hint=cls.hint,
+            )
+        return str(given["config"])
+
+    @classmethod
+    def restore(cls, record: TargetRecord) -> str:
+        """Return the settings file of a record, if it is still of the same server."""
+        own = load_settings(record.settings).get(cls.kind)
+        scope = "" if own is None else own.scope
+        if scope != record.scope:
+            raise SettingsError(
+                f"cannot remove what is at {record.scope}: settings {record.settings!r} are "
+                f"{f'of {scope}' if scope else f'without {record.target}'} now"
+            )
+        return record.settings
+
+    @classmethod
+    def token_variables(cls, settings: str) -> frozenset[str]:
+        """Return those of every server of the file."""
+        servers = load_settings(settings).values()
+        return frozenset(each.token.env for each in servers if each.token and each.token.env)
+
+    @classmethod
+    def export(cls, settings: str, rules: RuleSet, system: str) -> str:  # noqa: ARG003 - Target
+        """Return the bodies as JSON: `{"subscriptions": [{key, flow, asks, body}], …}`."""
+        return cls.document(rules, cls._of_file(settings)) + "\n"
+
+    @classmethod
+    def _of_file(cls, path: str) -> ServerSettings:
+        own = load_settings(path).get(cls.kind)
+        if own is None:
+            raise SettingsError(
+                f"cannot program {cls.kind}: settings {str(Path(path).absolute())!r} have no key "
+                f"{cls.kind!r}"
+            )
+        return own
+
+    @classmethod
+    def document(cls, rules: RuleSet, server: ServerSettings) -> str:
+        """Return requests as JSON for people and scripts: each body beside what it is for."""
+        wanted, left_out = cls.wanted(rules.rules, server)
+        requests = [
+            {
+                "key": each.key,
+                "flow": each.rule.describe(),
+                "asks": asks(each.rule),
+                "body": each.body,
+            }
+            for each in wanted
+        ]
+        left = [str(each) for each in (*rules.left_out, *left_out)]
+        return to_json({cls.collection[1:]: requests, "left_out": left}).decode()
+
+    @classmethod
+    def wanted(
+        cls, rules: Iterable[FlowRule], server: Any
+    ) -> tuple[tuple[Wanted, ...], tuple[LeftOut, ...]]:
+        """Return one request per flow and device, and the flows that none can be made for."""
+        wanted: list[Wanted] = []
+        left: list[LeftOut] = []
+        for rule in rules:
+            try:
+                wanted += [
+                    Wanted(
+                        key=f"{rule.key} {'from' if end.sends else 'to'} device",
+                        rule=rule,
+                        body=cls.body(rule, end, server),
+                    )
+                    for end in device_ends(rule, server.devices)
+                ]
+            except ValueError as error:  # noqa: PERF203 - the other flows are asked for
+                left += rule.left_out(str(error))
+        return tuple(wanted), tuple(left)
+
+    @staticmethod
+    @abc.abstractmethod
+    def body(rule: FlowRule, end: DeviceEnd, settings: Any) -> Body:
+        """Return what is asked for one flow and one of its ends that is a device.
+
+        Raises:
+            ValueError: it cannot be asked for.
+        """
+
+    @abc.abstractmethod
+    def create(self, body: Body) -> Made:
+        """Ask for it."""
+
+    @abc.abstractmethod
+    def find(self, body: Body) -> Made | None:
+        """Look for one that was asked for with this body; None if there is none."""
+
+    @abc.abstractmethod
+    def see(self, id_: str, body: Body) -> Made | None:
+        """Look at one, and compare it with what was asked for; None if it is gone."""
+
+    @abc.abstractmethod
+    def update(self, id_: str, before: Body, body: Body) -> Made:
+        """Change one; the id may become another."""
+
+    def delete(self, id_: str) -> None:
+        """Delete one; that it is gone already is no error."""
+        self._api.request("DELETE", self.path(id_), may_be_gone=True)
+
+    def path(self, id_: str) -> str:
+        """Return the path of one thing."""
+        return f"{self.collection}/{as_segment(id_)}"
+
+    def plan(self, rules: Sequence[FlowRule]) -> TargetChanges:
+        """Compare rules, ledger and server; asks the server about each thing of ours."""
+        return self._planned(*self.wanted(rules, self._server))
+
+    def apply(self, rules: Sequence[FlowRule]) -> TargetChanges:
+        """Make it so, one flow after the other.
+
+        Raises:
+            PartlyError: for some flows it failed; the others are done.
+        """
+        wanted, left_out = self.wanted(rules, self._server)
+        bodies = {each.key: each.body for each in wanted}
+        return self._carried_out(self._planned(wanted, left_out), bodies)
+
+    def remove(self) -> TargetChanges:
+        """Delete everything of ours at the server.
+
+        Raises:
+            PartlyError: some could not be deleted; they stay in the ledger.
+        """
+        return self._carried_out(self._planned((), ()), {})
+
+    def _planned(self, wanted: Sequence[Wanted], left_out: Sequence[LeftOut]) -> TargetChanges:
+        keys = {each.key for each in wanted}
+        entries = self._entries()
+        # Deletions come first: what is in the way of something new goes before it.
+        changes = [
+            FlowChange(kind=ChangeKind.DELETE, key=each.key, what=each.what)
+            for each in entries.values()
+            if each.key not in keys
+        ]
+        for each in wanted:
+            kind, detail = self._compare(entries.get(each.key), each.body)
+            what = describe_rule(each.rule)
+            changes.append(FlowChange(kind=kind, key=each.key, what=what, detail=detail))
+        return TargetChanges(
+            target=self.name, changes=tuple(changes), left_out=tuple(map(str, left_out))
+        )
+
+    def _compare(self, entry: Entry | None, body: Body) -> tuple[ChangeKind, str]:
+        if entry is None:
+            return ChangeKind.CREATE, ""
+        asked: Body = json.loads(entry.body)
+        if not entry.id:
+            found = self.find(asked)
+            if found is None:
+                return ChangeKind.CREATE, "asked for before, but never made"
+            entry = replace(entry, id=found.id)
+            self._note(entry)
+        seen = self.see(entry.id, asked)
+        if seen is None:
+            return ChangeKind.CREATE, "gone from the server"
+        if seen.expires_s != entry.expires_s:
+            self._note(replace(entry, expires_s=seen.expires_s))
+        if asked != body:
+            return ChangeKind.UPDATE, ""
+        if seen.differs:
+            return ChangeKind.UPDATE, seen.differs
+        return ChangeKind.KEEP, seen.detail
+
+    def _carried_out(self, planned: TargetChanges, bodies: Mapping[str, Body]) -> TargetChanges:
+        done: list[FlowChange] = []
+        errors: list[tuple[str, LifecycleError]] = []
+        for change in planned.changes:
+            try:
+                detail = self._make(change, bodies.get(change.key, {}))
+            except LifecycleError as error:  # noqa: PERF203 - the other flows go on
+                errors.append((change.key, error))
+            else:
+                done.append(replace(change, detail=detail or change.detail))
+        made = replace(planned, changes=tuple(done))
+        if errors:
+            text = [replace(made, left_out=()).render(done=True)]
+            raise PartlyError(
+                self.name, len(planned.changes), errors, done=text if made.pending else ()
+            )
+        return made
+
+    def _make(self, change: FlowChange, body: Body) -> str:
+        """Make one change; returns what is to be reported of it."""
+        if change.kind is ChangeKind.CREATE:
+            return self._create(change, body)
+        entry = self._entries()[change.key]
+        if change.kind is ChangeKind.UPDATE:
+            made = self.update(entry.id, json.loads(entry.body), body)
+            self._note(_entry(change, body, made))
+            return made.detail
+        if change.kind is ChangeKind.DELETE:
+            found = Made(id=entry.id) if entry.id else self.find(json.loads(entry.body))
+            if found is not None:
+                self.delete(found.id)
+            self._forget(change.key)
+        return ""
+
+    def _create(self, change: FlowChange, body: Body) -> str:
+        self._note(_entry(change, body, None))
+        try:
+            made = self.create(body)
+        except HttpError as error:
+            if not error.uncertain:
+                self._forget(change.key)
+                raise
+            try:
+                found = self.find(body)
+            except HttpError as second:
+                raise error from second
+            if found is None:
+                # The entry stays pending: the server may still be making it.
+                raise
+            made = found
+        self._note(_entry(change, body, made))
+        return made.detail
+
+    def _entries(self) -> dict[str, Entry]:
+        """What is ours there, by key."""
+        return {each.key: each for each in self._ledger.entries(self._record)}
+
+    def _note(self, entry: Entry) -> None:
+        every = {**self._entries(), entry.key: entry}
+        self._ledger.put(replace(self._record, entries=tuple(every.values())))
+
+    def _forget(self, key: str) -> None:
+        every = tuple(each for name, each in self._entries().items() if name != key)
+        if every:
+            self._ledger.put(replace(self._record, entries=every))
+        else:
+            self._ledger.drop(self._record)
+
+
+def _entry(change: FlowChange, body: Body, made: Made | None) -> Entry:
+    return Entry(
+        key=change.key,
+        what=change.what,
+        id="" if made is None else made.id,
+        expires_s=None if made is None else made.expires_s,
+        body=json.dumps(body, sort_keys=True),
+    )

@@ -1,0 +1,335 @@
+"""What a network target is, which there are, what it changes, and what can go wrong.
+
+Owns: `Target`, which plans, applies and removes; the names of all of them; their answers as text;
+the errors of this package. A target is a module here that has its class as `TARGET`, and one name
+in `TARGETS`; it is imported on first use.
+"""
+
+from __future__ import annotations
+
+import abc
+import enum
+import importlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import msgspec
+
+from lifecycle.errors import ExitCode, LifecycleError, UsageError
+from lifecycle.programming.patience import Clock, Deadline, Patience
+from lifecycle.programming.rules import FlowRule, RuleSet, asks
+
+if TYPE_CHECKING:
+    from lifecycle.programming.ledger import Ledger, TargetRecord
+
+TARGETS = ("nft", "tc", "nef", "camara")
+
+_TAKEN = {("tc",): ("device", "rate", "guarantee"), ("nef", "camara"): ("config",)}
+"""Targets → options that only they take."""
+
+
+class ChangeKind(enum.Enum):
+    """What happens to one flow."""
+
+    CREATE = "create"
+    UPDATE = "update"
+    DELETE = "delete"
+    KEEP = "keep"
+
+
+_SIGNS = {
+    ChangeKind.CREATE: "+",
+    ChangeKind.UPDATE: "~",
+    ChangeKind.DELETE: "-",
+    ChangeKind.KEEP: "=",
+}
+
+
+class FlowChange(msgspec.Struct, frozen=True, kw_only=True):
+    """One flow in one target.
+
+    Attributes:
+        key: of the FlowRule.
+        what: the rule for people, `udp 10.77.0.1:17900 → 10.77.0.2:17910, EF = DSCP 46 …`.
+        detail: why, or what came of it: "gone from the server", "granted for 600 s".
+    """
+
+    kind: ChangeKind
+    key: str
+    what: str = ""
+    detail: str = ""
+
+
+class TargetChanges(msgspec.Struct, frozen=True, kw_only=True):
+    """What one target has to do, or did.
+
+    Attributes:
+        target: for people: "nft table inet flowqos_teleop", "tc on eth0".
+        left_out: flows that this target cannot express, each with its reason.
+        warnings: what people should know, whole sentences.
+    """
+
+    target: str
+    changes: tuple[FlowChange, ...] = ()
+    left_out: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def pending(self) -> bool:
+        """Whether there is anything to do."""
+        return any(each.kind is not ChangeKind.KEEP for each in self.changes)
+
+    def render(self, *, done: bool = False) -> str:
+        """Return the changes as text, one line per flow.
+
+        Args:
+            done: they have been made.
+        """
+        kinds = [each.kind for each in self.changes]
+        counts = [
+            f"{number} {kind.value}d" if done else f"{number} to {kind.value}"
+            for kind in ChangeKind
+            if kind is not ChangeKind.KEEP and (number := kinds.count(kind))
+        ]
+        counts.append(f"{kinds.count(ChangeKind.KEEP)} unchanged")
+        lines = [f"{self.target}: {', '.join(counts)}"]
+        for each in self.changes:
+            detail = f" ({each.detail})" if each.detail else ""
+            what = f": {each.what}" if each.what else ""
+            lines.append(f"  {_SIGNS[each.kind]} {each.key}{what}{detail}")
+        lines += [f"  left out: {reason}" for reason in self.left_out]
+        lines += [f"  warning: {warning}" for warning in self.warnings]
+        return "\n".join(lines)
+
+
+class Means:
+    """What targets are opened with.
+
+    Args:
+        ledger: of the system.
+        patience: with servers.
+        clock: for servers.
+
+    Attributes:
+        deadline: of everything that the targets ask of servers.
+    """
+
+    def __init__(
+        self, ledger: Ledger, *, patience: Patience | None = None, clock: Clock | None = None
+    ) -> None:
+        self.ledger = ledger
+        self.patience = patience or Patience()
+        self.clock = clock or Clock()
+        self.deadline = Deadline()
+
+
+class Target(abc.ABC):
+    """A network that can be programmed with flow rules, and everything of ours in it.
+
+    Args:
+        settings: what `read` or `restore` returned.
+        means: see Means.
+
+    Attributes:
+        kind: name of the target.
+        hint: how to give what it cannot do without; empty if there is nothing such.
+        settings_type: of its key in the settings file of servers; None if it is no server.
+        name: for people: "nft table inet flowqos_teleop".
+    """
+
+    kind: ClassVar[str]
+    hint: ClassVar[str] = ""
+    settings_type: ClassVar[type[msgspec.Struct] | None] = None
+    name: str
+
+    def __init__(self, settings: Any, means: Means) -> None:
+        self._settings = settings
+        self._ledger = means.ledger
+
+    @classmethod
+    def read(cls, given: Mapping[str, Any]) -> Any:  # noqa: ARG003 - most take some
+        """Read the values of the options it takes; what is missing, None or empty was not given.
+
+        Raises:
+            UsageError: something is missing, or they do not fit together.
+        """
+        return None
+
+    @classmethod
+    @abc.abstractmethod
+    def restore(cls, record: TargetRecord) -> Any:
+        """Return settings that are good enough to remove what a ledger's record lists.
+
+        The record has to be enough, long after the options are forgotten.
+
+        Raises:
+            SettingsError: the settings file is gone, or is of another server now.
+        """
+
+    @classmethod
+    @abc.abstractmethod
+    def export(cls, settings: Any, rules: RuleSet, system: str) -> str:
+        """Return what the network would be given, as text, and what is left out of it.
+
+        Raises:
+            ValueError: the rates of a device do not fit.
+        """
+
+    @classmethod
+    def token_variables(cls, settings: Any) -> frozenset[str]:  # noqa: ARG003 - servers have some
+        """Return the environment variables that hold tokens."""
+        return frozenset()
+
+    @abc.abstractmethod
+    def plan(self, rules: Sequence[FlowRule]) -> TargetChanges:
+        """Compare what should be with what is; changes nothing."""
+
+    @abc.abstractmethod
+    def apply(self, rules: Sequence[FlowRule]) -> TargetChanges:
+        """Make it so, and return what was done; a second time changes nothing."""
+
+    @abc.abstractmethod
+    def remove(self) -> TargetChanges:
+        """Delete everything of ours."""
+
+    def dry_run(self, rules: Sequence[FlowRule]) -> str:
+        """Return what would be sent, checked as far as that is possible; changes nothing."""
+        given = RuleSet(rules=tuple(rules), left_out=())
+        return self.export(self._settings, given, self._ledger.system)
+
+    def renew(self) -> float | None:
+        """Prolong what would expire; return seconds until the next time, None if never."""
+        return None
+
+
+class Chosen(msgspec.Struct, frozen=True):
+    """A network that a person asked for, with what he said of it."""
+
+    target: type[Target]
+    settings: Any
+
+    def open(self, means: Means) -> Target:
+        """Return the target.
+
+        Raises:
+            UsageError: the options or the settings file cannot be used.
+        """
+        return self.target(self.settings, means)
+
+
+def target_kind(name: str) -> type[Target]:
+    """Return the class of a target.
+
+    Raises:
+        UsageError: there is no such target.
+    """
+    if name not in TARGETS:
+        raise UsageError(f"cannot program target {name!r}; use {', '.join(TARGETS)}")
+    kind: type[Target] = importlib.import_module(f"{__package__}.{name}").TARGET
+    return kind
+
+
+def read_targets(
+    names: Iterable[str], given: Mapping[str, Any], *, option: str = "--target"
+) -> tuple[Chosen, ...]:
+    """Return the targets that a person asked for, with their options.
+
+    Args:
+        names: of TARGETS.
+        given: values of options by name; what is missing, None or empty was not given.
+        option: what chose the targets, for messages.
+
+    Raises:
+        UsageError: they do not fit together.
+    """
+    chosen = tuple(dict.fromkeys(names))
+    for those, flags in _TAKEN.items():
+        if not {*those} & {*chosen} and any(given.get(each) for each in flags):
+            needs = _either([f"--{each}" for each in flags])
+            raise UsageError(f"cannot use {needs} without {option} {_either(those)}")
+    kinds = map(target_kind, chosen)
+    return tuple(Chosen(each, each.read(given)) for each in kinds)
+
+
+def _either(words: Sequence[str]) -> str:
+    *most, last = words
+    return f"{', '.join(most)} or {last}" if most else last
+
+
+def describe_rule(rule: FlowRule) -> str:
+    """Return a rule for people: the tuple and what it gets."""
+    return f"{rule.describe()}, {asks(rule)}"
+
+
+def usable(
+    rules: Iterable[FlowRule], why_not: Callable[[FlowRule], str]
+) -> tuple[tuple[FlowRule, ...], tuple[str, ...]]:
+    """Return the rules that `why_not` has no reason against, and the others with their reasons."""
+    reasons = [(each, why_not(each)) for each in rules]
+    return (
+        tuple(each for each, why in reasons if not why),
+        tuple(f"{each.key}: {why}" for each, why in reasons if why),
+    )
+
+
+class ProgrammingError(LifecycleError):
+    """A network refused, or could not be reached or read."""
+
+    exit_code = ExitCode.BRING_UP_FAILED
+
+
+class PrivilegeError(ProgrammingError):
+    """A command needs a privilege that this process lacks."""
+
+
+class MissingFeatureError(ProgrammingError):
+    """The kernel or the machine lacks something: a queueing discipline, a program."""
+
+
+class NotOursError(ProgrammingError):
+    """An object that is not ours is in the way; it is never touched."""
+
+
+class SettingsError(UsageError):
+    """The settings file of the HTTP targets cannot be read, or what it points to."""
+
+
+class HttpError(ProgrammingError):
+    """An HTTP interface refused or failed.
+
+    Attributes:
+        status: HTTP status; 0 if there was no answer.
+        uncertain: the request may have taken effect all the same.
+    """
+
+    def __init__(
+        self, message: str, *, status: int = 0, uncertain: bool = False, hint: str = ""
+    ) -> None:
+        super().__init__(message, hint=hint)
+        self.status = status
+        self.uncertain = uncertain
+
+
+class PartlyError(ProgrammingError):
+    """Some flows or targets could not be programmed; the others are.
+
+    Attributes:
+        done: what was done all the same and is there now, as text for people, one per target.
+    """
+
+    def __init__(
+        self,
+        target: str,
+        total: int,
+        errors: Sequence[tuple[str, LifecycleError]],
+        *,
+        done: Sequence[str] = (),
+    ) -> None:
+        lines = "".join(f"\n  {key}{': ' if key else ''}{error}" for key, error in errors)
+        made = "\n".join(("\ndone all the same:", *done)) if done else ""
+        super().__init__(f"cannot make {len(errors)} of {total} changes to {target}:{lines}{made}")
+        self.done = tuple(done)
+
+    def __str__(self) -> str:
+        """The message ends with lists, so a hint has a line of its own."""
+        return f"{self.message}\n{self.hint}" if self.hint else self.message

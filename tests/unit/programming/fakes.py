@@ -1,0 +1,78 @@
+"""A target and a tool that remember what was asked of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from lifecycle.programming.rules import FlowRule
+from lifecycle.programming.target import (
+    ChangeKind,
+    FlowChange,
+    ProgrammingError,
+    TargetChanges,
+)
+from lifecycle.programming.tool import ToolOutput
+
+
+class FakeTarget:
+    """Holds rules as a network would."""
+
+    def __init__(self, name: str = "fake") -> None:
+        self.name = name
+        self.rules: tuple[FlowRule, ...] = ()
+        self.applied = 0
+        self.fails = ""
+        self.due_s: float | None = None
+
+    def plan(self, rules: Sequence[FlowRule]) -> TargetChanges:
+        before = {each.key: each for each in self.rules}
+        changes = []
+        for each in rules:
+            old = before.pop(each.key, None)
+            kind = ChangeKind.CREATE if old is None else ChangeKind.UPDATE
+            kind = ChangeKind.KEEP if old == each else kind
+            changes.append(FlowChange(kind=kind, key=each.key, what=each.describe()))
+        changes += [FlowChange(kind=ChangeKind.DELETE, key=key, what="") for key in before]
+        return TargetChanges(target=self.name, changes=tuple(changes))
+
+    def apply(self, rules: Sequence[FlowRule]) -> TargetChanges:
+        self.applied += 1
+        if self.fails:
+            raise ProgrammingError(self.fails)
+        changes, self.rules = self.plan(rules), tuple(rules)
+        return changes
+
+    def dry_run(self, rules: Sequence[FlowRule]) -> str:
+        return "".join(f"{each.describe()}\n" for each in rules)
+
+    def remove(self) -> TargetChanges:
+        return self.apply(())
+
+    def renew(self) -> float | None:
+        return self.due_s
+
+
+class FakeTool:
+    """Answers command lines; what is not answered succeeds silently.
+
+    Attributes:
+        answers: (words that begin a command line, what it leaves).
+        lines: every command line, joined by spaces.
+    """
+
+    def __init__(self, *answers: tuple[str, ToolOutput | Callable[[], ToolOutput]]) -> None:
+        self.answers = dict(answers)
+        self.lines: list[str] = []
+
+    def run(self, argv: Sequence[str], *, stdin: str = "") -> ToolOutput:
+        line = " ".join(argv)
+        self.lines.append(line)
+        for begins, answer in self.answers.items():
+            if line.startswith(begins):
+                return answer if isinstance(answer, ToolOutput) else answer()
+        return ToolOutput(returncode=0, stdout="", stderr="")
+
+
+def failed(stderr: str, returncode: int = 1) -> ToolOutput:
+    """What a program that failed leaves."""
+    return ToolOutput(returncode=returncode, stdout="", stderr=stderr)

@@ -1,0 +1,141 @@
+"""nftables rulesets: whole outputs, accepted by nft itself, replaced and removed as a whole."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from msgspec.structs import replace
+
+from lifecycle.errors import UsageError
+from lifecycle.network.dscp import MAX_DSCP
+from lifecycle.programming.nft import (
+    MAX_COMMENT_BYTES,
+    digest_of,
+    nft_keyword,
+    render_nft,
+    render_table_removal,
+    table_name,
+)
+from tests.unit.programming.flow_samples import (
+    EXPECTED,
+    LEFT_OUT,
+    RULES,
+    VIDEO,
+    in_a_network_namespace,
+)
+
+
+def ruleset() -> str:
+    return render_nft(RULES, system="teleop", left_out=LEFT_OUT)
+
+
+def test_a_ruleset_is_one_table_that_is_replaced_in_one_transaction() -> None:
+    assert ruleset() == (EXPECTED / "teleop.nft").read_text(encoding="utf-8")
+
+
+def test_nft_accepts_the_ruleset(tmp_path: Path) -> None:
+    file = tmp_path / "teleop.nft"
+    file.write_text(ruleset(), encoding="utf-8")
+    done = in_a_network_namespace("nft", "-c", "-f", str(file))
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_nft_knows_how_every_dscp_is_spelled(tmp_path: Path) -> None:
+    rules = [
+        replace(VIDEO, dscp=dscp, destination_port=1000 + dscp) for dscp in range(MAX_DSCP + 1)
+    ]
+    file = tmp_path / "all.nft"
+    file.write_text(render_nft(rules, system="all"), encoding="utf-8")
+    script = f"nft -f {file} && nft -nn list table inet flowqos_all"
+    done = in_a_network_namespace("sh", "-c", script, needs="nft")
+    assert (done.returncode, done.stderr) == (0, "")
+    listed = re.findall(r'ip dscp set (\S+) counter packets 0 bytes 0 comment "(.*)"', done.stdout)
+    spelled = {int(value, 0): comment for value, comment in listed}
+    assert sorted(spelled) == list(range(MAX_DSCP + 1))
+    assert all(f"DSCP {dscp} = " in comment for dscp, comment in spelled.items())
+
+
+def test_applied_twice_there_is_one_table_and_removed_twice_there_is_none(
+    tmp_path: Path,
+) -> None:
+    ours, gone = tmp_path / "ours", tmp_path / "gone"
+    ours.write_text(ruleset(), encoding="utf-8")
+    gone.write_text(render_table_removal(table_name("teleop")), encoding="utf-8")
+    script = f"""set -e
+nft add table inet someone_else
+nft -f {ours}; nft list ruleset > {tmp_path}/once
+nft -f {ours}; nft list ruleset > {tmp_path}/twice
+nft -f {gone}; nft -f {gone}; nft list ruleset"""
+    done = in_a_network_namespace("sh", "-c", script, needs="nft")
+    assert (done.returncode, done.stderr) == (0, "")
+    once = (tmp_path / "once").read_text(encoding="utf-8")
+    assert once == (tmp_path / "twice").read_text(encoding="utf-8")
+    assert digest_of(once) == digest_of(ruleset()) != ""
+    assert done.stdout.split() == ["table", "inet", "someone_else", "{", "}"]
+
+
+def test_a_removal_names_our_table_only() -> None:
+    assert render_table_removal(table_name("teleop")) == (
+        "add table inet flowqos_teleop\ndelete table inet flowqos_teleop\n"
+    )
+
+
+def test_without_rules_the_table_is_there_and_empty() -> None:
+    text = render_nft([], system="teleop")
+    assert text.splitlines()[3:] == [
+        "add table inet flowqos_teleop",
+        "delete table inet flowqos_teleop",
+        "table inet flowqos_teleop {",
+        f'  comment "managed-by=lifecycle digest={digest_of(text)} system=teleop"',
+        "  chain post {",
+        "    type filter hook postrouting priority mangle; policy accept;",
+        "  }",
+        "}",
+    ]
+
+
+def test_two_rules_of_one_5_tuple_are_one_element() -> None:
+    other = replace(VIDEO, names=(("/depth", "/robot/camera", "/viewer"),))
+    elements = [
+        line.strip()
+        for line in render_nft([VIDEO, other], system="teleop").splitlines()
+        if line.startswith("      ")
+    ]
+    assert elements == [
+        (
+            "10.9.0.1 . 17900 . 10.9.0.2 . 17910 "
+            'comment "/video /robot/camera → /viewer, /depth /robot/camera → /viewer",'
+        )
+    ]
+
+
+def test_a_comment_that_nftables_would_not_keep_is_cut() -> None:
+    long = replace(VIDEO, names=((f'/{"é" * 100}"', "/robot/camera", "/viewer"),))
+    (comment,) = re.findall(r'17910 comment "(.*)",', render_nft([long], system="teleop"))
+    assert comment == f"/{'é' * 61}..."
+    assert len(comment.encode()) <= MAX_COMMENT_BYTES
+
+
+@pytest.mark.parametrize(
+    ("dscp", "keyword"),
+    [(0, "cs0"), (1, "lephb"), (44, "va"), (45, "45"), (46, "ef"), (5, "5"), (34, "af41")],
+)
+def test_nft_has_words_of_its_own_for_some_code_points(dscp: int, keyword: str) -> None:
+    assert nft_keyword(dscp) == keyword
+
+
+def test_a_table_without_our_comment_is_not_ours() -> None:
+    assert digest_of(ruleset()) != digest_of(render_nft(RULES[1:], system="teleop"))
+    assert digest_of('table inet x {\n\tcomment "by hand"\n}') == ""
+
+
+@pytest.mark.parametrize("system", ["", "1a", "a b", "a;b", "a}b", "é"])
+def test_a_name_that_no_manifest_may_have_makes_no_table(system: str) -> None:
+    message = (
+        f"cannot name an nftables table after system {system!r}; "
+        "use letters, digits, '_' and '-', a letter first"
+    )
+    with pytest.raises(UsageError, match=f"^{re.escape(message)}$"):
+        table_name(system)

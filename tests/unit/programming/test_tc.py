@@ -1,0 +1,147 @@
+"""Lines for tc: whole batches, accepted by tc twice, and classes that fit their link."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from msgspec.structs import replace
+
+from lifecycle.network.dscp import MAX_DSCP
+from lifecycle.programming.tc import (
+    TcMatch,
+    TcSettings,
+    class_of,
+    classes_of,
+    divide,
+    render_tc,
+    render_tc_removal,
+)
+from tests.unit.programming.flow_samples import (
+    EXPECTED,
+    LEFT_OUT,
+    RULES,
+    VIDEO,
+    in_a_network_namespace,
+)
+
+
+def settings(**rest: object) -> TcSettings:
+    return TcSettings(device="eth0", **{"link_kbit": 20_000, **rest})
+
+
+CASES = {
+    "htb_flow": settings(guaranteed_kbit={"ef": 4000}),
+    "htb_mark": settings(match=TcMatch.MARK),
+}
+
+
+def cannot(message: str) -> object:
+    return pytest.raises(ValueError, match=f"^{re.escape(message)}$")
+
+
+def script(case: TcSettings) -> str:
+    return render_tc(RULES, case, system="teleop", left_out=LEFT_OUT)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_script_makes_a_class_per_dscp_or_5qi_and_puts_each_flow_into_one(name: str) -> None:
+    assert script(CASES[name]) == (EXPECTED / f"{name}.sh").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("match", TcMatch)
+def test_tc_and_nft_take_the_script_once_and_remove_it_whole(
+    tmp_path: Path, match: TcMatch
+) -> None:
+    case = TcSettings(device="lo", link_kbit=20_000, match=match)
+    (tmp_path / "made").write_text(script(case), encoding="utf-8")
+    (tmp_path / "gone").write_text(render_tc_removal("lo"), encoding="utf-8")
+    text = f"""cd {tmp_path}
+tc qdisc add dev lo root handle 1: htb || exit 77
+set -e
+tc qdisc del dev lo root
+sh made; tc class show dev lo > shown; nft list table inet flowtc_lo_teleop >> shown
+if sh made 2>&1; then exit 1; fi
+tc -batch gone; tc qdisc show dev lo
+if tc -batch gone 2>&1; then exit 1; fi"""
+    done = in_a_network_namespace("sh", "-c", text, needs="nft")
+    if done.returncode == 77:
+        pytest.skip(f"this kernel has no htb: {done.stderr.strip()}")
+    assert done.returncode == 0, done.stderr
+    shown = (tmp_path / "shown").read_text(encoding="utf-8")
+    classes = set(re.findall(r"class htb (1f10:\w+)", shown))
+    assert set(re.findall(r"meta priority set (1f10:\w+)", shown)) < classes
+    assert "1f10:" not in done.stdout
+
+
+def test_a_removal_names_our_handle_so_that_nobody_elses_qdisc_goes() -> None:
+    assert render_tc_removal("eth0") == "qdisc del dev eth0 root handle 1f10:\n"
+
+
+def test_ef_comes_first_and_less_than_best_effort_last() -> None:
+    rules = [replace(VIDEO, dscp=dscp, five_qi=None) for dscp in range(MAX_DSCP + 1)]
+    names = [each.name for each in classes_of(rules)]
+    assert names[:4] == ["ef", "va", "dscp63", "dscp62"]
+    assert names[-2:] == ["cs1", "le"]
+    assert "df" not in names
+    assert [each.name for each in classes_of(rules) if each.below_default] == ["cs1", "le"]
+
+
+def test_5qis_are_ranked_by_their_guarantee_and_then_their_priority() -> None:
+    rules = [replace(VIDEO, dscp=None, five_qi=each) for each in (9, 5, 4, 3, 85)]
+    assert [each.name for each in classes_of(rules)] == ["5qi85", "5qi3", "5qi4", "5qi5", "5qi9"]
+
+
+def test_a_rule_without_dscp_and_5qi_and_one_of_df_stay_with_the_rest() -> None:
+    assert class_of(replace(VIDEO, dscp=None, five_qi=None)) is None
+    assert class_of(replace(VIDEO, dscp=0)) is None
+
+
+def test_a_link_is_divided_without_remainder_lost_or_spent_twice() -> None:
+    classes = classes_of(RULES)
+    rates, rest = divide(classes, link_kbit=20_000, guaranteed_kbit={"ef": 4000})
+    assert rates == {"ef": 4000, "nqb": 3950, "dscp5": 3950, "5qi9": 3950, "le": 200}
+    assert rest == 3950
+    assert sum(rates.values()) + rest <= 20_000
+
+
+@pytest.mark.parametrize(
+    ("link", "guaranteed", "message"),
+    [
+        (0, {}, "cannot divide a link of 0 kbit/s; use 1 or more"),
+        (
+            20_000,
+            {"af41": 1},
+            (
+                "cannot guarantee a rate to class 'af41'; "
+                "classes of these rules are: ef, nqb, dscp5, 5qi9, le"
+            ),
+        ),
+        (20_000, {"ef": 0}, "cannot guarantee 0 kbit/s to class ef; use 1 or more"),
+        (
+            20_000,
+            {"ef": 20_000},
+            (
+                "cannot guarantee 20200 kbit/s (ef 20000, le 200) on a link of 20000 kbit/s: "
+                "something must be left for nqb, dscp5, 5qi9, everything else"
+            ),
+        ),
+    ],
+)
+def test_rates_that_do_not_fit_are_refused(
+    link: int, guaranteed: dict[str, int], message: str
+) -> None:
+    with cannot(message):
+        divide(classes_of(RULES), link_kbit=link, guaranteed_kbit=guaranteed)
+
+
+@pytest.mark.parametrize(
+    "device", ["", "eth0; reboot", "a" * 16, "eth/0", "..", "eth0\nqdisc", "eth*", 'e"0']
+)
+def test_a_device_is_a_name_and_nothing_else(device: str) -> None:
+    with cannot(
+        f"cannot use device {device!r}; "
+        "use the name of a network device, such as eth0, of at most 15 characters"
+    ):
+        TcSettings(device=device, link_kbit=1)

@@ -1,0 +1,194 @@
+"""What programs say, in one sentence; and what people are told beside the changes."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from lifecycle.programming.nft import NftTarget
+from lifecycle.programming.target import (
+    ChangeKind,
+    FlowChange,
+    Means,
+    MissingFeatureError,
+    PrivilegeError,
+    ProgrammingError,
+    TargetChanges,
+)
+from lifecycle.programming.tc import parse_queue, parse_rate
+from lifecycle.programming.tool import HostTool, ToolOutput, demand
+from tests.unit.programming.fakes import FakeTool, failed
+from tests.unit.programming.samples import ledger_in, rule
+
+NO_TABLE = failed("Error: No such file or directory\nlist table inet flowqos_robot\n")
+QDISCS = [
+    {"dev": "eth0", "kind": "pfifo_fast", "root": True},
+    {"dev": "wlan0", "kind": "fq_codel", "root": True},
+    {"dev": "e1", "kind": "htb", "root": True},
+    {"dev": "lo", "kind": "pfifo_fast", "root": True},
+]
+
+
+@pytest.mark.parametrize(
+    ("stderr", "kind", "message"),
+    [
+        (
+            "Operation not permitted (you must be root)\nnetlink: Error: cache",
+            PrivilegeError,
+            (
+                "cannot mark: 'nft -f -' needs CAP_NET_ADMIN in this network namespace; "
+                "run this command as root, or give it that capability: in a container --cap-add "
+                "NET_ADMIN, in a systemd unit AmbientCapabilities=CAP_NET_ADMIN"
+            ),
+        ),
+        (
+            "Error: Specified qdisc kind is unknown.\n",
+            MissingFeatureError,
+            "cannot mark: 'nft -f -' says 'Error: Specified qdisc kind is unknown.'",
+        ),
+        (
+            "\n  syntax error, unexpected newline\n",
+            ProgrammingError,
+            "cannot mark: 'nft -f -' says 'syntax error, unexpected newline'",
+        ),
+        ("", ProgrammingError, "cannot mark: 'nft -f -' says 'exit code 1'"),
+    ],
+)
+def test_a_refusal_is_told_as_what_it_is(
+    stderr: str, kind: type[ProgrammingError], message: str
+) -> None:
+    with pytest.raises(ProgrammingError) as caught:
+        demand(FakeTool(("nft", failed(stderr))), ["nft", "-f", "-"], doing="mark")
+
+    assert type(caught.value) is kind
+    assert str(caught.value) == message
+
+
+def test_a_program_that_is_not_installed_is_told_with_its_package(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with pytest.raises(MissingFeatureError) as caught:
+        HostTool(("nft-of-nowhere",)).run(["nft"])
+
+    assert str(caught.value) == (
+        "cannot run 'nft-of-nowhere': it is not installed; "
+        "install it: apt-get install nft-of-nowhere"
+    )
+
+
+def test_programs_read_stdin_and_speak_english() -> None:
+    code = "import os, sys; print(sys.stdin.read(), os.environ['LC_ALL'])"
+
+    assert HostTool().run([sys.executable, "-c", code], stdin="x").stdout == "x C\n"
+
+
+def test_people_are_warned_where_marks_alone_change_nothing(tmp_path: Path) -> None:
+    listed = ToolOutput(returncode=0, stdout=json.dumps(QDISCS), stderr="")
+    tool = FakeTool(("nft list", NO_TABLE), ("tc -j qdisc show", listed))
+
+    changes = NftTarget(None, Means(ledger_in(tmp_path)), tool).plan([rule()])
+
+    remedy = "add one that looks at these flows: lifecycle flows apply MANIFEST --target tc"
+    bands = "puts EF, CS6 and unmarked packets into one band and AF*1 into the worst"
+    assert list(changes.warnings) == [
+        f"marking alone gives no priority on {device}: its queueing discipline {effect}; "
+        f"{remedy} --device {device} --rate RATE"
+        for device, effect in (
+            ("eth0", f"pfifo_fast {bands}"),
+            ("wlan0", "fq_codel does not look at DSCP"),
+        )
+    ]
+
+
+def test_a_machine_without_tc_is_marked_without_a_warning(tmp_path: Path) -> None:
+    def missing() -> ToolOutput:
+        raise MissingFeatureError("cannot run 'tc'")
+
+    tool = FakeTool(("nft list", NO_TABLE), ("tc", missing))
+
+    assert NftTarget(None, Means(ledger_in(tmp_path)), tool).plan([rule()]).warnings == ()
+
+
+def test_a_dry_run_that_no_privilege_can_check_says_so_in_its_first_line(tmp_path: Path) -> None:
+    refused = failed("netlink: Error: cache initialization failed: Operation not permitted")
+    no_namespaces = failed("unshare: unshare failed: Operation not permitted")
+    tool = FakeTool(("nft -c", refused), ("unshare", no_namespaces))
+
+    text = NftTarget(None, Means(ledger_in(tmp_path)), tool).dry_run([rule()])
+
+    first, _, rest = text.partition("\n")
+    assert first == "# Not checked: this kernel allows no user namespaces."
+    assert "add table inet flowqos_robot" in rest
+    assert tool.lines == ["nft -c -f -", "unshare -Urn nft -c -f -"]
+
+
+def test_a_write_that_failed_is_not_taken_for_done(tmp_path: Path) -> None:
+    ledger = ledger_in(tmp_path)
+    tool = FakeTool(("nft list", NO_TABLE), ("nft -f", failed("Error: no memory")))
+    target = NftTarget(None, Means(ledger), tool)
+
+    with pytest.raises(ProgrammingError, match="no memory"):
+        target.apply([rule()])
+
+    assert target.plan([rule()]).pending
+    assert ledger.read().targets == ()
+
+
+@pytest.mark.parametrize(
+    ("text", "kbit"), [("20mbit", 20_000), ("512kbit", 512), ("1Gbit", 1_000_000), ("2000bit", 2)]
+)
+def test_rates_are_read_as_tc_spells_them(text: str, kbit: int) -> None:
+    assert parse_rate(text) == kbit
+
+
+@pytest.mark.parametrize(("text", "ms"), [("50ms", 50.0), ("1.5s", 1500.0), ("500us", 0.5)])
+def test_times_are_read_as_tc_spells_them(text: str, ms: float) -> None:
+    assert parse_queue(text) == ms
+
+
+@pytest.mark.parametrize("text", ["", "50", "0ms", "-1ms", "1e3ms", "1.0000ms", "٣ms", "50kbit"])
+def test_what_is_no_time_is_refused(text: str) -> None:
+    with pytest.raises(ValueError) as caught:
+        parse_queue(text)
+
+    assert str(caught.value) == (f"cannot use queue {text!r}; use a number and us, ms or s: 50ms")
+
+
+@pytest.mark.parametrize("text", ["", "20", "20mbps", "-1kbit", "500bit", "1e3kbit", "٣kbit"])
+def test_what_is_no_rate_is_refused(text: str) -> None:
+    with pytest.raises(ValueError) as caught:
+        parse_rate(text)
+
+    assert str(caught.value) == (
+        f"cannot use rate {text!r}; use a number and kbit, mbit or gbit: 20mbit"
+    )
+
+
+def test_changes_read_as_a_list_with_their_counts() -> None:
+    changes = TargetChanges(
+        target="tc on eth0",
+        changes=(
+            FlowChange(kind=ChangeKind.CREATE, key="/a", what="udp x"),
+            FlowChange(kind=ChangeKind.UPDATE, key="/b", what="udp y", detail="moved"),
+            FlowChange(kind=ChangeKind.DELETE, key="/c", what=""),
+            FlowChange(kind=ChangeKind.KEEP, key="/d", what="udp z"),
+        ),
+        left_out=("/e: why",),
+        warnings=("look out",),
+    )
+
+    assert changes.render() == (
+        "tc on eth0: 1 to create, 1 to update, 1 to delete, 1 unchanged\n"
+        "  + /a: udp x\n"
+        "  ~ /b: udp y (moved)\n"
+        "  - /c\n"
+        "  = /d: udp z\n"
+        "  left out: /e: why\n"
+        "  warning: look out"
+    )
+    assert changes.render(done=True).startswith(
+        "tc on eth0: 1 created, 1 updated, 1 deleted, 1 unchanged\n"
+    )
