@@ -28,11 +28,14 @@ from rclpy.signals import SignalHandlerOptions
 from lifecycle import codec
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import Executor
+from lifecycle.middleware.discovery.environment import reach
+from lifecycle.middleware.discovery.prober import Prober
 from lifecycle.middleware.discovery.tcp import send_again_soon
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.middleware.fastdds.settings import discovery_by_profile
 from lifecycle.middleware.process.busy_sign import BusySign
 from lifecycle.middleware.process.teardown import leave_and_exit
+from lifecycle.middleware.rcl.graph_queries import OVER_DDS
 from lifecycle.middleware.rcl.hidden_node import made_participant
 from lifecycle.middleware.rcl.rclpy_nodes import follow_nodes
 from lifecycle.node.author.spec import load_nodes
@@ -80,11 +83,15 @@ class Participants:
 
     Args:
         default: that context.
+        joins: others run already. They answer a new participant once, before it listens, and would
+            announce themselves again within a second: they are asked to as soon as it listens.
     """
 
-    def __init__(self, default: Context) -> None:
+    def __init__(self, default: Context, *, joins: bool = False) -> None:
         self._default = default
+        self._joins = joins
         self._made: dict[ParticipantSettings, Context] = {}
+        self._probers: list[Prober] = []
 
     @contextlib.contextmanager
     def carrying(self, planned: PlannedNode) -> Iterator[Context]:
@@ -105,6 +112,10 @@ class Participants:
             with discovery_by_profile(settings):
                 context.init(args=[], domain_id=self._default.get_domain_id())
         with made_participant(context, settings, is_new=is_new):
+            if self._joins and OVER_DDS:
+                asked = reach(self._default.get_domain_id(), settings.urls, os.environ)
+                self._probers.append(Prober(asked))
+                self._probers[-1].ask(counted=False)
             yield context
         self._made[settings] = context
 
@@ -281,7 +292,7 @@ class Host:
         self._is_orderly = False
         self._left = threading.Event()
         self._nodes: dict[str, Hosted] = {}
-        self._participants = Participants(context)
+        self._participants = Participants(context, joins=spec.joins)
         self._adoption = Adoption(
             self._participants.carrying,
             self._loop,
