@@ -102,7 +102,7 @@ class Judge:
         if self._stills != (stills := self._standstill.count()):
             # What arrived meanwhile was not taken in: who came has to be asked for.
             self._stills = stills
-            self._observer.expect_newcomers(everybody=True)
+            self._observer.discovery.settling.expect_newcomers(everybody=True)
         system = self._system
         await system.refresh(self._observer, marks=stage is Stage.CONNECTED)
         observation = without(await self._observer.observe(self._asked()), system.dead())
