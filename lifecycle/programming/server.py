@@ -230,7 +230,7 @@ class ServerTarget(Target):
             }
             for each in wanted
         ]
-        left = [*map(str, rules.left_out), *left_out]
+        left = [*rules.left_out, *left_out]
         return to_json({cls.collection[1:]: requests, "left_out": left}).decode()
 
     @classmethod
@@ -251,7 +251,7 @@ class ServerTarget(Target):
                     for end in device_ends(rule, server.devices)
                 ]
             except ValueError as error:  # noqa: PERF203 - the other flows are asked for
-                left += map(str, rule.left_out(str(error)))
+                left += rule.left_out(str(error))
         return tuple(wanted), tuple(left)
 
     @staticmethod

@@ -400,7 +400,7 @@ def _show_changes(changes: Iterable[TargetChanges], *, done: bool) -> None:
         click.echo(each.render(done=done))
 
 
-def _show_left_out(flows: Iterable[object]) -> None:
+def _show_left_out(flows: Iterable[str]) -> None:
     """On stderr, beside a ruleset or bodies that go to a file."""
     for each in flows:
         click.echo(lines(f"left out: {each}"), err=True)
