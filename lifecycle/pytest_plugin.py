@@ -41,6 +41,7 @@ WAIT_S = 10.0
 DOWN_S = 30.0
 
 _LOG_LINES = 60
+_LOOK_S = 0.02
 _RUNNING = pytest.StashKey[list["LifecycleSystem"]]()
 
 
@@ -92,17 +93,15 @@ class LifecycleSystem:
         domain_id: its ROS domain, which is that of the test's process, too.
         environment: for programs that shall see the system, `ros2` for one.
         events: what it has reported so far: JSON events, docs/events.md.
-        directory: with `log`, the logs of its processes.
+        directory: with `log`, the logs of its processes, and `stderr`, what `lifecycle up` said.
     """
 
     def __init__(
         self,
         manifest: str | os.PathLike[str],
-        *,
+        words: Sequence[str],
         domain_id: int,
         directory: Path,
-        arguments: Mapping[str, object],
-        options: Sequence[str],
     ) -> None:
         self.manifest = Path(manifest)
         self.domain_id = domain_id
@@ -115,47 +114,33 @@ class LifecycleSystem:
         }
         self.environment.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         self.events: list[dict[str, Any]] = []
-        self.result: dict[str, Any] | None = None
-        self._said: list[str] = []
-        self._changed = threading.Condition()
-        words = [f"{name}:={value}" for name, value in arguments.items()]
-        self._process = subprocess.Popen(
-            [
-                *(sys.executable, "-m", "lifecycle", "up", str(manifest), *words),
-                *("--format", "json", "--domain", str(domain_id), *options),
-            ],
-            env=self.environment,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            encoding="utf-8",
-            errors="replace",
-            start_new_session=True,
-        )
-        self._readers = [
-            threading.Thread(target=each, daemon=True) for each in (self._read, self._hear)
-        ]
-        for each in self._readers:
-            each.start()
+        self._result: dict[str, Any] | None = None
+        with (directory / "stderr").open("wb") as said:
+            self._process = subprocess.Popen(
+                [
+                    *(sys.executable, "-m", "lifecycle", "up", str(manifest), *words),
+                    *("--format", "json", "--domain", str(domain_id)),
+                ],
+                env=self.environment,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=said,
+                encoding="utf-8",
+                errors="replace",
+                start_new_session=True,
+            )
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
 
     def _read(self) -> None:
         assert self._process.stdout is not None
         with self._process.stdout as lines:
             for line in lines:
                 document = json.loads(line)
-                with self._changed:
-                    if "event" in document:
-                        self.events.append(document)
-                    else:
-                        self.result = document
-                    self._changed.notify_all()
-
-    def _hear(self) -> None:
-        assert self._process.stderr is not None
-        with self._process.stderr as lines:
-            for line in lines:
-                with self._changed:
-                    self._said.append(line)
+                if "event" in document:
+                    self.events.append(document)
+                else:
+                    self._result = document
 
     @property
     def verdict(self) -> dict[str, Any]:
@@ -163,10 +148,9 @@ class LifecycleSystem:
 
         Of a system that has ended it has `run`: why, how far it came, and its exit code.
         """
-        with self._changed:
-            if self.result is not None:
-                return self.result
-            judged = [each["verdict"] for each in self.events if each["event"] == "verdict"]
+        if self._result is not None:
+            return self._result
+        judged = [each["verdict"] for each in self.events if each["event"] == "verdict"]
         return dict(judged[-1]) if judged else {"verdict": "unverifiable", "findings": []}
 
     def wait_for(
@@ -181,21 +165,16 @@ class LifecycleSystem:
         deadline = time.monotonic() + timeout_s
         looked = 0
         while True:
-            over = self._process.poll() is not None and not self._readers[0].is_alive()
-            with self._changed:
-                while looked < len(self.events):
-                    event = self.events[looked]
-                    looked += 1
-                    if holds(event):
-                        return event
-                if over:
-                    break
-                left_s = deadline - time.monotonic()
-                if left_s <= 0:
-                    raise TimeoutError(f"cannot find the event within {timeout_s:g} s")
-                self._changed.wait(min(left_s, 0.1))
-        self._readers[1].join(WAIT_S)
-        raise SystemFailedError(f"the system has ended\n{self.report()}")
+            over = not self._reader.is_alive()
+            for event in self.events[looked:]:
+                looked += 1
+                if holds(event):
+                    return event
+            if over:
+                raise SystemFailedError(f"the system has ended\n{self.report()}")
+            if time.monotonic() > deadline:
+                raise TimeoutError(f"cannot find the event within {timeout_s:g} s")
+            time.sleep(_LOOK_S)
 
     def until_active(self, timeout_s: float = UP_S) -> None:
         """Wait until the system is verified and active.
@@ -237,27 +216,8 @@ class LifecycleSystem:
 
     def log(self, process: str) -> list[str]:
         """Return all that a process has written, line by line."""
-        with self._changed:
-            return [
-                str(each["line"])
-                for each in self.events
-                if each["event"] == "log" and each["process"] == process
-            ]
-
-    def lifecycle(self, verb: str, *words: str) -> subprocess.CompletedProcess[str]:
-        """Run a verb about this system: `system.lifecycle("restart", "talker")`."""
-        started = next((each for each in self.events if each["event"] == "run"), None)
-        if started is None:
-            raise SystemFailedError(f"the system has not started\n{self.report()}")
-        name = f"{started['system']}@{started['domain_id']}"
-        return subprocess.run(
-            [sys.executable, "-m", "lifecycle", verb, name, *words],
-            env=self.environment,
-            capture_output=True,
-            text=True,
-            timeout=UP_S,
-            check=False,
-        )
+        logged = [each for each in self.events if each["event"] == "log"]
+        return [str(each["line"]) for each in logged if each["process"] == process]
 
     def stop(self) -> int:
         """End the system as `lifecycle down` does, and return its exit code; again is harmless."""
@@ -268,8 +228,7 @@ class LifecycleSystem:
         except subprocess.TimeoutExpired:
             os.killpg(self._process.pid, signal.SIGKILL)
             code = self._process.wait()
-        for each in self._readers:
-            each.join(WAIT_S)
+        self._reader.join(WAIT_S)
         return code
 
     def check(self) -> None:
@@ -278,10 +237,8 @@ class LifecycleSystem:
         Raises:
             SystemFailedError: its exit code is not 0.
         """
-        if self._process.poll() is not None:
-            self.stop()
-            return
-        if code := self.stop():
+        over = self._process.poll() is not None
+        if (code := self.stop()) and not over:
             raise SystemFailedError(f"lifecycle up ended with {code}\n{self.report()}")
 
     def report(self) -> str:
@@ -294,11 +251,10 @@ class LifecycleSystem:
             f"verdict on {self.manifest.name}, domain {self.domain_id}",
             _verdict_text(self.verdict),
         )
-        with self._changed:
-            said = "".join(self._said)
-            names = [each["process"] for each in self.events if each["event"] == "log"]
+        said = (self.directory / "stderr").read_text(encoding="utf-8", errors="replace")
         if said.strip():
             yield "lifecycle up", said.rstrip("\n")
+        names = [each["process"] for each in self.events if each["event"] == "log"]
         for name in dict.fromkeys(names):
             yield f"log of {name}", "\n".join(self.log(name)[-_LOG_LINES:])
 
@@ -349,13 +305,8 @@ def lifecycle_system(
     ) -> LifecycleSystem:
         directory = tmp_path / f"lifecycle{len(running)}"
         directory.mkdir(mode=0o700)
-        system = LifecycleSystem(
-            manifest,
-            domain_id=lifecycle_domain,
-            directory=directory,
-            arguments=arguments or {},
-            options=options,
-        )
+        words = (*options, *(f"{name}:={value}" for name, value in (arguments or {}).items()))
+        system = LifecycleSystem(manifest, words, lifecycle_domain, directory)
         running.append(system)
         system.until_active(timeout_s)
         return system

@@ -8,7 +8,10 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Callable, Iterator, Mapping
+import shutil
+import sys
+import textwrap
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -192,6 +195,19 @@ def write_text(path: Path, text: str) -> None:
     except (OSError, ValueError) as error:
         why = error.strerror if isinstance(error, OSError) else error
         raise UsageError(f"cannot write {str(path)!r}: {why}") from error
+
+
+def terminal_width() -> int:
+    """Return how many columns standard output has; 0 where it is no terminal."""
+    return shutil.get_terminal_size().columns if sys.stdout.isatty() else 0
+
+
+def wrapped(text: Iterable[str], width: int) -> str:
+    """Return lines, those that are longer than `width` continued below; 0 continues none."""
+    wrap = textwrap.TextWrapper(
+        width, subsequent_indent="    ", break_long_words=False, break_on_hyphens=False
+    ).wrap
+    return "\n".join(each for line in text for each in (wrap(line) if width else [line]))
 
 
 def target_arguments(function: F) -> F:

@@ -7,38 +7,42 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable
+from typing import Any
 
 from lifecycle.network.dscp import dscp_name, tos
-from lifecycle.network.nfe import FlowTuple
 from lifecycle.verify.verdict import FlowReport
 
-COLUMNS = (
-    "topic",
-    "publisher",
-    "subscription",
-    "transport_protocol",
-    "internet_protocol",
-    "source_address",
-    "source_port",
-    "destination_address",
-    "destination_port",
-    "flow_label",
-    "dscp",
-    "dscp_name",
-    "tos",
-    "unique",
-    "demanded",
-    "publisher_requirement",
-    "subscription_requirement",
-    "max_delay_ms",
-    "transport",
-    "outcome",
-    "five_qi",
-    "five_qi_reason",
-    "effective_transport",
-)
-"""Header line. An empty cell is something that is not known or does not apply.
+COLUMNS: dict[str, Callable[[FlowReport, Any], object]] = {
+    "topic": lambda report, _: report.topic,
+    "publisher": lambda report, _: report.publisher,
+    "subscription": lambda report, _: report.subscription,
+    "transport_protocol": lambda _, flow: flow and flow.transport_protocol.value,
+    "internet_protocol": lambda _, flow: flow and flow.internet_protocol.value,
+    "source_address": lambda _, flow: flow and flow.source_address,
+    "source_port": lambda _, flow: flow and flow.source_port,
+    "destination_address": lambda _, flow: flow and flow.destination_address,
+    "destination_port": lambda _, flow: flow and flow.destination_port,
+    "flow_label": lambda _, flow: flow and flow.label,
+    # Only what was read back from the sockets: an RMW reports 0 whatever is marked.
+    "dscp": lambda report, _: report.dscp,
+    "dscp_name": lambda report, _: None if report.dscp is None else dscp_name(report.dscp),
+    "tos": lambda report, _: None if report.dscp is None else tos(report.dscp),
+    "unique": lambda report, _: report.unique and report.unique.value,
+    "demanded": lambda report, _: report.demanded.value,
+    "publisher_requirement": lambda report, _: report.requirement[0].value,
+    "subscription_requirement": lambda report, _: report.requirement[1].value,
+    "max_delay_ms": lambda report, _: (
+        None if report.max_delay_ms is None else f"{report.max_delay_ms:g}"
+    ),
+    "transport": lambda report, _: report.transport,
+    "outcome": lambda report, _: report.outcome.value,
+    "five_qi": lambda report, _: report.five_qi,
+    "five_qi_reason": lambda report, _: report.five_qi_reason,
+    "effective_transport": lambda report, _: report.effective_transport,
+}
+"""Header → cell, of a report and one of its flows. None, something that is not known or does not
+apply, is an empty cell.
 
 `flow_label` is five hex digits, or `unset` where the sender sets none; empty on IPv4.
 """
@@ -54,44 +58,6 @@ def flows_to_csv(flows: Iterable[FlowReport]) -> str:
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)
     for report in flows:
-        writer.writerows(_rows(report))
+        for flow in report.tuples or (None,):
+            writer.writerow([cell(report, flow) for cell in COLUMNS.values()])
     return text.getvalue()
-
-
-def _rows(report: FlowReport) -> Iterator[tuple[object, ...]]:
-    for flow in report.tuples or (None,):
-        yield (
-            report.topic,
-            report.publisher,
-            report.subscription,
-            *_tuple_cells(flow),
-            *_dscp_cells(report.dscp),
-            "" if report.unique is None else report.unique.value,
-            report.demanded.value,
-            *(each.value for each in report.requirement),
-            "" if report.max_delay_ms is None else f"{report.max_delay_ms:g}",
-            report.transport,
-            report.outcome.value,
-            "" if report.five_qi is None else report.five_qi,
-            report.five_qi_reason,
-            report.effective_transport,
-        )
-
-
-def _tuple_cells(flow: FlowTuple | None) -> tuple[object, ...]:
-    if flow is None:
-        return ("",) * 7
-    return (
-        flow.transport_protocol.value,
-        flow.internet_protocol.value,
-        flow.source_address,
-        flow.source_port,
-        flow.destination_address,
-        flow.destination_port,
-        flow.label,
-    )
-
-
-def _dscp_cells(dscp: int | None) -> tuple[object, ...]:
-    """Only what was read back from the sockets: an RMW reports 0 whatever is marked."""
-    return ("", "", "") if dscp is None else (dscp, dscp_name(dscp), tos(dscp))

@@ -22,7 +22,7 @@ from lifecycle.errors import UsageError
 from lifecycle.network.dscp import code_points, describe, dscp_name
 from lifecycle.network.nfe import InternetProtocol
 from lifecycle.programming.ledger import TargetRecord
-from lifecycle.programming.rules import FlowRule, LeftOut, RuleSet, named, remarks
+from lifecycle.programming.rules import FlowRule, RuleSet, named, remarks
 from lifecycle.programming.target import (
     ChangeKind,
     FlowChange,
@@ -91,7 +91,7 @@ def digest_of(text: str) -> str:
     return match["digest"] if match else ""
 
 
-def render_nft(rules: Iterable[FlowRule], *, system: str, left_out: Sequence[LeftOut] = ()) -> str:
+def render_nft(rules: Iterable[FlowRule], *, system: str, left_out: Sequence[str] = ()) -> str:
     """Return a ruleset for `nft -f` that replaces the system's table in one transaction.
 
     Flows that ask for neither DSCP nor flow label get no rule and are named in a comment.

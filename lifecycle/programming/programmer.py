@@ -23,7 +23,7 @@ from lifecycle.network.five_qi import DscpMapping, dscp_mapping, parse_mapping
 from lifecycle.network.nfe import canonical, is_loopback
 from lifecycle.plan.model import Plan, PlannedNode
 from lifecycle.programming.ledger import Ledger, TargetRecord, has_ledger, owner_is_dead
-from lifecycle.programming.rules import FlowRule, LeftOut, RuleSet, SourceAddress, flow_rules
+from lifecycle.programming.rules import FlowRule, RuleSet, SourceAddress, flow_rules
 from lifecycle.programming.target import (
     Chosen,
     Means,
@@ -186,7 +186,7 @@ class Programmer(Removal):
         self._applied: tuple[FlowRule, ...] | None = None
         # What targets have, as far as is known: all of it once every target was brought up to date.
         self._programmed: dict[str, FlowRule] = {}
-        self.left_out: tuple[LeftOut, ...] = ()
+        self.left_out: tuple[str, ...] = ()
 
     def replan(self, plan: Plan) -> None:
         """Take another plan of the same system and machines: its flows are programmed next."""

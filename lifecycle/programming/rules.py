@@ -122,12 +122,9 @@ class FlowRule(msgspec.Struct, frozen=True, kw_only=True):
         """IANA protocol number, 6 or 17."""
         return PROTOCOL_NUMBERS[self.transport_protocol.value]
 
-    def left_out(self, reason: str) -> list[LeftOut]:
+    def left_out(self, reason: str) -> list[str]:
         """Return each pair that this one flow carries as one that is left out."""
-        return [
-            LeftOut(topic=topic, publisher=publisher, subscription=subscription, reason=reason)
-            for topic, publisher, subscription in self.names
-        ]
+        return [f"{_pair(*names)}: {reason}" for names in self.names]
 
     def describe(self) -> str:
         """Return the tuple for people: `udp 10.77.0.1:17900 → 10.77.0.2:17910`."""
@@ -152,27 +149,16 @@ def _address(text: str) -> IpAddress:
     return address
 
 
-class LeftOut(msgspec.Struct, frozen=True, kw_only=True):
-    """Something of a flow that makes no rule.
+class RuleSet(msgspec.Struct, frozen=True, kw_only=True):
+    """What may be programmed, and what may not.
 
     Attributes:
-        reason: one phrase, "shared memory: no packet that a network could see".
+        left_out: what makes no rule, each with its reason: `/map /a → /b: shared memory: no packet
+            that a network could see`.
     """
 
-    topic: str
-    publisher: str
-    subscription: str
-    reason: str
-
-    def __str__(self) -> str:
-        return f"{self.topic} {self.publisher} → {self.subscription}: {self.reason}"
-
-
-class RuleSet(msgspec.Struct, frozen=True, kw_only=True):
-    """What may be programmed, and what may not."""
-
     rules: tuple[FlowRule, ...]
-    left_out: tuple[LeftOut, ...]
+    left_out: tuple[str, ...] = ()
 
 
 class _Candidate(msgspec.Struct, frozen=True, kw_only=True):
@@ -210,7 +196,7 @@ def flow_rules(
         label_flows: give each IPv6 flow a flow label of its own, so that the 3-tuple of addresses
             and label distinguishes it from others too.
     """
-    left_out: list[LeftOut] = []
+    left_out: list[str] = []
     by_tuple: dict[tuple[object, ...], list[_Candidate]] = {}
     for report in flows:
         for each in _candidates(report, plan, source_address, left_out):
@@ -242,7 +228,7 @@ def _candidates(
     report: FlowReport,
     plan: Plan,
     source_address: SourceAddress | None,
-    left_out: list[LeftOut],
+    left_out: list[str],
 ) -> Iterator[_Candidate]:
     if report.outcome is not Outcome.OK:
         left_out.append(_left(report, f"not verified: its verdict is {report.outcome.value}"))
@@ -366,7 +352,7 @@ def _distinct(rules: Sequence[FlowRule]) -> tuple[FlowRule, ...]:
     return tuple(distinct)
 
 
-def _disagreement(sharing: Sequence[_Candidate]) -> Iterator[LeftOut]:
+def _disagreement(sharing: Sequence[_Candidate]) -> Iterator[str]:
     """Two flows in one tuple that are to be treated differently: the network sees only one."""
     for each in sharing:
         other = next(candidate for candidate in sharing if candidate.ask != each.ask)
@@ -378,13 +364,12 @@ def _disagreement(sharing: Sequence[_Candidate]) -> Iterator[LeftOut]:
         )
 
 
-def _left(report: FlowReport, reason: str) -> LeftOut:
-    return LeftOut(
-        topic=report.topic,
-        publisher=report.publisher,
-        subscription=report.subscription,
-        reason=reason,
-    )
+def _left(report: FlowReport, reason: str) -> str:
+    return f"{_pair(report.topic, report.publisher, report.subscription)}: {reason}"
+
+
+def _pair(topic: str, publisher: str, subscription: str) -> str:
+    return f"{topic} {publisher} → {subscription}"
 
 
 def _node(plan: Plan, full_name: str) -> PlannedNode | None:
@@ -418,9 +403,7 @@ def _same_host(plan: Plan, report: FlowReport) -> bool:
 
 def named(rule: FlowRule) -> str:
     """Return the flows of a rule: `/robot/video /robot/camera → /viewer`, several with commas."""
-    return ", ".join(
-        f"{topic} {publisher} → {subscription}" for topic, publisher, subscription in rule.names
-    )
+    return ", ".join(_pair(*names) for names in rule.names)
 
 
 def asks(rule: FlowRule) -> str:
@@ -436,7 +419,7 @@ def asks(rule: FlowRule) -> str:
 
 
 def remarks(
-    rules: Sequence[FlowRule], left_out: Iterable[LeftOut], why_not: Callable[[FlowRule], str]
+    rules: Sequence[FlowRule], left_out: Iterable[str], why_not: Callable[[FlowRule], str]
 ) -> Iterator[str]:
     """Return comment lines that say what an export has: its rules, and what is left out, and why.
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import abc
 import ipaddress
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
@@ -22,7 +22,7 @@ from lifecycle.codec import to_json
 from lifecycle.errors import LifecycleError, UsageError
 from lifecycle.programming.http import Api, as_segment
 from lifecycle.programming.ledger import Entry, TargetRecord
-from lifecycle.programming.rules import FlowRule, LeftOut, RuleSet, asks
+from lifecycle.programming.rules import FlowRule, RuleSet, asks
 from lifecycle.programming.settings import ServerSettings, device_networks, load_settings
 from lifecycle.programming.target import (
     ChangeKind,
@@ -230,16 +230,16 @@ class ServerTarget(Target):
             }
             for each in wanted
         ]
-        left = [str(each) for each in (*rules.left_out, *left_out)]
+        left = [*rules.left_out, *left_out]
         return to_json({cls.collection[1:]: requests, "left_out": left}).decode()
 
     @classmethod
     def wanted(
         cls, rules: Iterable[FlowRule], server: Any
-    ) -> tuple[tuple[Wanted, ...], tuple[LeftOut, ...]]:
+    ) -> tuple[tuple[Wanted, ...], tuple[str, ...]]:
         """Return one request per flow and device, and the flows that none can be made for."""
         wanted: list[Wanted] = []
-        left: list[LeftOut] = []
+        left: list[str] = []
         for rule in rules:
             try:
                 wanted += [
@@ -289,7 +289,9 @@ class ServerTarget(Target):
 
     def plan(self, rules: Sequence[FlowRule]) -> TargetChanges:
         """Compare rules, ledger and server; asks the server about each thing of ours."""
-        return self._planned(*self.wanted(rules, self._server))
+        wanted, left_out = self.wanted(rules, self._server)
+        changes = tuple(change for change, _ in self._changes(wanted))
+        return TargetChanges(target=self.name, changes=changes, left_out=left_out)
 
     def apply(self, rules: Sequence[FlowRule]) -> TargetChanges:
         """Make it so, one flow after the other.
@@ -298,8 +300,7 @@ class ServerTarget(Target):
             PartlyError: for some flows it failed; the others are done.
         """
         wanted, left_out = self.wanted(rules, self._server)
-        bodies = {each.key: each.body for each in wanted}
-        return self._carried_out(self._planned(wanted, left_out), bodies)
+        return replace(self._carried_out(wanted), left_out=left_out)
 
     def remove(self) -> TargetChanges:
         """Delete everything of ours at the server.
@@ -307,24 +308,20 @@ class ServerTarget(Target):
         Raises:
             PartlyError: some could not be deleted; they stay in the ledger.
         """
-        return self._carried_out(self._planned((), ()), {})
+        return self._carried_out(())
 
-    def _planned(self, wanted: Sequence[Wanted], left_out: Sequence[LeftOut]) -> TargetChanges:
+    def _changes(self, wanted: Sequence[Wanted]) -> Iterator[tuple[FlowChange, Body]]:
+        """Yield what is to be done, with the body that is wanted."""
         keys = {each.key for each in wanted}
         entries = self._entries()
         # Deletions come first: what is in the way of something new goes before it.
-        changes = [
-            FlowChange(kind=ChangeKind.DELETE, key=each.key, what=each.what)
-            for each in entries.values()
-            if each.key not in keys
-        ]
+        for entry in entries.values():
+            if entry.key not in keys:
+                yield FlowChange(kind=ChangeKind.DELETE, key=entry.key, what=entry.what), {}
         for each in wanted:
             kind, detail = self._compare(entries.get(each.key), each.body)
             what = describe_rule(each.rule)
-            changes.append(FlowChange(kind=kind, key=each.key, what=what, detail=detail))
-        return TargetChanges(
-            target=self.name, changes=tuple(changes), left_out=tuple(map(str, left_out))
-        )
+            yield FlowChange(kind=kind, key=each.key, what=what, detail=detail), each.body
 
     def _compare(self, entry: Entry | None, body: Body) -> tuple[ChangeKind, str]:
         if entry is None:
@@ -347,22 +344,21 @@ class ServerTarget(Target):
             return ChangeKind.UPDATE, seen.differs
         return ChangeKind.KEEP, seen.detail
 
-    def _carried_out(self, planned: TargetChanges, bodies: Mapping[str, Body]) -> TargetChanges:
+    def _carried_out(self, wanted: Sequence[Wanted]) -> TargetChanges:
+        planned = tuple(self._changes(wanted))  # all of it first: an error here changes nothing
         done: list[FlowChange] = []
         errors: list[tuple[str, LifecycleError]] = []
-        for change in planned.changes:
+        for change, body in planned:
             try:
-                detail = self._make(change, bodies.get(change.key, {}))
+                detail = self._make(change, body)
             except LifecycleError as error:  # noqa: PERF203 - the other flows go on
                 errors.append((change.key, error))
             else:
                 done.append(replace(change, detail=detail or change.detail))
-        made = replace(planned, changes=tuple(done))
+        made = TargetChanges(target=self.name, changes=tuple(done))
         if errors:
-            text = [replace(made, left_out=()).render(done=True)]
-            raise PartlyError(
-                self.name, len(planned.changes), errors, done=text if made.pending else ()
-            )
+            text = [made.render(done=True)] if made.pending else []
+            raise PartlyError(self.name, len(planned), errors, done=text)
         return made
 
     def _make(self, change: FlowChange, body: Body) -> str:

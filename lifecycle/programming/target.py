@@ -194,8 +194,7 @@ class Target(abc.ABC):
 
     def dry_run(self, rules: Sequence[FlowRule]) -> str:
         """Return what would be sent, checked as far as that is possible; changes nothing."""
-        given = RuleSet(rules=tuple(rules), left_out=())
-        return self.export(self._settings, given, self._ledger.system)
+        return self.export(self._settings, RuleSet(rules=tuple(rules)), self._ledger.system)
 
     def renew(self) -> float | None:
         """Prolong what would expire; return seconds until the next time, None if never."""

@@ -22,7 +22,7 @@ import hashlib
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 from msgspec.structs import replace
@@ -39,7 +39,7 @@ from lifecycle.programming.nft import (
     render_table,
     table_name,
 )
-from lifecycle.programming.rules import FlowRule, LeftOut, RuleSet, remarks
+from lifecycle.programming.rules import FlowRule, RuleSet, remarks
 from lifecycle.programming.target import (
     ChangeKind,
     FlowChange,
@@ -275,7 +275,7 @@ def divide(
     return {each.name: rates[each.name] for each in every}, left - share * len(open_)
 
 
-class Queues(msgspec.Struct, frozen=True, kw_only=True):
+class Queues(NamedTuple):
     """What makes a device queue by class.
 
     Attributes:
@@ -357,7 +357,7 @@ def render_tc(
     settings: TcSettings,
     *,
     system: str,
-    left_out: Sequence[LeftOut] = (),
+    left_out: Sequence[str] = (),
 ) -> str:
     """Return a file for `sh FILE` that gives `tc -batch` and `nft -f` their lines.
 

@@ -20,7 +20,9 @@ from lifecycle.cli.common import (
     target_arguments,
     target_plan,
     target_run,
+    terminal_width,
     timeout_option,
+    wrapped,
 )
 from lifecycle.cli.completion import completing
 from lifecycle.errors import ExitCode, UsageError
@@ -35,8 +37,13 @@ if TYPE_CHECKING:
 HEADS = ("node", "process", "pid", "state", "matched", "unique flows", "")
 
 
-def status_text(status: SystemStatus) -> str:
-    """Return a status as lines: one for the system, one for each node and each connection."""
+def status_text(status: SystemStatus, *, width: int = 0) -> str:
+    """Return a status as lines: one for the system, one for each node and each connection.
+
+    Args:
+        status: of a system.
+        width: columns that a line should not pass; 0 wraps none.
+    """
     verdict = "not judged yet" if status.verdict is None else status.verdict.value
     verdict += f" ({status.not_ok})" if status.not_ok else ""
     rows = [HEADS, *map(row, status.nodes)]
@@ -56,7 +63,7 @@ def status_text(status: SystemStatus) -> str:
         text += [
             one_line(f"  {connection_text(each)}") for each in (node.connections if node else ())
         ]
-    return "\n".join(text)
+    return wrapped(text, width)
 
 
 def connection_text(connection: ConnectionReport) -> str:
@@ -156,7 +163,7 @@ def status_command(
     if format_ == "json":
         click.echo(json_text(to_json(seen).decode()))
     else:
-        click.echo(status_text(seen))
+        click.echo(status_text(seen, width=terminal_width()))
     return ExitCode.VIOLATED if seen.verdict is Outcome.VIOLATED else ExitCode.OK
 
 
@@ -170,7 +177,8 @@ def _watch(path: Path, format_: str) -> int:
     with Watched(whole=not is_json) as shown, asking(path):
         for seen in follow(path / "control"):
             status, verdict = seen.status, seen.status.verdict
-            shown.show(json_text(to_json(status).decode()) if is_json else status_text(status))
+            text = json_text(to_json(status).decode()) if is_json else ""
+            shown.show(text or status_text(status, width=terminal_width()))
     click.echo(f"{path.name}: its supervisor has ended", err=True)
     return ExitCode.VIOLATED if verdict is Outcome.VIOLATED else ExitCode.OK
 

@@ -26,17 +26,20 @@ from lifecycle.cli.common import (
     network_options,
     target_argument,
     target_plan,
+    terminal_width,
     timeout_option,
+    wrapped,
 )
 from lifecycle.cli.verbs.verify import exit_code
 from lifecycle.cli.watched import Watched
 from lifecycle.codec import to_json
 from lifecycle.errors import ExitCode, UsageError
 from lifecycle.manifest.model import UniqueHow
-from lifecycle.network.dscp import describe
+from lifecycle.network.dscp import describe, dscp_name
 from lifecycle.network.nfe import NetworkFlowEndpoint
 from lifecycle.printable import columns, json_text, lines, one_line
 from lifecycle.programming.flows_csv import flows_to_csv
+from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import FlowReport
 
 if TYPE_CHECKING:
@@ -78,6 +81,28 @@ def render_flows(flows: Sequence[FlowReport], format_: str) -> str:
         return "no flow"
     rows = [_HEADS, *(tuple(map(one_line, row)) for flow in flows for row in _rows(flow))]
     return "\n".join(columns(rows))
+
+
+def watched_flows(verdict: Verdict, format_: str) -> str:
+    """Return the flows for `--watch`: on a terminal what fits its width, what is not ok first."""
+    width = terminal_width()
+    if format_ != "text" or not width:
+        return render_flows(verdict.flows, format_)
+    from lifecycle.cli.up_output import verdict_line
+
+    rows = [
+        (
+            flow.outcome.value,
+            one_line(flow.topic),
+            one_line(f"{flow.publisher} → {flow.subscription}"),
+            "unknown" if flow.unique is None else _UNIQUE[flow.unique],
+            "–" if flow.dscp is None else dscp_name(flow.dscp),
+            flow.effective_transport,
+        )
+        for flow in sorted(verdict.flows, key=lambda each: each.outcome is Outcome.OK)
+    ]
+    head = ("verdict", "topic", "flow", "unique", "dscp", "transport")
+    return "\n".join((wrapped([verdict_line(verdict)], width), *columns([head, *rows])))
 
 
 def _rows(flow: FlowReport) -> Iterator[tuple[str, ...]]:
@@ -198,7 +223,7 @@ def _show(
     plan = _plan_of(target, assignments)
     if watch:
         with Watched(whole=format_ == "text") as shown:
-            follow_running(plan, lambda seen: shown.show(render_flows(seen.verdict.flows, format_)))
+            follow_running(plan, lambda seen: shown.show(watched_flows(seen.verdict, format_)))
         return ExitCode.OK
     asked = click.get_current_context().get_parameter_source("timeout")
     waits = asked is not click.core.ParameterSource.DEFAULT or supervisor_of(os.environ, plan, "")
@@ -371,7 +396,7 @@ def _show_changes(changes: Iterable[TargetChanges], *, done: bool) -> None:
         click.echo(each.render(done=done))
 
 
-def _show_left_out(flows: Iterable[object]) -> None:
+def _show_left_out(flows: Iterable[str]) -> None:
     """On stderr, beside a ruleset or bodies that go to a file."""
     for each in flows:
         click.echo(lines(f"left out: {each}"), err=True)

@@ -15,7 +15,7 @@ from lifecycle.network.nfe import (
     UniqueRequirement,
 )
 from lifecycle.plan.model import Plan
-from lifecycle.programming.rules import FlowRule, LeftOut
+from lifecycle.programming.rules import FlowRule
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import FlowReport
 from tests.builders import at, need, nfe, node, planned, publisher, shared_memory, subscription
@@ -49,14 +49,7 @@ RULES = (
     rule("/lidar", "fd09::1:17904", "fd09::2:17914", dscp=45, flow_label=0x12345),
     rule("/touch", "10.9.0.1:17905", "10.9.0.2:17915", five_qi=9),
 )
-LEFT_OUT = (
-    LeftOut(
-        topic="/map",
-        publisher="/robot/camera",
-        subscription="/viewer",
-        reason="not verified: its verdict is unverifiable",
-    ),
-)
+LEFT_OUT = ("/map /robot/camera → /viewer: not verified: its verdict is unverifiable",)
 
 
 def report(topic: str = "/robot/video", **rest: object) -> FlowReport:

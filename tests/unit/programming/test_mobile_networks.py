@@ -61,7 +61,7 @@ def cannot(message: str) -> object:
 
 def reasons(found: object) -> list[str]:
     assert found.requests == ()
-    return [each.reason for each in found.left_out]
+    return [each.partition(": ")[2] for each in found.left_out]
 
 
 # --- NEF

@@ -89,9 +89,9 @@ def test_a_flow_that_is_not_verified_is_not_programmed_and_the_reason_is_kept(
     programs.update([report(outcome=Outcome.UNVERIFIABLE)])
 
     assert target.rules == ()
-    assert [str(each) for each in programs.left_out] == [
-        "/robot/video /robot/camera → /viewer: not verified: its verdict is unverifiable"
-    ]
+    assert programs.left_out == (
+        "/robot/video /robot/camera → /viewer: not verified: its verdict is unverifiable",
+    )
 
 
 def test_while_a_node_restarts_its_rule_is_held_and_then_moved(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from rich.console import Console
 from lifecycle.cli.live_view import Live
 from lifecycle.cli.up_output import JsonLines, Narrator, PlainLines, Timings
 from lifecycle.cli.verbs.control import status_text
-from lifecycle.cli.verbs.flows import render_flows
+from lifecycle.cli.verbs.flows import render_flows, watched_flows
 from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import Run, RunKind, UniqueHow
 from lifecycle.network.nfe import (
@@ -404,6 +404,21 @@ FLOW = FlowReport(
     five_qi_reason="the least demanding class",
     effective_transport="shm",
 )
+
+
+def test_a_status_and_flows_fit_a_terminal_and_say_what_is_wrong_first(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("lifecycle.cli.verbs.flows.terminal_width", lambda: 80)
+    why = "wrong: " + ", ".join(f"/robot/topic_{number} (qos.incompatible)" for number in range(9))
+    told = status_text(replace(STATUS, not_ok=why), width=80).splitlines()
+    verdict = replace(
+        verdict_of(Outcome.VIOLATED), flows=(FLOW, replace(FLOW, outcome=Outcome.VIOLATED))
+    )
+    flows = watched_flows(verdict, "text").splitlines()
+    assert max(map(len, (*told, *flows))) <= 80
+    assert "/robot/topic_8 (qos.incompatible)" in " ".join(told)
+    assert [line.split()[0] for line in flows[-2:]] == ["violated", "ok"]
 
 
 def test_a_flow_shows_its_tuple_dscp_and_tos_requirement_and_verdict() -> None:
