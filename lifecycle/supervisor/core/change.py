@@ -18,10 +18,10 @@ from lifecycle.plan.model import Plan, PlannedNode, in_mode
 from lifecycle.supervisor.control.protocol import ChangedNodes
 from lifecycle.supervisor.core.advance import is_settled_down, phase_of, rests_as
 from lifecycle.supervisor.core.state import (
-    Attempt,
     Change,
     Level,
     Order,
+    Passage,
     Process,
     Run,
     Switch,
@@ -57,7 +57,7 @@ def enter_mode(run: Run, mode: str, *, back: bool = False) -> list[Event]:
 def leave_mode(run: Run, before: str, error: str, code: ExitCode) -> list[Event]:
     """Go back to the mode before: a node refuses a parameter, or the gate stays closed."""
     text = f"cannot enter mode {run.mode!r}: back to {before!r}"
-    run.attempt = run.passage = None
+    run.passage = None
     said = [Notice(message=text)]
     if run.order is not None:
         run.undone = code, error
@@ -90,7 +90,7 @@ def settle_mode(run: Run) -> list[Event]:
         is_whole = phase_of(run) == "active"
         return [entered, *([SystemReached(reached="active", elapsed_s=run.now_s)] * is_whole)]
     until_s = run.now_s + run.options.timeout_s
-    run.attempt = Attempt(until_s=until_s, mode="" if switch.back else switch.before)
+    run.passage = Passage(until_s=until_s, mode="" if switch.back else switch.before)
     return [entered]
 
 
@@ -151,7 +151,7 @@ def go_back(run: Run, reason: str, code: ExitCode) -> list[Event]:
     events = [_said(run, "rolling_back", reason)]
     change.back, change.reason, change.code = True, reason, code
     change.until_s = run.now_s + run.options.timeout_s
-    run.attempt = run.passage = None
+    run.passage = None
     if change.taken:
         change.taken = False
         change.down = {key for key in change.touched if key in run.nodes}
@@ -184,8 +184,7 @@ def settle_change(run: Run) -> list[Event]:
     if change is None:
         return []
     if change.taken:
-        asks = run.attempt is not None or run.passage is not None
-        return [] if asks else _finish(run, change)
+        return [] if run.passage is not None else _finish(run, change)
     if change.to_give or change.giving or not _is_down(run, change):
         return []
     _take(run, change)
@@ -223,7 +222,7 @@ def _take(run: Run, change: Change) -> None:
     run.came = bool(change.touched)
     run.changed()
     keys = change.active if change.back else None
-    run.attempt = Attempt(until_s=change.until_s, activates=not run.paused, keys=keys)
+    run.passage = Passage(until_s=change.until_s, activates=not run.paused, keys=keys)
 
 
 def _connected_as(plan: Plan, stays: dict[str, PlannedNode], before: Plan) -> Plan:

@@ -257,15 +257,15 @@ def goes_on(failure: Failure) -> Failure:
 def _cut_short(run: Run, failure: Failure) -> None:
     """Answer the order that a failure cuts short; a pause goes on. All wait for the gate again."""
     order = run.order
-    run.passage = None
+    run.shut_gate()
     if order is None or run.change is not None:
         if run.change is not None:
             run.change.again = failure.message
-        if run.attempt is not None:
-            run.attempt.at_gate = False
-            run.attempt.until_s = run.now_s + run.options.timeout_s
+        if run.passage is not None:
+            run.passage.at_gate = False
+            run.passage.until_s = run.now_s + run.options.timeout_s
     elif order.ask is not ControlRequest.PAUSE:
-        run.attempt = run.switch = None
+        run.passage = run.switch = None
         run.answer(ExitCode.BRING_UP_FAILED, failure.message)
 
 
@@ -287,8 +287,8 @@ def _back_off(run: Run, process: Process, failure: Failure, end: Exited | None) 
         node.renew, node.due_s = True, max(node.due_s, due_s)
     process.failed = True
     process.away_s = run.now_s if process.away_s is None else process.away_s
-    if run.attempt is not None and run.held_s is None:
-        run.attempt.until_s = due_s + run.options.timeout_s
+    if run.passage is not None and run.held_s is None:
+        run.passage.until_s = due_s + run.options.timeout_s
     events.append(
         RestartScheduled(
             process=process.name,
@@ -361,7 +361,7 @@ def end(
         deaths=len(run.deaths),
     )
     change, run.undone = run.change, None
-    run.attempt = run.passage = run.switch = run.change = None
+    run.passage = run.switch = run.change = None
     text = f"cannot go on: {run.plan.system!r} is being taken down"
     said = "; ".join(each.message for each in failures) or text
     if change is not None and change.back and failures:
@@ -496,10 +496,10 @@ def fail_late(run: Run, limit_s: float) -> list[Event]:
     for node in busy:
         node.stuck = bool(node.process)
     process = None if culprit is None else run.process_of(culprit)
-    run.passage = None
+    run.shut_gate()
     events = fail(run, _failure(DEADLINE, subject, text, process))
     if run.failures:
         run.fails_s = run.now_s  # all that is missing is named
-    if run.attempt is not None:
-        run.attempt.until_s = NEVER_S if run.failures else run.now_s + limit_s
+    if run.passage is not None:
+        run.passage.until_s = NEVER_S if run.failures else run.now_s + limit_s
     return events

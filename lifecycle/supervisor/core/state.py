@@ -287,60 +287,55 @@ class Order(Question, kw_only=True, frozen=True):
 
 
 class Passage(msgspec.Struct, kw_only=True):
-    """Nodes that pass the gate: from the verdict that opens it to the one on what they became.
+    """Nodes are to pass the gate: for a bring-up, an order, or as policy started them again.
+
+    They come to the gate; it opens for those that wait at it once a verdict allows it; and they
+    have passed once the next verdict finds them as they were verified.
 
     Attributes:
-        waiting: keys of the nodes; `sent`: of those that were sent their requests.
+        until_s: when its time is over; it begins anew when all are at the gate.
+        asked: for a bring-up or an order, which ends with it; policy's nodes go on waiting.
+        judges: the gate is to open; else they are only to come to it.
+        activates: nodes are let through; else the system is only verified.
+        keys: of those that are, also where an order or a consequence kept them; None for all.
+        mode: to go back to where the gate stays closed; empty for a passage of another kind.
+        at_gate: the nodes have come as far.
+        mark: of the moment at which they had; `since_s`: when that was.
+        said: it was said what the gate waits for.
+        begun_s: when a verdict opened the gate; None before.
+        waiting: keys of the nodes that it is for; `sent`: of those that were sent their requests.
         flows: that networks are to have; None until that is asked for.
         programming: number of the request to program networks with them; 0 if none is open.
-        opened: the gate is open for the nodes, as far as nothing changes.
-        until_s: for so long what changes meanwhile may heal.
-        late_s: then they must be active.
+        opened: networks have them, and nodes are asked as far as nothing changes.
         paused: the system was paused before.
     """
 
-    waiting: tuple[str, ...]
     until_s: float
-    late_s: float
+    asked: bool = True
+    judges: bool = True
+    activates: bool = True
+    keys: frozenset[str] | None = None
+    mode: str = ""
+    at_gate: bool = False
+    mark: int = 0
+    since_s: float = NEVER_S
+    said: bool = False
+    begun_s: float | None = None
+    waiting: tuple[str, ...] = ()
+    sent: set[str] = msgspec.field(default_factory=set)
     flows: tuple[FlowReport, ...] | None = None
     programming: int = 0
-    paused: bool = False
-    sent: set[str] = msgspec.field(default_factory=set)
     opened: bool = False
+    paused: bool = False
 
     @property
     def is_programmed(self) -> bool:
         """Whether networks have the flows."""
         return self.flows is not None and not self.programming
 
-
-class Attempt(msgspec.Struct, kw_only=True):
-    """Somebody waits for the gate: a bring-up, or an order.
-
-    Attributes:
-        until_s: when its time is over; it begins anew when all are at the gate.
-        at_gate: the nodes have come as far.
-        mark: of the moment at which they had; `since_s`: when that was.
-        said: it was said what the gate waits for.
-        judges: the gate is to open; else they are only to come to it.
-        activates: nodes are let through; else the system is only verified.
-        keys: of those that are, also where an order or a consequence kept them; None for all.
-        mode: to go back to where the gate stays closed; empty for an attempt of another kind.
-    """
-
-    until_s: float
-    at_gate: bool = False
-    mark: int = 0
-    since_s: float = NEVER_S
-    said: bool = False
-    judges: bool = True
-    activates: bool = True
-    keys: frozenset[str] | None = None
-    mode: str = ""
-
-    def asks_for(self, key: str) -> bool:
+    def lets_go(self, key: str) -> bool:
         """Return whether a node is to be let through that was kept inactive until now."""
-        return self.activates and (self.keys is None or key in self.keys)
+        return self.asked and self.activates and (self.keys is None or key in self.keys)
 
 
 class Switch(msgspec.Struct, kw_only=True):
@@ -491,7 +486,6 @@ class Run(msgspec.Struct, kw_only=True):
         requests: counts what nodes were asked.
         came: nodes have come up, and not all are at the gate since; `again`: and not yet judged.
         undone: how the order under way is answered once what it did is undone.
-        waits_s: since when nodes wait at the gate that nobody asked for; `said`: it was said.
         furthest: "connected", "verified" or "active", as far as it came; empty before.
         held_s: since when it is held; None before it was up.
         pauses: it is to be said that it is paused, once nothing is active.
@@ -524,13 +518,10 @@ class Run(msgspec.Struct, kw_only=True):
     came: bool = True
     again: bool = False
     undone: tuple[ExitCode, str] | None = None
-    waits_s: float | None = None
-    said: bool = False
     furthest: str = ""
     held_s: float | None = None
     paused: bool = False
     pauses: bool = False
-    attempt: Attempt | None = None
     passage: Passage | None = None
     orders: deque[Order] = msgspec.field(default_factory=deque)
     order: Order | None = None
@@ -575,6 +566,24 @@ class Run(msgspec.Struct, kw_only=True):
             for each in self.nodes.values()
             if each.let_through or each.level is Level.ACTIVE
         )
+
+    @property
+    def asked(self) -> Passage | None:
+        """The passage that a bring-up or an order asks for; None if none does."""
+        return self.passage if self.passage is not None and self.passage.asked else None
+
+    @property
+    def opening(self) -> Passage | None:
+        """The passage for which a verdict has opened the gate; None if it has for none."""
+        passage = self.passage
+        return None if passage is None or passage.begun_s is None else passage
+
+    def shut_gate(self) -> None:
+        """Have who asked for the gate begin at it anew; who did not waits again by itself."""
+        self.passage = passage = self.asked
+        if passage is not None:
+            passage.begun_s, passage.waiting, passage.sent = None, (), set()
+            passage.flows, passage.programming, passage.opened = None, 0, False
 
     @property
     def is_changing(self) -> bool:
@@ -693,7 +702,7 @@ def begin(run: Run, options: Options) -> None:
     active = options.until is Level.ACTIVE
     judges = active or options.verifies
     run.options = options
-    run.attempt = Attempt(until_s=options.timeout_s, activates=active, judges=judges)
+    run.passage = Passage(until_s=options.timeout_s, activates=active, judges=judges)
 
 
 def install(run: Run, plan: Plan, *, own: frozenset[str] | None = None) -> None:
