@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from lifecycle.manifest.model import Condition, Restart, RunKind, Supervision
+from lifecycle.manifest.model import Condition, Restart, RunKind
 from lifecycle.supervisor.control.protocol import ControlRequest, ProcessState
 from lifecycle.supervisor.core import effects, gate
 from lifecycle.supervisor.core.state import (
@@ -351,7 +351,7 @@ def _may_be_spawned(run: Run, process: Process) -> bool:
 
 def _barks_at_s(process: Process) -> float:
     """Return when the watchdog of a process ends it; NEVER_S while it does not hang."""
-    how: Supervision = process.supervision
+    how = process.policy.how
     if process.hangs_s is None or not how.watchdog_sec or how.restart is Restart.NO:
         return NEVER_S
     return process.hangs_s + how.watchdog_sec
@@ -394,22 +394,16 @@ def _escalation(run: Run, process: Process, members: list[Node]) -> Escalation:
 
 
 def _parameters(run: Run) -> Iterator[effects.Give]:
-    if run.ending is not None:
+    if run.ending is not None or (run.switch is not None and not is_settled_down(run)):
         return
-    switch, change = run.switch, run.change
-    if switch is not None and is_settled_down(run):
-        for key in sorted(switch.to_ask):
-            switch.asked.add(key)
-            yield effects.Give(node=key)
-        switch.to_ask = set()
-    if change is not None and not change.taken:
-        later = {key: each for key, each in change.to_give.items() if key in change.giving}
-        for key, values in change.to_give.items():
-            if key not in later:  # it has still to answer what it was asked on the way here
-                change.giving.add(key)
-                change.given[key] = values
-                yield effects.Give(node=key, values=values)
-        change.to_give = later
+    later = {key: each for key, each in run.to_give.items() if key in run.giving}
+    for key, values in run.to_give.items():
+        if key not in later:  # it has still to answer what it was asked before
+            run.giving.add(key)
+            if run.change is not None and values is not None:
+                run.change.given[key] = values
+            yield effects.Give(node=key, values=values)
+    run.to_give = later
 
 
 def is_settled_down(run: Run) -> bool:

@@ -42,14 +42,14 @@ def enter_mode(run: Run, mode: str, *, back: bool = False) -> list[Event]:
     """Have nodes be as a mode says: what it keeps inactive goes down first, without a gate."""
     active = frozenset(key for key, each in run.nodes.items() if each.is_gated)
     had = {key: each.planned.expected_parameters for key, each in run.nodes.items()}
-    run.switch = Switch(before=run.mode, active=active, back=back)
+    run.switch, run.to_give = Switch(before=run.mode, active=active, back=back), {}
     run.mode, run.plan = mode, in_mode(run.plan, mode)
     for key, node in run.nodes.items():
         node.planned = run.plan.node(key)
         if node.planned.expected_parameters != had[key]:
             run.switch.given = (*run.switch.given, node.name)
             if node.level >= Level.STARTED:
-                run.switch.to_ask.add(key)
+                run.to_give[key] = None
     run.changed()
     return []
 
@@ -73,7 +73,7 @@ def leave_mode(run: Run, before: str, error: str, code: ExitCode) -> list[Event]
 def settle_mode(run: Run) -> list[Event]:
     """Enter the mode once all is inactive that it keeps so, and parameters are set."""
     switch = run.switch
-    if switch is None or switch.to_ask or switch.asked or not is_settled_down(run):
+    if switch is None or run.to_give or run.giving or not is_settled_down(run):
         return []
     run.switch = None
     inactive = [each for each in run.plan.nodes if each.state is TargetState.INACTIVE]
@@ -128,12 +128,12 @@ def apply(run: Run, order: Order) -> list[Event]:
         until_s=run.now_s + (order.timeout_s or run.options.timeout_s),
         down=set(down),
         touched={*down, *change.added},
-        to_give={
-            key: each
-            for key, each in change.parameters.items()
-            if key not in down and run.nodes[key].level >= Level.STARTED
-        },
     )
+    run.to_give = {
+        key: each
+        for key, each in change.parameters.items()
+        if key not in down and run.nodes[key].level >= Level.STARTED
+    }
     run.passage = None
     run.changed()
     return [_said(run, "begun")]
@@ -156,7 +156,7 @@ def go_back(run: Run, reason: str, code: ExitCode) -> list[Event]:
         change.taken = False
         change.down = {key for key in change.touched if key in run.nodes}
     change.touched |= change.down
-    change.to_give = {
+    run.to_give = {
         key: replace(each, before=each.now, now=each.before)
         for key, each in change.given.items()
         if key not in change.down and key in run.nodes
@@ -185,7 +185,7 @@ def settle_change(run: Run) -> list[Event]:
         return []
     if change.taken:
         return [] if run.passage is not None else _finish(run, change)
-    if change.to_give or change.giving or not _is_down(run, change):
+    if run.to_give or run.giving or not _is_down(run, change):
         return []
     _take(run, change)
     return []

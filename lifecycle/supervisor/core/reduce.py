@@ -302,16 +302,15 @@ def _verified(run: Run, given: inputs.Verified) -> list[Event]:
 
 def _given(run: Run, given: inputs.Given) -> list[Event]:
     run.changed()
-    switch, change = run.switch, run.change
-    if switch is not None and given.node in switch.asked:
-        switch.asked.discard(given.node)
-        if given.error and not switch.back:
-            text = f"cannot enter mode {run.mode!r}: {given.error}"
-            return leave_mode(run, switch.before, text, ExitCode.BRING_UP_FAILED)
-    elif change is not None and given.node in change.giving:
-        change.giving.discard(given.node)
-        if given.error:
-            return refused_parameters(run, given.node, given.error)
+    if given.node not in run.giving:
+        return []
+    run.giving.discard(given.node)
+    switch = run.switch
+    if given.error and switch is not None and not switch.back:
+        text = f"cannot enter mode {run.mode!r}: {given.error}"
+        return leave_mode(run, switch.before, text, ExitCode.BRING_UP_FAILED)
+    if given.error and run.change is not None:
+        return refused_parameters(run, given.node, given.error)
     return []
 
 

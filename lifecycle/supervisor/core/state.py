@@ -204,7 +204,7 @@ class Process(msgspec.Struct, kw_only=True):
         end: how it ended; None while it has not.
         log: file with its output; empty before it was started.
         sweeping: what it left is being ended, and forgotten by the graph.
-        policy: when it is started again, over all of its lives; None before the first.
+        policy: when it is started again, over all of its lives.
         by_hand: it is started next by a person, and its failures are forgotten.
         failed: it is started next because it failed.
         away_s: when it failed; None once it is as far again as it is to be.
@@ -217,15 +217,14 @@ class Process(msgspec.Struct, kw_only=True):
     """
 
     planned: PlannedProcess
-    supervision: Supervision
+    policy: RestartPolicy
     may_end: bool = False
     state: ProcessState | None = None
     pid: int = 0
     end: Exited | None = None
     log: str = ""
     sweeping: bool = False
-    policy: RestartPolicy | None = None
-    by_hand: bool = False
+    by_hand: bool = True
     failures: list[Failed] = []
     failed: bool = False
     away_s: float | None = None
@@ -244,13 +243,11 @@ class Process(msgspec.Struct, kw_only=True):
     @property
     def restarts(self) -> int:
         """How often it was started again after a failure."""
-        return 0 if self.policy is None else self.policy.restarts
+        return self.policy.restarts
 
     def started(self, now_s: float) -> None:
         """Count a start: StartLimitBurst= applies to all kinds of them (systemd.unit(5))."""
-        if self.policy is None or self.policy.how != self.supervision:
-            self.policy = RestartPolicy(self.supervision, now_s)
-        elif self.by_hand:
+        if self.by_hand:
             self.policy.reset(now_s)
         else:
             self.policy.started(now_s, after_failure=self.failed)
@@ -344,15 +341,12 @@ class Switch(msgspec.Struct, kw_only=True):
     Attributes:
         active: keys of the nodes that were to be active before.
         given: names of those whose parameters are others in this mode.
-        to_ask: keys of those that are to be given parameters; `asked`: that have not answered.
         back: the system goes back to the mode before.
     """
 
     before: str
     active: frozenset[str]
     given: tuple[str, ...] = ()
-    to_ask: set[str] = msgspec.field(default_factory=set)
-    asked: set[str] = msgspec.field(default_factory=set)
     back: bool = False
 
 
@@ -364,7 +358,6 @@ class Change(msgspec.Struct, kw_only=True):
         active: keys of the nodes that were active, or had failed and were to be again.
         touched: keys of the nodes that were taken down, or are new.
         down: keys of the nodes that go down before the manifest is taken.
-        to_give: parameters of running nodes that are to be set first; `giving`: who has to answer.
         given: what nodes were asked to take; who did not answer may have taken it.
         taken: the manifest is in force.
         back: the system goes back to the manifest before.
@@ -383,8 +376,6 @@ class Change(msgspec.Struct, kw_only=True):
     until_s: float
     touched: set[str] = msgspec.field(default_factory=set)
     down: set[str] = msgspec.field(default_factory=set)
-    to_give: dict[str, GivenParameters] = {}
-    giving: set[str] = msgspec.field(default_factory=set)
     given: dict[str, GivenParameters] = {}
     taken: bool = False
     back: bool = False
@@ -485,6 +476,8 @@ class Run(msgspec.Struct, kw_only=True):
         mark: counts what may change a verdict.
         requests: counts what nodes were asked.
         came: nodes have come up, and not all are at the gate since; `again`: and not yet judged.
+        to_give: parameters of running nodes that are set first, None for all of its mode; `giving`:
+            keys of the nodes that have to answer.
         undone: how the order under way is answered once what it did is undone.
         furthest: "connected", "verified" or "active", as far as it came; empty before.
         held_s: since when it is held; None before it was up.
@@ -517,6 +510,8 @@ class Run(msgspec.Struct, kw_only=True):
     judged: Judged = msgspec.field(default_factory=Judged)
     came: bool = True
     again: bool = False
+    to_give: dict[str, GivenParameters | None] = {}
+    giving: set[str] = msgspec.field(default_factory=set)
     undone: tuple[ExitCode, str] | None = None
     furthest: str = ""
     held_s: float | None = None
@@ -717,9 +712,9 @@ def install(run: Run, plan: Plan, *, own: frozenset[str] | None = None) -> None:
         if started:
             supervision = members[0].supervision if members else Supervision()
             process = processes.get(planned.name) or Process(
-                planned=planned, supervision=supervision
+                planned=planned, policy=RestartPolicy(supervision)
             )
-            process.planned, process.supervision = planned, supervision
+            process.planned, process.policy.how = planned, supervision
             process.may_end = bool(members) and all(each.may_end for each in members)
             run.processes[planned.name] = process
         for each in members:
