@@ -77,13 +77,10 @@ class Participants:
 
     Args:
         default: that context.
-        joins: others run already. They answer a new participant once, before it listens, and would
-            announce themselves again within a second: they are asked to as soon as it listens.
     """
 
-    def __init__(self, default: Context, *, joins: bool = False) -> None:
+    def __init__(self, default: Context) -> None:
         self._default = default
-        self._joins = joins
         self._made: dict[ParticipantSettings, Context] = {}
         self._probers: list[Prober] = []
 
@@ -106,12 +103,19 @@ class Participants:
             with discovery_by_profile(settings):
                 context.init(args=[], domain_id=self._default.get_domain_id())
         with made_participant(context, settings, is_new=is_new):
-            if self._joins and OVER_DDS:
-                asked = reach(self._default.get_domain_id(), settings.urls, os.environ)
-                self._probers.append(Prober(asked))
-                self._probers[-1].ask(counted=False)
             yield context
         self._made[settings] = context
+
+    def ask_others(self) -> None:
+        """Have those that run announce themselves to these participants now.
+
+        They answer a new participant once, before it listens, and announce themselves again within
+        a second. Call it once the sender sockets of all are known, see `nfe.senders_of`.
+        """
+        for settings in self._made if OVER_DDS else ():
+            reached = reach(self._default.get_domain_id(), settings.urls, os.environ)
+            self._probers.append(Prober(reached))
+            self._probers[-1].ask(counted=False)
 
 
 def maker_of(planned: PlannedNode, folders: tuple[str, ...]) -> Callable[..., Any]:
@@ -294,7 +298,7 @@ class Host:
         self._is_orderly = False
         self._left = threading.Event()
         self._nodes: dict[str, Hosted] = {}
-        self._participants = Participants(context, joins=spec.joins)
+        self._participants = Participants(context)
         self._adoption = Adoption(
             self._participants.carrying,
             self._loop,
@@ -398,6 +402,8 @@ class Host:
         for hosted in self._nodes.values():
             if isinstance(hosted, ForeignNode):
                 hosted.configuration_changes.touch()
+        if self._spec.joins:
+            self._participants.ask_others()
         self._channel.write(Event(kind="ready"))
         if any(hosted.is_marked for hosted in self._nodes.values()):
             threading.Thread(target=self._watch_marks, name="marks", daemon=True).start()
