@@ -53,13 +53,10 @@ class Participants:
 
     Args:
         default: that context.
-        joins: others run already. They answer a new participant once, before it listens, and would
-            announce themselves again within a second: they are asked to as soon as it listens.
     """
 
-    def __init__(self, default: Context, *, joins: bool = False) -> None:
+    def __init__(self, default: Context) -> None:
         self._default = default
-        self._joins = joins
         self._made: dict[ParticipantSettings, Context] = {}
         self._probers: list[Prober] = []
 
@@ -81,12 +78,19 @@ class Participants:
             with discovery_by_profile(settings):
                 context.init(args=[], domain_id=self._default.get_domain_id())
         with made_participant(context, settings, is_new=is_new):
-            if self._joins and OVER_DDS:
-                asked = reach(self._default.get_domain_id(), settings.urls, os.environ)
-                self._probers.append(Prober(asked))
-                self._probers[-1].ask(counted=False)
             yield context
         self._made[settings] = context
+
+    def ask_others(self) -> None:
+        """Have those that run announce themselves to these participants now.
+
+        They answer a new participant once, before it listens, and announce themselves again within
+        a second. Call it once the sender sockets of all are known, see `nfe.senders_of`.
+        """
+        for settings in self._made if OVER_DDS else ():
+            reached = reach(self._default.get_domain_id(), settings.urls, os.environ)
+            self._probers.append(Prober(reached))
+            self._probers[-1].ask(counted=False)
 
 
 class Adoption:
@@ -96,11 +100,11 @@ class Adoption:
         context: of the process: its first nodes are constructed on it.
         loop: runs the callbacks of nodes that are not ours.
         supervisor: name of the system whose gate holds the nodes; empty for none.
-        joins: the rest of its system runs already.
         mode: what drives the nodes; None leaves that to their own code.
         use_global_arguments: nodes take remaps from the process's own --ros-args.
 
     Attributes:
+        participants: of the process.
         made: what stands for each node, by its key in the plan.
     """
 
@@ -110,11 +114,10 @@ class Adoption:
         loop: NodeLoop,
         *,
         supervisor: str = "",
-        joins: bool = False,
         mode: Mode | None = Mode.MANUAL,
         use_global_arguments: bool = False,
     ) -> None:
-        self._participants = Participants(context, joins=joins)
+        self.participants = Participants(context)
         self._loop = loop
         self._supervisor = supervisor
         self._mode = mode
@@ -161,7 +164,7 @@ class Adoption:
 
     def make_unplanned(self, what: Callable[..., Any]) -> Managed:
         """Construct a LifecycleNode that has no plan."""
-        with self._participants.carrying(ParticipantSettings()) as context:
+        with self.participants.carrying(ParticipantSettings()) as context:
             construction = Construction(
                 spec=None,
                 mode=self._mode,
@@ -228,7 +231,7 @@ class Adoption:
         if not ours:
             name, options = planned.name, self._options(planned, options)
             parameters.give_empty_arrays(node, planned)
-        with self._participants.carrying(ParticipantSettings.of(planned)) as context:
+        with self.participants.carrying(ParticipantSettings.of(planned)) as context:
             yield name, {**options, "context": context}
         if not (ours and planned.managed):
             self._foreign[id(node)] = ForeignNode(

@@ -115,7 +115,7 @@ class Host:
         self._is_orderly = False
         self._left = threading.Event()
         self._nodes: dict[str, Hosted] = {}
-        self._adoption = Adoption(context, self._loop, supervisor=spec.system, joins=spec.joins)
+        self._adoption = Adoption(context, self._loop, supervisor=spec.system)
         self._marks: dict[str, tuple[int | None, ...]] = {}
 
     def run(self) -> NoReturn:
@@ -205,6 +205,8 @@ class Host:
         for hosted in self._nodes.values():
             if isinstance(hosted, ForeignNode):
                 hosted.configuration_changes.touch()
+        if self._spec.joins:
+            self._adoption.participants.ask_others()
         self._channel.write(Event(kind="ready"))
         if any(is_marked(hosted) for hosted in self._nodes.values()):
             threading.Thread(target=self._watch_marks, name="marks", daemon=True).start()

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from lifecycle.manifest.model import Condition, Restart, RunKind, Supervision
+from lifecycle.manifest.model import Condition, Restart, RunKind
 from lifecycle.supervisor.control.protocol import ControlRequest, ProcessState
 from lifecycle.supervisor.core import effects, gate
 from lifecycle.supervisor.core.state import (
@@ -75,7 +75,7 @@ def is_kept_inactive(run: Run, node: Node) -> bool:
     """Return whether a node is not to be active although the manifest has it so."""
     if node.base is Level.ACTIVE and node.level is Level.ACTIVE:
         return run.paused or bool(node.withheld)  # it is adopted as it was found
-    asked = run.attempt is not None and run.attempt.asks_for(node.key)
+    asked = run.passage is not None and run.passage.lets_go(node.key)
     if run.options.until < Level.ACTIVE:
         return True
     if not asked and (run.paused or node.withheld or node.refused):
@@ -129,18 +129,20 @@ def holds_up(run: Run, node: Node, target: Level) -> str:
 
 
 def goal_of(run: Run, node: Node) -> Level:
-    """Return where a node goes from here: as wanted, and never below what it was found in."""
+    """Return where a node goes from here: as wanted, and never below what it was found in.
+
+    One that others activate again and again is left to the verdict, unless it is to be down.
+    """
     least = node.base
     if run.ending is None and (run.paused or node.withheld):
         least = min(least, node.gate)  # it is adopted as it was found, and obeys orders
-    return max(wanted(run, node), least)
+    goal = max(wanted(run, node), least)
+    return max(goal, node.level) if goal and node.guarded > gate.GUARD_TRIES else goal
 
 
 def is_walking(run: Run, node: Node) -> bool:
     """Return whether a node is on its way to its gate, or down, and will be there by itself."""
     goal = goal_of(run, node)
-    if node.guarded > gate.GUARD_TRIES and goal > Level.DOWN:
-        return False  # it is left to the verdict
     if only_appears(node) and goal:  # it reports nothing: a verdict says whether it is there
         process = run.processes.get(node.process)
         return bool(node.process) and (process is None or not process.is_alive)
@@ -179,7 +181,7 @@ def waiting(run: Run) -> tuple[str, ...]:
 
 def stage_of(run: Run) -> Stage:
     """Return what the system is judged as now."""
-    passed = run.furthest == "active" or run.passage is not None
+    passed = run.furthest == "active" or run.opening is not None
     return Stage.ACTIVE if passed and not run.paused and _is_whole(run) else Stage.CONNECTED
 
 
@@ -249,8 +251,6 @@ def _step_down(run: Run, node: Node, goal: Level) -> Step | None:
     if not asked or _waits_for_dependents(run, node, wanted(run, node)):
         return None
     if process is not None and (not process.is_alive or process.asked >= 0):
-        return None
-    if node.guarded > gate.GUARD_TRIES and goal > Level.DOWN:
         return None
     if node.level is not Level.STARTED:
         return DOWNWARDS[node.level]
@@ -351,7 +351,7 @@ def _may_be_spawned(run: Run, process: Process) -> bool:
 
 def _barks_at_s(process: Process) -> float:
     """Return when the watchdog of a process ends it; NEVER_S while it does not hang."""
-    how: Supervision = process.supervision
+    how = process.policy.how
     if process.hangs_s is None or not how.watchdog_sec or how.restart is Restart.NO:
         return NEVER_S
     return process.hangs_s + how.watchdog_sec
@@ -394,37 +394,29 @@ def _escalation(run: Run, process: Process, members: list[Node]) -> Escalation:
 
 
 def _parameters(run: Run) -> Iterator[effects.Give]:
-    if run.ending is not None:
+    if run.ending is not None or (run.switch is not None and not is_settled_down(run)):
         return
-    switch, change = run.switch, run.change
-    if switch is not None and is_settled_down(run):
-        for key in sorted(switch.to_ask):
-            switch.asked.add(key)
-            yield effects.Give(node=key)
-        switch.to_ask = set()
-    if change is not None and not change.taken:
-        later = {key: each for key, each in change.to_give.items() if key in change.giving}
-        for key, values in change.to_give.items():
-            if key not in later:  # it has still to answer what it was asked on the way here
-                change.giving.add(key)
-                change.given[key] = values
-                yield effects.Give(node=key, values=values)
-        change.to_give = later
+    later = {key: each for key, each in run.to_give.items() if key in run.giving}
+    for key, values in run.to_give.items():
+        if key not in later:  # it has still to answer what it was asked before
+            run.giving.add(key)
+            if run.change is not None and values is not None:
+                run.change.given[key] = values
+            yield effects.Give(node=key, values=values)
+    run.to_give = later
 
 
 def is_settled_down(run: Run) -> bool:
     """Return whether nothing has still to be deactivated."""
     return not any(
-        goal_of(run, each) < each.may_be_at
-        for each in run.nodes.values()
-        if not each.stuck and each.guarded <= gate.GUARD_TRIES
+        goal_of(run, each) < each.may_be_at for each in run.nodes.values() if not each.stuck
     )
 
 
 def _gate(run: Run) -> Iterator[effects.Effect]:
     if run.ending is not None:
         return
-    judged, passage = run.judged, run.passage
+    judged, passage = run.judged, run.opening
     programs = passage is not None and passage.flows is None
     if programs and gate.is_open(run) and passage and judged.verdict:
         run.requests += 1
@@ -447,10 +439,10 @@ def phase_of(run: Run) -> str:
         (run.change is not None and run.change.back, "rolling back"),
         (run.change is not None, "applying"),
         (run.switch is not None, "switching"),
-        (run.passage is not None, "activating"),
+        (run.opening is not None, "activating"),
         (run.paused and pausing, "pausing"),
         (coming, "restarting" if up else "connecting"),
-        (run.attempt is not None, "verifying"),
+        (run.asked is not None, "verifying"),
         (run.paused, "paused"),
         (_is_whole(run), "active"),
     )

@@ -18,10 +18,10 @@ from lifecycle.plan.model import Plan, PlannedNode, in_mode
 from lifecycle.supervisor.control.protocol import ChangedNodes
 from lifecycle.supervisor.core.advance import is_settled_down, phase_of, rests_as
 from lifecycle.supervisor.core.state import (
-    Attempt,
     Change,
     Level,
     Order,
+    Passage,
     Process,
     Run,
     Switch,
@@ -42,14 +42,14 @@ def enter_mode(run: Run, mode: str, *, back: bool = False) -> list[Event]:
     """Have nodes be as a mode says: what it keeps inactive goes down first, without a gate."""
     active = frozenset(key for key, each in run.nodes.items() if each.is_gated)
     had = {key: each.planned.expected_parameters for key, each in run.nodes.items()}
-    run.switch = Switch(before=run.mode, active=active, back=back)
+    run.switch, run.to_give = Switch(before=run.mode, active=active, back=back), {}
     run.mode, run.plan = mode, in_mode(run.plan, mode)
     for key, node in run.nodes.items():
         node.planned = run.plan.node(key)
         if node.planned.expected_parameters != had[key]:
             run.switch.given = (*run.switch.given, node.name)
             if node.level >= Level.STARTED:
-                run.switch.to_ask.add(key)
+                run.to_give[key] = None
     run.changed()
     return []
 
@@ -57,7 +57,7 @@ def enter_mode(run: Run, mode: str, *, back: bool = False) -> list[Event]:
 def leave_mode(run: Run, before: str, error: str, code: ExitCode) -> list[Event]:
     """Go back to the mode before: a node refuses a parameter, or the gate stays closed."""
     text = f"cannot enter mode {run.mode!r}: back to {before!r}"
-    run.attempt = run.passage = None
+    run.passage = None
     said = [Notice(message=text)]
     if run.order is not None:
         run.undone = code, error
@@ -73,7 +73,7 @@ def leave_mode(run: Run, before: str, error: str, code: ExitCode) -> list[Event]
 def settle_mode(run: Run) -> list[Event]:
     """Enter the mode once all is inactive that it keeps so, and parameters are set."""
     switch = run.switch
-    if switch is None or switch.to_ask or switch.asked or not is_settled_down(run):
+    if switch is None or run.to_give or run.giving or not is_settled_down(run):
         return []
     run.switch = None
     inactive = [each for each in run.plan.nodes if each.state is TargetState.INACTIVE]
@@ -90,7 +90,7 @@ def settle_mode(run: Run) -> list[Event]:
         is_whole = phase_of(run) == "active"
         return [entered, *([SystemReached(reached="active", elapsed_s=run.now_s)] * is_whole)]
     until_s = run.now_s + run.options.timeout_s
-    run.attempt = Attempt(until_s=until_s, mode="" if switch.back else switch.before)
+    run.passage = Passage(until_s=until_s, mode="" if switch.back else switch.before)
     return [entered]
 
 
@@ -128,12 +128,12 @@ def apply(run: Run, order: Order) -> list[Event]:
         until_s=run.now_s + (order.timeout_s or run.options.timeout_s),
         down=set(down),
         touched={*down, *change.added},
-        to_give={
-            key: each
-            for key, each in change.parameters.items()
-            if key not in down and run.nodes[key].level >= Level.STARTED
-        },
     )
+    run.to_give = {
+        key: each
+        for key, each in change.parameters.items()
+        if key not in down and run.nodes[key].level >= Level.STARTED
+    }
     run.passage = None
     run.changed()
     return [_said(run, "begun")]
@@ -151,12 +151,12 @@ def go_back(run: Run, reason: str, code: ExitCode) -> list[Event]:
     events = [_said(run, "rolling_back", reason)]
     change.back, change.reason, change.code = True, reason, code
     change.until_s = run.now_s + run.options.timeout_s
-    run.attempt = run.passage = None
+    run.passage = None
     if change.taken:
         change.taken = False
         change.down = {key for key in change.touched if key in run.nodes}
     change.touched |= change.down
-    change.to_give = {
+    run.to_give = {
         key: replace(each, before=each.now, now=each.before)
         for key, each in change.given.items()
         if key not in change.down and key in run.nodes
@@ -184,9 +184,8 @@ def settle_change(run: Run) -> list[Event]:
     if change is None:
         return []
     if change.taken:
-        asks = run.attempt is not None or run.passage is not None
-        return [] if asks else _finish(run, change)
-    if change.to_give or change.giving or not _is_down(run, change):
+        return [] if run.passage is not None else _finish(run, change)
+    if run.to_give or run.giving or not _is_down(run, change):
         return []
     _take(run, change)
     return []
@@ -223,7 +222,7 @@ def _take(run: Run, change: Change) -> None:
     run.came = bool(change.touched)
     run.changed()
     keys = change.active if change.back else None
-    run.attempt = Attempt(until_s=change.until_s, activates=not run.paused, keys=keys)
+    run.passage = Passage(until_s=change.until_s, activates=not run.paused, keys=keys)
 
 
 def _connected_as(plan: Plan, stays: dict[str, PlannedNode], before: Plan) -> Plan:

@@ -42,7 +42,7 @@ def _strongest(finding: Finding, said: Iterable[OnViolation]) -> Reaction | None
 def settle_consequences(run: Run) -> list[Event]:
     """Do about violations that last what the manifest asks for, as a person would order it."""
     verdict = run.judged.verdict
-    busy = run.order or run.attempt or run.switch or run.change or run.passage or run.failures
+    busy = run.order or run.asked or run.switch or run.change or run.opening or run.failures
     if run.held_s is None or run.ending is not None or run.paused or verdict is None:
         run.judged.asked = {}
         return []

@@ -17,7 +17,7 @@ from lifecycle.supervisor.core import gate
 from lifecycle.supervisor.core.advance import holds_up, phase_of, wanted
 from lifecycle.supervisor.core.change import go_back, undone
 from lifecycle.supervisor.core.inputs import Exited
-from lifecycle.supervisor.core.restart import RestartPolicy, is_restarted
+from lifecycle.supervisor.core.restart import is_restarted
 from lifecycle.supervisor.core.state import (
     NEVER_S,
     UP,
@@ -103,7 +103,7 @@ def death(run: Run, process: Process, given: Exited) -> list[Failure]:
     what = f"process {name!r}" if node is None else repr(name)
     while_ = f" while {while_}" if while_ else ""
     hangs = next((each.hangs for each in members if each.hangs and process.barks), "")
-    after_s = process.supervision.watchdog_sec
+    after_s = process.policy.how.watchdog_sec
     why = f": its watchdog ended it after {after_s:g} s, because {hangs}" if hangs else ""
     words = f": {given.words}" if given.words else ""
     end = f"{given.text}{_not_run(process, given)}"
@@ -246,7 +246,7 @@ def _fails_in_change(run: Run, failure: Failure, end: Exited | None) -> list[Eve
 def _is_covered(process: Process | None, end: Exited | None) -> bool:
     if process is None or process.stays_down:
         return False
-    return is_restarted(process.supervision, None if end is None else end.status)
+    return is_restarted(process.policy.how, None if end is None else end.status)
 
 
 def goes_on(failure: Failure) -> Failure:
@@ -257,15 +257,15 @@ def goes_on(failure: Failure) -> Failure:
 def _cut_short(run: Run, failure: Failure) -> None:
     """Answer the order that a failure cuts short; a pause goes on. All wait for the gate again."""
     order = run.order
-    run.passage = None
+    run.shut_gate()
     if order is None or run.change is not None:
         if run.change is not None:
             run.change.again = failure.message
-        if run.attempt is not None:
-            run.attempt.at_gate = False
-            run.attempt.until_s = run.now_s + run.options.timeout_s
+        if run.passage is not None:
+            run.passage.at_gate = False
+            run.passage.until_s = run.now_s + run.options.timeout_s
     elif order.ask is not ControlRequest.PAUSE:
-        run.attempt = run.switch = None
+        run.passage, run.switch, run.to_give = None, None, {}
         run.answer(ExitCode.BRING_UP_FAILED, failure.message)
 
 
@@ -273,8 +273,7 @@ def _back_off(run: Run, process: Process, failure: Failure, end: Exited | None) 
     """Have a process, and what goes down with it, started again later; or give it up."""
     process.failures = [*process.failures, _remembered(run, failure, end)][-_REMEMBERED:]
     was_up = run.held_s is not None
-    policy = process.policy = process.policy or RestartPolicy(process.supervision, run.now_s)
-    due_s = policy.failed(run.now_s, was_up=was_up)
+    due_s = process.policy.failed(run.now_s, was_up=was_up)
     events: list[Event] = [goes_on(failure)]
     if due_s is None:
         history = tuple(process.failures)
@@ -287,8 +286,8 @@ def _back_off(run: Run, process: Process, failure: Failure, end: Exited | None) 
         node.renew, node.due_s = True, max(node.due_s, due_s)
     process.failed = True
     process.away_s = run.now_s if process.away_s is None else process.away_s
-    if run.attempt is not None and run.held_s is None:
-        run.attempt.until_s = due_s + run.options.timeout_s
+    if run.passage is not None and run.held_s is None:
+        run.passage.until_s = due_s + run.options.timeout_s
     events.append(
         RestartScheduled(
             process=process.name,
@@ -315,7 +314,7 @@ def _remembered(run: Run, failure: Failure, end: Exited | None) -> Failed:
 
 
 def _given_up(process: Process, failure: Failure, *, was_up: bool) -> Failure:
-    how = process.supervision
+    how = process.policy.how
     burst = how.start_limit_burst
     lines = "; ".join(
         f"at {each.elapsed_s:.1f} s, {each.message}" for each in process.failures[-burst:]
@@ -331,65 +330,54 @@ def _given_up(process: Process, failure: Failure, *, was_up: bool) -> Failure:
 # The end
 
 
-def end(
-    run: Run,
-    code: ExitCode,
-    stopping: str,
-    reason: str,
-    *,
-    failures: tuple[Failure, ...] = (),
-    failed: bool = False,
-) -> list[Event]:
-    """End the run: from now on everything is to be down. Whatever is open is answered.
-
-    Args:
-        run: see above.
-        code: of the run, as far as nothing dies on the way down.
-        stopping: why, in short.
-        reason: why, as the report has it.
-        failures: that end it.
-        failed: nobody asked for it.
-    """
+def end(run: Run, ending: Ending) -> list[Event]:
+    """End the run: from now on everything is to be down. Whatever is open is answered."""
     if run.ending is not None:
         return []
-    run.ending = Ending(
-        code=code,
-        stopping=stopping,
-        reason=_also(run, reason),
-        failures=failures,
-        failed=failed,
-        deaths=len(run.deaths),
-    )
+    restarts = [(each.name, each.restarts) for each in run.processes.values()]
+    said = [f"{name!r} {n} time{'s' * (n != 1)}" for name, n in restarts if n]
+    summary = f"restarted: {', '.join(said)}" if said else ""
+    reasons = (ending.reason, summary, gate.passed(run.judged))
+    run.ending, failures = ending, ending.failures
+    ending.reason, ending.deaths = "; ".join(filter(None, reasons)), len(run.deaths)
     change, run.undone = run.change, None
-    run.attempt = run.passage = run.switch = run.change = None
+    run.passage = run.switch = run.change = None
     text = f"cannot go on: {run.plan.system!r} is being taken down"
-    said = "; ".join(each.message for each in failures) or text
+    answer = "; ".join(each.message for each in failures) or text
     if change is not None and change.back and failures:
-        said = undone(run, change)
-    run.answer(ExitCode.BRING_UP_FAILED, said)
+        answer = undone(run, change)
+    run.answer(ExitCode.BRING_UP_FAILED, answer)
     run.outbox += [(each.id, ExitCode.BRING_UP_FAILED, text) for each in run.orders]
     run.orders.clear()
-    return [*failures, Stopping(reason=stopping)]
+    return [*failures, Stopping(reason=ending.stopping)]
 
 
 def end_failed(run: Run) -> list[Event]:
     """End the run for what failed."""
     gave_up = any(each.rule == GAVE_UP.id for each in run.failures)
     code = ExitCode.SUPERVISION_GAVE_UP if gave_up else ExitCode.BRING_UP_FAILED
-    failures, reason = tuple(run.failures), _named(run.failures)
-    return end(run, code, "rolling back", reason, failures=failures, failed=True)
+    ending = Ending(
+        code=code,
+        stopping="rolling back",
+        reason=_named(run.failures),
+        failures=tuple(run.failures),
+        failed=True,
+    )
+    return end(run, ending)
 
 
 def end_refused(run: Run, verdict: Verdict, stopping: str) -> list[Event]:
     """End the run because the gate stays closed."""
     reason = f"{stopping}; {not_ok(verdict) or verdict.verdict.value}"
-    return end(run, gate.exit_code(verdict), stopping, reason, failed=True)
+    ending = Ending(code=gate.exit_code(verdict), stopping=stopping, reason=reason, failed=True)
+    return end(run, ending)
 
 
 def end_done(run: Run) -> list[Event]:
     """End a run that was held for as long as was asked."""
     code, why = _outcome(run, run.judged.counted)
-    return end(run, code, "done", f"done, but {why}" if why else "done")
+    reason = f"done, but {why}" if why else "done"
+    return end(run, Ending(code=code, stopping="done", reason=reason))
 
 
 def stop(run: Run, reason: str, code: ExitCode) -> list[Event]:
@@ -412,7 +400,8 @@ def stop(run: Run, reason: str, code: ExitCode) -> list[Event]:
             code, why = asked, f"the system was {phase_of(run)}, not active"
         elif code is ExitCode.OK and run.judged.counted:
             why = f"violated meanwhile, {run.judged.counted}"
-    return end(run, code, reason, f"{reason}; {why}" if why else reason)
+    said = f"{reason}; {why}" if why else reason
+    return end(run, Ending(code=code, stopping=reason, reason=said))
 
 
 def _is_kept(run: Run) -> bool:
@@ -465,13 +454,6 @@ def follows_from_shut_down(run: Run, verdict: Verdict) -> bool:
     )
 
 
-def _also(run: Run, reason: str) -> str:
-    restarts = [(each.name, each.restarts) for each in run.processes.values()]
-    said = [f"{name!r} {n} time{'s' * (n != 1)}" for name, n in restarts if n]
-    summary = f"restarted: {', '.join(said)}" if said else ""
-    return "; ".join(each for each in (reason, summary, gate.passed(run.judged)) if each)
-
-
 def exit_code_of(run: Run) -> ExitCode:
     """Return the exit code of a run that is over: a death on the way down counts, too."""
     assert run.ending is not None
@@ -496,10 +478,10 @@ def fail_late(run: Run, limit_s: float) -> list[Event]:
     for node in busy:
         node.stuck = bool(node.process)
     process = None if culprit is None else run.process_of(culprit)
-    run.passage = None
+    run.shut_gate()
     events = fail(run, _failure(DEADLINE, subject, text, process))
     if run.failures:
         run.fails_s = run.now_s  # all that is missing is named
-    if run.attempt is not None:
-        run.attempt.until_s = NEVER_S if run.failures else run.now_s + limit_s
+    if run.passage is not None:
+        run.passage.until_s = NEVER_S if run.failures else run.now_s + limit_s
     return events

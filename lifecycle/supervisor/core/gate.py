@@ -136,8 +136,8 @@ def take_verdict(run: Run, given: Verified) -> Verdict | None:
     judged = run.judged
     guarded = tuple(_guarded(each) for each in run.nodes.values() if is_foreign_activation(each))
     verdict = with_findings(given.verdict, guarded, run.plan.policy)
-    at_gate = run.attempt is not None and run.attempt.at_gate
-    if run.held_s is not None and (run.attempt or run.change) and not at_gate:
+    at_gate = run.asked is not None and run.asked.at_gate
+    if run.held_s is not None and (run.asked or run.change) and not at_gate:
         verdict = without(run, verdict, run.away)  # they are away because it was ordered
     judged.looking = False
     judged.mark, judged.waits = given.mark, given.waits
@@ -205,7 +205,7 @@ def see_violations(run: Run) -> None:
     judged = run.judged
     if judged.verdict is None:
         return
-    if not run.is_watched or run.attempt is not None or run.change is not None:
+    if not run.is_watched or run.asked is not None or run.change is not None:
         judged.violated = {}  # what an order brings about is judged at its gate
         return
     names = run.away | run.left | judged.away

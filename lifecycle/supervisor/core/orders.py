@@ -11,7 +11,7 @@ from lifecycle.supervisor.control.protocol import ControlRequest
 from lifecycle.supervisor.core import advance
 from lifecycle.supervisor.core.change import apply, enter_mode
 from lifecycle.supervisor.core.passing import reached
-from lifecycle.supervisor.core.state import Attempt, Level, Node, Order, Run
+from lifecycle.supervisor.core.state import Level, Node, Order, Passage, Run
 from lifecycle.supervisor.run.events import Event
 
 SAID = {
@@ -147,12 +147,12 @@ def settle_orders(run: Run) -> list[Event]:
 
 def _is_free(run: Run) -> bool:
     """Return whether nothing else is under way that an order would have to wait for."""
-    busy = run.switch or run.change or run.attempt or run.failures
+    busy = run.switch or run.change or run.asked or run.failures
     return not busy and advance.is_settled_down(run)
 
 
 def _is_done(run: Run) -> bool:
-    return _is_free(run) and run.passage is None
+    return _is_free(run) and run.opening is None
 
 
 def begin(run: Run) -> list[Event]:
@@ -172,7 +172,7 @@ def begin(run: Run) -> list[Event]:
             run.pauses = run.paused
         opens = order.ask is ControlRequest.RESUME or not run.paused
         until_s = run.now_s + run.options.timeout_s
-        run.attempt = Attempt(until_s=until_s, activates=opens, judges=opens)
+        run.passage = Passage(until_s=until_s, activates=opens, judges=opens)
     run.changed()
     return []
 

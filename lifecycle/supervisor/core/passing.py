@@ -1,8 +1,6 @@
 """Nodes pass the gate: who asks, when it opens or stays closed, and what they became.
 
-Owns: attempts (a bring-up or an order asks for the gate) and passages (nodes are let through).
-Nodes that policy started again need no attempt: they are let through whenever the gate is open.
-Pure.
+Owns: the `Passage` of a run, from the way to the gate to the verdict on what came of it. Pure.
 """
 
 from __future__ import annotations
@@ -11,7 +9,7 @@ from lifecycle.errors import ExitCode
 from lifecycle.supervisor.core import advance, failure, gate
 from lifecycle.supervisor.core.change import go_back, leave_mode
 from lifecycle.supervisor.core.inputs import Programmed
-from lifecycle.supervisor.core.state import Attempt, Level, Passage, Run
+from lifecycle.supervisor.core.state import Level, Passage, Run
 from lifecycle.supervisor.run.events import Event, Failure, GateOpened, Notice, SystemReached
 from lifecycle.verify.judge import not_ok, taken_on_trust
 from lifecycle.verify.rules.run import NOT_PROGRAMMED, TRANSITION_FAILED
@@ -21,34 +19,53 @@ CLOSED = "the verdict keeps the gate closed"
 
 
 def settle(run: Run) -> list[Event]:
-    """Take attempt and passage as far as the state allows."""
+    """Take the passage as far as the state allows."""
     if run.ending is not None or run.failures:
         return []
     events = [*_come(run), *_arrive(run)]
-    if run.passage is not None:
-        return [*events, *_go_on(run)]
-    return [*events, *_open(run)]
+    if run.opening is not None:
+        return [*events, *_go_on(run, run.opening)]
+    _wait_again(run)
+    return [*events, *(_open(run, run.passage) if run.passage is not None else [])]
 
 
 def _arrive(run: Run) -> list[Event]:
     """Note that all who are on their way are at the gate; from now on its time counts."""
-    attempt = run.attempt
-    if attempt is None or attempt.at_gate:
+    passage = run.passage
+    if passage is None or passage.at_gate:
         return []
     coming = run.held_s is None and not all(run.is_past(each.due_s) for each in run.nodes.values())
     if run.is_changing or run.switch is not None or coming or not advance.is_at_gate(run):
-        return _late(run, failure.unfinished(run)) if run.is_past(attempt.until_s) else []
-    left_s = attempt.until_s - run.now_s
+        return _late(run, failure.unfinished(run)) if run.is_past(passage.until_s) else []
+    left_s = passage.until_s - run.now_s
     fresh_s = run.options.timeout_s if run.held_s is not None else min(left_s, run.options.gate_s)
     if run.change is None:
-        attempt.until_s = run.now_s + fresh_s
-    attempt.at_gate, attempt.since_s = True, run.now_s
-    run.changed()
-    attempt.mark = run.mark
-    run.judged.found, run.judged.since_s = frozenset(), run.now_s
-    if not attempt.judges:
-        run.attempt = None
+        passage.until_s = run.now_s + fresh_s
+    _is_at_gate(run, passage)
+    if not passage.judges:
+        run.passage = None
     return []
+
+
+def _is_at_gate(run: Run, passage: Passage) -> None:
+    """Have the gate judged anew, by a look that begins now."""
+    run.changed()
+    passage.at_gate, passage.since_s, passage.mark = True, run.now_s, run.mark
+    run.judged.found, run.judged.since_s = frozenset(), run.now_s
+
+
+def _wait_again(run: Run) -> None:
+    """Have those wait at the gate that policy started again, while nothing else is going on."""
+    if run.asked is not None:
+        return
+    busy = run.switch is not None or run.change is not None or run.held_s is None
+    keys = () if busy else advance.waiting(run)
+    if busy or not (keys or run.again) or not advance.is_at_gate(run):
+        run.passage = None
+    elif run.passage is None:
+        run.passage = Passage(until_s=run.now_s + run.options.timeout_s, asked=False, at_gate=True)
+        if keys and not gate.is_open(run):
+            _is_at_gate(run, run.passage)
 
 
 def _come(run: Run) -> list[Event]:
@@ -56,59 +73,40 @@ def _come(run: Run) -> list[Event]:
     coming = any(not run.is_past(each.due_s) or each.renew for each in run.nodes.values())
     if not run.came or run.is_changing or coming or not advance.is_at_gate(run):
         return []
-    attempt = run.attempt
-    waited = attempt is not None and attempt.at_gate and run.is_past(attempt.since_s + gate.SAY_S)
+    asked = run.asked
+    waited = asked is not None and asked.at_gate and run.is_past(asked.since_s + gate.SAY_S)
     if not waited and advance.is_awaited(run):
         return []
     run.came, run.again = False, run.held_s is not None
     return [reached(run, "connected")]
 
 
-def _open_for_returned(run: Run) -> list[Event]:
-    """Let through what was started again by policy, and nobody waits for."""
-    busy = run.switch is not None or run.change is not None or run.held_s is None
-    keys = () if busy else advance.waiting(run)
-    if busy or not (keys or run.again) or not advance.is_at_gate(run):
-        run.waits_s, run.said = None, False
-        return []
-    if not gate.is_open(run):
-        return _say_closed(run) if keys else []
-    _begin(run, keys, run.now_s + gate.AGAIN_S)
-    return [reached(run, "verified")]
-
-
-def _say_closed(run: Run) -> list[Event]:
-    """Say once that nodes wait at a gate that stays closed; they go on waiting."""
-    judged, verdict = run.judged, run.judged.verdict
-    if run.waits_s is None:
-        run.waits_s, judged.found, judged.since_s = run.now_s, frozenset(), run.now_s
-        run.changed()
-    until_s = run.waits_s + run.options.timeout_s
-    if run.said or verdict is None or not gate.is_latest(run):
-        return []
-    if not run.is_past(gate.refuses_at_s(run, until_s)):
-        return []
-    run.said = True
-    return [Notice(message=gate.refusal(verdict))]
-
-
-def _open(run: Run) -> list[Event]:
-    attempt = run.attempt
-    if attempt is None:
-        return _open_for_returned(run)
-    if not attempt.at_gate or run.judged.mark < attempt.mark:
+def _open(run: Run, passage: Passage) -> list[Event]:
+    if not passage.at_gate or run.judged.mark < passage.mark:
         return []
     if gate.is_open(run):
-        if attempt.activates:
-            _begin(run, advance.waiting(run), attempt.until_s)
+        if passage.activates:
+            _begin(run, passage)
         else:
-            run.attempt = None
+            run.passage = None
         return [reached(run, "verified")]
-    if run.is_past(gate.refuses_at_s(run, attempt.until_s)):
+    refuses = run.is_past(gate.refuses_at_s(run, passage.until_s))
+    if not passage.asked:
+        return _say_closed(run, passage) if refuses else []
+    if refuses:
         return _refused(run, again=False)
     # The verdict may allow it, and never be of a moment that lasts.
-    late = run.is_past(attempt.until_s + gate.LEAST_S)
-    return _late(run, "it changes all the time") if late else _say_waiting(run, attempt)
+    late = run.is_past(passage.until_s + gate.LEAST_S)
+    return _late(run, "it changes all the time") if late else _say_waiting(run, passage)
+
+
+def _say_closed(run: Run, passage: Passage) -> list[Event]:
+    """Say once that nodes wait at a gate that stays closed; they go on waiting."""
+    verdict = run.judged.verdict
+    if passage.said or verdict is None or not advance.waiting(run):
+        return []
+    passage.said = True
+    return [Notice(message=gate.refusal(verdict))]
 
 
 def _late(run: Run, why: str) -> list[Event]:
@@ -120,26 +118,23 @@ def _late(run: Run, why: str) -> list[Event]:
     return go_back(run, text, ExitCode.BRING_UP_FAILED)
 
 
-def _say_waiting(run: Run, attempt: Attempt) -> list[Event]:
+def _say_waiting(run: Run, passage: Passage) -> list[Event]:
     verdict = run.judged.verdict
-    if attempt.said or verdict is None or not run.is_past(attempt.since_s + gate.SAY_S):
+    if passage.said or verdict is None or not run.is_past(passage.since_s + gate.SAY_S):
         return []
-    attempt.said = True
+    passage.said = True
     if gate.allows(run):
         return []
-    left_s = max(0.0, attempt.until_s - run.now_s)
+    left_s = max(0.0, passage.until_s - run.now_s)
     text = f"waits up to {left_s:.0f} s more for its gate: {not_ok(verdict)}"
     return [Notice(message=text)]
 
 
-def _begin(run: Run, keys: tuple[str, ...], until_s: float) -> None:
+def _begin(run: Run, passage: Passage) -> None:
     run.judged.violated = {}
-    run.passage = Passage(
-        waiting=keys,
-        until_s=max(until_s, run.now_s + gate.LEAST_S),
-        late_s=max(until_s, run.now_s + run.options.timeout_s),
-        paused=run.paused,
-    )
+    passage.begun_s, passage.waiting, passage.paused = run.now_s, advance.waiting(run), run.paused
+    if not passage.asked:
+        passage.until_s = run.now_s + gate.AGAIN_S
 
 
 def programmed(run: Run, given: Programmed) -> list[Event]:
@@ -155,10 +150,10 @@ def programmed(run: Run, given: Programmed) -> list[Event]:
     return []
 
 
-def _go_on(run: Run) -> list[Event]:
-    passage, verdict = run.passage, run.judged.verdict
-    assert passage is not None
+def _go_on(run: Run, passage: Passage) -> list[Event]:
+    verdict = run.judged.verdict
     assert verdict is not None
+    assert passage.begun_s is not None
     nodes = [run.nodes[key] for key in passage.waiting if key in run.nodes]
     behind = [each for each in nodes if advance.wanted(run, each) is Level.ACTIVE]
     done = passage.is_programmed and all(each.level is Level.ACTIVE for each in behind)
@@ -168,9 +163,10 @@ def _go_on(run: Run) -> list[Event]:
             return []
         events = [] if passage.opened else _let_through(run, passage, verdict)
         return [*events, *(_passed(run) if done else [])]
-    if run.is_past(gate.refuses_at_s(run, passage.until_s)):
+    until_s = max(passage.until_s, passage.begun_s + gate.LEAST_S)
+    if run.is_past(gate.refuses_at_s(run, until_s)):
         return _became_another(run) if done and passage.sent else _refused(run, again=True)
-    if run.is_past(passage.late_s):
+    if run.is_past(max(passage.until_s, passage.begun_s + run.options.timeout_s)):
         return failure.fail_late(run, run.options.timeout_s)
     return []
 
@@ -178,18 +174,18 @@ def _go_on(run: Run) -> list[Event]:
 def _let_through(run: Run, passage: Passage, verdict: Verdict) -> list[Event]:
     passage.opened = True
     run.trusted = taken_on_trust(verdict)
-    if run.attempt is not None:
+    if passage.asked:
         run.paused = False
     for key in passage.waiting:
         run.nodes[key].withheld, run.nodes[key].refused = "", False
     names = tuple(run.nodes[key].name for key in passage.waiting)
-    if not names and (run.change is not None or run.attempt is None):
+    if not names and (run.change is not None or not passage.asked):
         return []
     return [GateOpened(outcome=verdict.verdict.value, nodes=names, trusted=run.trusted)]
 
 
 def _passed(run: Run) -> list[Event]:
-    run.attempt = run.passage = None
+    run.passage = None
     run.again = False
     for node in run.nodes.values():
         if node.level is Level.ACTIVE:
@@ -215,7 +211,7 @@ def _withdraw(run: Run) -> list[Event]:
         node.let_through = False
     if passage is not None and passage.paused:
         run.paused = True
-    run.attempt = run.passage = None
+    run.passage = None
     run.again = False
     names = ", ".join(sorted(each.name for each in begun))
     return [Notice(message=f"the gate closed again: {names} is deactivated")] if begun else []
@@ -223,33 +219,34 @@ def _withdraw(run: Run) -> list[Event]:
 
 def _refused(run: Run, *, again: bool) -> list[Event]:
     """The gate stays closed, or closed again, for who asked."""
-    verdict, attempt = run.judged.verdict, run.attempt
+    verdict, passage = run.judged.verdict, run.passage
     assert verdict is not None
+    assert passage is not None
     text, code = gate.refusal(verdict, again=again), gate.exit_code(verdict)
     keys = advance.waiting(run)
     if run.held_s is None:
         stopping = CLOSED
         if again:
             stopping = "the system changed before every node was activated"
-        if attempt is not None and run.is_past(attempt.until_s):
-            over = f"the {round(attempt.until_s, 1):g} s of the bring-up are over (--timeout)"
+        if run.is_past(passage.until_s):
+            over = f"the {round(passage.until_s, 1):g} s of the bring-up are over (--timeout)"
             stopping = f"{stopping}, and {over}"
         return failure.end_refused(run, verdict, stopping)
-    sent = () if run.passage is None else tuple(run.passage.sent)
+    sent = tuple(passage.sent)
     said = _withdraw(run)
     change = run.change
     if change is not None and not change.back:
         return [*said, *go_back(run, text, code)]
     said.append(Notice(message=text))
-    if attempt is None:
+    if not passage.asked:
         return said
     for key in (*keys, *sent):
         # With what is started again by its policy these pass, too.
         run.nodes[key].refused = change is None or not change.again
     if change is not None:
         change.state = f"its verdict is {verdict.verdict.value}: {not_ok(verdict)}"
-    elif attempt.mode:
-        return [*said, *leave_mode(run, attempt.mode, text, code)]
+    elif passage.mode:
+        return [*said, *leave_mode(run, passage.mode, text, code)]
     elif run.order is not None:
         run.answer(code, text)
     return said
@@ -257,17 +254,17 @@ def _refused(run: Run, *, again: bool) -> list[Event]:
 
 def _became_another(run: Run) -> list[Event]:
     """What became active is not what was verified."""
-    verdict, passage, attempt = run.judged.verdict, run.passage, run.attempt
+    verdict, passage = run.judged.verdict, run.passage
     assert verdict is not None
     assert passage is not None
     if run.change is not None and not run.change.back:
         said = _withdraw(run)
         return [*said, *go_back(run, gate.refusal(verdict), gate.exit_code(verdict))]
     if run.change is not None:
-        run.attempt = run.passage = None
+        run.passage = None
         run.change.state = f"its verdict is {verdict.verdict.value}: {not_ok(verdict)}"
         return [Notice(message=gate.refusal(verdict))]
-    if attempt is not None:
+    if passage.asked:
         if run.order is not None:
             run.answer(gate.exit_code(verdict), gate.refusal(verdict))
         return failure.end_refused(run, verdict, "what became active is not what was verified")

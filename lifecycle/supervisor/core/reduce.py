@@ -292,7 +292,7 @@ def _refused(run: Run, given: inputs.Refused) -> list[Event]:
 def _verified(run: Run, given: inputs.Verified) -> list[Event]:
     verdict, stage = gate.take_verdict(run, given), advance.stage_of(run)
     node = run.nodes.get(given.undiscovered)
-    if node is not None and run.passage is None:
+    if node is not None and run.opening is None:
         for each in run.nodes_of(node.process):
             each.renew = True
     if verdict is None:
@@ -302,16 +302,15 @@ def _verified(run: Run, given: inputs.Verified) -> list[Event]:
 
 def _given(run: Run, given: inputs.Given) -> list[Event]:
     run.changed()
-    switch, change = run.switch, run.change
-    if switch is not None and given.node in switch.asked:
-        switch.asked.discard(given.node)
-        if given.error and not switch.back:
-            text = f"cannot enter mode {run.mode!r}: {given.error}"
-            return leave_mode(run, switch.before, text, ExitCode.BRING_UP_FAILED)
-    elif change is not None and given.node in change.giving:
-        change.giving.discard(given.node)
-        if given.error:
-            return refused_parameters(run, given.node, given.error)
+    if given.node not in run.giving:
+        return []
+    run.giving.discard(given.node)
+    switch = run.switch
+    if given.error and switch is not None and not switch.back:
+        text = f"cannot enter mode {run.mode!r}: {given.error}"
+        return leave_mode(run, switch.before, text, ExitCode.BRING_UP_FAILED)
+    if given.error and run.change is not None:
+        return refused_parameters(run, given.node, given.error)
     return []
 
 
@@ -428,7 +427,7 @@ def _is_going(run: Run, node: Node) -> bool:
 def _hold(run: Run) -> list[Event]:
     """Hold the system once it is up, and end the run once it was held for as long as asked."""
     if run.held_s is None:
-        if run.attempt is None and run.passage is None and not run.failures and run.furthest:
+        if run.passage is None and not run.failures and run.furthest:
             run.held_s = run.now_s
         return []
     hold_s = run.options.hold_s
@@ -450,7 +449,7 @@ def _hold(run: Run) -> list[Event]:
 def _returned(run: Run) -> list[Event]:
     """Say of processes that failed that they are as far again as they are to be."""
     events: list[Event] = []
-    if run.ending is not None or run.passage is not None:
+    if run.ending is not None or run.opening is not None:
         return []
     for process in run.processes.values():
         if process.away_s is None or process.failed or process.state is not ProcessState.RUNNING:

@@ -12,27 +12,26 @@ from lifecycle.manifest.model import Restart, Supervision
 
 
 class RestartPolicy:
-    """Decides for one process.
+    """Decides for one process; `reset` it at its first start.
 
     Args:
         how: what the manifest says.
-        started_s: when it was started for the first time, by any clock that only goes forward.
 
     Attributes:
         restarts: how often it has been started again after a failure.
     """
 
-    def __init__(self, how: Supervision, started_s: float) -> None:
+    def __init__(self, how: Supervision) -> None:
         self.how = how
         self.restarts = 0
-        self._starts = [started_s]
+        self._starts: list[float] = []
         self._in_a_row = 0
 
     def failed(self, now_s: float, *, was_up: bool = True) -> float | None:
         """Take one failure.
 
         Args:
-            now_s: by the same clock.
+            now_s: by any clock that only goes forward.
             was_up: its system was up before. Until then no start is forgotten: a process that fails
                 late each time must not hold a bring-up for ever.
 
@@ -40,7 +39,7 @@ class RestartPolicy:
             When it is to be started again, by the same clock; None to give up.
         """
         interval_s = self.how.start_limit_interval_sec
-        if interval_s and now_s - self._starts[-1] >= interval_s:
+        if interval_s and self._starts and now_s - self._starts[-1] >= interval_s:
             self._in_a_row = 0
         self._in_a_row += 1
         again_s = now_s + delay_s(self.how, self._in_a_row)
@@ -62,7 +61,7 @@ class RestartPolicy:
         self._starts = [*kept, now_s]
 
     def reset(self, now_s: float) -> None:
-        """Begin anew: a person restarted it."""
+        """Begin anew: it is started for the first time, or a person restarts it."""
         self._starts = [now_s]
         self._in_a_row = 0
 

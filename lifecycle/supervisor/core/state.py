@@ -204,7 +204,7 @@ class Process(msgspec.Struct, kw_only=True):
         end: how it ended; None while it has not.
         log: file with its output; empty before it was started.
         sweeping: what it left is being ended, and forgotten by the graph.
-        policy: when it is started again, over all of its lives; None before the first.
+        policy: when it is started again, over all of its lives.
         by_hand: it is started next by a person, and its failures are forgotten.
         failed: it is started next because it failed.
         away_s: when it failed; None once it is as far again as it is to be.
@@ -217,15 +217,14 @@ class Process(msgspec.Struct, kw_only=True):
     """
 
     planned: PlannedProcess
-    supervision: Supervision
+    policy: RestartPolicy
     may_end: bool = False
     state: ProcessState | None = None
     pid: int = 0
     end: Exited | None = None
     log: str = ""
     sweeping: bool = False
-    policy: RestartPolicy | None = None
-    by_hand: bool = False
+    by_hand: bool = True
     failures: list[Failed] = []
     failed: bool = False
     away_s: float | None = None
@@ -244,13 +243,11 @@ class Process(msgspec.Struct, kw_only=True):
     @property
     def restarts(self) -> int:
         """How often it was started again after a failure."""
-        return 0 if self.policy is None else self.policy.restarts
+        return self.policy.restarts
 
     def started(self, now_s: float) -> None:
         """Count a start: StartLimitBurst= applies to all kinds of them (systemd.unit(5))."""
-        if self.policy is None or self.policy.how != self.supervision:
-            self.policy = RestartPolicy(self.supervision, now_s)
-        elif self.by_hand:
+        if self.by_hand:
             self.policy.reset(now_s)
         else:
             self.policy.started(now_s, after_failure=self.failed)
@@ -287,60 +284,55 @@ class Order(Question, kw_only=True, frozen=True):
 
 
 class Passage(msgspec.Struct, kw_only=True):
-    """Nodes that pass the gate: from the verdict that opens it to the one on what they became.
+    """Nodes are to pass the gate: for a bring-up, an order, or as policy started them again.
+
+    They come to the gate; it opens for those that wait at it once a verdict allows it; and they
+    have passed once the next verdict finds them as they were verified.
 
     Attributes:
-        waiting: keys of the nodes; `sent`: of those that were sent their requests.
+        until_s: when its time is over; it begins anew when all are at the gate.
+        asked: for a bring-up or an order, which ends with it; policy's nodes go on waiting.
+        judges: the gate is to open; else they are only to come to it.
+        activates: nodes are let through; else the system is only verified.
+        keys: of those that are, also where an order or a consequence kept them; None for all.
+        mode: to go back to where the gate stays closed; empty for a passage of another kind.
+        at_gate: the nodes have come as far.
+        mark: of the moment at which they had; `since_s`: when that was.
+        said: it was said what the gate waits for.
+        begun_s: when a verdict opened the gate; None before.
+        waiting: keys of the nodes that it is for; `sent`: of those that were sent their requests.
         flows: that networks are to have; None until that is asked for.
         programming: number of the request to program networks with them; 0 if none is open.
-        opened: the gate is open for the nodes, as far as nothing changes.
-        until_s: for so long what changes meanwhile may heal.
-        late_s: then they must be active.
+        opened: networks have them, and nodes are asked as far as nothing changes.
         paused: the system was paused before.
     """
 
-    waiting: tuple[str, ...]
     until_s: float
-    late_s: float
+    asked: bool = True
+    judges: bool = True
+    activates: bool = True
+    keys: frozenset[str] | None = None
+    mode: str = ""
+    at_gate: bool = False
+    mark: int = 0
+    since_s: float = NEVER_S
+    said: bool = False
+    begun_s: float | None = None
+    waiting: tuple[str, ...] = ()
+    sent: set[str] = msgspec.field(default_factory=set)
     flows: tuple[FlowReport, ...] | None = None
     programming: int = 0
-    paused: bool = False
-    sent: set[str] = msgspec.field(default_factory=set)
     opened: bool = False
+    paused: bool = False
 
     @property
     def is_programmed(self) -> bool:
         """Whether networks have the flows."""
         return self.flows is not None and not self.programming
 
-
-class Attempt(msgspec.Struct, kw_only=True):
-    """Somebody waits for the gate: a bring-up, or an order.
-
-    Attributes:
-        until_s: when its time is over; it begins anew when all are at the gate.
-        at_gate: the nodes have come as far.
-        mark: of the moment at which they had; `since_s`: when that was.
-        said: it was said what the gate waits for.
-        judges: the gate is to open; else they are only to come to it.
-        activates: nodes are let through; else the system is only verified.
-        keys: of those that are, also where an order or a consequence kept them; None for all.
-        mode: to go back to where the gate stays closed; empty for an attempt of another kind.
-    """
-
-    until_s: float
-    at_gate: bool = False
-    mark: int = 0
-    since_s: float = NEVER_S
-    said: bool = False
-    judges: bool = True
-    activates: bool = True
-    keys: frozenset[str] | None = None
-    mode: str = ""
-
-    def asks_for(self, key: str) -> bool:
+    def lets_go(self, key: str) -> bool:
         """Return whether a node is to be let through that was kept inactive until now."""
-        return self.activates and (self.keys is None or key in self.keys)
+        return self.asked and self.activates and (self.keys is None or key in self.keys)
 
 
 class Switch(msgspec.Struct, kw_only=True):
@@ -349,15 +341,12 @@ class Switch(msgspec.Struct, kw_only=True):
     Attributes:
         active: keys of the nodes that were to be active before.
         given: names of those whose parameters are others in this mode.
-        to_ask: keys of those that are to be given parameters; `asked`: that have not answered.
         back: the system goes back to the mode before.
     """
 
     before: str
     active: frozenset[str]
     given: tuple[str, ...] = ()
-    to_ask: set[str] = msgspec.field(default_factory=set)
-    asked: set[str] = msgspec.field(default_factory=set)
     back: bool = False
 
 
@@ -369,7 +358,6 @@ class Change(msgspec.Struct, kw_only=True):
         active: keys of the nodes that were active, or had failed and were to be again.
         touched: keys of the nodes that were taken down, or are new.
         down: keys of the nodes that go down before the manifest is taken.
-        to_give: parameters of running nodes that are to be set first; `giving`: who has to answer.
         given: what nodes were asked to take; who did not answer may have taken it.
         taken: the manifest is in force.
         back: the system goes back to the manifest before.
@@ -388,8 +376,6 @@ class Change(msgspec.Struct, kw_only=True):
     until_s: float
     touched: set[str] = msgspec.field(default_factory=set)
     down: set[str] = msgspec.field(default_factory=set)
-    to_give: dict[str, GivenParameters] = {}
-    giving: set[str] = msgspec.field(default_factory=set)
     given: dict[str, GivenParameters] = {}
     taken: bool = False
     back: bool = False
@@ -490,8 +476,9 @@ class Run(msgspec.Struct, kw_only=True):
         mark: counts what may change a verdict.
         requests: counts what nodes were asked.
         came: nodes have come up, and not all are at the gate since; `again`: and not yet judged.
+        to_give: parameters of running nodes that are set first, None for all of its mode; `giving`:
+            keys of the nodes that have to answer.
         undone: how the order under way is answered once what it did is undone.
-        waits_s: since when nodes wait at the gate that nobody asked for; `said`: it was said.
         furthest: "connected", "verified" or "active", as far as it came; empty before.
         held_s: since when it is held; None before it was up.
         pauses: it is to be said that it is paused, once nothing is active.
@@ -523,14 +510,13 @@ class Run(msgspec.Struct, kw_only=True):
     judged: Judged = msgspec.field(default_factory=Judged)
     came: bool = True
     again: bool = False
+    to_give: dict[str, GivenParameters | None] = {}
+    giving: set[str] = msgspec.field(default_factory=set)
     undone: tuple[ExitCode, str] | None = None
-    waits_s: float | None = None
-    said: bool = False
     furthest: str = ""
     held_s: float | None = None
     paused: bool = False
     pauses: bool = False
-    attempt: Attempt | None = None
     passage: Passage | None = None
     orders: deque[Order] = msgspec.field(default_factory=deque)
     order: Order | None = None
@@ -575,6 +561,24 @@ class Run(msgspec.Struct, kw_only=True):
             for each in self.nodes.values()
             if each.let_through or each.level is Level.ACTIVE
         )
+
+    @property
+    def asked(self) -> Passage | None:
+        """The passage that a bring-up or an order asks for; None if none does."""
+        return self.passage if self.passage is not None and self.passage.asked else None
+
+    @property
+    def opening(self) -> Passage | None:
+        """The passage for which a verdict has opened the gate; None if it has for none."""
+        passage = self.passage
+        return None if passage is None or passage.begun_s is None else passage
+
+    def shut_gate(self) -> None:
+        """Have who asked for the gate begin at it anew; who did not waits again by itself."""
+        self.passage = passage = self.asked
+        if passage is not None:
+            passage.begun_s, passage.waiting, passage.sent = None, (), set()
+            passage.flows, passage.programming, passage.opened = None, 0, False
 
     @property
     def is_changing(self) -> bool:
@@ -693,7 +697,7 @@ def begin(run: Run, options: Options) -> None:
     active = options.until is Level.ACTIVE
     judges = active or options.verifies
     run.options = options
-    run.attempt = Attempt(until_s=options.timeout_s, activates=active, judges=judges)
+    run.passage = Passage(until_s=options.timeout_s, activates=active, judges=judges)
 
 
 def install(run: Run, plan: Plan, *, own: frozenset[str] | None = None) -> None:
@@ -708,9 +712,9 @@ def install(run: Run, plan: Plan, *, own: frozenset[str] | None = None) -> None:
         if started:
             supervision = members[0].supervision if members else Supervision()
             process = processes.get(planned.name) or Process(
-                planned=planned, supervision=supervision
+                planned=planned, policy=RestartPolicy(supervision)
             )
-            process.planned, process.supervision = planned, supervision
+            process.planned, process.policy.how = planned, supervision
             process.may_end = bool(members) and all(each.may_end for each in members)
             run.processes[planned.name] = process
         for each in members:

@@ -41,7 +41,7 @@ from lifecycle.verify.rules.nodes import MISSING_NODE
 from lifecycle.verify.verdict import Stage, Verdict
 
 if TYPE_CHECKING:
-    from lifecycle.supervisor.core.state import Attempt
+    from lifecycle.supervisor.core.state import Passage
     from lifecycle.supervisor.nodes.system import NodeRun
     from lifecycle.supervisor.shell.supervisor import Supervisor
 
@@ -88,7 +88,7 @@ class Looks:
         self._latest: Verdict | None = None
         self._was_stale = False
         self._again_s = ASK_AGAIN_S
-        self._attempt: Attempt | None = None
+        self._asked: Passage | None = None
         self._seen_last: inputs.Saw | None = None
         self._activated_s: dict[str, float] = {}
         self._found: frozenset[tuple[str, str]] = frozenset()
@@ -128,13 +128,13 @@ class Looks:
 
     def _is_waited_for(self) -> bool:
         run = self._system.run
-        at_gate = run.attempt is not None and run.attempt.at_gate
-        return at_gate or run.passage is not None or bool(advance.waiting(run))
+        at_gate = run.passage is not None and run.passage.at_gate
+        return at_gate or bool(advance.waiting(run))
 
     def _left_s(self) -> float:
         run = self._system.run
-        until_s = [each.until_s for each in (run.attempt, run.passage) if each is not None]
-        return max(0.0, min(until_s, default=run.now_s) - self._shell.now_s())
+        passage = run.asked or run.opening
+        return 0.0 if passage is None else max(0.0, passage.until_s - self._shell.now_s())
 
     def _verified(
         self, mark: int, stage: Stage, away: frozenset[str], found: Verdict
@@ -142,7 +142,7 @@ class Looks:
         run, judge = self._system.run, self._shell.judge
         now_s = asyncio.get_running_loop().time()
         verdict, awaited_s, again_s = found, list[float](), list[float]()
-        watched = run.held_s is not None and run.attempt is None and run.passage is None
+        watched = run.held_s is not None and run.asked is None and run.opening is None
         if watched:
             verdict, kept_s = self._grace_period.after(
                 self._latest, found, self._system.expected, now_s
@@ -153,8 +153,8 @@ class Looks:
         if not closes and stage is Stage.CONNECTED and (left_s := judge.unsaid_s(found)) > 0:
             awaited_s.append(left_s)
         if judge.asks_again(found):
-            if run.attempt is not self._attempt:
-                self._attempt, self._again_s = run.attempt, ASK_AGAIN_S
+            if run.asked is not self._asked:
+                self._asked, self._again_s = run.asked, ASK_AGAIN_S
             again_s.append(ASK_AGAIN_AT_MOST_S if watched else self._again_s)
             self._again_s = min(self._again_s * 2, ASK_AGAIN_AT_MOST_S)
         if run.change is not None and judge.is_reconciling:
@@ -186,7 +186,7 @@ class Looks:
         same = frozenset((each.rule, each.subject) for each in found.findings)
         if same != self._found or not self._is_waited_for():
             self._found, self._found_s = same, now_s
-        if run.attempt is None or not run.attempt.at_gate or run.passage is not None:
+        if run.asked is None or not run.asked.at_gate or run.opening is not None:
             self._tries.clear()
             return ""
         if stage is not Stage.CONNECTED or not gate.closes(found, strict=run.options.strict):
@@ -196,7 +196,7 @@ class Looks:
             return ""
         name = undiscovered(found, restartable, self._tries)
         left_s = self._found_s + UNCHANGED_S - now_s
-        if name is None or run.attempt.until_s - run.now_s <= UNCHANGED_S + max(left_s, 0.0):
+        if name is None or run.asked.until_s - run.now_s <= UNCHANGED_S + max(left_s, 0.0):
             return ""
         if left_s > 0:
             again_s.append(left_s)

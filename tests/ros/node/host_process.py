@@ -35,6 +35,7 @@ class HostProcess:
         domain_id: int,
         nodes: tuple[PlannedNode, ...],
         log: Path,
+        **spec: Any,
     ) -> None:
         ours, theirs = socket.socketpair()
         ours.settimeout(30)
@@ -55,14 +56,16 @@ class HostProcess:
         self._control = ours
         self._reader = ours.makefile("rb")
         self._id = 0
-        spec = HostSpec(
-            system="test",
-            process="p",
-            domain_id=domain_id,
-            discovery_range=DiscoveryRange.LOCALHOST,
-            nodes=nodes,
+        self.send(
+            HostSpec(
+                system="test",
+                process="p",
+                domain_id=domain_id,
+                discovery_range=DiscoveryRange.LOCALHOST,
+                nodes=nodes,
+                **spec,
+            )
         )
-        self.send(spec)
 
     def send(self, message: object) -> None:
         self._control.sendall(codec.to_json(message) + b"\n")

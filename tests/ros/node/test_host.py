@@ -18,6 +18,7 @@ from planning import publisher, subscription
 
 from lifecycle.errors import BringUpError
 from lifecycle.manifest.model import Executor, Run, RunKind, Timeouts
+from lifecycle.network.ports import participant_ports
 from lifecycle.node.host.control import Event, Operation
 from lifecycle.node.host.in_process import NodeInProcess
 
@@ -47,6 +48,23 @@ def test_two_nodes_in_one_process_are_brought_up_and_end_with_the_channel(start:
     assert (told.name, told.identity.process_id) == ("/one", host.process.pid)
     host.hang_up()
     assert host.wait() == 0
+
+
+@pytest.mark.parametrize("joins", [True, False])
+def test_a_host_that_joins_a_running_system_has_the_others_announce_themselves_to_it(
+    start: Start, fresh_domain: int, joins: bool
+) -> None:
+    """Where another participant would listen; what makes it answer has a vendor id of ours."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", participant_ports(fresh_domain, 9).discovery_unicast))
+        other.settimeout(10.0)
+        start(hosted("one", "Good"), joins=joins).until("ready")
+        vendors = {other.recv(65536)[6:8]}
+        other.setblocking(False)
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                vendors.add(other.recv(65536)[6:8])
+    assert vendors == ({b"\x01\x0f", b"LC"} if joins else {b"\x01\x0f"})
 
 
 @pytest.mark.parametrize("class_", ["Good", "Plain", "Theirs"])

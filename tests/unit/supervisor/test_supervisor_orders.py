@@ -31,7 +31,7 @@ PLAN = plan_of(
 @pytest.mark.parametrize("phase", ["active", "paused", "held", "connecting", "stopping"])
 def test_an_order_fits_some_phases_and_no_others(ask: ControlRequest, phase: str) -> None:
     run = new_run(PLAN, Options())
-    run.held_s, run.attempt = (None if phase == "connecting" else 0.0), None
+    run.held_s, run.passage = (None if phase == "connecting" else 0.0), None
     run.paused = phase == "paused"
     run.nodes["camera"].refused = phase == "held"
     if phase == "stopping":
@@ -58,7 +58,7 @@ def test_an_order_fits_some_phases_and_no_others(ask: ControlRequest, phase: str
 )
 def test_a_node_that_is_not_ours_is_not_restarted(node: str, message: str) -> None:
     run = new_run(PLAN, Options())
-    run.held_s, run.attempt = 0.0, None
+    run.held_s, run.passage = 0.0, None
     assert refusal(run, Order(id=0, ask=ControlRequest.RESTART, node=node)) == message
 
 

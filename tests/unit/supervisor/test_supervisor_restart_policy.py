@@ -40,6 +40,12 @@ ON_FAILURE = Supervision(restart=Restart.ON_FAILURE, restart_sec=1.0)
 # The policy
 
 
+def _started(how: Supervision) -> RestartPolicy:
+    policy = RestartPolicy(how)
+    policy.reset(0.0)
+    return policy
+
+
 def test_the_delay_grows_by_one_factor_up_to_its_longest_and_stays() -> None:
     how = Supervision(restart_sec=1.0, restart_steps=4, restart_max_delay_sec=16.0)
     assert [delay_s(how, count) for count in range(1, 8)] == [1.0, 2.0, 4.0, 8.0, 16.0, 16.0, 16.0]
@@ -62,14 +68,14 @@ def test_which_ends_are_started_again_after(
 
 
 def test_it_gives_up_at_the_start_after_the_burst_and_never_without_an_interval() -> None:
-    policy = RestartPolicy(Supervision(restart=Restart.ALWAYS), 0.0)
+    policy = _started(Supervision(restart=Restart.ALWAYS))
     found = []
     for at_s in (0.1, 0.3, 0.5, 0.7, 0.9):
         found.append(policy.failed(at_s))
         policy.started(at_s + 0.1)
     assert found == [pytest.approx(at_s + 0.1) for at_s in (0.1, 0.3, 0.5, 0.7)] + [None]
     assert policy.restarts == 5
-    endless = RestartPolicy(Supervision(restart=Restart.ALWAYS, start_limit_interval_sec=0.0), 0.0)
+    endless = _started(Supervision(restart=Restart.ALWAYS, start_limit_interval_sec=0.0))
     for at_s in range(100):
         assert endless.failed(float(at_s)) == at_s + 0.1
         endless.started(at_s + 0.1)
@@ -77,7 +83,7 @@ def test_it_gives_up_at_the_start_after_the_burst_and_never_without_an_interval(
 
 def test_until_the_system_was_up_a_process_that_fails_late_each_time_is_given_up() -> None:
     how = Supervision(restart=Restart.ON_FAILURE, start_limit_interval_sec=1.0, start_limit_burst=3)
-    policies = {was_up: RestartPolicy(how, 0.0) for was_up in (True, False)}
+    policies = {was_up: _started(how) for was_up in (True, False)}
     again = {was_up: [] for was_up in policies}
     for now_s in (5.0, 10.0, 15.0):
         for was_up, policy in policies.items():
@@ -90,7 +96,7 @@ def test_after_a_long_run_and_after_a_person_the_delay_begins_anew() -> None:
     how = Supervision(
         restart=Restart.ALWAYS, restart_sec=1.0, restart_steps=2, restart_max_delay_sec=4.0
     )
-    policy = RestartPolicy(how, 0.0)
+    policy = _started(how)
     assert policy.failed(1.0) == 2.0
     policy.started(2.0)
     assert policy.failed(3.0) == 5.0
