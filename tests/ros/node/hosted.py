@@ -9,10 +9,11 @@ from typing import Any
 import rclpy
 from rclpy.lifecycle import LifecycleNode as RclpyLifecycleNode
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from lifecycle import LifecycleNode, on_message
+from lifecycle import LifecycleNode, on_message, on_timer
 
 
 class Good(LifecycleNode):
@@ -25,6 +26,21 @@ class Echo(LifecycleNode):
     @on_message("in")
     def receive(self, message: String) -> None:
         self.publisher("out").publish(message)
+
+
+class Restless(LifecycleNode):
+    """Has another configuration at each tick, of 4 kB, and says how many it has had."""
+
+    def on_configure(self) -> None:
+        self.count = 0
+        if not self.has_parameter("text"):
+            self.declare_parameter("text", "")
+
+    @on_timer(period_s=0.002)
+    def tick(self) -> None:
+        self.count += 1
+        self.set_parameters([Parameter("text", value=f"{self.count} " + "x" * 4000)])
+        self.publisher("out").publish(String(data=str(self.count)))
 
 
 class Raising(LifecycleNode):
