@@ -7,11 +7,13 @@ import time
 from typing import Any
 
 import rclpy
+from rclpy.action import ActionServer
 from rclpy.lifecycle import LifecycleNode as RclpyLifecycleNode
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
+from test_msgs.action import Fibonacci
 
 from lifecycle import LifecycleNode, on_message, on_timer
 
@@ -88,6 +90,20 @@ class Plain(Node):
         self.create_publisher(String, "out", 10)
         label = self.declare_parameter("label", "none").value
         print("label", label, file=sys.stderr, flush=True)
+
+
+class Acting(Node):
+    """A plain node whose action raises at a goal of order 0, and succeeds at others."""
+
+    def __init__(self) -> None:
+        super().__init__("acting")
+        self.server = ActionServer(self, Fibonacci, "count", self.count)
+
+    def count(self, goal: Any) -> Fibonacci.Result:
+        if not goal.request.order:
+            raise OSError("no such number")
+        goal.succeed()
+        return Fibonacci.Result()
 
 
 class Ending(Node):
