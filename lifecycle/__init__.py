@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from lifecycle.public import public_name
+
 if TYPE_CHECKING:
     from lifecycle.node.actions import GoalInterruptedError
     from lifecycle.node.author.handlers import on_action, on_goal, on_message, on_service, on_timer
@@ -36,10 +38,26 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> object:
-    """Load a name of `lifecycle.node` (PEP 562)."""
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from lifecycle import node
+_PUBLIC: dict[str, tuple[str, ...]] = {
+    "lifecycle.node.actions": ("GoalInterruptedError",),
+    "lifecycle.node.author.handlers": (
+        "on_action",
+        "on_goal",
+        "on_message",
+        "on_service",
+        "on_timer",
+    ),
+    "lifecycle.node.author.node": (
+        "ERROR",
+        "FAILURE",
+        "LifecycleNode",
+        "SUCCESS",
+        "TransitionCallbackReturn",
+    ),
+    "lifecycle.node.host.standalone": ("run",),
+}
 
-    return getattr(node, name)
+
+def __getattr__(name: str) -> object:
+    """Load the module of a public name on first use (PEP 562)."""
+    return public_name(__name__, _PUBLIC, name)

@@ -432,7 +432,6 @@ class ConfigurationChanges:
         self._failed = failed
         self._listeners: list[Listener] = []
         self._lock = threading.Lock()
-        self._behind: list[Listener] = []
         self._scheduled = False
 
     def listen(self, listener: Listener) -> None:
@@ -442,43 +441,24 @@ class ConfigurationChanges:
     def close(self) -> None:
         """Notify of nothing any more: the node's process leaves DDS."""
         self._listeners.clear()
-        with self._lock:
-            self._behind = []
 
     def touch(self) -> None:
         """Something of the configuration has changed, match counts included; from any thread."""
         with self._lock:
-            self._behind = list(self._listeners)
-            if self._scheduled or not self._behind:
+            if self._scheduled or not self._listeners:
                 return
             # Before it is handed over: it may have run when `later` returns.
             self._scheduled = True
         if not self._later(self._notify):
             self._scheduled = False
 
-    def give(self, listener: Listener) -> tuple[NodeConfiguration, bool]:
-        """Return the configuration as it is now to who gives it to `listener`.
-
-        Returns:
-            And whether that takes the place of its notification: it is not notified any more of
-            what changed before.
-        """
-        with self._lock:
-            behind = listener in self._behind
-            self._behind = [each for each in self._behind if each != listener]
-        return self._collect(), behind
-
     def _notify(self) -> None:
         with self._lock:
             self._scheduled = False
-            behind, self._behind = self._behind, []
-        if not behind:
-            return
-        configuration = self.collect()
-        if configuration is None:
-            return
-        for listener in behind:
-            listener(configuration)
+        configuration = self.collect() if self._listeners else None
+        if configuration is not None:
+            for listener in self._listeners:
+                listener(configuration)
 
     def collect(self) -> NodeConfiguration | None:
         """Return the configuration as it is now; None, and a line in the log, if that fails."""

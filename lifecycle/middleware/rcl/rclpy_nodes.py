@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import inspect
 import traceback
 from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Any, Protocol
@@ -161,6 +162,29 @@ def _action_name(node: Node, kind: EndpointKind, action: Any) -> str:
     known = {getattr(each, "action_name", "") for each in node.waitables}
     new = [name for name in listed if name not in known]
     return next(iter(new or listed), "")  # a second client of a name brings none
+
+
+def follow_goals(server: Any, ended: Callable[[Exception | None], None]) -> None:
+    """Call back at the end of each goal with what the handler of an action server raised, or None.
+
+    Where rclpy keeps the handler otherwise than is known, nothing is called.
+    """
+    execute = getattr(server, "_execute_callback", None)
+    if execute is None:
+        return
+
+    @functools.wraps(execute)
+    async def call(goal: Any) -> Any:
+        try:
+            returned = execute(goal)
+            returned = await returned if inspect.isawaitable(returned) else returned
+        except Exception as error:
+            ended(error)
+            raise
+        ended(None)
+        return returned
+
+    server.register_execute_callback(call)
 
 
 def interface_of(entity: Any) -> type[Any]:

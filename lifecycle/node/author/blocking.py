@@ -47,22 +47,13 @@ def refuse_to_block(what: str, instead: str) -> None:
         what: that an answer is awaited of.
         instead: what can be awaited.
     """
-    if in_executor():
-        raise DeadlockError(
-            f"cannot wait for {what} in a callback: the answer comes by the executor that waits "
-            "for this callback",
-            hint=f"write `async def` and `await {instead}`",
-        )
-
-
-def in_executor() -> bool:
-    """Return whether this thread is inside a single-threaded executor's turn.
-
-    A multi-threaded one runs callbacks in other threads than the one that spins.
-    """
+    # A multi-threaded executor runs callbacks in other threads than the one that spins.
     frame = inspect.currentframe()
     while frame is not None:
         if (frame.f_globals.get("__name__"), frame.f_code.co_name) in _SPINNING:
-            return True
+            raise DeadlockError(
+                f"cannot wait for {what} in a callback: the answer comes by the executor that "
+                "waits for this callback",
+                hint=f"write `async def` and `await {instead}`",
+            )
         frame = frame.f_back
-    return False

@@ -35,13 +35,6 @@ class _Mark(msgspec.Struct, frozen=True, kw_only=True):
     decides: bool = False  # on an action's goals, instead of executing them
 
 
-class TimerHandler(msgspec.Struct, frozen=True, kw_only=True):
-    """A method to be called every `period_s` seconds while the node is active."""
-
-    method: str
-    period_s: float
-
-
 class ActionHandler(msgspec.Struct, frozen=True, kw_only=True):
     """What an action server gives its goals to.
 
@@ -59,22 +52,23 @@ class ActionHandler(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Handlers(msgspec.Struct, frozen=True, kw_only=True):
-    """The handlers of one node: (kind, declared name) → method name, and its timers.
+    """The handlers of one node: (kind, declared name) → method name.
 
     Attributes:
-        deciders: action → method that decides on its goals, where there is one.
+        deciders: the methods that decide on goals of actions.
+        timers: (method, period in s) of those to be called while the node is active.
     """
 
     methods: Mapping[tuple[EndpointKind, str], str]
-    timers: tuple[TimerHandler, ...]
-    deciders: Mapping[str, str]
+    deciders: Mapping[tuple[EndpointKind, str], str]
+    timers: tuple[tuple[str, float], ...]
 
     def bound(self, node: object, endpoint: PlannedEndpoint) -> Callable[..., Any]:
         """Return what handles `endpoint`, a matched one, as methods of `node`."""
         method: Callable[..., Any] = getattr(node, self.methods[endpoint.kind, endpoint.name])
         if endpoint.kind is not EndpointKind.ACTION_SERVER:
             return method
-        decider = self.deciders.get(endpoint.name)
+        decider = self.deciders.get((endpoint.kind, endpoint.name))
         return ActionHandler(execute=method, accept=getattr(node, decider) if decider else None)
 
 
@@ -219,23 +213,27 @@ def match(node_class: type, endpoints: Iterable[PlannedEndpoint], *, node: str) 
         LifecycleError: with every endpoint without a handler, every handler without an endpoint
             and every endpoint with two, each with the nearest spelling.
     """
-    wanted = {(e.kind, e.name): e for e in endpoints if e.kind in _WORDS}
+    wanted = [(each.kind, each.name) for each in endpoints if each.kind in _WORDS]
     methods: dict[tuple[EndpointKind, str], str] = {}
     deciders: dict[tuple[EndpointKind, str], str] = {}
-    timers: list[TimerHandler] = []
+    timers: list[tuple[str, float]] = []
+    unused: list[tuple[EndpointKind, str]] = []
     problems: list[str] = []
-    marked = _marks(node_class)
-    for method, mark in marked:
+    for method, mark in _marks(node_class):
         if mark.kind is None:
-            timers.append(TimerHandler(method=method, period_s=mark.period_s))
+            timers.append((method, mark.period_s))
             continue
-        key = (mark.kind, mark.name)
+        key, taken = (mark.kind, mark.name), deciders if mark.decides else methods
+        noun, decorator = _WORDS[mark.kind]
         if key not in wanted:
-            problems.append(_without_endpoint(node_class, node, method, mark, list(wanted)))
-            continue
-        taken = deciders if mark.decides else methods
-        if key in taken:
-            noun = _WORDS[mark.kind][0]
+            decorator = "@on_goal" if mark.decides else decorator
+            declared = [name for kind, name in wanted if kind is mark.kind]
+            problems.append(
+                f"cannot use handler {node_class.__name__}.{method}: {decorator}({mark.name!r}) "
+                f"names no {noun} that {node} declares; {alternatives(mark.name, declared)}"
+            )
+            unused += [] if mark.decides else [key]
+        elif key in taken:
             what = f"decide on goals of {noun}" if mark.decides else f"handle {noun}"
             problems.append(
                 f"cannot {what} {mark.name!r} of {node} twice: "
@@ -243,53 +241,17 @@ def match(node_class: type, endpoints: Iterable[PlannedEndpoint], *, node: str) 
             )
         else:
             taken[key] = method
-    unused = [
-        (mark.kind, mark.name)
-        for _, mark in marked
-        if mark.kind and not mark.decides and (mark.kind, mark.name) not in wanted
-    ]
-    for (kind, name), endpoint in wanted.items():
-        if (kind, name) not in methods:
-            problems.append(_without_handler(node_class, node, endpoint, unused))
+    for kind, name in (each for each in wanted if each not in methods):
+        noun, decorator = _WORDS[kind]
+        near = nearest(name, [other for of, other in unused if of is kind])
+        hint = f"; did you mean it where {decorator}({near!r}) stands?" if near else ""
+        problems.append(
+            f"cannot serve {noun} {name!r} of {node}: no method of {node_class.__name__} is "
+            f"decorated with {decorator}({name!r}){hint}"
+        )
     if problems:
         raise LifecycleError("\n".join(problems))
-    return Handlers(
-        methods=methods,
-        timers=tuple(timers),
-        deciders={name: method for (_, name), method in deciders.items()},
-    )
-
-
-def _without_endpoint(
-    node_class: type,
-    node: str,
-    method: str,
-    mark: _Mark,
-    wanted: list[tuple[EndpointKind, str]],
-) -> str:
-    assert mark.kind is not None
-    noun, decorator = _WORDS[mark.kind]
-    decorator = "@on_goal" if mark.decides else decorator
-    declared = [name for kind, name in wanted if kind is mark.kind]
-    return (
-        f"cannot use handler {node_class.__name__}.{method}: {decorator}({mark.name!r}) names no "
-        f"{noun} that {node} declares; {alternatives(mark.name, declared)}"
-    )
-
-
-def _without_handler(
-    node_class: type,
-    node: str,
-    endpoint: PlannedEndpoint,
-    unused: list[tuple[EndpointKind, str]],
-) -> str:
-    noun, decorator = _WORDS[endpoint.kind]
-    near = nearest(endpoint.name, [name for kind, name in unused if kind is endpoint.kind])
-    hint = f"; did you mean it where {decorator}({near!r}) stands?" if near else ""
-    return (
-        f"cannot serve {noun} {endpoint.name!r} of {node}: no method of {node_class.__name__} is "
-        f"decorated with {decorator}({endpoint.name!r}){hint}"
-    )
+    return Handlers(methods=methods, deciders=deciders, timers=tuple(timers))
 
 
 def alternatives(name: str, declared: Iterable[str]) -> str:

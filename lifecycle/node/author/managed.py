@@ -226,9 +226,9 @@ class Managed:
         matched = match(type(self.node), self.data_layer.unhandled, node=self.full_name)
         parameters.declare(self.node, self.spec)
         self.data_layer.prepare(functools.partial(matched.bound, self.node))
-        for timer in matched.timers:
-            method = getattr(self.node, timer.method)
-            self._method_timers.append(self.node.create_timer(timer.period_s, method))
+        for method, period_s in matched.timers:
+            timer = self.node.create_timer(period_s, getattr(self.node, method))
+            self._method_timers.append(timer)
 
     def unprepare(self) -> None:
         """Undo `prepare`; parameters stay declared."""

@@ -41,7 +41,6 @@ from lifecycle.node.author.spec import (
     default_name,
     parse_mode,
     plan_without_manifest,
-    ros_arguments,
     take_construction,
 )
 from lifecycle.node.connections.connection_status import ConnectionEvent
@@ -163,9 +162,7 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         planned = construction.spec if construction is not None else None
         if planned is not None:
             name, namespace = planned.name, planned.namespace
-            options["cli_args"] = [*ros_arguments(planned), *(options.get("cli_args") or ())]
-            given = options.get("parameter_overrides") or ()
-            options["parameter_overrides"] = [*given, *parameters.overrides(planned)]
+            options = parameters.planned_options(planned, options)
             parameters.give_empty_arrays(self, planned)
         if construction is not None:
             context = construction.context or context

@@ -20,7 +20,6 @@ from rclpy.exceptions import (
 from rclpy.parameter import Parameter
 
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest.model import ParameterDeclaration, ParameterValue
 from lifecycle.manifest.parameter_files import type_of
 from lifecycle.middleware.services.parameters import (
     TYPES,
@@ -28,12 +27,13 @@ from lifecycle.middleware.services.parameters import (
     to_rclpy,
     type_word,
 )
+from lifecycle.node.author.spec import ros_arguments
 from lifecycle.plan.model import raw_value
 from lifecycle.plan.parameters import DEFAULT
 from lifecycle.verify.observation import ParameterReport
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Iterable, Mapping
 
     from rclpy.node import Node
 
@@ -44,12 +44,24 @@ _ARRAYS = frozenset(each for name, each in TYPES.items() if name.endswith("_arra
 
 def overrides(spec: PlannedNode) -> list[Parameter]:
     """Return the plan's values as rclpy overrides; they win over parameter files."""
-    types = {declared.name: declared.type for declared in spec.declared_parameters}
-    given = [
-        (name, to_rclpy(value, types.get(name, "") or type_of(value)))
-        for name, value in without_text(spec)
-    ]
-    return [Parameter(name, value=value) for name, value in given if value != []]
+    declared = {each.name: each.type for each in spec.declared_parameters}
+    expected = {each.name: each.type for each in spec.expected_parameters}
+    found: list[Parameter] = []
+    for name, written in spec.parameters:
+        given = raw_value(written, expected.get(name, ""))  # doubles that JSON cannot carry
+        value = to_rclpy(given, declared.get(name, "") or type_of(given))
+        if value != []:
+            found.append(Parameter(name, value=value))
+    return found
+
+
+def planned_options(spec: PlannedNode, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return keywords of rclpy's Node with the plan's remaps, parameter files and values added."""
+    return {
+        **options,
+        "cli_args": [*ros_arguments(spec), *(options.get("cli_args") or ())],
+        "parameter_overrides": [*(options.get("parameter_overrides") or ()), *overrides(spec)],
+    }
 
 
 def give_empty_arrays(node: Node, spec: PlannedNode) -> None:
@@ -155,7 +167,10 @@ def declare(node: Node, spec: PlannedNode) -> None:
                 value = TYPES[declared.type] if value == [] else value
                 node.declare_parameter(declared.name, value, descriptor)
         except (InvalidParameterTypeException, InvalidParameterValueException) as error:
-            problems.append(_problem(declared, error))
+            problems.append(
+                f"{declared.at.spelled}: cannot declare parameter {declared.name!r} as "
+                f"{declared.type}: {error}"
+            )
     if problems:
         raise LifecycleError("\n".join(problems))
 
@@ -173,15 +188,3 @@ def reports(node: Node) -> tuple[ParameterReport, ...]:
         )
         for (name, parameter), descriptor in zip(found, descriptors, strict=True)
     )
-
-
-def without_text(spec: PlannedNode) -> Iterator[tuple[str, ParameterValue]]:
-    """Yield the values under `parameters:`; doubles that JSON cannot carry are doubles again."""
-    types = {each.name: each.type for each in spec.expected_parameters}
-    for name, value in spec.parameters:
-        yield name, raw_value(value, types.get(name, ""))
-
-
-def _problem(declared: ParameterDeclaration, error: Exception) -> str:
-    at = declared.at
-    return f"{at.spelled}: cannot declare parameter {declared.name!r} as {declared.type}: {error}"

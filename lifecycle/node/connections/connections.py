@@ -8,6 +8,7 @@ Negotiation*; which endpoint is on which connection is data_layer.py's.
 from __future__ import annotations
 
 import contextlib
+import functools
 import re
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
@@ -207,16 +208,26 @@ class Connections:
 
         An unmarked flow is the verifier's to judge (`enforce`), so it is reported, not fatal here.
         """
+        make = functools.partial(
+            FlowParticipant,
+            planned.name,
+            self._node.get_namespace(),
+            self._node.context.get_domain_id(),
+            transports=planned.transports,
+            max_datagram_bytes=planned.max_datagram_bytes,
+            non_blocking_send=planned.non_blocking_send,
+            connections=how,
+            served=self._node,
+        )
         warning = ""
-        participant = None
-        if planned.dscp is not None:
-            try:
-                participant = self._participant(how, planned, planned.dscp)
-            except MiddlewareError as error:
-                warning = str(error)
-                self._node.get_logger().warning(warning)
-        if participant is None:
-            participant = self._participant(how, planned, None)
+        try:
+            participant = make(dscp=planned.dscp)
+        except MiddlewareError as error:
+            if planned.dscp is None:
+                raise
+            warning = str(error)
+            self._node.get_logger().warning(warning)
+            participant = make()
         connection = Connection(
             name=name,
             urls=how.urls,
@@ -228,21 +239,6 @@ class Connections:
         self._failed.pop(name, None)
         self._made[planned.name] = connection
         return connection
-
-    def _participant(
-        self, how: ParticipantConnections, planned: PlannedParticipant, dscp: int | None
-    ) -> FlowParticipant:
-        return FlowParticipant(
-            planned.name,
-            self._node.get_namespace(),
-            self._node.context.get_domain_id(),
-            dscp=dscp,
-            transports=planned.transports,
-            max_datagram_bytes=planned.max_datagram_bytes,
-            non_blocking_send=planned.non_blocking_send,
-            connections=how,
-            served=self._node,
-        )
 
 
 def connections_of(urls: Iterable[ConnectionUrl | str]) -> ParticipantConnections:

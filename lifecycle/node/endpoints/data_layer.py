@@ -626,12 +626,9 @@ class DataLayer:
         publisher, strict = EndpointKind.PUBLISHER, UniqueRequirement.STRICTLY_REQUIRED
         if connection.participant is None or endpoint.kind is not publisher:
             return
-        for other in self.endpoints.values():
-            if (
-                other is endpoint
-                or other.kind is not publisher
-                or other.connection is not connection
-            ):
+        others = [each for each in self.endpoints.values() if each.connection is connection]
+        for other in others:
+            if other is endpoint or other.kind is not publisher:
                 continue
             for one, two in ((endpoint, other), (other, endpoint)):
                 if one.planned.unique is strict:

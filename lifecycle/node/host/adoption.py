@@ -28,13 +28,7 @@ from lifecycle.middleware.rcl.rclpy_nodes import follow_nodes, is_rclpy_managed
 from lifecycle.node.author import parameters
 from lifecycle.node.author.managed import Managed
 from lifecycle.node.author.node import LifecycleNode
-from lifecycle.node.author.spec import (
-    Construction,
-    Mode,
-    constructing,
-    load_nodes,
-    ros_arguments,
-)
+from lifecycle.node.author.spec import Construction, Mode, constructing, load_nodes
 from lifecycle.node.host.foreign import ForeignNode
 from lifecycle.plan.model import PlannedNode
 
@@ -106,6 +100,7 @@ class Adoption:
     Attributes:
         participants: of the process.
         made: what stands for each node, by its key in the plan.
+        unfollow: ends that nodes of this process are taken for those of the plan.
     """
 
     def __init__(
@@ -129,7 +124,6 @@ class Adoption:
         self._foreign: dict[int, ForeignNode] = {}
         self.made: dict[str, Hosted] = {}
         self.unfollow = follow_nodes(self)
-        """Ends that nodes of this process are taken for those of the plan."""
 
     def make(
         self, planned: PlannedNode, group: Sequence[PlannedNode], what: Callable[..., Any]
@@ -229,7 +223,9 @@ class Adoption:
             return
         refuse_unmanaged(planned, type(node))
         if not ours:
-            name, options = planned.name, self._options(planned, options)
+            name, options = planned.name, parameters.planned_options(planned, options)
+            options["namespace"] = planned.namespace
+            options["use_global_arguments"] = self._use_global_arguments
             parameters.give_empty_arrays(node, planned)
         with self.participants.carrying(ParticipantSettings.of(planned)) as context:
             yield name, {**options, "context": context}
@@ -270,16 +266,6 @@ class Adoption:
         if chosen is not None:
             self._waiting.remove(chosen)
         return chosen
-
-    def _options(self, planned: PlannedNode, options: dict[str, Any]) -> dict[str, Any]:
-        given = options.get("parameter_overrides") or ()
-        return {
-            **options,
-            "namespace": planned.namespace,
-            "cli_args": [*ros_arguments(planned), *(options.get("cli_args") or ())],
-            "parameter_overrides": [*given, *parameters.overrides(planned)],
-            "use_global_arguments": self._use_global_arguments,
-        }
 
 
 def maker_of(planned: PlannedNode, folders: tuple[str, ...]) -> Callable[..., Any]:

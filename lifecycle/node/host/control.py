@@ -123,7 +123,6 @@ class Event(msgspec.Struct, frozen=True, kw_only=True):
         error: the reason, with the exception's last line; the traceback is in the log.
         configuration: for "configuration", and replies that carry it (all but ACTIVATE,
             DEACTIVATE, CLEANUP and SHUTDOWN).
-        reports: of a reply: it replaces a "configuration" that would follow.
         changed: of a reply to ACTIVATE: nothing was done, for the node is not as it was reported.
     """
 
@@ -135,7 +134,6 @@ class Event(msgspec.Struct, frozen=True, kw_only=True):
     connected: bool = False
     error: str = ""
     configuration: NodeConfiguration | None = None
-    reports: bool = False
     changed: bool = False
 
 

@@ -9,6 +9,7 @@ answer, and its plain publishers are held until it is activated through the gate
 from __future__ import annotations
 
 import collections
+import functools
 import time
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
@@ -35,6 +36,7 @@ from lifecycle.middleware.rcl.rclpy_nodes import (
     RCLError,
     RclpyStateMachine,
     Watching,
+    follow_goals,
     is_rclpy_managed,
 )
 from lifecycle.network.nfe import UniqueRequirement
@@ -45,7 +47,7 @@ from lifecycle.node.connections.node_interface import serve_interface
 from lifecycle.node.endpoints.endpoint import CLIENTS, Endpoint, MatchWatch, Placement, Watch
 from lifecycle.node.lifecycle.gate import GatedPublisher, NodeGate
 from lifecycle.node.lifecycle.machine import RefusedError
-from lifecycle.node.lifecycle.steps import SUCCESS, CallbackOutcome, Result
+from lifecycle.node.lifecycle.steps import SUCCESS, CallbackOutcome, Result, error_text
 from lifecycle.plan.model import PlannedEndpoint, PlannedNode
 from lifecycle.verify.observation import NodeConfiguration
 
@@ -176,6 +178,7 @@ class ForeignNode:
         self._unspun: dict[Callable[[Any], Any], Any] = {}
         self._connections = Connections(node)
         self._apart: dict[int, Connection] = {}  # by id of what is being made on others
+        self._faults: dict[int, str] = {}  # by id of the action server
         self._listeners: list[Callable[[Any], None]] = []
         self._let_through = not supervisor
         self._is_spun = False
@@ -239,8 +242,17 @@ class ForeignNode:
             watch = self._match_watch(kind, entity)
         elif kind in CLIENTS:
             watch = ServerWatch(self.node, entity, self.configuration_changes.touch)
+        elif kind is EndpointKind.ACTION_SERVER:
+            follow_goals(entity, functools.partial(self._goal_ended, id(entity)))
         connection = self._apart.pop(id(entity), self._connections.own)
         self._found.add(kind, Placement(connection=connection, entity=entity, watch=watch))
+
+    def _goal_ended(self, server: int, error: Exception | None) -> None:
+        """Keep what the handler of an action raised at its last goal."""
+        fault = "" if error is None else f"its handler raised {error_text(error)}"
+        if fault != self._faults.get(server, ""):
+            self._faults[server] = fault
+            self.configuration_changes.touch()
 
     def _match_watch(self, kind: EndpointKind, entity: Any) -> MatchWatch | SharedMatch:
         touch = self.configuration_changes.touch
@@ -354,6 +366,7 @@ class ForeignNode:
         declared = {(each.kind, each.resolved): each for each in self.spec.endpoints}
         endpoints: list[Endpoint] = []
         for each in self._found.beside():
+            each.fault = self._faults.get(id(each.entity), "")
             planned = declared.pop((each.kind, each.planned.resolved), None)
             if planned is not None:
                 each.planned = replace(

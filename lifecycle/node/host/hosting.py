@@ -372,10 +372,10 @@ class Host:
             # No event reports its sockets: what its callback did to them is read when it has ended.
             or (command.operation is Operation.ACTIVATE and is_marked(node))
         )
-        configuration, reports = None, False
+        configuration = None
         if carries:
             self._note_marks(node)
-            configuration, reports = node.configuration_changes.give(self._report_configuration)
+            configuration = node.get_configuration()
         return Event(
             kind="reply",
             node=command.node,
@@ -385,7 +385,6 @@ class Host:
             connected=state.connected,
             error=error,
             configuration=configuration,
-            reports=reports,
             changed=changed,
         )
 

@@ -24,7 +24,6 @@ import sys
 import threading
 import time
 import traceback
-import weakref
 from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -66,7 +65,6 @@ class Watchdog:
         self._on_overlong = on_overlong
         self._running = False
         self._changing: set[str] = set()
-        self._labels: weakref.WeakKeyDictionary[Any, bytes] = weakref.WeakKeyDictionary()
 
     def add(self, hosted: Hosted) -> None:
         """Leave the transitions of a node to their own deadlines."""
@@ -76,20 +74,12 @@ class Watchdog:
         """Note that a callback begins, and of what it is; None for a task."""
         self._running = True
         if not self._changing:
-            self._sign.begin(what=self._label(entity))
+            self._sign.begin(what=label("" if entity is None else described(entity)))
 
     def end(self) -> None:
         """Note that it has ended."""
         self._running = False
         self._idle()
-
-    def _label(self, entity: Any) -> bytes:
-        if entity is None:
-            return label("")
-        found = self._labels.get(entity)
-        if found is None:
-            found = self._labels[entity] = label(described(entity))
-        return found
 
     def _follow(self, hosted: Hosted) -> None:
         """A transition begins or ends, inside a callback as everything does."""

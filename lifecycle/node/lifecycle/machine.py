@@ -43,30 +43,18 @@ class State(msgspec.Struct, frozen=True, kw_only=True):
     label: str
 
 
-UNKNOWN = State(id=0, label="unknown")
-UNCONFIGURED = State(id=1, label="unconfigured")
-INACTIVE = State(id=2, label="inactive")
-ACTIVE = State(id=3, label="active")
-FINALIZED = State(id=4, label="finalized")
-CONFIGURING = State(id=10, label="configuring")
-CLEANINGUP = State(id=11, label="cleaningup")
-SHUTTINGDOWN = State(id=12, label="shuttingdown")
-ACTIVATING = State(id=13, label="activating")
-DEACTIVATING = State(id=14, label="deactivating")
-ERRORPROCESSING = State(id=15, label="errorprocessing")
-
 AVAILABLE_STATES = (
-    UNKNOWN,
-    UNCONFIGURED,
-    INACTIVE,
-    ACTIVE,
-    FINALIZED,
-    CONFIGURING,
-    CLEANINGUP,
-    SHUTTINGDOWN,
-    ACTIVATING,
-    DEACTIVATING,
-    ERRORPROCESSING,
+    State(id=0, label="unknown"),
+    State(id=1, label="unconfigured"),
+    State(id=2, label="inactive"),
+    State(id=3, label="active"),
+    State(id=4, label="finalized"),
+    State(id=10, label="configuring"),
+    State(id=11, label="cleaningup"),
+    State(id=12, label="shuttingdown"),
+    State(id=13, label="activating"),
+    State(id=14, label="deactivating"),
+    State(id=15, label="errorprocessing"),
 )
 """In the order in which rcl_lifecycle answers get_available_states."""
 

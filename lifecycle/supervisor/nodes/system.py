@@ -381,7 +381,7 @@ class System:
         if event.kind != "reply" and event.state:
             node.report(event.state, connected=event.connected)
         self.on_health(node)
-        if event.kind != "reply" or event.reports:
+        if event.kind != "reply":
             self.touch()
 
     async def refresh(self, observer: Graph, *, marks: bool = False) -> None:

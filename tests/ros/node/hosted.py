@@ -7,12 +7,15 @@ import time
 from typing import Any
 
 import rclpy
+from rclpy.action import ActionServer
 from rclpy.lifecycle import LifecycleNode as RclpyLifecycleNode
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
+from test_msgs.action import Fibonacci
 
-from lifecycle import LifecycleNode, on_message
+from lifecycle import LifecycleNode, on_message, on_timer
 
 
 class Good(LifecycleNode):
@@ -25,6 +28,21 @@ class Echo(LifecycleNode):
     @on_message("in")
     def receive(self, message: String) -> None:
         self.publisher("out").publish(message)
+
+
+class Restless(LifecycleNode):
+    """Has another configuration at each tick, of 4 kB, and says how many it has had."""
+
+    def on_configure(self) -> None:
+        self.count = 0
+        if not self.has_parameter("text"):
+            self.declare_parameter("text", "")
+
+    @on_timer(period_s=0.002)
+    def tick(self) -> None:
+        self.count += 1
+        self.set_parameters([Parameter("text", value=f"{self.count} " + "x" * 4000)])
+        self.publisher("out").publish(String(data=str(self.count)))
 
 
 class Raising(LifecycleNode):
@@ -72,6 +90,20 @@ class Plain(Node):
         self.create_publisher(String, "out", 10)
         label = self.declare_parameter("label", "none").value
         print("label", label, file=sys.stderr, flush=True)
+
+
+class Acting(Node):
+    """A plain node whose action raises at a goal of order 0, and succeeds at others."""
+
+    def __init__(self) -> None:
+        super().__init__("acting")
+        self.server = ActionServer(self, Fibonacci, "count", self.count)
+
+    def count(self, goal: Any) -> Fibonacci.Result:
+        if not goal.request.order:
+            raise OSError("no such number")
+        goal.succeed()
+        return Fibonacci.Result()
 
 
 class Ending(Node):

@@ -531,8 +531,7 @@ def test_a_planned_connection_that_cannot_be_made_fails_connect_and_leaves_none(
 
 _ALONE = """
 from tests.ros.node.planning import planned, publisher
-from lifecycle import LifecycleNode
-from lifecycle.node import run
+from lifecycle import LifecycleNode, run
 from lifecycle.plan.model import ParticipantConnections, PlannedParticipant
 
 class It(LifecycleNode):

@@ -15,6 +15,9 @@ import pytest
 from host_process import HostProcess, driver_in, hosted
 from msgspec.structs import replace
 from planning import publisher, subscription
+from rclpy.action import ActionClient
+from std_msgs.msg import String
+from test_msgs.action import Fibonacci
 
 from lifecycle.errors import BringUpError
 from lifecycle.manifest.model import Executor, Run, RunKind, Timeouts
@@ -140,6 +143,28 @@ def test_an_exception_in_a_callback_is_told_and_its_traceback_is_in_the_log(star
     assert (reply.ok, reply.state) == (False, "unconfigured")
     assert reply.error == "/one: on_configure raised OSError: no such camera"
     assert 'raise OSError("no such camera")' in host.log.read_text()
+
+
+def test_a_supervisor_that_does_not_read_holds_up_no_callback(
+    start: Start, fresh_domain: int
+) -> None:
+    host = start(hosted("one", "Restless", publisher("out")))
+    host.until("ready")
+    for operation in (CONFIGURE, CONNECT, ACTIVATE):
+        assert host.do("/one", operation).ok
+    ticks: list[int] = []
+    with driver_in(fresh_domain) as driver:
+        driver.node.create_subscription(String, "/out", lambda m: ticks.append(int(m.data)), 10)
+        driver.spin_until(
+            lambda: ticks and ticks[-1] > 300
+        )  # a socket has room for some 40 of them
+    asked = host.ask("/one", Operation.DEACTIVATE)
+    reply, before = host.until("reply")
+    assert (reply.id, reply.ok) == (asked, True)
+    told = [each.configuration for each in before if each.configuration is not None]
+    assert len(told) < 200  # of what was not read, only the newest
+    last = next(each.value for each in told[-1].parameters or () if each.name == "text")
+    assert int(str(last).partition(" ")[0]) >= ticks[-1]
 
 
 BLOCKED = (
@@ -360,6 +385,32 @@ def test_a_node_that_another_makes_is_hosted_where_it_is_declared(start: Start) 
     assert report.qos is not None
     assert report.qos.depth == 3
     assert host.do("/main", ACTIVATE).ok
+
+
+def test_what_the_action_of_a_plain_node_raises_is_reported_until_a_goal_ends_well(
+    start: Start, fresh_domain: int
+) -> None:
+    host = start(hosted("one", "Acting", managed=False))
+    host.until("ready")
+    assert host.do("/one", ACTIVATE).ok
+
+    def fault() -> str:
+        told = host.do("/one", Operation.GET_CONFIGURATION).configuration
+        assert told is not None
+        (report,) = told.endpoints
+        return report.fault
+
+    assert fault() == ""
+    with driver_in(fresh_domain) as driver:
+        client = ActionClient(driver.node, Fibonacci, "/count")
+        driver.spin_until(client.server_is_ready)
+        for order, expected in ((0, "its handler raised OSError: no such number"), (1, "")):
+            sent = client.send_goal_async(Fibonacci.Goal(order=order))
+            driver.spin_until(sent.done)
+            ended = sent.result().get_result_async()
+            driver.spin_until(ended.done)
+            assert fault() == expected
+        client.destroy()
 
 
 def test_a_node_of_rclpy_lifecycle_is_activated_by_its_supervisor_alone(

@@ -227,13 +227,10 @@ def test_a_supervisor_is_told_of_each_change_of_the_configuration(
 
 
 def until(host: HostProcess, holds: Callable[[NodeConfiguration], Any]) -> NodeConfiguration:
-    """Read until a configuration that was told is as it must be; bounded by the socket.
-
-    Unasked, or by an answer in the place of that.
-    """
+    """Read until a configuration that is reported unasked is as it must be."""
     while True:
         event = host.read()
-        if event.kind != "configuration" and not event.reports:
+        if event.kind != "configuration":
             continue
         assert event.configuration is not None
         assert (event.node, event.state) == ("/it", event.configuration.state)

@@ -135,9 +135,8 @@ def test_a_plain_node_gets_its_transports_too(start: Start, fresh_domain: int) -
 _ALONE = """
 import sys
 from tests.ros.node.planning import planned
-from lifecycle import LifecycleNode
+from lifecycle import LifecycleNode, run
 from lifecycle.middleware.fastdds.settings import has_shared_memory
-from lifecycle.node import run
 
 class It(LifecycleNode):
     def on_configure(self):

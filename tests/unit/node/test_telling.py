@@ -99,39 +99,6 @@ def test_a_node_that_cannot_be_described_tells_the_log_and_nobody_else() -> None
     assert log[0].endswith("OSError: no such file\n")
 
 
-def test_who_was_given_the_configuration_is_not_told_again_of_what_came_before() -> None:
-    executor = Executor()
-    collected: list[Any] = []
-    heard: list[tuple[str, Any]] = []
-
-    def collect() -> Any:
-        collected.append(object())
-        return collected[-1]
-
-    def one(configuration: Any) -> None:
-        heard.append(("one", configuration))
-
-    def other(configuration: Any) -> None:
-        heard.append(("other", configuration))
-
-    changes = ConfigurationChanges(executor.later, collect, failed=unexpected)
-    changes.listen(one)
-    changes.touch()
-    assert changes.give(one) == (collected[0], True)
-    executor.turn()
-    assert (heard, len(collected)) == ([], 1)
-    changes.listen(other)
-    changes.touch()
-    assert changes.give(one) == (collected[1], True)
-    executor.turn()
-    assert heard == [("other", collected[2])]
-    heard.clear()
-    assert changes.give(one) == (collected[3], False)
-    changes.touch()  # after it was given
-    executor.turn()
-    assert heard == [("one", collected[4]), ("other", collected[4])]
-
-
 def test_a_change_while_the_configuration_is_collected_is_told() -> None:
     executor = Executor()
     heard: list[Any] = []
@@ -143,6 +110,6 @@ def test_a_change_while_the_configuration_is_collected_is_told() -> None:
 
     changes = ConfigurationChanges(executor.later, collect, failed=unexpected)
     changes.listen(heard.append)
-    changes.give(heard.append)
+    changes.touch()
     executor.turn()
     assert len(heard) == 2
