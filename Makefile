@@ -28,7 +28,7 @@ help:
 	@echo "make bench-all  every benchmark, bring-up with up to 100 nodes; an hour"
 	@echo "make hostile attack everything that reads what others wrote, and list what was not handled"
 	@echo "make mutate  change what judges, one small change at a time, and list what no test notices"
-	@echo "make schemas write the JSON Schemas of results from their types, into schemas/"
+	@echo "make schemas write the JSON Schemas from their types, into schemas/, and docs/keys.md"
 	@echo "make findings write all that tests of rules find, which they compare with: read the difference"
 	@echo "make docs    build the documentation site, with the Python API, into build/site"
 
@@ -127,6 +127,7 @@ docs: $(VENV)/.docs
 
 schemas: $(STAMP)
 	$(BIN)/python -m tests.result_schemas
+	$(BIN)/python -m tests.keys_page
 
 findings: $(STAMP)
 	WRITE_FINDINGS=1 CI=1 $(PYTEST) -p no:xdist tests/unit/verify

@@ -43,7 +43,7 @@ _LONGEST_RECORD = 16 * 2**20
 _RECORD_NAME = "record.json"
 _PART_NAME = ".record.json"
 LEDGER_NAME = "programmed.json"
-"""File in a run directory that lists what is ours in networks, see programming/apply/ledger.py."""
+"""File in a run directory that lists what is ours in networks, see programming/ledger.py."""
 
 LEDGER_LOCK_NAME = "programmed.lock"
 """File beside it, locked while it is changed."""

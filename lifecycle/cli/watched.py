@@ -31,7 +31,9 @@ class Watched:
             self._live = Live(screen=True, auto_refresh=False, vertical_overflow="crop")
 
     def show(self, text: str) -> None:
-        """Show a text in the place of the last one."""
+        """Show a text in the place of the last one, unless it is the same."""
+        if text.rstrip("\n") == self._last:
+            return
         self._last = text.rstrip("\n")
         if self._live is None:
             echo_while_read(self._last)

@@ -18,7 +18,7 @@ from lifecycle.graph.diagnostics import DiagnosticReadings
 from lifecycle.graph.loop import GraphLoop, set_within
 from lifecycle.graph.model import GraphChange
 from lifecycle.graph.parameters import Names, ParameterReadings
-from lifecycle.graph.state import Answer, GraphState, Look
+from lifecycle.graph.state import Answer, GraphState
 from lifecycle.graph.status import NodeStatus
 from lifecycle.plan.model import Plan
 from lifecycle.verify.observation import (
@@ -111,7 +111,6 @@ class Observer:
         self._unplanned = unplanned
         self._follows = loop.has_thread
         self._present: frozenset[str] = frozenset()
-        self._asked: set[str] = set()
         self._answered: dict[str, NodeConfiguration] = {}
         self._read_as: dict[str, _Seen] = {}
         self._tasks: set[asyncio.Task[None]] = set()
@@ -120,7 +119,6 @@ class Observer:
         self._changed = asyncio.Event()
         self._changed.set()  # nothing was looked at yet
         self._to_note = False
-        self._is_used = False
         self._to_follow = asyncio.Event()
         self.state.on_change(self._state_changed)
         self._remove = discovery.on_change(self._wake)
@@ -142,7 +140,7 @@ class Observer:
         Raises:
             MiddlewareError: the graph can no longer be watched.
         """
-        self._bind()
+        self._loop.bind()
         planned = {node.full_name for node in plan.nodes}
         names = DeclaredNames.of(plan)
         while True:
@@ -171,18 +169,15 @@ class Observer:
         reporting = {name for name, each in said.items() if each.parameters is not None}
         if await self._parameters.follow(sorted(judged.keys() - reporting), reporting=reporting):
             return await self.observe(plan)  # each node is waited for once
-        self.state.put_look(
-            Look(
-                nodes=nodes,
-                endpoints=endpoints,
-                answers=answers,
-                parameters=self._parameters.latest,
-                health=self._diagnostics.reports(),
-            )
-        )
         for each in self._answered.values():
             self.state.learn(each)
-        return self.state.observation()
+        return self.state.observation(
+            nodes,
+            endpoints,
+            answers,
+            parameters=self._parameters.latest,
+            health=self._diagnostics.reports(),
+        )
 
     def drop_configuration(self, node: str) -> None:
         """Forget what a node said of itself whose process ended."""
@@ -207,7 +202,7 @@ class Observer:
         Discovery, a transition or a parameter of a node that is asked, or a status of one that
         changed makes a change; a configuration that is put into the state makes none.
         """
-        loop = self._bind()
+        loop = self._loop.bind()
         await self._changed.wait()
         end = loop.time() + self.burst_s
         while (left_s := end - loop.time()) > 0:
@@ -225,10 +220,6 @@ class Observer:
         self._parameters.close()
         for each in self._tasks:
             each.cancel()
-
-    def _bind(self) -> asyncio.AbstractEventLoop:
-        self._is_used = True
-        return self._loop.bind()
 
     # -- asking
 
@@ -260,7 +251,6 @@ class Observer:
 
     async def _ask(self, node: ObservedNode) -> tuple[str, Answer]:
         name = node.full_name
-        self._asked.add(name)
         if not node.managed:
             return name, (None, await self._ask_configuration(name))
         self._follow_transitions(name)
@@ -273,7 +263,6 @@ class Observer:
         configuration = await self._ask_configuration(name)
         if configuration is None:
             return name, (None, None)
-        self._asked.add(name)
         self._follow_transitions(name)
         return name, (configuration.state, configuration)
 
@@ -297,9 +286,7 @@ class Observer:
         self._wake()
 
     def _wake(self) -> None:
-        # Before the first use there is no waiter. What is to be noted is noted later than this, so
-        # that it is noted once.
-        if self._is_used and not self._to_note:
+        if not self._to_note:  # it is noted later than this, so that it is noted once
             self._to_note = True
             self._loop.post(self._note)
 
@@ -343,9 +330,7 @@ class Observer:
             self._hide(name)
         else:
             self._loop.bind().call_later(_FAREWELL_S, self._hide, name)
-        if name in self._asked:
-            self._asked.discard(name)
-            self.clients.forget(name)
+        self.clients.forget(name)
 
     def _hide(self, name: str) -> None:
         if name not in self._present:
@@ -354,7 +339,7 @@ class Observer:
     # -- nodes that are followed
 
     def _start(self, work: Coroutine[Any, Any, None]) -> None:
-        task = self._bind().create_task(work)
+        task = self._loop.bind().create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
@@ -395,7 +380,6 @@ class Observer:
     async def _read(self, name: str, seen: _Seen) -> None:
         """Hold what a node serves of itself, or else what is seen of it."""
         _, node, serves, endpoints = seen
-        self._asked.add(name)
         if node is not None and node.managed:
             self._follow_transitions(name)
         configuration: NodeConfiguration | None
@@ -411,7 +395,7 @@ class Observer:
             self.state.learn(configuration)
         else:
             del self._read_as[name]
-            self._bind().call_later(_AGAIN_S, self._wake)
+            self._loop.bind().call_later(_AGAIN_S, self._wake)
 
 
 def _judged_parameters(plan: Plan, present: Collection[str]) -> dict[str, Names]:

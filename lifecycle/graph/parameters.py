@@ -90,14 +90,13 @@ class ParameterReadings:
             if node is None or node.names != self._named[name]:
                 self.forget(name)
                 node = self._nodes[name] = _Node(name, self._named[name])
-                node.task = asyncio.ensure_future(self._keep(node))
+                self._begin(node)
             missing = node.latest is not None and node.latest.error == SERVES_NONE
             if missing and self._clients.serves_parameters(name):
                 node.due.set()  # the services have come
-        first = [each.first for each in self._nodes.values() if not each.first.done()]
-        if first:
-            await asyncio.wait(first)
-        return bool(first)
+        unread = [each.is_read.wait() for each in self._nodes.values() if not each.is_read.is_set()]
+        await asyncio.gather(*unread)
+        return bool(unread)
 
     @property
     def latest(self) -> tuple[NodeParameters, ...]:
@@ -108,10 +107,8 @@ class ParameterReadings:
         """Drop what is known of a node that left."""
         known = self._nodes.pop(node, None)
         if known is not None:
-            if known.task is not None:
-                known.task.cancel()
-            if not known.first.done():
-                known.first.set_result(None)
+            known.task.cancel()
+            known.is_read.set()
 
     def close(self) -> None:
         """Stop reading."""
@@ -128,11 +125,13 @@ class ParameterReadings:
         """
         nodes = [each for name, each in self._nodes.items() if node in (None, name)]
         for each in nodes:
-            each.wanted += 1
-            if each.first.done():
-                each.first = asyncio.get_running_loop().create_future()
-            each.due.set()
+            each.task.cancel()
+            self._begin(each)
         return bool(nodes)
+
+    def _begin(self, node: _Node) -> None:
+        node.is_read.clear()
+        node.task = asyncio.ensure_future(self._keep(node))
 
     def _arrived(self, node: str, names: frozenset[str]) -> None:
         # In a thread of DDS.
@@ -152,7 +151,6 @@ class ParameterReadings:
         pause_s, unanswered, notified = AGAIN_S, 0, True
         while True:
             node.due.clear()
-            wanted = node.wanted
             found = await self._read(node)
             unanswered = unanswered + 1 if found.error == _NO_ANSWER else 0
             # A node that is busy for a moment, and of which no event says that it has changed,
@@ -162,8 +160,7 @@ class ParameterReadings:
                 is_first, node.latest = node.latest is None, found
                 if not is_first:
                     self._wake()
-            if not node.first.done() and node.wanted == wanted:
-                node.first.set_result(None)
+            node.is_read.set()
             notified = await set_within(node.due, pause_s)
             pause_s = AGAIN_S if notified else min(2 * pause_s, AGAIN_AT_MOST_S)
             await asyncio.sleep(_BETWEEN_S)
@@ -197,13 +194,12 @@ class ParameterReadings:
 
 
 class _Node:
-    """What is known of the parameters of one node, and when they are to be read again."""
+    """What is known of the parameters of one node, and whether they are to be read again."""
 
     def __init__(self, name: str, names: Names) -> None:
         self.name = name
         self.names = names
         self.latest: NodeParameters | None = None
+        self.task: asyncio.Task[None]
+        self.is_read = asyncio.Event()
         self.due = asyncio.Event()
-        self.wanted = 0  # how often a reading was asked for that begins after that
-        self.first: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self.task: asyncio.Task[None] | None = None

@@ -13,10 +13,9 @@ import functools
 import logging
 import threading
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-import msgspec
 from msgspec.structs import replace
 
 from lifecycle.graph.model import End, GraphChange, Link, NodeView, link, match_ends
@@ -41,24 +40,6 @@ Answer = tuple[str | None, NodeConfiguration | None]
 """State and configuration of a node that was asked for them; None where it did not say."""
 
 
-class Look(msgspec.Struct, frozen=True, kw_only=True):
-    """What was there at one moment, as `lifecycle.graph.observer` saw it.
-
-    Attributes:
-        nodes: of the graph, without their states.
-        endpoints: of the graph.
-        answers: of the nodes that were asked, by full name.
-        parameters: of nodes that do not report them.
-        health: what /diagnostics says of nodes, by full name.
-    """
-
-    nodes: tuple[ObservedNode, ...] = ()
-    endpoints: tuple[ObservedEndpoint, ...] = ()
-    answers: Mapping[str, Answer] = {}
-    parameters: tuple[NodeParameters, ...] = ()
-    health: Mapping[str, HealthReport] = {}
-
-
 @typing.final
 class GraphState:
     """The state of one graph.
@@ -72,7 +53,6 @@ class GraphState:
         self._lock = threading.RLock()
         self._views: dict[str, NodeView] = {}
         self._given: Mapping[str, NodeConfiguration] = {}
-        self._look = Look()
         self._callbacks: dict[object, Callable[[GraphChange], None]] = {}
 
     # -- queries
@@ -247,7 +227,7 @@ class GraphState:
 
     def _set(self, node: str, **fields: Any) -> None:
         before = self._views.get(node)
-        view = msgspec.structs.replace(before or NodeView(name=node), **fields)
+        view = replace(before or NodeView(name=node), **fields)
         if view != before:
             self._views[node] = view
             self._notify(before, view)
@@ -273,30 +253,39 @@ class GraphState:
 
     # -- what is judged
 
-    def put_look(self, look: Look) -> None:
-        """Give what discovery and the nodes that were asked say now."""
-        self._look = look
-
-    def observation(self) -> Observation:
-        """Return what `lifecycle.verify` judges: the last look, and what is given of nodes now.
+    def observation(
+        self,
+        nodes: Iterable[ObservedNode] = (),
+        endpoints: tuple[ObservedEndpoint, ...] = (),
+        answers: Mapping[str, Answer] = {},
+        *,
+        parameters: tuple[NodeParameters, ...] = (),
+        health: Mapping[str, HealthReport] = {},
+    ) -> Observation:
+        """Return what `lifecycle.verify` judges: what was seen, and what is given of nodes now.
 
         A node that has no endpoint, and so nothing that discovery shows, is there by its report.
+
+        Args:
+            nodes: of the graph, without their states.
+            endpoints: of the graph.
+            answers: of the nodes that were asked, by full name.
+            parameters: of nodes that do not report them.
+            health: what /diagnostics says of nodes, by full name.
         """
-        look, given = self._look, self._given
-        asked = {name: configuration for name, (_, configuration) in look.answers.items()}
-        states = {name: state for name, (state, _) in look.answers.items()}
+        given, seen = self._given, tuple(nodes)
+        asked = {name: configuration for name, (_, configuration) in answers.items()}
+        states = {name: state for name, (state, _) in answers.items()}
         states |= {name: each.state for name, each in given.items()}
-        shown = {each.full_name for each in look.nodes}
+        shown = {each.full_name for each in seen}
         bare = (each for each in given.values() if not each.endpoints and each.name not in shown)
         reported = [ObservedNode(full_name=each.name, managed=bool(each.state)) for each in bare]
         return Observation(
             nodes=tuple(
-                replace(
-                    each, state=states.get(each.full_name), health=look.health.get(each.full_name)
-                )
-                for each in (*look.nodes, *reported)
+                replace(each, state=states.get(each.full_name), health=health.get(each.full_name))
+                for each in (*seen, *reported)
             ),
-            endpoints=look.endpoints,
+            endpoints=endpoints,
             configurations=tuple(each for each in {**given, **asked}.values() if each is not None),
-            parameters=look.parameters,
+            parameters=parameters,
         )

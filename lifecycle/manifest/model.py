@@ -744,7 +744,7 @@ class Discovery(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     Attributes:
         domain_id: DDS domain; ROS_DOMAIN_ID, else 0, if left out.
         mode: How participants find each other: by multicast (dynamic); at planned addresses and
-            ports, nobody else (static); likewise, and endpoints known without being told
+            ports, and no others (static); the same, and endpoints are not announced
             (static_endpoints); by a discovery server that the supervisor starts and watches
             (server).
         range: ROS_AUTOMATIC_DISCOVERY_RANGE.
@@ -779,12 +779,12 @@ class DataLayer(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     """How endpoints come onto connections; for the whole system.
 
     Attributes:
-        authority: Who calls connect_to and map_to: each node by itself, as it was told at its start
-            (nodes), or the supervisor (supervisor).
+        authority: Who calls connect_to and map_to: each node by itself, as planned (nodes),
+            or the supervisor (supervisor).
         source: What connections are made from: this manifest (static), or the node configurations,
             read while the system runs (dynamic).
-        events: Whether nodes tell the graph of connections made and lost, and lost ones are made
-            again.
+        events: Whether nodes report connections made and lost to the graph, and lost ones are
+            made again.
         multicast_group: First of the IPv4 groups given out, one to each topic that goes by
             multicast.
     """
@@ -879,7 +879,7 @@ class Policy(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     Attributes:
         undeclared_nodes: Whether nodes that no manifest declares may be in the graph.
         tolerated_nodes: Names of nodes that may be there although no manifest declares them, as
-            long as they only listen: tools. `*` stands for any characters, `?` for one; a pattern
+            long as they only subscribe: tools. `*` matches any characters, `?` for one; a pattern
             with a slash is compared with the full name, any other with the base name.
         unverifiable: Whether what cannot be observed keeps the gate closed (block), or is taken on
             trust and named when it opens (allow).

@@ -203,7 +203,7 @@ class Run(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         command: Program and its arguments; ROS arguments are appended as 'ros_args' says.
         package: Installed package that holds 'executable'.
         executable: Executable in lib/PACKAGE.
-        attach: Somebody else starts this node.
+        attach: Others start this node.
         environment: Environment variables on top of the supervisor's.
         working_directory: Folder the process starts in, relative to this manifest.
         component: Plugin that a component container loads, package/Plugin.
@@ -213,8 +213,8 @@ class Run(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             'use_intra_process_comms' of rclcpp_components.
         ros_args: ROS arguments of a command: 'auto' appends those that 'name', 'namespace',
             'remap', 'parameters' and 'log_level' ask for; 'none' never appends any.
-        prefix: Words before the process's command line, as gdb, nice, taskset and perf want it; as
-            one text, it is split as a shell does.
+        prefix: What comes before the process's command line, as for gdb, nice, taskset and perf;
+            one text is split as a shell does.
         output: Where what the process prints goes: to the terminal, to its log file, or both.
         no_new_privileges: Whether the process and what it starts can gain no privileges by running
             a program, as NoNewPrivileges= of systemd.exec(5).
@@ -385,7 +385,7 @@ Preset = Literal[
 
 
 class Qos(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """QoS profile in rmw's words.
+    """QoS profile, with rmw's names.
 
     What is left out is taken from 'preset', or from the default of the endpoint's kind.
 
@@ -436,7 +436,7 @@ class Parameter(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One parameter declaration.
 
     Attributes:
-        type: Type, in the words of generate_parameter_library and rcl_interfaces.
+        type: Type, as generate_parameter_library and rcl_interfaces name it.
         default_value: Value when none is given.
         description: What it means; for people.
         read_only: It cannot change once the node runs.
@@ -449,7 +449,7 @@ class Parameter(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class Interface(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What the node offers and needs, in NoDL v2 words.
+    """What the node offers and needs, with the keys of NoDL v2.
 
     Attributes:
         publishers: Topics it publishes.
@@ -549,7 +549,7 @@ class Node(Supervision, frozen=True, kw_only=True, forbid_unknown_fields=True):
     Attributes:
         if: This is there only if it is true.
         unless: This is there only if it is not true.
-        attach: Somebody else starts this node; short for run: {attach: true}.
+        attach: Others start this node; short for run: {attach: true}.
         machine: Key of a machine under 'machines'; this host if left out.
         namespace: Namespace of the node, / if left out.
         name: ROS name of the node; its key if left out.
@@ -564,7 +564,7 @@ class Node(Supervision, frozen=True, kw_only=True, forbid_unknown_fields=True):
         after: What each step waits for, by key of the other node: 'started' holds this node's
             start, 'configured' its configure, 'connected' its connect, 'active' its activate; so
             does 'healthy', until the other is active and healthy.
-        interface: What the node offers and needs, in NoDL v2 words, or a NoDL document.
+        interface: What the node offers and needs, with the keys of NoDL v2, or a NoDL document.
         connections: Connections that this node makes, by a name that is unique in it. Endpoints
             that none carries stay with the node's own participant.
         endpoints: Whether the node may have endpoints that its interface does not declare.
@@ -688,8 +688,8 @@ class Manifest(Shared, frozen=True, kw_only=True):
 
     YAML 1.2: only true and false are booleans; tags and merge keys are refused. $(arg NAME),
     $(env NAME [DEFAULT]), $(find-pkg-share PACKAGE), $(file PATH), $(command PROGRAM …) and the
-    words of conditions may stand in every value; an unquoted value that is one whole substitution
-    takes the type of what it becomes.
+    conditions may be written in every value; an unquoted value that is one whole substitution takes
+    the type of what it becomes.
 
     Attributes:
         manifest_version: Always 1 for documents that this schema describes.

@@ -1,9 +1,7 @@
 """Action goals of a node: from acceptance through the handler to the result, abort or cancel.
 
-Owns: what a handler's return value or exception makes of its goal; running the handler's coroutine
-step by step, so that it can be stopped where it awaits, and how a goal that can be worked on no
-longer is taken from it; and an action's name in the graph. Which goals are accepted when is
-making.py's.
+Owns: what a handler's return value or exception makes of its goal; how a goal that can be worked on
+no longer is taken from its handler; and an action's name in the graph.
 
 rcl of ROS 2 Jazzy remaps an action's hidden topics and services one by one and never the action, so
 that its name is what is left of theirs. `manifest.names.resolve` is the same without ROS.
@@ -12,22 +10,21 @@ that its name is what is left of theirs. `manifest.names.resolve` is the same wi
 from __future__ import annotations
 
 import inspect
-import threading
 import traceback
-from collections.abc import Callable, Coroutine, Generator
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from rclpy.node import Node
 
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.names import action_of, hidden_names
-from lifecycle.node.author.handlers import ActionHandler
-from lifecycle.node.lifecycle.steps import hint
+from lifecycle.node.lifecycle.steps import Running, error_text
 
 if TYPE_CHECKING:
     from rclpy.action.server import ServerGoalHandle
 
     from lifecycle.middleware.services.actions import GoalServer
+    from lifecycle.node.endpoints.endpoint import Endpoint
 
 
 class GoalInterruptedError(LifecycleError):
@@ -38,105 +35,14 @@ class GoalInterruptedError(LifecycleError):
     """
 
 
-class GoalRun:
-    """One handler at work on one goal.
-
-    Attributes:
-        returned: what the handler returned.
-        failure: what it raised; None if it did not.
-        trace: of the failure.
-        interruption: why it was stopped; None if it was not.
-        done: the handler works no longer.
-        judged: what it did has been looked at.
-    """
-
-    def __init__(self, handler: Callable[..., Any], goal: ServerGoalHandle) -> None:
-        self._handler = handler
-        self._goal = goal
-        self._coroutine: Coroutine[Any, Any, Any] | None = None
-        self._lock = threading.Lock()
-        self._thread = 0
-        self.done = False
-        self.judged = False
-        self.returned: Any | None = None
-        self.failure: Exception | None = None
-        self.trace = ""
-        self.interruption: GoalInterruptedError | None = None
-
-    def __await__(self) -> Generator[Any, None, None]:
-        while not self.done:
-            with self._lock:
-                yielded = self._step()
-            if not self.done:
-                yield yielded
-
-    def interrupt(self, error: GoalInterruptedError) -> bool:
-        """Stop the handler; false if it is the one that asks, which it then outlives."""
-        if self._thread == threading.get_ident():
-            return False
-        self.interruption = error
-        if not self._lock.acquire(blocking=False):
-            return True  # at work in another thread, it is stopped at its next await
-        self._thread = threading.get_ident()
-        try:
-            self._stop(error)
-        finally:
-            self._thread = 0
-            self._lock.release()
-        return True
-
-    def _step(self) -> Any:
-        """Run the handler until it awaits; return what it yields."""
-        if self.done:
-            return None
-        self._thread = threading.get_ident()
-        try:
-            if self._coroutine is None:
-                self._coroutine = self._begin()
-            yielded = self._coroutine.send(None)
-        except StopIteration as stop:
-            self.returned, self.done = stop.value, True
-        except Exception as error:  # noqa: BLE001 - the author's code: reported, then aborted
-            self._fail(error)
-        else:
-            if self.interruption is None:
-                return yielded
-            self._stop(self.interruption)
-        finally:
-            self._thread = 0
-        return None
-
-    async def _begin(self) -> Any:
-        """Call the handler, sync or async."""
-        returned = self._handler(self._goal)
-        return await returned if inspect.isawaitable(returned) else returned
-
-    def _stop(self, error: GoalInterruptedError) -> None:
-        """Throw into the handler where it awaits; whatever it makes of that, it does not run on."""
-        if self.done or self._coroutine is None:
-            return
-        try:
-            self._coroutine.throw(error)
-            self._coroutine.close()
-        except StopIteration as stop:
-            self.returned = stop.value
-        except Exception as raised:  # noqa: BLE001 - likewise
-            self._fail(raised)
-        self.done = True
-
-    def _fail(self, error: Exception) -> None:
-        self.failure, self.trace, self.done = error, traceback.format_exc(), True
-
-
 class Goals:
     """The goals of one action server. Closing it ends them all; that is what makes it `Gated`.
 
     Args:
         node: whose it is.
-        action: as declared.
-        action_type: the action class.
-        handler: the author's methods.
+        endpoint: the declared action server; what its handler raises is its `fault`.
         is_open: the node is active.
+        changed: called when that fault is another one.
 
     Attributes:
         server: set by its maker, before it can have a goal.
@@ -145,21 +51,21 @@ class Goals:
     def __init__(
         self,
         node: Node,
-        action: str,
-        action_type: type[Any],
-        handler: Callable[..., Any],
+        endpoint: Endpoint,
         *,
         is_open: Callable[[], bool],
+        changed: Callable[[], None],
     ) -> None:
+        assert endpoint.handler is not None
         self._node = str(node.get_fully_qualified_name())
-        self._what = f"action server {action!r} of {self._node}"
-        self._error = node.get_logger().error
-        self._warn = node.get_logger().warning
-        self._handler = handler
-        self._accept = handler.accept if isinstance(handler, ActionHandler) else None
+        self._endpoint = endpoint
+        self._what = f"action server {endpoint.name!r} of {self._node}"
+        self._log = node.get_logger()
+        self._handler = endpoint.handler
+        self._accept = getattr(endpoint.handler, "accept", None)
         self._is_open = is_open
-        self._type = action_type
-        self._runs: dict[bytes, GoalRun] = {}
+        self._changed = changed
+        self._runs: dict[bytes, Running] = {}
         self.server: GoalServer | None = None
 
     def open(self) -> None:
@@ -177,13 +83,19 @@ class Goals:
         if self.server is None:
             return
         for goal in self.server.goals:
-            run = self._runs.get(bytes(goal.goal_id.uuid))
+            key = bytes(goal.goal_id.uuid)
+            run = self._runs.get(key)
             if run is None:
                 self.server.finish(goal, None)  # accepted, and not begun
                 continue
             error = GoalInterruptedError(f"cannot go on with a goal of {self._what}: {reason}")
-            if run.interrupt(error):
-                self.server.finish(goal, self._outcome(goal, run) if run.done else None)
+            if not run.interrupt(error):
+                continue
+            result = None
+            if run.done:
+                del self._runs[key]
+                result = self._outcome(goal, run)
+            self.server.finish(goal, result)
 
     async def accept(self, goal: Any) -> bool:
         """Decide on a goal: never unless active, and as the author's method says."""
@@ -193,14 +105,14 @@ class Goals:
                 if inspect.isawaitable(answer):
                     answer = await answer
             except Exception as error:  # noqa: BLE001 - the author's code: reported, and no
-                self._error(traceback.format_exc())
-                self._error(
+                self._log.error(traceback.format_exc())
+                self._log.error(
                     f"cannot decide on a goal of {self._what}, so it is rejected: "
-                    f"{_error_text(error)}"
+                    f"{error_text(error)}"
                 )
                 return False
             if not isinstance(answer, bool):
-                self._error(
+                self._log.error(
                     f"cannot use {answer!r} as a decision on a goal of {self._what}, so "
                     "it is rejected: return True or False"
                 )
@@ -208,7 +120,7 @@ class Goals:
             if not answer:
                 return False
         if not self._is_open():
-            self._warn(f"cannot accept a goal of {self._what}: it is not active")
+            self._log.warning(f"cannot accept a goal of {self._what}: it is not active")
         return self._is_open()
 
     async def execute(self, goal: ServerGoalHandle) -> Any | None:
@@ -216,42 +128,43 @@ class Goals:
         if not goal.is_active:
             return None  # interrupted before it began
         key = bytes(goal.goal_id.uuid)
-        run = self._runs[key] = GoalRun(self._handler, goal)
+        run = self._runs[key] = Running(self._handled(goal))
         try:
             await run
         finally:
-            del self._runs[key]
-        return None if run.judged else self._outcome(goal, run)
+            is_open = self._runs.pop(key, None) is not None
+        return self._outcome(goal, run) if is_open else None
 
-    def _outcome(self, goal: ServerGoalHandle, run: GoalRun) -> Any | None:
-        """Say what is wrong with what a handler did, once; return the result, None for none."""
-        run.judged = True
-        if run.failure is not None:
-            if run.interruption is None or not isinstance(run.failure, GoalInterruptedError):
-                self._error(run.trace)
-                self._error(
-                    f"cannot go on with a goal of {self._what}: its handler raised "
-                    f"{_error_text(run.failure)}"
-                )
+    async def _handled(self, goal: ServerGoalHandle) -> Any:
+        returned = self._handler(goal)
+        return await returned if inspect.isawaitable(returned) else returned
+
+    def _outcome(self, goal: ServerGoalHandle, run: Running) -> Any | None:
+        """Say what is wrong with what a handler did; return the result, None for none."""
+        failure = run.failure
+        if run.interruption is not None and isinstance(failure, GoalInterruptedError):
+            return None
+        fault = "" if failure is None else f"its handler raised {error_text(failure)}"
+        if fault != self._endpoint.fault:
+            self._endpoint.fault = fault
+            self._changed()
+        if fault:
+            self._log.error(run.trace)
+            self._log.error(f"cannot go on with a goal of {self._what}: {fault}")
             return None
         returned = run.returned
-        if returned is not None and not isinstance(returned, self._type.Result):
-            self._error(
+        if returned is not None and not isinstance(returned, self._endpoint.interface.Result):
+            self._log.error(
                 f"cannot send {returned!r} as a result of {self._what}: return a "
-                f"{self._type.__name__}.Result, or None for an empty one"
+                f"{self._endpoint.interface.__name__}.Result, or None for an empty one"
             )
             return None
         if goal.is_active and run.interruption is None:
-            self._error(
+            self._log.error(
                 f"cannot tell what a goal of {self._what} came to, so it is aborted: its "
                 "handler returned without succeed(), abort() or canceled()"
             )
         return returned
-
-
-def _error_text(error: Exception) -> str:
-    todo = hint(error)
-    return f"{type(error).__name__}: {error}" + (f"; {todo}" if todo else "")
 
 
 def resolve_action_name(node: Node, name: str) -> str:

@@ -13,15 +13,17 @@ Communication Negotiation*, "Node Configuration Interface".
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import os
 import threading
 import traceback
 import weakref
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 from msgspec.structs import replace
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
@@ -38,16 +40,18 @@ from lifecycle.middleware.process.hosted import vouch_for
 from lifecycle.middleware.rcl.graph_changes import is_server_matched
 from lifecycle.middleware.rcl.graph_queries import endpoints_of, endpoints_of_node
 from lifecycle.middleware.rcl.qos import from_rclpy
-from lifecycle.middleware.rcl.rclpy_nodes import interface_of
 from lifecycle.network.medium import CONNECTABLE, Medium
 from lifecycle.network.nfe import NetworkFlowEndpoint
 from lifecycle.node.author import parameters
-from lifecycle.node.author.declaring import interface_name
 from lifecycle.node.connections.connections import Connection, Connections
-from lifecycle.node.connections.data_layer import NodeDataLayer
-from lifecycle.node.endpoints.making import CLIENTS
-from lifecycle.node.endpoints.mapping import Mapping, count_peers, wire_name
-from lifecycle.plan.model import PlannedEndpoint, PlannedNode
+from lifecycle.node.endpoints.endpoint import (
+    CLIENTS,
+    Endpoint,
+    Placement,
+    count_peers,
+    found_endpoint,
+)
+from lifecycle.plan.model import PlannedNode
 from lifecycle.plan.negotiation.data_layer import PARADIGMS, SERIALIZATIONS
 from lifecycle.verify.observation import (
     EndpointReport,
@@ -62,7 +66,22 @@ from lifecycle.verify.tool_filter import PREFIX_DIGITS
 if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup
 
+    from lifecycle.manifest.diagnostics import Position
     from lifecycle.node.lifecycle.gate import Later
+
+
+class HostedState(msgspec.Struct, frozen=True, kw_only=True):
+    """The state of a hosted node.
+
+    Attributes:
+        label: lifecycle_msgs/State label; empty for a node that is not managed.
+        connected: its data layer is made.
+        steady: no transition is running.
+    """
+
+    label: str
+    connected: bool
+    steady: bool
 
 
 _CONFIGURABLE_RMW = "rmw_fastrtps_cpp"
@@ -117,102 +136,56 @@ def checksum(configuration: NodeConfiguration) -> str:
     return hashlib.sha256(codec.to_json(stable)).hexdigest()[:_DIGITS]
 
 
-def endpoint_reports(
-    node: Node, data_layer: NodeDataLayer, undeclared: Iterable[tuple[EndpointKind, Any]]
-) -> tuple[EndpointReport, ...]:
-    """Return what the endpoints of one of our nodes are now.
+def connection_reports(
+    spec: PlannedNode, connections: Connections, endpoints: Iterable[EndpointReport]
+) -> tuple[ConnectionReport, ...]:
+    """Return every connection that exists or was asked for, the node's own participant first.
 
     Args:
-        node: the node itself.
-        data_layer: its declared endpoints and their entities.
-        undeclared: kind and rclpy object of endpoints that its code made by itself.
+        spec: what the node was planned to be.
+        connections: of the node.
+        endpoints: what it reports of its endpoints.
     """
-    return (
-        *(_report(node, mapping) for mapping in data_layer.mappings),
-        *(_undeclared_report(node, kind, entity) for kind, entity in undeclared),
-    )
+    mapped = [each for each in endpoints if each.mapped]
 
-
-def foreign_reports(
-    node: Node,
-    spec: PlannedNode,
-    connections: Connections,
-    endpoints: Iterable[tuple[EndpointKind, Any, Connection]],
-) -> tuple[tuple[EndpointReport, ...], tuple[ConnectionReport, ...]]:
-    """Return what endpoints and connections of a node are now of which the class is not ours.
-
-    Args:
-        node: the node itself.
-        spec: what it was planned to be.
-        connections: its participant, and those that give endpoints flows of their own.
-        endpoints: kind, rclpy object and connection of what it has made.
-    """
-    declared = {(each.kind, each.resolved): each for each in spec.endpoints}
-    reports: list[EndpointReport] = []
-    for kind, entity, connection in endpoints:
-        try:
-            report = _undeclared_report(node, kind, entity, connection)
-        except InvalidHandle:
-            continue  # destroyed meanwhile
-        planned = declared.pop((kind, report.resolved), None)
-        reports.append(report if planned is None else _named(report, planned, connection))
-    reports += [
-        EndpointReport(
-            kind=each.kind,
-            name=each.name,
-            resolved=each.resolved,
-            type=each.type,
-            qos=each.qos,
-            mapped=False,
+    def report(connection: Connection) -> ConnectionReport:
+        on = [each for each in mapped if each.connection == connection.name]
+        return ConnectionReport(
+            name=connection.name,
+            urls=connection.urls or (() if connection.name else spec.connections.urls),
+            node_name=connection.node_name,
+            prefix=_prefix_of(connection),
+            established=all(each.matched for each in on if each.kind.is_topic),
+            mappings=tuple(each.kind.spell(each.name) for each in on if each.name),
         )
-        for each in declared.values()
-    ]
-    return tuple(reports), tuple(
-        _foreign_connection(each, spec, reports) for each in (connections.own, *connections.named)
+
+    failed = (
+        ConnectionReport(name=each.name, urls=each.urls, error=each.error)
+        for each in connections.failed
     )
-
-
-def _named(
-    report: EndpointReport, planned: PlannedEndpoint, connection: Connection
-) -> EndpointReport:
-    error = connection.warning if planned.enforce_dscp else ""
-    return replace(report, name=planned.name, unique=planned.unique, error=error)
-
-
-def _foreign_connection(
-    connection: Connection, spec: PlannedNode, reports: Iterable[EndpointReport]
-) -> ConnectionReport:
-    urls = connection.urls or (() if connection.name else spec.connections.urls)
-    on = [each for each in reports if each.mapped and each.connection == connection.name]
-    return ConnectionReport(
-        name=connection.name,
-        urls=urls,
-        node_name=connection.node_name,
-        prefix=_prefix_of(connection),
-        established=all(each.matched for each in on if each.kind.is_topic),
-        mappings=tuple(each.kind.spell(each.name) for each in on if each.name),
-    )
+    return (*map(report, (connections.own, *connections.named)), *failed)
 
 
 def collect(
     node: Node,
-    state: str,
+    spec: PlannedNode,
+    state: HostedState,
     *,
-    connected: bool,
-    endpoints: tuple[EndpointReport, ...],
-    connections: tuple[ConnectionReport, ...],
+    endpoints: Iterable[Endpoint],
+    connections: Connections,
     health: HealthReport | None = None,
 ) -> NodeConfiguration:
     """Return the configuration of `node` as it is now.
 
     Args:
         node: the node itself.
-        state: lifecycle_msgs/State label; empty for a plain node.
-        connected: its data layer is made.
-        endpoints: what they are now.
-        connections: what they are now, the node's own participant first.
+        spec: what it was planned to be.
+        state: its own.
+        endpoints: all that it has, declared ones that do not exist among them.
+        connections: that it has.
         health: what it says of itself; None if it says nothing.
     """
+    reports = endpoint_reports(node, endpoints)
     name, prefix = node.get_fully_qualified_name(), _gid_prefix(node)
     vouch_for(prefix)  # before it is answered with
     configuration = NodeConfiguration(
@@ -222,41 +195,18 @@ def collect(
             node_id=f"{name}@{prefix}",
         ),
         name=name,
-        state=state,
-        connected=connected,
+        state=state.label,
+        connected=state.connected,
         rmw=get_rmw_implementation_identifier(),
-        transports=transports() or _transports(endpoints),
+        transports=transports() or _transports(reports),
         serializations=SERIALIZATIONS,
         paradigms=PARADIGMS,
-        endpoints=endpoints,
-        connections=connections,
+        endpoints=reports,
+        connections=connection_reports(spec, connections, reports),
         parameters=parameters.reports(node),
         health=health,
     )
     return replace(configuration, checksum=checksum(configuration))
-
-
-def connection_reports(
-    spec: PlannedNode, data_layer: NodeDataLayer
-) -> tuple[ConnectionReport, ...]:
-    """Return every connection that exists or was asked for, the node's own participant first."""
-    connections = data_layer.connections
-    made = tuple(
-        ConnectionReport(
-            name=each.name,
-            urls=each.urls or (spec.connections.urls if each is connections.own else ()),
-            node_name=each.node_name,
-            prefix=_prefix_of(each),
-            established=data_layer.status.established(each),
-            mappings=tuple(mapping.spelling for mapping in data_layer.status.on(each)),
-        )
-        for each in (connections.own, *connections.named)
-    )
-    failed = tuple(
-        ConnectionReport(name=each.name, urls=each.urls, error=each.error)
-        for each in connections.failed
-    )
-    return (*made, *failed)
 
 
 def serve(node: Node, collect: Callable[[], NodeConfiguration], group: CallbackGroup) -> None:
@@ -274,80 +224,55 @@ def serve(node: Node, collect: Callable[[], NodeConfiguration], group: CallbackG
     Node.create_service(node, Trigger, "~/get_configuration", describe, callback_group=group)
 
 
-def _report(node: Node, mapping: Mapping) -> EndpointReport:
-    endpoint, entity, connection = mapping.endpoint, mapping.entity, mapping.connection
-    carrier = connection.node_name if connection is not None else ""
+def endpoint_reports(node: Node, endpoints: Iterable[Endpoint]) -> tuple[EndpointReport, ...]:
+    """Return what the endpoints of a node are now, without those that are being destroyed."""
+    reports: list[EndpointReport] = []
+    for each in endpoints:
+        with contextlib.suppress(InvalidHandle):
+            reports.append(_endpoint_report(node, each))
+    return tuple(reports)
+
+
+def _endpoint_report(node: Node, endpoint: Endpoint) -> EndpointReport:
+    planned, placement = endpoint.planned, endpoint.placement
     report = EndpointReport(
         kind=endpoint.kind,
         name=endpoint.name,
-        resolved=mapping.wire_name,
-        type=endpoint.type,
-        qos=endpoint.qos,
-        unique=endpoint.unique,
-        participant=carrier if connection is not None else endpoint.participant,
-        error=mapping.error,
-        connection=connection.name if connection is not None else "",
-        mapped=connection is not None,
-        lossy=mapping.lossy,
-        size_bytes=mapping.size_bytes,
+        resolved=endpoint.wire_name,
+        type=planned.type,
+        qos=planned.qos,
+        unique=planned.unique,
+        participant=planned.participant,
+        error=endpoint.error,
+        fault=endpoint.fault,
+        lossy=endpoint.lossy,
+        size_bytes=endpoint.size_bytes,
     )
-    if entity is None:
+    if placement is None:
         return report
-    if endpoint.kind in CLIENTS:
+    connection, entity = placement.connection, placement.entity
+    report = replace(
+        report,
+        participant=connection.node_name,
+        error=report.error or (connection.warning if planned.enforce_dscp else ""),
+        connection=connection.name,
+        mapped=True,
+    )
+    if endpoint.kind in CLIENTS and placement.watch is not None:
         return replace(report, server_matched=is_server_matched(entity))
     if not endpoint.kind.is_topic:
         return report
     # A participant knows its own endpoints; the node's own need not know those of another.
-    hidden = connection.participant if connection is not None else None
-    witness = node if hidden is None else hidden.node
-    report = _with_matches(report, witness, entity)
-    return replace(
-        report, nfes=_nfes(witness, endpoint.kind, entity, connection), dscp=_dscp(connection)
-    )
-
-
-def _undeclared_report(
-    node: Node, kind: EndpointKind, entity: Any, connection: Connection | None = None
-) -> EndpointReport:
-    """Report an endpoint that no interface declares; it has no name but the one on the wire."""
-    resolved = wire_name(entity)
-    interface = interface_of(entity)
-    report = EndpointReport(
-        kind=kind, name="", resolved=resolved, type=interface_name(interface), mapped=True
-    )
-    if connection is None:
-        connection = Connection(name="")
-    elif kind in CLIENTS:
-        return replace(report, server_matched=is_server_matched(entity))
-    if not kind.is_topic:
-        return report
-    hidden = connection.participant
-    witness = node if hidden is None else hidden.node
-    report = _with_matches(report, witness, entity)
-    return replace(
-        report,
-        nfes=_nfes(witness, kind, entity, connection),
-        dscp=_dscp(connection),
-        connection=connection.name,
-        participant=connection.node_name,
-    )
-
-
-def _with_matches(report: EndpointReport, witness: Node, entity: Any) -> EndpointReport:
-    """Add to the report on a publisher or subscription its GID, QoS, type hash and matches.
-
-    Args:
-        report: the topic's name and the kind count.
-        witness: the node whose participant carries it.
-        entity: its rclpy object.
-    """
-    info = _own_endpoint(witness, report.resolved, report.kind)
+    witness = connection.node or node
+    info = _own_endpoint(witness, report.resolved, endpoint.kind)
     return replace(
         report,
         qos=_actual_qos(entity, info),
         gid=info.gid if info is not None else "",
         matched=count_peers(entity),
         type_hash=info.type_hash if info is not None else None,
+        nfes=_nfes(witness, endpoint.kind, entity, connection),
+        dscp=_dscp(connection),
     )
 
 
@@ -388,9 +313,9 @@ def _prefix_of(connection: Connection) -> str:
     It has nothing but what is mapped onto it, of which this process's graph cache knows at once. Of
     another process that has a node of this name, it may know too.
     """
-    if connection.participant is None:
+    node = connection.node
+    if node is None:
         return ""
-    node = connection.participant.node
     name = node.get_fully_qualified_name()
     found: set[str] = set()
     for kind in (each for each in EndpointKind if not each.is_action):
@@ -401,7 +326,7 @@ def _prefix_of(connection: Connection) -> str:
 
 
 def _nfes(
-    witness: Node, kind: EndpointKind, entity: Any, connection: Connection | None
+    witness: Node, kind: EndpointKind, entity: Any, connection: Connection
 ) -> tuple[NetworkFlowEndpoint, ...] | None:
     """Return all NFEs of a connected endpoint, shared memory included.
 
@@ -413,16 +338,16 @@ def _nfes(
         nfes = senders_of(witness) if publishes else get_network_flow_endpoints(entity)
     except MiddlewareError:
         return None  # "unknown to the RMW" is a value here, and the verifier's to judge
-    if publishes and connection is not None and connection.has_shared_memory:
+    if publishes and connection.has_shared_memory:
         return (*nfes, SHARED_MEMORY)
     return nfes
 
 
-def _dscp(connection: Connection | None) -> int | None:
+def _dscp(connection: Connection) -> int | None:
     try:
-        return None if connection is None else connection.read_dscp()
+        return connection.read_dscp()
     except MiddlewareError:
-        return None  # likewise: sockets that cannot be read are "not read"
+        return None  # sockets that cannot be read are "not read"
 
 
 def _actual_qos(entity: Any, info: ObservedEndpoint | None) -> QosProfile:
@@ -436,6 +361,51 @@ def _actual_qos(entity: Any, info: ObservedEndpoint | None) -> QosProfile:
 def _transports(endpoints: tuple[EndpointReport, ...]) -> tuple[str, ...]:
     """Return what the node can be reached by, as far as its endpoints' NFEs show."""
     return tuple(sorted({nfe.medium for each in endpoints for nfe in each.nfes or ()}))
+
+
+class Found:
+    """The endpoints that the code of one node makes by itself, with rclpy's factories.
+
+    Args:
+        at: where the node is declared.
+        changed: called when one is made or destroyed.
+    """
+
+    def __init__(self, at: Position, changed: Callable[[], None]) -> None:
+        self._at = at
+        self._changed = changed
+        self._made: dict[int, tuple[EndpointKind, Placement]] = {}
+
+    def add(self, kind: EndpointKind, placement: Placement) -> None:
+        """Note one that a factory returned."""
+        self._made[id(placement.entity)] = (kind, placement)
+        self._changed()
+
+    def remove(self, entity: Any) -> Placement | None:
+        """Forget one that is being destroyed, and return where it was; None if it is not known."""
+        _, placement = self._made.pop(id(entity), (None, None))
+        if placement is not None:
+            self._changed()
+        return placement
+
+    def beside(self, declared: Collection[Any] = ()) -> tuple[Endpoint, ...]:
+        """Return those of which the rclpy object belongs to no declared endpoint."""
+        known = {id(each) for each in declared}
+        found = []
+        for key, (kind, placement) in tuple(self._made.items()):
+            if key in known:
+                continue
+            try:
+                found.append(found_endpoint(kind, placement, self._at))
+            except InvalidHandle:
+                self._made.pop(key, None)  # destroyed behind its node's back
+        return tuple(found)
+
+    def close(self) -> None:
+        """Watch none of them any more: their node is being destroyed."""
+        for _, placement in self._made.values():
+            if placement.watch is not None:
+                placement.watch.stop()
 
 
 Listener = Callable[["NodeConfiguration"], None]

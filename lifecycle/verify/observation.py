@@ -60,6 +60,7 @@ class EndpointReport(msgspec.Struct, frozen=True, kw_only=True):
             with it both ways; None for everything else and where the RMW cannot show it.
         dscp: DSCP read back from the sender sockets with getsockopt, 0–63; None if not read.
         error: why the endpoint could not be made as asked; empty if it was.
+        fault: what the handler of an action server raised at its last goal; empty if it returned.
         connection: name of the connection it is mapped onto; empty for the node's own participant,
             or while it is mapped nowhere.
         mapped: it exists on a connection.
@@ -82,6 +83,7 @@ class EndpointReport(msgspec.Struct, frozen=True, kw_only=True):
     server_matched: bool | None = None
     dscp: DscpValue | None = None
     error: str = ""
+    fault: str = ""
     connection: str = ""
     mapped: bool = False
     lossy: bool | None = None

@@ -24,10 +24,10 @@ from lifecycle.manifest.model import (
 from lifecycle.plan.build import build_plan
 
 ROOT = Path(__file__).parents[2]
-README = (ROOT / "README.md").read_text(encoding="utf-8")
 GUIDE = (ROOT / "docs/nine_systems.md").read_text(encoding="utf-8")
+STATEMENTS = (ROOT / "tests/articles/topological_discovery.md").read_text(encoding="utf-8")
 TESTS = (ROOT / "tests/net/test_nine_systems.py").read_text(encoding="utf-8")
-NAME = re.compile(r"([^:]+): \[(\w+)\]\(manifests/\2\.lifecycle\.yaml\)")
+NAME = re.compile(r"([^:]+): \[(\w+)\]\(\.\./manifests/\2\.lifecycle\.yaml\)")
 COLUMNS = (
     "remote node API",
     "node configuration API",
@@ -92,8 +92,8 @@ def rows(page: str) -> list[Row]:
     return found
 
 
-README_ROWS = rows(README)
-EACH = pytest.mark.parametrize("row", README_ROWS, ids=lambda row: row.manifest)
+ROWS = rows(GUIDE)
+EACH = pytest.mark.parametrize("row", ROWS, ids=lambda row: row.manifest)
 
 
 def system(row: Row, **arguments: str) -> Manifest:
@@ -105,16 +105,16 @@ def system(row: Row, **arguments: str) -> Manifest:
 
 
 def test_the_first_seven_systems_have_the_articles_names_and_marks() -> None:
-    marked = {each.name: each.marks for each in README_ROWS if each.name not in OTHERS}
+    marked = {each.name: each.marks for each in ROWS if each.name not in OTHERS}
     assert list(marked.items()) == [
         (name, tuple(mark == "✓" for mark in marks.split())) for name, marks in ARTICLE.items()
     ]
-    assert {each.name for each in README_ROWS} == {*ARTICLE, *OTHERS}
+    assert {each.name for each in ROWS} == {*ARTICLE, *OTHERS}
 
 
 def test_every_manifest_but_the_two_introductions_is_one_of_these_systems() -> None:
     there = {each.name.split(".")[0] for each in (ROOT / "manifests").iterdir()}
-    assert there - {"first_node", "teleop"} == {each.manifest for each in README_ROWS}
+    assert there - {"first_node", "teleop"} == {each.manifest for each in ROWS}
 
 
 @EACH
@@ -156,7 +156,8 @@ def test_a_row_has_a_test_on_the_wire_that_is_named_after_it(row: Row) -> None:
 
 
 def test_every_statement_of_the_article_has_its_place_and_its_test() -> None:
-    tables = re.findall(r"^\| the article \| here \| test \|\n((?:\|.*\n)+)", GUIDE, re.MULTILINE)
+    head = r"^\| the article \| here \| test \|\n((?:\|.*\n)+)"
+    tables = re.findall(head, STATEMENTS, re.MULTILINE)
     lines = [line for table in tables for line in table.splitlines()[1:]]
     assert len(lines) > 60
     assert [each for each in lines if "::test_" not in each.strip("|").split(" | ")[2]] == []

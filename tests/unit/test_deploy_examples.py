@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import shlex
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -64,3 +67,44 @@ def test_systemd_finds_nothing_wrong_with_the_unit(tmp_path: Path) -> None:
         check=False,
     )
     assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.fixture
+def repository(tmp_path: Path) -> Path:
+    """A repository with a manifest that is sound and one that is not."""
+    sound = (ROOT / "manifests/first_node.lifecycle.yaml").read_text()
+    (tmp_path / "sound.lifecycle.yaml").write_text(sound)
+    (tmp_path / "wrong.lifecycle.yaml").write_text(sound.replace("nodes:\n", "nods:\n", 1))
+    return tmp_path
+
+
+def _run(command: list[str], folder: Path, **variables: str) -> subprocess.CompletedProcess[str]:
+    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}:"
+    environment = {**os.environ, "PATH": path, "PYTHONPATH": str(ROOT), **variables}
+    return subprocess.run(
+        command, cwd=folder, env=environment, capture_output=True, text=True, check=False
+    )
+
+
+@pytest.mark.parametrize(
+    ("files", "code"), [(["sound"], 0), (["wrong", "sound"], 3), (["sound", "wrong"], 3)]
+)
+def test_the_hook_of_pre_commit_checks_each_manifest(
+    repository: Path, files: list[str], code: int
+) -> None:
+    (hook,) = yaml.safe_load((ROOT / ".pre-commit-hooks.yaml").read_text())
+    named = [f"{each}.lifecycle.yaml" for each in files]
+    assert all(re.search(hook["files"], each) for each in named)
+    assert _run([*shlex.split(hook["entry"]), *named], repository).returncode == code
+
+
+@pytest.mark.parametrize(("pattern", "code"), [("sound.*", 0), ("*.lifecycle.yaml", 3)])
+def test_the_action_checks_each_manifest_and_annotates(
+    repository: Path, pattern: str, code: int
+) -> None:
+    action = yaml.safe_load((ROOT / "action.yml").read_text())
+    script = action["runs"]["steps"][-1]["run"]
+    options = action["inputs"]["options"]["default"]
+    done = _run(["bash", "-c", script], repository, MANIFESTS=pattern, OPTIONS=options)
+    assert done.returncode == code, done.stdout + done.stderr
+    assert ("::error file=wrong.lifecycle.yaml" in done.stdout) == bool(code)

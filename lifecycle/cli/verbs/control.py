@@ -173,15 +173,12 @@ def _watch(path: Path, format_: str) -> int:
     from lifecycle.supervisor.control.server import follow
     from lifecycle.verify.outcome import Outcome
 
-    verdict = None
-    last = ""
-    with Watched(whole=format_ == "text") as shown, asking(path):
+    verdict, is_json = None, format_ == "json"
+    with Watched(whole=not is_json) as shown, asking(path):
         for seen in follow(path / "control"):
-            verdict, is_json = seen.status.verdict, format_ == "json"
-            text = json_text(to_json(seen.status).decode()) if is_json else ""
-            text = text or status_text(seen.status, width=terminal_width())
-            if text != last:
-                shown.show(last := text)
+            status, verdict = seen.status, seen.status.verdict
+            text = json_text(to_json(status).decode()) if is_json else ""
+            shown.show(text or status_text(status, width=terminal_width()))
     click.echo(f"{path.name}: its supervisor has ended", err=True)
     return ExitCode.VIOLATED if verdict is Outcome.VIOLATED else ExitCode.OK
 

@@ -223,11 +223,7 @@ def _show(
     plan = _plan_of(target, assignments)
     if watch:
         with Watched(whole=format_ == "text") as shown:
-            follow_running(
-                plan,
-                lambda seen: seen.verdict,
-                lambda verdict: shown.show(watched_flows(verdict, format_)),
-            )
+            follow_running(plan, lambda seen: shown.show(watched_flows(seen.verdict, format_)))
         return ExitCode.OK
     asked = click.get_current_context().get_parameter_source("timeout")
     waits = asked is not click.core.ParameterSource.DEFAULT or supervisor_of(os.environ, plan, "")

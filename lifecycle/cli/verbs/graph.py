@@ -80,25 +80,15 @@ def command(
                     for picture in looking.supervised_pictures(path):
                         draw(picture)
         elif plan is not None and watch:
-            looking.follow_running(plan, lambda seen: seen.picture, draw)
+            looking.follow_running(plan, lambda seen: draw(seen.picture))
         elif plan is not None:
-            picture = looking.judge_running(plan, timeout_s=timeout, strict=False).picture
-            draw(picture)
-            _say_if_empty(picture, plan)
+            judged = looking.judge_running(plan, timeout_s=timeout, strict=False)
+            draw(judged.picture)
+            if judged.where:
+                click.echo(judged.where, err=True)
     if path is not None and watch:
         click.echo(f"{path.name}: its supervisor has ended", err=True)
     return ExitCode.OK
-
-
-def _say_if_empty(picture: Picture, plan: Plan) -> None:
-    from lifecycle.export.picture.model import PicturedNodeState
-
-    if all(node.state is PicturedNodeState.ABSENT for node in picture.nodes):
-        click.echo(
-            f"no node in the graph; looked in ROS domain {plan.domain_id}, discovery range "
-            f"{plan.discovery_range.value}",
-            err=True,
-        )
 
 
 def _found(

@@ -20,7 +20,7 @@ from lifecycle.errors import ExitCode, UsageError
 from lifecycle.printable import json_text, lines, one_line
 
 if TYPE_CHECKING:
-    from lifecycle.supervisor.run.history import RecordedRun
+    from lifecycle.supervisor.run.journal import RecordedRun
     from lifecycle.verify.verdict import Finding, Verdict
 
 
@@ -31,7 +31,7 @@ def _recorded(run: str | None, system: str) -> RecordedRun:
         UsageError: there is none.
     """
     from lifecycle.supervisor.processes.logs import ros_log_root, runs_of
-    from lifecycle.supervisor.run.history import journal_files, read_run
+    from lifecycle.supervisor.run.journal import journal_files, read_run
 
     if run is None:
         root = ros_log_root(os.environ)

@@ -21,7 +21,7 @@ from lifecycle.middleware.fastdds.profiles import (
     DefaultProfile,
     default_profile,
 )
-from lifecycle.middleware.fastdds.sockets import open_sockets, udp_sockets
+from lifecycle.middleware.fastdds.sockets import open_sockets
 from lifecycle.middleware.fastdds.url_profile import (
     DISCOVERY_GROUP,
     UrlTransport,
@@ -113,9 +113,8 @@ def reach(
         return ()
     if not urls and (chosen_otherwise(environment) or _connects_first(environment)):
         return ()
-    if urls and not leaves_discovery_open(urls):
-        return tuple(_listed(domain_id, family) for family in found)
-    return tuple(_around(domain_id, family.kind, environment) for family in found)
+    is_open = not urls or leaves_discovery_open(urls)
+    return tuple(_reach(domain_id, each, environment if is_open else None) for each in found)
 
 
 def settle_s(urls: Sequence[ConnectionUrl], environment: Mapping[str, str]) -> float:
@@ -123,43 +122,45 @@ def settle_s(urls: Sequence[ConnectionUrl], environment: Mapping[str, str]) -> f
     return SETTLE_S + (_CONNECTED_S if not urls and _connects_first(environment) else 0.0)
 
 
-def _around(domain_id: int, kind: Medium, environment: Mapping[str, str]) -> Reach:
-    range_ = _range(environment)
-    if range_ == "OFF":
+def _reach(domain_id: int, family: UrlTransport, environment: Mapping[str, str] | None) -> Reach:
+    """Return whom a participant can ask over one family.
+
+    Args:
+        domain_id: 0–232.
+        family: of its URLs.
+        environment: says who is looked for, and where; None where the URLs do.
+    """
+    kind = family.kind
+    here = _addresses_of(kind)
+    if environment is None:
+        peers = [(each.address, each.port, LOCALHOST_PEERS_RANGE) for each in family.peers]
+        by_multicast = all(url.multicast for url in family.urls)
+        if bound := set(family.interfaces):
+            here = {name: [one for one in at if {name, one} & bound] for name, at in here.items()}
+    elif (range_ := _range(environment)) == "OFF":
         return Reach(kind, (), (), ())
-    addresses = [kind.loopback]
-    targets = [*_well_known(domain_id, kind.loopback, PARTICIPANTS_PER_DOMAIN)]
-    if range_ == "SUBNET":
-        by_interface = _addresses_of(kind)
-        addresses += [each for found in by_interface.values() for each in found]
-        targets += _groups(domain_id, kind, by_interface)
-        for peer in _static_peers(environment):
-            parsed = parse_address(peer)  # a name would have to be looked up
-            if parsed is not None and parsed.version == kind.ip_version:
-                targets += _well_known(domain_id, peer, LOCALHOST_PEERS_RANGE)
-    return Reach(kind, tuple(targets), tuple(addresses), _receivers(domain_id, kind))
-
-
-def _listed(domain_id: int, family: UrlTransport) -> Reach:
-    """Return whom a participant can ask whose URLs list its peers."""
-    here = _addresses_of(family.kind, loopback=True)
-    if bound := set(family.interfaces):
-        here = {
-            name: addresses if name in bound else tuple(each for each in addresses if each in bound)
-            for name, addresses in here.items()
-        }
-    targets: list[Target] = []
-    for peer in family.peers:
-        if peer.port is None:
-            targets += _well_known(domain_id, peer.address, LOCALHOST_PEERS_RANGE)
+    else:
+        peers = [(kind.loopback, None, PARTICIPANTS_PER_DOMAIN)]
+        by_multicast = range_ == "SUBNET"
+        if by_multicast:
+            parsed = map(parse_address, _static_peers(environment))  # a name would be looked up
+            same = (each for each in parsed if each and each.version == kind.ip_version)
+            peers += [(str(each), None, LOCALHOST_PEERS_RANGE) for each in same]
         else:
-            targets.append(Target(peer.address, peer.port))
-    if all(url.multicast for url in family.urls):
-        targets += _groups(domain_id, family.kind, (name for name, found in here.items() if found))
+            here = {"": [kind.loopback]}
+    targets: list[Target] = []
+    for address, port, participants in peers:
+        if port is None:
+            targets += _well_known(domain_id, address, participants)
+        else:
+            targets.append(Target(address, port))
+    if by_multicast:
+        group = participant_ports(domain_id, 0).discovery_multicast
+        targets += [Target(DISCOVERY_GROUP[kind], group, name) for name, at in here.items() if at]
     fixed = family.option("metatraffic_port")
-    receivers = (fixed,) if fixed else _receivers(domain_id, family.kind)
-    addresses = tuple(each for found in here.values() for each in found)
-    return Reach(family.kind, tuple(targets), addresses, receivers)
+    receivers = (fixed,) if fixed else _receivers(domain_id, kind)
+    addresses = tuple(each for at in here.values() for each in at)
+    return Reach(kind, tuple(targets), addresses, receivers)
 
 
 def _receivers(domain_id: int, kind: Medium) -> tuple[int, ...]:
@@ -177,22 +178,18 @@ def _well_known(domain_id: int, address: str, participants: int) -> Iterator[Tar
     return (Target(address, port) for port, _ in unicast_pairs(domain_id, participants))
 
 
-def _groups(domain_id: int, kind: Medium, interfaces: Iterable[str]) -> Iterator[Target]:
-    """Yield the group of discovery by each interface."""
-    port = participant_ports(domain_id, 0).discovery_multicast
-    return (Target(DISCOVERY_GROUP[kind], port, interface) for interface in interfaces)
-
-
-def _addresses_of(kind: Medium, *, loopback: bool = False) -> dict[str, tuple[str, ...]]:
-    """Return this host's addresses of a family by interface; interfaces without one are left out.
+def _addresses_of(kind: Medium) -> dict[str, list[str]]:
+    """Return this host's addresses of a family by interface: loopback first, others next.
 
     Link-local ones of IPv6 mean nothing to others without an interface of theirs.
     """
-    found: dict[str, tuple[str, ...]] = {}
-    for name, text in sorted(interface_addresses(kind.socket_family), key=lambda each: each[0]):
-        each = ipaddress.ip_address(text)
-        if (loopback or not each.is_loopback) and not (each.version == 6 and each.is_link_local):
-            found[name] = (*found.get(name, ()), str(each))
+    found: dict[str, list[str]] = {}
+    every = [
+        (name, ipaddress.ip_address(at)) for name, at in interface_addresses(kind.socket_family)
+    ]
+    for name, address in sorted(every, key=lambda each: (not each[1].is_loopback, each[0])):
+        if not (address.version == 6 and address.is_link_local):
+            found.setdefault(name, []).append(str(address))
     return found
 
 
@@ -218,31 +215,6 @@ def is_served(urls: Sequence[ConnectionUrl], environment: Mapping[str, str]) -> 
     profile = None if urls else _users_profile(environment)
     protocols = () if profile is None else profile.element.iter("discoveryProtocol")
     return any((each.text or "").strip() not in ("", "SIMPLE", "NONE") for each in protocols)
-
-
-def missing_port(
-    domain_id: int, urls: Sequence[ConnectionUrl], environment: Mapping[str, str]
-) -> int | None:
-    """Return the UDP port of the multicast by which participants find each other, if it is missing.
-
-    Fast DDS shares that port with other participants. If another kind of socket has it, no
-    participant of this host receives announcements, and none of them finds another; Fast DDS 2.14
-    says nothing.
-
-    Args:
-        domain_id: of a participant of this process.
-        urls: its own.
-        environment: as for `reach`.
-
-    Returns:
-        None if this process has it, or participants look for each other elsewhere, too.
-    """
-    if urls or chosen_otherwise(environment) or _range(environment) != "SUBNET":
-        return None
-    port = participant_ports(domain_id, 0).discovery_multicast
-    if _static_peers(environment) or any(each.port == port for each in open_sockets()):
-        return None
-    return port if any(each.port == port for each in udp_sockets()) else None
 
 
 def chosen_otherwise(environment: Mapping[str, str]) -> bool:

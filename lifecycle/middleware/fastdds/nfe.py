@@ -134,7 +134,6 @@ def create_subscription(
     qos: QosProfile | QoSProfile,
     *,
     unique: UniqueRequirement = UniqueRequirement.NOT_REQUIRED,
-    content_filter: tuple[str, tuple[str, ...]] | None = None,
     **options: Any,
 ) -> Subscription:
     """Create a subscription on `node`, with network flow endpoints of its own where asked.
@@ -155,56 +154,33 @@ def create_subscription(
         callback: takes the message, or the message and its info.
         qos: the manifest's profile or rclpy's.
         unique: the requirement.
-        content_filter: expression, and the values of its parameters (DDS 1.4, annex B); rclpy 7 has
-            no way to give one.
         **options: of rclpy's `create_subscription`: callback_group, event_callbacks, raw.
 
     Raises:
         MiddlewareError: not possible here; no endpoint is left.
     """
     profile = to_rclpy(qos)
-    if content_filter is not None:
-        abi.load()  # before anything is made
     if unique is UniqueRequirement.STRICTLY_REQUIRED and not abi.is_known():
         hint = f"ask for optionally_required, or {INSTALL}"
         resolved = node.resolve_topic_name(topic)
         raise _not_feasible("subscription", resolved, unique, abi.refusal(), hint)
     if unique is UniqueRequirement.NOT_REQUIRED or not abi.is_known():
-        subscription = node.create_subscription(type_, topic, callback, profile, **options)
-    else:
-        listed = private(node, "_subscriptions", f"make a flow of its own for {topic!r}")
-        group = options.get("callback_group") or node.default_callback_group
-        raw = options.get("raw", False)
-        events = options.get("event_callbacks") or SubscriptionEventCallbacks()
-        with _unique_handle(node, type_, topic, profile=profile, unique=unique) as handle:
-            subscription = Subscription(
-                *(handle, type_, topic, callback, group, profile, raw), event_callbacks=events
-            )
-        group.add_entity(subscription)
-        listed.append(subscription)  # as Node.create_subscription does
-        for handler in subscription.event_handlers:
-            node.add_waitable(handler)
-        if node.executor is not None:
-            node.executor.wake()
-    if content_filter is not None:
-        _filter(node, subscription, *content_filter)
-    return subscription
-
-
-def _filter(
-    node: Node, subscription: Subscription, expression: str, parameters: tuple[str, ...]
-) -> None:
-    rcl = abi.load()
-    with subscription.handle:
-        code = rcl.filter(subscription.handle.pointer, expression, parameters)
-        reason = rcl.take_error() if code != abi.RCL_RET_OK else ""
-    if reason:
-        topic = subscription.topic_name
-        node.destroy_subscription(subscription)
-        raise MiddlewareError(
-            f"cannot filter subscription {topic!r} by {expression!r}: {reason}",
-            hint="write it as the WHERE part of SQL, with %0, %1, … for its parameters",
+        return node.create_subscription(type_, topic, callback, profile, **options)
+    listed = private(node, "_subscriptions", f"make a flow of its own for {topic!r}")
+    group = options.get("callback_group") or node.default_callback_group
+    raw = options.get("raw", False)
+    events = options.get("event_callbacks") or SubscriptionEventCallbacks()
+    with _unique_handle(node, type_, topic, profile=profile, unique=unique) as handle:
+        subscription = Subscription(
+            *(handle, type_, topic, callback, group, profile, raw), event_callbacks=events
         )
+    group.add_entity(subscription)
+    listed.append(subscription)  # as Node.create_subscription does
+    for handler in subscription.event_handlers:
+        node.add_waitable(handler)
+    if node.executor is not None:
+        node.executor.wake()
+    return subscription
 
 
 def create_publisher(

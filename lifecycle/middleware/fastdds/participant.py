@@ -11,7 +11,6 @@ One costs about 2.5 MB, 7 threads, 6 sockets and 6–10 ms.
 
 from __future__ import annotations
 
-import time
 import typing
 from collections.abc import Callable
 from typing import Any
@@ -29,15 +28,12 @@ from lifecycle.manifest.qos import QosProfile
 from lifecycle.middleware.fastdds import nfe, sockets
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.middleware.fastdds.settings import has_shared_memory
-from lifecycle.middleware.fastdds.static_edp import find_endpoint
+from lifecycle.middleware.fastdds.static_edp import check_endpoint
 from lifecycle.middleware.rcl import hidden_node
 from lifecycle.middleware.rcl.abi import is_known
 from lifecycle.middleware.rcl.hidden_node import forget_hidden, quiet_node
 from lifecycle.middleware.rcl.qos import to_rclpy
 from lifecycle.network.nfe import NetworkFlowEndpoint
-
-_RELEASE_S = 0.2
-"""An executor that waits for endpoints lets go of them within a millisecond of being woken."""
 
 
 @typing.final
@@ -86,11 +82,9 @@ class FlowParticipant:
         self._served = served
         self._moved: list[hidden_node.MovedEndpoint] = []
         self._nfes: tuple[NetworkFlowEndpoint, ...] = ()
-        before = self._on_fixed_ports()
         # Without ROS arguments: endpoint names come here resolved.
         self._context: rclpy.Context | None
         self._context, self.node = quiet_node(name, namespace, domain_id, settings=self.settings)
-        self._fixed = self._on_fixed_ports() - before
         self.has_shared_memory = has_shared_memory(self.node)
         try:
             # Every publisher of a participant lists the same sender sockets; rclpy's parameter
@@ -98,7 +92,9 @@ class FlowParticipant:
             probe = next(iter(self.node.publishers))
             if self._dscp is not None or is_known():
                 self._nfes = nfe.senders_of(self.node)
-            self.ensure_dscp()
+            # No socket of Fast DDS 2.14 opens later (see `sockets`).
+            if self._dscp is not None:
+                sockets.set_dscp(self._nfes, self._dscp)
             # It would share the sockets that are to be unique.
             self.node.destroy_publisher(probe)
         except BaseException:
@@ -110,8 +106,8 @@ class FlowParticipant:
     ) -> Publisher:
         """Create a publisher on this participant; `topic` should be fully qualified.
 
-        Events (matched, deadline, …) are only handled if an executor spins `self.node`; without
-        `event_callbacks` none are set up.
+        Events (matched, deadline, …) are handled where the node served is spun, else where
+        `self.node` is; without `event_callbacks` none are set up.
 
         Args:
             type_: message class.
@@ -123,11 +119,9 @@ class FlowParticipant:
         if not options.get("event_callbacks"):
             options["event_callbacks"] = PublisherEventCallbacks(use_default_callbacks=False)
         publisher = self.node.create_publisher(type_, topic, to_rclpy(qos), **options)
-        try:
-            self.ensure_dscp()
-        except BaseException:
-            self.node.destroy_publisher(publisher)
-            raise
+        if self._served is not None:
+            for event in publisher.event_handlers:
+                self._served.add_waitable(event)
         return publisher
 
     def create_subscription(
@@ -152,11 +146,6 @@ class FlowParticipant:
         subscription = nfe.create_subscription(
             self.node, type_, topic, callback, qos, callback_group=callback_group, **options
         )
-        try:
-            self.ensure_dscp()
-        except BaseException:
-            self.node.destroy_subscription(subscription)
-            raise
         self._receive(subscription)
         return subscription
 
@@ -186,24 +175,14 @@ class FlowParticipant:
     def destroy_endpoint(self, entity: Publisher | hidden_node.MovedEndpoint) -> None:
         """Destroy an endpoint that was made here; again is harmless."""
         if isinstance(entity, Publisher):
+            if self._served is not None and entity in self.node.publishers:
+                for event in entity.event_handlers:
+                    self._served.remove_waitable(event)
             self.node.destroy_publisher(entity)
             return
         hidden_node.dismiss(entity, self._served or self.node)
         if entity in self._moved:
             self._moved.remove(entity)
-
-    def ensure_dscp(self) -> None:
-        """Mark sender sockets that are not, or not any more; before an endpoint is handed out.
-
-        No socket of Fast DDS 2.14 opens later (see `lifecycle.middleware.fastdds.sockets`).
-
-        Raises:
-            MiddlewareError: the mark cannot be set.
-        """
-        if self._context is None or self._dscp is None:
-            return
-        if sockets.get_dscps(self._nfes) != {self._dscp}:
-            sockets.set_dscp(self._nfes, self._dscp)
 
     def read_dscp(self) -> int:
         """Return the DSCP (0–63) the kernel puts on what this participant sends; marks nothing.
@@ -220,8 +199,8 @@ class FlowParticipant:
     def destroy(self) -> None:
         """Destroy its endpoints, the hidden node and the participant; again is harmless.
 
-        When it returns, its fixed ports are free, if no callback blocks the executor that waits
-        for its endpoints.
+        Its ports are free as soon as an executor of another thread no longer waits for its
+        endpoints.
         """
         self._nfes = ()  # its ports may belong to another process from now on
         for entity in tuple(self._moved):
@@ -232,22 +211,6 @@ class FlowParticipant:
             self._context.try_shutdown()
             self._context.destroy()
             self._context = None
-        # An executor of another thread may still hold what it waits for.
-        deadline = time.monotonic() + _RELEASE_S
-        while self._fixed & self._on_fixed_ports() and time.monotonic() < deadline:
-            time.sleep(0.001)
-        self._fixed = set()
-
-    def _on_fixed_ports(self) -> set[int]:
-        """Return this process's sockets that have a port which the URLs name, by their inodes."""
-        ports = {
-            port
-            for url in self.settings.urls
-            for port in (url.port, url.metatraffic_port, url.output_port)
-            if port is not None
-        }
-        found = sockets.open_sockets() if ports else ()
-        return {each.inode for each in found if each.port in ports}
 
     def _receive(self, entity: hidden_node.MovedEndpoint) -> None:
         if self._served is not None:
@@ -259,7 +222,7 @@ class FlowParticipant:
         if not self.settings.static_endpoints:
             return
         package, kind = type_.__module__.split(".")[:2]
-        find_endpoint(
+        check_endpoint(
             self.settings.static_endpoints,
             writer=writer,
             profile=self.node.resolve_topic_name(topic),

@@ -19,6 +19,7 @@ import contextlib
 import os
 import socket
 import struct
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -43,6 +44,9 @@ _DSCP_OPTION = {
     socket.AF_INET6: (socket.IPPROTO_IPV6, socket.IPV6_TCLASS),
 }
 _DISCOVERY_BYTES = 1 << 22
+
+_RELEASED_S = 0.2
+"""An executor that waits for endpoints of a participant lets go of it within a millisecond."""
 
 
 class OpenSocket(msgspec.Struct, frozen=True, kw_only=True):
@@ -139,7 +143,7 @@ def check_free(urls: Sequence[ConnectionUrl]) -> None:
     """Refuse URLs with a port that is taken, before a participant is made of them.
 
     Fast DDS 2.14 hangs for ever in the destruction of a participant that could not listen on its
-    TCP port, so that must not be found out afterwards.
+    TCP port, so that must not be found out afterwards. Who is just leaving is waited for.
 
     Raises:
         MiddlewareError: names the URL and the port.
@@ -154,7 +158,7 @@ def check_free(urls: Sequence[ConnectionUrl]) -> None:
             (f"{protocol} output port", url.output_port),
         ):
             kind = udp_to(url.address) if group else url.transport
-            if port is not None and not _is_free(kind, address, port):
+            if port is not None and not _becomes_free(kind, address, port):
                 where = f"{url.address}:{port}" if url.address else f"port {port}"
                 raise MiddlewareError(
                     f"cannot connect by {str(url)!r}: {what} {where} is not free on this host",
@@ -245,6 +249,13 @@ def widen_discovery_buffers(domain_id: int) -> int:
 def _address(text: str) -> str:
     # A scope (fe80::1%eth0) distinguishes interfaces; rmw leaves it out.
     return canonical(text.partition("%")[0])
+
+
+def _becomes_free(kind: Medium, address: str, port: int) -> bool:
+    deadline = time.monotonic() + _RELEASED_S
+    while not (is_free := _is_free(kind, address, port)) and time.monotonic() < deadline:
+        time.sleep(0.001)
+    return is_free
 
 
 def _is_free(kind: Medium, address: str, port: int) -> bool:

@@ -47,10 +47,10 @@ def endpoint_profiles(endpoints: Sequence[StaticEndpoint]) -> str:
     return ET.tostring(root, encoding="unicode", xml_declaration=True)
 
 
-def find_endpoint(
+def check_endpoint(
     endpoints: Sequence[StaticEndpoint], *, writer: bool, profile: str, type_name: str
-) -> StaticEndpoint:
-    """Return the line of an endpoint that is about to be made.
+) -> None:
+    """Refuse an endpoint that is about to be made and that the table does not have.
 
     Args:
         endpoints: the participant's.
@@ -59,15 +59,15 @@ def find_endpoint(
         type_name: DDS name of its type.
 
     Raises:
-        MiddlewareError: the table has none like it: no participant would ever find this endpoint.
+        MiddlewareError: no participant would ever find it.
     """
-    for each in endpoints:
-        if (each.writer, each.profile, each.type) == (writer, profile, type_name):
-            return each
+    same_end = [each for each in endpoints if each.writer is writer]
+    if any((each.profile, each.type) == (profile, type_name) for each in same_end):
+        return
     what = "writers" if writer else "readers"
-    listed = [f"{e.profile} ({e.type})" for e in endpoints if e.writer is writer]
+    listed = ", ".join(f"{each.profile} ({each.type})" for each in same_end)
     raise MiddlewareError(
         f"cannot make a {what[:-1]} of {profile!r} ({type_name}): the table of static discovery "
-        f"has only these {what} for this participant: {', '.join(listed) or 'none'}",
+        f"has only these {what} for this participant: {listed or 'none'}",
         hint="declare the endpoint, and check or plan again",
     )

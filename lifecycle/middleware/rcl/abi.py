@@ -26,15 +26,9 @@ _ERROR_LOCATION = re.compile(r", at [^,]+?:\d+(?=,|$)")
 
 
 class Allocator(ctypes.Structure):
-    """rcutils_allocator_t."""
+    """rcutils_allocator_t: four functions and their state, which nothing here looks into."""
 
-    _fields_ = (
-        ("allocate", ctypes.c_void_p),
-        ("deallocate", ctypes.c_void_p),
-        ("reallocate", ctypes.c_void_p),
-        ("zero_allocate", ctypes.c_void_p),
-        ("state", ctypes.c_void_p),
-    )
+    _fields_ = (("words", ctypes.c_void_p * 5),)
 
 
 class Nfe(ctypes.Structure):
@@ -102,35 +96,10 @@ class SubscriptionOptions(ctypes.Structure):
     )
 
 
-class _ContentFilter(ctypes.Structure):
-    """rcl_subscription_content_filter_options_t."""
-
-    _fields_ = (
-        ("expression", ctypes.c_void_p),
-        ("count", ctypes.c_size_t),
-        ("parameters", ctypes.c_void_p),
-        ("allocator", Allocator),
-    )
-
-
 class WaitSet(ctypes.Structure):
-    """rcl_wait_set_t."""
+    """rcl_wait_set_t: six arrays, each with its size, and a pointer; rcl alone looks into it."""
 
-    _fields_ = (
-        ("subscriptions", ctypes.c_void_p),
-        ("size_of_subscriptions", ctypes.c_size_t),
-        ("guard_conditions", ctypes.POINTER(ctypes.c_void_p)),
-        ("size_of_guard_conditions", ctypes.c_size_t),
-        ("timers", ctypes.c_void_p),
-        ("size_of_timers", ctypes.c_size_t),
-        ("clients", ctypes.c_void_p),
-        ("size_of_clients", ctypes.c_size_t),
-        ("services", ctypes.c_void_p),
-        ("size_of_services", ctypes.c_size_t),
-        ("events", ctypes.c_void_p),
-        ("size_of_events", ctypes.c_size_t),
-        ("impl", ctypes.c_void_p),
-    )
+    _fields_ = (("words", ctypes.c_void_p * 13),)
 
 
 class _ErrorString(ctypes.Structure):
@@ -235,21 +204,6 @@ class Rcl:
             subscription, node, type_support(type_), topic.encode(), ctypes.byref(options)
         )
         return int(made)
-
-    def filter(self, subscription: int, expression: str, parameters: Sequence[str]) -> int:
-        """Have the middleware take only what a content filter lets through; return the code."""
-        values = (ctypes.c_char_p * len(parameters))(*(each.encode() for each in parameters))
-        options = _ContentFilter()
-        at, pointer, integer = ctypes.byref(options), ctypes.c_void_p, ctypes.c_int
-        prefix = "rcl_subscription_content_filter_options"
-        arguments = (pointer, ctypes.c_char_p, ctypes.c_size_t, pointer, pointer)
-        init = bind("rcl", f"{prefix}_init", integer, arguments)
-        apply = bind("rcl", "rcl_subscription_set_content_filter", integer, (pointer, pointer))
-        end = bind("rcl", f"{prefix}_fini", integer, (pointer, pointer))
-        code = init(subscription, expression.encode(), len(parameters), values, at)
-        code = code or apply(subscription, at)
-        end(subscription, at)
-        return int(code)
 
     def _check_layout(self, version: str) -> None:
         """Compare what the libraries put into our structs with what must be there.

@@ -27,7 +27,7 @@ _FIRST_ATTEMPT_S = 0.1
 """So long a server of rmw_fastrtps waits for the client's reader before it drops its reply."""
 _LONGEST_ATTEMPT_S = 2.0
 _MATCH_CHECK_S = 0.02
-"""Discovery shows a service a moment before the client is matched with it, and only once."""
+"""No event reports a match, which follows a moment after discovery shows the service."""
 _UNMATCHED_S = 0.5
 """So long a service that is in the graph may keep its client unmatched before it is asked anyway.
 
@@ -161,54 +161,34 @@ class ServiceCalls:
     async def _usable(
         self, service: str, type_: type[Any], deadline: float, *, fresh: bool
     ) -> Client | None:
-        """Wait until a service is there; None at the deadline.
+        """Return a client matched with every server, or long enough with some; None if none came.
 
-        Its client may be dropped meanwhile, with a node of that name that the graph shows to have
-        left only now: its successor is waited for by another one.
+        It may be dropped meanwhile, with a node of that name that the graph shows to have left only
+        now: its successor is waited for by another one.
         """
+        loop = asyncio.get_running_loop()
+        offered_s: float | None = None
+        client = self._client(service, type_, fresh=fresh)
         while True:
-            client = self._client(service, type_, fresh=fresh)
             try:
-                return client if await self._found(client, service, deadline) else None
+                if client.service_is_ready():
+                    return client
             except InvalidHandle:
                 if self._destroyed:
                     raise
-
-    async def _found(self, client: Client, service: str, deadline: float) -> bool:
-        """Wait until `client` may be used: matched with every server, or long enough with some.
-
-        Returns:
-            Whether it is in the graph; False only at the deadline.
-        """
-        if client.service_is_ready():
-            return True
-        loop = asyncio.get_running_loop()
-        changed = asyncio.Event()
-        remove = self._observer.on_change(lambda: _post(loop, changed.set))
-        try:
-            check_s = _MATCH_CHECK_S
-            offered_s: float | None = None
-            while not client.service_is_ready():
-                now_s = loop.time()
-                if not self._observer.node.count_services(service):
-                    offered_s = None
-                elif offered_s is None:
-                    offered_s = now_s
-                if offered_s is not None and now_s - offered_s >= _UNMATCHED_S:
-                    return True
-                if now_s >= deadline:
-                    return offered_s is not None
-                # Not wait_for: of Python 3.10 and 3.11 it may swallow our cancellation.
-                waiting = asyncio.ensure_future(changed.wait())
-                try:
-                    await asyncio.wait((waiting,), timeout=min(check_s, deadline - now_s))
-                finally:
-                    waiting.cancel()
-                check_s = _MATCH_CHECK_S if changed.is_set() else min(2 * check_s, 1.0)
-                changed.clear()
-        finally:
-            remove()
-        return True
+                client = self._client(service, type_, fresh=fresh)
+                continue
+            now_s = loop.time()
+            if not self._observer.node.count_services(service):
+                offered_s = None
+            elif offered_s is None:
+                offered_s = now_s
+            is_late = now_s >= deadline
+            if offered_s is not None and (is_late or now_s - offered_s >= _UNMATCHED_S):
+                return client
+            if is_late:
+                return None
+            await asyncio.sleep(min(_MATCH_CHECK_S, deadline - now_s))
 
 
 async def _ask(client: Client, request: object, deadline: float, attempt_s: float) -> Any:

@@ -1,38 +1,30 @@
-"""The managed half of a LifecycleNode (`node.lifecycle`): controller, gate, data layer, services.
+"""The managed half of a LifecycleNode (`node.lifecycle`): machine, gate, data layer, services.
 
-Owns: putting controller, gate, data layer, parameters, timers and services of one node together;
-its reporter to the ROS graph, whose publisher must work in every state, so that it does not pass
-the gate; and the endpoints that code makes with rclpy's own factories, which are on no
-interface, so that the node configuration can report them. It is reached as `node.lifecycle`, so
-that authors have every other attribute name to themselves.
+Owns: putting them together for one node, and what the rows of the machine's table run. It is
+reached as `node.lifecycle`, so that authors have every other attribute name to themselves.
 """
 
 from __future__ import annotations
 
+import functools
 import traceback
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-import msgspec
-from rclpy.exceptions import InvalidHandle
 from rclpy.lifecycle import LifecycleState
 from rclpy.node import Node
 from rclpy.task import Future
 from rclpy.timer import Timer
 
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest.model import EndpointKind, Health
+from lifecycle.manifest.model import Health
 from lifecycle.node import configuration
 from lifecycle.node.author import parameters
-from lifecycle.node.author.declaring import DeclaredInCode
-from lifecycle.node.author.handlers import alternatives
+from lifecycle.node.author.handlers import alternatives, match
 from lifecycle.node.author.spec import Mode
-from lifecycle.node.configuration import ConfigurationChanges
-from lifecycle.node.connections.connection_status import (
-    ConnectionEvents,
-)
-from lifecycle.node.connections.data_layer import NodeDataLayer, serve_interface
-from lifecycle.node.endpoints.mapping import wire_name
+from lifecycle.node.configuration import ConfigurationChanges, Found, HostedState
+from lifecycle.node.connections.node_interface import acts_of, serve_interface
+from lifecycle.node.endpoints.data_layer import DataLayer
 from lifecycle.node.lifecycle.gate import NodeGate
 from lifecycle.node.lifecycle.health import HealthCheck
 from lifecycle.node.lifecycle.machine import (
@@ -50,60 +42,8 @@ from lifecycle.verify.observation import NodeConfiguration
 if TYPE_CHECKING:
     from lifecycle.graph.reporter import GraphReporter
 
-
-class Undeclared:
-    """The endpoints that the code of one node made by itself.
-
-    Args:
-        changed: called when one is made or destroyed.
-    """
-
-    def __init__(self, changed: Callable[[], None]) -> None:
-        self._changed = changed
-        self._made: dict[int, tuple[EndpointKind, Any]] = {}
-
-    def add(self, kind: EndpointKind, entity: Any) -> None:
-        """Note one that rclpy's factory returned; those of the data layer are sorted out later."""
-        self._made[id(entity)] = (kind, entity)
-        self._changed()
-
-    def remove(self, entity: Any) -> None:
-        """Forget one that is being destroyed."""
-        if self._made.pop(id(entity), None) is not None:
-            self._changed()
-
-    def beside(self, declared: Collection[Any]) -> tuple[tuple[EndpointKind, Any], ...]:
-        """Return (kind, rclpy object) of those that belong to no declared endpoint."""
-        known = {id(each) for each in declared}
-        found = []
-        for key, (kind, entity) in tuple(self._made.items()):
-            if key in known:
-                continue
-            try:
-                wire_name(entity)
-            except InvalidHandle:
-                del self._made[key]  # destroyed behind its node's back
-                continue
-            found.append((kind, entity))
-        return tuple(found)
-
-
 _WITHOUT_DATA_LAYER = (NodeState.INACTIVE_DISCONNECTED, NodeState.UNCONFIGURED, NodeState.FINALIZED)
 """A node that enters one of these is not the one that was verified any more."""
-
-
-class HostedState(msgspec.Struct, frozen=True, kw_only=True):
-    """The state of a hosted node.
-
-    Attributes:
-        label: lifecycle_msgs/State label; empty for a node that is not managed.
-        connected: its data layer is made.
-        steady: no transition is running.
-    """
-
-    label: str
-    connected: bool
-    steady: bool
 
 
 BRING_UP = (TransitionRequest.CONFIGURE, TransitionRequest.CONNECT, TransitionRequest.ACTIVATE)
@@ -115,13 +55,11 @@ class Managed:
     Attributes:
         mode: what drives the transitions.
         gate: holds back what the node was made to send, receive and time.
+        turns: has things done in its executor.
+        spec: what the node was planned to be.
         data_layer: its endpoints.
-        declared: what its manifest and its code say of them.
-        connection_events: what becomes of its connections and mappings.
         configuration_changes: notifies of each change of its configuration.
-        undeclared: endpoints that its code made with rclpy's factories.
-        client_group: reentrant, of its clients.
-        call_soon: runs a function, sync or async, in its executor; returns whether there is one.
+        found: endpoints that its code made with rclpy's factories.
     """
 
     def __init__(
@@ -136,51 +74,38 @@ class Managed:
         health: Callable[[], Any] | None = None,
     ) -> None:
         self._node = node
+        self.spec = spec
         self._supervisor = supervisor
         # By its supervisor, through the gate; a node without one needs no permission.
         self._let_through = not supervisor
         self.mode = mode
         self.gate = gate
-        self._turns = Turns(node)
-        self.client_group = self._turns.group
-        self.call_soon = self._turns.call_soon
+        self.turns = Turns(node)
         self._listeners: list[Callable[[Managed], None]] = []
         self._method_timers: list[Timer] = []
         self._reporter: GraphReporter | None = None
-        self.connection_events = ConnectionEvents(self.call_soon)
+        self._services: LifecycleServices | None = None
         self.configuration_changes = ConfigurationChanges(
-            self.call_soon, self.get_configuration, failed=node.get_logger().error
+            self.turns.call_soon, self.get_configuration, failed=node.get_logger().error
         )
+        changed = self.configuration_changes.touch
         self._health = HealthCheck(
             health,
-            self._turns,
+            self.turns,
             spec.health or Health(),
-            changed=self.configuration_changes.touch,
+            changed=changed,
             failed=node.get_logger().error,
         )
-        node.add_post_set_parameters_callback(lambda _: self.configuration_changes.touch())
-        self.undeclared = Undeclared(self.configuration_changes.touch)
-        self.data_layer = NodeDataLayer(
-            node,
-            gate,
-            self._turns,
-            state=lambda: self.state,
-            changed=self.configuration_changes.touch,
-            notify=self.connection_events.notify,
+        node.add_post_set_parameters_callback(lambda _: changed())
+        self.found = Found(spec.at, changed)
+        self.data_layer = DataLayer(
+            node, spec, gate, self.turns, state=lambda: self.state, changed=changed
         )
-        self.declared = DeclaredInCode(node, spec, self.data_layer, lambda: self.state)
         self._machine = Machine(self, spec.timeouts)
-        self._services: LifecycleServices | None = None
         if served:
-            self._services = LifecycleServices(
-                node,
-                state_machine=self._machine,
-                change=self._change_by_service,
-                refuse=node.get_logger().warning,
-                group=self._turns.group,
-            )
-            configuration.serve(node, self.get_configuration, self._turns.group)
-            serve_interface(node, self.data_layer, self._turns.group)
+            self._services = LifecycleServices(node, self._machine, self.turns.group)
+            configuration.serve(node, self.get_configuration, self.turns.group)
+            serve_interface(node, acts_of(self.data_layer), self.turns.group)
         if spec.events or spec.membership:
             self._join()
 
@@ -190,19 +115,9 @@ class Managed:
         return str(self._node.get_fully_qualified_name())
 
     @property
-    def spec(self) -> PlannedNode:
-        """What the node was planned to be, with the endpoints that its code declares."""
-        return self.declared.spec
-
-    @property
     def state(self) -> NodeState:
         """The state, nested ones distinguished; `state.seen` is what other tools see."""
         return self._machine.state
-
-    @property
-    def interface(self) -> NodeDataLayer:
-        """What a supervisor may ask of its data layer."""
-        return self.data_layer
 
     @property
     def reported(self) -> HostedState:
@@ -233,7 +148,7 @@ class Managed:
 
         Raises:
             RefusedError: as for `change`.
-            LifecycleError: likewise.
+            LifecycleError: no such transition.
         """
         known = _known(request)
         if self._supervisor and known is TransitionRequest.DEACTIVATE:
@@ -262,20 +177,20 @@ class Managed:
         """Bring the node up on the first turn of whatever executor spins it."""
 
         async def once() -> None:
-            Node.destroy_timer(self._node, timer)
+            self.turns.end(timer)
             await self.bring_up()
 
-        timer = self._turns.timer(0.0, once)
+        timer = self.turns.timer(0.0, once)
 
     def sleep(self, seconds: float) -> Future:
         """Return what is done in `seconds`, in every state."""
         future: Future = Future()
-        self._turns.call_after(seconds, lambda: future.set_result(None))
+        self.turns.call_after(seconds, lambda: future.set_result(None))
         return future
 
     def close(self) -> None:
         """Leave the graph and take the data layer away: the node is being destroyed."""
-        self._turns.close()
+        self.turns.close()
         self.data_layer.remove()
         if self._reporter is not None:
             self._reporter.left()
@@ -286,11 +201,6 @@ class Managed:
         return await self._machine.shut_down(reason)
 
     @property
-    def is_marked(self) -> bool:
-        """Whether the plan says what DSCP any of its endpoints sends with."""
-        return any(each.dscp is not None for each in self.spec.endpoints)
-
-    @property
     def marks(self) -> tuple[int | None, ...]:
         """DSCP on the sender sockets of its participants, as it is now."""
         return self.data_layer.connections.marks
@@ -298,17 +208,32 @@ class Managed:
     def get_configuration(self) -> NodeConfiguration:
         """Return this node's identity and its endpoints as they are."""
         # Whatever the policy: what a node says of itself is known before discovery shows it.
-        undeclared = self.undeclared.beside(self.data_layer.entities)
+        found = self.found.beside(self.data_layer.entities)
         return configuration.collect(
             self._node,
-            self.state.seen.label,
-            connected=self.state.connected,
-            endpoints=configuration.endpoint_reports(self._node, self.data_layer, undeclared),
-            connections=configuration.connection_reports(self.spec, self.data_layer),
+            self.spec,
+            self.reported,
+            endpoints=(*self.data_layer.endpoints.values(), *found),
+            connections=self.data_layer.connections,
             health=self._health.report,
         )
 
-    # What the rows of the machine's table run.
+    # What the rows of the machine's table run, beside methods of gate and data layer.
+
+    def prepare(self) -> None:
+        """Declare parameters and endpoints, and make the timers of `@on_timer` methods."""
+        matched = match(type(self._node), self.data_layer.unhandled, node=self.full_name)
+        parameters.declare(self._node, self.spec)
+        self.data_layer.prepare(functools.partial(matched.bound, self._node))
+        for timer in matched.timers:
+            method = getattr(self._node, timer.method)
+            self._method_timers.append(self._node.create_timer(timer.period_s, method))
+
+    def unprepare(self) -> None:
+        """Undo `prepare`; parameters stay declared."""
+        while self._method_timers:
+            self._node.destroy_timer(self._method_timers.pop())
+        self.data_layer.unprepare()
 
     def may_activate(self) -> bool:
         """Return True.
@@ -324,49 +249,25 @@ class Managed:
             f"lifecycle resume {self._supervisor}",
         )
 
-    def prepare(self) -> None:
-        """Declare parameters and endpoints, and make the timers of `@on_timer` methods."""
-        matched = self.declared.match()
-        parameters.declare(self._node, self.spec)
-        self.declared.enact(matched)
-        for timer in matched.timers:
-            method = getattr(self._node, timer.method)
-            self._method_timers.append(self._node.create_timer(timer.period_s, method))
-
-    def unprepare(self) -> None:
-        """Undo `prepare`; parameters stay declared."""
-        while self._method_timers:
-            self._node.destroy_timer(self._method_timers.pop())
-        self.data_layer.undeclare()
-
-    def make_data_layer(self) -> None:
-        """Make every endpoint or none."""
-        self.data_layer.make(self.spec)
-
-    def undo_data_layer(self) -> None:
-        """Undo `make_data_layer`, if it has made them."""
-        if self.data_layer.is_made:
-            self.data_layer.remove()
-
-    def remove_data_layer(self) -> None:
-        """Remove every endpoint."""
-        self.data_layer.remove()
-
-    def open_gate(self) -> None:
-        """Let data flow."""
-        self.gate.open()
-
-    def close_gate(self) -> None:
-        """Stop data; goals end."""
-        self.gate.close()
-
     def take_down(self) -> None:
         """Remove and undo everything; what of it fails is logged, for the node has to end."""
-        for step in (self.close_gate, self.remove_data_layer, self.unprepare):
+        for step in (self.gate.close, self.data_layer.remove, self.unprepare):
             try:
                 step()
             except Exception:  # noqa: BLE001, PERF203 - a fault of ours
                 self._node.get_logger().error(traceback.format_exc())
+
+    def changed(self, change: StateChange) -> None:
+        """Notify others of a change of the state."""
+        if self._supervisor and change.goal in _WITHOUT_DATA_LAYER:
+            self._let_through = False
+        if change.event is not None and self._services is not None:
+            self._services.publish(change.event)
+        if self._reporter is not None:
+            self._reporter.report(state=change.goal.seen.label, connected=change.goal.connected)
+        self._health.follow(change.goal)
+        for listener in self._listeners:
+            listener(self)
 
     # What the machine needs for the author's callbacks.
 
@@ -378,14 +279,6 @@ class Managed:
     def callback_argument(self, state: NodeState) -> LifecycleState:
         """Return what rclpy's callbacks are given: the state before the transition."""
         return LifecycleState(label=state.seen.label, state_id=state.seen.id)
-
-    def wake_at_deadline(self, deadline_s: float) -> Callable[[], None]:
-        """Wake the executor in `deadline_s`; returns what calls that off."""
-        return self._turns.wake_at_deadline(deadline_s)
-
-    def wake(self) -> None:
-        """Make the executor look at its waiting tasks again."""
-        self._turns.wake()
 
     def report(self, result: Result) -> None:
         """Log why a step did not succeed, with the traceback where there is one."""
@@ -414,26 +307,6 @@ class Managed:
             self._reporter.report_configuration(now)
         else:
             self._reporter.report(checksum=now.checksum)
-
-    async def _change_by_service(self, request: TransitionRequest) -> bool:
-        try:
-            result = await self._machine.change(request)
-        except RefusedError as refused:
-            self._node.get_logger().warning(str(refused))
-            return False
-        return result.outcome is CallbackOutcome.SUCCESS
-
-    def changed(self, change: StateChange) -> None:
-        """Notify others of a change of the state."""
-        if self._supervisor and change.goal in _WITHOUT_DATA_LAYER:
-            self._let_through = False
-        if change.event is not None and self._services is not None:
-            self._services.publish(change.event)
-        if self._reporter is not None:
-            self._reporter.report(state=change.goal.seen.label, connected=change.goal.connected)
-        self._health.follow(change.goal)
-        for listener in self._listeners:
-            listener(self)
 
 
 def _known(request: TransitionRequest | str) -> TransitionRequest:

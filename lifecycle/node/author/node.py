@@ -1,21 +1,13 @@
-"""LifecycleNode: the base class of managed nodes, its node interface and gated rclpy factories.
+"""LifecycleNode: the class to derive from.
 
-Owns: the node as its author sees it: how it is constructed, its callbacks, and access to what is
-declared; the node interface's signatures for a node's own code (connections/data_layer.py does the
-work, and has the services for others); which of rclpy's factories are overridden, so that what they
-make is known and sends and receives only while active; and the guard that makes a blocking call of
-a service or action that would wait for ever an error at once. Declaring in code is in
-declarations.py; what all of it does is put together in managed.py.
-
-rclpy's blocking `Client.call` and its like, called from a callback, wait for an answer that only
-the executor can bring, and the executor waits for the callback (rclcpp#2213 and its like are the
-oldest trap of lifecycle callbacks).
+Owns: the node as its author sees it: how it is constructed, its callbacks, the signatures of
+`declare_…` and of the node interface; and which of rclpy's factories are overridden, so that what
+they make is known and sends and receives only while active. What all of it does is put together in
+managed.py.
 """
 
 from __future__ import annotations
 
-import functools
-import inspect
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -36,13 +28,16 @@ from rclpy.timer import Timer
 
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import EndpointKind
+from lifecycle.manifest.qos import QosProfile
+from lifecycle.middleware.rcl.qos import from_rclpy
 from lifecycle.network.connection_url import ConnectionUrl
-from lifecycle.node import configuration
 from lifecycle.node.author import parameters
-from lifecycle.node.author.declarations import Declarations
+from lifecycle.node.author.blocking import refuse_to_deadlock
+from lifecycle.node.author.handlers import ActionHandler
 from lifecycle.node.author.managed import Managed
 from lifecycle.node.author.spec import (
     Mode,
+    calling_position,
     default_name,
     parse_mode,
     plan_without_manifest,
@@ -51,169 +46,425 @@ from lifecycle.node.author.spec import (
 )
 from lifecycle.node.connections.connection_status import ConnectionEvent
 from lifecycle.node.connections.connections import Connection, connections_of
+from lifecycle.node.endpoints.endpoint import EndpointOptions, Placement, interface_name
+from lifecycle.node.endpoints.making import resolve_name
 from lifecycle.node.endpoints.publisher import DeclaredPublisher
 from lifecycle.node.lifecycle.gate import GatedPublisher, GatedTimer, NodeGate
 from lifecycle.node.lifecycle.machine import NodeState
+from lifecycle.plan.model import PlannedEndpoint
 from lifecycle.verify.outcome import ConnectionReport
 
 if TYPE_CHECKING:
     from rclpy.action import ActionClient
+    from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+    from rclpy.service_introspection import ServiceIntrospectionState
 
 
 __all__ = ["ERROR", "FAILURE", "SUCCESS", "LifecycleNode", "TransitionCallbackReturn"]
 
-_SPINNING = {("rclpy.executors", "_spin_once_impl"), ("lifecycle.node.host.loop", "_turn")}
-"""Where a single-threaded executor calls back: rclpy's, and that of our own processes."""
+SUCCESS = TransitionCallbackReturn.SUCCESS
+FAILURE = TransitionCallbackReturn.FAILURE
+ERROR = TransitionCallbackReturn.ERROR
+
+CallbackReturn = Any
+"""What a callback may return: rclpy's TransitionCallbackReturn, or None for SUCCESS."""
 
 
-class DeadlockError(LifecycleError):
-    """A blocking call was made in the thread that would have to bring its answer."""
+def _any_signature(callback: Callable[..., CallbackReturn]) -> Callable[..., CallbackReturn]:
+    """Type a callback so that who overrides it may leave `state` out, or write `async def`."""
+    return callback
 
 
-def refuse_to_deadlock(client: Client) -> None:
-    """Make `client.call` raise DeadlockError inside the executor; elsewhere it is rclpy's own."""
-    blocking = client.call
+class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
+    """A ROS 2 managed node whose endpoints are declared, not scattered through its code.
 
-    @functools.wraps(blocking)
-    def call(*arguments: Any, **options: Any) -> Any:
-        refuse_to_block(f"service {client.srv_name!r}", "client.call_async(request)")
-        return blocking(*arguments, **options)
+    From outside it is exactly a managed node (`ros2 lifecycle`, launch_ros and nav2 drive it),
+    with two more transitions inside *inactive*: `connect` makes the endpoints, `disconnect`
+    removes them. Data flows only while the node is active.
 
-    client.call = call
+    With a manifest that declares a publisher `chatter` and a subscription `echo`:
 
+        class Talker(LifecycleNode):
+            def on_configure(self):
+                self.chatter = self.publisher("chatter")
+                self.count = 0
 
-def refuse_to_block(what: str, instead: str) -> None:
-    """Raise DeadlockError inside the executor, where waiting for `what` would never end.
+            @on_timer(period_s=0.5)
+            def tick(self):
+                self.count += 1
+                self.chatter.publish(Int32(data=self.count))
+
+            @on_message("echo")
+            def heard(self, message):
+                self.get_logger().info(f"heard {message.data}")
+
+    Without a manifest, the same class declares them itself and drives itself up:
+
+        class Talker(LifecycleNode):
+            def __init__(self):
+                super().__init__("talker", lifecycle="auto")
+                self.declare_publisher("chatter", Int32)
+                self.declare_subscription("echo", Int32)
+            ...
+
+        lifecycle.run(Talker)
+
+    Callbacks `on_configure`, `on_connect`, `on_activate`, `on_deactivate`, `on_disconnect`,
+    `on_cleanup`, `on_shutdown` and `on_error` take `(self, state)` or `(self)`, return SUCCESS,
+    FAILURE, ERROR or None for SUCCESS, and may be `async def`:
+
+        async def on_activate(self, state):
+            answer = await self.client("calibrate").call_async(Trigger.Request())
+            return SUCCESS if answer.success else FAILURE
+
+    An exception is logged with its traceback and counts as ERROR. Every callback has a deadline
+    (`timeouts:` in the manifest, 10 s by default): an `async def` one is interrupted where it
+    awaits; a sync one cannot be, so it is judged when it returns, and a supervisor may end the
+    process before that. An exception in a message, service or timer callback ends the process,
+    as with any rclpy node; one in an action's handler ends its goal.
 
     Args:
-        what: that an answer is awaited of.
-        instead: what can be awaited.
+        node_name: base name; by default the class's name in snake_case. A manifest's name wins.
+        lifecycle: "manual" waits for others to drive it; "auto" configures, connects and activates
+            itself as soon as it is spun. Under a supervisor or `lifecycle run` theirs wins.
+        namespace: as in rclpy; a manifest's wins.
+        context: as in rclpy.
+        enable_communication_interface: serve and announce its states; without, no other process
+            can drive it or read its configuration.
+        options: further keywords of rclpy.node.Node.
+
+    Attributes:
+        lifecycle: the managed half: `lifecycle.state`, `await lifecycle.change("configure")`,
+            `lifecycle.get_configuration()`.
     """
-    if in_executor():
-        raise DeadlockError(
-            f"cannot wait for {what} in a callback: the answer comes by the executor that waits "
-            "for this callback",
-            hint=f"write `async def` and `await {instead}`",
-        )
-
-
-def in_executor() -> bool:
-    """Return whether this thread is inside a single-threaded executor's turn.
-
-    A multi-threaded one runs callbacks in other threads than the one that spins.
-    """
-    frame = inspect.currentframe()
-    while frame is not None:
-        if (frame.f_globals.get("__name__"), frame.f_code.co_name) in _SPINNING:
-            return True
-        frame = frame.f_back
-    return False
-
-
-class GatedFactories(Node):  # type: ignore[misc]  # rclpy is not typed
-    """Makes and destroys publishers, subscriptions, timers, clients and services as rclpy does."""
 
     lifecycle: Managed
     _gate: NodeGate | None = None
     """None until rclpy has made its own publishers: those are never held back."""
 
-    def create_publisher(
-        self, msg_type: Any, topic: str, qos_profile: QoSProfile | int, **options: Any
-    ) -> Publisher:
-        """As rclpy's; what is published while the node is not active is dropped."""
-        publisher = super().create_publisher(msg_type, topic, qos_profile, **options)
-        if self._gate is not None:
-            self.lifecycle.undeclared.add(EndpointKind.PUBLISHER, publisher)
-            self._gate.add(publisher, GatedPublisher(publisher, self.get_logger().warning))
-        return publisher
-
-    def create_subscription(
+    def __init__(
         self,
-        msg_type: Any,
-        topic: str,
-        callback: Callable[..., Any],
-        qos_profile: QoSProfile | int,
+        node_name: str | None = None,
+        *,
+        lifecycle: str = "manual",
+        namespace: str | None = None,
+        context: Context | None = None,
+        enable_communication_interface: bool = True,
         **options: Any,
-    ) -> Subscription:
-        """As rclpy's; messages that arrive while the node is not active are dropped."""
-        subscription = super().create_subscription(
-            msg_type, topic, callback, qos_profile, **options
+    ) -> None:
+        mode = parse_mode(lifecycle)
+        if not isinstance(enable_communication_interface, bool):
+            raise TypeError(
+                f"cannot use enable_communication_interface={enable_communication_interface!r}; "
+                "allowed: True, False"
+            )
+        name = node_name or default_name(type(self))
+        construction = take_construction(name, namespace)
+        planned = construction.spec if construction is not None else None
+        if planned is not None:
+            name, namespace = planned.name, planned.namespace
+            options["cli_args"] = [*ros_arguments(planned), *(options.get("cli_args") or ())]
+            given = options.get("parameter_overrides") or ()
+            options["parameter_overrides"] = [*given, *parameters.overrides(planned)]
+            parameters.give_empty_arrays(self, planned)
+        if construction is not None:
+            context = construction.context or context
+            options.setdefault("use_global_arguments", construction.use_global_arguments)
+            mode = construction.mode or mode
+        supervisor = construction.supervisor if construction is not None else ""
+        super().__init__(name, namespace=namespace, context=context, **options)
+        self._gate = NodeGate()
+        spec = planned or plan_without_manifest(
+            type(self), name=self.get_name(), namespace=self.get_namespace()
         )
-        # /clock belongs to rclpy: simulated time must pass in every state.
-        is_clock = isinstance(getattr(callback, "__self__", None), TimeSource)
-        if self._gate is not None and not is_clock:
-            self.lifecycle.undeclared.add(EndpointKind.SUBSCRIPTION, subscription)
-            self._gate.add_subscription(subscription, self.lifecycle.call_soon)
-        return subscription
+        if spec.log_level:
+            self.get_logger().set_level(LoggingSeverity[spec.log_level.upper()])
+        self.lifecycle = Managed(
+            self,
+            spec,
+            mode,
+            self._gate,
+            supervisor,
+            served=enable_communication_interface,
+            health=None if type(self).health is LifecycleNode.health else self.health,
+        )
+        if construction is None and mode is Mode.AUTO:
+            self.lifecycle.bring_up_when_spun()
 
-    def create_timer(
-        self,
-        timer_period_sec: float,
-        callback: Callable[..., Any] | None,
-        callback_group: CallbackGroup | None = None,
-        clock: Clock | None = None,
-        autostart: bool = True,
-    ) -> Timer:
-        """As rclpy's; the timer runs only while the node is active, and then starts anew."""
-        timer = super().create_timer(timer_period_sec, callback, callback_group, clock, autostart)
-        # No callback is rclpy.Rate's: a thread that sleeps must wake up.
-        if self._gate is not None and callback is not None:
-            self._gate.add(timer, GatedTimer(timer, wanted=autostart))
-        return timer
+    @property
+    def is_active(self) -> bool:
+        """Data may flow."""
+        return self.lifecycle.state is NodeState.ACTIVE
 
-    def create_client(self, srv_type: Any, srv_name: str, **options: Any) -> Client:
-        """As rclpy's, by default in a reentrant group: awaiting it in a callback is safe."""
-        if options.get("callback_group") is None:
-            options["callback_group"] = self.lifecycle.client_group
-        client = super().create_client(srv_type, srv_name, **options)
-        refuse_to_deadlock(client)
-        self.lifecycle.undeclared.add(EndpointKind.SERVICE_CLIENT, client)
+    def publisher(self, name: str) -> DeclaredPublisher:
+        """Return the declared publisher `name`, from on_configure on.
+
+        Raises:
+            UnknownEndpointError: nothing of that name is declared; a KeyError too.
+        """
+        return self.lifecycle.data_layer.publisher(name)
+
+    def client(self, name: str) -> Client:
+        """Return the declared service client `name`, from on_connect on.
+
+        In callbacks, `await self.client("reset").call_async(request)`; the blocking `call` would
+        wait for the executor that is waiting for it.
+
+        Raises:
+            UnknownEndpointError: nothing of that name is declared; a KeyError too.
+            LifecycleError: the node is not connected.
+        """
+        client: Client = self.lifecycle.data_layer.entity(EndpointKind.SERVICE_CLIENT, name)
         return client
 
-    def create_service(
-        self, srv_type: Any, srv_name: str, callback: Callable[..., Any], **options: Any
-    ) -> Service:
-        """As rclpy's."""
-        service = super().create_service(srv_type, srv_name, callback, **options)
-        if self._gate is not None:
-            self.lifecycle.undeclared.add(EndpointKind.SERVICE_SERVER, service)
-        return service
+    def subscription(self, name: str) -> Subscription:
+        """Return rclpy's object of the declared subscription `name`, from on_connect on.
 
-    def destroy_publisher(self, publisher: Publisher) -> bool:
-        """As rclpy's."""
-        self._forget(publisher)
-        return bool(super().destroy_publisher(publisher))
+        For `get_publisher_count()` and the like; it is another one after a handover.
 
-    def destroy_subscription(self, subscription: Subscription) -> bool:
-        """As rclpy's."""
-        self._forget(subscription)
-        return bool(super().destroy_subscription(subscription))
+        Raises:
+            UnknownEndpointError: nothing of that name is declared; a KeyError too.
+            LifecycleError: the node is not connected.
+        """
+        return self.lifecycle.data_layer.entity(EndpointKind.SUBSCRIPTION, name)
 
-    def destroy_client(self, client: Client) -> bool:
-        """As rclpy's."""
-        self._forget(client)
-        return bool(super().destroy_client(client))
+    def service(self, name: str) -> Service:
+        """Return rclpy's object of the declared service server `name`; as `subscription`."""
+        return self.lifecycle.data_layer.entity(EndpointKind.SERVICE_SERVER, name)
 
-    def destroy_service(self, service: Service) -> bool:
-        """As rclpy's."""
-        self._forget(service)
-        return bool(super().destroy_service(service))
+    def action_client(self, name: str) -> ActionClient:
+        """Return the declared action client `name`, from on_connect on; raises as `client`.
 
-    def destroy_timer(self, timer: Timer) -> bool:
-        """As rclpy's."""
-        self._forget(timer)
-        return bool(super().destroy_timer(timer))
+        In callbacks, `goal = await self.action_client("dock").send_goal_async(Dock.Goal())`, then
+        `await goal.get_result_async()`; the blocking calls raise DeadlockError.
+        """
+        client: ActionClient = self.lifecycle.data_layer.entity(EndpointKind.ACTION_CLIENT, name)
+        return client
 
-    def _forget(self, entity: object) -> None:
-        if self._gate is not None:
-            self._gate.remove(entity)
-            self.lifecycle.undeclared.remove(entity)
+    def sleep(self, seconds: float) -> Future:
+        """Return what is done in `seconds` (> 0) of wall time: `await self.sleep(0.1)`.
 
+        For `async def` callbacks, above all handlers of actions: whatever else the node has to do
+        goes on meanwhile, requests to cancel a goal included.
+        """
+        return self.lifecycle.sleep(seconds)
 
-class LocalInterface(Node):  # type: ignore[misc]  # rclpy is not typed
-    """Makes connections and maps endpoints onto them, in callbacks from on_configure to cleanup."""
+    def undeclare_parameter(self, name: str) -> None:
+        """As rclpy's, which notifies nothing; the node's configuration has changed."""
+        super().undeclare_parameter(name)
+        self.lifecycle.configuration_changes.touch()
 
-    lifecycle: Managed
+    def destroy_node(self) -> None:
+        """As rclpy's; participants of its own go with it."""
+        self.lifecycle.close()
+        super().destroy_node()
+
+    # Callbacks of the author.
+
+    @_any_signature
+    def on_configure(self, state: LifecycleState) -> CallbackReturn:
+        """Read parameters, take resources. Endpoints are declared but do not exist yet."""
+
+    @_any_signature
+    def on_connect(self, state: LifecycleState) -> CallbackReturn:
+        """The data layer is made: endpoints exist, clients can be used, data does not flow."""
+
+    @_any_signature
+    def on_activate(self, state: LifecycleState) -> CallbackReturn:
+        """Start working; data flows once this has succeeded."""
+
+    @_any_signature
+    def on_deactivate(self, state: LifecycleState) -> CallbackReturn:
+        """Stop working; data has stopped flowing already."""
+
+    @_any_signature
+    def on_disconnect(self, state: LifecycleState) -> CallbackReturn:
+        """The data layer is about to be removed."""
+
+    @_any_signature
+    def on_cleanup(self, state: LifecycleState) -> CallbackReturn:
+        """Give back what on_configure took."""
+
+    @_any_signature
+    def on_shutdown(self, state: LifecycleState) -> CallbackReturn:
+        """The last call, from any state; endpoints are removed after it."""
+
+    @_any_signature
+    def health(self) -> Any:
+        """Return what is wrong, as text; None if all is well. May be `async def`.
+
+        Asked once a second while the node is connected or active, and at once after each change of
+        its state, if a class overrides it. An exception counts as unhealthy, no answer in time as
+        not known. The manifest says with `health` what follows.
+        """
+
+    @_any_signature
+    def on_error(self, state: LifecycleState) -> CallbackReturn:
+        """A callback ended in ERROR: SUCCESS says the node is as new, FAILURE finalizes it."""
+
+    # What it declares: in `__init__`, or later where the manifest says `endpoints: open`.
+
+    def declare_publisher(
+        self,
+        name: str,
+        msg_type: type[Any],
+        qos: QosProfile | QoSProfile | int = 10,
+        *,
+        lossy: bool | None = None,
+        size_bytes: int | None = None,
+    ) -> None:
+        """Declare a publisher; `self.publisher(name)` is its handle from on_configure on.
+
+        Args:
+            name: relative, absolute or private.
+            msg_type: message class.
+            qos: a number is a history depth.
+            lossy: hint for negotiation: the data bear an unreliable transport.
+            size_bytes: hint for negotiation: the largest serialized message, > 0.
+
+        Raises:
+            LifecycleError: declared already, or not allowed (any more).
+        """
+        hints = (lossy, size_bytes)
+        self._declare(EndpointKind.PUBLISHER, name, msg_type, qos, hints=hints)
+
+    def declare_subscription(
+        self,
+        name: str,
+        msg_type: type[Any],
+        qos: QosProfile | QoSProfile | int = 10,
+        *,
+        callback: Callable[..., Any] | None = None,
+        lossy: bool | None = None,
+        size_bytes: int | None = None,
+    ) -> None:
+        """Declare a subscription; a method decorated with `@on_message(name)` receives it.
+
+        One that is declared after configure needs its `callback` given here. Otherwise as
+        `declare_publisher`.
+        """
+        hints = (lossy, size_bytes)
+        self._declare(
+            EndpointKind.SUBSCRIPTION, name, msg_type, qos, callback=callback, hints=hints
+        )
+
+    def declare_service(
+        self, name: str, srv_type: type[Any], *, callback: Callable[..., Any] | None = None
+    ) -> None:
+        """Declare a service server; a method decorated with `@on_service(name)` answers.
+
+        One that is declared after configure needs its `callback` given here.
+        """
+        self._declare(EndpointKind.SERVICE_SERVER, name, srv_type, callback=callback)
+
+    def declare_client(self, name: str, srv_type: type[Any]) -> None:
+        """Declare a service client; `self.client(name)` from on_connect on."""
+        self._declare(EndpointKind.SERVICE_CLIENT, name, srv_type)
+
+    def declare_action(
+        self,
+        name: str,
+        action_type: type[Any],
+        *,
+        callback: Callable[..., Any] | None = None,
+        accept: Callable[..., Any] | None = None,
+    ) -> None:
+        """Declare an action server; a method decorated with `@on_action(name)` executes goals.
+
+        One that is declared after configure needs its `callback` given here, and with it `accept`,
+        which decides on goals as a method decorated with `@on_goal(name)` does.
+
+        Raises:
+            LifecycleError: as declare_publisher, or `accept` is given without `callback`.
+        """
+        if accept is not None and callback is None:
+            raise LifecycleError(
+                f"cannot decide on goals of action server {name!r} by accept= alone",
+                hint=f"give callback= too, or decorate a method with @on_goal({name!r})",
+            )
+        if callback is not None:
+            callback = ActionHandler(execute=callback, accept=accept)
+        self._declare(EndpointKind.ACTION_SERVER, name, action_type, callback=callback)
+
+    def declare_action_client(self, name: str, action_type: type[Any]) -> None:
+        """Declare an action client; `self.action_client(name)` from on_connect on."""
+        self._declare(EndpointKind.ACTION_CLIENT, name, action_type)
+
+    def hint(
+        self, endpoint: str, *, lossy: bool | None = None, size_bytes: int | None = None
+    ) -> None:
+        """Give negotiation a hint on a declared endpoint; the manifest's `flows:` win.
+
+        Args:
+            endpoint: `video`, or `publishers/video` where another kind has the name too.
+            lossy: the data bear an unreliable transport.
+            size_bytes: the largest serialized message, > 0.
+
+        Raises:
+            UnknownEndpointError: nothing, or more than one thing, is declared so.
+        """
+        data_layer = self.lifecycle.data_layer
+        data_layer.hint(data_layer.find(endpoint), lossy, size_bytes)
+
+    def set_options(
+        self,
+        endpoint: str,
+        *,
+        callback_group: CallbackGroup | None = None,
+        event_callbacks: PublisherEventCallbacks | SubscriptionEventCallbacks | None = None,
+        raw: bool = False,
+        introspection: ServiceIntrospectionState | None = None,
+    ) -> None:
+        """Say how a declared endpoint is made, as the arguments of rclpy's factories do.
+
+        In `__init__` or on_configure; it holds each time that the endpoint is made.
+
+        Args:
+            endpoint: `video`, or `publishers/video` where another kind has the name too.
+            callback_group: of its callback and its events.
+            event_callbacks: of a publisher or subscription: deadline, liveliness, incompatible QoS,
+                matched, …
+            raw: a subscription's handler is given serialized bytes instead of a message.
+            introspection: of a service server or client: what it publishes of each call.
+
+        Raises:
+            UnknownEndpointError: nothing, or more than one thing, is declared so.
+            LifecycleError: its kind cannot have one of them, or it exists already.
+        """
+        self.lifecycle.data_layer.set_options(
+            endpoint,
+            EndpointOptions(
+                callback_group=callback_group,
+                event_callbacks=event_callbacks,
+                raw=raw,
+                introspection=introspection,
+            ),
+        )
+
+    def _declare(
+        self,
+        kind: EndpointKind,
+        name: str,
+        interface: type[Any],
+        qos: QosProfile | QoSProfile | int | None = None,
+        *,
+        callback: Callable[..., Any] | None = None,
+        hints: tuple[bool | None, int | None] = (None, None),
+    ) -> None:
+        if isinstance(qos, int):
+            qos = QosProfile(depth=qos)
+        planned = PlannedEndpoint(
+            kind=kind,
+            name=name,
+            resolved=resolve_name(self, kind, name),
+            type=interface_name(interface),
+            qos=from_rclpy(qos) if isinstance(qos, QoSProfile) else qos,
+            at=calling_position(depth=2),
+        )
+        data_layer = self.lifecycle.data_layer
+        data_layer.hint(data_layer.declare(planned, callback), *hints)
+
+    # The node interface, in callbacks from on_configure to cleanup.
 
     def connect_to(self, *urls: str | ConnectionUrl, name: str = "") -> Connection:
         """Make a connection that endpoints can be mapped onto: a DDS participant of its own.
@@ -280,7 +531,7 @@ class LocalInterface(Node):  # type: ignore[misc]  # rclpy is not typed
     @property
     def connections(self) -> tuple[ConnectionReport, ...]:
         """Every connection as it is now, the node's own participant (with the empty name) first."""
-        return configuration.connection_reports(self.lifecycle.spec, self.lifecycle.data_layer)
+        return self.lifecycle.get_configuration().connections
 
     @property
     def mappings(self) -> tuple[tuple[str, str | None], ...]:
@@ -290,7 +541,7 @@ class LocalInterface(Node):  # type: ignore[misc]  # rclpy is not typed
         """
         return tuple(
             (each.spelling, each.connection.name if each.connection is not None else None)
-            for each in self.lifecycle.data_layer.mappings
+            for each in self.lifecycle.data_layer.endpoints.values()
         )
 
     def on_connection_event(self, callback: Callable[[ConnectionEvent], Any]) -> Callable[[], None]:
@@ -299,245 +550,102 @@ class LocalInterface(Node):  # type: ignore[misc]  # rclpy is not typed
         Returns:
             What ends it.
         """
-        return self.lifecycle.connection_events.listen(callback)
+        return self.lifecycle.data_layer.events.listen(callback)
 
+    # The factories of rclpy: what they make is gated.
 
-SUCCESS = TransitionCallbackReturn.SUCCESS
-FAILURE = TransitionCallbackReturn.FAILURE
-ERROR = TransitionCallbackReturn.ERROR
+    def create_publisher(
+        self, msg_type: Any, topic: str, qos_profile: QoSProfile | int, **options: Any
+    ) -> Publisher:
+        """As rclpy's; what is published while the node is not active is dropped."""
+        publisher = super().create_publisher(msg_type, topic, qos_profile, **options)
+        if self._gate is not None:
+            self._found(EndpointKind.PUBLISHER, publisher)
+            self._gate.add(publisher, GatedPublisher(publisher, self.get_logger().warning))
+        return publisher
 
-CallbackReturn = Any
-"""What a callback may return: rclpy's TransitionCallbackReturn, or None for SUCCESS."""
-
-
-def _any_signature(callback: Callable[..., CallbackReturn]) -> Callable[..., CallbackReturn]:
-    """Type a callback so that who overrides it may leave `state` out, or write `async def`."""
-    return callback
-
-
-class LifecycleNode(Declarations, LocalInterface, GatedFactories):
-    """A ROS 2 managed node whose endpoints are declared, not scattered through its code.
-
-    From outside it is exactly a managed node (`ros2 lifecycle`, launch_ros and nav2 drive it),
-    with two more transitions inside *inactive*: `connect` makes the endpoints, `disconnect`
-    removes them. Data flows only while the node is active.
-
-    With a manifest that declares a publisher `chatter` and a subscription `echo`:
-
-        class Talker(LifecycleNode):
-            def on_configure(self):
-                self.chatter = self.publisher("chatter")
-                self.count = 0
-
-            @on_timer(period_s=0.5)
-            def tick(self):
-                self.count += 1
-                self.chatter.publish(Int32(data=self.count))
-
-            @on_message("echo")
-            def heard(self, message):
-                self.get_logger().info(f"heard {message.data}")
-
-    Without a manifest, the same class declares them itself and drives itself up:
-
-        class Talker(LifecycleNode):
-            def __init__(self):
-                super().__init__("talker", lifecycle="auto")
-                self.declare_publisher("chatter", Int32)
-                self.declare_subscription("echo", Int32)
-            ...
-
-        lifecycle.run(Talker)
-
-    Callbacks `on_configure`, `on_connect`, `on_activate`, `on_deactivate`, `on_disconnect`,
-    `on_cleanup`, `on_shutdown` and `on_error` take `(self, state)` or `(self)`, return SUCCESS,
-    FAILURE, ERROR or None for SUCCESS, and may be `async def`:
-
-        async def on_activate(self, state):
-            answer = await self.client("calibrate").call_async(Trigger.Request())
-            return SUCCESS if answer.success else FAILURE
-
-    An exception is logged with its traceback and counts as ERROR. Every callback has a deadline
-    (`timeouts:` in the manifest, 10 s by default): an `async def` one is interrupted where it
-    awaits; a sync one cannot be, so it is judged when it returns, and a supervisor may end the
-    process before that. An exception in a message, service or timer callback ends the process,
-    as with any rclpy node; one in an action's handler ends its goal.
-
-    Args:
-        node_name: base name; by default the class's name in snake_case. A manifest's name wins.
-        lifecycle: "manual" waits for others to drive it; "auto" configures, connects and activates
-            itself as soon as it is spun. Under a supervisor or `lifecycle run` theirs wins.
-        namespace: as in rclpy; a manifest's wins.
-        context: as in rclpy.
-        enable_communication_interface: serve and announce its states; without, no other process
-            can drive it or read its configuration.
-        options: further keywords of rclpy.node.Node.
-
-    Attributes:
-        lifecycle: the managed half: `lifecycle.state`, `await lifecycle.change("configure")`,
-            `lifecycle.get_configuration()`.
-    """
-
-    def __init__(
+    def create_subscription(
         self,
-        node_name: str | None = None,
-        *,
-        lifecycle: str = "manual",
-        namespace: str | None = None,
-        context: Context | None = None,
-        enable_communication_interface: bool = True,
+        msg_type: Any,
+        topic: str,
+        callback: Callable[..., Any],
+        qos_profile: QoSProfile | int,
         **options: Any,
-    ) -> None:
-        mode = parse_mode(lifecycle)
-        if not isinstance(enable_communication_interface, bool):
-            raise TypeError(
-                f"cannot use enable_communication_interface={enable_communication_interface!r}; "
-                "allowed: True, False"
-            )
-        name = node_name or default_name(type(self))
-        construction = take_construction(name, namespace)
-        planned = construction.spec if construction is not None else None
-        if planned is not None:
-            name, namespace = planned.name, planned.namespace
-            options["cli_args"] = [*ros_arguments(planned), *(options.get("cli_args") or ())]
-            given = options.get("parameter_overrides") or ()
-            options["parameter_overrides"] = [*given, *parameters.overrides(planned)]
-            parameters.give_empty_arrays(self, planned)
-        if construction is not None:
-            context = construction.context or context
-            options.setdefault("use_global_arguments", construction.use_global_arguments)
-            mode = construction.mode or mode
-        supervisor = construction.supervisor if construction is not None else ""
-        super().__init__(name, namespace=namespace, context=context, **options)
-        self._gate = NodeGate()
-        spec = planned or plan_without_manifest(
-            type(self), name=self.get_name(), namespace=self.get_namespace()
+    ) -> Subscription:
+        """As rclpy's; messages that arrive while the node is not active are dropped."""
+        subscription = super().create_subscription(
+            msg_type, topic, callback, qos_profile, **options
         )
-        if spec.log_level:
-            self.get_logger().set_level(LoggingSeverity[spec.log_level.upper()])
-        self.lifecycle: Managed = Managed(
-            self,
-            spec,
-            mode,
-            self._gate,
-            supervisor,
-            served=enable_communication_interface,
-            health=None if type(self).health is LifecycleNode.health else self.health,
-        )
-        if construction is None and mode is Mode.AUTO:
-            self.lifecycle.bring_up_when_spun()
+        # /clock belongs to rclpy: simulated time must pass in every state.
+        is_clock = isinstance(getattr(callback, "__self__", None), TimeSource)
+        if self._gate is not None and not is_clock:
+            self._found(EndpointKind.SUBSCRIPTION, subscription)
+            self._gate.add_subscription(subscription, self.lifecycle.turns.call_soon)
+        return subscription
 
-    @property
-    def is_active(self) -> bool:
-        """Data may flow."""
-        return self.lifecycle.state is NodeState.ACTIVE
+    def create_timer(
+        self,
+        timer_period_sec: float,
+        callback: Callable[..., Any] | None,
+        callback_group: CallbackGroup | None = None,
+        clock: Clock | None = None,
+        autostart: bool = True,
+    ) -> Timer:
+        """As rclpy's; the timer runs only while the node is active, and then starts anew."""
+        timer = super().create_timer(timer_period_sec, callback, callback_group, clock, autostart)
+        # No callback is rclpy.Rate's: a thread that sleeps must wake up.
+        if self._gate is not None and callback is not None:
+            self._gate.add(timer, GatedTimer(timer, wanted=autostart))
+        return timer
 
-    def publisher(self, name: str) -> DeclaredPublisher:
-        """Return the declared publisher `name`, from on_configure on.
-
-        Raises:
-            UnknownEndpointError: nothing of that name is declared; a KeyError too.
-        """
-        return self.lifecycle.data_layer.endpoints.publisher(name)
-
-    def client(self, name: str) -> Client:
-        """Return the declared service client `name`, from on_connect on.
-
-        In callbacks, `await self.client("reset").call_async(request)`; the blocking `call` would
-        wait for the executor that is waiting for it.
-
-        Raises:
-            UnknownEndpointError: nothing of that name is declared; a KeyError too.
-            LifecycleError: the node is not connected.
-        """
-        client: Client = self.lifecycle.data_layer.endpoints.client(
-            EndpointKind.SERVICE_CLIENT, name
-        )
+    def create_client(self, srv_type: Any, srv_name: str, **options: Any) -> Client:
+        """As rclpy's, by default in a reentrant group: awaiting it in a callback is safe."""
+        if options.get("callback_group") is None:
+            options["callback_group"] = self.lifecycle.turns.group
+        client = super().create_client(srv_type, srv_name, **options)
+        refuse_to_deadlock(client)
+        self._found(EndpointKind.SERVICE_CLIENT, client)
         return client
 
-    def subscription(self, name: str) -> Subscription:
-        """Return rclpy's object of the declared subscription `name`, from on_connect on.
+    def create_service(
+        self, srv_type: Any, srv_name: str, callback: Callable[..., Any], **options: Any
+    ) -> Service:
+        """As rclpy's."""
+        service = super().create_service(srv_type, srv_name, callback, **options)
+        if self._gate is not None:
+            self._found(EndpointKind.SERVICE_SERVER, service)
+        return service
 
-        For `get_publisher_count()` and the like; it is another one after a handover.
+    def destroy_publisher(self, publisher: Publisher) -> bool:
+        """As rclpy's."""
+        self._forget(publisher)
+        return bool(super().destroy_publisher(publisher))
 
-        Raises:
-            UnknownEndpointError: nothing of that name is declared; a KeyError too.
-            LifecycleError: the node is not connected.
-        """
-        return self.lifecycle.data_layer.endpoints.client(EndpointKind.SUBSCRIPTION, name)
+    def destroy_subscription(self, subscription: Subscription) -> bool:
+        """As rclpy's."""
+        self._forget(subscription)
+        return bool(super().destroy_subscription(subscription))
 
-    def service(self, name: str) -> Service:
-        """Return rclpy's object of the declared service server `name`; as `subscription`."""
-        return self.lifecycle.data_layer.endpoints.client(EndpointKind.SERVICE_SERVER, name)
+    def destroy_client(self, client: Client) -> bool:
+        """As rclpy's."""
+        self._forget(client)
+        return bool(super().destroy_client(client))
 
-    def action_client(self, name: str) -> ActionClient:
-        """Return the declared action client `name`, from on_connect on; raises as `client`.
+    def destroy_service(self, service: Service) -> bool:
+        """As rclpy's."""
+        self._forget(service)
+        return bool(super().destroy_service(service))
 
-        In callbacks, `goal = await self.action_client("dock").send_goal_async(Dock.Goal())`, then
-        `await goal.get_result_async()`; the blocking calls raise DeadlockError.
-        """
-        client: ActionClient = self.lifecycle.data_layer.endpoints.client(
-            EndpointKind.ACTION_CLIENT, name
-        )
-        return client
+    def destroy_timer(self, timer: Timer) -> bool:
+        """As rclpy's."""
+        self._forget(timer)
+        return bool(super().destroy_timer(timer))
 
-    def sleep(self, seconds: float) -> Future:
-        """Return what is done in `seconds` (> 0) of wall time: `await self.sleep(0.1)`.
+    def _found(self, kind: EndpointKind, entity: Any) -> None:
+        own = self.lifecycle.data_layer.connections.own
+        self.lifecycle.found.add(kind, Placement(connection=own, entity=entity))
 
-        For `async def` callbacks, above all handlers of actions: whatever else the node has to do
-        goes on meanwhile, requests to cancel a goal included.
-        """
-        return self.lifecycle.sleep(seconds)
-
-    def undeclare_parameter(self, name: str) -> None:
-        """As rclpy's, which notifies nothing; the node's configuration has changed."""
-        super().undeclare_parameter(name)
-        self.lifecycle.configuration_changes.touch()
-
-    def destroy_node(self) -> None:
-        """As rclpy's; participants of its own go with it."""
-        self.lifecycle.close()
-        super().destroy_node()
-
-    # Callbacks of the author.
-
-    @_any_signature
-    def on_configure(self, state: LifecycleState) -> CallbackReturn:
-        """Read parameters, take resources. Endpoints are declared but do not exist yet."""
-
-    @_any_signature
-    def on_connect(self, state: LifecycleState) -> CallbackReturn:
-        """The data layer is made: endpoints exist, clients can be used, data does not flow."""
-
-    @_any_signature
-    def on_activate(self, state: LifecycleState) -> CallbackReturn:
-        """Start working; data flows once this has succeeded."""
-
-    @_any_signature
-    def on_deactivate(self, state: LifecycleState) -> CallbackReturn:
-        """Stop working; data has stopped flowing already."""
-
-    @_any_signature
-    def on_disconnect(self, state: LifecycleState) -> CallbackReturn:
-        """The data layer is about to be removed."""
-
-    @_any_signature
-    def on_cleanup(self, state: LifecycleState) -> CallbackReturn:
-        """Give back what on_configure took."""
-
-    @_any_signature
-    def on_shutdown(self, state: LifecycleState) -> CallbackReturn:
-        """The last call, from any state; endpoints are removed after it."""
-
-    @_any_signature
-    def health(self) -> Any:
-        """Return what is wrong, as text; None if all is well. May be `async def`.
-
-        Asked once a second while the node is connected or active, and at once after each change of
-        its state, if a class overrides it. An exception counts as unhealthy, no answer in time as
-        not known. The manifest says with `health` what follows.
-        """
-
-    @_any_signature
-    def on_error(self, state: LifecycleState) -> CallbackReturn:
-        """A callback ended in ERROR: SUCCESS says the node is as new, FAILURE finalizes it."""
+    def _forget(self, entity: object) -> None:
+        if self._gate is not None:
+            self._gate.remove(entity)
+            self.lifecycle.found.remove(entity)

@@ -12,14 +12,13 @@ import collections
 import enum
 import functools
 import inspect
-from collections.abc import Callable
-from collections.abc import Mapping as AbstractMapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from lifecycle.node.connections.connections import Connection, Connections
-from lifecycle.node.endpoints.mapping import Key, Mapping, count_peers
+from lifecycle.node.connections.connections import Connection
+from lifecycle.node.endpoints.endpoint import Endpoint, Key, count_peers
 
 if TYPE_CHECKING:
     from lifecycle.node.lifecycle.gate import Later
@@ -63,12 +62,19 @@ Listener = Callable[[ConnectionEvent], Any]
 
 
 class ConnectionEvents:
-    """The listeners of one node's connection events."""
+    """What becomes of one node's connections and mappings, and who is called then.
 
-    def __init__(self, later: Later) -> None:
+    Args:
+        later: runs a function, sync or async, in the node's executor.
+        endpoints: every declared endpoint, as it is at any time.
+    """
+
+    def __init__(self, later: Later, endpoints: Mapping[Key, Endpoint]) -> None:
         self._later = later
+        self._endpoints = endpoints
         self._listeners: dict[object, Listener] = {}
         self._waiting: collections.deque[ConnectionEvent] = collections.deque()
+        self._established: set[str] = set()
 
     def listen(self, listener: Listener) -> Callable[[], None]:
         """Call `listener`, sync or async, with each event from now on; returns what ends that."""
@@ -95,97 +101,58 @@ class ConnectionEvents:
                 else:
                     listener(event)
 
-
-class ConnectionStatus:
-    """The status of one node's connections and mappings.
-
-    Args:
-        connections: of the node.
-        mappings: every declared endpoint, as it is at any time.
-        notify: called with each event.
-    """
-
-    def __init__(
-        self,
-        connections: Connections,
-        mappings: AbstractMapping[Key, Mapping],
-        notify: Callable[[ConnectionEvent], None],
-    ) -> None:
-        self._connections = connections
-        self._mappings = mappings
-        self._notify = notify
-        self._established: set[Connection] = set()
-
-    def on(self, connection: Connection) -> tuple[Mapping, ...]:
-        """Return what is mapped onto a connection; flows of their own are the node's own."""
-        known = self._known(connection)
-        return tuple(
-            mapping
-            for mapping in self._mappings.values()
-            if mapping.connection is not None and self._known(mapping.connection) is known
-        )
-
-    def established(self, connection: Connection) -> bool:
-        """Return whether a connection exists and every topic endpoint on it has a peer."""
-        topics = (each for each in self.on(connection) if each.endpoint.kind.is_topic)
-        return not connection.error and all(each.peers for each in topics)
-
     def opened(self, connection: Connection) -> None:
         """A connection was made, or is there already."""
         self._judge(connection, lost=False)
 
     def closed(self, connection: Connection) -> None:
         """A connection with a name was removed."""
-        self._established.discard(connection)
+        self._established.discard(connection.name)
         self._report(ConnectionEventKind.CONNECTION_LOST, connection, unmade=True)
 
-    def mapped(self, mapping: Mapping) -> None:
+    def mapped(self, endpoint: Endpoint) -> None:
         """An endpoint was mapped."""
-        assert mapping.connection is not None
-        self._count(mapping)
-        self._report(ConnectionEventKind.MAPPING_ESTABLISHED, mapping.connection, mapping)
-        self._judge(mapping.connection, lost=False)
+        assert endpoint.connection is not None
+        self._count(endpoint)
+        self._report(ConnectionEventKind.MAPPING_ESTABLISHED, endpoint.connection, endpoint)
+        self._judge(endpoint.connection, lost=False)
 
-    def unmapped(self, mapping: Mapping, connection: Connection) -> None:
+    def unmapped(self, endpoint: Endpoint, connection: Connection) -> None:
         """An endpoint was taken off a connection."""
-        self._report(ConnectionEventKind.MAPPING_LOST, connection, mapping, unmade=True)
+        self._report(ConnectionEventKind.MAPPING_LOST, connection, endpoint, unmade=True)
 
-    def matched(self, mapping: Mapping) -> None:
+    def matched(self, endpoint: Endpoint) -> None:
         """Count the peers of a mapping again, and notify if they are more or fewer."""
-        before = mapping.peers or 0
-        self._count(mapping)
-        now = mapping.peers or 0
-        if mapping.connection is None or now == before:
+        before = endpoint.peers or 0
+        self._count(endpoint)
+        now, connection = endpoint.peers or 0, endpoint.connection
+        if connection is None or now == before:
             return
         kind = ConnectionEventKind.MAPPING_ESTABLISHED
         if now < before:
             kind = ConnectionEventKind.MAPPING_LOST
-        self._report(kind, mapping.connection, mapping)
-        self._judge(mapping.connection, lost=now < before)
+        self._report(kind, connection, endpoint)
+        self._judge(connection, lost=now < before)
 
-    def _known(self, connection: Connection) -> Connection:
-        """Return the connection as which others know it."""
-        return connection if connection.name else self._connections.own
-
-    def _count(self, mapping: Mapping) -> None:
-        if mapping.endpoint.kind.is_topic and mapping.placement is not None:
-            mapping.peers = count_peers(mapping.placement.entity)
+    def _count(self, endpoint: Endpoint) -> None:
+        if endpoint.kind.is_topic and endpoint.placement is not None:
+            endpoint.peers = count_peers(endpoint.placement.entity)
 
     def _report(
         self,
         kind: ConnectionEventKind,
         connection: Connection,
-        mapping: Mapping | None = None,
+        endpoint: Endpoint | None = None,
         *,
         unmade: bool = False,
     ) -> None:
-        self._notify(
+        self.notify(
             ConnectionEvent(
                 kind=kind,
                 connection=connection.name,
                 urls=connection.urls,
-                endpoint="" if mapping is None else mapping.spelling,
-                peers=None if mapping is None or unmade else mapping.peers,
+                endpoint="" if endpoint is None else endpoint.spelling,
+                peers=None if endpoint is None or unmade else endpoint.peers,
                 unmade=unmade,
             )
         )
@@ -193,18 +160,23 @@ class ConnectionStatus:
     def _judge(self, connection: Connection, *, lost: bool) -> None:
         """Notify that a connection is established, or no longer.
 
-        What is mapped onto it and has no peer yet is no loss, and is not reported.
+        What is mapped onto it and has no peer yet is no loss, and is not reported. The node's own
+        participant is no connection before something is mapped onto it.
         """
-        known = self._known(connection)
-        is_own_and_empty = known is self._connections.own and not self.on(known)
-        established = self.established(known) and not is_own_and_empty
-        if established == (known in self._established):
+        on = [
+            each
+            for each in self._endpoints.values()
+            if each.connection is not None and each.connection.name == connection.name
+        ]
+        established = bool(connection.name or on) and all(
+            each.peers for each in on if each.kind.is_topic
+        )
+        if established == (connection.name in self._established):
             return
-        kind = ConnectionEventKind.CONNECTION_ESTABLISHED
         if established:
-            self._established.add(known)
+            self._established.add(connection.name)
+            self._report(ConnectionEventKind.CONNECTION_ESTABLISHED, connection)
         else:
-            self._established.discard(known)
-            kind = ConnectionEventKind.CONNECTION_LOST
-        if established or lost:
-            self._report(kind, known)
+            self._established.discard(connection.name)
+            if lost:
+                self._report(ConnectionEventKind.CONNECTION_LOST, connection)

@@ -58,6 +58,11 @@ class Connection(msgspec.Struct, kw_only=True, eq=False):
     warning: str = ""
     error: str = ""
 
+    @property
+    def node(self) -> Node | None:
+        """The hidden node that owns the participant; None for the node's own."""
+        return None if self.participant is None else self.participant.node
+
     def read_dscp(self) -> int | None:
         """Return the DSCP on the participant's sender sockets, 0–63; None for the node's own."""
         return None if self.participant is None else self.participant.read_dscp()
@@ -107,13 +112,9 @@ class Connections:
             UnknownConnectionError: there is none, or no longer.
         """
         name = connection if isinstance(connection, str) else connection.name
-        if isinstance(connection, Connection):
-            if connection is self.own or any(each is connection for each in self._made.values()):
-                return connection
-        elif not name:
-            return self.own
-        elif (found := self.named_so(name)) is not None:
-            return found
+        for each in (self.own, *self._made.values()):
+            if each is connection or each.name == connection:
+                return each
         names = [each.name for each in self.named]
         near = nearest(name, names)
         listed = ", ".join(repr(each) for each in names) or "none but its own participant, ''"
@@ -121,10 +122,6 @@ class Connections:
             f"cannot find connection {name!r} of {self._node.get_fully_qualified_name()}",
             hint=(f"did you mean {near!r}? " if near else "") + f"connected: {listed}",
         )
-
-    def named_so(self, name: str) -> Connection | None:
-        """Return the connection of that name, or None."""
-        return next((each for each in self.named if each.name == name), None)
 
     def free_name(self) -> str:
         """Return a name that no connection has."""
@@ -156,7 +153,7 @@ class Connections:
             )
         if not how.urls:
             raise ConnectError(f"{what}: no URL was given", hint="udpv4://, tcpv4://…:5100, shm://")
-        found = self.named_so(name)
+        found = next((each for each in self.named if each.name == name), None)
         if found is not None:
             if found.urls == how.urls:
                 return found

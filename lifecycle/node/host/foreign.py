@@ -17,8 +17,9 @@ import contextlib
 import inspect
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NoReturn, Protocol, cast
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
+from msgspec.structs import replace
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.event_handler import (
     EventHandler,
@@ -45,13 +46,14 @@ from lifecycle.middleware.rcl.rclpy_nodes import (
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.node import configuration
 from lifecycle.node.author import parameters
-from lifecycle.node.author.managed import HostedState, Managed, Undeclared
+from lifecycle.node.author.managed import Managed
 from lifecycle.node.author.node import LifecycleNode
 from lifecycle.node.author.spec import Construction, Mode, constructing, ros_arguments
-from lifecycle.node.configuration import ConfigurationChanges
+from lifecycle.node.configuration import ConfigurationChanges, Found, HostedState
 from lifecycle.node.connections.connections import Connection, Connections
-from lifecycle.node.connections.data_layer import NodeDataLayer, serve_interface
-from lifecycle.node.endpoints.mapping import MatchWatch
+from lifecycle.node.connections.node_interface import serve_interface
+from lifecycle.node.endpoints.data_layer import DataLayer
+from lifecycle.node.endpoints.endpoint import CLIENTS, Endpoint, MatchWatch, Placement, Watch
 from lifecycle.node.lifecycle.gate import GatedPublisher, NodeGate
 from lifecycle.node.lifecycle.machine import RefusedError
 from lifecycle.node.lifecycle.steps import SUCCESS, CallbackOutcome, Result
@@ -197,10 +199,9 @@ class ForeignNode:
         self._watching = spinner.watching
         self._group = ReentrantCallbackGroup()
         self._gate = NodeGate()
-        self._watches: dict[int, MatchWatch | SharedMatch | ServerWatch] = {}
         self._unspun: dict[Callable[[Any], Any], Any] = {}
         self._connections = Connections(node)
-        self._apart: dict[int, Connection] = {}  # by id of what is not on the node's participant
+        self._apart: dict[int, Connection] = {}  # by id of what is being made on others
         self._listeners: list[Callable[[Any], None]] = []
         self._let_through = not supervisor
         self._is_spun = False
@@ -212,7 +213,7 @@ class ForeignNode:
         self.configuration_changes = ConfigurationChanges(
             spinner.call_beside, self.get_configuration, failed=node.get_logger().error
         )
-        self._made = Undeclared(self.configuration_changes.touch)
+        self._found = Found(spec.at, self.configuration_changes.touch)
         node.add_post_set_parameters_callback(lambda _: self.configuration_changes.touch())
         if self._let_through:
             self._gate.open()
@@ -224,7 +225,7 @@ class ForeignNode:
         self._is_ours = True
         configuration.serve(self._node, self.get_configuration, self._group)
         # With it a node is known to be one of ours.
-        serve_interface(self._node, cast("NodeDataLayer", self), self._group, "map_to")
+        serve_interface(self._node, {"map_to": lambda _: data_layer_of(self)}, self._group)
         self._is_ours = False
         services = tuple(each for each in self._node.services if each not in before)
         self._watching.take_services(self._node, services)
@@ -263,13 +264,14 @@ class ForeignNode:
             return  # /clock belongs to rclpy
         if kind is EndpointKind.PUBLISHER:
             self._gate.add(entity, HeldPublisher(entity, self._node.get_logger().warning))
-        touch = self.configuration_changes.touch
+        watch: Watch | None = None
         if kind.is_topic:
             # In the host's executor: the node's own need not run.
-            self._watches[id(entity)] = self._match_watch(kind, entity)
-        elif kind in (EndpointKind.SERVICE_CLIENT, EndpointKind.ACTION_CLIENT):
-            self._watches[id(entity)] = ServerWatch(self._node, entity, touch)
-        self._made.add(kind, entity)
+            watch = self._match_watch(kind, entity)
+        elif kind in CLIENTS:
+            watch = ServerWatch(self._node, entity, self.configuration_changes.touch)
+        connection = self._apart.pop(id(entity), self._connections.own)
+        self._found.add(kind, Placement(connection=connection, entity=entity, watch=watch))
 
     def _match_watch(self, kind: EndpointKind, entity: Any) -> MatchWatch | SharedMatch:
         touch = self.configuration_changes.touch
@@ -284,7 +286,7 @@ class ForeignNode:
                     forward=self._forward,
                 )
         sink: Any = self._watching
-        return MatchWatch(sink, entity, self._group, lambda _: touch())
+        return MatchWatch(sink, entity, self._group, touch)
 
     def _forward(self, callback: Callable[[Any], Any], status: Any) -> None:
         """Have a callback of its own called; while it is not spun, the last time once it is."""
@@ -340,8 +342,6 @@ class ForeignNode:
             make = connection.participant.create_subscription
         entity = make(given["msg_type"], planned.resolved, *called, **options)
         self._apart[id(entity)] = connection
-        for event in entity.event_handlers:
-            self._node.add_waitable(event)
         return entity
 
     def _planned(self, kind: EndpointKind, topic: object) -> PlannedEndpoint | None:
@@ -359,17 +359,14 @@ class ForeignNode:
 
     def removed(self, entity: Any) -> None:
         """Forget an endpoint that is about to be destroyed."""
-        connection = self._apart.pop(id(entity), None)
-        if connection is not None and connection.participant is not None:
-            for event in entity.event_handlers:
-                self._node.remove_waitable(event)
-            if isinstance(entity, Publisher):
-                connection.participant.destroy_endpoint(entity)
-        watch = self._watches.pop(id(entity), None)
-        if watch is not None:
-            watch.stop()
         self._gate.remove(entity)
-        self._made.remove(entity)
+        placement = self._found.remove(entity)
+        if placement is None:
+            return
+        if placement.watch is not None:
+            placement.watch.stop()
+        if isinstance(entity, Publisher) and placement.connection.participant is not None:
+            placement.connection.participant.destroy_endpoint(entity)
 
     def constructed(self) -> None:
         """Its class's constructor has returned: hold it, or have it spun."""
@@ -385,28 +382,26 @@ class ForeignNode:
 
     def get_configuration(self) -> NodeConfiguration:
         """Return its identity and its endpoints as they are."""
-        reported, own = self.reported, self._connections.own
-        endpoints, connections = configuration.foreign_reports(
-            self._node,
-            self._spec,
-            self._connections,
-            (
-                (kind, entity, self._apart.get(id(entity), own))
-                for kind, entity in self._made.beside(())
-            ),
-        )
+        declared = {(each.kind, each.resolved): each for each in self._spec.endpoints}
+        endpoints: list[Endpoint] = []
+        for each in self._found.beside():
+            planned = declared.pop((each.kind, each.planned.resolved), None)
+            if planned is not None:
+                each.planned = replace(
+                    each.planned,
+                    name=planned.name,
+                    unique=planned.unique,
+                    enforce_dscp=planned.enforce_dscp,
+                )
+            endpoints.append(each)
+        endpoints += [Endpoint(planned=each) for each in declared.values()]
         return configuration.collect(
             self._node,
-            reported.label,
-            connected=reported.connected,
+            self._spec,
+            self.reported,
             endpoints=endpoints,
-            connections=connections,
+            connections=self._connections,
         )
-
-    @property
-    def is_marked(self) -> bool:
-        """Whether the plan says what DSCP any of its endpoints sends with."""
-        return any(each.dscp is not None for each in self._spec.endpoints)
 
     @property
     def marks(self) -> tuple[int | None, ...]:
@@ -415,9 +410,7 @@ class ForeignNode:
 
     def close(self) -> None:
         """Take its further participants away: it is being destroyed."""
-        for watch in self._watches.values():
-            watch.stop()
-        self._watches.clear()
+        self._found.close()
         self._watching.drop_services(self._services)
         self._connections.close_all()
 
@@ -425,24 +418,6 @@ class ForeignNode:
         """The node was destroyed, in a process that goes on."""
         if self._machine is not None:
             self._machine.destroy()
-
-    @property
-    def interface(self) -> Any:
-        """Raise: it has no node interface; see `map_to`."""
-        self.map_to("", "")
-
-    def map_to(self, endpoint: str, connection: str) -> NoReturn:
-        """Raise: its own code makes its endpoints.
-
-        Raises:
-            LifecycleError: always.
-        """
-        del endpoint, connection
-        raise LifecycleError(
-            f"cannot move the endpoints of {self.full_name}: its class is not a "
-            "lifecycle.LifecycleNode, and makes them itself",
-            hint="subclass lifecycle.LifecycleNode, or write data_layer.authority: nodes",
-        )
 
     async def change_for_supervisor(self, operation: str) -> Result:
         """Do what the supervisor asked for; its activate is the gate's permit.
@@ -555,6 +530,22 @@ class ForeignNode:
 
 Hosted = Managed | ForeignNode
 """What a host knows of one of its nodes."""
+
+
+def data_layer_of(hosted: Hosted) -> DataLayer:
+    """Return what maps the endpoints of a node.
+
+    Raises:
+        LifecycleError: its own code makes its endpoints.
+    """
+    if isinstance(hosted, Managed):
+        return hosted.data_layer
+    raise LifecycleError(
+        f"cannot move the endpoints of {hosted.full_name}: its class is not a "
+        "lifecycle.LifecycleNode, and makes them itself",
+        hint="subclass lifecycle.LifecycleNode, or write data_layer.authority: nodes",
+    )
+
 
 Carrying = Callable[[PlannedNode], contextlib.AbstractContextManager[Any]]
 

@@ -44,7 +44,13 @@ from lifecycle.node.host.control import (
     Operation,
     report_failure,
 )
-from lifecycle.node.host.foreign import Adoption, ForeignNode, Hosted, refuse_unmanaged
+from lifecycle.node.host.foreign import (
+    Adoption,
+    ForeignNode,
+    Hosted,
+    data_layer_of,
+    refuse_unmanaged,
+)
 from lifecycle.node.host.loop import Heartbeat, NodeLoop, Watchdog, on_signal
 from lifecycle.node.lifecycle.steps import CallbackOutcome
 from lifecycle.plan.model import PlannedNode
@@ -129,38 +135,9 @@ class ChangedError(LifecycleError):
     """A node is not activated: it is not any more as it was reported, and is reported again."""
 
 
-class Marks:
-    """The DSCP of the nodes' sockets as it was last reported: no event says that it was changed."""
-
-    def __init__(self) -> None:
-        self._reported: dict[str, tuple[int | None, ...]] = {}
-
-    def note(self, node: Hosted) -> None:
-        """Take the marks that are reported now."""
-        if node.is_marked:
-            self._reported[node.full_name] = node.marks
-
-    def check(self, node: Hosted) -> None:
-        """Refuse to activate a node whose marks are not those that were verified.
-
-        Raises:
-            ChangedError: its code, or another program, has changed them since.
-        """
-        before = self._reported.get(node.full_name)
-        if before is not None and node.marks != before:
-            node.configuration_changes.touch()
-            raise ChangedError(
-                f"cannot activate {node.full_name}: the DSCP of its sockets was changed since it "
-                "was verified",
-                hint="look for IP_TOS or IPV6_TCLASS in its code",
-            )
-
-    def look(self, node: Hosted) -> None:
-        """Have marks that differ from those that were reported reported again."""
-        before = self._reported.get(node.full_name)
-        if before is not None and node.marks != before:
-            self._reported[node.full_name] = node.marks
-            node.configuration_changes.touch()
+def is_marked(hosted: Hosted) -> bool:
+    """Whether the plan says what DSCP any endpoint of a node sends with."""
+    return any(each.dscp is not None for each in hosted.spec.endpoints)
 
 
 _MARKS_S = 0.5
@@ -185,7 +162,23 @@ class HostCommands:
         self._nodes = nodes
         self._report = report
         self._of_process = of_process
-        self.marks = Marks()
+        self._marks: dict[str, tuple[int | None, ...]] = {}
+
+    def note_marks(self, node: Hosted) -> None:
+        """Take the DSCP of a node's sockets that is reported now."""
+        if is_marked(node):
+            self._marks[node.full_name] = node.marks
+
+    def look_at_marks(self) -> None:
+        """Have marks that are not as they were reported reported again: no event says so."""
+        for node in tuple(self._nodes.values()):
+            if self._has_other_marks(node):
+                self.note_marks(node)
+                node.configuration_changes.touch()
+
+    def _has_other_marks(self, node: Hosted) -> bool:
+        before = self._marks.get(node.full_name)
+        return before is not None and node.marks != before
 
     async def execute(self, command: Command) -> Event:
         """Carry out one command and return the answer to it, whatever happens."""
@@ -209,14 +202,19 @@ class HostCommands:
         if operation in self._of_process:
             self._of_process[operation]()
         elif operation is Operation.CONNECT_TO:
-            node.interface.connect_to(command.connection, command.connections)
+            data_layer_of(node).connect_to(command.connection, command.connections)
         elif operation is Operation.MAP_TO:
-            await node.interface.map_to(command.endpoint, command.connection)
+            await data_layer_of(node).map_to(command.endpoint, command.connection)
         elif operation is Operation.DISCONNECT_FROM:
-            node.interface.disconnect(command.connection)
+            data_layer_of(node).disconnect(command.connection)
         elif operation is not Operation.GET_CONFIGURATION:
-            if operation is Operation.ACTIVATE:
-                self.marks.check(node)
+            if operation is Operation.ACTIVATE and self._has_other_marks(node):
+                node.configuration_changes.touch()
+                raise ChangedError(
+                    f"cannot activate {node.full_name}: the DSCP of its sockets was changed since "
+                    "it was verified",
+                    hint="look for IP_TOS or IPV6_TCLASS in its code",
+                )
             result = await node.change_for_supervisor(operation.value)
             ok, error = result.outcome is CallbackOutcome.SUCCESS, result.error
         return self._reply(command, ok=ok, error=error)
@@ -237,11 +235,11 @@ class HostCommands:
         carries = describe and (
             command.operation not in _ANSWERED_WITHOUT_CONFIGURATION
             # No event reports its sockets: what its callback did to them is read when it has ended.
-            or (command.operation is Operation.ACTIVATE and node.is_marked)
+            or (command.operation is Operation.ACTIVATE and is_marked(node))
         )
         configuration, reports = None, False
         if carries:
-            self.marks.note(node)
+            self.note_marks(node)
             configuration, reports = node.configuration_changes.give(self._report)
         return Event(
             kind="reply",
@@ -388,14 +386,13 @@ class Host:
             if isinstance(hosted, ForeignNode):
                 hosted.configuration_changes.touch()
         self._channel.write(Event(kind="ready"))
-        if any(hosted.is_marked for hosted in self._nodes.values()):
+        if any(is_marked(hosted) for hosted in self._nodes.values()):
             threading.Thread(target=self._watch_marks, name="marks", daemon=True).start()
 
     def _watch_marks(self) -> None:
         """Read the marks of the sockets again and again, whatever the node's callbacks do."""
         while not self._left.wait(_MARKS_S):
-            for hosted in tuple(self._nodes.values()):
-                self._commands.marks.look(hosted)
+            self._commands.look_at_marks()
 
     def _report_state(self, hosted: Hosted) -> None:
         state = hosted.reported
@@ -410,7 +407,7 @@ class Host:
 
     def _report_configuration(self, configuration: NodeConfiguration) -> None:
         if (hosted := self._nodes.get(configuration.name)) is not None:
-            self._commands.marks.note(hosted)
+            self._commands.note_marks(hosted)
         self._channel.write(
             Event(
                 kind="configuration",

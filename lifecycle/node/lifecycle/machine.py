@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import enum
 import functools
+import operator
 import threading
 import traceback
 from collections.abc import Callable, Generator, Iterable
@@ -25,7 +26,14 @@ import transitions
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import Timeouts
 from lifecycle.node.lifecycle import steps
-from lifecycle.node.lifecycle.steps import SUCCESS, CallbackOutcome, Interruptible, Result
+from lifecycle.node.lifecycle.steps import (
+    SUCCESS,
+    CallbackOutcome,
+    CancelledError,
+    DeadlineError,
+    Result,
+    Running,
+)
 
 
 class State(msgspec.Struct, frozen=True, kw_only=True):
@@ -147,9 +155,9 @@ class Row(msgspec.Struct, frozen=True):
     Attributes:
         id: of the edge that other tools see; 0 where they see none.
         trigger: a request or an outcome.
-        condition: method of the node that must be true, or raises RefusedError.
-        before: method of the node that is called before the state changes.
-        after: method of the node that is called once it has changed.
+        condition: method of the node's managed half that must be true, or raises RefusedError.
+        before: method of it, or of a part of it, that is called before the state changes.
+        after: such a method, called once the state has changed.
     """
 
     id: int
@@ -170,7 +178,7 @@ TABLE = (
     Row(11, _FAILURE, _S.CONFIGURING, _S.UNCONFIGURED, before="unprepare"),
     Row(12, _ERROR, _S.CONFIGURING, _S.ERRORPROCESSING),
     Row(2, "cleanup", _S.INACTIVE_CONNECTED, _S.CLEANINGUP_CONNECTED),
-    Row(0, _OK, _S.CLEANINGUP_CONNECTED, _S.CLEANINGUP_DISCONNECTED, before="remove_data_layer"),
+    Row(0, _OK, _S.CLEANINGUP_CONNECTED, _S.CLEANINGUP_DISCONNECTED, before="data_layer.remove"),
     Row(2, "cleanup", _S.INACTIVE_DISCONNECTED, _S.CLEANINGUP_DISCONNECTED),
     Row(20, _OK, _S.CLEANINGUP_DISCONNECTED, _S.UNCONFIGURED, before="unprepare"),
     Row(21, _FAILURE, _S.CLEANINGUP_CONNECTED, _S.INACTIVE_CONNECTED),
@@ -183,7 +191,7 @@ TABLE = (
         _S.INACTIVE_DISCONNECTED,
         _S.ACTIVATING_DISCONNECTED,
         condition="may_activate",
-        after="make_data_layer",
+        after="data_layer.make",
     ),
     Row(0, _OK, _S.ACTIVATING_DISCONNECTED, _S.ACTIVATING_CONNECTED),
     Row(
@@ -193,25 +201,25 @@ TABLE = (
         _S.ACTIVATING_CONNECTED,
         condition="may_activate",
     ),
-    Row(30, _OK, _S.ACTIVATING_CONNECTED, _S.ACTIVE, before="open_gate"),
+    Row(30, _OK, _S.ACTIVATING_CONNECTED, _S.ACTIVE, before="gate.open"),
     Row(
         31,
         _FAILURE,
         _S.ACTIVATING_DISCONNECTED,
         _S.INACTIVE_DISCONNECTED,
-        before="undo_data_layer",
+        before="data_layer.undo",
     ),
     Row(31, _FAILURE, _S.ACTIVATING_CONNECTED, _S.INACTIVE_CONNECTED),
     Row(32, _ERROR, _S.ACTIVATING_DISCONNECTED, _S.ERRORPROCESSING),
     Row(32, _ERROR, _S.ACTIVATING_CONNECTED, _S.ERRORPROCESSING),
-    Row(4, "deactivate", _S.ACTIVE, _S.DEACTIVATING, before="close_gate"),
+    Row(4, "deactivate", _S.ACTIVE, _S.DEACTIVATING, before="gate.close"),
     Row(40, _OK, _S.DEACTIVATING, _S.INACTIVE_CONNECTED),
-    Row(41, _FAILURE, _S.DEACTIVATING, _S.ACTIVE, before="open_gate"),
+    Row(41, _FAILURE, _S.DEACTIVATING, _S.ACTIVE, before="gate.open"),
     Row(42, _ERROR, _S.DEACTIVATING, _S.ERRORPROCESSING),
     Row(5, "shutdown", _S.UNCONFIGURED, _S.SHUTTINGDOWN),
     Row(6, "shutdown", _S.INACTIVE_DISCONNECTED, _S.SHUTTINGDOWN),
     Row(6, "shutdown", _S.INACTIVE_CONNECTED, _S.SHUTTINGDOWN),
-    Row(7, "shutdown", _S.ACTIVE, _S.SHUTTINGDOWN, before="close_gate"),
+    Row(7, "shutdown", _S.ACTIVE, _S.SHUTTINGDOWN, before="gate.close"),
     Row(50, _OK, _S.SHUTTINGDOWN, _S.FINALIZED, before="take_down"),
     Row(51, _FAILURE, _S.SHUTTINGDOWN, _S.FINALIZED, before="take_down"),
     Row(52, _ERROR, _S.SHUTTINGDOWN, _S.ERRORPROCESSING),
@@ -220,12 +228,12 @@ TABLE = (
     Row(61, _FAILURE, _S.ERRORPROCESSING, _S.FINALIZED, before="take_down"),
     Row(62, _ERROR, _S.ERRORPROCESSING, _S.FINALIZED, before="take_down"),
     # Ours: seen from outside the node stays inactive. The ids are free in lifecycle_msgs.
-    Row(120, "connect", _S.INACTIVE_DISCONNECTED, _S.CONNECTING, after="make_data_layer"),
+    Row(120, "connect", _S.INACTIVE_DISCONNECTED, _S.CONNECTING, after="data_layer.make"),
     Row(120, _OK, _S.CONNECTING, _S.INACTIVE_CONNECTED),
-    Row(0, _FAILURE, _S.CONNECTING, _S.INACTIVE_DISCONNECTED, before="undo_data_layer"),
+    Row(0, _FAILURE, _S.CONNECTING, _S.INACTIVE_DISCONNECTED, before="data_layer.undo"),
     Row(0, _ERROR, _S.CONNECTING, _S.ERRORPROCESSING),
     Row(121, "disconnect", _S.INACTIVE_CONNECTED, _S.DISCONNECTING),
-    Row(121, _OK, _S.DISCONNECTING, _S.INACTIVE_DISCONNECTED, before="remove_data_layer"),
+    Row(121, _OK, _S.DISCONNECTING, _S.INACTIVE_DISCONNECTED, before="data_layer.remove"),
     Row(0, _FAILURE, _S.DISCONNECTING, _S.INACTIVE_CONNECTED),
     Row(0, _ERROR, _S.DISCONNECTING, _S.ERRORPROCESSING),
 )
@@ -300,13 +308,14 @@ class Machine:
         self._node = node
         self._timeouts = timeouts
         self._lock = threading.Lock()
-        self._running: Interruptible | None = None
+        self._running: Running | None = None
+        self._what = ""
         self._machine = transitions.Machine(
             model=None, states=NodeState, initial=self.state, auto_transitions=False
         )
 
         def methods(name: str) -> list[str | Callable[..., bool | None]]:
-            return [getattr(node, name)] if name else []
+            return [operator.attrgetter(name)(node)] if name else []
 
         for row in table:
             self._machine.add_transition(
@@ -372,7 +381,7 @@ class Machine:
             with self._lock:
                 result = self._take(result.outcome.value)
             returned = self._reported(result, returned)
-        self._node.wake()
+        self._node.turns.wake()
         return returned
 
     async def shut_down(self, reason: str) -> Result:
@@ -381,9 +390,7 @@ class Machine:
         A running async callback is cancelled first; each step keeps its own deadline.
         """
         if not self.state.steady:
-            if self._running is not None:
-                self._running.cancel(reason)
-            self._node.wake()  # which resumes the callback for the last time
+            self._interrupt(CancelledError(f"cannot go on with {self._what}: {reason}"))
             await _Steady(self)
         if self.state is NodeState.FINALIZED:
             return SUCCESS
@@ -425,17 +432,20 @@ class Machine:
         """Run the author's callback of the present state."""
         name, limit = CALLBACKS[self.state]
         deadline_s: float = getattr(self._timeouts, limit)
+        what = f"{self._node.full_name}: {name}"
+        late = DeadlineError(f"cannot finish {what} within its deadline of {deadline_s:g} s")
         call_off: list[Callable[[], None]] = []
 
-        def started(running: Interruptible) -> None:
+        def started(running: Running) -> None:
             self._running = running
-            call_off.append(self._node.wake_at_deadline(deadline_s))
+            self._what = what
+            call_off.append(self._node.turns.call_after(deadline_s, lambda: self._interrupt(late)))
 
         try:
             return await steps.call(
                 self._node.callback(name),
                 (argument,),
-                what=f"{self._node.full_name}: {name}",
+                what=what,
                 deadline_s=deadline_s,
                 started=started,
             )
@@ -443,6 +453,12 @@ class Machine:
             self._running = None
             for each in call_off:
                 each()
+
+    def _interrupt(self, error: LifecycleError) -> None:
+        """Stop the author's callback that runs; its task is resumed for the last time."""
+        if self._running is not None:
+            self._running.interrupt(error)
+        self._node.turns.wake()
 
     def _refusal(self, request: TransitionRequest) -> str:
         if not self.state.steady:

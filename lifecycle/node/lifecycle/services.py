@@ -20,7 +20,8 @@ from rclpy.node import Node
 from rclpy.timer import Timer
 
 from lifecycle.node.lifecycle import machine
-from lifecycle.node.lifecycle.machine import Machine, TransitionRequest
+from lifecycle.node.lifecycle.machine import Machine, RefusedError
+from lifecycle.node.lifecycle.steps import CallbackOutcome
 
 if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup
@@ -32,27 +33,16 @@ _TRANSITION_EVENT_DEPTH = 10  # rmw_qos_profile_default
 class LifecycleServices:
     """Serves one node's state machine to `ros2 lifecycle`, launch_ros, nav2 and all others."""
 
-    def __init__(
-        self,
-        node: Node,
-        *,
-        state_machine: Machine,
-        change: Callable[[TransitionRequest], Coroutine[Any, Any, bool]],
-        refuse: Callable[[str], None],
-        group: CallbackGroup,
-    ) -> None:
+    def __init__(self, node: Node, state_machine: Machine, group: CallbackGroup) -> None:
         """Create the services and the event publisher on `node`.
 
         Args:
             node: the node to be seen as managed.
-            state_machine: its state; only read.
-            change: runs a transition, returns whether it succeeded.
-            refuse: called with why a request that names no available transition was refused.
+            state_machine: its state machine.
             group: must be reentrant, so that others can ask while a transition runs.
         """
         self._machine = state_machine
-        self._change = change
-        self._refuse = refuse
+        self._warn = node.get_logger().warning
         # Not through our node's own create_publisher: this one must work in every state.
         self._events = Node.create_publisher(
             node, msg.TransitionEvent, "~/transition_event", _TRANSITION_EVENT_DEPTH
@@ -88,46 +78,41 @@ class LifecycleServices:
     ) -> srv.ChangeState.Response:
         asked = request.transition
         resolved = self._machine.resolve(asked.id, asked.label)
+        response.success = False
         if resolved is None:
             name = repr(asked.label) if asked.label else f"number {asked.id}"
             allowed = ", ".join(each.value for each in self._machine.allowed()) or "nothing"
-            self._refuse(
+            self._warn(
                 f"cannot take transition {name} in state {self._machine.state.value!r}; "
                 f"allowed here: {allowed}"
             )
-            response.success = False
             return response
-        response.success = await self._change(resolved)
+        try:
+            result = await self._machine.change(resolved)
+        except RefusedError as refused:
+            self._warn(str(refused))
+        else:
+            response.success = result.outcome is CallbackOutcome.SUCCESS
         return response
 
-    def _get_state(
-        self,
-        request: srv.GetState.Request,  # noqa: ARG002
-        response: srv.GetState.Response,
-    ) -> srv.GetState.Response:
+    def _get_state(self, _: object, response: srv.GetState.Response) -> srv.GetState.Response:
         response.current_state = _state(self._machine.state.seen)
         return response
 
     def _get_available_states(
-        self,
-        request: srv.GetAvailableStates.Request,  # noqa: ARG002
-        response: srv.GetAvailableStates.Response,
+        self, _: object, response: srv.GetAvailableStates.Response
     ) -> srv.GetAvailableStates.Response:
         response.available_states = [_state(each) for each in machine.AVAILABLE_STATES]
         return response
 
     def _get_available_transitions(
-        self,
-        request: srv.GetAvailableTransitions.Request,  # noqa: ARG002
-        response: srv.GetAvailableTransitions.Response,
+        self, _: object, response: srv.GetAvailableTransitions.Response
     ) -> srv.GetAvailableTransitions.Response:
         response.available_transitions = _descriptions(self._machine.available_transitions())
         return response
 
     def _get_transition_graph(
-        self,
-        request: srv.GetAvailableTransitions.Request,  # noqa: ARG002
-        response: srv.GetAvailableTransitions.Response,
+        self, _: object, response: srv.GetAvailableTransitions.Response
     ) -> srv.GetAvailableTransitions.Response:
         response.available_transitions = _descriptions(machine.TRANSITION_GRAPH)
         return response
@@ -200,16 +185,7 @@ class Turns:
         """Have a timer call back no more."""
         Node.destroy_timer(self._node, timer)
 
-    def wake_at_deadline(self, deadline_s: float) -> Callable[[], None]:
-        """Wake the executor in `deadline_s`, by a timer that is not gated."""
-        timer = self.timer(deadline_s, _wake)
-        return lambda: Node.destroy_timer(self._node, timer)
-
     def wake(self) -> None:
         """Make the executor look at its waiting tasks again."""
         if self._node.executor is not None:
             self._node.executor.wake()
-
-
-def _wake() -> None:
-    """Being called is the point: the executor has woken."""

@@ -1,16 +1,17 @@
-"""Run one user callback with a deadline, sync or async, inside rclpy's executor.
+"""Run the author's callbacks, sync or async, inside rclpy's executor.
 
-Owns: how a callback's return value or exception becomes an Outcome, and what a deadline does.
-An `async def` callback that exceeds its deadline gets `DeadlineError` thrown in where it awaits,
-so that its traceback shows what it was waiting for. A sync callback cannot be interrupted in
-Python: it is judged when it returns, and a supervisor that lost patience ends the process.
+Owns: `Running`, by which an author's coroutine is stopped where it awaits; and how a callback's
+return value or exception becomes an outcome. An `async def` callback that exceeds its deadline gets
+`DeadlineError` thrown in, so that its traceback shows what it was waiting for. A sync callback
+cannot be interrupted in Python: it is judged when it returns, and a supervisor that lost patience
+ends the process.
 """
 
 from __future__ import annotations
 
-import contextlib
 import enum
 import inspect
+import threading
 import time
 import traceback
 from collections.abc import Callable, Coroutine, Generator
@@ -55,49 +56,86 @@ SUCCESS = Result(outcome=CallbackOutcome.SUCCESS)
 _RCLPY_TYPE = "TransitionCallbackReturnType"
 
 
-class Interruptible:
-    """Awaits a coroutine inside rclpy's executor and can be made to stop.
+class Running:
+    """A coroutine of the author's at work in rclpy's executor; it is stopped where it awaits.
 
-    rclpy has no running asyncio loop: an awaiting task is resumed each time its executor wakes.
-    This steps the inner coroutine itself and looks at its deadline on every resumption, so
-    something must wake the executor at the deadline (the node keeps a timer for that).
+    rclpy has no running asyncio loop: an awaiting task is resumed each time its executor wakes, so
+    whoever interrupts it has to wake the executor.
+
+    Attributes:
+        returned: what it returned.
+        failure: what it raised; None if it did not.
+        trace: of the failure.
+        interruption: why it was stopped; None if it was not.
+        done: it works no longer.
     """
 
-    def __init__(
-        self, coroutine: Coroutine[Any, Any, Any], *, deadline_s: float, what: str
-    ) -> None:
+    def __init__(self, coroutine: Coroutine[Any, Any, Any]) -> None:
         self._coroutine = coroutine
-        self._ends = time.monotonic() + deadline_s
-        self._deadline_s = deadline_s
-        self._what = what
-        self._interruption: LifecycleError | None = None
+        self._lock = threading.Lock()
+        self._thread = 0
+        self.done = False
+        self.returned: Any = None
+        self.failure: Exception | None = None
+        self.trace = ""
+        self.interruption: LifecycleError | None = None
 
-    def cancel(self, reason: str) -> None:
-        """Make the coroutine fail with CancelledError at its next resumption."""
-        self._interruption = CancelledError(f"cannot go on with {self._what}: {reason}")
-
-    def __await__(self) -> Generator[Any, None, Any]:
-        try:
-            while True:
-                try:
-                    yielded = self._coroutine.send(None)
-                except StopIteration as stop:
-                    return stop.value
+    def __await__(self) -> Generator[Any, None, None]:
+        while not self.done:
+            with self._lock:
+                yielded = self._step()
+            if not self.done:
                 yield yielded
-                if self._interruption is None and time.monotonic() >= self._ends:
-                    self._interruption = DeadlineError(
-                        f"cannot finish {self._what} within its deadline of {self._deadline_s:g} s"
-                    )
-                if self._interruption is not None:
-                    self._stop(self._interruption)
-        finally:
-            self._coroutine.close()
 
-    def _stop(self, interruption: LifecycleError) -> None:
-        """Throw into the coroutine; whatever it makes of that, it does not run on."""
-        with contextlib.suppress(StopIteration):  # it returned instead of passing it on
-            self._coroutine.throw(interruption)
-        raise interruption
+    def interrupt(self, error: LifecycleError) -> bool:
+        """Raise an error where it awaits; false if it is the one that asks, which goes on."""
+        if self._thread == threading.get_ident():
+            return False
+        self.interruption = error
+        if not self._lock.acquire(blocking=False):
+            return True  # at work in another thread, it is stopped at its next await
+        self._thread = threading.get_ident()
+        try:
+            self._stop(error)
+        finally:
+            self._thread = 0
+            self._lock.release()
+        return True
+
+    def _step(self) -> Any:
+        """Run it until it awaits; return what it yields."""
+        if self.done:
+            return None
+        self._thread = threading.get_ident()
+        try:
+            yielded = self._coroutine.send(None)
+        except StopIteration as stop:
+            self.returned, self.done = stop.value, True
+        except Exception as error:  # noqa: BLE001 - the author's code: reported
+            self._fail(error)
+        else:
+            if self.interruption is None:
+                return yielded
+            self._stop(self.interruption)
+        finally:
+            self._thread = 0
+        return None
+
+    def _stop(self, error: LifecycleError) -> None:
+        """Throw into it; whatever it makes of that, it does not run on."""
+        if self.done:
+            return
+        try:
+            self._coroutine.throw(error)
+            self._coroutine.close()
+        except StopIteration as stop:
+            self.returned = stop.value
+        except Exception as raised:  # noqa: BLE001 - the author's code: reported
+            self._fail(raised)
+        self.done = True
+
+    def _fail(self, error: Exception) -> None:
+        self.failure, self.trace, self.done = error, traceback.format_exc(), True
 
 
 async def call(
@@ -106,7 +144,7 @@ async def call(
     *,
     what: str,
     deadline_s: float,
-    started: Callable[[Interruptible], None],
+    started: Callable[[Running], None],
 ) -> Result:
     """Run a transition callback and return its result; never raises for what the user did.
 
@@ -114,41 +152,50 @@ async def call(
         callback: sync or async; may take fewer arguments than given (`on_configure(self)`).
         arguments: what the callback may take.
         what: for messages, "/camera: on_configure".
-        deadline_s: seconds, > 0.
-        started: called with the Interruptible before an async callback first runs.
+        deadline_s: seconds, > 0; of a sync callback. An async one is interrupted by the caller.
+        started: called before an async callback first runs.
     """
     began = time.monotonic()
     try:
         returned = callback(*arguments[: positional_count(callback, len(arguments))])
-        if inspect.isawaitable(returned):
-            coroutine = returned if inspect.iscoroutine(returned) else _await(returned)
-            running = Interruptible(coroutine, deadline_s=deadline_s, what=what)
-            started(running)
-            returned = await running
-        elif time.monotonic() - began >= deadline_s:
-            took_s = time.monotonic() - began
-            return Result(
-                outcome=CallbackOutcome.ERROR,
-                error=f"cannot accept {what}: it blocked for {took_s:.1f} s, its deadline is "
-                f"{deadline_s:g} s; make it `async def` so that it can be interrupted",
-            )
-    except LifecycleError as error:
-        return Result(outcome=CallbackOutcome.ERROR, error=str(error), trace=traceback.format_exc())
     except Exception as error:  # noqa: BLE001 - the user's code: reported, then ERROR
-        line = f"{type(error).__name__}: {error}" + (f"; {todo}" if (todo := hint(error)) else "")
+        return _raised(error, traceback.format_exc(), what=what)
+    took_s = time.monotonic() - began
+    if inspect.isawaitable(returned):
+        running = Running(awaiting(returned))
+        started(running)
+        await running
+        failure = running.failure or running.interruption
+        if failure is not None:
+            return _raised(failure, running.trace, what=what)
+        returned = running.returned
+    elif took_s >= deadline_s:
         return Result(
             outcome=CallbackOutcome.ERROR,
-            error=f"{what} raised {line}",
-            trace=traceback.format_exc(),
+            error=f"cannot accept {what}: it blocked for {took_s:.1f} s, its deadline is "
+            f"{deadline_s:g} s; make it `async def` so that it can be interrupted",
         )
     return judge(returned, what=what)
 
 
-def hint(error: Exception) -> str:
-    """Return what to do about an exception whose text does not say it; empty if there is nothing.
+def _raised(error: Exception, trace: str, *, what: str) -> Result:
+    text = str(error)
+    if not isinstance(error, LifecycleError):
+        text = f"{what} raised {error_text(error)}"
+    return Result(outcome=CallbackOutcome.ERROR, error=text, trace=trace)
+
+
+def error_text(error: Exception) -> str:
+    """Return what was raised in one line, and what to do about it where the text does not say it.
 
     asyncio says `no running event loop` of whatever is awaited of it, `asyncio.sleep` first of all.
     """
+    todo = hint(error)
+    return f"{type(error).__name__}: {error}" + (f"; {todo}" if todo else "")
+
+
+def hint(error: Exception) -> str:
+    """Return what to do about an exception whose text does not say it, or nothing."""
     if isinstance(error, RuntimeError) and str(error).startswith("no running event loop"):
         return (
             "callbacks run in rclpy's executor, which has no asyncio loop: await what rclpy gives, "
@@ -193,5 +240,6 @@ def positional_count(callback: Callable[..., Any], available: int) -> int:
     return min(available, sum(kind in positional for kind in kinds))
 
 
-async def _await(awaitable: Any) -> Any:
+async def awaiting(awaitable: Any) -> Any:
+    """Await what a callback of the author's has returned, a coroutine or a future."""
     return await awaitable

@@ -16,7 +16,6 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING
 
 import msgspec
-from msgspec.structs import replace
 
 from lifecycle.errors import BringUpError
 from lifecycle.graph.loop import set_within
@@ -24,7 +23,6 @@ from lifecycle.manifest.model import After, Authority, Condition, DataLayerSourc
 from lifecycle.node.host.control import Command, Operation
 from lifecycle.plan.model import Plan, PlannedNode
 from lifecycle.supervisor.connections.desired_state import (
-    ActualState,
     Instructions,
     not_wired,
     planned_instructions,
@@ -33,7 +31,12 @@ from lifecycle.supervisor.connections.desired_state import (
 )
 from lifecycle.supervisor.connections.negotiation import NegotiatedSource
 from lifecycle.supervisor.core.state import Level
-from lifecycle.supervisor.nodes.driver import ACTIVE, INACTIVE, NodeInterfaceClient
+from lifecycle.supervisor.nodes.driver import (
+    ACTIVE,
+    INACTIVE,
+    NodeDriver,
+    NodeInterfaceClient,
+)
 from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.run.events import Notice, WiringChanged, WiringLost
 from lifecycle.supervisor.run.failure import ended, within
@@ -41,7 +44,6 @@ from lifecycle.verify.observation import NodeConfiguration, Observation
 from lifecycle.verify.verdict import Finding
 
 if TYPE_CHECKING:
-    from lifecycle.supervisor.nodes.driver import NodeDriver
     from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
 
 _BEYOND = (Condition.CONNECTED, Condition.ACTIVE, Condition.HEALTHY)
@@ -123,18 +125,21 @@ class PlannedSource:
         return self._instructions
 
 
+_Interface = NodeDriver | NodeInterfaceClient
+
+
 class _Wiring(msgspec.Struct):
     """What the authority knows of one node that it wires.
 
     Attributes:
-        actual: what the node had at last.
+        has: what the node had at last.
         ours: names of what it was connected to by us, oldest first.
         rounds: tries to make what is missing; `last_s`: when the last one was.
         error: why the last one failed; empty if it did not.
         given_up: checksum of the configuration with which the tries were used up.
     """
 
-    actual: ActualState = msgspec.field(default_factory=ActualState)
+    has: Instructions
     ours: list[str] = msgspec.field(default_factory=list)
     rounds: int = 0
     last_s: float = float("-inf")
@@ -145,11 +150,12 @@ class _Wiring(msgspec.Struct):
 class _Wirable(msgspec.Struct):
     """A node that can be wired now; `node` is None if it joined without being declared."""
 
-    interface: NodeDriver | NodeInterfaceClient
+    interface: _Interface
     node: NodeRun | None
-    configuration: NodeConfiguration
-    wanted: Instructions
+    checksum: str
     wiring: _Wiring
+    has: Instructions
+    missing: tuple[Command, ...]
 
 
 class ConnectionAuthority:
@@ -205,11 +211,11 @@ class ConnectionAuthority:
                     hint="only nodes of ours can be wired; give it no connection",
                 )
             return  # it makes its endpoints itself
-        wiring = self._wirings.setdefault(node.name, _Wiring())
-        wiring.actual = wired(configuration)
-        there = {connection for connection, _ in wiring.actual.connections}
+        wiring = self._wiring(node.name)
+        wiring.has = wired(configuration)
+        there = dict(wiring.has.connections)
         wiring.ours = [connection for connection in wiring.ours if connection in there]
-        await self._make(wiring, node.driver, steps(wanted, wiring.actual), node)
+        await self._make(wiring, node.driver, steps(wanted, wiring.has), node)
 
     async def unwire(self, node: NodeRun) -> None:
         """Unmake what a node was connected to, the last connection first, each bounded."""
@@ -223,8 +229,7 @@ class ConnectionAuthority:
                 text = str(error) or f"cannot {step} within {limit_s:g} s"
                 self._system.emit(Notice(message=text))
             else:
-                done = WiringChanged(node=node.name, operation=step.operation, connection=name)
-                self._system.emit(done)
+                self._system.emit(_done(step))
 
     def replan(self, plan: Plan, names: Collection[str]) -> None:
         """Forget what these nodes were instructed: they are started again, by this plan."""
@@ -235,14 +240,12 @@ class ConnectionAuthority:
 
     def look(self, observation: Observation) -> None:
         """Take what was seen: negotiate again, and have what is missing made."""
-        own = self._system.nodes.values()
-        names = {each.name for each in own}
-        self._others = {
-            each.name: each for each in observation.configurations if each.name not in names
-        }
+        self._others = {}
         for each in observation.configurations:
             node = self._system.node_named(each.name)
-            if node is not None and not node.core.process:
+            if node is None:
+                self._others[each.name] = each
+            elif not node.core.process:
                 node.configuration = each
         if not self._follows:
             return
@@ -265,7 +268,7 @@ class ConnectionAuthority:
         for name, wiring in tuple(self._wirings.items()):  # nodes leave meanwhile
             if self._system.node_named(name) is not None or name not in self._others:
                 continue
-            unmade = steps(Instructions(node=name), wiring.actual, ours=wiring.ours)
+            unmade = steps(Instructions(node=name), wiring.has, ours=wiring.ours)
             interface = NodeInterfaceClient(self._participant.clients, name)
             making = self._make(wiring, interface, unmade, None)
             try:
@@ -293,10 +296,11 @@ class ConnectionAuthority:
         if not self._follows:
             return False
         return bool(self._making) or any(
-            steps(each.wanted, wired(each.configuration), ours=each.wiring.ours)
-            for each in self._wirable()
-            if each.wiring.given_up != each.configuration.checksum
+            each.missing and each.wiring.given_up != each.checksum for each in self._wirable()
         )
+
+    def _wiring(self, name: str) -> _Wiring:
+        return self._wirings.setdefault(name, _Wiring(has=Instructions(node=name)))
 
     def _negotiate(self) -> Mapping[str, Instructions]:
         known = dict(self._others)
@@ -315,6 +319,7 @@ class ConnectionAuthority:
             await set_within(self._wake, min(filter(None, waits_s), default=None))
 
     def _wirable(self) -> Iterator[_Wirable]:
+        """Yield the nodes that can be wired now, with what each lacks."""
         dead = self._system.dead()
         remote = {each.full_name for each in self._system.remote.values()}
         for name, wanted in self._instructions.items():
@@ -322,7 +327,7 @@ class ConnectionAuthority:
             configuration = self._others.get(name) if node is None else node.configuration
             if configuration is None or configuration.state not in (INACTIVE, ACTIVE):
                 continue
-            interface: NodeDriver | NodeInterfaceClient
+            interface: _Interface
             if node is None:
                 if name in remote:
                     continue
@@ -333,76 +338,64 @@ class ConnectionAuthority:
                 if not configuration.connected or node.core.base is Level.ACTIVE:
                     continue  # the latter is verified as it was found
                 interface = node.driver
-            wiring = self._wirings.setdefault(name, _Wiring())
-            yield _Wirable(interface, node, configuration, wanted, wiring)
+            wiring = self._wiring(name)
+            has = wired(configuration) if self._repairs or node is None else wiring.has
+            missing = steps(wanted, has, ours=wiring.ours)
+            yield _Wirable(interface, node, configuration.checksum, wiring, has, missing)
 
     async def _repair(self, one: _Wirable) -> float | None:
         """Wire a node that lacks something; return after how many seconds to try again."""
-        wiring, configuration = one.wiring, one.configuration
-        has = wired(configuration) if self._repairs or one.node is None else wiring.actual
-        missing = steps(one.wanted, has, ours=wiring.ours)
-        if not missing:
-            wiring.actual, wiring.error = has, ""
+        wiring = one.wiring
+        if not one.missing:
+            wiring.has, wiring.error = one.has, ""
+            return None
+        if wiring.given_up == one.checksum:
             return None
         now_s = asyncio.get_running_loop().time()
-        if wiring.given_up == configuration.checksum:
-            return None
         if wiring.given_up is not None or now_s - wiring.last_s > CALM_S:
             wiring.rounds, wiring.given_up = 0, None
         due_s = wiring.last_s + _backoff_s(wiring.rounds)
         if now_s < due_s:
             return due_s - now_s
-        self._say_lost(one.wanted.node, wiring, has)
+        self._say_lost(wiring, one.has)
         wiring.rounds += 1
-        wiring.last_s = now_s
-        wiring.actual = has
+        wiring.last_s, wiring.has, wiring.error = now_s, one.has, ""
         try:
-            await self._make(wiring, one.interface, missing, one.node)
+            await self._make(wiring, one.interface, one.missing, one.node)
         except BringUpError as error:
             wiring.error = error.message
-        else:
-            wiring.error = ""
         if wiring.rounds >= TRIES:
-            wiring.given_up = configuration.checksum
+            wiring.given_up = one.checksum
             return None
         # Also after a success: one that does not show in the node's own report is none.
         return _backoff_s(wiring.rounds)
 
-    def _say_lost(self, name: str, wiring: _Wiring, has: ActualState) -> None:
+    def _say_lost(self, wiring: _Wiring, has: Instructions) -> None:
         """Say what the node had been given and has no more."""
-        there = {connection for connection, _ in has.connections}
-        for connection, _ in wiring.actual.connections:
+        there, mapped, name = dict(has.connections), dict(has.mappings), has.node
+        for connection, _ in wiring.has.connections:
             if connection in wiring.ours and connection not in there:
                 self._system.emit(WiringLost(node=name, connection=connection))
-        mapped = dict(has.mappings)
-        for endpoint, connection in wiring.actual.mappings:
+        for endpoint, connection in wiring.has.mappings:
             if endpoint not in mapped and (connection in there or not connection):
                 self._system.emit(WiringLost(node=name, connection=connection, endpoint=endpoint))
 
     async def _make(
         self,
         wiring: _Wiring,
-        interface: NodeDriver | NodeInterfaceClient,
+        interface: _Interface,
         missing: Iterable[Command],
         node: NodeRun | None,
     ) -> None:
         """Make steps in order; the first that fails ends it."""
         for step in missing:
-            event = WiringChanged(
-                node=step.node,
-                operation=step.operation,
-                connection=step.connection,
-                endpoint=step.endpoint,
-                urls=step.connections.urls,
-                attempt=max(1, wiring.rounds),
-            )
             if node is not None:
                 node.wiring = str(step)
             self._making += 1
             try:
                 configuration = await interface.wire(step)
             except BringUpError as error:
-                self._system.emit(replace(event, error=error.message))
+                self._system.emit(_done(step, attempt=wiring.rounds, error=error.message))
                 raise
             finally:
                 self._making -= 1
@@ -413,13 +406,25 @@ class ConnectionAuthority:
             elif step.operation is Operation.DISCONNECT_FROM and step.connection in wiring.ours:
                 wiring.ours.remove(step.connection)
             if configuration is not None:
-                wiring.actual = wired(configuration)
+                wiring.has = wired(configuration)
                 if node is None:
                     self._others[configuration.name] = configuration
                 else:
                     node.learn(configuration)
-            self._system.emit(event)
+            self._system.emit(_done(step, attempt=wiring.rounds))
         self._system.touch()
+
+
+def _done(step: Command, *, attempt: int = 1, error: str = "") -> WiringChanged:
+    return WiringChanged(
+        node=step.node,
+        operation=step.operation,
+        connection=step.connection,
+        endpoint=step.endpoint,
+        urls=step.connections.urls,
+        attempt=max(1, attempt),
+        error=error,
+    )
 
 
 def _backoff_s(rounds: int) -> float:

@@ -1,14 +1,13 @@
-"""Desired state of one node's connections and mappings, and the steps that it still lacks.
+"""Connections and mappings of one node: those that it must have, has, and still lacks.
 
-Owns: `Instructions`, the connections and mappings that a node must have; `ActualState`, those that
-it has; and `steps`, the difference in the order in which it is made. Comparing the two makes one
-case of the first wiring, of a change and of making again what was lost. Pure.
+Owns: `Instructions`, and `steps`, the difference of two in the order in which it is made. Comparing
+them makes one case of the first wiring, of a change and of making again what was lost. Pure.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 
 import msgspec
 
@@ -21,7 +20,7 @@ from lifecycle.verify.verdict import Finding
 
 
 class Instructions(msgspec.Struct, frozen=True, kw_only=True):
-    """What one node must have.
+    """What one node must have, or what it has.
 
     Attributes:
         node: fully qualified name.
@@ -32,18 +31,6 @@ class Instructions(msgspec.Struct, frozen=True, kw_only=True):
 
     node: str
     connections: tuple[tuple[str, ParticipantConnections], ...] = ()
-    mappings: tuple[tuple[str, str], ...] = ()
-
-
-class ActualState(msgspec.Struct, frozen=True, kw_only=True):
-    """What one node has.
-
-    Attributes:
-        connections: (name, its URLs as text).
-        mappings: (endpoint, name of its connection).
-    """
-
-    connections: tuple[tuple[str, tuple[str, ...]], ...] = ()
     mappings: tuple[tuple[str, str], ...] = ()
 
 
@@ -67,11 +54,12 @@ def planned_instructions(node: PlannedNode) -> Instructions:
     )
 
 
-def wired(configuration: NodeConfiguration) -> ActualState:
+def wired(configuration: NodeConfiguration) -> Instructions:
     """Return what a node says that it has; what it could not make it has not."""
-    return ActualState(
+    return Instructions(
+        node=configuration.name,
         connections=tuple(
-            (each.name, each.urls)
+            (each.name, ParticipantConnections(urls=each.urls))
             for each in configuration.connections
             if each.name and not each.error
         ),
@@ -84,7 +72,7 @@ def wired(configuration: NodeConfiguration) -> ActualState:
 
 
 def steps(
-    wanted: Instructions, has: ActualState, *, ours: Collection[str] = ()
+    wanted: Instructions, has: Instructions, *, ours: Collection[str] = ()
 ) -> tuple[Command, ...]:
     """Return what is missing, in the order in which it is made: make before break.
 
@@ -96,17 +84,16 @@ def steps(
         ours: names of connections that this authority made; others are not its to break.
     """
     step = functools.partial(Command, node=wanted.node)
-    connections = dict(has.connections)
+    connections, mappings = dict(has.connections), dict(has.mappings)
     made: list[Command] = []
     stale: set[str] = set()
     for name, how in wanted.connections:
-        if connections.get(name) == how.urls:
-            continue
         if name in connections:
+            if connections[name].urls == how.urls:
+                continue
             stale.add(name)
             made.append(step(operation=Operation.DISCONNECT_FROM, connection=name))
         made.append(step(operation=Operation.CONNECT_TO, connection=name, connections=how))
-    mappings: Mapping[str, str] = dict(has.mappings)
     for endpoint, name in wanted.mappings:
         if name in stale or mappings.get(endpoint) != name:
             made.append(step(operation=Operation.MAP_TO, connection=name, endpoint=endpoint))

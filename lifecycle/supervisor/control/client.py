@@ -130,9 +130,9 @@ def down(path: Path, timeout_s: float) -> ExitCode:
         ProgrammingError: nothing runs, but something of it could not be removed from a network.
     """
     deadline = time.monotonic() + timeout_s
-    answer = _asked(path, Question(ask=ControlRequest.DOWN), timeout_s, Answer)
     patience = time.monotonic() + _STARTS_S
-    while answer is None and is_held(path):
+    question, left_s = Question(ask=ControlRequest.DOWN), timeout_s
+    while (answer := _asked(path, question, left_s, Answer)) is None and is_held(path):
         # It is just starting, and will listen; or ending, and does so no more.
         if time.monotonic() > deadline:
             raise TimeoutError
@@ -141,10 +141,9 @@ def down(path: Path, timeout_s: float) -> ExitCode:
             patience = deadline
         time.sleep(_ASKED_AGAIN_S)
         left_s = max(_ASKED_AGAIN_S, deadline - time.monotonic())
-        answer = _asked(path, Question(ask=ControlRequest.DOWN), left_s, Answer)
-    if answer is not None and answer.exit_code is None:
-        raise strange(path / _SOCKET, "it has no exit code")
     if answer is not None:
+        if answer.exit_code is None:
+            raise strange(path / _SOCKET, "it has no exit code")
         # It has answered already, and is about to let go of its directory.
         while is_held(path):
             if time.monotonic() > deadline:

@@ -17,6 +17,7 @@ from msgspec.structs import replace
 
 from lifecycle.codec import to_json
 from lifecycle.errors import ExitCode, MiddlewareError
+from lifecycle.graph.loop import set_within
 from lifecycle.manifest.model import Policy, RosInterfaceAccess
 from lifecycle.manifest.names import supervisor_prefix, supervisor_services
 from lifecycle.supervisor.control.protocol import ControlRequest, NodeStatus, SystemStatus
@@ -77,47 +78,41 @@ class RosInterface:
         self._supervisor = supervisor
         self._machine = min(supervisor.system.machines or ("",))
         self._offer: RosEntities | None = None
-        self._due: asyncio.TimerHandle | None = None
+        self._active = asyncio.Event()
+        self._changed = asyncio.Event()
+        self._ends = False
         self._rules: set[str] = set()
         self._published: SystemStatus | None = None
-        self._hurries = False
-
-    def begin(self) -> None:
-        """Wait from now on for the system to be active, or its bring-up to take long."""
-        if self._supervisor.system.plan.policy.access is not RosInterfaceAccess.OFF:
-            self._in(BRINGS_UP_S, self._open)
 
     def on_event(self, event: Event) -> None:
-        """Publish what changed; a listener of the run."""
-        if self._offer is not None:
-            if not self._hurries:
-                self._hurries = True  # changes come in bursts
-                self._in(_BURST_S, self._publish)
-        elif isinstance(event, Stopping):
-            self._stop()
-        elif isinstance(event, SystemReached) and event.reached == "active" and self._due:
-            self._in(AFTER_ACTIVE_S, self._open)
+        """Note that there is something new to publish; a listener of the run."""
+        self._changed.set()
+        if isinstance(event, SystemReached) and event.reached == "active":
+            self._active.set()
+        self._ends = self._ends or isinstance(event, Stopping)
+
+    async def follow(self) -> None:
+        """Offer it as soon as it is time, and publish what changes, until this is cancelled."""
+        if self._supervisor.system.plan.policy.access is RosInterfaceAccess.OFF:
+            return
+        if await set_within(self._active, BRINGS_UP_S):
+            await asyncio.sleep(AFTER_ACTIVE_S)
+        if not self._ends:
+            self._open()
+        while self._offer is not None:
+            self._changed.clear()
+            self._say(self._offer)
+            if await set_within(self._changed, EACH_S):
+                await asyncio.sleep(_BURST_S)  # changes come in bursts
 
     def close(self) -> None:
         """Publish a last time, and offer nothing any more; again is harmless."""
-        self._stop()
         offer, self._offer = self._offer, None
         if offer is not None:
             self._say(offer)
             offer.destroy()
 
-    def _in(self, wait_s: float, do: Callable[[], None]) -> None:
-        """Do something later, in place of what was to be done."""
-        self._stop()
-        self._due = asyncio.get_running_loop().call_later(wait_s, do)
-
-    def _stop(self) -> None:
-        if self._due is not None:
-            self._due.cancel()
-            self._due = None
-
     def _open(self) -> None:
-        self._due = None
         loop, system = asyncio.get_running_loop(), self._supervisor.system
 
         def called(name: str, answer: Answer) -> None:
@@ -138,14 +133,6 @@ class RosInterface:
                 "'policy: {ros_interface: off}' does not try"
             )
             system.emit(Notice(message=why))
-        else:
-            self._publish()
-
-    def _publish(self) -> None:
-        if self._offer is not None:
-            self._hurries = False
-            self._say(self._offer)
-            self._in(EACH_S, self._publish)
 
     def _say(self, offer: RosEntities) -> None:
         seen = self._supervisor.look()

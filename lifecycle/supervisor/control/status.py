@@ -6,6 +6,7 @@ Owns: how a status is drawn from the running system and its last verdict. Must n
 from __future__ import annotations
 
 import datetime as dt
+import os
 from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
@@ -35,17 +36,7 @@ def process_state(run: Run, process: Process) -> ProcessState:
     return ProcessState.BACKOFF if process.failed and not run.ending else ProcessState.EXITED
 
 
-def node_status(
-    system: System, node: NodeRun, *, elapsed_s: float, began_at: dt.datetime
-) -> NodeStatus:
-    """Return what is known of one node.
-
-    Args:
-        system: whose it is.
-        node: which.
-        elapsed_s: seconds since the supervisor started.
-        began_at: when it did.
-    """
+def _node_status(system: System, node: NodeRun, elapsed_s: float) -> NodeStatus:
     run, verdict = system.run, system.run.judged.verdict
     process, known = node.process, run.processes.get(node.core.process)
     runs = known is not None and known.is_alive and process is not None and process.pid != 0
@@ -61,7 +52,8 @@ def node_status(
     external = node.planned.run.kind is RunKind.ATTACH
     last = None if known is None or not known.failures else known.failures[-1]
     if last is not None:
-        at = began_at + dt.timedelta(seconds=last.elapsed_s)
+        ago = dt.timedelta(seconds=elapsed_s - last.elapsed_s)
+        at = dt.datetime.now(dt.timezone.utc) - ago
         last = replace(last, at=at.isoformat(timespec="milliseconds"))
     due_s = node.core.due_s - elapsed_s
     return NodeStatus(
@@ -156,24 +148,21 @@ def _died(run: Run, process: Process | None, pid: int) -> str:
     return f"pid {pid} died: {process.end.text}"
 
 
-def system_status(system: System, *, supervisor: int, elapsed_s: float, ends: str) -> SystemStatus:
+def system_status(system: System) -> SystemStatus:
     """Return what is known of the whole system, with what its processes use now."""
-    verdict = system.run.judged.verdict
-    began_at = dt.datetime.now(dt.timezone.utc) - dt.timedelta(seconds=elapsed_s)
+    run, elapsed_s = system.run, system.emit.elapsed_s
+    verdict = run.judged.verdict
     return SystemStatus(
-        system=system.plan.system,
-        domain_id=system.plan.domain_id,
-        phase=phase_of(system.run),
+        system=run.plan.system,
+        domain_id=run.plan.domain_id,
+        phase=phase_of(run),
         verdict=None if verdict is None else verdict.verdict,
-        supervisor=supervisor,
+        supervisor=os.getpid(),
         elapsed_s=elapsed_s,
-        nodes=tuple(
-            node_status(system, node, elapsed_s=elapsed_s, began_at=began_at)
-            for node in system.nodes.values()
-        ),
+        nodes=tuple(_node_status(system, node, elapsed_s) for node in system.nodes.values()),
         not_ok="" if verdict is None else not_ok(verdict),
-        mode=system.run.mode,
-        manifest=system.first.manifest_path,
-        revision=system.run.revision,
-        ends=ends,
+        mode=run.mode,
+        manifest=run.first.manifest_path,
+        revision=run.revision,
+        ends="" if run.ending is None else run.ending.why,
     )

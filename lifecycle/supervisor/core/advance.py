@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from lifecycle.manifest.model import Condition, RunKind, Supervision
+from lifecycle.manifest.model import Condition, Restart, RunKind, Supervision
 from lifecycle.supervisor.control.protocol import ControlRequest, ProcessState
 from lifecycle.supervisor.core import effects, gate
 from lifecycle.supervisor.core.state import (
@@ -60,9 +60,9 @@ def wanted(run: Run, node: Node) -> Level:
     if (
         run.ending is not None
         or node.renew
-        or node.due_s > run.now_s
+        or not run.is_past(node.due_s)
         or (process is not None and process.stays_down)
-        or (change is not None and not change.taken and node.key in change.down)
+        or (change is not None and node.key in change.down)
     ):
         return Level.DOWN
     top = node.levels[-1]
@@ -164,8 +164,8 @@ def is_awaited(run: Run) -> bool:
 def is_at_gate(run: Run) -> bool:
     """Return whether all nodes but those in backoff are where they can be without the gate."""
     return not any(
-        is_walking(run, each) for each in run.nodes.values() if each.due_s <= run.now_s
-    ) and not any(each.is_alive and _is_to_end(run, each) for each in run.processes.values())
+        is_walking(run, each) for each in run.nodes.values() if run.is_past(each.due_s)
+    ) and not any(each.is_alive and is_to_end(run, each) for each in run.processes.values())
 
 
 def waiting(run: Run) -> tuple[str, ...]:
@@ -181,22 +181,6 @@ def stage_of(run: Run) -> Stage:
     """Return what the system is judged as now."""
     passed = run.furthest == "active" or run.passage is not None
     return Stage.ACTIVE if passed and not run.paused and _is_whole(run) else Stage.CONNECTED
-
-
-def away(run: Run) -> frozenset[str]:
-    """Return the full names of the nodes that are not as far as their manifest has them."""
-    return frozenset(
-        each.name
-        for each in run.nodes.values()
-        if each.level < each.levels[-1] or each.renew or each.due_s > run.now_s
-    )
-
-
-def ahead(run: Run) -> frozenset[str]:
-    """Return the full names of the nodes that may be active before the gate opens for others."""
-    return frozenset(
-        each.name for each in run.nodes.values() if each.let_through or each.level is Level.ACTIVE
-    )
 
 
 def advance(run: Run) -> list[effects.Effect]:
@@ -217,8 +201,11 @@ def advance(run: Run) -> list[effects.Effect]:
             found.append(_ask(run, node, step))
     found += _parameters(run)
     found += _gate(run)
-    if (at_s := wakes_at_s(run)) < NEVER_S:
-        found.append(effects.Wake(at_s=at_s))
+    for node in run.nodes.values():
+        if node.request is not None:  # if it is late now, only a tick says so
+            run.wakes_at(late_at_s(node.request))
+    if run.wake_s < NEVER_S:
+        found.append(effects.Wake(at_s=run.wake_s))
     return found
 
 
@@ -248,8 +235,7 @@ def _step_up(run: Run, node: Node) -> Step | None:
     if target is Level.ACTIVE:
         passage = run.passage
         passes = passage is not None and passage.opened and node.key in passage.waiting
-        change = run.change is not None and not run.change.taken
-        if not passes or change or run.switch is not None or not gate.is_open(run):
+        if not passes or run.is_changing or run.switch is not None or not gate.is_open(run):
             return None
     if target is Level.CONNECTED and run.options.wires and not node.wired:
         return Step.WIRE
@@ -325,12 +311,18 @@ def _ask(run: Run, node: Node, step: Step) -> effects.Ask:
     return effects.Ask(node=node.key, step=step, number=run.requests, mark=run.mark)
 
 
+def late_at_s(request: Request) -> float:
+    """Return when a request is late: its process's time without a processor does not count."""
+    waited_s = min(request.waited_s, 9 * request.limit_s)
+    return request.since_s + request.limit_s + request.own_s + waited_s
+
+
 # Processes
 
 
-def _is_to_end(run: Run, process: Process) -> bool:
-    members = [*run.nodes_of(process.name)]
-    return not any(wanted(run, each) for each in members)
+def is_to_end(run: Run, process: Process) -> bool:
+    """Return whether all nodes of a process are to be down."""
+    return not any(wanted(run, each) for each in run.nodes_of(process.name))
 
 
 def _process(run: Run, process: Process) -> Iterator[effects.Effect]:
@@ -343,18 +335,26 @@ def _process(run: Run, process: Process) -> Iterator[effects.Effect]:
             process.state, process.end = ProcessState.STARTING, None
             process.started(run.now_s)
             yield effects.Spawn(process=process.name)
-    elif process.barks and SIGKILL not in process.sent:
-        process.sent = [*process.sent, SIGKILL]
+    elif SIGKILL not in process.sent and run.is_past(_barks_at_s(process)):
+        process.barks, process.sent = True, [*process.sent, SIGKILL]
         yield effects.Signal(process=process.name, number=SIGKILL)
-    elif process.pid and _is_to_end(run, process):
+    elif process.pid and is_to_end(run, process):
         yield from _end(run, process)
 
 
 def _may_be_spawned(run: Run, process: Process) -> bool:
     members = [*run.nodes_of(process.name)]
-    if run.fails_s < NEVER_S or _is_to_end(run, process):
+    if run.fails_s < NEVER_S or is_to_end(run, process):
         return False
     return not any(holds_up(run, each, Level.STARTED) for each in members)
+
+
+def _barks_at_s(process: Process) -> float:
+    """Return when the watchdog of a process ends it; NEVER_S while it does not hang."""
+    how: Supervision = process.supervision
+    if process.hangs_s is None or not how.watchdog_sec or how.restart is Restart.NO:
+        return NEVER_S
+    return process.hangs_s + how.watchdog_sec
 
 
 def _end(run: Run, process: Process) -> Iterator[effects.Signal]:
@@ -367,7 +367,7 @@ def _end(run: Run, process: Process) -> Iterator[effects.Signal]:
         if busy or any(_waits_for_dependents(run, each, Level.DOWN) for each in members):
             return
     hurried = run.hurry and SIGKILL not in process.sent
-    if process.asked >= 0 and run.now_s < process.asked_until_s and not hurried:
+    if process.asked >= 0 and not hurried and not run.is_past(process.asked_until_s):
         return
     process.asked = min(process.asked + 1, len(escalation) - 1)
     if hurried:
@@ -375,6 +375,7 @@ def _end(run: Run, process: Process) -> Iterator[effects.Signal]:
     process.state = ProcessState.STOPPING
     number, wait_s = escalation[process.asked]
     process.asked_until_s = run.now_s + wait_s
+    run.wakes_at(process.asked_until_s)
     process.sent = [*process.sent, number]
     yield effects.Signal(process=process.name, number=number)
 
@@ -424,72 +425,16 @@ def _gate(run: Run) -> Iterator[effects.Effect]:
     if run.ending is not None:
         return
     judged, passage = run.judged, run.passage
-    programs = passage is not None and not (passage.programmed or passage.programming)
+    programs = passage is not None and passage.flows is None
     if programs and gate.is_open(run) and passage and judged.verdict:
         run.requests += 1
-        passage.programming, passage.flows = True, judged.verdict.flows
-        passage.number = run.requests
+        passage.programming, passage.flows = run.requests, judged.verdict.flows
         yield effects.Program(verdict=judged.verdict, number=run.requests)
     # A loop that looks while its nodes are on their way would look at each step of each.
-    active = any(each.level is Level.ACTIVE for each in run.nodes.values())
-    due = not gate.is_latest(run) or judged.again_s <= run.now_s
-    watched = active and run.held_s is not None
-    if due and not judged.looking and (watched or is_at_gate(run)):
+    due = not gate.is_latest(run) or run.is_past(judged.again_s)
+    if due and not judged.looking and (run.is_watched or is_at_gate(run)):
         judged.looking, judged.again_s = True, NEVER_S
         yield effects.Look(mark=run.mark)
-
-
-# Time
-
-
-def late_at_s(request: Request, waited_s: float | None = None) -> float:
-    """Return when a request is late: its process's time without a processor does not count.
-
-    Args:
-        request: which.
-        waited_s: that time, seconds; what is known of it if left out.
-    """
-    waited_s = request.waited_s if waited_s is None else waited_s
-    return request.since_s + request.limit_s + request.own_s + min(waited_s, 9 * request.limit_s)
-
-
-def barks_at_s(process: Process) -> float:
-    """Return when the watchdog of a process ends it; NEVER_S while it does not hang."""
-    how: Supervision = process.supervision
-    watched = how.watchdog_sec and how.restart.value != "no" and process.is_alive
-    if process.hangs_s is None or not watched or process.barks:
-        return NEVER_S
-    return process.hangs_s + how.watchdog_sec
-
-
-def wakes_at_s(run: Run) -> float:
-    """Return when something is to be done although nothing happens; NEVER_S if nothing is."""
-    now_s = run.now_s
-    late = [late_at_s(each.request) for each in run.nodes.values() if each.request is not None]
-    if any(each <= now_s for each in late):
-        return now_s  # only a tick says so
-    times = [*late, *(each.due_s for each in run.nodes.values())]
-    times += [each.asked_until_s for each in run.processes.values() if each.is_alive]
-    times += map(barks_at_s, run.processes.values())
-    if run.ending is None:
-        times += [run.judged.again_s, run.fails_s, gate.counts_at_s(run.judged, now_s)]
-        times += (since_s + gate.SETTLED_S for since_s in run.judged.asked.values())
-        for each in (run.attempt, run.passage):
-            if each is not None:
-                times += [each.until_s, gate.refuses_at_s(run, each.until_s)]
-                times.append(each.until_s + gate.LEAST_S)
-        if run.attempt is not None and not run.attempt.said:
-            times.append(run.attempt.since_s + gate.SAY_S)
-        if run.passage is not None:
-            times.append(run.passage.late_s)
-        if run.waits_s is not None and not run.said:
-            times.append(gate.refuses_at_s(run, run.waits_s + run.options.timeout_s))
-        if run.change is not None:
-            times.append(run.change.until_s)
-        if run.held_s is not None and run.options.hold_s is not None:
-            over_s = run.held_s + run.options.hold_s
-            times += [over_s, over_s + NOTICE_S, over_s + GLANCE_S]
-    return min((each for each in times if each > now_s), default=NEVER_S)
 
 
 def phase_of(run: Run) -> str:
@@ -510,6 +455,14 @@ def phase_of(run: Run) -> str:
         (_is_whole(run), "active"),
     )
     return next((name for holds, name in found if holds), "held")
+
+
+def rests_as(run: Run) -> str:
+    """Return what a system that was up is, whatever its policy starts again meanwhile."""
+    if run.paused:
+        return "paused"
+    kept = any(each.withheld or each.refused for each in run.nodes.values())
+    return "held" if kept or waiting(run) else "active"
 
 
 def _is_whole(run: Run) -> bool:

@@ -16,7 +16,7 @@ from lifecycle.plan.change import PlanChange, change_between
 from lifecycle.plan.comparison import difference_lines
 from lifecycle.plan.model import Plan, PlannedNode, in_mode
 from lifecycle.supervisor.control.protocol import ChangedNodes
-from lifecycle.supervisor.core.advance import is_settled_down, phase_of, waiting
+from lifecycle.supervisor.core.advance import is_settled_down, phase_of, rests_as
 from lifecycle.supervisor.core.state import (
     Attempt,
     Change,
@@ -42,7 +42,7 @@ def enter_mode(run: Run, mode: str, *, back: bool = False) -> list[Event]:
     """Have nodes be as a mode says: what it keeps inactive goes down first, without a gate."""
     active = frozenset(key for key, each in run.nodes.items() if each.is_gated)
     had = {key: each.planned.expected_parameters for key, each in run.nodes.items()}
-    run.switch = Switch(mode=mode, before=run.mode, active=active, back=back)
+    run.switch = Switch(before=run.mode, active=active, back=back)
     run.mode, run.plan = mode, in_mode(run.plan, mode)
     for key, node in run.nodes.items():
         node.planned = run.plan.node(key)
@@ -78,7 +78,7 @@ def settle_mode(run: Run) -> list[Event]:
     run.switch = None
     inactive = [each for each in run.plan.nodes if each.state is TargetState.INACTIVE]
     entered = ModeEntered(
-        mode=switch.mode,
+        mode=run.mode,
         before=switch.before,
         inactive=tuple(each.full_name for each in inactive if each.key in run.nodes),
         parameters=switch.given,
@@ -109,7 +109,7 @@ def apply(run: Run, order: Order) -> list[Event]:
     failed = {
         key
         for key, each in run.nodes.items()
-        if each.due_s > run.now_s or _stays_down(run.process_of(each))
+        if not run.is_past(each.due_s) or _stays_down(run.process_of(each))
     }
     again = {*change.removed, *change.restarted, *(failed & known)}
     down = run.whole(again)
@@ -218,8 +218,7 @@ def _take(run: Run, change: Change) -> None:
     for key in change.touched & run.nodes.keys():
         process = run.processes.get(run.nodes[key].process)
         if process is not None and process.state is None:
-            process.by_hand, process.failed, process.away_s = True, False, None
-            process.stays_down = False
+            process.restarted_by_hand()
     change.taken, change.down = True, set()
     run.came = bool(change.touched)
     run.changed()
@@ -253,7 +252,7 @@ def _finish(run: Run, change: Change) -> list[Event]:
     run.change = None
     run.answer(change.code, text)
     if change.ends:
-        run.failures, run.fails_s = [*run.failures, *change.ends], run.now_s
+        run.fails_now(*change.ends)
     return events
 
 
@@ -264,8 +263,7 @@ def undone(run: Run, change: Change) -> str:
     if ends := [*change.ends, *run.failures]:
         why = "; ".join(each.message for each in ends)
         return f"{text}cannot go back to {before}: {why}; the system is taken down"
-    kept = any(each.withheld or each.refused for each in run.nodes.values())
-    now = "paused" if run.paused else "held" if kept or waiting(run) else "active"
+    now = rests_as(run)
     how = f"{now} and verified"
     if change.again:
         how = f"and what failed meanwhile is started again as its policy says: {change.again}"
@@ -279,9 +277,7 @@ def undone(run: Run, change: Change) -> str:
 
 def change_to(run: Run, plan: Plan) -> PlanChange:
     """Return what another manifest is for what runs; it stays in its mode, if that has it."""
-    modes = [each.name for each in plan.modes]
-    then = run.mode if run.mode in modes else next(iter(modes), "")
-    return change_between(run.first, plan, modes=(run.mode, then))
+    return change_between(run.first, plan, modes=(run.mode, run.mode_by(plan)))
 
 
 def changed_nodes(change: PlanChange, running: Plan, plan: Plan, revision: int) -> ChangedNodes:

@@ -8,7 +8,6 @@ from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import BY_DEFAULT, Consequence, OnViolation, Reaction, Restart
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.core import gate
-from lifecycle.supervisor.core.advance import away
 from lifecycle.supervisor.core.change import enter_mode
 from lifecycle.supervisor.core.failure import stop
 from lifecycle.supervisor.core.state import Level, Run
@@ -49,7 +48,7 @@ def settle_consequences(run: Run) -> list[Event]:
         return []
     if busy or run.options.until < Level.ACTIVE:
         return []
-    verdict = gate.of_those_there(run, gate.without(run, verdict, away(run) | run.judged.away))
+    verdict = gate.of_those_there(run, gate.without(run, verdict, run.away | run.judged.away))
     run.judged.tried &= {each.key for each in verdict.findings}
     coming = _coming_elsewhere(run, verdict.findings)
     asked: dict[FindingKey, tuple[Consequence, Finding, tuple[str, ...], str]] = {}
@@ -58,9 +57,9 @@ def settle_consequences(run: Run) -> list[Event]:
         if each.outcome is Outcome.VIOLATED and due and coming.isdisjoint(each.nodes):
             asked[each.key] = due
     run.judged.asked = {key: run.judged.asked.get(key, run.now_s) for key in asked}
-    until_s = gate.holds_until_s(run)
+    since_s = run.judged.asked
     lasting = [
-        due for key, due in asked.items() if until_s - run.judged.asked[key] >= gate.SETTLED_S
+        due for key, due in asked.items() if gate.lasts_until(run, since_s[key] + gate.SETTLED_S)
     ]
     if not lasting:
         return []

@@ -44,7 +44,7 @@ class Ask(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Look(msgspec.Struct, frozen=True, kw_only=True):
-    """Observe and judge; `Verified` with the same mark."""
+    """Observe and judge; `Verified`, with the mark at which it began: this one, or a later one."""
 
     mark: int
 

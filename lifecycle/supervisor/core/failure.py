@@ -17,7 +17,7 @@ from lifecycle.supervisor.core import gate
 from lifecycle.supervisor.core.advance import holds_up, phase_of, wanted
 from lifecycle.supervisor.core.change import go_back, undone
 from lifecycle.supervisor.core.inputs import Exited
-from lifecycle.supervisor.core.restart import RestartPolicy, group_of
+from lifecycle.supervisor.core.restart import RestartPolicy, is_restarted
 from lifecycle.supervisor.core.state import (
     NEVER_S,
     UP,
@@ -102,7 +102,9 @@ def death(run: Run, process: Process, given: Exited) -> list[Failure]:
     while_ = doing(run, node) if node is not None else ""
     what = f"process {name!r}" if node is None else repr(name)
     while_ = f" while {while_}" if while_ else ""
-    why = f": {process.why}" if process.why else ""
+    hangs = next((each.hangs for each in members if each.hangs and process.barks), "")
+    after_s = process.supervision.watchdog_sec
+    why = f": its watchdog ended it after {after_s:g} s, because {hangs}" if hangs else ""
     words = f": {given.words}" if given.words else ""
     end = f"{given.text}{_not_run(process, given)}"
     text = f"cannot keep {what} running: pid {process.pid} died{while_}: {end}{words}{why}"
@@ -126,7 +128,7 @@ def forced(process: Process) -> Event:
 
 def activated(node: Node) -> Event:
     """Return what is said of a node that the gate has not let through, and that is active."""
-    text = f"{node.name!r} was activated by its own code or another client while the gate is closed"
+    text = f"{node.name!r} {gate.BY_ITSELF}"
     tries = gate.GUARD_TRIES
     if node.guarded < tries:
         return Notice(message=f"{text}: it is deactivated")
@@ -244,8 +246,7 @@ def _fails_in_change(run: Run, failure: Failure, end: Exited | None) -> list[Eve
 def _is_covered(process: Process | None, end: Exited | None) -> bool:
     if process is None or process.stays_down:
         return False
-    policy = RestartPolicy(process.supervision, 0.0)
-    return policy.takes(exit_status=None if end is None else end.status)
+    return is_restarted(process.supervision, None if end is None else end.status)
 
 
 def goes_on(failure: Failure) -> Failure:
@@ -271,7 +272,6 @@ def _cut_short(run: Run, failure: Failure) -> None:
 def _back_off(run: Run, process: Process, failure: Failure, end: Exited | None) -> list[Event]:
     """Have a process, and what goes down with it, started again later; or give it up."""
     process.failures = [*process.failures, _remembered(run, failure, end)][-_REMEMBERED:]
-    process.why = ""
     was_up = run.held_s is not None
     policy = process.policy = process.policy or RestartPolicy(process.supervision, run.now_s)
     due_s = policy.failed(run.now_s, was_up=was_up)
@@ -279,10 +279,9 @@ def _back_off(run: Run, process: Process, failure: Failure, end: Exited | None) 
     if due_s is None:
         history = tuple(process.failures)
         events.append(GaveUp(process=process.name, restarts=process.restarts, history=history))
-        run.failures = [*run.failures, _given_up(process, failure, was_up=was_up)]
-        run.fails_s = run.now_s
+        run.fails_now(_given_up(process, failure, was_up=was_up))
         return events
-    keys = group_of((each.planned for each in run.nodes.values()), process.name)
+    keys = run.group(process.name)
     for key in keys:
         node = run.nodes[key]
         node.renew, node.due_s = True, max(node.due_s, due_s)
@@ -326,65 +325,71 @@ def _given_up(process: Process, failure: Failure, *, was_up: bool) -> Failure:
         f"cannot keep {process.name!r} running: it was started {burst} time{'s' * (burst != 1)} "
         f"{within} (start_limit_burst, start_limit_interval_sec) and failed again: {lines}"
     )
-    return Failure(
-        rule=GAVE_UP.id,
-        subject=failure.subject,
-        message=text,
-        process=process.name,
-        log=failure.log,
-    )
+    return replace(failure, rule=GAVE_UP.id, message=text, process=process.name)
 
 
 # The end
 
 
-def end(run: Run, ending: Ending) -> list[Event]:
-    """End the run: from now on everything is to be down. Whatever is open is answered."""
+def end(
+    run: Run,
+    code: ExitCode,
+    stopping: str,
+    reason: str,
+    *,
+    failures: tuple[Failure, ...] = (),
+    failed: bool = False,
+) -> list[Event]:
+    """End the run: from now on everything is to be down. Whatever is open is answered.
+
+    Args:
+        run: see above.
+        code: of the run, as far as nothing dies on the way down.
+        stopping: why, in short.
+        reason: why, as the report has it.
+        failures: that end it.
+        failed: nobody asked for it.
+    """
     if run.ending is not None:
         return []
-    run.ending, ending.deaths = ending, len(run.deaths)
-    change = run.change
+    run.ending = Ending(
+        code=code,
+        stopping=stopping,
+        reason=_also(run, reason),
+        failures=failures,
+        failed=failed,
+        deaths=len(run.deaths),
+    )
+    change, run.undone = run.change, None
     run.attempt = run.passage = run.switch = run.change = None
-    open_ = [*([run.order] if run.order is not None else []), *run.orders]
     text = f"cannot go on: {run.plan.system!r} is being taken down"
-    said = "; ".join(each.message for each in ending.failures) or text
-    if change is not None and change.back and ending.failures:
+    said = "; ".join(each.message for each in failures) or text
+    if change is not None and change.back and failures:
         said = undone(run, change)
-    for order in open_:
-        own = order is run.order and bool(ending.failures)
-        run.outbox = [*run.outbox, (order.id, ExitCode.BRING_UP_FAILED, said if own else text)]
-    run.order, run.ready = None, None
+    run.answer(ExitCode.BRING_UP_FAILED, said)
+    run.outbox += [(each.id, ExitCode.BRING_UP_FAILED, text) for each in run.orders]
     run.orders.clear()
-    return [*ending.failures, Stopping(reason=ending.stopping)]
+    return [*failures, Stopping(reason=stopping)]
 
 
 def end_failed(run: Run) -> list[Event]:
     """End the run for what failed."""
     gave_up = any(each.rule == GAVE_UP.id for each in run.failures)
     code = ExitCode.SUPERVISION_GAVE_UP if gave_up else ExitCode.BRING_UP_FAILED
-    reason = _also(run, _named(run.failures))
-    ending = Ending(
-        code=code,
-        stopping="rolling back",
-        reason=reason,
-        failures=tuple(run.failures),
-        failed=True,
-    )
-    return end(run, ending)
+    failures, reason = tuple(run.failures), _named(run.failures)
+    return end(run, code, "rolling back", reason, failures=failures, failed=True)
 
 
 def end_refused(run: Run, verdict: Verdict, stopping: str) -> list[Event]:
     """End the run because the gate stays closed."""
-    reason = _also(run, f"{stopping}; {not_ok(verdict) or verdict.verdict.value}")
-    code = gate.exit_code(verdict)
-    return end(run, Ending(code=code, stopping=stopping, reason=reason, failed=True))
+    reason = f"{stopping}; {not_ok(verdict) or verdict.verdict.value}"
+    return end(run, gate.exit_code(verdict), stopping, reason, failed=True)
 
 
 def end_done(run: Run) -> list[Event]:
     """End a run that was held for as long as was asked."""
     code, why = _outcome(run, run.judged.counted)
-    reason = f"done, but {why}" if why else "done"
-    return end(run, Ending(code=code, stopping="done", reason=_also(run, reason)))
+    return end(run, code, "done", f"done, but {why}" if why else "done")
 
 
 def stop(run: Run, reason: str, code: ExitCode) -> list[Event]:
@@ -407,8 +412,7 @@ def stop(run: Run, reason: str, code: ExitCode) -> list[Event]:
             code, why = asked, f"the system was {phase_of(run)}, not active"
         elif code is ExitCode.OK and run.judged.counted:
             why = f"violated meanwhile, {run.judged.counted}"
-    text = f"{reason}; {why}" if why else reason
-    return end(run, Ending(code=code, stopping=reason, reason=_also(run, text)))
+    return end(run, code, reason, f"{reason}; {why}" if why else reason)
 
 
 def _is_kept(run: Run) -> bool:
@@ -499,9 +503,3 @@ def fail_late(run: Run, limit_s: float) -> list[Event]:
     if run.attempt is not None:
         run.attempt.until_s = NEVER_S if run.failures else run.now_s + limit_s
     return events
-
-
-def fail_for_good(run: Run, failure: Failure) -> list[Event]:
-    """Fail the run whatever is to be kept going: nothing can be started any more."""
-    run.failures, run.fails_s = [*run.failures, failure], run.now_s
-    return []

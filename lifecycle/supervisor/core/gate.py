@@ -14,14 +14,13 @@ from msgspec.structs import replace
 from lifecycle.errors import ExitCode
 from lifecycle.supervisor.core.inputs import Verified
 from lifecycle.supervisor.core.state import NEVER_S, Judged, Level, Node, Run
-from lifecycle.supervisor.run.events import Event, VerdictChanged
 from lifecycle.verify.judge import not_ok, with_findings, with_only
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import rule
 from lifecycle.verify.rules.catalogue import Heals
 from lifecycle.verify.rules.nodes import UNATTRIBUTED_ENDPOINT
 from lifecycle.verify.rules.state import ACTIVATED_AT_CLOSED_GATE, MISSING_REPORT
-from lifecycle.verify.verdict import Finding, FindingKey, Stage, Verdict
+from lifecycle.verify.verdict import Finding, FindingKey, Verdict
 
 SETTLED_S = 0.5
 """A finding that time does not heal counts once it is unchanged for so long."""
@@ -40,6 +39,8 @@ LASTS_S = 1.0
 
 SAY_S = 2.0
 """A gate that stays closed for so long says what it waits for, and until when."""
+
+BY_ITSELF = "was activated by its own code or another client while the gate is closed"
 
 ACTIVATES_ITSELF = (
     "leave its activation to the supervisor: remove trigger_activate or change_state from its "
@@ -104,9 +105,9 @@ def is_latest(run: Run) -> bool:
     return run.judged.mark == run.mark
 
 
-def holds_until_s(run: Run) -> float:
-    """Return until when what was found is known to be so: what changed since may have mended it."""
-    return run.now_s if is_latest(run) else run.judged.seen_s
+def lasts_until(run: Run, at_s: float) -> bool:
+    """Return whether what was found was so until then: what changed since may have mended it."""
+    return run.judged.seen_s >= at_s or (is_latest(run) and run.is_past(at_s))
 
 
 def refuses_at_s(run: Run, until_s: float) -> float:
@@ -123,39 +124,32 @@ def refuses_at_s(run: Run, until_s: float) -> float:
         return until_s  # what speaks against it is being mended
     if any(each.guarded > GUARD_TRIES for each in run.nodes.values()):
         return run.now_s
-    if any(each.due_s > run.now_s for each in run.nodes.values()):
+    if not all(run.is_past(each.due_s) for each in run.nodes.values()):
         return until_s  # what comes again may mend it
     over_s = judged.since_s + patience_s(judged.verdict)
     lasts = is_latest(run) or judged.seen_s >= over_s
     return min(until_s, over_s) if lasts else until_s
 
 
-def take_verdict(run: Run, given: Verified, away: Collection[str], stage: Stage) -> list[Event]:
-    """Take the verdict of a look.
-
-    Args:
-        run: see above.
-        given: the result of the look.
-        away: full names of nodes that are not as far as they are to be: they violate nothing.
-        stage: that was looked at.
-    """
+def take_verdict(run: Run, given: Verified) -> Verdict | None:
+    """Take the verdict of a look; return it if it is another than the one before."""
     judged = run.judged
     guarded = tuple(_guarded(each) for each in run.nodes.values() if is_foreign_activation(each))
     verdict = with_findings(given.verdict, guarded, run.plan.policy)
     at_gate = run.attempt is not None and run.attempt.at_gate
     if run.held_s is not None and (run.attempt or run.change) and not at_gate:
-        verdict = without(run, verdict, away)  # they are away because it was ordered
+        verdict = without(run, verdict, run.away)  # they are away because it was ordered
     judged.looking = False
     judged.mark, judged.waits = given.mark, given.waits
     judged.away = given.away
     judged.seen_s = run.now_s
-    judged.again_s = NEVER_S if given.again_s is None else run.now_s + given.again_s
+    judged.again_s = run.now_s + given.again_s
     found = frozenset((each.rule, each.subject) for each in verdict.findings)
     if found != judged.found or judged.verdict is None:
         judged.found, judged.since_s = found, run.now_s
     is_new, judged.verdict = verdict != judged.verdict, verdict
-    see_violations(run, away)
-    return [VerdictChanged(stage=stage, verdict=verdict)] if is_new else []
+    see_violations(run)
+    return verdict if is_new else None
 
 
 def is_foreign_activation(node: Node) -> bool:
@@ -174,8 +168,7 @@ def _guarded(node: Node) -> Finding:
         outcome=Outcome.VIOLATED,
         expected="inactive",
         observed="activated by its own code or another client",
-        message=f"cannot accept node {node.name}: it was activated by its own code or another "
-        f"client while the gate is closed; {what}",
+        message=f"cannot accept node {node.name}: it {BY_ITSELF}; {what}",
     )
 
 
@@ -204,7 +197,7 @@ def of_those_there(run: Run, verdict: Verdict) -> Verdict:
     return with_only(verdict, known, run.plan.policy) if comes else verdict
 
 
-def see_violations(run: Run, away: Collection[str]) -> None:
+def see_violations(run: Run) -> None:
     """Note what is violated of the nodes that are to be as planned, and what of it counts.
 
     It is asked at each verdict and at each moment in which something begins to count.
@@ -212,18 +205,17 @@ def see_violations(run: Run, away: Collection[str]) -> None:
     judged = run.judged
     if judged.verdict is None:
         return
-    active = any(each.level is Level.ACTIVE for each in run.nodes.values())
-    if run.held_s is None or run.attempt is not None or run.change is not None or not active:
+    if not run.is_watched or run.attempt is not None or run.change is not None:
         judged.violated = {}  # what an order brings about is judged at its gate
         return
-    verdict = of_those_there(run, without(run, judged.verdict, {*away, *run.left, *judged.away}))
+    names = run.away | run.left | judged.away
+    verdict = of_those_there(run, without(run, judged.verdict, names))
     found = {each.key: each for each in verdict.findings if each.outcome is Outcome.VIOLATED}
     keys = [*found]
     if verdict.verdict is Outcome.VIOLATED and not found:
         keys = [("", verdict.verdict.value, "", None)]
     judged.violated = {key: judged.violated.get(key, run.now_s) for key in keys}
-    until_s = holds_until_s(run)
-    lasting = [key for key, since_s in judged.violated.items() if until_s - since_s >= LASTS_S]
+    lasting = [key for key, at_s in judged.violated.items() if lasts_until(run, at_s + LASTS_S)]
     if lasting:
         findings = tuple(found[key] for key in lasting if key in found)
         text = not_ok(replace(verdict, findings=findings)) or _named(keys[0])
@@ -233,12 +225,6 @@ def see_violations(run: Run, away: Collection[str]) -> None:
         if key in lasting or (passes and len(judged.passed) < _MOST):
             name = _named(key)
             judged.passed[name] = judged.passed.get(name, False) or key in lasting
-
-
-def counts_at_s(judged: Judged, now_s: float) -> float:
-    """Return when the next violation begins to count; NEVER_S if none would."""
-    ends_s = (since_s + LASTS_S for since_s in judged.violated.values())
-    return min((each for each in ends_s if each > now_s), default=NEVER_S)
 
 
 def passed(judged: Judged) -> str:

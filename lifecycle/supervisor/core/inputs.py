@@ -91,17 +91,19 @@ class Replied(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Saw(msgspec.Struct, frozen=True, kw_only=True):
-    """What the graph, or a host unasked, shows of nodes; all by key.
+    """What the graph, a host or another supervisor, unasked, shows of nodes; by key.
 
     Attributes:
         levels: of nodes of ours whose state others may change.
         health: whether nodes are healthy, as far as that is known.
         elsewhere: conditions that nodes of other supervisors have reached.
+        left: full names of all nodes whose supervisor was shut down; None if nothing is new.
     """
 
     levels: Mapping[str, Level] = {}
     health: Mapping[str, bool] = {}
     elsewhere: Mapping[str, frozenset[Condition]] = {}
+    left: frozenset[str] | None = None
 
 
 class Changed(msgspec.Struct, frozen=True, kw_only=True):
@@ -121,7 +123,7 @@ class Verified(msgspec.Struct, frozen=True, kw_only=True):
 
     mark: int
     verdict: Verdict
-    again_s: float | None = None
+    again_s: float = float("inf")
     waits: bool = False
     undiscovered: str = ""
     away: frozenset[str] = frozenset()
@@ -180,12 +182,6 @@ class Silent(msgspec.Struct, frozen=True, kw_only=True):
     hangs: bool = False
 
 
-class Left(msgspec.Struct, frozen=True, kw_only=True):
-    """Supervisors of other hosts were shut down: full names of their nodes, all of them."""
-
-    nodes: frozenset[str]
-
-
 class Adopted(msgspec.Struct, frozen=True, kw_only=True):
     """It is known what of the system runs already: `plan` attaches to it, `nodes` by full name."""
 
@@ -215,5 +211,5 @@ class Broken(msgspec.Struct, frozen=True, kw_only=True):
 
 Input = (
     Tick | Spawned | Exited | Swept | Replied | Saw | Changed | Verified | Programmed | Given
-    | Ready | Ordered | Stop | Silent | Left | Adopted | Refused | Broken
+    | Ready | Ordered | Stop | Silent | Adopted | Refused | Broken
 )  # fmt: skip

@@ -11,7 +11,6 @@ from lifecycle.supervisor.control.protocol import ControlRequest
 from lifecycle.supervisor.core import advance
 from lifecycle.supervisor.core.change import apply, enter_mode
 from lifecycle.supervisor.core.passing import reached
-from lifecycle.supervisor.core.restart import group_of
 from lifecycle.supervisor.core.state import Attempt, Level, Node, Order, Run
 from lifecycle.supervisor.run.events import Event
 
@@ -20,21 +19,14 @@ SAID = {
     ControlRequest.APPLY: "apply another manifest to",
 }
 
+_UP = ("active", "paused", "held")
+_ONLY_UP = "only a system that is active or paused can"
 FITS = {
     ControlRequest.PAUSE: (("active", "held"), "only an active system can be paused"),
     ControlRequest.RESUME: (("paused", "held"), "only a paused system can be resumed"),
-    ControlRequest.RESTART: (
-        ("active", "paused", "held"),
-        "only a system that is active or paused can be restarted",
-    ),
-    ControlRequest.MODE: (
-        ("active", "paused", "held"),
-        "only a system that is active or paused can enter another mode",
-    ),
-    ControlRequest.APPLY: (
-        ("active", "paused", "held"),
-        "only a system that is active or paused can take another manifest",
-    ),
+    ControlRequest.RESTART: (_UP, f"{_ONLY_UP} be restarted"),
+    ControlRequest.MODE: (_UP, f"{_ONLY_UP} enter another mode"),
+    ControlRequest.APPLY: (_UP, f"{_ONLY_UP} take another manifest"),
 }
 """In which phases an order can begin, and what is said in any other."""
 
@@ -45,29 +37,29 @@ def settled_phase(run: Run) -> str:
     """Return the phase without what policy does meanwhile, which is nobody's order."""
     if run.held_s is None or run.ending is not None or run.change is not None:
         return advance.phase_of(run)
-    if run.paused:
-        return "paused"
-    kept = any(each.withheld or each.refused for each in run.nodes.values())
-    return "held" if kept or advance.waiting(run) else "active"
+    return advance.rests_as(run)
 
 
 def refusal(run: Run, order: Order) -> str:
     """Return why an order cannot be carried out now; empty if it can."""
-    what = f"cannot {SAID.get(order.ask, order.ask.value)} {run.plan.system!r}"
     phases, hint = FITS[order.ask]
     phase = settled_phase(run)
     if phase not in phases:
-        return f"{what}: it is {phase}; {hint}"
+        return f"{_cannot(order, run.plan.system)}: it is {phase}; {hint}"
     return _unfit(run, order)
+
+
+def _cannot(order: Order, what: str) -> str:
+    return f"cannot {SAID.get(order.ask, order.ask.value)} {what!r}"
 
 
 def _unfit(run: Run, order: Order) -> str:
     """Say why an order can be carried out in no phase; empty if it can."""
     if order.first is not None and order.first is not run.first:
-        what = f"cannot {SAID.get(order.ask, order.ask.value)} {run.plan.system!r}"
+        what = _cannot(order, run.plan.system)
         return f"{what}: another manifest was applied meanwhile; ask again"
     if order.ask in _STARTS and run.broken:
-        what = f"cannot {SAID.get(order.ask, order.ask.value)} {order.node or run.plan.system!r}"
+        what = _cannot(order, order.node or run.plan.system)
         return (
             f"{what}: the discovery server has died, and without it nobody who comes again is "
             "found; start the system again: lifecycle down, then lifecycle up"
@@ -126,9 +118,9 @@ def refused_at_once(run: Run, order: Order) -> tuple[ExitCode, str]:
         return ExitCode.BRING_UP_FAILED, text
     if run.order is not None and run.order.ask is ControlRequest.APPLY:
         return ExitCode.USAGE, (
-            f"cannot {SAID.get(order.ask, order.ask.value)} {run.plan.system!r}: it is "
-            f"{advance.phase_of(run)}, another manifest is being applied to it; ask again once "
-            "'lifecycle apply' has ended; 'lifecycle down' is taken at once"
+            f"{_cannot(order, run.plan.system)}: it is {advance.phase_of(run)}, another manifest "
+            "is being applied to it; ask again once 'lifecycle apply' has ended; 'lifecycle down' "
+            "is taken at once"
         )
     return ExitCode.USAGE, refusal(run, order) if run.held_s is None else _unfit(run, order)
 
@@ -201,8 +193,7 @@ def _restart(run: Run, order: Order) -> None:
         each.renew = each.level > Level.DOWN or bool(each.process)
         process = run.processes.get(each.process)
         if process is not None:
-            process.by_hand, process.failed = True, False
-            process.away_s, process.stays_down = None, False
+            process.restarted_by_hand()
 
 
 def _gone_with(run: Run, keys: set[str]) -> set[str]:
@@ -212,6 +203,6 @@ def _gone_with(run: Run, keys: set[str]) -> set[str]:
     for name in names:
         process = run.processes.get(name)
         if process is not None and process.failed:
-            found.update(group_of((each.planned for each in run.nodes.values()), name))
+            found.update(run.group(name))
     others = {each.name for each in run.processes.values() if each.failed} - names
     return {key for key in found if run.nodes[key].process not in others}

@@ -35,10 +35,9 @@ def _arrive(run: Run) -> list[Event]:
     attempt = run.attempt
     if attempt is None or attempt.at_gate:
         return []
-    change = run.change is not None and not run.change.taken
-    coming = run.held_s is None and any(each.due_s > run.now_s for each in run.nodes.values())
-    if change or run.switch is not None or coming or not advance.is_at_gate(run):
-        return _late(run, failure.unfinished(run)) if run.now_s >= attempt.until_s else []
+    coming = run.held_s is None and not all(run.is_past(each.due_s) for each in run.nodes.values())
+    if run.is_changing or run.switch is not None or coming or not advance.is_at_gate(run):
+        return _late(run, failure.unfinished(run)) if run.is_past(attempt.until_s) else []
     left_s = attempt.until_s - run.now_s
     fresh_s = run.options.timeout_s if run.held_s is not None else min(left_s, run.options.gate_s)
     if run.change is None:
@@ -54,12 +53,11 @@ def _arrive(run: Run) -> list[Event]:
 
 def _come(run: Run) -> list[Event]:
     """Say that all who came up are at the gate."""
-    change = run.change is not None and not run.change.taken
-    coming = any(each.due_s > run.now_s or each.renew for each in run.nodes.values())
-    if not run.came or change or coming or not advance.is_at_gate(run):
+    coming = any(not run.is_past(each.due_s) or each.renew for each in run.nodes.values())
+    if not run.came or run.is_changing or coming or not advance.is_at_gate(run):
         return []
     attempt = run.attempt
-    waited = attempt is not None and attempt.at_gate and run.now_s >= attempt.since_s + gate.SAY_S
+    waited = attempt is not None and attempt.at_gate and run.is_past(attempt.since_s + gate.SAY_S)
     if not waited and advance.is_awaited(run):
         return []
     run.came, run.again = False, run.held_s is not None
@@ -88,7 +86,7 @@ def _say_closed(run: Run) -> list[Event]:
     until_s = run.waits_s + run.options.timeout_s
     if run.said or verdict is None or not gate.is_latest(run):
         return []
-    if run.now_s < gate.refuses_at_s(run, until_s):
+    if not run.is_past(gate.refuses_at_s(run, until_s)):
         return []
     run.said = True
     return [Notice(message=gate.refusal(verdict))]
@@ -106,10 +104,10 @@ def _open(run: Run) -> list[Event]:
         else:
             run.attempt = None
         return [reached(run, "verified")]
-    if run.now_s >= gate.refuses_at_s(run, attempt.until_s):
+    if run.is_past(gate.refuses_at_s(run, attempt.until_s)):
         return _refused(run, again=False)
     # The verdict may allow it, and never be of a moment that lasts.
-    late = run.now_s >= attempt.until_s + gate.LEAST_S
+    late = run.is_past(attempt.until_s + gate.LEAST_S)
     return _late(run, "it changes all the time") if late else _say_waiting(run, attempt)
 
 
@@ -124,7 +122,7 @@ def _late(run: Run, why: str) -> list[Event]:
 
 def _say_waiting(run: Run, attempt: Attempt) -> list[Event]:
     verdict = run.judged.verdict
-    if attempt.said or run.now_s < attempt.since_s + gate.SAY_S or verdict is None:
+    if attempt.said or verdict is None or not run.is_past(attempt.since_s + gate.SAY_S):
         return []
     attempt.said = True
     if gate.allows(run):
@@ -147,14 +145,13 @@ def _begin(run: Run, keys: tuple[str, ...], until_s: float) -> None:
 def programmed(run: Run, given: Programmed) -> list[Event]:
     """Take it that networks are programmed: the gate opens for those that wait at it."""
     passage = run.passage
-    if passage is None or not passage.programming or passage.number != given.number:
+    if passage is None or passage.programming != given.number:
         return []  # that passage was given up
-    passage.programming = False
+    passage.programming = 0
     if given.error:
         run.passage = None
         found = Failure(rule=NOT_PROGRAMMED.id, subject=run.plan.system, message=given.error)
         return failure.fail(run, found)
-    passage.programmed = True
     return []
 
 
@@ -164,16 +161,16 @@ def _go_on(run: Run) -> list[Event]:
     assert verdict is not None
     nodes = [run.nodes[key] for key in passage.waiting if key in run.nodes]
     behind = [each for each in nodes if advance.wanted(run, each) is Level.ACTIVE]
-    done = passage.programmed and all(each.level is Level.ACTIVE for each in behind)
-    if gate.is_open(run) and passage.programmed:
+    done = passage.is_programmed and all(each.level is Level.ACTIVE for each in behind)
+    if gate.is_open(run) and passage.is_programmed:
         if not passage.sent and verdict.flows != passage.flows:
-            passage.programmed = False  # other flows are verified than were programmed
+            passage.flows = None  # other flows are verified than were programmed
             return []
         events = [] if passage.opened else _let_through(run, passage, verdict)
         return [*events, *(_passed(run) if done else [])]
-    if run.now_s >= gate.refuses_at_s(run, passage.until_s):
+    if run.is_past(gate.refuses_at_s(run, passage.until_s)):
         return _became_another(run) if done and passage.sent else _refused(run, again=True)
-    if run.now_s >= passage.late_s:
+    if run.is_past(passage.late_s):
         return failure.fail_late(run, run.options.timeout_s)
     return []
 
@@ -218,6 +215,8 @@ def _withdraw(run: Run) -> list[Event]:
         node.let_through = False
     if passage is not None and passage.paused:
         run.paused = True
+    run.attempt = run.passage = None
+    run.again = False
     names = ", ".join(sorted(each.name for each in begun))
     return [Notice(message=f"the gate closed again: {names} is deactivated")] if begun else []
 
@@ -232,14 +231,12 @@ def _refused(run: Run, *, again: bool) -> list[Event]:
         stopping = CLOSED
         if again:
             stopping = "the system changed before every node was activated"
-        if attempt is not None and run.now_s >= attempt.until_s:
+        if attempt is not None and run.is_past(attempt.until_s):
             over = f"the {round(attempt.until_s, 1):g} s of the bring-up are over (--timeout)"
             stopping = f"{stopping}, and {over}"
         return failure.end_refused(run, verdict, stopping)
     sent = () if run.passage is None else tuple(run.passage.sent)
     said = _withdraw(run)
-    run.attempt = run.passage = None
-    run.again = False
     change = run.change
     if change is not None and not change.back:
         return [*said, *go_back(run, text, code)]
@@ -265,7 +262,6 @@ def _became_another(run: Run) -> list[Event]:
     assert passage is not None
     if run.change is not None and not run.change.back:
         said = _withdraw(run)
-        run.attempt = run.passage = None
         return [*said, *go_back(run, gate.refusal(verdict), gate.exit_code(verdict))]
     if run.change is not None:
         run.attempt = run.passage = None

@@ -49,9 +49,9 @@ def take(run: Run, now_s: float, given: inputs.Input) -> list[Event]:
         now_s: of the input, on the run's clock, which begins at 0 and only goes forward.
         given: what happened.
     """
-    run.now_s = max(run.now_s, now_s)
+    run.now_s, run.wake_s = max(run.now_s, now_s), NEVER_S
     events = _HANDLERS[type(given)](run, given)
-    _see_time(run)
+    gate.see_violations(run)
     quiet = 0
     while quiet < _PASSES:  # what moved without a word is looked at once more
         more = _settle(run)
@@ -89,12 +89,10 @@ def _spawned(run: Run, given: inputs.Spawned) -> list[Event]:
         process.pid = given.pid or -1
         return []
     process.state = None
+    if run.ending is not None:
+        return []
     node = next(run.nodes_of(process.name))
-    return (
-        []
-        if run.ending
-        else failure.fail(run, failure.of_step(run, node, START_FAILED, given.error))
-    )
+    return failure.fail(run, failure.of_step(run, node, START_FAILED, given.error))
 
 
 def _exited(run: Run, given: inputs.Exited) -> list[Event]:
@@ -102,45 +100,36 @@ def _exited(run: Run, given: inputs.Exited) -> list[Event]:
     if process is None or not process.is_alive:
         return []
     failures = failure.death(run, process, given)
-    members = [*run.nodes_of(process.name)]
-    loaded = [each for each in run.nodes.values() if run.process_of(each) is process]
-    shut_down = all(each.level is Level.DOWN for each in members if each.planned.managed)
-    to_end = not any(advance.wanted(run, each) for each in members)
+    in_order = _ends_in_order(run, process, given)
+    asked = process.asked >= 0
+    expected = asked or run.ending is not None or advance.is_to_end(run, process)
     process.state, process.end = ProcessState.EXITED, given
-    for node in {each.key: each for each in (*members, *loaded)}.values():
-        _is_down(node)
+    for node in run.nodes.values():
+        if run.process_of(node) is process:
+            _is_down(node)
     run.changed()
-    if process.asked >= 0:
-        forced = [] if process.asked == 0 or run.hurry else [failure.forced(process)]
-        return [*forced, *_died_when_asked(run, process, given, failures)]
-    if process.is_over:
+    if process.is_over and not asked:
         process.stays_down = True
         return []
-    if run.ending is not None or to_end:
-        hosted = process.planned.run.kind is RunKind.PYTHON
-        in_order = given.clean and (shut_down or not hosted)
-        if in_order:
-            return []
-        if run.ending is not None:
-            run.deaths += failures
-        return [failure.goes_on(each) for each in failures]
-    return [event for each in failures for event in failure.fail(run, each, given)]
-
-
-def _died_when_asked(
-    run: Run, process: Process, given: inputs.Exited, failures: list[Failure]
-) -> list[Event]:
-    """Take the end of a process that was asked to end, and may have died instead."""
-    if given.signal:
-        crashed = given.signal not in process.sent and not given.clean
-    else:
-        hosted = process.planned.run.kind is RunKind.PYTHON
-        crashed = given.crash or (hosted and (given.status or 0) > 1)
-    if not crashed:
-        return []
+    if not expected:
+        return [event for each in failures for event in failure.fail(run, each, given)]
+    forced = [failure.forced(process)] if process.asked > 0 and not run.hurry else []
+    if in_order:
+        return [*forced]
     if run.ending is not None:
         run.deaths += failures
-    return [failure.goes_on(each) for each in failures]
+    return [*forced, *map(failure.goes_on, failures)]
+
+
+def _ends_in_order(run: Run, process: Process, given: inputs.Exited) -> bool:
+    """Return whether a process that is to end, or was asked to, has not died instead."""
+    hosted = process.planned.run.kind is RunKind.PYTHON
+    if process.asked < 0:
+        managed = [each for each in run.nodes_of(process.name) if each.planned.managed]
+        return given.clean and (not hosted or all(each.level is Level.DOWN for each in managed))
+    if given.signal:
+        return given.signal in process.sent or given.clean
+    return not (given.crash or (hosted and (given.status or 0) > 1))
 
 
 def _is_down(node: Node) -> None:
@@ -156,7 +145,7 @@ def _swept(run: Run, given: inputs.Swept) -> list[Event]:
         return []
     process.state, process.pid, process.asked, process.sent = None, 0, -1, []
     process.asked_until_s, process.hangs_s, process.sweeping = NEVER_S, None, False
-    process.barks, process.why = False, ""
+    process.barks = False
     run.changed()
     if run.ending is not None or run.change is not None:
         return []
@@ -181,14 +170,9 @@ def _silent(run: Run, given: inputs.Silent) -> list[Event]:
     node.hangs = given.why if given.hangs else ""
     process = run.process_of(node)
     if process is not None:
-        why = next((each.hangs for each in run.nodes_of(process.name) if each.hangs), "")
-        hangs = bool(why)
         since_s = run.now_s if process.hangs_s is None else process.hangs_s
+        hangs = any(each.hangs for each in run.nodes_of(process.name))
         process.hangs_s = since_s if hangs else None
-        how = process.supervision
-        process.why = (
-            f"its watchdog ended it after {how.watchdog_sec:g} s, because {why}" if hangs else ""
-        )
     return []
 
 
@@ -240,9 +224,9 @@ def _step_failed(
 ) -> list[Event]:
     node.level = given.level
     is_up = step in _UPWARDS or (step is Step.DEACTIVATE and goal > Level.DOWN)
+    if not is_up:
+        node.level = node.after(step)  # the next step is tried all the same
     if not is_up or run.ending is not None:
-        if not is_up:
-            node.level = node.after(step)  # the next step is tried all the same
         return [Notice(message=given.error)]
     rules = {Step.START: START_FAILED, Step.WIRE: NOT_WIRED}
     what = rules.get(step, TRANSITION_FAILED)
@@ -268,6 +252,9 @@ def _saw(run: Run, given: inputs.Saw) -> list[Event]:
         if run.elsewhere.get(key) != conditions:
             run.elsewhere = {**run.elsewhere, key: conditions}
             run.changed()
+    if given.left is not None:
+        run.left = given.left
+        run.changed()
     return events
 
 
@@ -303,12 +290,14 @@ def _refused(run: Run, given: inputs.Refused) -> list[Event]:
 
 
 def _verified(run: Run, given: inputs.Verified) -> list[Event]:
-    events = gate.take_verdict(run, given, advance.away(run), advance.stage_of(run))
+    verdict, stage = gate.take_verdict(run, given), advance.stage_of(run)
     node = run.nodes.get(given.undiscovered)
     if node is not None and run.passage is None:
         for each in run.nodes_of(node.process):
             each.renew = True
-    return events
+    if verdict is None:
+        return []
+    return [VerdictChanged(stage=stage, verdict=verdict)]
 
 
 def _given(run: Run, given: inputs.Given) -> list[Event]:
@@ -317,7 +306,7 @@ def _given(run: Run, given: inputs.Given) -> list[Event]:
     if switch is not None and given.node in switch.asked:
         switch.asked.discard(given.node)
         if given.error and not switch.back:
-            text = f"cannot enter mode {switch.mode!r}: {given.error}"
+            text = f"cannot enter mode {run.mode!r}: {given.error}"
             return leave_mode(run, switch.before, text, ExitCode.BRING_UP_FAILED)
     elif change is not None and given.node in change.giving:
         change.giving.discard(given.node)
@@ -345,18 +334,15 @@ def _stop(run: Run, given: inputs.Stop) -> list[Event]:
     return []
 
 
-def _left(run: Run, given: inputs.Left) -> list[Event]:
-    run.left = given.nodes
-    run.changed()
-    return []
-
-
 def _broken(run: Run, given: inputs.Broken) -> list[Event]:
     found = Failure(rule=given.rule, subject=given.subject, message=given.message)
     run.broken = run.broken or given.finds
     if run.ending is not None:
         return []
-    return failure.fail(run, found) if given.finds else failure.fail_for_good(run, found)
+    if given.finds:
+        return failure.fail(run, found)
+    run.fails_now(found)
+    return []
 
 
 def _changed(run: Run, _: inputs.Changed) -> list[Event]:
@@ -379,21 +365,10 @@ _HANDLERS: dict[type, Callable[[Run, Any], list[Event]]] = {
     inputs.Ordered: lambda run, given: orders.take_order(run, given.order),
     inputs.Stop: _stop,
     inputs.Silent: _silent,
-    inputs.Left: _left,
     inputs.Adopted: _adopted,
     inputs.Refused: _refused,
     inputs.Broken: _broken,
 }
-
-
-# Time
-
-
-def _see_time(run: Run) -> None:
-    for process in run.processes.values():
-        if run.now_s >= advance.barks_at_s(process):
-            process.barks = True
-    gate.see_violations(run, advance.away(run))
 
 
 def _late(run: Run, node: Node, request: Request, where: str) -> list[Event]:
@@ -413,7 +388,7 @@ def _late(run: Run, node: Node, request: Request, where: str) -> list[Event]:
 def _has_failed(run: Run) -> bool:
     """Return whether the run ends now: nothing is in a step, or a moment is over."""
     busy = any(each.request is not None for each in run.nodes.values())
-    return not busy or run.now_s >= run.fails_s
+    return not busy or run.is_past(run.fails_s)
 
 
 def _give_up_steps(run: Run) -> None:
@@ -457,18 +432,19 @@ def _hold(run: Run) -> list[Event]:
             run.held_s = run.now_s
         return []
     hold_s = run.options.hold_s
-    if hold_s is None or run.now_s < run.held_s + hold_s or run.order is not None or run.failures:
+    over_s = NEVER_S if hold_s is None else run.held_s + hold_s
+    if not run.is_past(over_s) or run.order is not None or run.failures:
         return []
-    over_s = run.held_s + hold_s
     waits = not gate.is_latest(run) and any(
         each.level is Level.ACTIVE for each in run.nodes.values()
     )
-    if run.now_s < over_s + advance.NOTICE_S and failure.only_elsewhere(run):
+    if failure.only_elsewhere(run) and not run.is_past(over_s + advance.NOTICE_S):
         return []  # who runs these may be about to say that it ends, too
     if run.options.until < Level.ACTIVE and not run.options.verifies:
         waits = not (gate.allows(run) and gate.is_latest(run))
-    waits = waits and run.now_s < over_s + advance.GLANCE_S
-    return [] if waits else failure.end_done(run)
+    if waits and not run.is_past(over_s + advance.GLANCE_S):
+        return []
+    return failure.end_done(run)
 
 
 def _returned(run: Run) -> list[Event]:

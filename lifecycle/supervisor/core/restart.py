@@ -1,17 +1,14 @@
 """When a failed process is started again: delay with exponential backoff, start limit, giving up.
 
-Owns: `RestartPolicy`: given failures and a clock it says when to start again, or that it gives up;
-and who goes down and comes again with a process (`group_of`). What the keys
-mean is systemd.service(5)'s. Pure: it starts nothing and looks at no clock.
+Owns: `RestartPolicy`: given failures and a clock it says when to start again, or that it gives up.
+What the keys mean is systemd.service(5)'s. Pure: it starts nothing and looks at no clock.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable
 
-from lifecycle.manifest.model import OnFailure, Restart, RunKind, Supervision
-from lifecycle.plan.model import PlannedNode
+from lifecycle.manifest.model import Restart, Supervision
 
 
 class RestartPolicy:
@@ -30,12 +27,6 @@ class RestartPolicy:
         self.restarts = 0
         self._starts = [started_s]
         self._in_a_row = 0
-
-    def takes(self, *, exit_status: int | None) -> bool:
-        """Whether it is to be started again after such an end; None: not an exit by itself."""
-        if self.how.restart is Restart.ON_FAILURE:
-            return exit_status != 0
-        return self.how.restart is Restart.ALWAYS
 
     def failed(self, now_s: float, *, was_up: bool = True) -> float | None:
         """Take one failure.
@@ -76,6 +67,13 @@ class RestartPolicy:
         self._in_a_row = 0
 
 
+def is_restarted(how: Supervision, exit_status: int | None) -> bool:
+    """Return whether a process is started again after such an end; None: not an exit by itself."""
+    if how.restart is Restart.ON_FAILURE:
+        return exit_status != 0
+    return how.restart is Restart.ALWAYS
+
+
 def delay_s(how: Supervision, in_a_row: int) -> float:
     """Return the seconds between a failure and the next start.
 
@@ -90,43 +88,3 @@ def delay_s(how: Supervision, in_a_row: int) -> float:
         return longest
     exponent = (in_a_row - 1) / how.restart_steps
     return how.restart_sec * math.pow(longest / how.restart_sec, exponent)
-
-
-def group_of(nodes: Iterable[PlannedNode], process: str) -> tuple[str, ...]:
-    """Return the keys of the nodes that go down and come again with a process, in plan order.
-
-    A component goes with its container, and a node with all others of its process.
-
-    Args:
-        nodes: all that this supervisor brings up.
-        process: name of the one that failed.
-    """
-    every = tuple(nodes)
-    failed = [each for each in every if each.process == process]
-    how = {each.supervision.on_failure for each in failed}
-    keys = {each.key for each in failed}
-    if OnFailure.ALL in how:
-        return tuple(each.key for each in every)
-    while more := _more(every, keys, dependents=OnFailure.DEPENDENTS in how):
-        keys |= more
-    return tuple(each.key for each in every if each.key in keys)
-
-
-def _more(
-    nodes: Iterable[PlannedNode], keys: Collection[str], *, dependents: bool
-) -> frozenset[str]:
-    """Return the nodes that go with some of `keys` and are not among them yet."""
-    every = tuple(nodes)
-    processes = {
-        each.process for each in every if each.key in keys and each.run.kind is not RunKind.ATTACH
-    }
-    return frozenset(
-        each.key
-        for each in every
-        if each.key not in keys
-        and (
-            (each.process in processes and each.run.kind is not RunKind.ATTACH)
-            or (each.run.component and each.run.container in keys)
-            or (dependents and any(after.node in keys for after in each.after))
-        )
-    )

@@ -17,14 +17,14 @@ from collections.abc import Iterable, Iterator
 import msgspec
 
 from lifecycle.errors import ExitCode
-from lifecycle.manifest.model import Condition, RunKind, Supervision, TargetState
+from lifecycle.manifest.model import Condition, OnFailure, RunKind, Supervision, TargetState
 from lifecycle.plan.change import GivenParameters, PlanChange
 from lifecycle.plan.model import Plan, PlannedNode, PlannedProcess
 from lifecycle.supervisor.control.protocol import Failed, ProcessState, Question
 from lifecycle.supervisor.core.inputs import Exited
 from lifecycle.supervisor.core.restart import RestartPolicy
 from lifecycle.supervisor.run.events import Failure
-from lifecycle.verify.verdict import FindingKey, Verdict
+from lifecycle.verify.verdict import FindingKey, FlowReport, Verdict
 
 NEVER_S = float("inf")
 
@@ -124,7 +124,7 @@ class Node(msgspec.Struct, kw_only=True):
         wired: the authority has connected it as it is to be.
         stuck: a request to it was given up; a further one would wait behind it.
         silent: why it cannot be reached; empty while it can.
-        hangs: why its process's watchdog is to end it; empty if it is not.
+        hangs: why its process's watchdog is to end it, if it has one; empty while it does not hang.
         renew: it is to go down once, whatever it is wanted to be.
         due_s: it is not started before.
         withheld: why a consequence keeps it inactive until a person lets it through the gate.
@@ -214,7 +214,6 @@ class Process(msgspec.Struct, kw_only=True):
         stays_down: it is not started again: it ended as it may, or the run goes on without it.
         hangs_s: since when it is stopped or hangs; None while it does not.
         barks: its watchdog ends it.
-        why: said of its end: why its watchdog ended it.
     """
 
     planned: PlannedProcess
@@ -236,7 +235,6 @@ class Process(msgspec.Struct, kw_only=True):
     stays_down: bool = False
     hangs_s: float | None = None
     barks: bool = False
-    why: str = ""
 
     @property
     def name(self) -> str:
@@ -257,6 +255,11 @@ class Process(msgspec.Struct, kw_only=True):
         else:
             self.policy.started(now_s, after_failure=self.failed)
         self.failed = self.by_hand = False
+
+    def restarted_by_hand(self) -> None:
+        """Note that a person starts it again: what failed before is forgotten."""
+        self.by_hand, self.failed = True, False
+        self.away_s, self.stays_down = None, False
 
     @property
     def is_alive(self) -> bool:
@@ -288,8 +291,8 @@ class Passage(msgspec.Struct, kw_only=True):
 
     Attributes:
         waiting: keys of the nodes; `sent`: of those that were sent their requests.
-        number: of the request that networks are programmed by.
-        programming: networks are being programmed with `flows`; `programmed`: they have them.
+        flows: that networks are to have; None until that is asked for.
+        programming: number of the request to program networks with them; 0 if none is open.
         opened: the gate is open for the nodes, as far as nothing changes.
         until_s: for so long what changes meanwhile may heal.
         late_s: then they must be active.
@@ -299,13 +302,16 @@ class Passage(msgspec.Struct, kw_only=True):
     waiting: tuple[str, ...]
     until_s: float
     late_s: float
-    flows: object = None
-    number: int = 0
+    flows: tuple[FlowReport, ...] | None = None
+    programming: int = 0
     paused: bool = False
     sent: set[str] = msgspec.field(default_factory=set)
-    programming: bool = False
-    programmed: bool = False
     opened: bool = False
+
+    @property
+    def is_programmed(self) -> bool:
+        """Whether networks have the flows."""
+        return self.flows is not None and not self.programming
 
 
 class Attempt(msgspec.Struct, kw_only=True):
@@ -342,12 +348,11 @@ class Switch(msgspec.Struct, kw_only=True):
 
     Attributes:
         active: keys of the nodes that were to be active before.
-        given: of those whose parameters are others in this mode.
+        given: names of those whose parameters are others in this mode.
         to_ask: keys of those that are to be given parameters; `asked`: that have not answered.
         back: the system goes back to the mode before.
     """
 
-    mode: str
     before: str
     active: frozenset[str]
     given: tuple[str, ...] = ()
@@ -442,6 +447,11 @@ class Ending(msgspec.Struct, kw_only=True):
     failed: bool = False
     deaths: int = 0
 
+    @property
+    def why(self) -> str:
+        """What failed, as people read it; else the reason."""
+        return "; ".join(each.message for each in self.failures) or self.reason
+
 
 class Options(msgspec.Struct, kw_only=True, frozen=True):
     """What a person asked of the run.
@@ -490,6 +500,7 @@ class Run(msgspec.Struct, kw_only=True):
         fails_s: then it ends all the same.
         deaths: of processes that died while they were taken down, or that the run went on without.
         outbox: answers to orders that have not been sent.
+        wake_s: the next moment that something was asked about since the last input, see `is_past`.
     """
 
     options: Options
@@ -532,6 +543,7 @@ class Run(msgspec.Struct, kw_only=True):
     deaths: list[Failure] = []
     hurry: bool = False
     outbox: list[tuple[int, ExitCode, str]] = []
+    wake_s: float = NEVER_S
     trusted: str = ""
 
     @property
@@ -545,6 +557,49 @@ class Run(msgspec.Struct, kw_only=True):
                 for each in self.nodes.values()
             )
         )
+
+    @property
+    def away(self) -> frozenset[str]:
+        """Full names of the nodes that are not as far as their manifest has them."""
+        return frozenset(
+            each.name
+            for each in self.nodes.values()
+            if each.level < each.levels[-1] or each.renew or not self.is_past(each.due_s)
+        )
+
+    @property
+    def ahead(self) -> frozenset[str]:
+        """Full names of the nodes that may be active before the gate opens for others."""
+        return frozenset(
+            each.name
+            for each in self.nodes.values()
+            if each.let_through or each.level is Level.ACTIVE
+        )
+
+    @property
+    def is_changing(self) -> bool:
+        """Whether a manifest is being changed to, or back to, and is not in force yet."""
+        return self.change is not None and not self.change.taken
+
+    @property
+    def is_watched(self) -> bool:
+        """Whether it was up and some of it is active: then all that changes is looked at."""
+        active = any(each.level is Level.ACTIVE for each in self.nodes.values())
+        return active and self.held_s is not None
+
+    def is_past(self, at_s: float) -> bool:
+        """Return whether a moment is over; one that is still to come wakes the run.
+
+        What is decided by time is decided by this: so it is decided again as soon as it may differ.
+        """
+        if self.now_s >= at_s:
+            return True
+        self.wakes_at(at_s)
+        return False
+
+    def wakes_at(self, at_s: float) -> None:
+        """Have a tick come then, or at once if that is over; before that anything else may."""
+        self.wake_s = min(self.wake_s, max(at_s, self.now_s))
 
     def mode_by(self, plan: Plan) -> str:
         """Return the mode that it would be in by another manifest: the same, if that has it."""
@@ -581,15 +636,36 @@ class Run(msgspec.Struct, kw_only=True):
             self.outbox = [*self.outbox, (self.order.id, code, error)]
         self.order, self.ready, self.undone = None, None, None
 
-    def whole(self, keys: Iterable[str]) -> tuple[str, ...]:
-        """Return the keys with those of all that comes and goes with these nodes."""
+    def fails_now(self, *failures: Failure) -> None:
+        """End at once for what failed, whatever is to be kept going."""
+        self.failures, self.fails_s = [*self.failures, *failures], self.now_s
+
+    def whole(self, keys: Iterable[str], *, dependents: bool = False) -> tuple[str, ...]:
+        """Return the keys with those of all that comes and goes with these nodes, in plan order.
+
+        A component goes with its container, and a node with all others of its process.
+
+        Args:
+            keys: of the nodes.
+            dependents: those that depend on them go, too.
+        """
         found, more = set[str](), set(keys)
         while more != found:
             found, processes = set(more), {self.nodes[key].process for key in more} - {""}
             for key, node in self.nodes.items():
-                if node.process in processes or node.planned.run.container in found:
+                depends = dependents and any(after.node in found for after in node.planned.after)
+                if depends or node.process in processes or node.planned.run.container in found:
                     more.add(key)
         return tuple(key for key in self.nodes if key in found)
+
+    def group(self, process: str) -> tuple[str, ...]:
+        """Return the keys of the nodes that go down and come again with a process that failed."""
+        members = [*self.nodes_of(process)]
+        how = {each.planned.supervision.on_failure for each in members}
+        if OnFailure.ALL in how:
+            return tuple(self.nodes)
+        keys = (each.key for each in members)
+        return self.whole(keys, dependents=OnFailure.DEPENDENTS in how)
 
     def changed(self) -> None:
         """Note that something may be other than the last verdict saw it."""

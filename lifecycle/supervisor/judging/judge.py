@@ -16,7 +16,6 @@ from msgspec.structs import replace
 from lifecycle.middleware.fastdds.profiles import FORGOTTEN_S
 from lifecycle.plan.model import Plan
 from lifecycle.supervisor.connections import discovery_server
-from lifecycle.supervisor.core.advance import ahead
 from lifecycle.supervisor.health.liveliness import arrivals
 from lifecycle.supervisor.judging.standstill import Standstill
 from lifecycle.supervisor.processes.scope import unlimited
@@ -117,7 +116,7 @@ class Judge:
             observation,
             stage=stage,
             machines=system.machines,
-            ahead=ahead(system.run),  # as of now: some are activated meanwhile
+            ahead=system.run.ahead,  # as of now: some are activated meanwhile
             over=system.over(),
         )
         verdict = self._without_passing_peers(verdict, stage)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -21,7 +21,6 @@ from lifecycle.verify.observation import NodeConfiguration
 
 if TYPE_CHECKING:
     from lifecycle.middleware.services.clients import NodeClients
-    from lifecycle.supervisor.shell.permit import Permit
 
 ACTIVE = "active"
 INACTIVE = "inactive"
@@ -33,6 +32,13 @@ _PRIMARY = (ACTIVE, INACTIVE, UNCONFIGURED, FINALIZED)
 
 _PASSING_S = 0.1
 """Who drives a node that is in the middle of a transition is somebody else: it is asked again."""
+
+
+Permit = Callable[[], Awaitable[None]]
+"""The right to send one node its activate request, asked for where the bytes leave.
+
+It returns once the request may leave, and nothing may be awaited after it; it raises ChangedError
+where the gate has closed again."""
 
 
 class NodeCondition(msgspec.Struct, frozen=True, kw_only=True):
@@ -203,7 +209,7 @@ class ServiceDriver(NodeInterfaceClient):
         wanted, reason, asked, accepted = _REACHED[operation], "it is", False, False
         for _ in range(_TRIES):
             if state == wanted and operation is Operation.ACTIVATE and permit is not None:
-                await permit.use()
+                await permit()
                 # The gate may have had it deactivated meanwhile.
                 state = await self._settled(limit_s)
             if state == wanted:
@@ -242,7 +248,7 @@ class ServiceDriver(NodeInterfaceClient):
             self._node,
             operation.value,
             timeout_s=limit_s,
-            before=permit.use if activates and permit is not None else None,
+            before=permit if activates else None,
         )
 
     def _limit_s(self, operation: Operation) -> float:

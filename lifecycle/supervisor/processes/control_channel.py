@@ -20,7 +20,7 @@ from lifecycle.middleware.process.busy_sign import BusySign, Overdue
 from lifecycle.node.host.control import Command, Event, HostSpec, Operation
 
 if TYPE_CHECKING:
-    from lifecycle.supervisor.shell.permit import Permit
+    from lifecycle.supervisor.nodes.driver import Permit
 
 _LONGEST_LINE = 1 << 24
 """Bytes; a node configuration with thousands of endpoints is one line."""
@@ -124,7 +124,7 @@ class ControlChannel:
         if command.operation is Operation.ACTIVATE:
             if permit is None:
                 raise BringUpError(f"cannot activate {node!r} without a permit from the gate")
-            await permit.use()
+            await permit()
         if self._writer is None or self._task is None or self._task.done():
             raise ChannelClosedError(
                 f"cannot reach {node!r}: its process closed the control channel"

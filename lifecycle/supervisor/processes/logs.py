@@ -30,7 +30,7 @@ LARGEST_LOG = 16 * 2**20
 _LARGEST_PIPE = 2**20
 """Bytes; /proc/sys/fs/pipe-max-size by default, pipe(7)."""
 
-_TRIED_AGAIN_S = 1.0
+TRIED_AGAIN_S = 1.0
 """How often a log is tried that could not be written."""
 
 _SAID_AGAIN_S = 60.0
@@ -286,11 +286,11 @@ class LogDirectory:
         self._failing: set[str] = set()
         self._lost = 0
 
-    def fails(self, process: str, error: OSError, *, lines: int) -> None:
+    def fails(self, process: str, error: OSError | None, *, lines: int) -> None:
         """Note that so many lines of a process could not be written."""
         self._failing.add(process)
         self._lost += lines
-        self._why = error.strerror or str(error)
+        self._why = "" if error is None else error.strerror or str(error)
         now_s = time.monotonic()
         if self._said_s is None or now_s - self._said_s > _SAID_AGAIN_S:
             self._said_s = now_s
@@ -316,37 +316,57 @@ class RotatedFile:
     """A file of lines: one that is full becomes `NAME.1`, and replaces the one before.
 
     Args:
-        path: of the file.
+        path: of the file; it, and its directory, are made where they are missing.
+        largest: bytes that it has at most.
         mode: its permissions.
         head: returns the line that each file begins with.
+
+    Attributes:
+        error: why the last line could not be written; None if it was.
     """
 
-    def __init__(self, path: Path, mode: int = 0o666, head: Callable[[], bytes] = bytes) -> None:
+    def __init__(
+        self,
+        path: Path,
+        largest: int,
+        *,
+        mode: int = 0o666,
+        head: Callable[[], bytes] = bytes,
+    ) -> None:
         self.path = path
+        self.largest = largest
+        self.error: OSError | None = None
         self._mode = mode
         self._head = head
+        self._failed_s = 0.0
         self._file: int | None = None
         self._bytes = 0
         self._torn = False
 
-    def open(self) -> int:
-        """Return its descriptor; the file, and its directory, are made where they are missing."""
+    def add(self, line: bytes) -> bool:
+        """Append a line; False if that failed, now or within the last second."""
+        now_s = time.monotonic()
+        if self.error is not None and now_s - self._failed_s < TRIED_AGAIN_S:
+            return False
+        try:
+            self._write(line)
+            self.error = None
+        except OSError as error:
+            self.error, self._failed_s = error, now_s
+        return self.error is None
+
+    def _write(self, line: bytes) -> None:
+        if self._bytes and self._bytes + len(line) > self.largest:
+            self.path.replace(self.path.with_name(f"{self.path.name}.1"))
+            self.close()
         if self._file is None:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC
             self._file = os.open(self.path, flags, self._mode)
             self._bytes = os.fstat(self._file).st_size
-        return self._file
-
-    def write(self, line: bytes, largest: int) -> None:
-        """Append a line, to a new file where this one would have more bytes than `largest`."""
-        if self._bytes and self._bytes + len(line) > largest:
-            self.path.replace(self.path.with_name(f"{self.path.name}.1"))
-            self.close()
-        file = self.open()
         left = memoryview(b"\n" * self._torn + (b"" if self._bytes else self._head()) + line)
         while left:
-            written = os.write(file, left)
+            written = os.write(self._file, left)
             self._bytes += written
             left = left[written:]
             self._torn = bool(left)
@@ -375,52 +395,30 @@ class ProcessLog:
         self._directory = directory
         self._process = process
         self.path = directory.path / f"{process.replace('/', '.')}.log"
-        self._file = RotatedFile(self.path)
-        self._failed_s = 0.0
-        self._error: OSError | None = None
+        self._file = RotatedFile(self.path, LARGEST_LOG)
         self._lost = 0
         self._open = False
 
     def open(self) -> None:
         """Create the file, and its directory where it is missing."""
         self._open = self._kept
-        if not self._kept:
-            return
-        try:
-            self._file.open()
-        except OSError as error:
-            self._fails(error, lines=0)
+        if self._open and not self._file.add(b""):
+            self._directory.fails(self._process, self._file.error, lines=0)
 
     def add(self, line: str) -> None:
         """Write one line, and before it how many are missing there."""
         if not self._open:
             return
-        now_s = time.monotonic()
-        if self._error is not None and now_s - self._failed_s < _TRIED_AGAIN_S:
+        file, before = self._file, self._file.error
+        text = f"{line}\n"
+        if self._lost and before is not None:
+            text = f"{_missing(self._lost)} missing here: {before.strerror}\n{text}"
+        if not file.add(text.encode(errors="backslashreplace")):
             self._lost += 1
-            self._directory.fails(self._process, self._error, lines=1)
-            return
-        try:
-            if self._lost:
-                assert self._error is not None
-                self._write(f"{_missing(self._lost)} missing here: {self._error.strerror}")
-                self._lost = 0
-            self._write(line)
-        except OSError as error:
-            self._fails(error, lines=1)
-            return
-        if self._error is not None:
-            self._error = None
+            self._directory.fails(self._process, file.error, lines=1)
+        elif before is not None:
+            self._lost = 0
             self._directory.recovers(self._process)
-
-    def _fails(self, error: OSError, *, lines: int) -> None:
-        self._error = error
-        self._failed_s = time.monotonic()
-        self._lost += lines
-        self._directory.fails(self._process, error, lines=lines)
-
-    def _write(self, line: str) -> None:
-        self._file.write(f"{line}\n".encode(errors="backslashreplace"), LARGEST_LOG)
 
     @property
     def shown(self) -> str:

@@ -67,21 +67,11 @@ def finding_of(failure: Failure) -> Finding:
     )
 
 
-def ended_early(reason: str, exit_code: ExitCode) -> UpResult:
+def ended_early(reason: str, exit_code: ExitCode, *failures: Failure) -> UpResult:
     """Return the result of a run that ended before there was anything to judge."""
-    verdict = never_connected(NOT_JUDGED, reason, exit_code)
-    return UpResult(exit_code=exit_code, verdict=verdict)
-
-
-def never_connected(verdict: Verdict, reason: str, exit_code: ExitCode) -> Verdict:
-    """Return `verdict` as the last one of a run that ended before its system was connected."""
+    verdict = with_failures(NOT_JUDGED, failures) if failures else NOT_JUDGED
     run = RunEnd(reason=reason, reached=None, exit_code=exit_code)
-    return replace(verdict, run=run)
-
-
-def with_failure(verdict: Verdict, failure: StepFailedError) -> Verdict:
-    """Return `verdict`, violated, with a failed step as its first finding."""
-    return with_failures(verdict, (failure.event(),))
+    return UpResult(exit_code=exit_code, verdict=replace(verdict, run=run))
 
 
 def with_failures(

@@ -24,7 +24,6 @@ from lifecycle.errors import MiddlewareError, UsageError
 from lifecycle.export.captured import CapturedParameter, CapturedSystem, Programs, capture
 from lifecycle.export.picture.build import Supervised, build_picture
 from lifecycle.export.picture.model import Picture
-from lifecycle.graph.state import Look
 from lifecycle.manifest.model import DiscoveryRange, EndpointPolicy
 from lifecycle.middleware.discovery.environment import peers_environment
 from lifecycle.middleware.process.control import check_memory
@@ -72,23 +71,15 @@ class JudgedSystem(msgspec.Struct, frozen=True, kw_only=True):
         plan: what it was judged against: with the connections that its nodes negotiated.
         observation: what was there.
         verdict: of an active system.
-        rmw: name of the RMW implementation it was looked at with.
+        where: where it was looked if nothing at all was there, else empty.
         limits: which installed libraries are not known, and what that costs; empty if all are.
     """
 
     plan: Plan
     observation: Observation
     verdict: Verdict
-    rmw: str = ""
+    where: str = ""
     limits: str = ""
-
-    @property
-    def where(self) -> str:
-        """Where it was looked if nothing at all was there, else an empty text."""
-        tools = self.plan.policy.tolerated_nodes
-        names = (each.full_name for each in self.observation.nodes)
-        foreign = any(not tolerating_pattern(each, tools) for each in names)
-        return "" if foreign else where(self.plan, self.rmw)
 
     @property
     def picture(self) -> Picture:
@@ -116,67 +107,68 @@ def judge_running(
     Raises:
         MiddlewareError: no participant can be made.
     """
-    with _looking(plan) as observer_participant:
-        return asyncio.run(
-            _judge(
-                plan, observer_participant, timeout_s, strict=strict, empty_graph_s=empty_graph_s
-            )
-        )
+
+    async def judge(participant: ObserverParticipant) -> JudgedSystem:
+        loop = asyncio.get_running_loop()
+        began = loop.time()
+        while True:
+            observation = await participant.graph.observe(plan)
+            # One that is not there may be yet to come.
+            seen = _judged(plan, observation, participant, may_be_over=False)
+            limit_s = timeout_s
+            if empty_graph_s is not None and seen.where:
+                limit_s = min(empty_graph_s, timeout_s)
+            left_s = began + limit_s - loop.time()
+            if left_s <= 0 or not _worth_waiting(seen.verdict, strict=strict):
+                unanswered = await _unanswering(plan, observation, participant)
+                return _judged(plan, observation, participant, unanswered=unanswered)
+            await _change(participant, min(left_s, _ASK_AGAIN_S))
+
+    with _looking(plan) as participant:
+        return asyncio.run(judge(participant))
 
 
-async def _following(
-    plan: Plan, of: Callable[[JudgedSystem], T], on_change: Callable[[T], None]
-) -> None:
-    """Look at every change and give what `of` says of it, where that differs, until cancelled.
+def follow_running(plan: Plan, on_change: Callable[[JudgedSystem], None]) -> None:
+    """Judge what runs whenever it changes, and give it to `on_change`, until interrupted.
 
     What may pass by itself is given a moment to do so, see `GracePeriod`.
     """
-    told: T | None = None
-    grace_period = GracePeriod()
-    last: Verdict | None = None
-    clock = asyncio.get_running_loop().time
-    pause_s = _ASK_AGAIN_S
-    with _looking(plan) as observer_participant:
+
+    async def follow(participant: ObserverParticipant) -> None:
+        grace_period = GracePeriod()
+        last: JudgedSystem | None = None
+        clock = asyncio.get_running_loop().time
+        pause_s = _ASK_AGAIN_S
         while True:
-            observation = await observer_participant.graph.observe(plan)
-            seen = _judged(plan, observation, observer_participant)
-            now, again_s = grace_period.after(last, seen.verdict, seen.plan, clock())
-            if now != last or again_s is not None:
+            seen = _judged(plan, await participant.graph.observe(plan), participant)
+            before = None if last is None else last.verdict
+            now, again_s = grace_period.after(before, seen.verdict, seen.plan, clock())
+            if now != before or again_s is not None:
                 pause_s = _ASK_AGAIN_S
-            last = now
-            said = of(replace(seen, verdict=last))
-            if said != told:
-                told = said
-                on_change(said)
-            if await _change(observer_participant, pause_s):
-                pause_s = _ASK_AGAIN_S
-            else:
-                pause_s = min(pause_s * 2, _ASK_AT_MOST_S)
+            seen = replace(seen, verdict=now)
+            if seen != last:
+                last = seen
+                on_change(seen)
+            changed = await _change(participant, pause_s)
+            pause_s = _ASK_AGAIN_S if changed else min(pause_s * 2, _ASK_AT_MOST_S)
+
+    with _looking(plan) as participant:
+        asyncio.run(follow(participant))
 
 
-def follow_running(
-    plan: Plan, of: Callable[[JudgedSystem], T], on_change: Callable[[T], None]
-) -> None:
-    """Judge what runs and give what `of` says of it whenever that differs, until interrupted."""
-    asyncio.run(_following(plan, of, on_change))
-
-
-def where(plan: Plan, rmw: str) -> str:
-    """Say where an empty graph was looked at: what usually differs when nodes are not found."""
-    return (
-        f"no node in the graph; looked in ROS domain {plan.domain_id} with {rmw}, "
-        f"discovery range {plan.discovery_range.value}"
-    )
+def _enter_domain(domain_id: int, discovery_range: DiscoveryRange) -> None:
+    """Have participants of this process be made in a domain, if there is room for one."""
+    os.environ["ROS_DOMAIN_ID"] = str(domain_id)
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = discovery_range.name
+    check_memory()
 
 
 def _looking(plan: Plan) -> ObserverParticipant:
     """Observe a plan's domain; also nodes that are not planned, where they are negotiated with."""
-    os.environ["ROS_DOMAIN_ID"] = str(plan.domain_id)
-    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = plan.discovery_range.name
+    _enter_domain(plan.domain_id, plan.discovery_range)
     hosts = reached_hosts(plan, own_machines(plan, ""))
     os.environ.update(peers_environment(hosts, os.environ))
     is_open = plan.policy.undeclared_nodes is EndpointPolicy.OPEN
-    check_memory()
     return ObserverParticipant.open(
         plan.domain_id,
         onlooker_connections(plan, _reported_to_supervisors(plan)),
@@ -229,33 +221,20 @@ def _judged(
         plan=expected.plan,
         observation=observation,
         verdict=with_findings(verdict, found, expected.plan.policy),
-        rmw=observer_participant.rmw,
+        where=_where(plan, observation, observer_participant.rmw),
         limits=observer_participant.unknown_versions,
     )
 
 
-async def _judge(
-    plan: Plan,
-    observer_participant: ObserverParticipant,
-    timeout_s: float,
-    *,
-    strict: bool,
-    empty_graph_s: float | None,
-) -> JudgedSystem:
-    loop = asyncio.get_running_loop()
-    began = loop.time()
-    while True:
-        observation = await observer_participant.graph.observe(plan)
-        # One that is not there may be yet to come.
-        seen = _judged(plan, observation, observer_participant, may_be_over=False)
-        limit_s = timeout_s
-        if empty_graph_s is not None and seen.where:
-            limit_s = min(empty_graph_s, timeout_s)
-        left_s = began + limit_s - loop.time()
-        if left_s <= 0 or not _worth_waiting(seen.verdict, strict=strict):
-            unanswered = await _unanswering(plan, observation, observer_participant)
-            return _judged(plan, observation, observer_participant, unanswered=unanswered)
-        await _change(observer_participant, min(left_s, _ASK_AGAIN_S))
+def _where(plan: Plan, observation: Observation, rmw: str) -> str:
+    """Say where an empty graph was looked at: what usually differs when nodes are not found."""
+    tools, names = plan.policy.tolerated_nodes, (each.full_name for each in observation.nodes)
+    if any(not tolerating_pattern(each, tools) for each in names):
+        return ""
+    return (
+        f"no node in the graph; looked in ROS domain {plan.domain_id} with {rmw}, "
+        f"discovery range {plan.discovery_range.value}"
+    )
 
 
 async def _unanswering(
@@ -363,10 +342,7 @@ def capture_running(
     from lifecycle.graph.graph import Graph
 
     environment = dict(os.environ)
-
-    os.environ["ROS_DOMAIN_ID"] = str(domain_id)
-    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = discovery_range.name
-    check_memory()
+    _enter_domain(domain_id, discovery_range)
     with Graph.in_loop(domain_id) as graph:
         observation, parameters, unsettled, programs = asyncio.run(
             _look(graph, wait_s, None if attach else environment)
@@ -401,20 +377,15 @@ async def _look(
         *(_ask(graph.clients, node, parameters=node.full_name in serving) for node in nodes)
     )
     names = [node.full_name for node in nodes]
-    graph.state.put_look(
-        Look(
-            nodes=nodes,
-            endpoints=endpoints,
-            answers={
-                name: (state, configuration)
-                for name, (state, configuration, _) in zip(names, answers, strict=True)
-            },
-        )
-    )
+    said = {
+        name: (state, configuration)
+        for name, (state, configuration, _) in zip(names, answers, strict=True)
+    }
     parameters = {
         name: each for name, (_, _, each) in zip(names, answers, strict=True) if name in serving
     }
-    return graph.state.observation(), parameters, unsettled, note_ended(programs)
+    observation = graph.state.observation(nodes, endpoints, said)
+    return observation, parameters, unsettled, note_ended(programs)
 
 
 async def _ask(

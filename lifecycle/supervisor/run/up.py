@@ -19,12 +19,11 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
-from lifecycle.errors import ExitCode, MiddlewareError
+from lifecycle.errors import ExitCode
 from lifecycle.manifest.model import Authority, DataLayerSource, EndpointPolicy, RunKind
 from lifecycle.middleware.discovery.environment import (
     all_by_multicast,
     discovery_peers,
-    missing_port,
     peers_environment,
 )
 from lifecycle.middleware.fastdds.profiles import (
@@ -72,7 +71,7 @@ from lifecycle.supervisor.run.events import (
     Stopping,
     SystemReached,
 )
-from lifecycle.supervisor.run.failure import StepFailedError, never_connected, with_failure
+from lifecycle.supervisor.run.failure import StepFailedError, ended_early
 from lifecycle.supervisor.run.journal import Journal
 from lifecycle.supervisor.run.options import (
     Until,
@@ -87,7 +86,6 @@ from lifecycle.supervisor.run.records import Records
 from lifecycle.supervisor.run.service_manager import ServiceManager
 from lifecycle.supervisor.run.signals import Ending
 from lifecycle.supervisor.shell.supervisor import Means, Supervisor
-from lifecycle.verify.verdict import NOT_JUDGED
 
 LEAVE_S = 10.0
 """A participant leaves within 0.2 s, over connections that are not answered within 4 s.
@@ -177,8 +175,7 @@ def up(
             leaving.enter_context(journal.writing(logs))
             fork_server = ForkServer(process)
             leaving.enter_context(_forgetting_runs(emit, logs, plan.system))
-            records = Records(directory, system, fork_server, emit)
-            leaving.callback(records.close)
+            records = Records(directory, system, fork_server)
             records.write()
             try:
                 # Before any participant: who asks a server that is not there waits to ask again.
@@ -203,13 +200,9 @@ def up(
                 on_start(supervisor.status)
                 return await supervisor.run()
             except StepFailedError as failure:
-                emit(failure.event())
-                verdict = never_connected(
-                    with_failure(NOT_JUDGED, failure),
-                    f"failed: {failure.subject} ({failure.rule.id})",
-                    failure.exit_code,
-                )
-                return UpResult(exit_code=failure.exit_code, verdict=verdict)
+                emit(failed := failure.event())
+                reason = f"failed: {failed.subject} ({failed.rule})"
+                return ended_early(reason, failure.exit_code, failed)
             finally:
                 await discovery_server.end(system, asyncio.Event())
                 await fork_server.close()
@@ -370,21 +363,7 @@ async def _observer_participant(
                 f"try {number + 1} of {OBSERVER_TRIES - 1}"
             )
         )
-    # Nodes elsewhere would be found: they answer to ports of ours.
-    discovery = observer_participant.discovery
-    port = None
-    if local_processes(plan, options.machine):
-        port = missing_port(discovery.domain_id, discovery.urls, os.environ)
-    if port is not None:
-        observer_participant.prepare_to_leave()
-        observer_participant.destroy()
-        raise MiddlewareError(
-            f"cannot discover nodes of this host in domain {plan.domain_id}: UDP port {port}, by "
-            "which all participants find each other, is taken by something else",
-            hint=f"`ss -lunp 'sport = :{port}'` says by what; end it, or choose another domain: "
-            "`lifecycle ports` says which are safe",
-        )
-    if unasked_s := discovery.settling.unasked_s:
+    if unasked_s := observer_participant.discovery.settling.unasked_s:
         emit(
             Notice(
                 message=f"who is there is seen within {unasked_s:g} s, before which the gate stays "

@@ -26,8 +26,8 @@ from lifecycle.manifest.model import Condition
 from lifecycle.plan.model import Plan, PlannedNode
 from lifecycle.plan.restart import moving_nodes
 from lifecycle.supervisor.control.protocol import ProcessState
-from lifecycle.supervisor.core import advance, gate, inputs
-from lifecycle.supervisor.core.state import Level
+from lifecycle.supervisor.core import advance, effects, gate, inputs
+from lifecycle.supervisor.core.state import NEVER_S, Level
 from lifecycle.supervisor.judging.grace_period import GracePeriod
 from lifecycle.supervisor.nodes.driver import ACTIVE, INACTIVE
 from lifecycle.supervisor.run.events import Notice
@@ -95,7 +95,7 @@ class Looks:
         self._found_s = 0.0
         self._tries: Counter[str] = Counter()
 
-    async def look(self) -> None:
+    async def look(self, _: effects.Look) -> None:
         """Look and judge, once a burst of changes is over."""
         run, judge = self._system.run, self._shell.judge
         loop = asyncio.get_running_loop()
@@ -108,7 +108,7 @@ class Looks:
         is_read_again = False
         while True:
             self._shell.catch_up()
-            mark, stage, away = run.mark, advance.stage_of(run), advance.away(run)
+            mark, stage, away = run.mark, advance.stage_of(run), run.away
             found = await judge.look(stage)
             closes = gate.closes(found, strict=run.options.strict)
             if closes or stage is not Stage.CONNECTED or not self._is_waited_for():
@@ -141,36 +141,30 @@ class Looks:
     ) -> inputs.Verified:
         run, judge = self._system.run, self._shell.judge
         now_s = asyncio.get_running_loop().time()
-        verdict, waits_s = found, [float("inf")]
-        waits = False
+        verdict, awaited_s, again_s = found, list[float](), list[float]()
         watched = run.held_s is not None and run.attempt is None and run.passage is None
         if watched:
-            verdict, again_s = self._grace_period.after(
+            verdict, kept_s = self._grace_period.after(
                 self._latest, found, self._system.expected, now_s
             )
-            waits = again_s is not None
-            waits_s += [again_s] if again_s is not None else []
+            awaited_s += [] if kept_s is None else [kept_s]
         self._latest = verdict
-        if not gate.closes(found, strict=run.options.strict) and stage is Stage.CONNECTED:
-            unsaid_s = judge.unsaid_s(found)
-            if unsaid_s > 0:
-                waits = True
-                waits_s.append(unsaid_s)
+        closes = gate.closes(found, strict=run.options.strict)
+        if not closes and stage is Stage.CONNECTED and (left_s := judge.unsaid_s(found)) > 0:
+            awaited_s.append(left_s)
         if judge.asks_again(found):
             if run.attempt is not self._attempt:
                 self._attempt, self._again_s = run.attempt, ASK_AGAIN_S
-            waits_s.append(ASK_AGAIN_AT_MOST_S if watched else self._again_s)
+            again_s.append(ASK_AGAIN_AT_MOST_S if watched else self._again_s)
             self._again_s = min(self._again_s * 2, ASK_AGAIN_AT_MOST_S)
         if run.change is not None and judge.is_reconciling:
-            waits = True
-            waits_s.append(ASK_AGAIN_AT_MOST_S)
-        undiscovered = self._undiscovered(stage, found, now_s, waits_s)
-        again_s = min(waits_s)
+            awaited_s.append(ASK_AGAIN_AT_MOST_S)
+        undiscovered = self._undiscovered(stage, found, now_s, again_s)
         return inputs.Verified(
             mark=mark,
             verdict=verdict,
-            again_s=None if again_s == float("inf") else again_s,
-            waits=waits,
+            again_s=min((*awaited_s, *again_s), default=NEVER_S),
+            waits=bool(awaited_s),
             undiscovered=undiscovered,
             away=away,
         )
@@ -185,7 +179,7 @@ class Looks:
     # Who is not discovered over TCP
 
     def _undiscovered(
-        self, stage: Stage, found: Verdict, now_s: float, waits_s: list[float]
+        self, stage: Stage, found: Verdict, now_s: float, again_s: list[float]
     ) -> str:
         """Return the key of the node to be started again on a fresh port; empty if none is."""
         run = self._system.run
@@ -205,7 +199,7 @@ class Looks:
         if name is None or run.attempt.until_s - run.now_s <= UNCHANGED_S + max(left_s, 0.0):
             return ""
         if left_s > 0:
-            waits_s.append(left_s)
+            again_s.append(left_s)
             return ""
         self._tries[name] += 1
         self._found_s = now_s
@@ -246,9 +240,7 @@ class Looks:
 
     def _is_looked_at(self) -> bool:
         run = self._system.run
-        active = any(each.level is Level.ACTIVE for each in run.nodes.values())
-        watched = active and run.held_s is not None
-        return run.judged.looking or watched or advance.is_at_gate(run)
+        return run.judged.looking or run.is_watched or advance.is_at_gate(run)
 
     def _followed(self) -> Plan:
         run = self._system.run

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 from collections.abc import Awaitable
 from typing import TYPE_CHECKING
 
@@ -20,7 +21,7 @@ from lifecycle.manifest.model import RunKind
 from lifecycle.node.host.control import Operation
 from lifecycle.plan.parameters import GIVEN
 from lifecycle.supervisor.core import effects, inputs
-from lifecycle.supervisor.core.gate import ACTIVATES_ITSELF, GUARD_TRIES
+from lifecycle.supervisor.core.gate import ACTIVATES_ITSELF, BY_ITSELF, GUARD_TRIES
 from lifecycle.supervisor.core.state import REACHES, Level, Step
 from lifecycle.supervisor.nodes.adoption import ran_before
 from lifecycle.supervisor.nodes.driver import (
@@ -31,12 +32,12 @@ from lifecycle.supervisor.nodes.driver import (
     ChangedError,
     ControlDriver,
     NodeCondition,
+    Permit,
     ServiceDriver,
 )
 from lifecycle.supervisor.nodes.system import level_of
 from lifecycle.supervisor.processes.control_channel import ChannelClosedError, HostFailedError
 from lifecycle.supervisor.run.events import Notice, RequestSent
-from lifecycle.supervisor.shell.permit import Permit
 from lifecycle.verify.judge import with_findings
 from lifecycle.verify.verdict import NOT_JUDGED
 
@@ -47,17 +48,8 @@ if TYPE_CHECKING:
 _DEATH_S = 0.5
 """A closed channel usually means a dying process; its end says more than the channel did."""
 
-BY_ITSELF = "was activated by its own code or another client while the gate is closed"
-
-_OPERATIONS = {
-    Step.CONFIGURE: Operation.CONFIGURE,
-    Step.CONNECT: Operation.CONNECT,
-    Step.ACTIVATE: Operation.ACTIVATE,
-    Step.DEACTIVATE: Operation.DEACTIVATE,
-    Step.DISCONNECT: Operation.DISCONNECT,
-    Step.CLEANUP: Operation.CLEANUP,
-    Step.SHUTDOWN: Operation.SHUTDOWN,
-}
+_REOPENS_S = 1.0
+"""What changes as others are activated is judged within milliseconds, on a loaded machine later."""
 
 
 class Requests:
@@ -137,13 +129,26 @@ class Requests:
             condition = await self._configure(node)
         else:
             if step is Step.ACTIVATE:
-                permit = Permit(self._shell, node.core.key)
-                await permit.use()
-            condition = await self._perform(node, _OPERATIONS[step], permit)
+                permit = functools.partial(self._permit, node.core.key)
+                await permit()
+            condition = await self._perform(node, Operation(step.value), permit)
         node.report(condition.state, connected=condition.connected)
         if step is Step.CONFIGURE:
             await self._give_what_is_missing(node)
         return condition
+
+    async def _permit(self, key: str) -> None:
+        """Return once a node's activate request may leave; nothing may be awaited after it.
+
+        Raises:
+            ChangedError: what changed keeps the gate closed; the node is to be asked again later.
+        """
+        loop = asyncio.get_running_loop()
+        until_s = loop.time() + _REOPENS_S
+        while not self._shell.may_activate(key):
+            left_s = until_s - loop.time()
+            if left_s <= 0 or not await set_within(self._shell.moved, left_s):
+                raise ChangedError(f"cannot activate {key!r}: the gate closed again")
 
     async def _perform(
         self, node: NodeRun, operation: Operation, permit: Permit | None = None
@@ -247,7 +252,7 @@ class Requests:
         reports = isinstance(node.driver, ControlDriver)  # others may have moved any other
         if reports and node.planned.managed and not _applies(step, node):
             return min(done, level_of(node))
-        condition = await self._perform(node, _OPERATIONS[step])
+        condition = await self._perform(node, Operation(step.value))
         node.report(condition.state, connected=condition.connected)
         if step is Step.DEACTIVATE and not node.planned.managed:
             return Level.STARTED

@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import os
 import signal
 from collections import deque
-from collections.abc import Coroutine, Iterator
+from collections.abc import Callable, Coroutine, Iterator
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -63,8 +62,7 @@ from lifecycle.supervisor.shell.looks import Looks
 from lifecycle.supervisor.shell.processes import Processes
 from lifecycle.supervisor.shell.requests import Requests
 from lifecycle.verify.judge import with_findings
-from lifecycle.verify.rules.run import PROCESS_DIED
-from lifecycle.verify.verdict import NOT_JUDGED
+from lifecycle.verify.verdict import NOT_JUDGED, Verdict
 
 if TYPE_CHECKING:
     from lifecycle.supervisor.nodes.observer_participant import ObserverParticipant
@@ -125,9 +123,8 @@ class Supervisor:
         self._said: dict[str, object] = {}
         self._answers: dict[int, asyncio.Future[Answer]] = {}
         self._plans: tuple[Plan, Plan] = (system.plan, system.first)
-        self._is_leaving = False
-        self._ends: asyncio.Task[None] | None = None
-        self._last = NOT_JUDGED
+        self._closing: asyncio.Task[None] | None = None
+        self._last: Verdict | None = None
         self._programming: asyncio.Task[None] | None = None
         self._over = asyncio.Event()
         self._hurry = asyncio.Event()
@@ -151,6 +148,18 @@ class Supervisor:
         self._looks = Looks(self)
         self._load = Load(system)
         self._ros_interface = RosInterface(self)
+        self._ports: dict[type, Callable[[Any], Coroutine[Any, Any, None] | None]] = {
+            effects.Ask: self._requests.ask,
+            effects.Give: self._requests.give,
+            effects.Spawn: self._processes.spawn,
+            effects.Signal: self._processes.signal,
+            effects.Sweep: self._processes.sweep,
+            effects.Look: self._looks.look,
+            effects.Program: self._program,
+            effects.Prepare: self._prepare,
+            effects.Answer: self._answer,
+            effects.Wake: self._wake_at,
+        }
         system.on_change = self._touch
         system.on_health = self._health
         system.liveliness.listen(self._silence)
@@ -183,11 +192,7 @@ class Supervisor:
 
     def status(self) -> SystemStatus:
         """Return what is known now."""
-        run = self.system.run
-        ends = "" if run.ending is None else self._why(run.ending)
-        return system_status(
-            self.system, supervisor=os.getpid(), elapsed_s=self._emit.elapsed_s, ends=ends
-        )
+        return system_status(self.system)
 
     def look(self) -> SupervisorSnapshot:
         """Return all that is known now."""
@@ -222,13 +227,12 @@ class Supervisor:
         if order.ask is ControlRequest.APPLY and order.plan is not None:
             what = change_to(run, order.plan)
             change = changed_nodes(what, run.first, order.plan, run.revision)
-        number = len(self._answers)
-        order = replace(order, id=number, first=run.first)
+        order = replace(order, id=len(self._answers), first=run.first)
         if change is not None and order.dry_run:
             code, why = refused_at_once(run, order)
             differs = ExitCode.VIOLATED if change.differences else ExitCode.OK
             return Answer(exit_code=code if why else differs, error=why, change=change)
-        answer = self._answers[number] = self._loop.create_future()
+        answer = self._answers[order.id] = self._loop.create_future()
         self.give(inputs.Ordered(order=order))
         done: Answer = await asyncio.shield(answer)
         if change is not None and done.exit_code == ExitCode.OK:
@@ -267,7 +271,8 @@ class Supervisor:
         wanted = advance.advance(run)
         self._say_states()
         for effect in wanted:
-            self._perform(effect)
+            if (work := self._ports[type(effect)](effect)) is not None:
+                self.start(work)
         self.moved.set()
         self.moved = asyncio.Event()
         self._follow_plan()
@@ -278,38 +283,17 @@ class Supervisor:
             if run.is_over:
                 self._over.set()
         elif self.system.remote and (left := self._peers.left()) != run.left:
-            self.give(inputs.Left(nodes=left))
+            self.give(inputs.Saw(left=left))
 
-    def _perform(self, effect: effects.Effect) -> None:
-        if isinstance(effect, effects.Ask):
-            self._requests.ask(effect)
-        elif isinstance(effect, effects.Spawn):
-            self._processes.spawn(effect)
-        elif isinstance(effect, effects.Signal):
-            self._processes.signal(effect)
-        elif isinstance(effect, effects.Sweep):
-            self.start(self._processes.sweep(effect))
-        elif isinstance(effect, effects.Look):
-            self.start(self._looks.look())
-        elif isinstance(effect, effects.Program):
-            if self._programming is not None:
-                self._programming.cancel()  # for a passage that was given up
-            self._programming = self.start(self._program(effect))
-        elif isinstance(effect, effects.Give):
-            self.start(self._requests.give(effect))
-        elif isinstance(effect, effects.Prepare):
-            self.start(self._prepare())
-        elif isinstance(effect, effects.Answer):
-            answer = self._answers[effect.order]
-            if not answer.done():
-                answer.set_result(Answer(exit_code=effect.code, error=effect.error))
-        else:
-            self._wake_at(effect.at_s)
+    def _answer(self, effect: effects.Answer) -> None:
+        answer = self._answers[effect.order]
+        if not answer.done():
+            answer.set_result(Answer(exit_code=effect.code, error=effect.error))
 
-    def _wake_at(self, at_s: float) -> None:
+    def _wake_at(self, effect: effects.Wake) -> None:
         if self._wake is not None:
             self._wake.cancel()
-        wait_s = max(0.0, min(at_s, self._load.next_s(self.now_s())) - self.now_s())
+        wait_s = max(0.0, min(effect.at_s, self._load.next_s(self.now_s())) - self.now_s())
         self._wake = self._loop.call_later(wait_s, self._tick)
 
     def _tick(self) -> None:
@@ -375,14 +359,11 @@ class Supervisor:
         liveliness = self.system.liveliness
         hangs = {**liveliness.causes(Cause.HUNG), **liveliness.causes(Cause.STOPPED)}
         known, self._silent = self._silent, dict(liveliness.silent)
-        for name in {name for name in {**known, **self._silent} if self._is_news(name, known)}:
-            if (node := self.system.node_named(name)) is not None:
-                away, why = liveliness.is_out_of_reach(name), self._silent.get(name, "")
-                hung = name in hangs
+        for name in known.keys() | self._silent.keys():
+            node, why = self.system.node_named(name), self._silent.get(name, "")
+            if node is not None and why != known.get(name, ""):
+                away, hung = liveliness.is_out_of_reach(name), name in hangs
                 self.give(inputs.Silent(node=node.core.key, why=why, away=away, hangs=hung))
-
-    def _is_news(self, name: str, known: dict[str, str]) -> bool:
-        return known.get(name) != self._silent.get(name)
 
     async def is_seen(self, name: str) -> bool:
         """Return whether discovery shows a node of this name."""
@@ -438,14 +419,14 @@ class Supervisor:
         for node in self.system.nodes.values():
             node.say()
 
-    @staticmethod
-    def _why(ending: core.Ending) -> str:
-        said = "; ".join(each.message for each in ending.failures)
-        return said or ending.reason
-
     # What is done
 
-    async def _program(self, effect: effects.Program) -> None:
+    def _program(self, effect: effects.Program) -> None:
+        if self._programming is not None:
+            self._programming.cancel()  # for a passage that was given up
+        self._programming = self.start(self._programmed(effect))
+
+    async def _programmed(self, effect: effects.Program) -> None:
         passage = self.system.run.passage
         until_s = self.now_s() if passage is None else passage.until_s
         error = ""
@@ -456,7 +437,7 @@ class Supervisor:
             error = failed.message
         self.give(inputs.Programmed(number=effect.number, error=error))
 
-    async def _prepare(self) -> None:
+    async def _prepare(self, _: effects.Prepare) -> None:
         error = ""
         try:
             await self.means.fork_server.ready()
@@ -479,12 +460,14 @@ class Supervisor:
         else:
             self.give(inputs.Adopted(plan=plan, nodes=frozenset(self.system.adopted or ())))
 
-    async def _watch(self, died: asyncio.Future[Any], subject: str, rule: str) -> None:
-        """Say that what others depend on has died."""
-        message = await asyncio.shield(died)
-        if self.system.run.ending is None:
-            text = message if isinstance(message, str) else str(message)
-            self.give(inputs.Broken(subject=subject, message=f"cannot go on: {text}", rule=rule))
+    async def _watch_fork_server(self) -> None:
+        text = await asyncio.shield(self.means.fork_server.died)
+        self.give(inputs.Broken(subject="fork server", message=f"cannot go on: {text}"))
+
+    async def _watch_discovery_server(self) -> None:
+        if (server := self.system.server) is not None:
+            found = discovery_server.death(server, await asyncio.shield(server.ended))
+            self.give(inputs.Broken(subject=found.subject, message=found.message, finds=True))
 
     # From begin to end
 
@@ -500,7 +483,7 @@ class Supervisor:
                 self._ros_interface.on_event(event)
 
         self._emit.listen(changed)
-        self._ros_interface.begin()
+        self.start(self._ros_interface.follow())
         result = UpResult(exit_code=ExitCode.INTERNAL, verdict=NOT_JUDGED)
         beside = [
             asyncio.ensure_future(each)
@@ -508,8 +491,8 @@ class Supervisor:
                 self._follow_graph(),
                 self._looks.follow(),
                 self.answering.follow(),
-                self._watch(self.means.fork_server.died, "fork server", PROCESS_DIED.id),
-                self._watch_server(),
+                self._watch_fork_server(),
+                self._watch_discovery_server(),
             )
         ]
         for each in beside:
@@ -527,7 +510,7 @@ class Supervisor:
                     raise
                 await ended(*beside)
                 await self._leave_nothing()
-            result = result_of(self.system, self._last)
+            result = result_of(self.system, self._last or NOT_JUDGED)
         finally:
             await ended(*beside, *self._tasks)
             if self._wake is not None:
@@ -547,41 +530,26 @@ class Supervisor:
             raise self._error
         return result
 
-    async def _watch_server(self) -> None:
-        server = self.system.server
-        if server is None:
-            return
-        end = await asyncio.shield(server.ended)
-        if self.system.run.ending is None:
-            found = discovery_server.death(server, end)
-            self.give(
-                inputs.Broken(
-                    subject=found.subject, message=found.message, rule=found.rule, finds=True
-                )
-            )
-
     def _end(self, ending: core.Ending) -> None:
         """Begin to leave, once."""
-        if self._is_leaving:
+        if self._last is not None:
             return
-        self._is_leaving = True
         latest = self.system.run.judged.verdict
-        if latest is not None:
-            self._last = self.system.liveliness.by_now(latest)
+        self._last = NOT_JUDGED if latest is None else self.system.liveliness.by_now(latest)
         how = FAILED if ending.failed else ""
         self._peers.leave(f"{how}{ending.stopping}")
         self.means.participant.prepare_to_leave()
         if self._programming is not None:
             self._programming.cancel()  # nothing is programmed once all is removed
         if self.authority is not None:
-            self._ends = self.start(self.authority.close())
+            self._closing = self.start(self.authority.close())
 
     async def _leave_nothing(self) -> None:
         """Undo what is no process's: after the last message has left, and before strays end."""
         await asyncio.gather(*self._processes.releasing)
         await ended(*filter(None, (self._programming,)))
-        if self._ends is not None:
-            await asyncio.wait({self._ends})
+        if self._closing is not None:
+            await asyncio.wait({self._closing})
         try:
             await self.means.networks.close(self._hurry)
         finally:

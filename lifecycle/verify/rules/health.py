@@ -61,9 +61,10 @@ def health_of(
 
 
 def check(view: View) -> Iterator[Finding]:
-    """Judge the health of every node of which the manifest asks it."""
+    """Judge the health of every node of which the manifest asks it, and what handlers raised."""
     for facts in view.nodes.values():
         yield from _judge(view, facts)
+        yield from _faults(facts)
 
 
 def _judge(view: View, facts: NodeFacts) -> Iterator[Finding]:
@@ -110,3 +111,18 @@ def _judge(view: View, facts: NodeFacts) -> Iterator[Finding]:
             observed="unknown",
             message=f"cannot verify that node {node.full_name} is healthy: {health.message}",
         )
+
+
+def _faults(facts: NodeFacts) -> Iterator[Finding]:
+    """Find action servers of which the handler raised at the last goal, whatever is asked."""
+    node, report = facts.node, facts.configuration
+    for each in () if report is None or facts.absent else report.endpoints:
+        if each.fault:
+            wrong = f"{each.kind.noun} {each.name!r}: {each.fault}"
+            yield UNHEALTHY.on_node(
+                node,
+                outcome=Outcome.VIOLATED,
+                expected=_HEALTHY,
+                observed=wrong,
+                message=f"cannot accept node {node.full_name}: it is not healthy: {wrong}",
+            )

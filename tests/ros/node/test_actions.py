@@ -16,9 +16,10 @@ from rclpy.task import Future
 from std_msgs.msg import String
 from test_msgs.action import Fibonacci
 
-from lifecycle import GoalInterruptedError, LifecycleNode, on_action, on_goal
+from lifecycle import GoalInterruptedError, LifecycleNode, codec, on_action, on_goal
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import EndpointPolicy
+from lifecycle.verify.observation import NodeConfiguration
 
 Active = Callable[..., Any]
 Ask = Callable[..., Asking]
@@ -187,7 +188,16 @@ def test_what_a_sync_handler_does_wrong_is_said_and_ends_its_goal_alone(
     assert asking.result(asking.goal(order)) == (status, sequence)
     trace = ["OSError: no such number"] if order == 0 else []
     assert said(capfd) == [*trace, *([expected] if expected else [])]
+    fault = "its handler raised OSError: no such number" if order == 0 else ""
+    assert fault_of(driver) == fault
     assert asking.result(asking.goal(3)) == (SUCCEEDED, [])
+    assert fault_of(driver) == ""
+
+
+def fault_of(driver: Driver) -> str:
+    """Return what /it reports of its action server's handler."""
+    (report,) = codec.from_json(driver.configuration("/it"), NodeConfiguration).endpoints
+    return report.fault
 
 
 class Stubborn(LifecycleNode):

@@ -30,6 +30,6 @@ def test_an_answer_that_comes_after_its_server_was_unmade_is_lost_and_the_node_l
     driver.spin_until(lambda: node.asked)
     node.map_to("ask", node.connect_to("udpv4://127.0.0.1", name="net"))
     node.go_on.set_result(None)
-    node.lifecycle.wake()
+    node.executor.wake()
     driver.settle()
     assert driver.state("/it") == (3, "active")

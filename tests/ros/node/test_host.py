@@ -16,8 +16,10 @@ from host_process import HostProcess, driver_in, hosted
 from msgspec.structs import replace
 from planning import publisher, subscription
 
+from lifecycle.errors import BringUpError
 from lifecycle.manifest.model import Executor, Run, RunKind, Timeouts
 from lifecycle.node.host.control import Event, Operation
+from lifecycle.node.host.in_process import NodeInProcess
 
 HERE = Path(__file__).parent
 CONFIGURE, CONNECT, ACTIVATE = Operation.CONFIGURE, Operation.CONNECT, Operation.ACTIVATE
@@ -120,6 +122,32 @@ def test_an_exception_in_a_callback_is_told_and_its_traceback_is_in_the_log(star
     assert (reply.ok, reply.state) == (False, "unconfigured")
     assert reply.error == "/one: on_configure raised OSError: no such camera"
     assert 'raise OSError("no such camera")' in host.log.read_text()
+
+
+BLOCKED = (
+    "cannot wait for service '/nobody' in a callback: the answer comes by the executor that waits "
+    "for this callback; write `async def` and `await client.call_async(request)`"
+)
+
+
+@pytest.mark.parametrize("executor", [Executor.SINGLE, Executor.EVENTS])
+def test_a_blocking_call_in_a_callback_is_an_error_in_whatever_executor_would_wait(
+    start: Start, executor: Executor
+) -> None:
+    run = Run(kind=RunKind.PYTHON, python="hosted:Calling", executor=executor)
+    host = start(hosted("one", "Calling", run=run))
+    host.until("ready")
+    assert host.do("/one", CONFIGURE).error == BLOCKED
+
+
+def test_a_blocking_call_is_an_error_in_a_node_of_a_test_too(fresh_domain: int) -> None:
+    node = NodeInProcess(hosted("one", "Calling"), domain_id=fresh_domain)
+    try:
+        with pytest.raises(BringUpError) as error:
+            node.change("configure")
+    finally:
+        node.close()
+    assert str(error.value) == f"cannot configure /one: {BLOCKED}"
 
 
 @pytest.mark.parametrize(

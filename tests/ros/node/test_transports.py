@@ -76,7 +76,7 @@ def test_a_flow_that_needs_the_network_has_no_shared_memory_and_its_node_has(
     assert (video.error, video.dscp) == ("", 46)
     assert (has_shared_memory(video.nfes), has_shared_memory(map_.nfes)) == (False, True)
     assert {"shm", "tcpv4", "udpm", "udpv4"} <= set(configuration.transports)
-    made = next(m for m in node.lifecycle.data_layer.mappings if m.endpoint.name == "video")
+    made = next(e for e in node.lifecycle.data_layer.endpoints.values() if e.name == "video")
     assert made.connection is not None
     assert made.connection.participant is not None
     sockets = own_sockets(senders_of(made.connection.participant.node))

@@ -25,6 +25,20 @@ class Counter(LifecycleNode):
         return Fibonacci.Result(sequence=counted)
 
 
+class Failing(LifecycleNode):
+    @on_action("count")
+    async def count(self, goal: Any) -> Fibonacci.Result:
+        raise OSError("no such number")
+
+
+class Asking(LifecycleNode):
+    """Sends one goal after the other, whatever becomes of them."""
+
+    @on_timer(period_s=0.1)
+    async def ask(self) -> None:
+        await self.action_client("count").send_goal_async(Fibonacci.Goal())
+
+
 class Caller(LifecycleNode):
     _endless: Any = None
 

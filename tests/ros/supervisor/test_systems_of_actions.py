@@ -59,3 +59,27 @@ def test_a_remapped_action_on_a_connection_is_brought_up_judged_drawn_and_ended(
         run.met("log", line="stopped counting")
         run.assert_gate_held()
         run.assert_nothing_left()
+
+
+def test_a_system_whose_action_raises_at_every_goal_does_not_end_well(
+    tmp_path: Path, fresh_domain: int
+) -> None:
+    interface = {"name": "count", "type": TYPE}
+    nodes: dict[str, Any] = {
+        "counter": {
+            "run": {"python": f"{_NODES}:Failing"},
+            "interface": {"action_servers": [interface]},
+        },
+        "caller": {
+            "run": {"python": f"{_NODES}:Asking"},
+            "interface": {"action_clients": [interface]},
+        },
+    }
+    with up(write(tmp_path, fresh_domain, nodes, "failing"), runtime=tmp_path) as run:
+        run.until("system", reached="active")
+        found = run.until_found("node.unhealthy", "/counter")
+        assert any(
+            "raised OSError: no such number" in each["message"] for each in found["findings"]
+        )
+        assert verb("down", "failing", runtime=tmp_path).returncode == ExitCode.OK
+        assert run.finish() == ExitCode.VIOLATED

@@ -8,7 +8,7 @@ import pytest
 from msgspec.structs import replace
 
 from lifecycle.graph.model import End, GraphChange, NodeView, link, match_ends
-from lifecycle.graph.state import GraphState, Look
+from lifecycle.graph.state import GraphState
 from lifecycle.graph.status import NodeStatus, decode, encode
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import QosProfile, Reliability
@@ -131,10 +131,9 @@ def test_a_node_without_any_endpoint_is_there_by_its_report(state: GraphState) -
     assert [(each.full_name, each.state, each.managed) for each in seen.nodes] == [
         ("/bare", bare.state, True)
     ]
-    state.put_look(Look(nodes=(ObservedNode(full_name="/bare", count=2, managed=True),)))
-    assert [each.count for each in state.observation().nodes] == [2]
+    twice = ObservedNode(full_name="/bare", count=2, managed=True)
+    assert [each.count for each in state.observation([twice]).nodes] == [2]
     state.drop_configuration("/bare")
-    state.put_look(Look())
     assert state.observation().nodes == ()
 
 

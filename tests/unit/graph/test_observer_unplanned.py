@@ -39,7 +39,7 @@ def test_a_guest_is_read_and_followed_and_nobody_else_is() -> None:
         assert list(clients.followed) == ["/guest"]
         graph.nodes = ()
         assert (await observer.observe(plan())).configurations == ()
-        assert clients.forgotten == ["/guest"]
+        assert "/guest" in clients.forgotten
 
     run(main())
 

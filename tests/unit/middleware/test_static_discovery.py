@@ -9,9 +9,9 @@ from msgspec.structs import replace
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds.static_edp import (
+    check_endpoint,
     endpoint_profiles,
     endpoint_table,
-    find_endpoint,
 )
 from lifecycle.plan.model import StaticEndpoint, StaticParticipant
 
@@ -96,8 +96,9 @@ def test_an_endpoint_is_found_by_direction_name_and_type_together() -> None:
         line("/y", 3),
         line("/x", 4),
     ]
-    found = find_endpoint(lines, writer=True, profile="/x", type_name=_STRING)
-    assert found.user_id == 4
+    check_endpoint(lines, writer=True, profile="/x", type_name=_STRING)
+    with pytest.raises(MiddlewareError):
+        check_endpoint(lines[:3], writer=True, profile="/x", type_name=_STRING)
 
 
 @pytest.mark.parametrize(
@@ -108,7 +109,7 @@ def test_an_endpoint_that_nobody_would_find_is_refused(
     lines: tuple[StaticEndpoint, ...], listed: str
 ) -> None:
     with pytest.raises(MiddlewareError) as refused:
-        find_endpoint(lines, writer=True, profile="/y", type_name=_STRING)
+        check_endpoint(lines, writer=True, profile="/y", type_name=_STRING)
     assert str(refused.value) == (
         f"cannot make a writer of '/y' ({_STRING}): the table of static discovery has only these "
         f"writers for this participant: {listed}; declare the endpoint, and check or plan again"

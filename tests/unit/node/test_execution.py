@@ -8,7 +8,14 @@ from typing import Any
 
 import pytest
 
-from lifecycle.node.lifecycle.steps import CallbackOutcome, Interruptible, Result, call
+from lifecycle.errors import LifecycleError
+from lifecycle.node.lifecycle.steps import (
+    CallbackOutcome,
+    DeadlineError,
+    Result,
+    Running,
+    call,
+)
 
 WHAT = "/camera: on_configure"
 
@@ -26,18 +33,24 @@ def drive(
     *,
     deadline_s: float = 10.0,
     turns: int = 3,
-    started: Callable[[Interruptible], None] = lambda running: None,
+    interruption: LifecycleError | None = None,
 ) -> Result:
-    """Run a callback as an executor does: resume it at each turn."""
-    coroutine = call(callback, ("state",), what=WHAT, deadline_s=deadline_s, started=started)
+    """Run a callback as an executor does: resume it at each turn; interrupt it after the first."""
+    begun: list[Running] = []
+    coroutine = call(callback, ("state",), what=WHAT, deadline_s=deadline_s, started=begun.append)
     for _ in range(turns):
         try:
             coroutine.send(None)
-        except StopIteration as stop:  # noqa: PERF203
+        except StopIteration as stop:
             result: Result = stop.value
             return result
+        if interruption is not None:
+            assert begun[0].interrupt(interruption)
     coroutine.close()
     raise AssertionError(f"still running after {turns} turns")
+
+
+LATE = DeadlineError("it is late")
 
 
 @pytest.mark.parametrize(
@@ -96,9 +109,9 @@ def test_an_async_callback_beyond_its_deadline_is_interrupted_where_it_awaits() 
         finally:
             ended.append("finally")
 
-    result = drive(on_configure, deadline_s=1e-9)
+    result = drive(on_configure, interruption=LATE)
     assert result.outcome is CallbackOutcome.ERROR
-    assert result.error == ("cannot finish /camera: on_configure within its deadline of 1e-09 s")
+    assert result.error == "it is late"
     assert "a calibration service that never answers" in result.trace
     assert ended == ["finally"]
 
@@ -111,18 +124,35 @@ def test_a_callback_that_swallows_its_interruption_is_ended_all_the_same() -> No
             except Exception:  # noqa: BLE001, PERF203
                 continue
 
-    result = drive(on_configure, deadline_s=1e-9)
+    result = drive(on_configure, interruption=LATE)
     assert result.outcome is CallbackOutcome.ERROR
-    assert "within its deadline" in result.error
+    assert result.error == "it is late"
 
 
-def test_a_running_callback_can_be_cancelled() -> None:
-    async def on_activate() -> None:
-        await Never()
+def test_a_callback_that_answers_its_interruption_has_not_succeeded() -> None:
+    async def on_configure() -> CallbackOutcome:
+        try:
+            await Never()
+        except DeadlineError:
+            return CallbackOutcome.SUCCESS
+        return CallbackOutcome.FAILURE
 
-    result = drive(on_activate, started=lambda running: running.cancel("the process ends"))
-    assert result.outcome is CallbackOutcome.ERROR
-    assert result.error == "cannot go on with /camera: on_configure: the process ends"
+    result = drive(on_configure, interruption=LATE)
+    assert (result.outcome, result.error) == (CallbackOutcome.ERROR, "it is late")
+
+
+def test_a_callback_that_interrupts_itself_goes_on() -> None:
+    running: list[Running] = []
+    refused: list[bool] = []
+
+    async def on_configure() -> None:
+        refused.append(running[0].interrupt(LATE))
+
+    ending = call(on_configure, (), what=WHAT, deadline_s=10.0, started=running.append)
+    with pytest.raises(StopIteration) as stop:
+        ending.send(None)
+    assert stop.value.value.outcome is CallbackOutcome.SUCCESS
+    assert refused == [False]
 
 
 def test_a_sync_callback_beyond_its_deadline_is_an_error_that_says_what_to_do() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Coroutine, Iterable
-from types import CoroutineType
+from types import CoroutineType, SimpleNamespace
 from typing import Any
 
 import pytest
@@ -115,6 +115,13 @@ class FakeNode:
         self.answer = Answer()
         self.running: CoroutineType[Any, Any, Result] | None = None
         self.result: Result | None = None
+        do = self._do
+        self.data_layer = SimpleNamespace(
+            make=lambda: do("make"), undo=lambda: do("undo"), remove=lambda: do("remove")
+        )
+        self.timers: dict[Callable[[], None], float] = {}
+        self.turns = SimpleNamespace(call_after=self._call_after, wake=lambda: None)
+        self.gate = SimpleNamespace(open=lambda: do("open"), close=lambda: do("close"))
         self.machine = Machine(self, Timeouts(), table)
 
     def _do(self, what: str) -> None:
@@ -122,20 +129,19 @@ class FakeNode:
         if what in self.fail:
             raise self.fail[what]
 
+    def _call_after(self, delay_s: float, callback: Callable[[], None]) -> Callable[[], None]:
+        self.timers[callback] = delay_s
+
+        def call_off() -> None:
+            del self.timers[callback]
+
+        return call_off
+
     def prepare(self) -> None:
         self._do("prepare")
 
     def unprepare(self) -> None:
         self._do("unprepare")
-
-    def make_data_layer(self) -> None:
-        self._do("make")
-
-    def undo_data_layer(self) -> None:
-        self._do("undo")
-
-    def remove_data_layer(self) -> None:
-        self._do("remove")
 
     def take_down(self) -> None:
         self._do("take-down")
@@ -143,12 +149,6 @@ class FakeNode:
     def may_activate(self) -> bool:
         self._do("may?")
         return True
-
-    def open_gate(self) -> None:
-        self._do("open")
-
-    def close_gate(self) -> None:
-        self._do("close")
 
     def changed(self, change: StateChange) -> None:
         self.changes.append(change)
@@ -162,13 +162,6 @@ class FakeNode:
 
     def callback_argument(self, state: NodeState) -> object:
         return state
-
-    def wake_at_deadline(self, deadline_s: float) -> Callable[[], None]:
-        del deadline_s
-        return lambda: None
-
-    def wake(self) -> None:
-        pass
 
     def report(self, result: Result) -> None:
         self.reports.append(result)
@@ -323,6 +316,16 @@ def test_a_transition_does_these_things_in_this_order(
     assert node.did == did.split()
 
 
+@pytest.mark.parametrize("asked", ["deactivate", "shutdown"])
+def test_nothing_is_sent_any_more_once_the_end_of_being_active_is_announced(asked: str) -> None:
+    node = node_in(NodeState.ACTIVE)
+    announced: list[int] = []
+    node.gate.close = lambda: announced.append(len(node.changes))
+    node.machine = Machine(node, Timeouts())
+    node.follow(f"{PATHS[NodeState.ACTIVE]} {asked}")
+    assert announced == [len(node.changes) - 1]
+
+
 @pytest.mark.parametrize(
     ("state", "asked", "did", "goal"),
     [
@@ -431,6 +434,19 @@ def test_a_condition_that_refuses_leaves_the_node_as_it_is() -> None:
         node.request(TransitionRequest.ACTIVATE)
     assert node.machine.state is NodeState.INACTIVE_CONNECTED
     assert node.changes == []
+
+
+def test_a_callback_has_until_its_deadline() -> None:
+    node = node_in(NodeState.CONNECTING)
+    node.callbacks["on_error"] = lambda: OK
+    ((late, delay_s),) = node.timers.items()
+    assert delay_s == Timeouts().connect_s
+    late()
+    assert node.running is not None
+    result = ended(node.running)
+    assert result.outcome is ERROR
+    assert result.error == "cannot finish /camera: on_connect within its deadline of 10 s"
+    assert node.timers == {}
 
 
 def test_shutting_down_cancels_what_runs_first() -> None:

@@ -40,7 +40,7 @@ class Executor:
 
 def test_events_come_in_order_and_to_sync_and_async_listeners() -> None:
     executor = Executor()
-    events = ConnectionEvents(executor.later)
+    events = ConnectionEvents(executor.later, {})
     heard: list[tuple[str, ConnectionEvent]] = []
 
     async def listen(event: ConnectionEvent) -> None:

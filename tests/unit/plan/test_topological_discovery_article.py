@@ -1,8 +1,8 @@
 """The design article *Topological Discovery and Communication Negotiation*, as it is applied.
 
 Its example, its declarative instructions, and what the planner, the authority and the negotiator
-make of them. docs/nine_systems.md lists every statement of the article with its test; most are
-proven where their code is.
+make of them. tests/articles/topological_discovery.md lists every statement of the article with its
+test; most are proven where their code is.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from lifecycle.plan.model import Plan
 from lifecycle.plan.negotiation.data_layer import DataLayerGraph
 from lifecycle.plan.negotiation.negotiate import negotiate
 from lifecycle.plan.negotiation.parties import hosts_of, party_of_node, terms_of, wishes_of
-from lifecycle.supervisor.connections.desired_state import ActualState, planned_instructions, steps
+from lifecycle.supervisor.connections.desired_state import Instructions, planned_instructions, steps
 from lifecycle.supervisor.connections.negotiation import NegotiatedSource, party_of
 from lifecycle.verify.observation import Identity, NodeConfiguration
 from tests.builders import (
@@ -228,7 +228,7 @@ def test_connect_to_topic_of_type_via_protocol_address_port_is_said_in_a_manifes
 def test_iterating_over_the_instructions_is_connect_to_for_each_url_then_map_to_for_each_endpoint(
     instructed: Plan,
 ):
-    told = steps(planned_instructions(instructed.node("n")), ActualState())
+    told = steps(planned_instructions(instructed.node("n")), Instructions(node="/n"))
     # Once per connection, whatever is mapped onto it: the name is the handle.
     assert [(each.operation, each.connection, each.endpoint) for each in told] == [
         (Operation.CONNECT_TO, "data", ""),

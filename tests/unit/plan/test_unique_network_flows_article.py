@@ -1,7 +1,8 @@
 """The design article *Unique Network Flows* as the manifest, the planner and the verifier apply it.
 
 Definitions and identifiers are tested in tests/unit/network/test_nfe.py and test_flow.py, the table
-of 5QIs in test_five_qi.py; docs/flows.md lists every part of the article with its test.
+of 5QIs in test_five_qi.py; tests/articles/unique_network_flows.md lists every part of the article
+with its test.
 """
 
 from __future__ import annotations

@@ -55,8 +55,7 @@ from lifecycle.supervisor.run.events import (
     VerdictChanged,
 )
 from lifecycle.supervisor.run.failure import StepFailedError
-from lifecycle.supervisor.run.history import journal_files, read_run
-from lifecycle.supervisor.run.journal import Journal
+from lifecycle.supervisor.run.journal import Journal, journal_files, read_run
 from lifecycle.supervisor.run.options import UpOptions, UpResult
 from lifecycle.supervisor.run.records import Records
 from lifecycle.supervisor.run.signals import Ending
@@ -507,7 +506,7 @@ class SessionWorld:
         self._tmp_path = tmp_path
         self._emit = Emitter(loop.time)
         self._emit.listen(self._take)
-        self.journal = Journal("robot", "0", say=self.story.append, wall=loop.time, clock=loop.time)
+        self.journal = Journal("robot", "0", say=self.story.append)
         self._emit.listen(self.journal.on_event)
         self._options = UpOptions(**options)
         (tmp_path / "logs").mkdir()
@@ -551,7 +550,7 @@ class SessionWorld:
         with self.ending, self._run_directory() as directory, kept:
             means = Means(
                 directory=directory,
-                records=Records(directory, self.system, self.hosts, self._emit),
+                records=Records(directory, self.system, self.hosts),
                 fork_server=self.hosts,
                 participant=self.graph,
                 networks=self.networks,

@@ -6,6 +6,7 @@ import contextlib
 import os
 import signal
 import weakref
+from collections.abc import Callable
 
 import pytest
 
@@ -42,46 +43,50 @@ def test_a_signal_whose_exception_was_lost_is_found_at_the_next_look() -> None:
             ending.check()
 
 
-def test_a_signal_that_comes_while_a_class_is_made_is_no_error_of_the_class() -> None:
+def _makes_a_class() -> None:
     class Named:
         def __set_name__(self, owner: type, name: str) -> None:
             os.kill(os.getpid(), signal.SIGTERM)
 
-    with pytest.raises(Ended, match="SIGTERM"), Ending() as ending, ending.unmasked():
-        type("Made", (), {"named": Named()})
+    type("Made", (), {"named": Named()})
 
 
-def test_a_signal_that_an_import_makes_its_own_error_of_is_no_error_of_the_import() -> None:
-    def imports() -> None:
-        with contextlib.suppress(KeyboardInterrupt):
-            os.kill(os.getpid(), signal.SIGINT)
-        raise ImportError("initialization failed")
-
-    with pytest.raises(Ended, match="SIGINT"), Ending() as ending, ending.unmasked():
-        imports()
+def _imports() -> None:
+    with contextlib.suppress(KeyboardInterrupt):
+        os.kill(os.getpid(), signal.SIGTERM)
+    raise ImportError("initialization failed")
 
 
-def test_a_signal_that_is_lost_where_a_hash_is_asked_for_is_no_error_of_the_value() -> None:
+def _asks_for_a_hash() -> None:
     class Late:
         def __get__(self, instance: object, owner: type | None = None) -> object:
-            os.kill(os.getpid(), signal.SIGHUP)
+            os.kill(os.getpid(), signal.SIGTERM)
             return lambda: 1
 
     late = type("Hashed", (), {"__hash__": Late()})()
-    with pytest.raises(Ended, match="SIGHUP"), Ending() as ending, ending.unmasked():
-        {late}  # noqa: B018
+    {late}  # noqa: B018
 
 
-def test_an_error_without_a_signal_or_after_one_that_was_only_noted_stays_what_it_is() -> None:
-    def fails(ending: Ending, *, after_one: bool) -> None:
+@pytest.mark.parametrize("does", [_makes_a_class, _imports, _asks_for_a_hash])
+def test_a_signal_of_which_python_makes_an_error_of_its_own_is_that_signal_again(
+    does: Callable[[], None],
+) -> None:
+    with pytest.raises(Ended, match="SIGTERM"), Ending() as ending, ending.unmasked():
+        does()
+
+
+@pytest.mark.parametrize("after_one", [False, True])
+def test_an_error_without_a_signal_or_after_one_that_was_only_noted_stays_what_it_is(
+    after_one: bool,
+) -> None:
+    def fails(ending: Ending) -> None:
         with ending.noted():
             if after_one:
                 os.kill(os.getpid(), signal.SIGTERM)
         raise ValueError("mine")
 
-    for after_one in (False, True):
-        with pytest.raises(ValueError, match="mine"), Ending() as ending, ending.unmasked():
-            fails(ending, after_one=after_one)
+    with pytest.raises(ValueError, match="mine"), Ending() as ending, ending.unmasked():
+        fails(ending)
 
 
 def test_where_something_is_made_a_signal_is_noted_and_raised_where_something_waits() -> None:

@@ -141,7 +141,7 @@ class Permit:
     def __init__(self, *, holds: bool = True) -> None:
         self._holds = holds
 
-    async def use(self) -> None:
+    async def __call__(self) -> None:
         if not self._holds:
             raise ChangedError("the gate closed again")
 

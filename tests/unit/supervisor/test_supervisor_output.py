@@ -466,8 +466,8 @@ async def test_a_command_is_shown_as_it_was_judged_and_matches_where_its_flows_a
     )
     verdict = replace(verdict_of(Outcome.OK), findings=(wrong,), flows=(FLOW,))
     system.run.judged.verdict = verdict
-    (shown,) = system_status(system, supervisor=1, elapsed_s=0.0, ends="").nodes
+    (shown,) = system_status(system).nodes
     assert (shown.state, shown.matched, shown.unreported, shown.endpoints) == ("inactive", 1, 1, 2)
     command.core.planned = hosted
-    (shown,) = system_status(system, supervisor=1, elapsed_s=0.0, ends="").nodes
+    (shown,) = system_status(system).nodes
     assert shown.state == "active"

@@ -17,7 +17,8 @@ from msgspec.structs import replace
 from lifecycle.manifest.model import Condition, OnFailure, Restart, RunKind, Supervision
 from lifecycle.plan.model import Plan, PlannedNode
 from lifecycle.supervisor.control.server import ControlRequest
-from lifecycle.supervisor.core.restart import RestartPolicy, delay_s, group_of
+from lifecycle.supervisor.core.restart import RestartPolicy, delay_s, is_restarted
+from lifecycle.supervisor.core.state import Options, new_run
 from lifecycle.supervisor.processes.process import ProcessExit
 from tests.builders import plan_of, planned_node
 from tests.unit.supervisor.session_world import (
@@ -56,8 +57,8 @@ def test_the_delay_grows_by_one_factor_up_to_its_longest_and_stays() -> None:
 def test_which_ends_are_started_again_after(
     restart: Restart, taken: dict[int | None, bool]
 ) -> None:
-    policy = RestartPolicy(Supervision(restart=restart), 0.0)
-    assert {status: policy.takes(exit_status=status) for status in taken} == taken
+    how = Supervision(restart=restart)
+    assert {status: is_restarted(how, status) for status in taken} == taken
 
 
 def test_it_gives_up_at_the_start_after_the_burst_and_never_without_an_interval() -> None:
@@ -119,7 +120,7 @@ def test_who_goes_down_with_a_process(how: OnFailure, group: str) -> None:
         planned_node("other"),
         _component("part", of="helper"),
     )
-    assert " ".join(group_of(nodes, "p")) == group
+    assert " ".join(new_run(plan_of(*nodes), Options()).group("p")) == group
 
 
 def _component(key: str, *, of: str) -> PlannedNode:

@@ -5,44 +5,38 @@ from __future__ import annotations
 import pytest
 from msgspec.structs import replace
 
-from lifecycle.manifest.model import EndpointKind, FlowTransport
-from lifecycle.plan.model import Plan
-from lifecycle.supervisor.connections.negotiation import NegotiatedSource
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.plan.model import ParticipantConnections, Plan, PlannedParticipant
 from lifecycle.supervisor.judging.grace_period import PASSING_S, GracePeriod
 from lifecycle.verify.judge import verify
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import Finding, Stage, Verdict
-from tests.builders import endpoint, node, planned
+from tests.builders import endpoint, node, planned, publisher, subscription
 from tests.unit.supervisor.fakes import verdict_of
-from tests.unit.supervisor.test_supervisor_negotiation import LISTENER, TALKER, known, plan_of
 from tests.unit.verify.perfect import perfect
 
-PUB = EndpointKind.PUBLISHER
+ASK = ("/ask", "not_installed_interfaces/srv/Ask")
+SERVER = endpoint(EndpointKind.SERVICE_SERVER, *ASK, qos=None)
+CLIENT = endpoint(EndpointKind.SERVICE_CLIENT, *ASK, qos=None)
+
+BEFORE = planned(node("talker", publisher("/chatter")), node("listener", subscription("/chatter")))
+AFTER = planned(
+    node("talker", publisher("/chatter"), publisher("/news"), CLIENT),
+    node("listener", subscription("/chatter"), subscription("/news"), SERVER),
+)
+"""The same once both nodes made endpoints of /news and of /ask in code."""
+
+_NET = ParticipantConnections(urls=("udpv4://10.77.0.1:7911",))
+_CONNECTED = PlannedParticipant(
+    name="_talker_net", dscp=None, reason="", connection="net", connections=_NET
+)
+CONNECTED = replace(
+    BEFORE, nodes=(replace(BEFORE.nodes[0], participants=(_CONNECTED,)), BEFORE.nodes[1])
+)
+"""The same once a connection was negotiated."""
+
 OK = verdict_of(Outcome.OK)
 UNATTRIBUTED = "graph.unattributed-endpoint"
-
-
-def grown() -> tuple[Plan, Plan]:
-    """A plan, and what is expected once both nodes made an endpoint of /news in code."""
-    source = NegotiatedSource(plan_of())
-    source.instructions(known(TALKER, LISTENER))
-    before = source.expected
-    more = [
-        replace(
-            each,
-            checksum="1",
-            endpoints=(
-                *each.endpoints,
-                replace(each.endpoints[0], name="news", resolved="/news"),
-            ),
-        )
-        for each in (TALKER, LISTENER)
-    ]
-    source.instructions(known(*more))
-    return before, source.expected
-
-
-BEFORE, AFTER = grown()
 
 
 def found(*findings: tuple[str, str, str]) -> Verdict:
@@ -59,7 +53,7 @@ def found(*findings: tuple[str, str, str]) -> Verdict:
                 observed="",
                 message="",
                 node=node,
-                endpoint=PUB if rule == "graph.missing-endpoint" else None,
+                endpoint=EndpointKind.PUBLISHER if rule == "graph.missing-endpoint" else None,
             )
             for rule, subject, node in findings
         ),
@@ -67,23 +61,29 @@ def found(*findings: tuple[str, str, str]) -> Verdict:
     )
 
 
-YOUNG = [
-    ("graph.missing-endpoint", "/news", "/talker"),
-    ("flow.wrong-medium", "/news: /talker → /listener", ""),
-    ("graph.unmatched-flow", "/news: /talker → /listener", ""),
-]
+NEWS = ("graph.missing-endpoint", "/news", "/talker")
+GONE = ("graph.missing-node", "/talker", "/talker")
 
 
-@pytest.mark.parametrize("finding", YOUNG, ids=lambda each: each[0])
+@pytest.mark.parametrize(
+    ("finding", "plan"),
+    [
+        (NEWS, AFTER),
+        (("flow.wrong-medium", "/news: /talker → /listener", ""), AFTER),
+        (("graph.unmatched-flow", "/news: /talker → /listener", ""), AFTER),
+        (("graph.unmatched-client", "/ask: /talker → /listener", "/talker"), AFTER),
+        (("connection.missing", "/talker", "/talker"), CONNECTED),
+    ],
+)
 def test_what_has_only_just_become_expected_may_be_missing_for_a_moment(
-    finding: tuple[str, str, str],
+    finding: tuple[str, str, str], plan: Plan
 ) -> None:
     grace_period = GracePeriod()
     assert grace_period.after(None, OK, BEFORE, 10.0) == (OK, None)
     bad = found(finding)
-    assert grace_period.after(OK, bad, AFTER, 20.0) == (OK, PASSING_S)
-    assert grace_period.after(OK, bad, AFTER, 20.25) == (OK, PASSING_S - 0.25)
-    assert grace_period.after(OK, bad, AFTER, 20.0 + PASSING_S) == (bad, None)
+    assert grace_period.after(OK, bad, plan, 20.0) == (OK, PASSING_S)
+    assert grace_period.after(OK, bad, plan, 20.25) == (OK, PASSING_S - 0.25)
+    assert grace_period.after(OK, bad, plan, 20.0 + PASSING_S) == (bad, None)
 
 
 @pytest.mark.parametrize(
@@ -91,12 +91,12 @@ def test_what_has_only_just_become_expected_may_be_missing_for_a_moment(
     [
         ([("graph.missing-endpoint", "/chatter", "/talker")], AFTER),
         ([("flow.wrong-medium", "/chatter: /talker → /listener", "")], AFTER),
-        ([("graph.missing-node", "/talker", "/talker")], AFTER),
+        ([GONE], AFTER),
         ([("connection.missing", "/talker", "/talker")], AFTER),
         # It was expected at the first look already.
         ([("graph.missing-endpoint", "/chatter", "/talker")], BEFORE),
-        # With whatever else is wrong all of it is told.
-        ([YOUNG[0], ("graph.missing-node", "/talker", "/talker")], AFTER),
+        # With whatever else is wrong all of it is said.
+        ([NEWS, GONE], AFTER),
     ],
 )
 def test_what_was_expected_before_may_not(findings: list[tuple[str, str, str]], plan: Plan) -> None:
@@ -106,22 +106,12 @@ def test_what_was_expected_before_may_not(findings: list[tuple[str, str, str]], 
     assert grace_period.after(OK, bad, plan, 20.0) == (bad, None)
 
 
-def test_a_connection_that_was_only_just_negotiated_may_be_missing_for_a_moment() -> None:
-    plan = plan_of(transport=FlowTransport.UDPV4)
-    source = NegotiatedSource(plan)
-    source.instructions(known(TALKER, LISTENER))
+def test_the_first_verdict_and_what_healed_are_said_at_once() -> None:
     grace_period = GracePeriod()
-    grace_period.after(None, OK, plan, 10.0)
-    bad = found(("connection.missing", "/talker", "/talker"))
-    assert grace_period.after(OK, bad, source.expected, 20.0) == (OK, PASSING_S)
-
-
-def test_what_healed_is_told_at_once_too() -> None:
-    grace_period = GracePeriod()
-    bad = found(("graph.missing-node", "/talker", "/talker"))
-    grace_period.after(None, bad, BEFORE, 10.0)
-    other = found(YOUNG[0])
-    assert grace_period.after(bad, other, AFTER, 20.0) == (other, None)
+    first = found((UNATTRIBUTED, "/rosout", ""), GONE)
+    assert grace_period.after(None, first, BEFORE, 10.0) == (first, None)
+    other = found(NEWS)
+    assert grace_period.after(first, other, AFTER, 20.0) == (other, None)
 
 
 def test_each_newcomer_has_a_moment_of_its_own() -> None:
@@ -136,67 +126,29 @@ def test_each_newcomer_has_a_moment_of_its_own() -> None:
     assert grace_period.after(OK, one, BEFORE, 2.0) == (OK, PASSING_S)
 
 
-def test_the_first_verdict_of_all_is_told_whatever_it_is() -> None:
-    bad = found((UNATTRIBUTED, "/rosout", ""))
-    assert GracePeriod().after(None, bad, BEFORE, 0.0) == (bad, None)
+STATION = planned(node("station", SERVER))
 
 
-def test_a_client_that_has_only_just_become_expected_may_be_unmatched_for_a_moment() -> None:
-    grace_period = GracePeriod()
-    grace_period.after(None, OK, BEFORE, 10.0)
-    asks = replace(AFTER.nodes[0].endpoints[0], kind=EndpointKind.SERVICE_CLIENT, resolved="/ask")
-    answers = replace(asks, kind=EndpointKind.SERVICE_SERVER)
-    client, server = AFTER.nodes[:2]
-    plan = replace(
-        AFTER,
-        nodes=(
-            replace(client, endpoints=(*client.endpoints, asks)),
-            replace(server, endpoints=(*server.endpoints, answers)),
-        ),
-    )
-    names = client.full_name, server.full_name
-    bad = found(("graph.unmatched-client", f"/ask: {names[0]} → {names[1]}", names[0]))
-    assert grace_period.after(OK, bad, plan, 20.0) == (OK, PASSING_S)
-    assert grace_period.after(OK, bad, plan, 20.0 + PASSING_S) == (bad, None)
-
-
-STATUS = "not_installed_interfaces/srv/Status"
-
-
-def with_client(plan: Plan, *hashes: str) -> Verdict:
+def with_client(*hashes: str) -> Verdict:
     """The verdict on a tool's client for each hash, seen while the name of the tool is not known.
 
     That is so while the tool comes and while it goes.
     """
-    seen = perfect(plan, Stage.ACTIVE)
+    seen = perfect(STATION, Stage.ACTIVE)
     server = replace(seen.endpoints[0], type_hash="RIHS01_a RIHS01_a")
     client = replace(server, kind=EndpointKind.SERVICE_CLIENT, node="", gid="010f78fd" + 24 * "0")
     clients = (replace(client, type_hash=each) for each in hashes)
     observation = replace(seen, endpoints=(server, *clients))
-    return verify(plan, observation, stage=Stage.ACTIVE)
+    return verify(STATION, observation, stage=Stage.ACTIVE)
 
 
-def test_a_client_of_an_unknown_node_that_is_half_seen_may_pass() -> None:
-    plan = planned(
-        node("station", endpoint(EndpointKind.SERVICE_SERVER, "/status", STATUS, qos=None))
-    )
-    fine = with_client(plan)
-    half = with_client(plan, "")
-    both = {"graph.unattributed-endpoint", "graph.type-definition-differs"}
+def test_a_client_of_an_unknown_node_may_be_half_seen_and_not_of_another_definition() -> None:
+    fine, half, other = with_client(), with_client(""), with_client("RIHS01_b RIHS01_b")
+    both = {UNATTRIBUTED, "graph.type-definition-differs"}
     assert {each.rule for each in half.findings} - {each.rule for each in fine.findings} == both
-    grace_period = GracePeriod()
-    grace_period.after(None, fine, plan, 0.0)
-    assert grace_period.after(fine, half, plan, 10.0) == (fine, PASSING_S)
-    assert grace_period.after(fine, half, plan, 10.0 + PASSING_S) == (half, None)
-
-
-def test_a_client_of_an_unknown_node_with_another_definition_is_told_at_once() -> None:
-    plan = planned(
-        node("station", endpoint(EndpointKind.SERVICE_SERVER, "/status", STATUS, qos=None))
-    )
-    fine = with_client(plan)
-    other = with_client(plan, "RIHS01_b RIHS01_b")
     assert other.verdict is Outcome.VIOLATED
-    grace_period = GracePeriod()
-    grace_period.after(None, fine, plan, 0.0)
-    assert grace_period.after(fine, other, plan, 10.0) == (other, None)
+    for seen, holds in ((half, (fine, PASSING_S)), (other, (other, None))):
+        grace_period = GracePeriod()
+        grace_period.after(None, fine, STATION, 0.0)
+        assert grace_period.after(fine, seen, STATION, 10.0) == holds
+        assert grace_period.after(fine, seen, STATION, 10.0 + PASSING_S) == (seen, None)

@@ -31,7 +31,6 @@ from lifecycle.supervisor.connections.authority import (
     PlannedSource,
 )
 from lifecycle.supervisor.connections.desired_state import (
-    ActualState,
     Instructions,
     steps,
     wired,
@@ -241,7 +240,7 @@ async def test_what_cannot_be_made_again_is_tried_ever_later_and_then_a_finding(
         wiring.look()
         await settle()
         assert wiring.authority.findings() == ()
-        assert dict(wired(wiring.hosts.interfaces["/a"]).connections) == {"net": (URL,)}
+        assert dict(wired(wiring.hosts.interfaces["/a"]).connections) == {"net": NET}
 
 
 async def test_only_the_difference_is_wired_when_the_negotiation_changes(tmp_path: Path) -> None:
@@ -312,8 +311,9 @@ def test_steps_make_before_they_break_and_spare_what_is_not_ours() -> None:
         connections=(("new", NET),),
         mappings=(("publishers/out", "new"), ("subscriptions/in", "")),
     )
-    has = ActualState(
-        connections=(("old", (URL,)), ("own", (URL,))),
+    has = Instructions(
+        node="/a",
+        connections=(("old", NET), ("own", NET)),
         mappings=(("publishers/out", "old"), ("subscriptions/in", "")),
     )
     made = steps(wanted, has, ours=("old",))

@@ -23,7 +23,7 @@ from lifecycle.manifest.qos import (
 )
 from lifecycle.plan.build import build_plan
 from lifecycle.plan.model import Plan
-from lifecycle.verify.observation import HealthReport, Observation
+from lifecycle.verify.observation import EndpointReport, HealthReport, Observation
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.run import node_of
 from lifecycle.verify.verdict import Finding, Stage
@@ -389,6 +389,25 @@ def test_the_health_that_a_node_reports_is_judged_where_the_manifest_asks_it(
     # It is asked from when it is connected.
     early = both(edit, change_configuration("/viewer", connected=False))
     assert findings_after(early, plan=plan) == ["violated state.wrong-state: /viewer"]
+
+
+def test_a_handler_that_raised_at_its_last_goal_is_unhealthy_though_nobody_asks():
+    report = EndpointReport(
+        kind=EndpointKind.ACTION_SERVER,
+        name="dock",
+        resolved="/dock",
+        type="nav/action/Dock",
+        fault="its handler raised OSError: no such dock",
+    )
+    seen = perfect(PLAN, Stage.ACTIVE)
+    before = next(each for each in seen.configurations if each.name == "/viewer")
+    edit = change_configuration("/viewer", endpoints=(*before.endpoints, report))
+    findings = verify(PLAN, edit(seen), stage=Stage.ACTIVE).findings
+    (unhealthy,) = (each.message for each in findings if each.rule == "node.unhealthy")
+    assert unhealthy == (
+        "cannot accept node /viewer: it is not healthy: action server 'dock': its handler raised "
+        "OSError: no such dock"
+    )
 
 
 def test_a_node_that_has_ended_as_it_may_is_unverifiable_and_not_missing():

@@ -59,14 +59,14 @@ MUTANTS = [
     ("order", "advance.py", "    if holds_up(run, node, target):", "    if False:"),
     ("order", "advance.py", "    return not run.hurry and any(", "    return False and any("),
     ("ends", "advance.py", "process.asked = min(process.asked + 1, ", "process.asked = min(0, "),
-    ("ends", "advance.py", "    times += [each.asked_until_s for", "    times += [NEVER_S for"),
+    ("ends", "advance.py", "    run.wakes_at(process.asked_until_s)\n", ""),
     (
         "ends",
         "reduce.py",
         "        if node.request is not None and at_s >= advance.late_at_s",
         "        if False and late_at_s",
     ),
-    ("processes", "advance.py", " or _is_to_end(run, process):", ":"),
+    ("processes", "advance.py", " or is_to_end(run, process):", ":"),
     (
         "processes",
         "reduce.py",
@@ -84,7 +84,7 @@ MUTANTS = [
     ("violations", "gate.py", "LASTS_S = 1.0", "LASTS_S = 60.0"),
     ("violations", "failure.py", "_outcome(run, run.judged.counted)", '_outcome(run, "")'),
     ("answers", "state.py", "        self.order, self.ready, self.undone =", "        _ ="),
-    ("answers", "failure.py", "    for order in open_:", "    for order in []:"),
+    ("answers", "failure.py", "    run.answer(ExitCode.BRING_UP_FAILED, said)\n", ""),
     ("answers", "reduce.py", "        run.answer(ExitCode.BRING_UP_FAILED, text)", "        pass"),
 ]
 """The promise that is broken, the module, what it has, and what the mutant has instead."""

@@ -206,7 +206,7 @@ def test_a_node_waits_for_one_that_another_supervisor_brings_up() -> None:
 def test_the_end_of_other_hosts_is_no_violation_of_this_one() -> None:
     play = Play(CHAIN, hold_s=5.0)
     play.see(GONE)
-    play.give(inputs.Left(nodes=frozenset({"/camera"})))
+    play.give(inputs.Saw(left=frozenset({"/camera"})))
     play.wait(6.0)
     assert play.code == 0
 

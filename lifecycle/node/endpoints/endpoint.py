@@ -1,17 +1,15 @@
-"""One declared endpoint and where it is now: its mapping, its spellings, its matched peers.
+"""One endpoint of a node: what it is, how code wants it made, and where it is now.
 
-Owns: the types of a mapping, without behaviour of their own; what code says of how an endpoint is
-made; the meaning of a spelling in requests
-and messages (`video`, or `publishers/video`), and the error when it names nothing or too much;
-rclpy's matched events on our executor. Such an event is handled in a group of the framework's: an
-author's callback that awaits something must not delay the event of a peer that appeared or left.
+Owns: `Endpoint`; the meaning of a spelling in requests and messages (`video`, or
+`publishers/video`), and the error when it names nothing or too much; rclpy's matched events on our
+executor. Such an event is handled in a group of the framework's: an author's callback that awaits
+something must not delay the event of a peer that appeared or left.
 """
 
 from __future__ import annotations
 
-import typing
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import msgspec
 from rclpy.event_handler import (
@@ -23,7 +21,9 @@ from rclpy.event_handler import (
 from rclpy.publisher import Publisher
 
 from lifecycle.errors import LifecycleError, nearest
+from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import EndpointKind
+from lifecycle.middleware.rcl.rclpy_nodes import interface_of
 from lifecycle.node.connections.connections import Connection
 from lifecycle.plan.model import PlannedEndpoint
 
@@ -33,12 +33,13 @@ if TYPE_CHECKING:
     from rclpy.service_introspection import ServiceIntrospectionState
     from rclpy.subscription import Subscription
 
-    from lifecycle.middleware.rcl.graph_changes import ServerWatch
     from lifecycle.node.endpoints.publisher import DeclaredPublisher
 
 
 Key = tuple[EndpointKind, str]
 """Kind and declared name: what identifies an endpoint within its node."""
+
+CLIENTS = frozenset({EndpointKind.SERVICE_CLIENT, EndpointKind.ACTION_CLIENT})
 
 
 class UnknownEndpointError(LifecycleError, KeyError):
@@ -86,6 +87,15 @@ def find_endpoint(spelling: str, declared: Iterable[Key], *, node: str) -> Key:
     )
 
 
+def wire_name(entity: Any) -> str:
+    """Return an entity's name on the wire, as rcl resolved it; empty if it is unknown."""
+    for attribute in ("topic_name", "service_name", "action_name"):
+        name = getattr(entity, attribute, None)
+        if name is not None:
+            return str(name)
+    return ""
+
+
 def count_peers(entity: Publisher | Subscription) -> int:
     """Return how many remote endpoints are matched with a publisher or subscription."""
     if isinstance(entity, Publisher):
@@ -93,15 +103,14 @@ def count_peers(entity: Publisher | Subscription) -> int:
     return int(entity.get_publisher_count())
 
 
-@typing.final
 class MatchWatch:
-    """Calls back with the number of matched peers each time it has changed.
+    """Calls back each time that peers of an endpoint were matched or unmatched.
 
     Args:
         node: whose executor calls; the endpoint may be on another participant.
         entity: what to watch.
         group: reentrant.
-        changed: takes the number of matched peers, >= 0.
+        changed: is called.
     """
 
     def __init__(
@@ -109,23 +118,21 @@ class MatchWatch:
         node: Node,
         entity: Publisher | Subscription,
         group: CallbackGroup,
-        changed: Callable[[int], None],
+        changed: Callable[[], None],
     ) -> None:
         self._node = node
         self._handler: EventHandler | None = None
-        publishes = isinstance(entity, Publisher)
         event = (
             QoSPublisherEventType.RCL_PUBLISHER_MATCHED
-            if publishes
+            if isinstance(entity, Publisher)
             else QoSSubscriptionEventType.RCL_SUBSCRIPTION_MATCHED
         )
-
-        def matched(status: Any) -> None:
-            changed(int(status.current_count))
-
         try:
             self._handler = EventHandler(
-                callback_group=group, callback=matched, event_type=event, parent_impl=entity.handle
+                callback_group=group,
+                callback=lambda _: changed(),
+                event_type=event,
+                parent_impl=entity.handle,
             )
         except UnsupportedEventTypeError:
             return  # an RMW without the event: counts are then read on request
@@ -146,103 +153,108 @@ class EndpointOptions(msgspec.Struct, frozen=True, kw_only=True):
         callback_group: of its callback and its events; None for the node's own choice.
         event_callbacks: rclpy's PublisherEventCallbacks or SubscriptionEventCallbacks.
         raw: a subscription's handler is given serialized bytes.
-        content_filter: expression of a subscription, and the values of its parameters.
         introspection: of a service server or client (REP-2012).
     """
 
     callback_group: CallbackGroup | None = None
     event_callbacks: Any = None
     raw: bool = False
-    content_filter: tuple[str, tuple[str, ...]] | None = None
     introspection: ServiceIntrospectionState | None = None
 
     def refuse_unfit(self, kind: EndpointKind) -> None:
         """Raise LifecycleError for what endpoints of a kind cannot have."""
-        given = {
-            "raw": self.raw,
-            "content_filter": self.content_filter is not None,
-            "event_callbacks": self.event_callbacks is not None,
-            "introspection": self.introspection is not None,
-        }
-        for name, is_given in given.items():
-            if is_given and kind not in _FITTING[name]:
-                fitting = ", ".join(f"{each.noun}s" for each in _FITTING[name])
-                raise LifecycleError(f"cannot set {name} of a {kind.noun}; only of {fitting}")
+        for name, fitting in _FITTING.items():
+            if getattr(self, name) not in (None, False) and kind not in fitting:
+                nouns = ", ".join(f"{each.noun}s" for each in fitting)
+                raise LifecycleError(f"cannot set {name} of a {kind.noun}; only of {nouns}")
 
 
 _FITTING = {
     "raw": (EndpointKind.SUBSCRIPTION,),
-    "content_filter": (EndpointKind.SUBSCRIPTION,),
     "event_callbacks": (EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION),
     "introspection": (EndpointKind.SERVICE_SERVER, EndpointKind.SERVICE_CLIENT),
 }
-NO_OPTIONS = EndpointOptions()
 
 
-def wire_name(entity: Any) -> str:
-    """Return an entity's name on the wire, as rcl resolved it; empty if it is unknown."""
-    for attribute in ("topic_name", "service_name", "action_name"):
-        name = getattr(entity, attribute, None)
-        if name is not None:
-            return str(name)
-    return ""
+class Watch(Protocol):
+    """What notifies of the peers or the server of an endpoint."""
+
+    def stop(self) -> None:
+        """End it, before the endpoint is destroyed; again is harmless."""
 
 
 class Placement(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     """The rclpy object of an endpoint on one connection.
 
     Attributes:
-        watch: notifies of its peers or its server; None for service and action servers.
+        watch: notifies of its peers or its server; None where nothing is watched.
     """
 
     connection: Connection
     entity: Any
-    watch: MatchWatch | ServerWatch | None = None
+    watch: Watch | None = None
 
 
-class Mapping(msgspec.Struct, kw_only=True, eq=False):
-    """One declared endpoint and where it is now.
+class Endpoint(msgspec.Struct, kw_only=True, eq=False):
+    """One endpoint and where it is now.
 
     Attributes:
-        interface: the message, service or action class.
+        planned: as it is declared; without a name if only the code that made it knows of it.
+        callback: its handler, where code gave one with the declaration.
+        interface: the message, service or action class, once it is imported.
         handler: takes messages, requests or goals; None where the kind has no handler.
         handle: what authors publish by; None for other kinds.
         placement: where it is; None while it is mapped nowhere.
+        is_late: it was declared after configure, and goes with cleanup.
         error: why it could not be made as asked; empty if it was.
-        name: fully qualified, given by `remap`; empty for the name that was declared.
+        fault: what its handler raised at the last goal of an action; empty if it returned.
+        given_name: fully qualified, given by `remap`; empty for the name that was declared.
         peers: matched remote endpoints; None while mapped nowhere, and for services and actions.
         lossy: the author's hint: the data bear an unreliable transport; None without one.
         size_bytes: the author's hint: its largest serialized message; None without one.
         options: how it is made, as far as code says it.
     """
 
-    endpoint: PlannedEndpoint
-    interface: type[Any]
+    planned: PlannedEndpoint
+    callback: Callable[..., Any] | None = None
+    interface: Any = None
     handler: Callable[..., Any] | None = None
     handle: DeclaredPublisher | None = None
     placement: Placement | None = None
+    is_late: bool = False
     error: str = ""
-    name: str = ""
+    fault: str = ""
+    given_name: str = ""
     peers: int | None = None
     lossy: bool | None = None
     size_bytes: int | None = None
-    options: EndpointOptions = NO_OPTIONS
+    options: EndpointOptions = EndpointOptions()
+
+    @property
+    def kind(self) -> EndpointKind:
+        """What it is: a publisher, a subscription."""
+        return self.planned.kind
+
+    @property
+    def name(self) -> str:
+        """As declared."""
+        return self.planned.name
 
     @property
     def key(self) -> Key:
         """Kind and declared name."""
-        return self.endpoint.kind, self.endpoint.name
+        return self.kind, self.name
 
     @property
     def spelling(self) -> str:
         """`publishers/video`."""
-        return self.endpoint.kind.spell(self.endpoint.name)
+        return self.kind.spell(self.name)
 
     @property
     def wire_name(self) -> str:
         """Fully qualified name as it is now, or will be once it is mapped."""
         made = "" if self.placement is None else wire_name(self.placement.entity)
-        return made or self.name or self.endpoint.resolved
+        return made or self.given_name or self.planned.resolved
 
     @property
     def entity(self) -> Any:
@@ -253,3 +265,33 @@ class Mapping(msgspec.Struct, kw_only=True, eq=False):
     def connection(self) -> Connection | None:
         """Where it is mapped; None while it is nowhere."""
         return None if self.placement is None else self.placement.connection
+
+
+def found_endpoint(kind: EndpointKind, placement: Placement, at: Position) -> Endpoint:
+    """Return an endpoint that only the code that made it knows of.
+
+    Args:
+        kind: what it is.
+        placement: its rclpy object.
+        at: where its node is declared.
+    """
+    type_ = interface_name(interface_of(placement.entity))
+    resolved = wire_name(placement.entity)
+    planned = PlannedEndpoint(kind=kind, name="", resolved=resolved, type=type_, qos=None, at=at)
+    return Endpoint(planned=planned, placement=placement)
+
+
+def interface_name(interface: type[Any]) -> str:
+    """Return `package/msg/Type` of a generated class.
+
+    Raises:
+        LifecycleError: not a generated message, service or action class.
+    """
+    package, _, rest = interface.__module__.partition(".")
+    kind = rest.partition(".")[0]
+    if kind not in {"msg", "srv", "action"}:
+        raise LifecycleError(
+            f"cannot declare an endpoint of type {interface!r}; "
+            "give a message, service or action class such as std_msgs.msg.String"
+        )
+    return f"{package}/{kind}/{interface.__name__}"

@@ -1,0 +1,654 @@
+"""The data layer of a node: what it declares, and which connection each of it is mapped onto.
+
+Owns: the endpoints by kind and name, as the node's manifest or plan and its own code declare them,
+taken together; the order in which connections and endpoints are made and removed; `connect_to`,
+`map_to`, `disconnect` and `remap`, in which states they are allowed, and that a strictly unique
+flow is not shared: one implementation behind the local API, the ROS services (node_interface.py)
+and the control channel.
+
+*configure* imports what is declared, *connect* maps what is not mapped yet onto the connection
+that the plan says, *disconnect* takes everything away. In between `connect_to`, `map_to`,
+`disconnect` and `remap` change single ones. See *Topological Discovery and Communication
+Negotiation*, "Node Interface".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.task import Future
+
+from lifecycle.errors import LifecycleError
+from lifecycle.manifest.model import Authority, EndpointKind, EndpointPolicy
+from lifecycle.middleware.rcl.graph_changes import ServerWatch
+from lifecycle.middleware.rcl.qos import import_interface
+from lifecycle.network.nfe import UniqueRequirement
+from lifecycle.node.author.handlers import alternatives, needs_handler
+from lifecycle.node.connections.connection_status import ConnectionEvents
+from lifecycle.node.connections.connections import ConnectError, Connection, Connections
+from lifecycle.node.endpoints.endpoint import (
+    CLIENTS,
+    Endpoint,
+    EndpointOptions,
+    Key,
+    MatchWatch,
+    Placement,
+    UnknownEndpointError,
+    Watch,
+    find_endpoint,
+)
+from lifecycle.node.endpoints.handover import Handover, nothing_to_hand_over
+from lifecycle.node.endpoints.making import Maker
+from lifecycle.node.endpoints.publisher import DeclaredPublisher, Kept
+from lifecycle.node.lifecycle.machine import NodeState
+from lifecycle.plan.model import ParticipantConnections, PlannedEndpoint, PlannedNode
+
+if TYPE_CHECKING:
+    from lifecycle.node.lifecycle.gate import NodeGate
+    from lifecycle.node.lifecycle.services import Turns
+
+_CONFIGURED = frozenset(
+    {
+        NodeState.CONFIGURING,  # in on_configure everything is declared already
+        NodeState.INACTIVE_DISCONNECTED,
+        NodeState.CONNECTING,
+        NodeState.INACTIVE_CONNECTED,
+        NodeState.ACTIVATING_DISCONNECTED,
+        NodeState.ACTIVATING_CONNECTED,
+        NodeState.ACTIVE,
+        NodeState.DEACTIVATING,
+    }
+)
+"""Where endpoints are declared and not being taken away."""
+
+_DECLARING = {
+    EndpointKind.SUBSCRIPTION: "declare_subscription",
+    EndpointKind.SERVICE_SERVER: "declare_service",
+    EndpointKind.ACTION_SERVER: "declare_action",
+}
+"""Those that take a handler."""
+
+_ACKNOWLEDGED = Duration(seconds=0.1)
+"""How long a reliable publisher that is handed over is waited for; on one network a millisecond."""
+
+
+class NotConfiguredError(LifecycleError):
+    """The node interface was used in a state in which nothing is declared."""
+
+
+class DataLayer:
+    """Declared endpoints of one node and their mapping onto connections.
+
+    Args:
+        node: whose endpoints these are.
+        spec: what it was planned to be.
+        gate: holds back its publishers and subscriptions.
+        turns: of the node's executor.
+        state: of the node, now.
+        changed: called when the node configuration has changed, match counts included.
+
+    Attributes:
+        endpoints: from configure to cleanup every declared endpoint, in the order of declaration.
+        connections: what endpoints may be mapped onto.
+        events: what becomes of connections and mappings.
+        is_made: connect has made all of it, or found it made by the authority.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        spec: PlannedNode,
+        gate: NodeGate,
+        turns: Turns,
+        *,
+        state: Callable[[], NodeState],
+        changed: Callable[[], None],
+    ) -> None:
+        self._node = node
+        self._name = node.get_fully_qualified_name()
+        self._spec = spec
+        self._gate = gate
+        self._turns = turns
+        self._state = state
+        self._changed = changed
+        self._maker = Maker(node, gate, turns, changed)
+        self._declared = {(each.kind, each.name): Endpoint(planned=each) for each in spec.endpoints}
+        self._handovers: dict[Key, tuple[Handover, Placement]] = {}
+        self.endpoints: dict[Key, Endpoint] = {}
+        self.connections = Connections(node)
+        self.events = ConnectionEvents(turns.call_soon, self.endpoints)
+        self.is_made = False
+
+    # What is declared.
+
+    def declare(self, planned: PlannedEndpoint, callback: Callable[..., Any] | None) -> Endpoint:
+        """Have one more endpoint, made at once where the others are.
+
+        What a manifest says of the same name is kept. The same line may declare the same again:
+        on_activate runs more than once.
+
+        Args:
+            planned: with the place where it is declared.
+            callback: its handler, beside the decorated methods.
+
+        Raises:
+            LifecycleError: not in this state, the manifest fixes the endpoints at configure, it is
+                declared already, it needs a handler, or it cannot be made.
+        """
+        is_early = self._state() is NodeState.UNCONFIGURED
+        if not is_early:
+            self._refuse_late(planned)
+        endpoint = self._declared.get((planned.kind, planned.name))
+        if endpoint is not None:
+            _refuse_other(planned, endpoint.planned)
+        else:
+            endpoint = Endpoint(planned=planned, callback=callback, is_late=not is_early)
+            if not is_early:
+                self._add_late(endpoint)
+            self._declared[endpoint.key] = endpoint
+        if is_early and callback is not None:
+            endpoint.callback = callback
+        return endpoint
+
+    def _refuse_late(self, planned: PlannedEndpoint) -> None:
+        state = self._state()
+        what = (
+            f"cannot declare {planned.kind.noun} {planned.name!r} while {self._name} is "
+            f"{state.value!r}"
+        )
+        if state not in _CONFIGURED:
+            raise LifecycleError(
+                what, hint="declare endpoints in __init__, or from on_configure until cleanup"
+            )
+        if self._spec.endpoint_policy is EndpointPolicy.DECLARED:
+            raise LifecycleError(
+                f"{what}: nodes.{self._spec.key}.endpoints is 'declared' in its manifest, which "
+                "fixes them at configure",
+                hint=f"write nodes.{self._spec.key}.endpoints: open, or declare it in the manifest",
+            )
+
+    def _add_late(self, endpoint: Endpoint) -> None:
+        """Add what is declared after configure; map it if the others are mapped by the node."""
+        kind, name = endpoint.key
+        if endpoint.callback is None and needs_handler(kind):
+            raise LifecycleError(
+                f"cannot serve {kind.noun} {name!r} of {self._name} that is "
+                "declared after configure: it has no handler",
+                hint=f"give one, {_DECLARING[kind]}({name!r}, …, callback=…)",
+            )
+        self._prepare(endpoint, endpoint.callback)
+        if not self.is_made or self._is_mapped_by_others:
+            return
+        try:
+            self._map(endpoint, self._default(endpoint))
+        except BaseException:
+            self._forget(endpoint)
+            raise
+
+    def hint(self, endpoint: Endpoint, lossy: bool | None, size_bytes: int | None) -> None:
+        """Keep the author's hints on an endpoint; None leaves what was said before."""
+        endpoint.lossy = endpoint.lossy if lossy is None else lossy
+        endpoint.size_bytes = endpoint.size_bytes if size_bytes is None else size_bytes
+        self._changed()
+
+    def set_options(self, spelling: str, options: EndpointOptions) -> None:
+        """Keep how an endpoint is to be made.
+
+        Raises:
+            UnknownEndpointError: nothing, or more than one thing, is declared so.
+            LifecycleError: it exists already, or its kind cannot have them.
+        """
+        endpoint = self.find(spelling)
+        options.refuse_unfit(endpoint.kind)
+        if endpoint.placement is not None:
+            raise LifecycleError(
+                f"cannot set options of {endpoint.spelling} of {self._name}: it exists already",
+                hint="call set_options in __init__ or in on_configure",
+            )
+        endpoint.options = options
+
+    def find(self, spelling: str) -> Endpoint:
+        """Return the endpoint `video`, `publishers/video`, or `publishers//robot/video` in full.
+
+        Raises:
+            UnknownEndpointError: none, or more than one, is called so.
+        """
+        declared = self.endpoints
+        if self._state() is NodeState.UNCONFIGURED:
+            declared = self._declared
+        on_wire = {each.kind.spell(each.wire_name): each for each in self.endpoints.values()}
+        if spelling in on_wire and spelling not in {e.spelling for e in self.endpoints.values()}:
+            return on_wire[spelling]
+        return declared[find_endpoint(spelling, declared, node=self._name)]
+
+    def publisher(self, name: str) -> DeclaredPublisher:
+        """Return the handle of a declared publisher.
+
+        Raises:
+            UnknownEndpointError: no such declaration.
+        """
+        handle = self._find(EndpointKind.PUBLISHER, name).handle
+        assert handle is not None
+        return handle
+
+    def entity(self, kind: EndpointKind, name: str) -> Any:
+        """Return the rclpy object of a declared endpoint.
+
+        Raises:
+            UnknownEndpointError: no such declaration.
+            LifecycleError: the node is not connected.
+        """
+        entity = self._find(kind, name).entity
+        if entity is None:
+            raise LifecycleError(
+                f"cannot use {kind.noun} {name!r}: {self._name} is not connected; "
+                "endpoints exist from connect until disconnect"
+            )
+        return entity
+
+    @property
+    def entities(self) -> tuple[Any, ...]:
+        """Every rclpy object of a declared endpoint."""
+        return tuple(each.entity for each in self._placements)
+
+    def _find(self, kind: EndpointKind, name: str) -> Endpoint:
+        endpoint = self.endpoints.get((kind, name))
+        if endpoint is not None:
+            return endpoint
+        if not self.endpoints:
+            hint = "endpoints are declared at configure; ask for it in on_configure or later"
+        else:
+            hint = alternatives(name, [n for k, n in self.endpoints if k is kind])
+        raise UnknownEndpointError(f"cannot find {kind.noun} {name!r} of {self._name}", hint=hint)
+
+    # The transitions.
+
+    @property
+    def unhandled(self) -> tuple[PlannedEndpoint, ...]:
+        """What is declared without a handler in code."""
+        return tuple(e.planned for e in self._declared.values() if e.callback is None)
+
+    def prepare(self, bound: Callable[[PlannedEndpoint], Callable[..., Any]]) -> None:
+        """Import every type and make the publishers' handles; no endpoint exists yet.
+
+        Args:
+            bound: returns the decorated method of one that has no handler in code.
+
+        Raises:
+            LifecycleError: types that are not installed, all of them at once.
+        """
+        problems: list[str] = []
+        for endpoint in self._declared.values():
+            handler = endpoint.callback
+            if handler is None and needs_handler(endpoint.kind):
+                handler = bound(endpoint.planned)
+            try:
+                self._prepare(endpoint, handler)
+            except LifecycleError as error:
+                problems.append(str(error))
+        if problems:
+            self.unprepare()
+            raise LifecycleError("\n".join(problems))
+
+    def unprepare(self) -> None:
+        """Undo `prepare`, unmap what was mapped before a connect, and forget what came later."""
+        self.remove()
+        for endpoint in tuple(self.endpoints.values()):
+            self._forget(endpoint)
+            endpoint.error = endpoint.fault = endpoint.given_name = ""
+            if endpoint.is_late:
+                del self._declared[endpoint.key]
+        self._changed()
+
+    def _prepare(self, endpoint: Endpoint, handler: Callable[..., Any] | None) -> None:
+        planned = endpoint.planned
+        try:
+            endpoint.interface = import_interface(planned.type)
+        except LifecycleError as error:
+            raise LifecycleError(f"{planned.kind.noun} {planned.name!r}: {error}") from error
+        endpoint.handler = handler
+        self.endpoints[endpoint.key] = endpoint
+        if planned.kind is EndpointKind.PUBLISHER:
+            warn = self._node.get_logger().warning
+            endpoint.handle = DeclaredPublisher(planned.name, warn, Kept.of(planned.qos))
+            self._gate.add(endpoint.handle, endpoint.handle)
+        self._changed()
+
+    def _forget(self, endpoint: Endpoint) -> None:
+        del self.endpoints[endpoint.key]
+        if endpoint.handle is not None:
+            self._gate.remove(endpoint.handle)
+            endpoint.handle = None
+
+    def make(self) -> None:
+        """Map every endpoint that is mapped nowhere onto what the plan says, or none.
+
+        Under an authority nothing is mapped here: it must have been done.
+
+        Raises:
+            ConnectError: the first endpoint that could not be made, with the RMW's reason; or all
+                that are not mapped.
+        """
+        for endpoint in self.endpoints.values():
+            endpoint.error = ""
+        if self._is_mapped_by_others:
+            self._refuse_unmapped()
+        else:
+            self._map_all()
+            self._changed()
+        self.is_made = True
+
+    def undo(self) -> None:
+        """Undo `make`, if it has made all of it."""
+        if self.is_made:
+            self.remove()
+
+    def remove(self) -> None:
+        """Remove every endpoint and every connection but the node's own participant."""
+        for endpoint in reversed(self.endpoints.values()):
+            self._unmap(endpoint)
+            if endpoint.handle is not None:
+                endpoint.handle.forget()
+        for connection in reversed(self.connections.named):
+            self._close(connection)
+        self.connections.close_all()
+        self.is_made = False
+        self._changed()
+
+    @property
+    def _is_mapped_by_others(self) -> bool:
+        return self._spec.authority is Authority.SUPERVISOR
+
+    def _map_all(self) -> None:
+        before = [each for each in self.endpoints.values() if each.placement]
+        connected_before = self.connections.named
+        current: Endpoint | None = None
+        try:
+            for planned in self._spec.participants:
+                if planned.connection:
+                    self.events.opened(self.connections.carrier(planned))
+            for current in self.endpoints.values():
+                if current.placement is None:
+                    self._map(current, self._default(current))
+        except Exception as error:
+            for each in reversed(self.endpoints.values()):
+                if each not in before:
+                    self._unmap(each)
+            for connection in self.connections.named:
+                if connection not in connected_before:
+                    self._close(connection)
+            if current is None:
+                raise ConnectError(str(error)) from error
+            current.error = str(error)
+            raise ConnectError(
+                f"cannot connect {current.kind.noun} {current.name!r} of {self._name}: {error}"
+            ) from error
+
+    def _default(self, endpoint: Endpoint) -> Connection:
+        """Return the connection that the plan says; make its participant at first use."""
+        name = endpoint.planned.participant
+        if not name:
+            return self.connections.own
+        for each in self._spec.participants:
+            if each.name == name:
+                return self.connections.carrier(each)
+        raise ConnectError(f"cannot find participant {name!r} in the plan of {self._name}")
+
+    def _refuse_unmapped(self) -> None:
+        missing = [each.spelling for each in self.endpoints.values() if each.placement is None]
+        if missing:
+            names = [repr(each.name) for each in self.connections.named]
+            raise ConnectError(
+                f"cannot connect {self._name}: nobody has mapped "
+                f"{', '.join(map(repr, missing))}; its authority is the supervisor, which "
+                f"connected it to {', '.join(names) or 'nothing'}",
+                hint=f"call {self._name}/map_to for each, or write data_layer.authority: nodes",
+            )
+
+    def _close(self, connection: Connection) -> None:
+        self.connections.close(connection)
+        self.events.closed(connection)
+
+    # The node interface.
+
+    def connect_to(self, name: str, how: ParticipantConnections) -> Connection:
+        """Make a connection, or return the present one: LifecycleNode.connect_to."""
+        where = ", ".join(how.urls) or repr(name)
+        self._refuse_unconfigured(f"connect {self._name} to {where}")
+        name = name or self.connections.free_name()
+        planned = next((each for each in self._spec.participants if each.connection == name), None)
+        try:
+            connection = self.connections.connect_to(name, how, planned)
+        finally:
+            self._changed()
+        self.events.opened(connection)
+        return connection
+
+    def map_to(self, spelling: str, connection: Connection | str) -> Future:
+        """Map an endpoint, or hand it over from where it is: LifecycleNode.map_to.
+
+        The empty name is where the plan would have it: the node's own participant, or the one that
+        gives a publisher its own flow.
+        """
+        self._refuse_unconfigured(f"map {spelling!r} of {self._name}")
+        endpoint = self.find(spelling)
+        target = self.connections.find(connection)
+        try:
+            if target is self.connections.own and not self._is_on_named(endpoint.planned):
+                target = self._default(endpoint)
+            return self._move(endpoint, target)
+        except LifecycleError as error:
+            message = (
+                f"cannot map {endpoint.kind.noun} {endpoint.name!r} of {self._name} to "
+                f"{target.name!r}: {error.message}"
+            )
+            if endpoint.placement is None:
+                endpoint.error = message
+            raise ConnectError(message, hint=error.hint) from error
+        finally:
+            self._tidy()
+            self._changed()
+
+    def disconnect(self, connection: Connection | str) -> None:
+        """Unmake a connection: LifecycleNode.disconnect."""
+        name = connection if isinstance(connection, str) else connection.name
+        self._refuse_unconfigured(f"disconnect {self._name} from {name!r}")
+        if self.connections.forget(name):
+            self._changed()
+            return
+        found = self.connections.find(connection)
+        if found is self.connections.own:
+            raise ConnectError(
+                f"cannot disconnect {self._name} from its own participant: its services are on it",
+                hint="map its endpoints onto another connection, or take transition 'disconnect'",
+            )
+        for endpoint in self.endpoints.values():
+            running = self._handovers.get(endpoint.key)
+            if running is not None and found in (running[1].connection, endpoint.connection):
+                running[0].end()
+            if endpoint.connection is found:
+                self._unmap(endpoint)
+        self._close(found)
+        self._changed()
+
+    def remap(self, spelling: str, name: str) -> None:
+        """Make an endpoint anew under another name, where it is: LifecycleNode.remap."""
+        self._refuse_unconfigured(f"remap {spelling!r} of {self._name}")
+        endpoint = self.find(spelling)
+        before = endpoint.given_name
+        expanded = self._maker.expand(endpoint, name) if name else ""
+        if expanded == before:
+            return
+        self._end_handover(endpoint)
+        endpoint.given_name = expanded
+        old = endpoint.placement
+        if old is not None:
+            try:
+                endpoint.placement = self._place(endpoint, old.connection)
+            except BaseException:
+                endpoint.given_name = before
+                raise
+            self._take_over(endpoint, old)
+            self.events.mapped(endpoint)
+        self._changed()
+
+    def _refuse_unconfigured(self, what: str) -> None:
+        state = self._state()
+        if state not in _CONFIGURED:
+            raise NotConfiguredError(
+                f"cannot {what}: it is {state.value!r}",
+                hint="endpoints are declared from configure until cleanup; configure it first",
+            )
+
+    def _is_on_named(self, planned: PlannedEndpoint) -> bool:
+        """Whether the plan has an endpoint on a connection with a name."""
+        named = {each.name for each in self._spec.participants if each.connection}
+        return planned.participant in named
+
+    # Single endpoints.
+
+    @property
+    def _placements(self) -> tuple[Placement, ...]:
+        placements = [each.placement for each in self.endpoints.values()]
+        placements += [old for _, old in self._handovers.values()]
+        return tuple(each for each in placements if each is not None)
+
+    def _map(self, endpoint: Endpoint, connection: Connection) -> None:
+        """Map an endpoint that is mapped nowhere; raises LifecycleError."""
+        endpoint.placement = self._place(endpoint, connection)
+        if endpoint.handle is not None:
+            endpoint.handle.attach(endpoint.entity)
+        self.events.mapped(endpoint)
+        self._changed()
+
+    def _unmap(self, endpoint: Endpoint) -> None:
+        """Take an endpoint off where it is; harmless if it is nowhere."""
+        self._end_handover(endpoint)
+        placement = endpoint.placement
+        if placement is None:
+            return
+        if endpoint.handle is not None:
+            endpoint.handle.detach()
+        endpoint.placement = endpoint.peers = None
+        self._unplace(endpoint, placement)
+
+    def _move(self, endpoint: Endpoint, connection: Connection) -> Future:
+        """Map an endpoint onto another connection, make before break; raises LifecycleError."""
+        running = self._handovers.get(endpoint.key)
+        if endpoint.connection is connection:
+            return running[0].done if running is not None else nothing_to_hand_over()
+        self._end_handover(endpoint)
+        if endpoint.placement is not None:
+            return self._hand_over(endpoint, endpoint.placement, connection)
+        self._map(endpoint, connection)
+        endpoint.error = ""
+        return nothing_to_hand_over()
+
+    def _hand_over(self, endpoint: Endpoint, old: Placement, connection: Connection) -> Future:
+        """Make an endpoint anew, live on both sides for a while, then destroy the old one."""
+        peers = endpoint.peers
+        endpoint.placement = self._place(endpoint, connection)
+        endpoint.error = ""
+
+        def finish() -> None:
+            del self._handovers[endpoint.key]
+            self._take_over(endpoint, old)
+            self._tidy()
+            self._changed()
+
+        # Two servers would both answer; and a client's answers may still be under way.
+        lives_on = bool(peers) if endpoint.kind.is_topic else endpoint.kind in CLIENTS
+        handover = Handover(peers_before=peers or 1, after=self._turns.call_after, finish=finish)
+        self._handovers[endpoint.key] = (handover, old)
+        self.events.mapped(endpoint)
+        if not lives_on or self._node.executor is None:
+            handover.end()
+        else:
+            handover.peers_changed(endpoint.peers or 0)
+        return handover.done
+
+    def _end_handover(self, endpoint: Endpoint) -> None:
+        running = self._handovers.get(endpoint.key)
+        if running is not None:
+            running[0].end()
+
+    def _take_over(self, endpoint: Endpoint, old: Placement) -> None:
+        """Let the new one do what the old one did until now, which is destroyed."""
+        if endpoint.handle is not None:
+            qos = endpoint.planned.qos
+            if qos is None or qos.reliability.name != "BEST_EFFORT":
+                old.entity.wait_for_all_acked(_ACKNOWLEDGED)
+            endpoint.handle.attach(endpoint.entity)
+        self._unplace(endpoint, old)
+
+    def _place(self, endpoint: Endpoint, connection: Connection) -> Placement:
+        """Make an endpoint on a connection; where it is now is left alone."""
+        self._refuse_shared_flow(endpoint, connection)
+        entity = self._maker.make(endpoint, connection)
+        watch: Watch | None = None
+        if endpoint.kind.is_topic:
+            watch = MatchWatch(
+                self._node, entity, self._turns.group, lambda: self._matched(endpoint)
+            )
+        elif endpoint.kind in CLIENTS:  # their peers are not counted
+            watch = ServerWatch(connection.node or self._node, entity, self._changed)
+        return Placement(connection=connection, entity=entity, watch=watch)
+
+    def _unplace(self, endpoint: Endpoint, placement: Placement) -> None:
+        if placement.watch is not None:
+            placement.watch.stop()
+        self._maker.unmake(endpoint, placement.entity, placement.connection)
+        self.events.unmapped(endpoint, placement.connection)
+
+    def _matched(self, endpoint: Endpoint) -> None:
+        """Some entity of an endpoint has been matched or unmatched."""
+        self.events.matched(endpoint)
+        running = self._handovers.get(endpoint.key)
+        if running is not None:
+            running[0].peers_changed(endpoint.peers or 0)
+        self._changed()  # as many peers as before may be others
+
+    def _tidy(self) -> None:
+        """Unmake participants of single flows that carry nothing any more."""
+        used = [each.connection for each in self._placements]
+        for connection in self.connections.unnamed:
+            if connection not in used:
+                self.connections.close(connection)
+
+    def _refuse_shared_flow(self, endpoint: Endpoint, connection: Connection) -> None:
+        """Keep a strictly unique publisher alone: a participant's publishers share its sockets.
+
+        On the node's own participant the RMW refuses such a publisher itself.
+        """
+        publisher, strict = EndpointKind.PUBLISHER, UniqueRequirement.STRICTLY_REQUIRED
+        if connection.participant is None or endpoint.kind is not publisher:
+            return
+        for other in self.endpoints.values():
+            if (
+                other is endpoint
+                or other.kind is not publisher
+                or other.connection is not connection
+            ):
+                continue
+            for one, two in ((endpoint, other), (other, endpoint)):
+                if one.planned.unique is strict:
+                    raise ConnectError(
+                        f"publisher {one.name!r} must have a network flow for itself "
+                        f"(strictly_required), and would share it with publisher {two.name!r}",
+                        hint="give each a connection of its own",
+                    )
+
+
+def _refuse_other(planned: PlannedEndpoint, before: PlannedEndpoint) -> None:
+    """Raise unless an endpoint is declared again as it was, by a manifest or by the same line."""
+    at = planned.at
+    again = (before.at.file, before.at.line) == (at.file, at.line)
+    if before.type != planned.type or not (before.at.path or again):
+        raise LifecycleError(
+            f"{at.file}:{at.line}: cannot declare {planned.name!r} in {planned.kind.value} "
+            f"as {planned.type}: {before.at.file}:{before.at.line} declares it as {before.type} "
+            "already"
+        )
