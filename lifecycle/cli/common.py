@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from lifecycle.cli.completion import completing
-from lifecycle.errors import UsageError
+from lifecycle.errors import UsageError, did_you_mean
 from lifecycle.printable import lines
 
 if TYPE_CHECKING:
@@ -38,13 +38,49 @@ def manifest_arguments(function: F) -> F:
 
 
 def assignments_argument(function: F) -> F:
-    """Add `[NAME:=VALUE …]` to a verb."""
+    """Add `[NAME:=VALUE …]` to a verb; with MANIFEST before it, `PACKAGE FILE` may be that."""
     return click.argument(
         "assignments",
         nargs=-1,
         metavar="[NAME:=VALUE]...",
         shell_complete=completing("arguments"),
+        callback=_of_package,
     )(function)
+
+
+def _of_package(ctx: click.Context, _: click.Parameter, words: tuple[str, ...]) -> tuple[str, ...]:
+    """Take `PACKAGE FILE` for the file that a package has installed, as `ros2 launch` does."""
+    package = ctx.params.get("manifest")
+    if package is None or is_manifest(package) or not words or ":=" in words[0]:
+        return words
+    ctx.params["manifest"] = _installed(package, words[0])
+    return words[1:]
+
+
+def _installed(package: str, name: str) -> str:
+    """Return the only file of a name in the share directory of a package.
+
+    Raises:
+        UsageError: there is no such package, no such file in it, or several.
+    """
+    from lifecycle.manifest.installed_types import find_resource, list_resources, search_prefixes
+
+    prefixes = search_prefixes()
+    index = None if "/" in package else find_resource("packages", package, prefixes)
+    if index is None:
+        hint = did_you_mean(package, list_resources("packages", prefixes))
+        raise UsageError(f"cannot find a file or a package {package!r}", hint=hint)
+    share = index.parents[3] / package  # of PREFIX/share/ament_index/resource_index/packages/NAME
+    found = sorted(share.rglob("*.yaml"))
+    named = [str(each) for each in found if each.name == name]
+    if len(named) != 1:
+        known = [each.name for each in found if each.name.endswith(".lifecycle.yaml")]
+        there = ", ".join(named or known) or "none"
+        number = "several" if named else "no"
+        raise UsageError(
+            f"cannot choose {name!r}: {number} such manifest in {str(share)!r}: {there}"
+        )
+    return named[0]
 
 
 def format_option(*formats: str) -> Callable[[F], F]:

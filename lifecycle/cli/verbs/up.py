@@ -110,6 +110,8 @@ def command(
 ) -> int:
     """Bring a system up: start, configure, connect, verify, and only then activate.
 
+    MANIFEST is a file, or PACKAGE FILE, as `ros2 launch` takes it; so it is for other verbs.
+
     Ctrl-C ends it in reverse order (exit 130), a second one kills. SIGTERM, SIGHUP and `lifecycle
     down` do so too: exit 0 if it was verified and as far up as was asked for, else 143, 129 and 6.
     If a process dies, the others are taken down and the exit code is 6.

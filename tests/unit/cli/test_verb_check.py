@@ -232,3 +232,29 @@ def test_what_decides_about_the_rest_cannot_be_left_out(
     assert main(["check", str(path)]) == 3
     assert "give --run-commands" in capsys.readouterr().out
     assert main(["check", str(path), "--run-commands"]) == 0
+
+
+@pytest.mark.usefixtures("without_programs")
+def test_a_manifest_may_be_named_by_its_package_and_file_as_ros2_launch_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    index = tmp_path / "share/ament_index/resource_index/packages"
+    folder = tmp_path / "share/robot/manifests"
+    for each in (index, folder):
+        each.mkdir(parents=True)
+    (index / "robot").touch()
+    text = (ROOT / "manifests/first_node.lifecycle.yaml").read_text()
+    (folder / "first.lifecycle.yaml").write_text(text)
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
+
+    assert main(["check", "robot", "first.lifecycle.yaml", "greeting:=Hi"]) == 0
+    assert main(["check", "robot", "other.lifecycle.yaml"]) == 2
+    assert main(["check", "robt", "first.lifecycle.yaml"]) == 2
+
+    out, err = capsys.readouterr()
+    assert out.startswith("first_node: 2 nodes")
+    where = f"'{tmp_path}/share/robot'"
+    assert err.splitlines() == [
+        f"cannot choose 'other.lifecycle.yaml': no such manifest in {where}: first.lifecycle.yaml",
+        "cannot find a file or a package 'robt'; did you mean 'robot'?",
+    ]

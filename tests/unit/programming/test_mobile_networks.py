@@ -1,19 +1,17 @@
-"""NEF and CAMARA bodies: our models, and CAMARA's own document as the judge of its half."""
+"""NEF and CAMARA bodies, and the settings that they follow from.
+
+CAMARA's own document judges its half in test_camara.py.
+"""
 
 from __future__ import annotations
 
 import json
 import re
-import warnings
 from collections.abc import Callable
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 from msgspec.structs import replace
-from openapi_core import OpenAPI
-from openapi_core.testing import MockRequest
-from openapi_core.validation.request.exceptions import InvalidRequestBody
 
 from lifecycle.programming.camara import CamaraSettings, CamaraTarget
 from lifecycle.programming.nef import NefSettings, NefTarget
@@ -21,7 +19,6 @@ from lifecycle.programming.rules import RuleSet
 from tests.unit.programming.flow_samples import EXPECTED, LEFT_OUT, RULES, VIDEO, rule
 
 ROBOT, VIEWER = "10.9.0.1", "10.9.0.2"
-DOCUMENT = Path(__file__).parents[2] / "data" / "camara" / "quality-on-demand.yaml"
 IPV6 = rule("/lidar", "fd09::1:17904", "fd09::2:17914", five_qi=85)
 
 
@@ -48,15 +45,6 @@ def camara(**rest: object) -> CamaraSettings:
 def nef_subscriptions(rules: object, settings: NefSettings) -> SimpleNamespace:
     requests, left_out = NefTarget.wanted(rules, settings)
     return SimpleNamespace(requests=requests, left_out=left_out)
-
-
-def camara_sessions(rules: object, settings: CamaraSettings) -> SimpleNamespace:
-    requests, left_out = CamaraTarget.wanted(rules, settings)
-    return SimpleNamespace(requests=requests, left_out=left_out)
-
-
-def cannot(message: str) -> object:
-    return pytest.raises(ValueError, match=f"^{re.escape(message)}$")
 
 
 def reasons(found: object) -> list[str]:
@@ -143,6 +131,14 @@ def test_the_export_says_what_each_body_is_for() -> None:
     assert made == json.loads((EXPECTED / "nef.json").read_text(encoding="utf-8"))
 
 
+# --- CAMARA
+
+
+def test_the_camara_export_says_what_each_body_is_for() -> None:
+    made = json.loads(CamaraTarget.document(RuleSet(rules=RULES, left_out=LEFT_OUT), camara()))
+    assert made == json.loads((EXPECTED / "camara.json").read_text(encoding="utf-8"))
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -168,82 +164,6 @@ def test_the_export_says_what_each_body_is_for() -> None:
                 "use an address or a network, such as 10.45.0.0/16"
             ),
         ),
-    ],
-)
-def test_a_subscription_that_a_server_would_misread_is_refused(
-    make: Callable[[], object], message: str
-) -> None:
-    with cannot(message):
-        make()
-
-
-# --- CAMARA
-
-
-@pytest.fixture(scope="module")
-def openapi() -> OpenAPI:
-    """CAMARA's document."""
-    return OpenAPI.from_file_path(str(DOCUMENT))
-
-
-def post(openapi: OpenAPI, body: object) -> None:
-    """Let CAMARA's document judge the request that creates a session."""
-    request = MockRequest(
-        "http://localhost:9091",
-        "post",
-        "/quality-on-demand/v1/sessions",
-        data=json.dumps(body).encode(),
-        content_type="application/json",
-    )
-    with warnings.catch_warnings():
-        # The validator knows no OpenID Connect and says so; who may ask is not judged here.
-        warnings.filterwarnings("ignore", message="Unsupported scheme type")
-        openapi.validate_request(request)
-
-
-VARIANTS = {
-    "plain": camara(),
-    "device named by the token": camara(device_by_token=True),
-    "the sender is the device": camara(devices=("source",)),
-}
-
-
-@pytest.mark.parametrize("variant", VARIANTS)
-def test_camaras_document_accepts_every_session(openapi: OpenAPI, variant: str) -> None:
-    found = camara_sessions([VIDEO, IPV6], VARIANTS[variant])
-    assert found.left_out == ()
-    assert len(found.requests) >= 2
-    for each in found.requests:
-        post(openapi, each.body)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"qosProfile": "no spaces"},
-        {"duration": 0},
-        {"sink": "http://robots.example.net"},
-        {"devicePorts": {}},
-        {"applicationServer": {}},
-        {"device": {"ipv4Address": {"publicAddress": "203.0.113.9"}}},
-    ],
-)
-def test_camaras_document_would_notice_a_wrong_session(
-    openapi: OpenAPI, change: dict[str, object]
-) -> None:
-    (request,) = camara_sessions([VIDEO], camara()).requests
-    with pytest.raises(InvalidRequestBody):
-        post(openapi, {**request.body, **change})
-
-
-def test_the_camara_export_says_what_each_body_is_for() -> None:
-    made = json.loads(CamaraTarget.document(RuleSet(rules=RULES, left_out=LEFT_OUT), camara()))
-    assert made == json.loads((EXPECTED / "camara.json").read_text(encoding="utf-8"))
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
         (
             lambda: camara(default_qos_profile="x"),
             (
@@ -261,8 +181,8 @@ def test_the_camara_export_says_what_each_body_is_for() -> None:
         ),
     ],
 )
-def test_a_session_that_a_server_would_refuse_is_refused_by_us(
+def test_settings_that_a_server_would_refuse_or_misread_are_refused_by_us(
     make: Callable[[], object], message: str
 ) -> None:
-    with cannot(message):
+    with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
         make()
