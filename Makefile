@@ -13,12 +13,13 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --co
 # Tests start hundreds of programs: where nothing may be compiled ahead, each compiles the whole package again.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test test-thorough test-kilted outside check check-static soak soak-tests bench bench-all hostile mutate docs schemas findings clean help
+.PHONY: demo test test-thorough test-kilted test-engines outside check check-static soak soak-tests bench bench-all hostile mutate docs schemas findings clean help
 
 help:
 	@echo "make demo    bring up a small robot from its manifest, verified, then shut it down"
 	@echo "make test    set up and run the tests, real DDS included; no privilege needed; five minutes"
 	@echo "make test-kilted  try the verbs on ROS 2 Kilted, in a venv of its own; two minutes"
+	@echo "make test-engines  run the pods of an exported system with podman; three minutes"
 	@echo "make outside try the promise from outside: every attack, the nine systems, ros2 clients, faults; eight minutes."
 	@echo "             LIFECYCLE=path/to/lifecycle make outside asks another installation"
 	@echo "make check   everything CI runs: lint, types, import contracts, all tests"
@@ -81,6 +82,10 @@ ROUNDS ?= 100
 SEED   ?= 1
 soak: $(STAMP)
 	$(BIN)/python -m tests.soak --seed $(SEED) --rounds $(ROUNDS)
+
+# The pods of an exported system, run by podman as a kubelet would; skips without root and podman. Three minutes.
+test-engines: $(STAMP)
+	$(PYTEST) tests/engines
 
 # What holds must hold each time: the faults and the gate, TIMES over and without a second try, then bring-ups on a busy machine.
 TIMES ?= 20

@@ -244,22 +244,13 @@ def _kubernetes_object(deployment: Deployment, machine: str) -> dict[str, object
         "app.kubernetes.io/component": "supervisor",
     }
     spec = _pod(deployment, machine)
-    if deployment.restarts(machine):
-        # A supervisor that gives up is not started again by the engine; one that the machine
-        # loses is, when the pod is applied again.
-        return {
-            "apiVersion": "v1",
-            "kind": "Pod",
-            "metadata": {"name": name, "labels": labels},
-            "spec": {**spec, "restartPolicy": "Never"},
-        }
     return {
         "apiVersion": "apps/v1",
         "kind": "Deployment",
         "metadata": {"name": name, "labels": labels},
         "spec": {
             "replicas": 1,
-            # Never two of a system in one domain.
+            # The supervisor restarts nodes, the engine a supervisor; never two of a system.
             "strategy": {"type": "Recreate"},
             "selector": {"matchLabels": {"app.kubernetes.io/instance": name}},
             "template": {"metadata": {"labels": labels}, "spec": spec},
@@ -336,12 +327,10 @@ def _title(deployment: Deployment, machine: str) -> str:
 
 
 def _head(deployment: Deployment, machine: str) -> str:
-    by = "its supervisor" if deployment.restarts(machine) else "the engine"
+    restarts = deployment.restarts(machine)
+    by = "the supervisor restarts nodes, the engine it" if restarts else "the engine restarts all"
     source = one_line(deployment.manifest)
-    return (
-        f"# {_title(deployment, machine)}.\n"
-        f"# Written by lifecycle export from {source}; {by} restarts what fails.\n"
-    )
+    return f"# {_title(deployment, machine)}.\n# Written by lifecycle export from {source}; {by}.\n"
 
 
 class _Plain(yaml.SafeDumper):

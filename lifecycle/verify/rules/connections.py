@@ -95,7 +95,7 @@ def _connection(
             outcome=Outcome.UNVERIFIABLE,
             expected=f"connection {name}",
             observed="unknown",
-            message=f"cannot verify connection {name!r} of {node.full_name}: the node does not"
+            message=f"nothing shows connection {name!r} of {node.full_name}: the node does not"
             " report its connections",
         )
         return
@@ -106,7 +106,7 @@ def _connection(
             outcome=Outcome.VIOLATED,
             expected=f"connection {name}",
             observed=_listed(configuration.connections),
-            message=f"cannot find connection {name!r} of {node.full_name};"
+            message=f"{node.full_name} has no connection {name!r};"
             f" it has {_listed(configuration.connections)}",
         )
     elif report.error:
@@ -114,7 +114,7 @@ def _connection(
             node,
             expected=f"connection {name}",
             observed=report.error,
-            message=f"cannot connect {node.full_name} to {name!r}"
+            message=f"{node.full_name} is not connected to {name!r}"
             f" ({', '.join(report.urls or planned.urls)}): {report.error}",
         )
     else:
@@ -131,7 +131,7 @@ def _urls(
         node,
         expected=", ".join(planned.urls),
         observed=", ".join(report.urls) or "no URL",
-        message=f"cannot accept {what} of {node.full_name}: it was connected to"
+        message=f"{what} of {node.full_name} was made to"
         f" {', '.join(report.urls) or 'no URL'} and must be to {', '.join(planned.urls)}",
     )
 
@@ -148,8 +148,8 @@ def _mapping(actual: Actual) -> Iterator[Finding]:
         actual,
         expected=_spell(wanted),
         observed=_spell(report.connection),
-        message=f"cannot accept the {planned.kind.noun} of {planned.resolved} in"
-        f" {node.full_name}: it is mapped onto {_spell(report.connection)} and must be onto"
+        message=f"the {planned.kind.noun} of {planned.resolved} in"
+        f" {node.full_name} is mapped onto {_spell(report.connection)} and must be onto"
         f" {_spell(wanted)}",
     )
 

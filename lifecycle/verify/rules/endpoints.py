@@ -96,7 +96,7 @@ def _declared(actual: Actual, *, absent: bool) -> Iterator[Finding]:
             actual,
             expected=f"{word} of {node.full_name}",
             observed=actual.report.error,
-            message=f"cannot make the {word} {planned.name!r} of {node.full_name}:"
+            message=f"{node.full_name} could not make its {word} {planned.name!r}:"
             f" {actual.report.error}",
         )
     elif actual.observed is None and not absent and not (actual.unseen and actual.report is None):
@@ -104,7 +104,7 @@ def _declared(actual: Actual, *, absent: bool) -> Iterator[Finding]:
             actual,
             expected=f"{word} of {node.full_name}",
             observed=f"no such {word}",
-            message=f"cannot find the {word} of {planned.resolved} that {node.full_name} declares",
+            message=f"{node.full_name} has no {word} of {planned.resolved}, which is declared",
             hint=_remapped(actual),
         )
     seen = actual.observed or actual.report
@@ -113,8 +113,8 @@ def _declared(actual: Actual, *, absent: bool) -> Iterator[Finding]:
             actual,
             expected=planned.type,
             observed=seen.type or "no type",
-            message=f"cannot accept the {word} of {planned.resolved} in {node.full_name}:"
-            f" it is declared as {planned.type} and is {seen.type or 'of unknown type'}",
+            message=f"the {word} of {planned.resolved} in {node.full_name}"
+            f" is declared as {planned.type} and is {seen.type or 'of unknown type'}",
         )
 
 
@@ -151,7 +151,7 @@ def _unseen(
         actual,
         expected=f"{word} of {node.full_name}",
         observed="not shown by discovery",
-        message=f"cannot verify the {word} of {planned.resolved} in {node.full_name}: {reason}",
+        message=f"nothing shows the {word} of {planned.resolved} in {node.full_name}: {reason}",
     )
 
 
@@ -179,8 +179,8 @@ def _undeclared(view: View) -> Iterator[Finding]:
             subject=endpoint.name,
             expected=f"no such {word} of {endpoint.node}",
             observed=f"{word} of type {endpoint.type}" if endpoint.type else word,
-            message=f"cannot allow the {word} of {endpoint.name} in {endpoint.node}:"
-            " the manifest does not declare it",
+            message=f"the manifest does not declare the {word} of {endpoint.name} in"
+            f" {endpoint.node}",
             at=node.at,
             node=endpoint.node,
             endpoint=endpoint.kind,
@@ -203,8 +203,8 @@ def _wrong_part(view: View, endpoint: ObservedEndpoint) -> Finding | None:
                 actual,
                 expected=expected,
                 observed=endpoint.type or "no type",
-                message=f"cannot accept the {planned.kind.noun} of {planned.resolved} in"
-                f" {endpoint.node}: {endpoint.name} must be {expected} and is"
+                message=f"the {planned.kind.noun} of {planned.resolved} in"
+                f" {endpoint.node} has another type: {endpoint.name} must be {expected} and is"
                 f" {endpoint.type or 'of unknown type'}",
             )
     return None
@@ -246,7 +246,7 @@ def _conflicts(view: View) -> Iterator[Finding]:
             subject=seen.name,
             expected=" or ".join(declared),
             observed=seen.type or "no type",
-            message=f"cannot match the {word} of {seen.name} in {who}: it is"
+            message=f"the {word} of {seen.name} in {who} matches none: it is"
             f" {seen.type or 'of unknown type'}, the manifest declares the {what} as"
             f" {' or '.join(declared)}",
             node=seen.node,
@@ -349,8 +349,8 @@ def _differs(place: _Place, end: _End, expected: str, source: str) -> Finding:
         subject=name,
         expected=f"{type_} as {expected}",
         observed=f"{type_} as {end.type_hash}",
-        message=f"cannot accept the {end.kind.noun} of {name} in {node}: its {type_} is not"
-        f" that of {source}; both have the name, so the {what} is matched and the data are not"
+        message=f"the {end.kind.noun} of {name} in {node} has another definition: its {type_} is"
+        f" not that of {source}; both have the name, so the {what} is matched and the data are not"
         " understood",
         at=end.at,
         node=end.node,
@@ -367,7 +367,7 @@ def _unverifiable(node: str, ends: list[tuple[_Place, _End]]) -> Finding:
         subject=who,
         expected="a type hash",
         observed="none announced",
-        message=f"cannot verify which definitions {who} uses on {listed}: it announces no type"
+        message=f"nothing shows which definitions {who} uses on {listed}: it announces no type"
         " hashes",
         at=next((end.at for _, end in ends if end.at), None),
         node=node,

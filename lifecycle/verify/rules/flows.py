@@ -124,7 +124,7 @@ def _unmeasured(
         subject=subject,
         expected=str(quantity),
         observed="not measured",
-        message=f"cannot verify {quantity} of {where}: nothing measures it",
+        message=f"nothing measures {quantity} of {where}",
         at=quantity.at,
         node=node,
         endpoint=endpoint,
@@ -141,7 +141,7 @@ def _broken(actual: Actual) -> Iterator[Finding]:
             actual,
             expected="at least one network flow endpoint",
             observed="none",
-            message=f"cannot reach the subscription of {planned.resolved} in"
+            message=f"nothing reaches the subscription of {planned.resolved} in"
             f" {actual.node.full_name}: it has no network flow endpoint",
         )
 
@@ -160,8 +160,8 @@ def _strict(actual: Actual, uniqueness: Uniqueness) -> Iterator[Finding]:
             actual,
             expected=f"unique {word}",
             observed="network flow endpoints not reported",
-            message=f"cannot accept {where}: it strictly requires a unique network flow, which"
-            f" cannot be proven: {_why_unproven(actual)}",
+            message=f"{where} strictly requires a unique network flow, which"
+            f" is not proven: {_why_unproven(actual)}",
         )
     elif unique is False:
         shared = ", ".join(dict.fromkeys(map(_spell, uniqueness.nfes((actual,)))))
@@ -169,7 +169,7 @@ def _strict(actual: Actual, uniqueness: Uniqueness) -> Iterator[Finding]:
             actual,
             expected=f"unique {word}",
             observed=f"shares {shared}",
-            message=f"cannot accept {where}: it strictly requires a unique network flow and shares"
+            message=f"{where} strictly requires a unique network flow and shares"
             f" {shared} with other {word}s",
         )
 
@@ -186,7 +186,7 @@ def _demanded(flow: FlowView, uniqueness: Uniqueness) -> Iterator[Finding]:
     if met:
         return
     observed = f"publisher {_answer(publisher)}, subscription {_answer(subscription)}"
-    unproven = ", which cannot be proven" if met is None else ""
+    unproven = ", which is not proven" if met is None else ""
     rule = UNVERIFIABLE if met is None else NOT_UNIQUE
     yield rule.finding(
         outcome=Outcome.VIOLATED,
@@ -194,8 +194,8 @@ def _demanded(flow: FlowView, uniqueness: Uniqueness) -> Iterator[Finding]:
         ends=flow.ends,
         expected=f"{how} unique flow",
         observed=observed,
-        message=f"cannot accept the flow {flow.publisher} → {flow.subscription} on"
-        f" {flow.planned.topic}: its link demands a {how} unique flow{unproven}; {observed}",
+        message=f"the flow {flow.publisher} → {flow.subscription} on {flow.planned.topic} is not as"
+        f" its link demands, a {how} unique flow{unproven}; {observed}",
         at=flow.at,
     )
 
@@ -286,8 +286,8 @@ def _not_by_network(flow: FlowView, demanding: Actual, used: str) -> Finding:
         ends=flow.ends,
         expected="an IP transport",
         observed=_WORDS[used],
-        message=f"cannot {'verify' if unknown else 'accept'} the flow {flow.publisher} →"
-        f" {flow.subscription} on {flow.planned.topic}: it needs the network, and {why}",
+        message=f"the flow {flow.publisher} →"
+        f" {flow.subscription} on {flow.planned.topic} needs the network, and {why}",
         at=demanding.planned.at,
     )
 
@@ -302,9 +302,9 @@ def _otherwise(flow: FlowView, used: str) -> Finding:
         ends=flow.ends,
         expected=planned,
         observed=word,
-        message=f"cannot {'verify' if unknown else 'accept'} what carries {flow.publisher} →"
-        f" {flow.subscription} on {flow.planned.topic}: it must be {planned}, and"
-        f" {'nothing shows what it is' if unknown else f'it is {word}'}",
+        message=f"what carries {flow.publisher} →"
+        f" {flow.subscription} on {flow.planned.topic} must be {planned}, and"
+        f" {'nothing shows what it is' if unknown else f'is {word}'}",
         at=flow.at,
     )
 
@@ -346,7 +346,7 @@ def check_dscp(view: View) -> Iterator[Finding]:
                 actual,
                 expected=describe(wanted),
                 observed="not read back",
-                message=f"cannot verify the DSCP of {where}: nobody read it back",
+                message=f"nothing shows the DSCP of {where}: it was not read back",
             )
         elif read != wanted:
             waived = "" if planned.enforce_dscp else "; the manifest does not enforce it"
@@ -355,7 +355,7 @@ def check_dscp(view: View) -> Iterator[Finding]:
                 outcome=Outcome.VIOLATED if planned.enforce_dscp else Outcome.UNVERIFIABLE,
                 expected=describe(wanted),
                 observed=describe(read),
-                message=f"cannot accept {where}: its sockets carry {describe(read)}"
+                message=f"the sockets of {where} carry {describe(read)}"
                 f" and not {describe(wanted)}{waived}",
                 hint="" if planned.enforce_dscp else "see the node's log for the refused option",
             )

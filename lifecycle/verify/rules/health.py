@@ -78,7 +78,7 @@ def _judge(view: View, facts: NodeFacts) -> Iterator[Finding]:
             node,
             expected="a method 'health'",
             observed="none",
-            message=f"cannot ask node {node.full_name} whether it is healthy: "
+            message=f"node {node.full_name} is to be asked whether it is healthy, and "
             "its class has no method 'health'",
         )
     # A method is asked from when its node is connected, and a held node publishes nothing before it
@@ -101,7 +101,7 @@ def _judge(view: View, facts: NodeFacts) -> Iterator[Finding]:
             outcome=Outcome.VIOLATED,
             expected=_HEALTHY,
             observed=health.message,
-            message=f"cannot accept node {node.full_name}: it is not healthy: {health.message}",
+            message=f"node {node.full_name} is not healthy: {health.message}",
         )
     elif health.ok is None:
         yield UNHEALTHY.on_node(
@@ -109,7 +109,7 @@ def _judge(view: View, facts: NodeFacts) -> Iterator[Finding]:
             outcome=Outcome.UNVERIFIABLE,
             expected=_HEALTHY,
             observed="unknown",
-            message=f"cannot verify that node {node.full_name} is healthy: {health.message}",
+            message=f"nothing shows that node {node.full_name} is healthy: {health.message}",
         )
 
 
@@ -124,5 +124,5 @@ def _faults(facts: NodeFacts) -> Iterator[Finding]:
                 outcome=Outcome.VIOLATED,
                 expected=_HEALTHY,
                 observed=wrong,
-                message=f"cannot accept node {node.full_name}: it is not healthy: {wrong}",
+                message=f"node {node.full_name} is not healthy: {wrong}",
             )

@@ -175,8 +175,8 @@ def _unknown_peers(view: View, topics: Mapping[str, _Ends]) -> Iterator[Finding]
             actual,
             expected=f"at most {possible} {other.noun}{'s' * (possible != 1)}, as in the graph",
             observed=f"matched {report.matched}",
-            message=f"cannot explain all that the {end.kind.noun} of {actual.planned.resolved} in "
-            f"{actual.node.full_name} is matched with: it counts {report.matched}, and the graph "
+            message=f"the {end.kind.noun} of {actual.planned.resolved} in {actual.node.full_name} "
+            f"is matched with more than the graph shows: it counts {report.matched}, and the graph "
             f"shows {possible} that can match it",
         )
 
@@ -195,7 +195,7 @@ def _unreported_flows(view: View) -> Iterator[Finding]:
         ends=flows[0].ends if len(names) == 1 else (),
         expected="a report of one end",
         observed="no report",
-        message=f"cannot verify that data can flow: neither end reports anything: {listed}",
+        message=f"nothing proves that data can flow: neither end reports anything: {listed}",
         at=flows[0].at,
     )
 
@@ -227,9 +227,9 @@ def _judge_flow(flow: FlowView, ends: _Ends) -> Iterator[Finding]:
         ends=flow.ends,
         expected="matched",
         observed=reason,
-        message=f"cannot see {pair} matched on {flow.planned.topic}: {reason}"
+        message=f"{pair} are not matched on {flow.planned.topic}: {reason}"
         if violated
-        else f"cannot verify that {pair} are matched on {flow.planned.topic}: {reason}",
+        else f"nothing proves that {pair} are matched on {flow.planned.topic}: {reason}",
         at=flow.at,
     )
 
@@ -281,7 +281,7 @@ def _of_one_end(end: SeenEndpoint, others: Sequence[SeenEndpoint]) -> Match | No
         return None
     matched, possible = report.matched, _possible(end, others)
     word = f"the {end.kind.noun}"
-    reason = f"{word} matched {matched} of {len(possible)}" if matched else f"{word} matched nobody"
+    reason = f"{word} matched {matched} of {len(possible)}" if matched else f"{word} matched none"
     if matched == len(possible):
         return _OK
     if matched < len(possible) and (matched == 0 or all(each.expected for each in possible)):
@@ -356,22 +356,23 @@ def _judge_client(client: Actual, server: str, *, count: int) -> Iterator[Findin
     if report.server_matched is False:
         outcome, reason = Outcome.VIOLATED, "the client counts no server as available"
     elif report.server_matched is None:
-        outcome, reason = Outcome.UNVERIFIABLE, "its client does not tell"
+        outcome, reason = Outcome.UNVERIFIABLE, "its client does not report it"
     elif count > 1:
         outcome = Outcome.UNVERIFIABLE
-        reason = f"it has {count} servers, and the client does not tell which it is matched with"
+        reason = f"it has {count} servers, and the client does not report which it is matched with"
     else:
         return
     name, node = client.planned.resolved, client.node.full_name
-    verb = "see" if outcome is Outcome.VIOLATED else "verify that"
-    state = "matched" if outcome is Outcome.VIOLATED else "are matched"
+    says, state = "", "are not matched"
+    if outcome is not Outcome.VIOLATED:
+        says, state = "nothing proves that ", "are matched"
     yield UNMATCHED_CLIENT.finding(
         outcome=outcome,
         subject=f"{name}: {node} → {server}",
         ends=(node, server),
         expected="matched",
         observed=reason,
-        message=f"cannot {verb} {node} → {server} {state} on"
+        message=f"{says}{node} → {server} {state} on"
         f" {client.planned.kind.meets_in} {name}: {reason}",
         at=client.planned.at,
         node=node,

@@ -73,9 +73,9 @@ def _missing(view: View, others: Mapping[str, list[str]]) -> Iterator[Finding]:
                 node,
                 expected="node in the graph, or ended by itself",
                 observed=view.over[name] or "no such node",
-                message=f"cannot verify node {name}: it has ended by itself, as it may"
+                message=f"node {name} has ended by itself, as it may"
                 if view.over[name]
-                else f"cannot verify node {name}: it may have ended by itself, or not have started",
+                else f"node {name} may have ended by itself, or not have started",
             )
             continue
         hint = ""
@@ -99,10 +99,10 @@ def _missing(view: View, others: Mapping[str, list[str]]) -> Iterator[Finding]:
             outcome=Outcome.UNVERIFIABLE if beyond else Outcome.VIOLATED,
             expected="node in the graph",
             observed="out of reach" if beyond else "no such node",
-            message=f"cannot verify node {name}: it talks by the shared memory of machine"
+            message=f"node {name} cannot be seen from here: it uses the shared memory of machine"
             f" {node.machine!r} alone"
             if beyond
-            else f"cannot find node {name} in domain {view.plan.domain_id}",
+            else f"there is no node {name} in domain {view.plan.domain_id}",
             hint=hint,
         )
 
@@ -160,7 +160,7 @@ def _duplicate(view: View) -> Iterator[Finding]:
             subject=name,
             expected="1 node of this name",
             observed=f"{count} nodes",
-            message=f"cannot tell {count} nodes named {name} apart",
+            message=f"there are {count} nodes named {name}",
             at=node.at if node else None,
             node=name,
             hint=hint,
@@ -179,7 +179,7 @@ def _undeclared(view: View, others: Mapping[str, list[str]]) -> Iterator[Finding
             subject=name,
             expected="no such node",
             observed=f"node with {endpoints}" if endpoints else "node",
-            message=f"cannot allow node {name}: the manifest does not declare it",
+            message=f"the manifest does not declare node {name}",
             node=name,
             hint=f"if it is {' or '.join(missing)}, which is missing, write a `name` there; else"
             f" {UNDECLARED_NODE.fix}"
@@ -192,7 +192,7 @@ UNATTRIBUTED_ENDPOINT = Rule(
     id="graph.unattributed-endpoint",
     meaning="the graph has an endpoint whose node is not known",
     outcomes=(Outcome.VIOLATED, Outcome.UNVERIFIABLE),
-    fix="wait for discovery; a plain DDS program never tells a node name: give it another domain",
+    fix="wait for discovery; a plain DDS program has no node name: give it another domain",
     heals=Heals.WITH_TIME,
     if_undiscovered=True,
     awaits=MISSING_NODE,  # discovery shows an endpoint before its node
@@ -239,8 +239,8 @@ def _offered_by_tools(view: View) -> Iterator[Finding]:
             subject=endpoint.name,
             expected=f"no such {word} of {endpoint.node}",
             observed=f"{word} of type {endpoint.type}" if endpoint.type else word,
-            message=f"cannot allow the {word} of {endpoint.name} in {endpoint.node}: the manifest"
-            f" does not declare it, and it {verb} {whom}",
+            message=f"the manifest does not declare the {word} of {endpoint.name} in"
+            f" {endpoint.node}, which {verb} {whom}",
             node=endpoint.node,
             endpoint=endpoint.kind,
             hint="only the supervisor of this system offers it; if several nodes do, none is taken"
@@ -267,7 +267,7 @@ def _unattributed(view: View) -> Iterator[Finding]:
             subject=endpoint.name,
             expected=f"{word} of a declared node",
             observed=f"{word} of an unknown node",
-            message=f"cannot tell whose {word} of {endpoint.name} this is{described(endpoint)}",
+            message=f"no known node has this {word} of {endpoint.name}{described(endpoint)}",
             endpoint=endpoint.kind,
         )
 

@@ -121,8 +121,8 @@ def _reached_none(view: View) -> Iterator[Finding]:
             subject=each.name,
             expected=_wanted(each),
             observed="no such parameter",
-            message=f"cannot find parameter {each.name}, which is {_origin(each)}, in any node "
-            f"that it is for: {', '.join(nodes[:_NAMED])}",
+            message=f"no node has parameter {each.name}, which is {_origin(each)} "
+            f"for {', '.join(nodes[:_NAMED])}",
             at=at,
         )
 
@@ -151,7 +151,7 @@ def _judge(
                 expected,
                 wanted=_wanted(expected),
                 observed="no such parameter",
-                message=f"cannot find {what}, which is {_origin(expected)}",
+                message=f"there is no {what}, which is {_origin(expected)}",
             )
         return
     if not _is_of_type(actual, expected.type):
@@ -161,7 +161,7 @@ def _judge(
             expected,
             wanted=expected.type,
             observed=actual.type or "not set",
-            message=f"cannot accept {what}: it is {_with_type(actual)}, and must be "
+            message=f"{what} is {_with_type(actual)}, and must be "
             f"{expected.type} as {_origin(expected)}",
         )
     elif expected.value is not None and not _is_value(actual, expected.value):
@@ -175,8 +175,7 @@ def _judge(
             expected,
             wanted=wanted,
             observed=_value_of(actual),
-            message=f"cannot accept {what}: it is {_value_of(actual)}, and must be {wanted} as "
-            f"{_origin(expected)}",
+            message=f"{what} is {_value_of(actual)}, and must be {wanted} as {_origin(expected)}",
             hint=hint,
         )
     if expected.read_only and not actual.read_only:
@@ -186,8 +185,7 @@ def _judge(
             expected,
             wanted="read_only",
             observed="can be set",
-            message=f"cannot accept {what}: it can be set, and must be read_only as its interface "
-            "declares it",
+            message=f"{what} can be set, and must be read_only as its interface declares it",
         )
 
 
@@ -204,8 +202,7 @@ def _undeclared(node: PlannedNode, known: Mapping[str, ParameterReport]) -> Iter
             node,
             expected="no such parameter",
             observed=", ".join(f"{name} ({known[name].type})" for name in names[:_NAMED]),
-            message=f"cannot allow {_listed(names)} of node {node.full_name}: its interface does"
-            f" not declare {'it' if len(names) == 1 else 'them'}",
+            message=f"the interface of node {node.full_name} does not declare {_listed(names)}",
         )
 
 
@@ -238,7 +235,7 @@ def _unknown(node: PlannedNode, why: str) -> Finding:
         node,
         expected=", ".join(names) or "no parameters",
         observed="unknown",
-        message=f"cannot verify {what} of node {node.full_name}: {why}",
+        message=f"nothing shows {what} of node {node.full_name}: {why}",
     )
 
 
@@ -247,7 +244,7 @@ def _unread(node: PlannedNode, file: str) -> Finding:
         subject=f"{node.full_name}: {file}",
         expected=f"values of {file}",
         observed="unknown",
-        message=f"cannot verify the parameters that {file} gives node {node.full_name}: "
+        message=f"nothing shows the parameters that {file} gives node {node.full_name}: "
         "it could not be read",
         at=node.at,
         node=node.full_name,

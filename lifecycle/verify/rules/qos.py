@@ -100,7 +100,7 @@ def _against_declaration(actual: Actual, unknown: _Unknown) -> Iterator[Finding]
             actual,
             expected=f"{policy} {want}",
             observed=f"{policy} {have}",
-            message=f"cannot accept {where}: {policy} is declared {want} and is {have}",
+            message=f"{where} has {policy} {have}, and is declared with {want}",
         )
     if hidden:
         unknown.append((actual, hidden))
@@ -118,7 +118,7 @@ def _unverifiable(node: PlannedNode, unknown: _Unknown) -> Finding:
             for each, hidden in unknown
         ),
         observed="not announced",
-        message=f"cannot verify {policies} of {node.full_name} on {of}: neither discovery nor the"
+        message=f"nothing shows {policies} of {node.full_name} on {of}: neither discovery nor the"
         " node reports the actual value",
         at=unknown[0][0].planned.at,
         node=node.full_name,
@@ -204,14 +204,14 @@ def _incompatible(
     certain = found.severity is Certainty.CERTAIN
     offers, requests = publisher.node or "an unknown node", subscription.node or "an unknown node"
     declared = publisher.planned or subscription.planned
-    verb = "cannot match" if certain else "cannot verify that these match:"
+    how = "do not match" if certain else "may not match"
     return QOS_INCOMPATIBLE.finding(
         outcome=Outcome.VIOLATED if certain else Outcome.UNVERIFIABLE,
         subject=f"{publisher.name}: {offers} → {requests}",
         ends=tuple(filter(None, (publisher.node, subscription.node))),
         expected=f"{found.policy} of at least {found.requested} offered",
         observed=f"{found.policy} {found.offered} offered",
-        message=f"{verb} {offers} → {requests} on {publisher.name}: {offers} offers"
+        message=f"{offers} → {requests} {how} on {publisher.name}: {offers} offers"
         f" {found.policy} {found.offered}, {requests} requests {found.policy} {found.requested}",
         at=declared.at if declared else None,
     )

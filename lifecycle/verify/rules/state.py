@@ -88,14 +88,14 @@ def _judge(view: View, facts: NodeFacts) -> Iterator[Finding]:
             node,
             expected=expected,
             observed=wrong[0],
-            message=f"cannot accept node {name}: it is {wrong[0]} and must be {expected}",
+            message=f"node {name} is {wrong[0]} and must be {expected}",
         )
     elif observed is not None and observed.managed is False and not _reports_state(facts):
         yield WRONG_STATE.on_node(
             node,
             expected=f"managed node, {expected}",
             observed="not a managed node",
-            message=f"cannot accept node {name}: it offers no lifecycle services",
+            message=f"node {name} offers no lifecycle services",
             hint="make it a managed node, or declare it `managed: false`",
         )
     elif not states:
@@ -103,7 +103,7 @@ def _judge(view: View, facts: NodeFacts) -> Iterator[Finding]:
             node,
             expected=expected,
             observed="unknown",
-            message=f"cannot verify the state of node {name}: no report and no service says it",
+            message=f"nothing shows the state of node {name}: neither a report nor a service",
         )
 
 
@@ -155,7 +155,7 @@ def _judge_report(facts: NodeFacts) -> Iterator[Finding]:
             facts.node,
             expected="node configuration",
             observed="no report",
-            message=f"cannot judge node {name}: it did not report its configuration",
+            message=f"node {name} did not report its configuration",
         )
         return
     for actual in facts.actual:
@@ -167,5 +167,5 @@ def _judge_report(facts: NodeFacts) -> Iterator[Finding]:
             actual,
             expected=f"{word} in the report of {name}",
             observed="not mentioned",
-            message=f"cannot judge the {word} of {planned.resolved}: {name} does not report it",
+            message=f"{name} does not report the {word} of {planned.resolved}",
         )

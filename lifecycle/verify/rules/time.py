@@ -63,7 +63,7 @@ def check(view: View) -> Iterator[Finding]:
             users,
             expected="one publisher",
             observed=f"{len(publishers)} publishers",
-            message=f"cannot tell which time holds for {_named(users)}: {owners} publish {topic}",
+            message=f"several nodes give {_named(users)} their time: {owners} publish {topic}",
         )
     elif not publishers:
         # Of a declared one that is missing, or cannot be seen from here, there is a finding.
@@ -73,7 +73,8 @@ def check(view: View) -> Iterator[Finding]:
                 users,
                 expected=f"publisher of {type_}",
                 observed="no publisher",
-                message=f"cannot give {_named(users)} simulated time: nobody publishes {topic}",
+                message=f"there is no simulated time for {_named(users)}:"
+                f" nothing publishes {topic}",
             )
     else:
         yield from _of_one(view, users, publishers[0])
@@ -87,7 +88,7 @@ def _of_one(view: View, users: list[PlannedNode], publisher: ObservedEndpoint) -
             users,
             expected="declared publisher",
             observed=f"publisher of {who}",
-            message=f"cannot verify the time of {_named(users)}: {who} publishes {publisher.name},"
+            message=f"{who} gives {_named(users)} their time on {publisher.name},"
             " and the manifest does not declare it",
         )
     # A managed publisher sends once it is active.
@@ -97,8 +98,8 @@ def _of_one(view: View, users: list[PlannedNode], publisher: ObservedEndpoint) -
             users,
             expected="time",
             observed="no message",
-            message=f"cannot verify that {_named(users)} have time: {who} has not sent any on"
-            f" {publisher.name}",
+            message=f"there is no time yet for {_named(users)}:"
+            f" {who} has not sent any on {publisher.name}",
         )
 
 

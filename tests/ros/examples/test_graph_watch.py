@@ -66,4 +66,4 @@ def test_a_program_says_what_of_a_system_does_not_run(fresh_domain: int) -> None
     )
     said = asked.stdout.splitlines()
     assert (asked.returncode, without_fast_dds(asked.stderr)) == (1, [])
-    assert said[0] == f"cannot find node /talker in domain {fresh_domain}", said
+    assert said[0] == f"there is no node /talker in domain {fresh_domain}", said

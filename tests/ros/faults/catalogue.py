@@ -305,7 +305,7 @@ GRAPH = (
         rule="graph.missing-endpoint",
         options=("--timeout", "6"),
         subject="/dock",
-        message="cannot find the action server of /dock that /dock declares",
+        message="/dock has no action server of /dock, which is declared",
     ),
     Fault(
         name="a command ignores its remap and publishes elsewhere",
@@ -493,7 +493,7 @@ OUTSIDERS = (
         exit_code=ExitCode.VIOLATED,
         rule="graph.unmatched-link",
         subject="/chatter",
-        message="the publisher matched nobody",
+        message="the publisher matched none",
         options=("--strict", "--timeout", "6"),
     ),
     Fault(
@@ -514,7 +514,7 @@ OUTSIDERS = (
             exit_code=ExitCode.VIOLATED,
             rule="graph.undeclared-publisher",
             subject="/chatter",
-            message=f"cannot allow the publisher of /chatter in {full}",
+            message=f"the manifest does not declare the publisher of /chatter in {full}",
             options=("--strict",),
         )
         for tool, full, more in (

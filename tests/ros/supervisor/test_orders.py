@@ -640,7 +640,7 @@ def test_health_holds_who_waits_for_it_and_has_consequences_when_it_is_lost(
         mood.unlink()
         taken = run.until("consequence")
         assert (taken["rule"], taken["nodes"]) == ("node.unhealthy", ["/talker"])
-        assert taken["message"] == f"cannot accept node /talker: it is not healthy: {said}"
+        assert taken["message"] == f"node /talker is not healthy: {said}"
         mood.touch()
         assert verb("resume", "pair", runtime=tmp_path).returncode == ExitCode.OK
         run.until("system", reached="active")

@@ -129,7 +129,7 @@ def test_a_plain_node_does_nothing_while_the_gate_is_closed(
     with running.up(manifest, "--timeout", "2", runtime=tmp_path) as up:
         assert up.finish() == 4
         assert [each["message"] for each in up.verdict["findings"]] == [
-            "cannot find the publisher of /shouts that /talker declares"
+            "/talker has no publisher of /shouts, which is declared"
         ]
         assert "heard" not in log_of(up, "listener")
         assert "/words is dropped" in log_of(up, "talker").replace("'", "").replace(

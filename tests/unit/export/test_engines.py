@@ -99,9 +99,8 @@ def test_kubernetes_takes_its_objects(*, restarts: bool) -> None:
     plan = restarting(restarts=restarts)
     made = yaml.safe_load(written("kubernetes", plan=plan, words=("a:=$(b)",)))
     kubernetes_validate.validate(made, "1.30", strict=True)
-    assert made["kind"] == ("Pod" if restarts else "Deployment")
-    pod = made["spec"] if restarts else made["spec"]["template"]["spec"]
-    (container,) = pod["containers"]
+    assert made["kind"] == "Deployment"  # which starts a killed supervisor again, and no node
+    (container,) = made["spec"]["template"]["spec"]["containers"]
     assert container["args"][-1] == "a:=$$(b)"
     assert container["readinessProbe"]["exec"]["command"][-2:] == ["--probe", "ready"]
     assert container["livenessProbe"]["exec"]["command"][-2:] == ["--probe", "live"]
@@ -126,8 +125,6 @@ def test_machines_of_kubernetes_are_its_nodes(tmp_path: Path) -> None:
 def test_what_fails_is_restarted_by_one_of_both(restarts: bool, unit: str) -> None:
     plan = restarting(restarts=restarts)
     assert sections(written("systemd", plan=plan))["Service"]["Restart"] == unit
-    pod = yaml.safe_load(written("kubernetes", plan=plan))["spec"]
-    assert pod.get("restartPolicy") == ("Never" if restarts else None)
 
 
 LIMITED = """

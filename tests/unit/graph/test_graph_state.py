@@ -195,9 +195,9 @@ def judged(
     ("publisher", "subscription", "outcome", "reason"),
     [
         ({"matched": 1}, {}, Outcome.OK, ""),
-        ({"matched": 0}, {"matched": 1}, Outcome.VIOLATED, "the publisher matched nobody"),
+        ({"matched": 0}, {"matched": 1}, Outcome.VIOLATED, "the publisher matched none"),
         ({}, {}, Outcome.UNVERIFIABLE, "neither end reports whom it is matched with"),
-        ({"matched": 0}, {}, Outcome.VIOLATED, "the publisher matched nobody"),
+        ({"matched": 0}, {}, Outcome.VIOLATED, "the publisher matched none"),
         (
             {"matched": 2},
             {},

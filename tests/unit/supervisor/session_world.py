@@ -736,11 +736,11 @@ ATTACHED = plan_of(
 CHANGED = "the system changed before every node was activated"
 
 REFUSED = """cannot activate: the verdict is violated
-  graph.undeclared-node: cannot allow node /intruder: the manifest does not declare it"""
+  graph.undeclared-node: the manifest does not declare node /intruder"""
 
 REFUSED_AGAIN = """cannot activate: the system changed before every node was activated, and its \
 verdict now is violated
-  graph.undeclared-node: cannot allow node /intruder: the manifest does not declare it"""
+  graph.undeclared-node: the manifest does not declare node /intruder"""
 
 INTRUDED = "graph.undeclared-node /intruder"
 

@@ -308,4 +308,4 @@ async def test_a_node_waits_until_another_is_healthy_and_one_that_no_longer_is_h
         "[consequence] deactivate /camera for node.unhealthy",
         "/camera deactivate",
     ]
-    assert "cannot accept node /camera: it is not healthy: too hot" in world.messages
+    assert "node /camera is not healthy: too hot" in world.messages

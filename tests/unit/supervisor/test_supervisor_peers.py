@@ -395,7 +395,7 @@ async def test_who_was_shut_down_is_the_reason_of_its_missing_nodes(tmp_path: Pa
         subject="/viewer",
         expected="node in the graph",
         observed="no such node",
-        message="cannot find node /viewer in domain 7",
+        message="there is no node /viewer in domain 7",
         node="/viewer",
     )
     verdict = Verdict(verdict=Outcome.VIOLATED, blocking=True, findings=(missing,), flows=())
@@ -406,7 +406,7 @@ async def test_who_was_shut_down_is_the_reason_of_its_missing_nodes(tmp_path: Pa
     await robot.receives(two_machines(), left=True, reason="lifecycle down")
     (explained,) = robot.peers.explained(verdict).findings
     assert explained.message == (
-        "cannot find node /viewer in domain 7: machine 'desk' was shut down by its supervisor "
+        "there is no node /viewer in domain 7: machine 'desk' was shut down by its supervisor "
         "(lifecycle down)"
     )
     assert robot.peers.left() == {"/viewer", "/lamp"}

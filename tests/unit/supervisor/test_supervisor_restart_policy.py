@@ -391,7 +391,7 @@ async def test_a_restarted_node_waits_for_one_that_is_away_and_orders_do_not(
         world.graph.note()
         assert await world.order(ControlRequest.RESUME) == "0"
         assert await world.order(ControlRequest.DOWN) == "0"
-    away = "graph.missing-node: cannot find node /viewer in domain 30"
+    away = "graph.missing-node: there is no node /viewer in domain 30"
     assert world.since("networks programmed", 2)[1:8] == [
         "[verdict] connected violated graph.missing-node /viewer",
         f"[notice] cannot activate: {CHANGED}, and its verdict now is violated\n  {away}",

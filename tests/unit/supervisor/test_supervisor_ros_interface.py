@@ -66,7 +66,7 @@ async def test_a_bring_up_that_is_held_up_says_why_before_it_is_active(tmp_path:
             (
                 ERROR,
                 "robot: graph.missing-node",
-                "cannot find node /camera in domain 30",
+                "there is no node /camera in domain 30",
             ),
         ]
         world.graph.unseen.clear()

@@ -312,7 +312,7 @@ async def test_a_node_that_does_not_appear_is_waited_for_as_long_as_there_is_tim
         *BACK,
         *over(4),
     ]
-    assert world.messages == ["cannot find node /viewer in domain 30"]
+    assert world.messages == ["there is no node /viewer in domain 30"]
 
 
 @pytest.mark.parametrize("strict", [False, True])

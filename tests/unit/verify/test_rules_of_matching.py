@@ -124,7 +124,7 @@ def test_one_end_that_matched_nobody_is_enough(kind, word, other_says):
     edits = [change_report(kind, "/a", matched=0)]
     if other_says == "nothing":
         edits.append(silent(SUB if kind is PUB else PUB))
-    assert said(both(*edits), pair()) == [("violated", f"the {word} matched nobody")]
+    assert said(both(*edits), pair()) == [("violated", f"the {word} matched none")]
 
 
 @pytest.mark.parametrize("kind", [PUB, SUB])
@@ -169,8 +169,8 @@ def second(node_name: str, **fields: object) -> Edit:
 @pytest.mark.parametrize(
     ("counts", "name", "words"),
     [
-        ((2, 1), "/one", "the publisher matched nobody"),
-        ((1, 2), "/two", "the subscription matched nobody"),
+        ((2, 1), "/one", "the publisher matched none"),
+        ((1, 2), "/two", "the subscription matched none"),
     ],
 )
 @pytest.mark.parametrize("linked", [False, True])
@@ -226,8 +226,8 @@ BEST = QosProfile(reliability=Reliability.BEST_EFFORT)
     [
         (pair(), counts(PUB, 1), []),
         (pair(), counts(SUB, 1), []),
-        (pair(), counts(PUB, 0), [("violated", "the publisher matched nobody")]),
-        (pair(), counts(SUB, 0), [("violated", "the subscription matched nobody")]),
+        (pair(), counts(PUB, 0), [("violated", "the publisher matched none")]),
+        (pair(), counts(SUB, 0), [("violated", "the subscription matched none")]),
         (
             pair(),
             counts(PUB, 2),
@@ -241,7 +241,7 @@ BEST = QosProfile(reliability=Reliability.BEST_EFFORT)
         (
             pair(),
             both(counts(PUB, 0), stranger(SUB, qos=BEST)),
-            [("violated", "the publisher matched nobody")],
+            [("violated", "the publisher matched none")],
         ),
         (pair(), both(counts(PUB, 2), stranger(SUB, qos=None)), []),
         (pair(), both(counts(SUB, 2), stranger(PUB, qos=None)), []),
@@ -280,4 +280,4 @@ def test_a_pair_that_may_be_matched_is_unverifiable_and_told_whole():
     (found,) = matching(unsure, pair())
     reason = "the publisher matched 1 of 2, and does not tell which"
     assert (found.outcome, found.observed) == (Outcome.UNVERIFIABLE, reason)
-    assert found.message == f"cannot verify that /one → /two are matched on /a: {reason}"
+    assert found.message == f"nothing proves that /one → /two are matched on /a: {reason}"

@@ -101,11 +101,13 @@ def test_a_node_that_reports_to_use_simulated_time_needs_it(
 
 @pytest.mark.parametrize(("count", "named"), [(1, "/a"), (4, "/a, /b, /c, /d")])
 def test_few_nodes_without_a_clock_are_named(count: int, named: str) -> None:
-    assert without_clock(count) == f"cannot give {named} simulated time: nobody publishes /clock"
+    assert (
+        without_clock(count) == f"there is no simulated time for {named}: nothing publishes /clock"
+    )
 
 
 def test_of_many_nodes_without_a_clock_four_are_named() -> None:
-    assert "cannot give /a, /b, /c, /d and 2 more simulated time" in without_clock(6)
+    assert "there is no simulated time for /a, /b, /c, /d and 2 more" in without_clock(6)
 
 
 def without_clock(count: int) -> str:

@@ -172,12 +172,12 @@ def test_a_finding_names_both_values_and_where_the_demand_comes_from():
     )
     messages = "\n".join(each.message for each in judged(plan, seen))
     assert messages == (
-        "cannot accept parameter gain of node /arm: it is 99.0, and must be 1.5 as given under "
+        "parameter gain of node /arm is 99.0, and must be 1.5 as given under "
         "`parameters`\n"
-        "cannot accept parameter limits of node /arm: it is 2.0, and must be 1.5 as declared in "
+        "parameter limits of node /arm is 2.0, and must be 1.5 as declared in "
         "its interface, where nothing else is given\n"
-        "cannot find parameter bogus of node /arm, which is declared in its interface\n"
-        "cannot accept parameter unset of node /arm: it is .inf, and must be .nan as given in "
+        "there is no parameter bogus of node /arm, which is declared in its interface\n"
+        "parameter unset of node /arm is .inf, and must be .nan as given in "
         "cfg/arm.yaml"
     )
 
@@ -268,7 +268,7 @@ def test_what_a_node_does_not_tell_is_one_unverifiable_finding(error: str, why: 
     (finding,) = judged(plan, seen)
     assert (finding.rule, finding.outcome) == ("param.unverifiable", Outcome.UNVERIFIABLE)
     assert finding.message == (
-        "cannot verify parameters p0, p1, p2, p3, p4, p5, p6, p7 and 2 more of node /arm: " + why
+        "nothing shows parameters p0, p1, p2, p3, p4, p5, p6, p7 and 2 more of node /arm: " + why
     )
     assert finding.expected.split(", ") == [f"p{number}" for number in range(10)]
 
@@ -357,7 +357,7 @@ def test_at_most_eight_parameters_are_named(count: int, listed: str):
     plan = plan_of(*(expected(name=f"p{number}") for number in range(count)))
     (finding,) = judged(plan, perfect(plan, Stage.ACTIVE))
     assert finding.message == (
-        f"cannot verify parameters {listed} of node /arm: they were not read"
+        f"nothing shows parameters {listed} of node /arm: they were not read"
     )
 
 
@@ -385,6 +385,6 @@ def test_a_node_of_ours_that_neither_reports_nor_answers_says_why():
     ] == [
         (
             "param.unverifiable",
-            "cannot verify parameter gain of node /arm: it did not answer",
+            "nothing shows parameter gain of node /arm: it did not answer",
         )
     ]

@@ -201,8 +201,8 @@ BAD_TEXT = """\
 verdict: violated (1 violated, 1 unverifiable, 3 flows)
 
 violated graph.qos-differs: /robot/status
-  cannot accept the subscription of /robot/status in /viewer: depth is declared
-  10 and is 1
+  the subscription of /robot/status in /viewer has depth 1, and is declared with
+  10
   expected  depth 10
   observed  depth 1
   at        robot.lifecycle.yaml:18:9
@@ -210,8 +210,8 @@ violated graph.qos-differs: /robot/status
             profile or a qos_overrides parameter
 
 unverifiable flow.dscp-unverifiable: /robot/battery
-  cannot verify the DSCP of the publisher of /robot/battery in /robot/camera:
-  nobody read it back
+  nothing shows the DSCP of the publisher of /robot/battery in /robot/camera: it
+  was not read back
   expected  CS1 = DSCP 8 = TOS 32 (0x20)
   observed  not read back
   at        robot.lifecycle.yaml:12:9
@@ -440,7 +440,7 @@ def test_what_may_be_unverifiable_neither_fails_nor_skips_a_test():
     unverifiable = after(change_report(PUB, "/robot/battery", dscp=None))
     assert unverifiable.verdict is Outcome.UNVERIFIABLE
     assert set(cases(unverifiable).values()) == {"passed"}
-    assert "cannot verify the DSCP" in to_junit(unverifiable, PLAN)
+    assert "nothing shows the DSCP" in to_junit(unverifiable, PLAN)
     failed = [name for name, came in cases(unverifiable, strict=True).items() if came == "failure"]
     assert [each.partition("/")[0] for each in failed] == ["flow.dscp-unverifiable"]
     policy = replace(PLAN.policy, unverifiable="block")

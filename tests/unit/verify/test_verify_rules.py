@@ -353,17 +353,17 @@ def asking(health: Health) -> Plan:
         (HealthReport(ok=True), ""),
         (
             HealthReport(ok=False, message="no scan"),
-            "violated cannot accept node /viewer: it is not healthy: no scan",
+            "violated node /viewer is not healthy: no scan",
         ),
         (
             HealthReport(ok=None, message="it is late"),
-            "unverifiable cannot verify that node /viewer is healthy: it is late",
+            "unverifiable nothing shows that node /viewer is healthy: it is late",
         ),
         (
             None,
             (
-                "violated cannot ask node /viewer whether it is healthy: its class has no method"
-                " 'health'"
+                "violated node /viewer is to be asked whether it is healthy, and its class has no"
+                " method 'health'"
             ),
         ),
     ],
@@ -405,7 +405,7 @@ def test_a_handler_that_raised_at_its_last_goal_is_unhealthy_though_nobody_asks(
     findings = verify(PLAN, edit(seen), stage=Stage.ACTIVE).findings
     (unhealthy,) = (each.message for each in findings if each.rule == "node.unhealthy")
     assert unhealthy == (
-        "cannot accept node /viewer: it is not healthy: action server 'dock': its handler raised "
+        "node /viewer is not healthy: action server 'dock': its handler raised "
         "OSError: no such dock"
     )
 
@@ -415,10 +415,10 @@ def test_a_node_that_has_ended_as_it_may_is_unverifiable_and_not_missing():
     verdict = verify(PLAN, seen, stage=Stage.CONNECTED, over={"/viewer": "exit status 0"})
     (finding,) = (each for each in verdict.findings if each.node == "/viewer")
     assert (finding.rule, finding.outcome) == ("graph.ended-node", Outcome.UNVERIFIABLE)
-    assert finding.message == "cannot verify node /viewer: it has ended by itself, as it may"
+    assert finding.message == "node /viewer has ended by itself, as it may"
     from_outside = verify(PLAN, seen, stage=Stage.CONNECTED, over={"/viewer": ""})
     assert [each.message for each in from_outside.findings if each.node == "/viewer"] == [
-        "cannot verify node /viewer: it may have ended by itself, or not have started"
+        "node /viewer may have ended by itself, or not have started"
     ]
     both_gone = both(drop_node("/robot/camera"), drop_node("/viewer"))(perfect(PLAN))
     verdict = verify(PLAN, both_gone, stage=Stage.CONNECTED, over={"/robot/camera": ""})
@@ -630,7 +630,7 @@ def test_a_written_depth_needs_keep_last_and_is_one_finding_for_all_endpoints_of
     )
     finding = the_finding(edit, plan=plan)
     assert finding.message == (
-        "cannot verify history, depth of /talker on 2 endpoints: /a (publisher), /b (publisher):"
+        "nothing shows history, depth of /talker on 2 endpoints: /a (publisher), /b (publisher):"
         " neither discovery nor the node reports the actual value"
     )
     assert finding.expected == (
@@ -747,7 +747,7 @@ def test_a_writer_of_no_node_on_a_declared_topic_is_violated_at_every_stage(stag
     finding = the_finding(edit, stage=stage)
     assert (finding.rule, finding.outcome) == ("graph.unattributed-endpoint", Outcome.VIOLATED)
     assert finding.message == (
-        f"cannot tell whose publisher of {STATUS} this is (a participant of Cyclone DDS, at "
+        f"no known node has this publisher of {STATUS} (a participant of Cyclone DDS, at "
         f"10.0.0.7, GID {CYCLONE})"
     )
 

@@ -146,7 +146,7 @@ def test_a_flow_that_needs_the_network_is_violated_by_shared_memory_although_udp
             ends=("/one", "/two"),
             expected="an IP transport",
             observed="shared memory",
-            message="cannot accept the flow /one → /two on /a: it needs the network, and what"
+            message="the flow /one → /two on /a needs the network, and what"
             " carries it is shared memory",
             at="robot.lifecycle.yaml:10:9",
             hint="run both ends in our host and in processes of their own, or drop"
