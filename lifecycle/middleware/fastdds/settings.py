@@ -20,7 +20,7 @@ from collections.abc import Iterator
 from msgspec.structs import replace
 from rclpy.context import Context
 from rclpy.node import Node
-from rclpy.utilities import get_rmw_implementation_identifier
+from rclpy.utilities import get_default_context, get_rmw_implementation_identifier
 
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds.factory import (
@@ -116,9 +116,7 @@ def has_shared_memory(node: Node) -> bool:
 
 
 @contextlib.contextmanager
-def participant_settings(
-    context: Context, settings: ParticipantSettings, *, is_new: bool = False
-) -> Iterator[None]:
+def participant_settings(context: Context, settings: ParticipantSettings) -> Iterator[None]:
     """Give the participant of `context` these settings: construct its first node in the block.
 
     Everything is as before after the block, and later participants get what they always got.
@@ -128,7 +126,6 @@ def participant_settings(
         context: initialised in `discovery_by_profile`, without a node yet; otherwise it has no
             effect.
         settings: empty ones change nothing, and need no Fast DDS.
-        is_new: it has no participant yet.
 
     Raises:
         MiddlewareError: another RMW than rmw_fastrtps_cpp, an unknown version of it, a default
@@ -141,8 +138,10 @@ def participant_settings(
     # Not by a subscription, whose list has it: one that is announced and taken back while others
     # discover the participant may cost another participant of the process its subscriptions.
     opened = not own_segments() <= before
-    if get_rmw_implementation_identifier() == RMW and (opened or is_new or not before):
-        _SHARED_MEMORY_OF[context] = opened
+    # Of the default context others may have made the participant, with what was there before.
+    is_ours = context is not get_default_context() or not before
+    if get_rmw_implementation_identifier() == RMW and (opened or is_ours):
+        _SHARED_MEMORY_OF.setdefault(context, opened)
 
 
 @contextlib.contextmanager

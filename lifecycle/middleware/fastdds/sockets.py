@@ -45,8 +45,9 @@ _DSCP_OPTION = {
 }
 _DISCOVERY_BYTES = 1 << 22
 
-_RELEASED_S = 0.2
-"""An executor that waits for endpoints of a participant lets go of it within a millisecond."""
+_RELEASED_S = 0.5
+"""An executor that waits for endpoints of a participant lets go of it within a millisecond; on a
+busy machine later."""
 
 
 class OpenSocket(msgspec.Struct, frozen=True, kw_only=True):

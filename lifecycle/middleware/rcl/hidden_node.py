@@ -59,7 +59,7 @@ def quiet_node(
     try:
         with discovery_by_profile(settings):
             context.init(args=[*enclave], domain_id=domain_id, initialize_logging=False)
-        with participant_settings(context, settings, is_new=True):
+        with participant_settings(context, settings):
             node = Node(name, namespace=namespace, context=context, **_QUIET)
     except Exception as error:
         if node is not None:
@@ -107,21 +107,18 @@ def republish_names(nodes: Iterable[Node]) -> None:
 
 
 @contextlib.contextmanager
-def made_participant(
-    context: rclpy.Context, settings: ParticipantSettings, *, is_new: bool = False
-) -> Iterator[None]:
+def made_participant(context: rclpy.Context, settings: ParticipantSettings) -> Iterator[None]:
     """Make the participant of a context with these settings; construct its first node in the block.
 
     Args:
         context: initialised in `discovery_by_profile`; settings have no effect where it has a
             participant already.
         settings: of the participant.
-        is_new: it has none yet.
 
     Raises:
         MiddlewareError: as `participant_settings`.
     """
-    with participant_settings(context, settings, is_new=is_new):
+    with participant_settings(context, settings):
         first = bare_node(context)
     try:
         widen_discovery_buffers(context.get_domain_id())

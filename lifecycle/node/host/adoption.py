@@ -66,12 +66,11 @@ class Participants:
             yield context
             return
         context = self._default
-        is_new = bool(self._made)  # a user's module may have made the default context's
-        if is_new:
+        if self._made:
             context = Context()
             with discovery_by_profile(settings):
                 context.init(args=[], domain_id=self._default.get_domain_id())
-        with made_participant(context, settings, is_new=is_new):
+        with made_participant(context, settings):
             yield context
         self._made[settings] = context
 
