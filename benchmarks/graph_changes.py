@@ -157,6 +157,7 @@ class Shown:
         self._nodes = seen.nodes
         self._endpoints = seen.endpoints, seen.endpoints[:-1]
         self.turn = 0
+        self.settling = self
 
     def snapshot(
         self, *, declared: Collection[str] = (), names: DeclaredNames = NO_NAMES
@@ -169,7 +170,7 @@ class Shown:
         """Return that all are in hosts."""
         return dict.fromkeys(nodes, True)
 
-    def settling_s(self) -> float:
+    def left_s(self) -> float:
         """Return that nobody is on the way."""
         return 0.0
 
@@ -191,6 +192,8 @@ class Supervised:
         system: Any = World(plan, folder).system
         peers: Any = Peers(system, None)  # type: ignore[arg-type]
         self.state: Any = self
+        self.discovery: Any = self
+        self.settling: Any = self
         self.judge = Judge(system, self, looker=None, peers=peers)  # type: ignore[arg-type]
 
     async def observe(self, plan: Plan) -> Observation:

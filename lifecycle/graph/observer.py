@@ -146,7 +146,7 @@ class Observer:
         while True:
             self._changed.clear()
             nodes, endpoints = self.discovery.snapshot(declared=planned, names=names)
-            settling_s = self.discovery.settling_s()
+            settling_s = self.discovery.settling.left_s()
             if settling_s <= 0:
                 break
             # To look costs more than the moment in which the rest of a burst comes.
@@ -183,14 +183,6 @@ class Observer:
         """Forget what a node said of itself whose process ended."""
         self.state.drop_configuration(node)
         self._diagnostics.forget(node)
-
-    def expect_newcomers(self, *, everybody: bool = False) -> bool:
-        """Have the next `observe` wait for who came lately; return whether there may be anybody.
-
-        Args:
-            everybody: this process did not run for a while, and anybody may have come.
-        """
-        return self.discovery.expect_newcomers(everybody=everybody)
 
     def reread_parameters(self) -> bool:
         """Have the next `observe` read all parameters again; return whether it reads any."""

@@ -2,8 +2,8 @@
 
 Owns: their grammar, `TRANSPORT://[ADDRESS][:PORT][?OPTION=VALUE&…]`, both ways; which transport has
 which option, how a value is read and spelled, and the option names. The idea is that of
-*Topological Discovery and Communication Negotiation* ("Statically Configured Nodes"); what a URL
-becomes is decided in middleware/. Pure.
+*Topological Discovery and Communication Negotiation* ("Statically Configured Nodes"); which URLs
+one participant cannot have together. What a URL becomes is decided in middleware/. Pure.
 
     udpv4://10.77.0.1:7911?metatraffic_port=7910&output_port=7999&peer=10.77.0.2:7910&multicast=off
     udpv6://[fd77::1]:7911?metatraffic_port=7910&peer=[fd77::2]:7910&multicast=off
@@ -19,14 +19,15 @@ import contextlib
 import functools
 import ipaddress
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 from urllib.parse import parse_qsl, urlencode, urlsplit
 
 import msgspec
 
 from lifecycle.errors import LifecycleError, did_you_mean
-from lifecycle.network.medium import SCHEMES, Medium
+from lifecycle.network.medium import SCHEMES, Medium, udp_to
+from lifecycle.network.nfe import is_wildcard
 
 _PORTS = range(1, 65536)
 _TTLS = range(256)
@@ -206,6 +207,63 @@ class ConnectionUrl(msgspec.Struct, frozen=True, kw_only=True):
     def __str__(self) -> str:
         """Return the URL; `parse` of it is equal to this."""
         return _spell(self)
+
+    @property
+    def family(self) -> Medium:
+        """The transport that carries it; that of a group is UDP, over the address's protocol."""
+        return udp_to(self.address) if self.transport.is_group else self.transport
+
+    @property
+    def bound(self) -> tuple[str, ...]:
+        """Addresses or names of interfaces that its transport is bound to; empty for all."""
+        is_any = not self.address or is_wildcard(self.address) or self.transport.is_group
+        return self.interfaces or (() if is_any else (self.address,))
+
+
+def check_together(urls: Sequence[ConnectionUrl]) -> None:
+    """Refuse URLs that one participant of Fast DDS 2.14 cannot have together.
+
+    It has one transport for all URLs of a family: with two of a kind it would send all twice.
+
+    Raises:
+        ConnectionUrlError: names two of them.
+    """
+    for family in dict.fromkeys(url.family for url in urls):
+        same = [url for url in urls if url.family is family]
+        some = [url for url in same if url.bound]
+        free = [url for url in same if not (url.bound or url.transport.is_group)]
+        if some and free:
+            raise ConnectionUrlError(
+                f"cannot use {str(free[0])!r} on all interfaces and {str(some[0])!r} on some: one "
+                "participant has one transport for both",
+                hint="give both an address or interface=",
+            )
+        one_port = ("port",) if family.is_tcp else ()
+        for option in ("ttl", "output_port", "metatraffic_port", *one_port):
+            values = {getattr(url, option): url for url in same}
+            values.pop(None, None)
+            if len(values) > 1:
+                spelt = " and ".join(repr(str(url)) for url in values.values())
+                what = "TCP port" if option == "port" else option
+                raise ConnectionUrlError(
+                    f"cannot use {spelt} together: one participant has one {what}",
+                    hint="give them to different connections",
+                )
+    fixed = [url for url in urls if url.transport.is_udp and url.port]
+    if fixed and not all(url.transport.is_network for url in urls):
+        raise ConnectionUrlError(
+            f"cannot use 'shm://' beside {str(fixed[0])!r}: a profile with fixed ports cannot say "
+            "where shared memory listens, so it would not",
+            hint="leave shm:// or the port out",
+        )
+    servers = [url for url in urls if url.server]
+    peers = [url for url in urls if url.peers]
+    if servers and peers:
+        raise ConnectionUrlError(
+            f"cannot look for peers {str(peers[0])!r} as a client of {str(servers[0])!r}: a client "
+            "of a discovery server finds nobody else",
+            hint="leave peer= or server= out",
+        )
 
 
 def parse(text: str) -> ConnectionUrl:

@@ -8,7 +8,7 @@ its arguments. Pure.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 
 from msgspec.structs import replace
 
@@ -32,7 +32,7 @@ from lifecycle.verify.verdict import (
     ToleratedNode,
     Verdict,
 )
-from lifecycle.verify.view import Actual, FlowView, View
+from lifecycle.verify.view import Actual, FlowView, View, flow_subject
 
 _HOW = (UniqueHow.NOT, UniqueHow.WEAKLY, UniqueHow.STRONGLY)
 
@@ -65,15 +65,19 @@ def _spoiled(findings: Iterable[Finding]) -> dict[_Place, Outcome]:
     return worst
 
 
-def _outcome(flow: FlowView, spoiled: dict[_Place, Outcome]) -> Outcome:
-    publisher, subscription = flow.ends
-    places: tuple[_Place, ...] = (
-        (flow.subject, "", None),
+def _places(topic: str, publisher: str, subscription: str) -> tuple[_Place, ...]:
+    """Return where findings are that concern the flow between two nodes."""
+    return (
+        (flow_subject(topic, publisher, subscription), "", None),
         (publisher, publisher, None),
         (subscription, subscription, None),
-        (flow.planned.topic, publisher, EndpointKind.PUBLISHER),
-        (flow.planned.topic, subscription, EndpointKind.SUBSCRIPTION),
+        (topic, publisher, EndpointKind.PUBLISHER),
+        (topic, subscription, EndpointKind.SUBSCRIPTION),
     )
+
+
+def _outcome(flow: FlowView, spoiled: dict[_Place, Outcome]) -> Outcome:
+    places = _places(flow.planned.topic, *flow.ends)
     unreported = (Outcome.UNVERIFIABLE,) if is_unreported(flow) else ()
     return Outcome.worst((*unreported, *(spoiled[each] for each in places if each in spoiled)))
 
@@ -200,6 +204,21 @@ def with_only(verdict: Verdict, findings: tuple[Finding, ...], policy: Policy) -
         blocking=_blocks(findings, policy),
         findings=findings,
     )
+
+
+def without_findings(verdict: Verdict, dropped: Collection[Finding], policy: Policy) -> Verdict:
+    """Return `verdict` as if these findings had not been made; its flows follow, too."""
+    kept = tuple(each for each in verdict.findings if each not in dropped)
+    spoiled, freed = _spoiled(kept), _spoiled(dropped)
+
+    def judged(flow: FlowReport) -> FlowReport:
+        places = _places(flow.topic, flow.publisher, flow.subscription)
+        if freed.keys().isdisjoint(places):
+            return flow
+        left = (spoiled[each] for each in places if each in spoiled)
+        return replace(flow, outcome=Outcome.worst(left))
+
+    return replace(with_only(verdict, kept, policy), flows=tuple(map(judged, verdict.flows)))
 
 
 def with_findings(verdict: Verdict, findings: tuple[Finding, ...], policy: Policy) -> Verdict:

@@ -119,6 +119,11 @@ class NodeFacts(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         return self.node.run.kind is RunKind.PYTHON
 
 
+def flow_subject(topic: str, publisher: str, subscription: str) -> str:
+    """Return what findings call the flow on `topic` from one node to another."""
+    return f"{topic}: {publisher} → {subscription}"
+
+
 class FlowView(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     """A planned flow and what was seen of its two ends.
 
@@ -142,7 +147,7 @@ class FlowView(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     @property
     def subject(self) -> str:
         """What findings call this flow."""
-        return f"{self.planned.topic}: {self.publisher} → {self.subscription}"
+        return flow_subject(self.planned.topic, self.publisher, self.subscription)
 
     @property
     def ends(self) -> tuple[str, str]:

@@ -27,7 +27,7 @@ async def _settled(observer: GraphObserver) -> None:
         while True:
             changed.clear()
             observer.snapshot()
-            left_s = observer.settling_s()
+            left_s = observer.settling.left_s()
             if left_s <= 0:
                 return
             await set_within(changed, left_s)

@@ -20,8 +20,7 @@ from lifecycle.manifest.model import (
     Node,
 )
 from lifecycle.manifest.yaml.document import error, warning
-from lifecycle.network.connection_url import ConnectionUrl, Peer
-from lifecycle.network.medium import UDP_UNICAST
+from lifecycle.network.connection_url import ConnectionUrl, ConnectionUrlError, Peer, check_together
 from lifecycle.network.nfe import is_loopback, may_be_same
 from lifecycle.network.ports import DG, MAX_DOMAIN_ID, domain_base, owner_of
 
@@ -250,33 +249,12 @@ def _remote_nodes(
 
 
 def _together(node: Node, connection: ConnectionDeclaration) -> Iterator[Diagnostic]:
-    """Judge URLs that one participant cannot have together (Fast DDS 2.14)."""
-    at = node.where(f"connections.{connection.name}")
-    udp = [url for url in connection.urls if url.transport in UDP_UNICAST]
-    fixed = [url for url in udp if url.port]
-    shm = [url for url in connection.urls if not url.transport.is_network]
-    rule, name = "check.connection-urls", connection.name
-    if shm and fixed:
-        message = (
-            f"cannot use 'shm://' beside {str(fixed[0])!r} in {name!r}: beside fixed ports Fast "
-            "DDS does not listen to shared memory"
-        )
-        yield error(rule, at, message, "leave shm:// or the port out")
-    served = [url for url in connection.urls if url.server]
-    looking = [url for url in connection.urls if url.peers]
-    if served and looking:
-        message = (
-            f"cannot look for peers by {str(looking[0])!r} in {name!r} as a client of a discovery "
-            "server: a client finds nobody else"
-        )
-        yield error(rule, at, message, "leave peer= or server= out")
-    tcp = [url for url in connection.urls if url.transport.is_tcp and url.port]
-    if len(tcp) > 1:
-        message = (
-            f"cannot listen on {str(tcp[0])!r} and {str(tcp[1])!r} in {name!r}: one participant "
-            "has one TCP port"
-        )
-        yield error(rule, at, message, "make two connections of it")
+    """Judge URLs that one participant cannot have together."""
+    try:
+        check_together(connection.urls)
+    except ConnectionUrlError as refusal:
+        at = node.where(f"connections.{connection.name}")
+        yield error("check.connection-urls", at, refusal.message, refusal.hint)
 
 
 CHECKS = (check_urls,)

@@ -264,6 +264,8 @@ class Settling:
         self._asks = bool(reached)
         self.prober = Prober(reached)
         self._familiar: frozenset[OpenSocket] = frozenset()
+        self._named: frozenset[str] = frozenset()
+        self._own = ""
         self._known: frozenset[str] = frozenset()
         self._known_before: frozenset[str] = frozenset()
         self._silent = self.prober.listeners()
@@ -279,13 +281,18 @@ class Settling:
         """Seconds that are waited for because nobody can be asked; 0 where all can be."""
         return 0.0 if self._asks else self._settle_s
 
-    def left_s(self, named: frozenset[str]) -> float:
-        """Return for how many seconds a look may still miss a participant; 0 once it cannot.
+    def saw(self, named: frozenset[str], own: str) -> None:
+        """Take what a look has shown; what follows is about that look.
 
         Args:
             named: GUID prefixes (24 hex digits) of participants of which some node is known now.
+            own: that of our participant; empty while it is not known.
         """
+        self._named, self._own = named, own
         self._known |= named  # who was known and left is not on the way into the graph
+
+    def left_s(self) -> float:
+        """Return for how many seconds a look may still miss a participant; 0 once it cannot."""
         age_s = time.monotonic() - self._began_s
         left_s = max(0.0, self._settle_s - age_s)
         if not (self._asks and left_s):
@@ -305,15 +312,13 @@ class Settling:
             self.prober.ask(counted=bool(self._silent))
         return min(left_s, ANSWER_S)
 
-    def expect_newcomers(self, named: frozenset[str], own: str, *, everybody: bool = False) -> bool:
+    def expect_newcomers(self, *, everybody: bool = False) -> bool:
         """Have `left_s` wait for who came since; return whether there may be anybody.
 
         On this host participants have sockets, and who has more of them than the graph shows
         participants is not seen yet. On others they have to be asked.
 
         Args:
-            named: as for `left_s`.
-            own: GUID prefix of our participant.
             everybody: wait also for what those have to say that are known: this process did not
                 run for a while.
         """
@@ -321,15 +326,15 @@ class Settling:
             if everybody:
                 self._began_s = time.monotonic()
             return everybody
-        if self.left_s(named) > 0 and not everybody:
+        if self.left_s() > 0 and not everybody:
             return True
         everybody |= self.prober.leaves_host and time.monotonic() - self._began_s > _OFTEN_S
         listeners = self.prober.listeners()
         came = listeners - self._familiar
         new = {
             each
-            for each in named - self._known_before
-            if is_of_host(each, own) and each[:PROCESS_DIGITS] != own[:PROCESS_DIGITS]
+            for each in self._named - self._known_before
+            if is_of_host(each, self._own) and each[:PROCESS_DIGITS] != self._own[:PROCESS_DIGITS]
         }
         self._familiar, self._known_before = listeners, self._known
         if not everybody and len({each.port for each in came}) <= len(new):

@@ -31,7 +31,7 @@ from lifecycle.middleware.fastdds.settings import has_shared_memory
 from lifecycle.middleware.fastdds.static_edp import check_endpoint
 from lifecycle.middleware.rcl import hidden_node
 from lifecycle.middleware.rcl.abi import is_known
-from lifecycle.middleware.rcl.hidden_node import forget_hidden, quiet_node
+from lifecycle.middleware.rcl.hidden_node import quiet_node
 from lifecycle.middleware.rcl.qos import to_rclpy
 from lifecycle.network.nfe import NetworkFlowEndpoint
 
@@ -205,7 +205,6 @@ class FlowParticipant:
         self._nfes = ()  # its ports may belong to another process from now on
         for entity in tuple(self._moved):
             self.destroy_endpoint(entity)
-        forget_hidden(self.node)
         self.node.destroy_node()
         if self._context is not None:
             self._context.try_shutdown()

@@ -1,8 +1,8 @@
 """Transports of a participant in its Fast DDS profile, with their locators and discovery.
 
-Owns: the grouping of connection URLs into Fast DDS transports, and which URLs one participant
-cannot have together; the XML of transports, of where data and discovery arrive and discovery is
-sent to, and of discovery servers. Must not import rclpy; reads no environment.
+Owns: the grouping of connection URLs into Fast DDS transports; the XML of transports, of where data
+and discovery arrive and discovery is sent to, and of discovery servers. Must not import rclpy;
+reads no environment.
 
 Two URLs of one family (IPv4 UDP and a group over IPv4) share one transport: with two of a kind Fast
 DDS would send everything twice.
@@ -20,9 +20,9 @@ import msgspec
 from lifecycle.errors import MiddlewareError
 from lifecycle.middleware.fastdds.profiles import child, drop, put
 from lifecycle.middleware.versions import installed
-from lifecycle.network.connection_url import ConnectionUrl, Peer
-from lifecycle.network.medium import Medium, udp_to
-from lifecycle.network.nfe import is_wildcard, parse_address
+from lifecycle.network.connection_url import ConnectionUrl, ConnectionUrlError, Peer, check_together
+from lifecycle.network.medium import Medium
+from lifecycle.network.nfe import parse_address
 from lifecycle.network.ports import LOCALHOST_PEERS_RANGE, participant_ports
 
 DISCOVERY_GROUP = {Medium.UDPV4: "239.255.0.1", Medium.UDPV6: "ff1e::ffff:efff:1"}
@@ -61,7 +61,7 @@ class UrlTransport(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def interfaces(self) -> tuple[str, ...]:
         """Addresses or names that it is bound to; empty for all."""
-        return tuple(dict.fromkeys(each for url in self.urls for each in _bound(url)))
+        return tuple(dict.fromkeys(each for url in self.urls for each in url.bound))
 
     def option(self, name: str) -> Any:
         """Return the value of an option that it can have only once; None if no URL has it."""
@@ -75,22 +75,14 @@ def families(urls: Sequence[ConnectionUrl]) -> tuple[UrlTransport, ...]:
     Raises:
         MiddlewareError: URLs that one participant cannot have together.
     """
+    try:
+        check_together(urls)
+    except ConnectionUrlError as error:
+        raise MiddlewareError(error.message, hint=error.hint) from error
     by_kind: dict[Medium, list[ConnectionUrl]] = {}
     for url in urls:
-        by_kind.setdefault(_kind(url), []).append(url)
-    found = tuple(UrlTransport(kind=kind, urls=tuple(each)) for kind, each in by_kind.items())
-    _check(found, urls)
-    return found
-
-
-def _kind(url: ConnectionUrl) -> Medium:
-    return udp_to(url.address) if url.transport.is_group else url.transport
-
-
-def _bound(url: ConnectionUrl) -> tuple[str, ...]:
-    """Return what a URL binds its transport to; empty for everything."""
-    is_any = not url.address or is_wildcard(url.address) or url.transport.is_group
-    return url.interfaces or (() if is_any else (url.address,))
+        by_kind.setdefault(url.family, []).append(url)
+    return tuple(UrlTransport(kind=kind, urls=tuple(each)) for kind, each in by_kind.items())
 
 
 def leaves_discovery_open(urls: Iterable[ConnectionUrl]) -> bool:
@@ -283,44 +275,6 @@ def _add_discovery(
     put(builtin, "mutation_tries", 0)
 
 
-def _check(found: Sequence[UrlTransport], urls: Sequence[ConnectionUrl]) -> None:
-    for family in found:
-        some = [url for url in family.urls if _bound(url)]
-        free = [url for url in family.urls if not (_bound(url) or url.transport.is_group)]
-        if some and free:
-            raise MiddlewareError(
-                f"cannot use {str(free[0])!r} on all interfaces and {str(some[0])!r} on some: one "
-                "participant has one transport for both",
-                hint="give both an address or interface=",
-            )
-        one_port = ("port",) if family.kind.is_tcp else ()
-        for option in ("ttl", "output_port", "metatraffic_port", *one_port):
-            values = {getattr(url, option): url for url in family.urls}
-            values.pop(None, None)
-            if len(values) > 1:
-                spelt = " and ".join(repr(str(url)) for url in values.values())
-                what = "TCP port" if option == "port" else option
-                raise MiddlewareError(
-                    f"cannot use {spelt} together: one participant has one {what}",
-                    hint="give them to different connections",
-                )
-    fixed = [url for url in urls if url.transport.is_udp and url.port]
-    if fixed and not all(family.kind.is_network for family in found):
-        raise MiddlewareError(
-            f"cannot use 'shm://' beside {str(fixed[0])!r}: a profile with fixed ports cannot say "
-            "where shared memory listens, so it would not",
-            hint="leave shm:// or the port out",
-        )
-    servers = [url for url in urls if url.server]
-    peers = [url for url in urls if url.peers]
-    if servers and peers:
-        raise MiddlewareError(
-            f"cannot look for peers {str(peers[0])!r} as a client of {str(servers[0])!r}: a client "
-            "of a discovery server finds nobody else",
-            hint="leave peer= or server= out",
-        )
-
-
 def _add_servers(config: ET.Element, urls: Sequence[ConnectionUrl]) -> None:
     drop(config, "discoveryProtocol", "discoveryServersList")
     put(config, "discoveryProtocol", "CLIENT")
@@ -336,4 +290,4 @@ def _add_servers(config: ET.Element, urls: Sequence[ConnectionUrl]) -> None:
                 listened = child(remote, "metatrafficUnicastLocatorList")
             # A server's logical port is its physical one.
             physical = server.port if url.transport.is_tcp else None
-            _locate(listened, _kind(url), server.address, port=server.port, physical=physical)
+            _locate(listened, url.family, server.address, port=server.port, physical=physical)

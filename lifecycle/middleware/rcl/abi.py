@@ -12,7 +12,7 @@ from __future__ import annotations
 import ctypes
 import functools
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from lifecycle.errors import MiddlewareError
@@ -111,57 +111,51 @@ class _PaddedOptions(ctypes.Structure):
     _fields_ = (("options", SubscriptionOptions), ("room", ctypes.c_ubyte * 1024))
 
 
-class Rcl:
-    """The loaded libraries with every signature declared; get it from `load`.
+_POINTER, _SIZE, _CODE = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int
+_GET_NFES = (_CODE, (_POINTER,) * 3)
+_FUNCTIONS: dict[str, tuple[Any, tuple[Any, ...]]] = {
+    "rcutils_get_default_allocator": (Allocator, ()),
+    "rcutils_get_error_string": (_ErrorString, ()),
+    "rcutils_reset_error": (None, ()),
+    "rmw_network_flow_endpoint_set_internet_address": (_CODE, (_POINTER, ctypes.c_char_p, _SIZE)),
+    "rmw_network_flow_endpoint_array_fini": (_CODE, (_POINTER,)),
+    "rcl_publisher_get_network_flow_endpoints": _GET_NFES,
+    "rcl_subscription_get_network_flow_endpoints": _GET_NFES,
+    "rcl_subscription_get_default_options": (_PaddedOptions, ()),
+    "rcl_subscription_get_options": (ctypes.POINTER(SubscriptionOptions), (_POINTER,)),
+    "rcl_subscription_init": (_CODE, (_POINTER, _POINTER, _POINTER, ctypes.c_char_p, _POINTER)),
+    "rcl_subscription_fini": (_CODE, (_POINTER, _POINTER)),
+    "rcl_node_get_graph_guard_condition": (_POINTER, (_POINTER,)),
+    "rcl_get_zero_initialized_wait_set": (WaitSet, ()),
+    "rcl_wait_set_init": (_CODE, (_POINTER, *[_SIZE] * 6, _POINTER, Allocator)),
+    "rcl_wait_set_fini": (_CODE, (_POINTER,)),
+    "rcl_wait_set_clear": (_CODE, (_POINTER,)),
+    "rcl_wait_set_add_guard_condition": (_CODE, (_POINTER,) * 3),
+    "rcl_wait": (_CODE, (_POINTER, ctypes.c_int64)),
+}
+"""The result and the arguments of each function that is called of a library that is known."""
 
-    Functions keep their C names. They release the GIL while they run, as ctypes.CDLL does.
+
+class Rcl:
+    """The loaded libraries; get it from `load`.
+
+    Attributes:
+        call: their functions, by name. They release the GIL while they run, as ctypes.CDLL does.
+        default_allocator: rcutils_get_default_allocator's.
     """
 
     def __init__(self) -> None:
         version = rcl_version()
         if of_rcl(version) is None:
             raise MiddlewareError(f"rcl {version} is not known (known: {KNOWN_RCL})", hint=INSTALL)
-        pointer, size, integer = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int
-        self._get_error_string = bind("rcutils", "rcutils_get_error_string", _ErrorString)
-        self._reset_error = bind("rcutils", "rcutils_reset_error", None)
-        self.default_allocator: Allocator = bind(
-            "rcutils", "rcutils_get_default_allocator", Allocator
-        )()
-        nfe = "rmw_network_flow_endpoint"
-        self.nfe_set_address = bind(
-            "rmw", f"{nfe}_set_internet_address", integer, (pointer, ctypes.c_char_p, size)
-        )
-        self.nfe_array_fini = bind("rmw", f"{nfe}_array_fini", integer, (pointer,))
-        rcl = functools.partial(bind, "rcl")
-        self.default_options = rcl("rcl_subscription_get_default_options", _PaddedOptions)
-        self.options = rcl(
-            "rcl_subscription_get_options", ctypes.POINTER(SubscriptionOptions), (pointer,)
-        )
-        self.subscription_init = rcl(
-            "rcl_subscription_init", integer, (*[pointer] * 3, ctypes.c_char_p, pointer)
-        )
-        self.subscription_fini = rcl("rcl_subscription_fini", integer, (pointer, pointer))
-        self.nfes = {
-            kind: rcl(f"rcl_{kind}_get_network_flow_endpoints", integer, (pointer,) * 3)
-            for kind in ("publisher", "subscription")
-        }
-        self.graph_guard: Callable[[int], int] = rcl(
-            "rcl_node_get_graph_guard_condition", pointer, (pointer,)
-        )
-        self.zero_wait_set = rcl("rcl_get_zero_initialized_wait_set", WaitSet)
-        self.wait_set_init = rcl(
-            "rcl_wait_set_init", integer, (pointer, *[size] * 6, pointer, Allocator)
-        )
-        self.wait_set_fini = rcl("rcl_wait_set_fini", integer, (pointer,))
-        self.wait_set_clear = rcl("rcl_wait_set_clear", integer, (pointer,))
-        self.wait_set_add_guard = rcl("rcl_wait_set_add_guard_condition", integer, (pointer,) * 3)
-        self.wait = rcl("rcl_wait", integer, (pointer, ctypes.c_int64))
+        self.call = {name: bind(name, *signature) for name, signature in _FUNCTIONS.items()}
+        self.default_allocator: Allocator = self.call["rcutils_get_default_allocator"]()
         self._check_layout(version)
 
     def take_error(self) -> str:
         """Return and clear this thread's rcl error, without the C file names it drags along."""
-        text: str = self._get_error_string().text.decode(errors="replace")
-        self._reset_error()
+        text: str = self.call["rcutils_get_error_string"]().text.decode(errors="replace")
+        self.call["rcutils_reset_error"]()
         return _ERROR_LOCATION.sub("", text).strip() or "no reason given"
 
     def flow_endpoints(self, kind: str, entity: int) -> tuple[int, list[Nfe]]:
@@ -172,12 +166,13 @@ class Rcl:
             entity: address of its rcl struct.
         """
         array = NfeArray()
-        code = self.nfes[kind](entity, ctypes.byref(self.default_allocator), ctypes.byref(array))
+        get = self.call[f"rcl_{kind}_get_network_flow_endpoints"]
+        code = get(entity, ctypes.byref(self.default_allocator), ctypes.byref(array))
         if code != RCL_RET_OK:
             return code, []
         found = [Nfe.from_buffer_copy(array.items[index]) for index in range(array.size)]
         if array.allocator:  # an empty list was never initialised, and fini would complain of it
-            self.nfe_array_fini(ctypes.byref(array))
+            self.call["rmw_network_flow_endpoint_array_fini"](ctypes.byref(array))
         return code, found
 
     def remake_unique(
@@ -195,12 +190,12 @@ class Rcl:
         Raises:
             MiddlewareError: it could not be ended; it is as before.
         """
-        held = self.options(subscription).contents
+        held = self.call["rcl_subscription_get_options"](subscription).contents
         options = type(held).from_buffer_copy(held)  # fini frees the original
         options.rmw.unique = unique
-        if self.subscription_fini(subscription, node) != RCL_RET_OK:
+        if self.call["rcl_subscription_fini"](subscription, node) != RCL_RET_OK:
             raise MiddlewareError(f"cannot re-create subscription {topic!r}: {self.take_error()}")
-        made = self.subscription_init(
+        made = self.call["rcl_subscription_init"](
             subscription, node, type_support(type_), topic.encode(), ctypes.byref(options)
         )
         return int(made)
@@ -212,7 +207,7 @@ class Rcl:
         that moved shows as a wrong default before anything is written through it.
         """
         expected = (1, 10, 1, 2, False, bytes(self.default_allocator), 0)
-        options = self.default_options().options
+        options = self.call["rcl_subscription_get_default_options"]().options
         found = (
             options.qos.history,
             options.qos.depth,
@@ -226,7 +221,8 @@ class Rcl:
             raise _layout_error("rcl_subscription_options_t", version)
         # One spare element behind it, should the library's struct be longer.
         probe = (Nfe * 2)()
-        self.nfe_set_address(ctypes.byref(probe), b"192.0.2.1", 9)
+        put = self.call["rmw_network_flow_endpoint_set_internet_address"]
+        put(ctypes.byref(probe), b"192.0.2.1", 9)
         if probe[0].internet_address != b"192.0.2.1" or bytes(probe[1]).strip(b"\0"):
             raise _layout_error("rmw_network_flow_endpoint_t", version)
 
@@ -244,10 +240,11 @@ class GuardWait:
 
     def __init__(self, context: int, count: int) -> None:
         self._rcl = load()
-        self._set = self._rcl.zero_wait_set()
-        sizes = (0, count, 0, 0, 0, 0)
-        allocator = self._rcl.default_allocator
-        self._check(self._rcl.wait_set_init(ctypes.byref(self._set), *sizes, context, allocator))
+        self._call = self._rcl.call
+        self._set = self._call["rcl_get_zero_initialized_wait_set"]()
+        sizes, allocator = (0, count, 0, 0, 0, 0), self._rcl.default_allocator
+        at = ctypes.byref(self._set)
+        self._check(self._call["rcl_wait_set_init"](at, *sizes, context, allocator))
 
     def wait(self, guards: Sequence[int], timeout_s: float | None) -> bool:
         """Return whether one of the guard conditions was triggered in time.
@@ -260,11 +257,11 @@ class GuardWait:
             MiddlewareError: rcl cannot wait.
         """
         wait_set = ctypes.byref(self._set)
-        self._check(self._rcl.wait_set_clear(wait_set))
+        self._check(self._call["rcl_wait_set_clear"](wait_set))
         for each in guards:
-            self._check(self._rcl.wait_set_add_guard(wait_set, each, None))
+            self._check(self._call["rcl_wait_set_add_guard_condition"](wait_set, each, None))
         timeout_ns = _FOR_EVER if timeout_s is None else round(timeout_s * 1e9)
-        result = self._rcl.wait(wait_set, timeout_ns)
+        result = self._call["rcl_wait"](wait_set, timeout_ns)
         if result == RCL_RET_TIMEOUT:
             return False
         self._check(result)
@@ -272,7 +269,7 @@ class GuardWait:
 
     def close(self) -> None:
         """Free it."""
-        self._rcl.wait_set_fini(ctypes.byref(self._set))
+        self._call["rcl_wait_set_fini"](ctypes.byref(self._set))
 
     def _check(self, result: int) -> None:
         if result != RCL_RET_OK:
@@ -317,7 +314,7 @@ def assert_liveliness(publisher: int) -> bool:
 
 @functools.lru_cache(maxsize=1)
 def _asserting() -> Any:
-    return bind("rcl", "rcl_publisher_assert_liveliness", ctypes.c_int, (ctypes.c_void_p,))
+    return bind("rcl_publisher_assert_liveliness", ctypes.c_int, (ctypes.c_void_p,))
 
 
 def type_support(message_type: object) -> int:
@@ -333,11 +330,10 @@ def type_support(message_type: object) -> int:
     return int(pointer(capsule, name(capsule)))
 
 
-def bind(library: str, symbol: str, result: Any, arguments: Sequence[Any] = ()) -> Any:
-    """Return a function of a library, or of one that it needs.
+def bind(symbol: str, result: Any, arguments: Sequence[Any]) -> Any:
+    """Return a function of the library that its name begins with: rcl, rmw or rcutils.
 
     Args:
-        library: "rcl" for librcl.so.
         symbol: its C name.
         result: ctypes type.
         arguments: ctypes types.
@@ -352,6 +348,7 @@ def bind(library: str, symbol: str, result: Any, arguments: Sequence[Any] = ()) 
     except ImportError as error:
         raise MiddlewareError(f"cannot import rclpy: {error}", hint=INSTALL) from error
     try:
+        library = symbol.partition("_")[0]
         function = getattr(ctypes.CDLL(f"lib{library}.so"), symbol)
     except OSError as error:
         raise MiddlewareError(f"cannot load 'lib{library}.so': {error}", hint=INSTALL) from error

@@ -101,7 +101,7 @@ class GraphObserver:
 
     Attributes:
         urls: of its connections; none where the RMW chooses.
-        settling: for how long it may still miss a participant.
+        settling: for how long the last `snapshot` may miss a participant.
         owns_node: the node is its own, and is spun and destroyed by nothing else.
 
     Raises:
@@ -145,14 +145,13 @@ class GraphObserver:
         self._ended_until_s: dict[int, float] = {}  # by the pid of processes that ended lately
         self._own = ""  # the observer's GUID prefix, once a process has ended
         self._topics_before: frozenset[str] = frozenset()
-        self._named: frozenset[str] = frozenset()
 
     @classmethod
     def on(cls, node: Node) -> GraphObserver:
         """Look through a node that others spin, and destroy after this.
 
         How its participant is connected is not known here, so that no participant can be asked to
-        announce itself: for the first 3.5 s a snapshot may miss some (`settling_s`).
+        announce itself: for the first 3.5 s a snapshot may miss some (`settling`).
 
         Raises:
             MiddlewareError: rcl's graph guard condition could not be waited on.
@@ -212,7 +211,8 @@ class GraphObserver:
                 homes.setdefault(each.node, Counter())[each.gid[:PREFIX_DIGITS]] += has_events
             if not _is_noise(each, declared, names):
                 shown.setdefault(each.node, []).append(self._timed(each))
-        self._named = frozenset(itertools.chain.from_iterable(homes.values()))
+        named = frozenset(itertools.chain.from_iterable(homes.values()))
+        self.settling.saw(named, next(iter(homes.get(self._name, ())), ""))
         # A participant may have several nodes of one name.
         counts = {name: sum(max(1, each) for each in on.values()) for name, on in homes.items()}
         ourselves = self._name if self.owns_node and counts.get(self._name) == 1 else None
@@ -242,22 +242,6 @@ class GraphObserver:
             folded = fold_actions(self._hashed(name, judged, ends))
             endpoints += sorted(folded if name else self._located(folded), key=_order)
         return tuple(nodes), tuple(endpoints)
-
-    def settling_s(self) -> float:
-        """Return for how many seconds a snapshot may still miss nodes; 0 once it cannot.
-
-        Judged by the last `snapshot`, see `Settling`.
-        """
-        return self.settling.left_s(self._named)
-
-    def expect_newcomers(self, *, everybody: bool = False) -> bool:
-        """Have `settling_s` wait for who came since; return whether there may be anybody.
-
-        Args:
-            everybody: wait also for what those have to say that are known: this process did not
-                run for a while.
-        """
-        return self.settling.expect_newcomers(self._named, self.prefix, everybody=everybody)
 
     @property
     def prefix(self) -> str:

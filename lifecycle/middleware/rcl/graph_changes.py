@@ -215,7 +215,8 @@ class _Guarded(_Comparison):
 
     def __init__(self, node: Node) -> None:
         super().__init__(node)
-        self._graph = abi.load().graph_guard(node.handle.pointer)
+        graph_guard = abi.load().call["rcl_node_get_graph_guard_condition"]
+        self._graph = graph_guard(node.handle.pointer)
         self._wake = GuardCondition(None, None, context=node.context)
         self._guards = abi.GuardWait(node.context.handle.pointer, 2)
 

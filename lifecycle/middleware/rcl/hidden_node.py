@@ -142,12 +142,7 @@ def _security_hint() -> str:
 
 def hidden_nodes() -> tuple[Node, ...]:
     """Return the hidden nodes of this process, each on a participant of its own."""
-    return tuple(_hidden)
-
-
-def forget_hidden(node: Node) -> None:
-    """No longer list a node that is about to be destroyed; again is harmless."""
-    _hidden.discard(node)
+    return tuple(node for node in _hidden if node.context.ok())
 
 
 Action: typing.TypeAlias = Waitable

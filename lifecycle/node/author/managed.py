@@ -53,6 +53,7 @@ class Managed:
     """The managed half of one node.
 
     Attributes:
+        node: the LifecycleNode.
         mode: what drives the transitions.
         gate: holds back what the node was made to send, receive and time.
         turns: has things done in its executor.
@@ -73,7 +74,7 @@ class Managed:
         served: bool = True,
         health: Callable[[], Any] | None = None,
     ) -> None:
-        self._node = node
+        self.node = node
         self.spec = spec
         self._supervisor = supervisor
         # By its supervisor, through the gate; a node without one needs no permission.
@@ -112,7 +113,7 @@ class Managed:
     @property
     def full_name(self) -> str:
         """Fully qualified node name."""
-        return str(self._node.get_fully_qualified_name())
+        return str(self.node.get_fully_qualified_name())
 
     @property
     def state(self) -> NodeState:
@@ -210,7 +211,7 @@ class Managed:
         # Whatever the policy: what a node says of itself is known before discovery shows it.
         found = self.found.beside(self.data_layer.entities)
         return configuration.collect(
-            self._node,
+            self.node,
             self.spec,
             self.reported,
             endpoints=(*self.data_layer.endpoints.values(), *found),
@@ -222,17 +223,17 @@ class Managed:
 
     def prepare(self) -> None:
         """Declare parameters and endpoints, and make the timers of `@on_timer` methods."""
-        matched = match(type(self._node), self.data_layer.unhandled, node=self.full_name)
-        parameters.declare(self._node, self.spec)
-        self.data_layer.prepare(functools.partial(matched.bound, self._node))
+        matched = match(type(self.node), self.data_layer.unhandled, node=self.full_name)
+        parameters.declare(self.node, self.spec)
+        self.data_layer.prepare(functools.partial(matched.bound, self.node))
         for timer in matched.timers:
-            method = getattr(self._node, timer.method)
-            self._method_timers.append(self._node.create_timer(timer.period_s, method))
+            method = getattr(self.node, timer.method)
+            self._method_timers.append(self.node.create_timer(timer.period_s, method))
 
     def unprepare(self) -> None:
         """Undo `prepare`; parameters stay declared."""
         while self._method_timers:
-            self._node.destroy_timer(self._method_timers.pop())
+            self.node.destroy_timer(self._method_timers.pop())
         self.data_layer.unprepare()
 
     def may_activate(self) -> bool:
@@ -255,7 +256,7 @@ class Managed:
             try:
                 step()
             except Exception:  # noqa: BLE001, PERF203 - a fault of ours
-                self._node.get_logger().error(traceback.format_exc())
+                self.node.get_logger().error(traceback.format_exc())
 
     def changed(self, change: StateChange) -> None:
         """Notify others of a change of the state."""
@@ -273,7 +274,7 @@ class Managed:
 
     def callback(self, name: str) -> Callable[..., Any]:
         """Return the author's `on_…` method."""
-        method: Callable[..., Any] = getattr(self._node, name)
+        method: Callable[..., Any] = getattr(self.node, name)
         return method
 
     def callback_argument(self, state: NodeState) -> LifecycleState:
@@ -282,7 +283,7 @@ class Managed:
 
     def report(self, result: Result) -> None:
         """Log why a step did not succeed, with the traceback where there is one."""
-        logger = self._node.get_logger()
+        logger = self.node.get_logger()
         if result.trace:
             logger.error(result.trace)
         logger.error(result.error)
@@ -293,7 +294,7 @@ class Managed:
         # Late: most nodes report to their supervisor only.
         from lifecycle.graph.reporter import GraphReporter
 
-        self._reporter = GraphReporter(self._node)
+        self._reporter = GraphReporter(self.node)
         self._reporter.report(state=self.state.seen.label, connected=self.state.connected)
         self.configuration_changes.listen(self._report_configuration)
         now = self.configuration_changes.collect()

@@ -30,7 +30,7 @@ from lifecycle.plan.model import PlannedNode
 if TYPE_CHECKING:
     from rclpy.context import Context
 
-    from lifecycle.node.host.foreign import Adoption
+    from lifecycle.node.host.adoption import Adoption
 
 
 class Mode(enum.Enum):

@@ -63,6 +63,7 @@ class HostSpec(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         folders: absolute, of the manifest and what it includes: modules are looked for there.
         log: file that it appends its output to once its supervisor was killed; empty for none.
+        joins: the rest of its system runs already, and is asked to announce itself at once.
     """
 
     system: str
@@ -72,6 +73,7 @@ class HostSpec(msgspec.Struct, frozen=True, kw_only=True):
     nodes: tuple[PlannedNode, ...]
     folders: tuple[str, ...] = ()
     log: str = ""
+    joins: bool = False
 
 
 class Command(msgspec.Struct, frozen=True, kw_only=True):

@@ -1,8 +1,4 @@
-"""Nodes of rclpy's own classes, and whatever a function returns, hosted as planned nodes.
-
-Owns: `Adoption`, which gives the nodes that a class or function of the user's constructs the names,
-parameters, remaps and participants of the plan; and `ForeignNode`, one such node: its report, what
-holds it before the gate opens, and its transitions where its class is rclpy.lifecycle's.
+"""One hosted node of rclpy's own classes: its report, what holds it, and its transitions.
 
 A plain node is held by its executor, which is not run, and by its publishers: what it publishes is
 dropped, as before any subscription is matched, but for the last messages of TRANSIENT_LOCAL, which
@@ -13,11 +9,9 @@ answer, and its plain publishers are held until it is activated through the gate
 from __future__ import annotations
 
 import collections
-import contextlib
-import inspect
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
 
 from msgspec.structs import replace
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -33,7 +27,7 @@ from rclpy.qos import QoSProfile
 from rclpy.serialization import serialize_message
 from rclpy.time_source import TimeSource
 
-from lifecycle.errors import BringUpError, LifecycleError
+from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.middleware.fastdds.nfe import create_subscription
 from lifecycle.middleware.rcl.graph_changes import ServerWatch
@@ -45,14 +39,9 @@ from lifecycle.middleware.rcl.rclpy_nodes import (
 )
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.node import configuration
-from lifecycle.node.author import parameters
-from lifecycle.node.author.managed import Managed
-from lifecycle.node.author.node import LifecycleNode
-from lifecycle.node.author.spec import Construction, Mode, constructing, ros_arguments
 from lifecycle.node.configuration import ConfigurationChanges, Found, HostedState
 from lifecycle.node.connections.connections import Connection, Connections
 from lifecycle.node.connections.node_interface import serve_interface
-from lifecycle.node.endpoints.data_layer import DataLayer
 from lifecycle.node.endpoints.endpoint import CLIENTS, Endpoint, MatchWatch, Placement, Watch
 from lifecycle.node.lifecycle.gate import GatedPublisher, NodeGate
 from lifecycle.node.lifecycle.machine import RefusedError
@@ -62,6 +51,9 @@ from lifecycle.verify.observation import NodeConfiguration
 
 if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup
+
+    from lifecycle.node.endpoints.data_layer import DataLayer
+    from lifecycle.node.host.loop import NodeLoop
 
 
 _STEADY = ("unconfigured", "inactive", "active", "finalized")
@@ -73,26 +65,6 @@ _MATCHED = {
 _REACHED = {"configure": "inactive", "deactivate": "inactive", "cleanup": "unconfigured"}
 _CONNECTED = ("inactive", "activating", "active", "deactivating")
 """Where a node of rclpy.lifecycle has its data layer, which it makes in on_configure."""
-
-
-class Spinner(Protocol):
-    """What runs the callbacks of nodes: NodeLoop, and NodeInProcess."""
-
-    @property
-    def watching(self) -> Watching:
-        """Events that its own executor waits for, whether a node is spun or not."""
-
-    def spin(self, node: Node) -> None:
-        """Run a node's callbacks from now on."""
-
-    def rest(self, node: Node) -> None:
-        """Run no callback of a node that begins from now on."""
-
-    def call_soon(self, task: Callable[..., Any], *arguments: object) -> None:
-        """Run a function, sync or async, where callbacks of nodes run."""
-
-    def call_beside(self, task: Callable[[], Any]) -> object:
-        """Run a function, sync or async, where `watching` is watched; false after its end."""
 
 
 class SharedMatch:
@@ -119,7 +91,7 @@ class SharedMatch:
         changed: Callable[[], None],
         forward: Callable[[Callable[[Any], Any], Any], None],
     ) -> None:
-        self._node = node
+        self.node = node
         self._event = event
         self._watching = watching
         callback = event.callback
@@ -136,7 +108,7 @@ class SharedMatch:
     def stop(self) -> None:
         """Wait for it no more: its endpoint is about to be destroyed, by its node."""
         self._watching.remove_waitable(self._event)
-        self._node.add_waitable(self._event)
+        self.node.add_waitable(self._event)
 
 
 class HeldPublisher(GatedPublisher):
@@ -178,9 +150,11 @@ class ForeignNode:
         node: constructed by rclpy so far; its class's constructor may have more to do.
         spec: what it was planned to be.
         supervisor: name of the system whose gate holds it; empty for none.
-        spinner: runs its callbacks.
+        loop: runs its callbacks.
 
     Attributes:
+        node: rclpy's.
+        spec: what it was planned to be.
         configuration_changes: notifies of each change of its configuration.
     """
 
@@ -190,13 +164,13 @@ class ForeignNode:
         spec: PlannedNode,
         *,
         supervisor: str,
-        spinner: Spinner,
+        loop: NodeLoop,
     ) -> None:
-        self._node = node
-        self._spec = spec
+        self.node = node
+        self.spec = spec
         self._supervisor = supervisor
-        self._spinner = spinner
-        self._watching = spinner.watching
+        self._loop = loop
+        self._watching = loop.watching
         self._group = ReentrantCallbackGroup()
         self._gate = NodeGate()
         self._unspun: dict[Callable[[Any], Any], Any] = {}
@@ -211,7 +185,7 @@ class ForeignNode:
         if spec.managed and is_rclpy_managed(node):
             self._machine = RclpyStateMachine(node, self)
         self.configuration_changes = ConfigurationChanges(
-            spinner.call_beside, self.get_configuration, failed=node.get_logger().error
+            loop.call_beside, self.get_configuration, failed=node.get_logger().error
         )
         self._found = Found(spec.at, self.configuration_changes.touch)
         node.add_post_set_parameters_callback(lambda _: self.configuration_changes.touch())
@@ -221,25 +195,20 @@ class ForeignNode:
 
     def _serve(self) -> tuple[Any, ...]:
         """Offer what others know our nodes by; the host answers, also while the node is held."""
-        before = set(self._node.services)
+        before = set(self.node.services)
         self._is_ours = True
-        configuration.serve(self._node, self.get_configuration, self._group)
+        configuration.serve(self.node, self.get_configuration, self._group)
         # With it a node is known to be one of ours.
-        serve_interface(self._node, {"map_to": lambda _: data_layer_of(self)}, self._group)
+        serve_interface(self.node, {"map_to": lambda _: self.data_layer}, self._group)
         self._is_ours = False
-        services = tuple(each for each in self._node.services if each not in before)
-        self._watching.take_services(self._node, services)
+        services = tuple(each for each in self.node.services if each not in before)
+        self._watching.take_services(self.node, services)
         return services
 
     @property
     def full_name(self) -> str:
         """Fully qualified node name."""
-        return str(self._node.get_fully_qualified_name())
-
-    @property
-    def spec(self) -> PlannedNode:
-        """What it was planned to be."""
-        return self._spec
+        return str(self.node.get_fully_qualified_name())
 
     @property
     def reported(self) -> HostedState:
@@ -263,13 +232,13 @@ class ForeignNode:
         if isinstance(getattr(callback, "__self__", None), TimeSource):
             return  # /clock belongs to rclpy
         if kind is EndpointKind.PUBLISHER:
-            self._gate.add(entity, HeldPublisher(entity, self._node.get_logger().warning))
+            self._gate.add(entity, HeldPublisher(entity, self.node.get_logger().warning))
         watch: Watch | None = None
         if kind.is_topic:
             # In the host's executor: the node's own need not run.
             watch = self._match_watch(kind, entity)
         elif kind in CLIENTS:
-            watch = ServerWatch(self._node, entity, self.configuration_changes.touch)
+            watch = ServerWatch(self.node, entity, self.configuration_changes.touch)
         connection = self._apart.pop(id(entity), self._connections.own)
         self._found.add(kind, Placement(connection=connection, entity=entity, watch=watch))
 
@@ -278,7 +247,7 @@ class ForeignNode:
         for event in entity.event_handlers:
             if event.event_type == _MATCHED[kind]:
                 return SharedMatch(
-                    self._node,
+                    self.node,
                     event,
                     self._group,
                     self._watching,
@@ -291,15 +260,15 @@ class ForeignNode:
     def _forward(self, callback: Callable[[Any], Any], status: Any) -> None:
         """Have a callback of its own called; while it is not spun, the last time once it is."""
         if self._is_spun:
-            self._spinner.call_soon(callback, status)
+            self._loop.call_soon(callback, status)
         else:
             self._unspun[callback] = status
 
     def _spin(self) -> None:
         self._is_spun = True
-        self._spinner.spin(self._node)
+        self._loop.spin(self.node)
         for callback, status in self._unspun.items():
-            self._spinner.call_soon(callback, status)
+            self._loop.call_soon(callback, status)
         self._unspun.clear()
 
     def make(self, kind: EndpointKind, given: Mapping[str, Any]) -> Any:
@@ -315,7 +284,7 @@ class ForeignNode:
         if planned is None or given.get("qos_overriding_options") is not None:
             return None
         carrier = next(
-            (each for each in self._spec.participants if each.name == planned.participant), None
+            (each for each in self.spec.participants if each.name == planned.participant), None
         )
         qos = given["qos_profile"]
         options: dict[str, Any] = {
@@ -334,7 +303,7 @@ class ForeignNode:
             if kind is EndpointKind.PUBLISHER:
                 return None  # no RMW makes one unique on a participant that others use
             make: Callable[..., Any] = create_subscription
-            return make(self._node, given["msg_type"], given["topic"], *called, **options)
+            return make(self.node, given["msg_type"], given["topic"], *called, **options)
         connection = self._connections.carrier(carrier)
         assert connection.participant is not None
         make = connection.participant.create_publisher
@@ -348,13 +317,13 @@ class ForeignNode:
         """Return what is planned of an endpoint, if it is more than rclpy does."""
         wanted = [
             each
-            for each in self._spec.endpoints
+            for each in self.spec.endpoints
             if each.kind is kind
             and (each.participant or each.unique is not UniqueRequirement.NOT_REQUIRED)
         ]
         if not wanted or not isinstance(topic, str):
             return None
-        resolved = self._node.resolve_topic_name(topic)
+        resolved = self.node.resolve_topic_name(topic)
         return next((each for each in wanted if each.resolved == resolved), None)
 
     def removed(self, entity: Any) -> None:
@@ -370,8 +339,8 @@ class ForeignNode:
 
     def constructed(self) -> None:
         """Its class's constructor has returned: hold it, or have it spun."""
-        if self._spec.log_level:
-            self._node.get_logger().set_level(LoggingSeverity[self._spec.log_level.upper()])
+        if self.spec.log_level:
+            self.node.get_logger().set_level(LoggingSeverity[self.spec.log_level.upper()])
         self._is_constructed = True
         if self._machine is not None:
             self._machine.complete()
@@ -382,7 +351,7 @@ class ForeignNode:
 
     def get_configuration(self) -> NodeConfiguration:
         """Return its identity and its endpoints as they are."""
-        declared = {(each.kind, each.resolved): each for each in self._spec.endpoints}
+        declared = {(each.kind, each.resolved): each for each in self.spec.endpoints}
         endpoints: list[Endpoint] = []
         for each in self._found.beside():
             planned = declared.pop((each.kind, each.planned.resolved), None)
@@ -396,11 +365,24 @@ class ForeignNode:
             endpoints.append(each)
         endpoints += [Endpoint(planned=each) for each in declared.values()]
         return configuration.collect(
-            self._node,
-            self._spec,
+            self.node,
+            self.spec,
             self.reported,
             endpoints=endpoints,
             connections=self._connections,
+        )
+
+    @property
+    def data_layer(self) -> DataLayer:
+        """What maps the endpoints of our nodes.
+
+        Raises:
+            LifecycleError: its own code makes its endpoints.
+        """
+        raise LifecycleError(
+            f"cannot move the endpoints of {self.full_name}: its class is not a "
+            "lifecycle.LifecycleNode, and makes them itself",
+            hint="subclass lifecycle.LifecycleNode, or write data_layer.authority: nodes",
         )
 
     @property
@@ -439,7 +421,7 @@ class ForeignNode:
             return self._transition("activate")  # refused, and it stays as it is
         succeeded = False
         self._release()  # its on_activate may publish
-        limit_s = self._spec.timeouts.activate_s
+        limit_s = self.spec.timeouts.activate_s
         began_s = time.monotonic()
         try:
             result = self._transition("activate")
@@ -494,7 +476,7 @@ class ForeignNode:
 
     def complain(self, text: str) -> None:
         """Log it."""
-        self._node.get_logger().error(text)
+        self.node.get_logger().error(text)
 
     def _release(self) -> None:
         self._let_through = True
@@ -507,7 +489,7 @@ class ForeignNode:
         self._gate.close()
         if self._machine is None:
             self._is_spun = False
-            self._spinner.rest(self._node)
+            self._loop.rest(self.node)
 
     def _transition(self, operation: str) -> Result:
         """Run one of its transitions; what its class knows nothing of succeeds at once."""
@@ -526,241 +508,3 @@ class ForeignNode:
         why = f"{self.full_name}: on_{operation} returned {returned.name}"
         self.complain(why)
         return Result(outcome=outcome, error=why)
-
-
-Hosted = Managed | ForeignNode
-"""What a host knows of one of its nodes."""
-
-
-def data_layer_of(hosted: Hosted) -> DataLayer:
-    """Return what maps the endpoints of a node.
-
-    Raises:
-        LifecycleError: its own code makes its endpoints.
-    """
-    if isinstance(hosted, Managed):
-        return hosted.data_layer
-    raise LifecycleError(
-        f"cannot move the endpoints of {hosted.full_name}: its class is not a "
-        "lifecycle.LifecycleNode, and makes them itself",
-        hint="subclass lifecycle.LifecycleNode, or write data_layer.authority: nodes",
-    )
-
-
-Carrying = Callable[[PlannedNode], contextlib.AbstractContextManager[Any]]
-
-
-class Adoption:
-    """Makes nodes of the user's classes and functions, each as one planned node.
-
-    Args:
-        carrying: yields the context that a planned node is to be constructed on.
-        spinner: runs the callbacks of nodes that are not ours.
-        supervisor: name of the system whose gate holds the nodes; empty for none.
-        use_global_arguments: nodes take remaps from the process's own --ros-args.
-
-    Attributes:
-        made: rclpy node by key of the plan, with its ForeignNode unless it is one of ours.
-    """
-
-    def __init__(
-        self,
-        carrying: Carrying,
-        spinner: Spinner,
-        *,
-        supervisor: str = "",
-        mode: Mode | None = Mode.MANUAL,
-        use_global_arguments: bool = False,
-    ) -> None:
-        self._carrying = carrying
-        self._spinner = spinner
-        self._supervisor = supervisor
-        self._mode = mode
-        self._use_global_arguments = use_global_arguments
-        self._waiting: list[PlannedNode] = []
-        self._current: PlannedNode | None = None
-        self._taken: PlannedNode | None = None
-        self._foreign: dict[int, ForeignNode] = {}
-        self.made: dict[str, tuple[Node, ForeignNode | None]] = {}
-
-    def make(
-        self, planned: PlannedNode, group: Sequence[PlannedNode], what: Callable[..., Any]
-    ) -> tuple[tuple[str, Any, Hosted], ...]:
-        """Construct a planned node, and those of its group that the same call makes.
-
-        Args:
-            planned: the node that is to be made.
-            group: all that `what` may make, `planned` among them.
-            what: the class or function.
-
-        Returns:
-            Key of the plan, rclpy node and what stands for it, of what was made.
-
-        Raises:
-            LifecycleError: something else was made. What the class or function raises passes.
-        """
-        before = set(self.made)
-        self._waiting = [each for each in group if each.key not in self.made]
-        self._current = planned
-        try:
-            with constructing(self):
-                returned = what(**keywords(planned, what))
-        finally:
-            self._waiting, self._current = [], None
-        self._check(planned, what, returned)
-        made: list[tuple[str, Any, Hosted]] = []
-        for key, (node, foreign) in tuple(self.made.items()):
-            if key in before:
-                continue
-            if foreign is not None:
-                foreign.constructed()
-            made.append((key, node, foreign or cast("LifecycleNode", node).lifecycle))
-        return tuple(made)
-
-    def _check(self, planned: PlannedNode, what: Callable[..., Any], returned: object) -> None:
-        reference = planned.run.python
-        nodes = [each for each in _each(returned) if isinstance(each, Node)]
-        if planned.key not in self.made:
-            names = ", ".join(each.get_fully_qualified_name() for each in nodes) or repr(returned)
-            raise BringUpError(
-                f"cannot use {reference!r}: it made {names}, and no node for {planned.full_name}",
-                hint="return the node, or a list of nodes; the host spins them",
-            )
-        known = {id(node) for node, _ in self.made.values()}
-        for each in nodes:
-            if id(each) not in known:
-                name = each.get_fully_qualified_name()
-                raise BringUpError(
-                    f"cannot host {name}, which {reference!r} returns: no node is declared for it "
-                    f"beside {planned.full_name}",
-                    hint=f"add a node of that name with the same `run:` and `process: "
-                    f"{planned.process}`",
-                )
-        if not isinstance(what, type) and not nodes:
-            raise BringUpError(
-                f"cannot use {reference!r}: it returns {returned!r} and must return its nodes",
-                hint="it must neither spin nor destroy them: the host does",
-            )
-
-    # What constructors ask: LifecycleNode's by author/spec.py, all others by middleware's hooks.
-
-    def take(self, name: str, namespace: str | None) -> Construction | None:
-        """Return the construction of a LifecycleNode that is about to be made."""
-        planned = self._take(name, namespace)
-        if planned is None:
-            return None
-        self._taken = planned
-        return Construction(
-            spec=planned,
-            mode=self._mode,
-            use_global_arguments=self._use_global_arguments,
-            # Of a plain node no states are driven.
-            supervisor=self._supervisor if planned.managed else "",
-        )
-
-    @contextlib.contextmanager
-    def constructing(
-        self, node: Node, name: str, options: dict[str, Any]
-    ) -> Iterator[tuple[str, dict[str, Any]]]:
-        """Have rclpy construct a node as planned; one that is not planned is not touched."""
-        ours = isinstance(node, LifecycleNode)
-        planned = self._taken if ours else self._take(name, options.get("namespace"))
-        self._taken = None
-        if planned is None:
-            yield name, options
-            return
-        refuse_unmanaged(planned, type(node))
-        if not ours:
-            name, options = planned.name, self._options(planned, options)
-            parameters.give_empty_arrays(node, planned)
-        with self._carrying(planned) as context:
-            yield name, {**options, "context": context}
-        foreign = None
-        if not (ours and planned.managed):
-            foreign = ForeignNode(node, planned, supervisor=self._supervisor, spinner=self._spinner)
-            self._foreign[id(node)] = foreign
-        self.made[planned.key] = (node, foreign)
-
-    def make_endpoint(self, node: Node, kind: EndpointKind, arguments: Mapping[str, Any]) -> Any:
-        """Make an endpoint that is planned otherwise than rclpy would make it; else None."""
-        foreign = self._foreign.get(id(node))
-        return None if foreign is None else foreign.make(kind, arguments)
-
-    def node_removed(self, node: Node) -> None:
-        """A node is about to be destroyed."""
-        foreign = self._foreign.pop(id(node), None)
-        if foreign is not None:
-            foreign.close()
-
-    def endpoint_made(self, node: Node, kind: EndpointKind, entity: Any) -> None:
-        """An endpoint of a node exists now."""
-        foreign = self._foreign.get(id(node))
-        if foreign is not None:
-            foreign.made(kind, entity)
-
-    def endpoint_removed(self, node: Node, entity: Any) -> None:
-        """An endpoint of a node is about to be destroyed."""
-        foreign = self._foreign.get(id(node))
-        if foreign is not None:
-            foreign.removed(entity)
-
-    def _take(self, name: str, namespace: str | None) -> PlannedNode | None:
-        """Choose whose construction this is: by name among the group, else the one asked for."""
-        full = f"/{(namespace or '').strip('/')}/{name}".replace("//", "/")
-        chosen = (
-            next((each for each in self._waiting if each.full_name == full), None)
-            or next((each for each in self._waiting if each.name == name), None)
-            or next((each for each in self._waiting if each is self._current), None)
-        )
-        if chosen is not None:
-            self._waiting.remove(chosen)
-        return chosen
-
-    def _options(self, planned: PlannedNode, options: dict[str, Any]) -> dict[str, Any]:
-        given = options.get("parameter_overrides") or ()
-        return {
-            **options,
-            "namespace": planned.namespace,
-            "cli_args": [*ros_arguments(planned), *(options.get("cli_args") or ())],
-            "parameter_overrides": [*given, *parameters.overrides(planned)],
-            "use_global_arguments": self._use_global_arguments,
-        }
-
-
-def refuse_unmanaged(planned: PlannedNode, node_class: type) -> None:
-    """Raise unless a class can be what the plan says.
-
-    Raises:
-        LifecycleError: it is to be managed, and knows nothing of that.
-    """
-    known = issubclass(node_class, LifecycleNode) or is_rclpy_managed(node_class)
-    if planned.managed and not known:
-        raise LifecycleError(
-            f"cannot manage {planned.full_name}: {planned.run.python!r} makes a plain node, a "
-            f"{node_class.__name__}",
-            hint="say `managed: false`, or subclass lifecycle.LifecycleNode",
-        )
-
-
-def keywords(planned: PlannedNode, what: Callable[..., Any]) -> dict[str, Any]:
-    """Return what a class or function is called with; one that needs a `node_name` gets it."""
-    keywords = {
-        name: list(value) if isinstance(value, tuple) else value
-        for name, value in planned.run.arguments
-    }
-    if _needs(what, "node_name"):
-        keywords.setdefault("node_name", planned.name)
-    return keywords
-
-
-def _needs(what: Callable[..., Any], name: str) -> bool:
-    """Return whether what is called so has a parameter of this name without a default."""
-    wanted = inspect.signature(what).parameters.get(name)
-    named = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
-    return wanted is not None and wanted.default is wanted.empty and wanted.kind in named
-
-
-def _each(returned: object) -> Iterable[object]:
-    if isinstance(returned, (list, tuple, set, frozenset)):
-        return returned
-    return (returned,)

@@ -1,11 +1,11 @@
 """Construct and run the nodes of a host process: carry out the supervisor's commands, report back.
 
 Owns: the order of a host's life: construct every node, say "ready", obey, and at end of file shut
-down and leave, nodes deactivated first if the supervisor was killed; which nodes of a process share
-a participant, and what a class must be to be hosted; what is reported without a request; what each
-Operation of control.py does to the nodes, by the same state machines that the lifecycle services
-drive, and that each command is answered exactly once. It holds no state of its nodes. While the
-user's modules are imported there is nothing to shut down: then it ends at once, and silently.
+down and leave, nodes deactivated first if the supervisor was killed; what is reported without a
+request; what each Operation of control.py does to the nodes, by the same state machines that the
+lifecycle services drive, and that each command is answered exactly once. It holds no state of its
+nodes. While the user's modules are imported there is nothing to shut down: then it ends at once,
+and silently.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import stat
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from typing import Any, NoReturn
 
 import rclpy
@@ -27,15 +27,12 @@ from rclpy.signals import SignalHandlerOptions
 
 from lifecycle import codec
 from lifecycle.errors import LifecycleError
-from lifecycle.manifest.model import Executor
 from lifecycle.middleware.discovery.tcp import send_again_soon
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.middleware.fastdds.settings import discovery_by_profile
 from lifecycle.middleware.process.busy_sign import BusySign
 from lifecycle.middleware.process.teardown import leave_and_exit
-from lifecycle.middleware.rcl.hidden_node import made_participant
-from lifecycle.middleware.rcl.rclpy_nodes import follow_nodes
-from lifecycle.node.author.spec import load_nodes
+from lifecycle.node.host.adoption import Adoption, Hosted, maker_of
 from lifecycle.node.host.control import (
     Command,
     Event,
@@ -44,14 +41,8 @@ from lifecycle.node.host.control import (
     Operation,
     report_failure,
 )
-from lifecycle.node.host.foreign import (
-    Adoption,
-    ForeignNode,
-    Hosted,
-    data_layer_of,
-    refuse_unmanaged,
-)
-from lifecycle.node.host.loop import Heartbeat, NodeLoop, Watchdog, on_signal
+from lifecycle.node.host.foreign import ForeignNode
+from lifecycle.node.host.loop import NodeLoop, on_signal
 from lifecycle.node.lifecycle.steps import CallbackOutcome
 from lifecycle.plan.model import PlannedNode
 from lifecycle.verify.observation import NodeConfiguration
@@ -70,55 +61,6 @@ def process_context(spec: HostSpec) -> Context:
             signal_handler_options=SignalHandlerOptions.NO,
         )
     return rclpy.get_default_context()
-
-
-class Participants:
-    """Contexts, and with them participants, for nodes that may share one and nodes that must not.
-
-    Nodes of equal transports, datagram size and connection URLs share. The first ones get the
-    process's default context, which is what code that names none uses.
-
-    Args:
-        default: that context.
-    """
-
-    def __init__(self, default: Context) -> None:
-        self._default = default
-        self._made: dict[ParticipantSettings, Context] = {}
-
-    @contextlib.contextmanager
-    def carrying(self, planned: PlannedNode) -> Iterator[Context]:
-        """Yield the context that `planned` is to be constructed on, inside the block.
-
-        Raises:
-            LifecycleError: its participant cannot be made as planned.
-        """
-        settings = ParticipantSettings.of(planned)
-        context = self._made.get(settings)
-        if context is not None:
-            yield context
-            return
-        context = self._default
-        is_new = bool(self._made)  # a user's module may have made the default context's
-        if is_new:
-            context = Context()
-            with discovery_by_profile(settings):
-                context.init(args=[], domain_id=self._default.get_domain_id())
-        with made_participant(context, settings, is_new=is_new):
-            yield context
-        self._made[settings] = context
-
-
-def maker_of(planned: PlannedNode, folders: tuple[str, ...]) -> Callable[..., Any]:
-    """Import the class or function of one planned node.
-
-    Raises:
-        LifecycleError: it cannot be used as planned. What its module raises passes.
-    """
-    found = load_nodes(planned.run.python, folders)
-    if isinstance(found, type):
-        refuse_unmanaged(planned, found)
-    return found
 
 
 _ANSWERED_WITHOUT_CONFIGURATION = frozenset(
@@ -144,117 +86,6 @@ _MARKS_S = 0.5
 """How often marks are read again; only in processes with nodes that have some."""
 
 
-class HostCommands:
-    """Carries out the commands to the nodes of one process.
-
-    Args:
-        nodes: by full name, as they are at any time.
-        report: listens to their configurations, to send them where the answers go.
-        of_process: what the operations of the whole process do.
-    """
-
-    def __init__(
-        self,
-        nodes: Mapping[str, Hosted],
-        report: Callable[[NodeConfiguration], None],
-        of_process: Mapping[Operation, Callable[[], object]],
-    ) -> None:
-        self._nodes = nodes
-        self._report = report
-        self._of_process = of_process
-        self._marks: dict[str, tuple[int | None, ...]] = {}
-
-    def note_marks(self, node: Hosted) -> None:
-        """Take the DSCP of a node's sockets that is reported now."""
-        if is_marked(node):
-            self._marks[node.full_name] = node.marks
-
-    def look_at_marks(self) -> None:
-        """Have marks that are not as they were reported reported again: no event says so."""
-        for node in tuple(self._nodes.values()):
-            if self._has_other_marks(node):
-                self.note_marks(node)
-                node.configuration_changes.touch()
-
-    def _has_other_marks(self, node: Hosted) -> bool:
-        before = self._marks.get(node.full_name)
-        return before is not None and node.marks != before
-
-    async def execute(self, command: Command) -> Event:
-        """Carry out one command and return the answer to it, whatever happens."""
-        try:
-            return await self._carry_out(command)
-        except ChangedError as error:
-            return self._reply(command, ok=False, error=str(error), changed=True)
-        except LifecycleError as error:
-            return self._reply(command, ok=False, error=str(error), describe=False)
-        except Exception as error:  # noqa: BLE001 - each command is answered exactly once
-            traceback.print_exc()
-            line = f"{type(error).__name__}: {error}"
-            return self._reply(command, ok=False, error=line, describe=False)
-
-    async def _carry_out(self, command: Command) -> Event:
-        node = self._nodes.get(command.node)
-        if node is None:
-            known = ", ".join(self._nodes) or "no node"
-            raise LifecycleError(f"cannot find node {command.node!r}; this process hosts {known}")
-        operation, ok, error = command.operation, True, ""
-        if operation in self._of_process:
-            self._of_process[operation]()
-        elif operation is Operation.CONNECT_TO:
-            data_layer_of(node).connect_to(command.connection, command.connections)
-        elif operation is Operation.MAP_TO:
-            await data_layer_of(node).map_to(command.endpoint, command.connection)
-        elif operation is Operation.DISCONNECT_FROM:
-            data_layer_of(node).disconnect(command.connection)
-        elif operation is not Operation.GET_CONFIGURATION:
-            if operation is Operation.ACTIVATE and self._has_other_marks(node):
-                node.configuration_changes.touch()
-                raise ChangedError(
-                    f"cannot activate {node.full_name}: the DSCP of its sockets was changed since "
-                    "it was verified",
-                    hint="look for IP_TOS or IPV6_TCLASS in its code",
-                )
-            result = await node.change_for_supervisor(operation.value)
-            ok, error = result.outcome is CallbackOutcome.SUCCESS, result.error
-        return self._reply(command, ok=ok, error=error)
-
-    def _reply(
-        self,
-        command: Command,
-        *,
-        ok: bool,
-        error: str = "",
-        describe: bool = True,
-        changed: bool = False,
-    ) -> Event:
-        node = self._nodes.get(command.node)
-        if node is None:
-            return Event(kind="reply", node=command.node, id=command.id, ok=ok, error=error)
-        state = node.reported
-        carries = describe and (
-            command.operation not in _ANSWERED_WITHOUT_CONFIGURATION
-            # No event reports its sockets: what its callback did to them is read when it has ended.
-            or (command.operation is Operation.ACTIVATE and is_marked(node))
-        )
-        configuration, reports = None, False
-        if carries:
-            self.note_marks(node)
-            configuration, reports = node.configuration_changes.give(self._report)
-        return Event(
-            kind="reply",
-            node=command.node,
-            id=command.id,
-            ok=ok,
-            state=state.label,
-            connected=state.connected,
-            error=error,
-            configuration=configuration,
-            reports=reports,
-            changed=changed,
-        )
-
-
 _LEAVE_S = 0.5
 """For the participants of nodes that were constructed while another's module is imported."""
 
@@ -267,13 +98,16 @@ class Host:
         self._context = context
         self._channel = channel
         run = spec.nodes[0].run
-        watchdog: Watchdog | Heartbeat | None = None
-        if channel.descriptors:
-            sign = BusySign(*channel.descriptors)
+        sign = BusySign(*channel.descriptors) if channel.descriptors else None
+        if sign is not None:
             sign.show_stacks()
-            kind = Watchdog if run.executor is Executor.SINGLE else Heartbeat
-            watchdog = kind(sign, lambda _: channel.write(Event(kind="beat")))
-        self._loop = NodeLoop(context, watchdog, executor=run.executor, threads=run.threads)
+        self._loop = NodeLoop(
+            context,
+            sign,
+            lambda _: channel.write(Event(kind="beat")),
+            executor=run.executor,
+            threads=run.threads,
+        )
         self._lock = threading.Lock()
         self._imports = False
         self._ended = False
@@ -281,20 +115,8 @@ class Host:
         self._is_orderly = False
         self._left = threading.Event()
         self._nodes: dict[str, Hosted] = {}
-        self._participants = Participants(context)
-        self._adoption = Adoption(
-            self._participants.carrying,
-            self._loop,
-            supervisor=spec.system,
-        )
-        self._commands = HostCommands(
-            self._nodes,
-            self._report_configuration,
-            {
-                Operation.SEND_AGAIN_SOON: send_again_soon,
-                Operation.REPUBLISH_NAMES: self._loop.republish_names,
-            },
-        )
+        self._adoption = Adoption(context, self._loop, supervisor=spec.system, joins=spec.joins)
+        self._marks: dict[str, tuple[int | None, ...]] = {}
 
     def run(self) -> NoReturn:
         """Construct, say ready, obey; never returns."""
@@ -302,7 +124,6 @@ class Host:
         self._obey()
         beside = {self._channel.fileno(): self._receive}
         with on_signal(lambda number: self._end(number.name), beside):
-            follow_nodes(self._adoption)
             for index, planned in enumerate(self._spec.nodes):
                 failure: Exception | None = None
                 try:
@@ -373,13 +194,12 @@ class Host:
 
     def _construct(self, planned: PlannedNode, maker: Callable[..., Any]) -> None:
         group = [each for each in self._spec.nodes if each.run == planned.run]
-        by_key = {each.key: each for each in group}
-        for key, node, hosted in self._adoption.make(planned, group, maker):
-            self._nodes[by_key[key].full_name] = hosted
-            if by_key[key].managed:
+        for hosted in self._adoption.make(planned, group, maker):
+            self._nodes[hosted.full_name] = hosted
+            if hosted.spec.managed:
                 hosted.add_listener(self._report_state)
             hosted.configuration_changes.listen(self._report_configuration)
-            self._loop.add(node, hosted)
+            self._loop.add(hosted)
 
     async def _ready(self) -> None:
         for hosted in self._nodes.values():
@@ -388,11 +208,6 @@ class Host:
         self._channel.write(Event(kind="ready"))
         if any(is_marked(hosted) for hosted in self._nodes.values()):
             threading.Thread(target=self._watch_marks, name="marks", daemon=True).start()
-
-    def _watch_marks(self) -> None:
-        """Read the marks of the sockets again and again, whatever the node's callbacks do."""
-        while not self._left.wait(_MARKS_S):
-            self._commands.look_at_marks()
 
     def _report_state(self, hosted: Hosted) -> None:
         state = hosted.reported
@@ -407,7 +222,7 @@ class Host:
 
     def _report_configuration(self, configuration: NodeConfiguration) -> None:
         if (hosted := self._nodes.get(configuration.name)) is not None:
-            self._commands.note_marks(hosted)
+            self._note_marks(hosted)
         self._channel.write(
             Event(
                 kind="configuration",
@@ -473,8 +288,104 @@ class Host:
                 _say(f"{hosted.full_name} cannot be deactivated: {failed}")
         self._loop.stop("the supervisor is gone", code=0)
 
+    # What the supervisor asks for.
+
+    def _note_marks(self, node: Hosted) -> None:
+        """Take the DSCP of a node's sockets that is reported now."""
+        if is_marked(node):
+            self._marks[node.full_name] = node.marks
+
+    def _watch_marks(self) -> None:
+        """Have marks that are not as they were reported reported again: no event says so.
+
+        They are read again and again, whatever the node's callbacks do.
+        """
+        while not self._left.wait(_MARKS_S):
+            for node in tuple(self._nodes.values()):
+                if self._has_other_marks(node):
+                    self._note_marks(node)
+                    node.configuration_changes.touch()
+
+    def _has_other_marks(self, node: Hosted) -> bool:
+        before = self._marks.get(node.full_name)
+        return before is not None and node.marks != before
+
     async def _execute(self, command: Command) -> None:
-        self._channel.write(await self._commands.execute(command))
+        """Carry out one command and answer it, whatever happens."""
+        try:
+            reply = await self._carry_out(command)
+        except ChangedError as error:
+            reply = self._reply(command, ok=False, error=str(error), changed=True)
+        except LifecycleError as error:
+            reply = self._reply(command, ok=False, error=str(error), describe=False)
+        except Exception as error:  # noqa: BLE001 - each command is answered exactly once
+            traceback.print_exc()
+            line = f"{type(error).__name__}: {error}"
+            reply = self._reply(command, ok=False, error=line, describe=False)
+        self._channel.write(reply)
+
+    async def _carry_out(self, command: Command) -> Event:
+        node = self._nodes.get(command.node)
+        if node is None:
+            known = ", ".join(self._nodes) or "no node"
+            raise LifecycleError(f"cannot find node {command.node!r}; this process hosts {known}")
+        operation, ok, error = command.operation, True, ""
+        if operation is Operation.SEND_AGAIN_SOON:
+            send_again_soon()
+        elif operation is Operation.REPUBLISH_NAMES:
+            self._loop.republish_names()
+        elif operation is Operation.CONNECT_TO:
+            node.data_layer.connect_to(command.connection, command.connections)
+        elif operation is Operation.MAP_TO:
+            await node.data_layer.map_to(command.endpoint, command.connection)
+        elif operation is Operation.DISCONNECT_FROM:
+            node.data_layer.disconnect(command.connection)
+        elif operation is not Operation.GET_CONFIGURATION:
+            if operation is Operation.ACTIVATE and self._has_other_marks(node):
+                node.configuration_changes.touch()
+                raise ChangedError(
+                    f"cannot activate {node.full_name}: the DSCP of its sockets was changed since "
+                    "it was verified",
+                    hint="look for IP_TOS or IPV6_TCLASS in its code",
+                )
+            result = await node.change_for_supervisor(operation.value)
+            ok, error = result.outcome is CallbackOutcome.SUCCESS, result.error
+        return self._reply(command, ok=ok, error=error)
+
+    def _reply(
+        self,
+        command: Command,
+        *,
+        ok: bool,
+        error: str = "",
+        describe: bool = True,
+        changed: bool = False,
+    ) -> Event:
+        node = self._nodes.get(command.node)
+        if node is None:
+            return Event(kind="reply", node=command.node, id=command.id, ok=ok, error=error)
+        state = node.reported
+        carries = describe and (
+            command.operation not in _ANSWERED_WITHOUT_CONFIGURATION
+            # No event reports its sockets: what its callback did to them is read when it has ended.
+            or (command.operation is Operation.ACTIVATE and is_marked(node))
+        )
+        configuration, reports = None, False
+        if carries:
+            self._note_marks(node)
+            configuration, reports = node.configuration_changes.give(self._report_configuration)
+        return Event(
+            kind="reply",
+            node=command.node,
+            id=command.id,
+            ok=ok,
+            state=state.label,
+            connected=state.connected,
+            error=error,
+            configuration=configuration,
+            reports=reports,
+            changed=changed,
+        )
 
 
 class _Output:

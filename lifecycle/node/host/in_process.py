@@ -7,11 +7,10 @@ out. Nothing is supervised or verified; pytest's fixture `lifecycle_node` makes 
 from __future__ import annotations
 
 import collections
-import contextlib
 import functools
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,13 +22,11 @@ from lifecycle.errors import BringUpError, UsageError
 from lifecycle.manifest.model import EndpointKind, RunKind
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.middleware.fastdds.settings import discovery_by_profile
-from lifecycle.middleware.rcl.executor import NodeExecutor
-from lifecycle.middleware.rcl.hidden_node import made_participant
 from lifecycle.middleware.rcl.qos import import_interface, to_rclpy
-from lifecycle.middleware.rcl.rclpy_nodes import Watching, follow_nodes
-from lifecycle.node.author.spec import Mode
-from lifecycle.node.host.foreign import Adoption, ForeignNode, Hosted
-from lifecycle.node.host.hosting import maker_of
+from lifecycle.node.author.managed import Managed
+from lifecycle.node.host.adoption import Adoption, maker_of
+from lifecycle.node.host.foreign import ForeignNode
+from lifecycle.node.host.loop import NodeLoop
 from lifecycle.node.lifecycle.steps import CallbackOutcome, Result
 from lifecycle.plan.model import PlannedNode
 
@@ -60,7 +57,6 @@ class NodeInProcess:
     Attributes:
         node: the user's own object.
         peer: an ordinary rclpy node beside it, spun by the same thread.
-        watching: events of nodes that are not ours.
     """
 
     def __init__(
@@ -84,61 +80,25 @@ class NodeInProcess:
         self._context = Context()
         with discovery_by_profile(ParticipantSettings.of(planned)):
             self._context.init(args=[], domain_id=domain_id)
-        self._executor = NodeExecutor(context=self._context)
-        self.watching = Watching()
-        self._executor.add_node(self.watching)
+        self._loop = NodeLoop(self._context)
+        adoption = Adoption(self._context, self._loop)
         try:
-            made = self._construct(planned, group, maker)
+            self._all = adoption.make(planned, group or (planned,), maker)
         except BaseException:
-            self._executor.shutdown()
+            self._loop.close()
             self._context.try_shutdown()
             raise
-        self._all: list[tuple[Node, Hosted]] = [(node, hosted) for _, node, hosted in made]
-        self.node: Any
-        ((self.node, self._hosted),) = (each[1:] for each in made if each[0] == planned.key)
+        finally:
+            adoption.unfollow()
+        (self._hosted,) = (each for each in self._all if each.spec.key == planned.key)
+        self.node: Any = self._hosted.node
         self.peer = Node("lifecycle_test_peer", context=self._context, enable_rosout=False)
         self._make_peers()
-        for node, hosted in self._all:
-            if not isinstance(hosted, ForeignNode):
-                self._executor.add_node(node)
-        self._executor.add_node(self.peer)
+        for each in self._all:
+            self._loop.add(each)
+        self._loop.spin(self.peer)
         self._thread = threading.Thread(target=self._spin, name=planned.full_name, daemon=True)
         self._thread.start()
-
-    def _construct(
-        self, planned: PlannedNode, group: Sequence[PlannedNode], maker: Callable[..., Any]
-    ) -> tuple[tuple[str, Any, Hosted], ...]:
-        """Make the nodes as a host does."""
-
-        @contextlib.contextmanager
-        def carrying(each: PlannedNode) -> Iterator[Context]:
-            with made_participant(self._context, ParticipantSettings.of(each)):
-                yield self._context
-
-        adoption = Adoption(carrying, self, mode=Mode.MANUAL)
-        follow_no_more = follow_nodes(adoption)
-        try:
-            return adoption.make(planned, group or (planned,), maker)
-        finally:
-            follow_no_more()
-
-    # What runs the callbacks of nodes that are not ours.
-
-    def spin(self, node: Node) -> None:
-        """Run a node's callbacks from now on."""
-        self._executor.add_node(node)
-
-    def rest(self, node: Node) -> None:
-        """Run no callback of a node that begins from now on."""
-        self._executor.remove_node(node)
-
-    def call_soon(self, task: Callable[..., Any], *arguments: object) -> None:
-        """Run a function, sync or async, where callbacks of nodes run."""
-        self._executor.create_task(task, *arguments)
-
-    def call_beside(self, task: Callable[[], Any]) -> object:
-        """As `call_soon`: everything runs in one thread."""
-        return self._executor.create_task(task)
 
     def _make_peers(self) -> None:
         from rcl_interfaces.msg import Log
@@ -179,7 +139,7 @@ class NodeInProcess:
     def _spin(self) -> None:
         try:
             while True:
-                self._executor.next_callback()()
+                self._loop.turn()
         except (ShutdownException, ExternalShutdownException):
             pass
         except BaseException as error:  # noqa: BLE001 - raised in the test's thread
@@ -242,12 +202,8 @@ class NodeInProcess:
             raise UsageError(
                 f"cannot {transition} {self._planned.full_name}: a plain node has no states"
             )
-        if isinstance(hosted, ForeignNode):
-            result: Result = self.run(
-                lambda: hosted.change_for_supervisor(transition), self._limit_s
-            )
-        else:
-            result = self.run(lambda: hosted.change(transition), self._limit_s)
+        change = hosted.change if isinstance(hosted, Managed) else hosted.change_for_supervisor
+        result: Result = self.run(lambda: change(transition), self._limit_s)
         if result.outcome is not CallbackOutcome.SUCCESS:
             raise BringUpError(f"cannot {transition} {self._planned.full_name}: {result.error}")
 
@@ -276,7 +232,7 @@ class NodeInProcess:
                 done.append((result, error))
                 self._changed.notify_all()
 
-        self._executor.create_task(call)
+        self._loop.call_soon(call)
         self._wait(lambda: done, f"cannot finish {function!r}", timeout_s)
         result, error = done[0]
         if error is not None:
@@ -350,22 +306,23 @@ class NodeInProcess:
         try:
             if not self._closed:
                 self._closed = True
-                for _, hosted in self._all:
+                for hosted in self._all:
                     self.run(functools.partial(hosted.shut_down, "the test is over"), self._limit_s)
         finally:
-            self._executor.shutdown()
+            self._loop.close()
             self._thread.join(WAIT_S)
-            for _, hosted in self._all:
+            for hosted in self._all:
                 if isinstance(hosted, ForeignNode):
                     hosted.close()
-            nodes = (self.peer, *(node for node, _ in self._all))
+            nodes = (self.peer, *self._loop.nodes)
             for each in nodes:
                 each.destroy_node()
-            for _, hosted in self._all:
+            for hosted in self._all:
                 if isinstance(hosted, ForeignNode):
                     hosted.destroyed()
-            self._context.try_shutdown()
-            self._context.destroy()
+            for context in dict.fromkeys([self._context, *(each.context for each in nodes)]):
+                context.try_shutdown()
+                context.destroy()
 
 
 _LOOK_S = 0.02

@@ -25,7 +25,7 @@ import threading
 import time
 import traceback
 import weakref
-from collections.abc import Callable, Coroutine, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 from rclpy.clock import Clock
@@ -46,11 +46,11 @@ from lifecycle.middleware.process.teardown import leave_and_exit
 from lifecycle.middleware.rcl.executor import NodeExecutor, described
 from lifecycle.middleware.rcl.hidden_node import hidden_nodes, republish_names
 from lifecycle.middleware.rcl.rclpy_nodes import Watching
-from lifecycle.node.author.node import LifecycleNode
+from lifecycle.node.author.managed import Managed
 from lifecycle.node.lifecycle.steps import hint
 
 if TYPE_CHECKING:
-    from lifecycle.node.host.foreign import Hosted
+    from lifecycle.node.host.adoption import Hosted
 
 
 class Watchdog:
@@ -131,16 +131,16 @@ class Heartbeat:
         self._runs = False
         sign.speak_for_process()
 
-    def start(self) -> None:
-        """The executor runs from now on."""
-        with self._lock:
-            self._runs = True
-            self._last_s = dict.fromkeys(self._timers, time.monotonic())
-            self._mark()
-
     def add(self, hosted: Hosted) -> None:
         """Leave the transitions of a node to their own deadlines."""
         hosted.add_listener(self._follow)
+
+    def run(self, *, runs: bool) -> None:
+        """Watch from now on, as the executor runs, or nothing any more."""
+        with self._lock:
+            self._runs = runs
+            self._last_s = dict.fromkeys(self._timers, time.monotonic())
+            self._mark()
 
     def spin(self, node: Node) -> None:
         """Watch a node that was added to the executor."""
@@ -157,12 +157,6 @@ class Heartbeat:
             Node.destroy_timer(node, timer)
         with self._lock:
             self._last_s.pop(node, None)
-            self._mark()
-
-    def stop(self) -> None:
-        """Watch nothing any more; again is harmless."""
-        with self._lock:
-            self._runs = False
             self._mark()
 
     def _beat(self, node: Node) -> None:
@@ -208,16 +202,19 @@ class NodeLoop:
 
     Args:
         context: of the executor; nodes may have others.
-        watchdog: notified when a callback begins and ends; for an executor that is not `single` a
-            Heartbeat.
+        sign: this process's busy sign; None where nobody looks at it.
+        on_overlong: called with the seconds that a callback took beyond the limit of the sign.
         executor: what runs the callbacks of nodes. One that is not `single` has a thread of its
             own, or several.
         threads: of a `multi` one; 0 is one for each processor, at least two.
 
+    Attributes:
+        watching: events that this loop waits for, whatever runs the callbacks of nodes.
+
     Example:
         >>> loop = NodeLoop(context)
         >>> camera = Camera()
-        >>> loop.add(camera, camera.lifecycle)
+        >>> loop.add(camera.lifecycle)
         >>> ending = lambda number: loop.stop(f"signal {number}", code=0)
         >>> with on_signal(ending):
         ...     loop.spin_and_exit()
@@ -226,19 +223,24 @@ class NodeLoop:
     def __init__(
         self,
         context: Context,
-        watchdog: Watchdog | Heartbeat | None = None,
+        sign: BusySign | None = None,
+        on_overlong: Callable[[float], None] = lambda _: None,
         *,
         executor: Executor = Executor.SINGLE,
         threads: int = 0,
     ) -> None:
         self._context = context
-        self._watchdog = watchdog
+        self.watching = Watching()
         self._executor = NodeExecutor(context=context)
+        self._executor.add_node(self.watching)
         self._own: Any = self._executor
+        self._watchdog: Watchdog | None = None
+        self._heartbeat: Heartbeat | None = None
         if executor is not Executor.SINGLE:
             self._own = _executor(executor, threads, context)
-        self._watching: Watching | None = None
-        self._nodes: list[Node] = []
+            self._heartbeat = Heartbeat(sign, on_overlong) if sign else None
+        elif sign is not None:
+            self._watchdog = Watchdog(sign, on_overlong)
         self._hosted: list[Hosted] = []
         self._lock = threading.Lock()
         self._stopping = False
@@ -250,46 +252,38 @@ class NodeLoop:
     @property
     def nodes(self) -> tuple[Node, ...]:
         """Those that were added."""
-        return tuple(self._nodes)
+        return tuple(each.node for each in self._hosted)
 
-    @property
-    def watching(self) -> Watching:
-        """Events that this loop waits for, whatever runs the callbacks of nodes."""
-        if self._watching is None:
-            self._watching = Watching()
-            self._executor.add_node(self._watching)
-        return self._watching
-
-    def add(self, node: Node, hosted: Hosted) -> None:
+    def add(self, hosted: Hosted) -> None:
         """Shut a node down in the end, in reverse order of addition; a managed one is spun now."""
-        self._nodes.append(node)
         self._hosted.append(hosted)
-        if self._watchdog is not None:
-            self._watchdog.add(hosted)
-        if isinstance(node, LifecycleNode) and hosted is node.lifecycle:
-            self.spin(node)
+        for each in (self._watchdog, self._heartbeat):
+            if each is not None:
+                each.add(hosted)
+        if isinstance(hosted, Managed):
+            self.spin(hosted.node)
 
     def spin(self, node: Node) -> None:
         """Run a node's callbacks from now on, unless its own code has another executor do it."""
         if node.executor is None or node.executor is self._own:
             self._own.add_node(node)
-            if isinstance(self._watchdog, Heartbeat):
-                self._watchdog.spin(node)
+            if self._heartbeat is not None:
+                self._heartbeat.spin(node)
 
     def rest(self, node: Node) -> None:
         """Run no callback of a node that begins from now on."""
         if node.executor is self._own:
-            if isinstance(self._watchdog, Heartbeat):
-                self._watchdog.rest(node)
+            if self._heartbeat is not None:
+                self._heartbeat.rest(node)
             self._own.remove_node(node)
 
     def republish_names(self) -> None:
         """Make every participant of this process publish anew which nodes and endpoints it has."""
-        by_context = {id(node.context): node for node in self._nodes}
+        by_context = {id(node.context): node for node in self.nodes}
         republish_names([*by_context.values(), *hidden_nodes()])
 
-    def call_soon(self, task: Callable[..., Coroutine[Any, Any, None]], *arguments: object) -> None:
-        """Run an `async def` where callbacks of nodes run; from any thread. It must not raise.
+    def call_soon(self, task: Callable[..., Any], *arguments: object) -> None:
+        """Run a function, sync or async, where callbacks of nodes run; from any thread.
 
         Once the process leaves, nothing runs any more.
         """
@@ -317,8 +311,8 @@ class NodeLoop:
             sum(each.spec.timeouts.shutdown_s for each in self._hosted if each.spec.managed)
             + _LEAVE_S
         )
-        if isinstance(self._watchdog, Heartbeat):
-            self._watchdog.stop()
+        if self._heartbeat is not None:
+            self._heartbeat.run(runs=False)
         guard = threading.Thread(
             target=self._give_up, args=(bound_s, reason), name="give-up", daemon=True
         )
@@ -338,29 +332,29 @@ class NodeLoop:
         """
         if self._own is not self._executor:
             threading.Thread(target=self._spin_own, name="executor", daemon=True).start()
-            if isinstance(self._watchdog, Heartbeat):
-                self._watchdog.start()
+            if self._heartbeat is not None:
+                self._heartbeat.run(runs=True)
         while not self._done:
             try:
-                self._turn()
-            except (Exception, SystemExit) as error:  # noqa: BLE001, PERF203 - the user's code
+                self.turn()
+            except ShutdownException:  # noqa: PERF203
+                pass
+            except (Exception, SystemExit) as error:  # noqa: BLE001 - the user's code
                 self._failed(error)
-        with self._leaving:
-            self._left = True
-        if self._own is not self._executor:
-            self._own.shutdown(_LEAVE_S)
-        self._executor.shutdown()
-        contexts = dict.fromkeys([self._context, *(node.context for node in self._nodes)])
+        self.close()
+        contexts = dict.fromkeys([self._context, *(node.context for node in self.nodes)])
         last()
-        leave_and_exit(self._code, nodes=self._nodes, contexts=contexts)
+        leave_and_exit(self._code, nodes=self.nodes, contexts=contexts)
 
-    def _turn(self) -> None:
-        """Run the next callback under the watchdog."""
-        try:
-            callback = self._executor.next_callback()
-        except ShutdownException:
-            return
-        if not isinstance(self._watchdog, Watchdog):
+    def turn(self) -> None:
+        """Run the next callback in this thread; raises what it raises.
+
+        Raises:
+            ShutdownException: the loop was closed.
+            ExternalShutdownException: rclpy was shut down.
+        """
+        callback = self._executor.next_callback()
+        if self._watchdog is None:
             callback()
             return
         self._watchdog.begin(callback.entity)
@@ -368,6 +362,14 @@ class NodeLoop:
             callback()
         finally:
             self._watchdog.end()
+
+    def close(self) -> None:
+        """Run nothing any more."""
+        with self._leaving:
+            self._left = True
+        if self._own is not self._executor:
+            self._own.shutdown(_LEAVE_S)
+        self._executor.shutdown()
 
     def _spin_own(self) -> None:
         """Run the executor of nodes in this thread until it is shut down."""
@@ -410,7 +412,7 @@ class NodeLoop:
     def _give_up(self, bound_s: float, reason: str) -> None:
         """End the process when a blocking callback keeps the executor from doing so."""
         threading.Event().wait(bound_s)
-        names = ", ".join(node.get_fully_qualified_name() for node in self._nodes)
+        names = ", ".join(node.get_fully_qualified_name() for node in self.nodes)
         sys.stderr.write(
             f"cannot shut down {names} within {bound_s:g} s after {reason}: "
             "a callback blocks; the process ends without it\n"

@@ -20,33 +20,26 @@ import threading
 import time
 import traceback
 import typing
-from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any, NoReturn
+from collections.abc import Callable
+from typing import Any, NoReturn
 
 import rclpy
 from rclpy.signals import SignalHandlerOptions
 
 from lifecycle.errors import ExitCode
-from lifecycle.manifest.model import Executor, Run, RunKind, Timeouts
+from lifecycle.manifest.model import Run, RunKind, Timeouts
 from lifecycle.manifest.names import node_alive_topic
 from lifecycle.middleware.discovery.liveliness import AlivePublisher
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.middleware.fastdds.settings import discovery_by_profile
 from lifecycle.middleware.process.busy_sign import BusySign, Overdue
 from lifecycle.middleware.process.stacks import brief
-from lifecycle.middleware.rcl.hidden_node import made_participant
-from lifecycle.middleware.rcl.rclpy_nodes import follow_nodes
 from lifecycle.node.author.managed import Managed
-from lifecycle.node.author.spec import Construction, Mode, constructing, parse_mode
-from lifecycle.node.host.foreign import Adoption, Hosted
-from lifecycle.node.host.loop import Heartbeat, NodeLoop, Watchdog, on_signal
+from lifecycle.node.author.spec import Mode, parse_mode
+from lifecycle.node.host.adoption import Adoption, Hosted
+from lifecycle.node.host.loop import NodeLoop, on_signal
 from lifecycle.node.lifecycle.steps import CallbackOutcome
 from lifecycle.plan.model import PlannedNode
-
-if TYPE_CHECKING:
-    from rclpy.context import Context
-
-    from lifecycle.node.author.node import LifecycleNode
 
 _REPEATED_AFTER_S = (0.1, 0.3)
 """Fast DDS repeats what was lost after up to 3 s: too late for a silence."""
@@ -58,53 +51,51 @@ class OwnLiveliness:
 
     Args:
         limit_s: seconds, > 0, that a callback may take.
-        executor: what runs the callbacks.
 
     Attributes:
-        watchdog: for the loop that spins the node.
+        sign: for the loop that spins the node.
     """
 
-    def __init__(self, limit_s: float, executor: Executor = Executor.SINGLE) -> None:
-        self._sign = BusySign.make(limit_s)
-        self._sign.show_stacks()
+    def __init__(self, limit_s: float) -> None:
+        self.sign = BusySign.make(limit_s)
+        self.sign.show_stacks()
         self._lock = threading.Lock()
         self._silent: dict[str, str] = {}
         self._publisher: AlivePublisher | None = None
         self._name = ""
-        kind = Watchdog if executor is Executor.SINGLE else Heartbeat
-        self.watchdog = kind(self._sign, lambda _: self._announce(""))
 
-    def open(self, node: LifecycleNode, republish_names: Callable[[], None]) -> None:
+    def open(self, hosted: Managed, republish_names: Callable[[], None]) -> None:
         """Assert its liveliness from now on.
 
         Args:
-            node: whose name it has.
+            hosted: whose name it has.
             republish_names: called when a subscriber is matched, which may have dropped the names.
         """
-        self._name = node.lifecycle.full_name
+        self._name = hosted.full_name
         self._publisher = AlivePublisher(
-            node, node_alive_topic(self._name), on_listener=republish_names
+            hosted.node, node_alive_topic(self._name), on_listener=republish_names
         )
         threading.Thread(target=self._watch, name="watchdog", daemon=True).start()
 
     def _watch(self) -> None:
         while True:
-            why, again_s = self._sign.look()
+            why, again_s = self.sign.look()
             if why is Overdue.HANGS:
-                what = f" {self._sign.what}" if self._sign.what else ""
-                where = brief(self._sign.where(os.getpid()))
-                self._announce(
+                what = f" {self.sign.what}" if self.sign.what else ""
+                where = brief(self.sign.where(os.getpid()))
+                self.announce(
                     f"a callback{what} in its process (pid {os.getpid()}) has been running for "
-                    f"more than {self._sign.limit_s:g} s{where and f', in {where}'}"
+                    f"more than {self.sign.limit_s:g} s{where and f', in {where}'}"
                 )
             elif why is Overdue.UNSERVED:
-                self._announce(
+                self.announce(
                     f"its process (pid {os.getpid()}) gets no processor for its callback: the "
                     "machine is overloaded"
                 )
             time.sleep(again_s)
 
-    def _announce(self, why: str) -> None:
+    def announce(self, why: str) -> None:
+        """Say why it is silent; nothing takes that back."""
         with self._lock:
             silent = self._silent = {self._name: why} if why else {}
         self._publish(silent)
@@ -163,20 +154,25 @@ def run(
     context = rclpy.get_default_context()
     planned = Run(kind=RunKind.PYTHON) if spec is None else spec.run
     limit_s = (spec.timeouts if spec is not None else Timeouts()).silent_s
-    liveliness = OwnLiveliness(limit_s, planned.executor)
+    liveliness = OwnLiveliness(limit_s)
     loop = NodeLoop(
-        context, liveliness.watchdog, executor=planned.executor, threads=planned.threads
+        context,
+        liveliness.sign,
+        lambda _: liveliness.announce(""),
+        executor=planned.executor,
+        threads=planned.threads,
     )
     with on_signal(lambda number: _on_signal(number, loop, report, interrupted)):
+        adoption = Adoption(context, loop, mode=mode, use_global_arguments=True)
+        hosted: Hosted
         if spec is None:
-            node = _make_alone(node_class, mode, context)
-            hosted: Hosted = node.lifecycle
+            hosted = adoption.make_unplanned(node_class)
         else:
-            node, hosted = _adopt(node_class, spec, loop, context=context, mode=mode)
+            (hosted,) = adoption.make(spec, [spec], node_class)
         name = hosted.full_name
-        loop.add(node, hosted)
+        loop.add(hosted)
         if isinstance(hosted, Managed):
-            liveliness.open(node, loop.republish_names)
+            liveliness.open(hosted, loop.republish_names)
         hosted.add_listener(lambda _: report(f"{name}: {_state(hosted)}"))
         report(f"{name}: {_state(hosted)}")
         if isinstance(hosted, Managed):
@@ -187,34 +183,6 @@ def run(
             loop.call_soon(_bring_up, hosted, loop, report)
         loop.spin_and_exit()
     raise AssertionError("spin_and_exit returned")
-
-
-def _make_alone(node_class: Callable[..., Any], mode: Mode | None, context: Context) -> Any:
-    """Make a LifecycleNode that has no plan."""
-    construction = Construction(spec=None, mode=mode, context=context, use_global_arguments=True)
-    with made_participant(context, ParticipantSettings()), constructing(construction):
-        return node_class()
-
-
-def _adopt(
-    maker: Callable[..., Any],
-    spec: PlannedNode,
-    loop: NodeLoop,
-    *,
-    context: Context,
-    mode: Mode | None,
-) -> tuple[Any, Hosted]:
-    """Make a node as planned; nothing holds it but its own states."""
-
-    @contextlib.contextmanager
-    def carrying(planned: PlannedNode) -> Iterator[Context]:
-        with made_participant(context, ParticipantSettings.of(planned)):
-            yield context
-
-    adoption = Adoption(carrying, loop, mode=mode, use_global_arguments=True)
-    follow_nodes(adoption)
-    ((_, node, hosted),) = adoption.make(spec, [spec], maker)
-    return node, hosted
 
 
 async def _bring_up(hosted: Hosted, loop: NodeLoop, report: Callable[[str], None]) -> None:

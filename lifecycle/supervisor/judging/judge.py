@@ -19,7 +19,7 @@ from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.health.liveliness import arrivals
 from lifecycle.supervisor.judging.standstill import Standstill
 from lifecycle.supervisor.processes.scope import unlimited
-from lifecycle.verify.judge import verify, with_findings, with_only
+from lifecycle.verify.judge import verify, with_findings, without_findings
 from lifecycle.verify.observation import Observation
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import rule
@@ -102,7 +102,7 @@ class Judge:
         if self._stills != (stills := self._standstill.count()):
             # What arrived meanwhile was not taken in: who came has to be asked for.
             self._stills = stills
-            self._observer.expect_newcomers(everybody=True)
+            self._observer.discovery.settling.expect_newcomers(everybody=True)
         system = self._system
         await system.refresh(self._observer, marks=stage is Stage.CONNECTED)
         observation = without(await self._observer.observe(self._asked()), system.dead())
@@ -157,8 +157,8 @@ class Judge:
         if self._again is not None:
             self._again.cancel()
         self._again = loop.call_at(min(passing.values()), self._system.touch)
-        findings = tuple(each for each in verdict.findings if each.key not in passing)
-        return with_only(verdict, findings, self._system.expected.policy)
+        dropped = [found[key] for key in passing]
+        return without_findings(verdict, dropped, self._system.expected.policy)
 
     def unsaid_s(self, verdict: Verdict) -> float:
         """Return for how long the health is waited for of nodes that have not said how they are.

@@ -209,7 +209,7 @@ async def settled(graph: GraphObserver, wait_s: float) -> tuple[Snapshot, str]:
         while True:
             changed.clear()
             snapshot = graph.snapshot()
-            pending = _pending(snapshot, settling_s=graph.settling_s())
+            pending = _pending(snapshot, settling_s=graph.settling.left_s())
             left_s = deadline - loop.time()
             if left_s <= 0:
                 what = ", ".join(pending) or "it still changed"

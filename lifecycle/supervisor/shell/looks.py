@@ -120,7 +120,7 @@ class Looks:
                 if self._graph.reread_parameters() or has_asked:
                     continue
             lately = loop.time() < newcomers_until_s
-            if not (lately and self._graph.expect_newcomers()):
+            if not (lately and self._graph.discovery.settling.expect_newcomers()):
                 break  # else the next look waits for them
         self._saw(judge.seen)
         self._was_stale = run.mark != mark

@@ -89,9 +89,9 @@ def test_with_an_unknown_rcl_only_what_strictly_requires_a_unique_flow_is_refuse
 
 def test_a_struct_that_is_laid_out_otherwise_is_refused() -> None:
     rcl = abi.Rcl()
-    shifted = rcl.default_options()
+    shifted = rcl.call["rcl_subscription_get_default_options"]()
     shifted.options.qos.depth = 0
-    rcl.default_options = lambda: shifted
+    rcl.call["rcl_subscription_get_default_options"] = lambda: shifted
     with pytest.raises(MiddlewareError) as refused:
         rcl._check_layout("9.9.9")
     assert str(refused.value) == (
@@ -104,8 +104,9 @@ def test_a_struct_that_is_laid_out_otherwise_is_refused() -> None:
 def other_rmw(monkeypatch: pytest.MonkeyPatch) -> None:
     """An RMW without network flow endpoints that ignores the creation option, as Cyclone's."""
     rcl = abi.load()
-    for kind in rcl.nfes:
-        monkeypatch.setitem(rcl.nfes, kind, lambda *_: abi.RCL_RET_UNSUPPORTED)
+    for kind in ("publisher", "subscription"):
+        name = f"rcl_{kind}_get_network_flow_endpoints"
+        monkeypatch.setitem(rcl.call, name, lambda *_: abi.RCL_RET_UNSUPPORTED)
     monkeypatch.setattr(rcl, "take_error", lambda: "not supported by rmw_other")
 
 
@@ -140,7 +141,8 @@ def test_an_rmw_that_only_pretends_to_be_strict_is_refused(make_node: MakeNode) 
 def test_an_endpoint_that_listens_nowhere_is_refused(
     make_node: MakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(abi.load().nfes, "subscription", lambda *_: abi.RCL_RET_OK)
+    name = "rcl_subscription_get_network_flow_endpoints"
+    monkeypatch.setitem(abi.load().call, name, lambda *_: abi.RCL_RET_OK)
     strictly = UniqueRequirement.STRICTLY_REQUIRED
     with pytest.raises(MiddlewareError) as refused:
         create_subscription(make_node("n"), String, "/a", ignore, QosProfile(), unique=strictly)

@@ -47,7 +47,7 @@ for _ in range(int(sys.argv[2])):
     with GraphObserver(int(sys.argv[1])) as observer:
         while True:
             endpoints = {(each.node, each.name) for each in observer.snapshot()[1]}
-            if (left_s := observer.settling_s()) <= 0:
+            if (left_s := observer.settling.left_s()) <= 0:
                 break
             time.sleep(min(left_s, 0.01))
         found.append(("/existing", "/words") in endpoints)

@@ -402,7 +402,7 @@ def test_destroying_twice_is_harmless(domain_id: int) -> None:
 def _settled_after_s(observer: GraphObserver, began_s: float) -> float:
     while True:
         observer.snapshot()
-        if (left_s := observer.settling_s()) <= 0:
+        if (left_s := observer.settling.left_s()) <= 0:
             return time.monotonic() - began_s
         time.sleep(min(left_s, 0.005))
 

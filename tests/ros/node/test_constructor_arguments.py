@@ -10,7 +10,7 @@ import pytest
 from host_process import hosted
 from msgspec.structs import replace
 
-from lifecycle.node.host.foreign import keywords
+from lifecycle.node.host.adoption import keywords
 
 
 class _Needs:

@@ -50,6 +50,7 @@ class FakeGraph:
         self.offered: set[str] = set()
         self.foreign: set[str] = set()
         self.elsewhere: set[str] = set()
+        self.settling = self
 
     def snapshot(
         self, *, declared: Collection[str] = (), names: DeclaredNames = NO_NAMES
@@ -59,11 +60,7 @@ class FakeGraph:
             self.nodes = self.arriving.pop(0)
         return self.nodes, self.endpoints
 
-    def expect_newcomers(self, *, everybody: bool = False) -> bool:
-        del everybody
-        return False
-
-    def settling_s(self) -> float:
+    def left_s(self) -> float:
         return 0.01 if self.arriving else 0.0
 
     def offers(self, node: str, service: str) -> bool:

@@ -220,7 +220,8 @@ def announced(port: int, order: str = "<") -> bytes:
 
 
 def settled(settling: Settling, named: frozenset[str] = frozenset()) -> bool:
-    return settling.left_s(named) == 0.0
+    settling.saw(named, "")
+    return settling.left_s() == 0.0
 
 
 @pytest.mark.parametrize("byte_order", ["<", ">"])
@@ -269,7 +270,7 @@ def test_who_answers_and_never_has_a_node_is_waited_for_once(
         assert not settled(settling)
         time.sleep(2.0)
         assert settled(settling)
-        assert settling.expect_newcomers(frozenset(), "", everybody=True)
+        assert settling.expect_newcomers(everybody=True)
         peer.sendto(_ANSWER, asked_from)
         time.sleep(ANSWER_S)
         assert settled(settling)
@@ -280,19 +281,19 @@ def test_a_socket_of_another_process_that_came_is_asked_for_once(peer: socket.so
     with contextlib.closing(Settling(reach(25, (parse(url),), {}))) as settling:
         time.sleep(ANSWER_S)
         assert settled(settling)
-        assert not settling.expect_newcomers(frozenset(), "")
+        assert not settling.expect_newcomers()
         with of_another_process(peer):
-            assert settling.expect_newcomers(frozenset(), "")
+            assert settling.expect_newcomers()
             assert not settled(settling)
 
 
 def test_where_nobody_can_be_asked_it_is_a_time() -> None:
     settling = Settling((), 0.2)
-    assert 0.0 < settling.left_s(frozenset()) <= 0.2
+    assert 0.0 < settling.left_s() <= 0.2
     time.sleep(0.2)
     assert settled(settling)
-    assert not settling.expect_newcomers(frozenset(), "")
-    assert settling.expect_newcomers(frozenset(), "", everybody=True)
+    assert not settling.expect_newcomers()
+    assert settling.expect_newcomers(everybody=True)
     assert not settled(settling)
     assert settling.unasked_s == 0.2
     settling.within(0.001)

@@ -61,13 +61,13 @@ def _late() -> Any:
 def _node(activate: Any) -> ForeignNode:
     node = ForeignNode.__new__(ForeignNode)
     members: dict[str, Any] = {
-        "_node": types.SimpleNamespace(get_fully_qualified_name=lambda: "/base"),
+        "node": types.SimpleNamespace(get_fully_qualified_name=lambda: "/base"),
         "_gate": NodeGate(),
         "_machine": Machine(activate),
         "_is_constructed": True,
         "_let_through": False,
         "_supervisor": "robot",
-        "_spec": types.SimpleNamespace(timeouts=Timeouts(activate_s=0.05)),
+        "spec": types.SimpleNamespace(timeouts=Timeouts(activate_s=0.05)),
         "complain": lambda _: None,
     }
     for name, value in members.items():

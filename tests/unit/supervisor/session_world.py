@@ -189,7 +189,7 @@ class FakeParticipant:
         self.no_ros = ""
         self.refuses = ""
         self.refuses_live: dict[str, str] = {}
-        self.graph = self.discovery = self.state = self
+        self.graph = self.discovery = self.settling = self.state = self
         self.clients = self.services
         self._hosts = hosts
         self._reports: dict[str, NodeConfiguration] = {}

@@ -14,11 +14,12 @@ from lifecycle.manifest.model import (
 )
 from lifecycle.manifest.qos import Durability, Liveliness, QosProfile
 from lifecycle.plan.model import Plan
+from lifecycle.verify.judge import without_findings
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.tool_filter import takes_diagnostics
 from lifecycle.verify.verdict import OpenEndpoint, Stage, ToleratedNode, Verdict
 from tests.builders import at, need, node, planned, publisher, subscription
-from tests.unit.verify.edits import Edit, add_endpoint, add_node, both, change_report
+from tests.unit.verify.edits import Edit, add_endpoint, add_node, both, change_report, drop_node
 from tests.unit.verify.lines import verify
 from tests.unit.verify.perfect import perfect
 
@@ -41,6 +42,23 @@ def judged(plan: Plan, *edits: Edit) -> Verdict:
 
 def has(kind: EndpointKind, node: str, name: str, type_: str = STRING) -> OpenEndpoint:
     return OpenEndpoint(kind=kind, node=node, name=name, type=type_)
+
+
+def test_a_verdict_without_a_finding_is_as_if_it_had_not_been_made_its_flows_too() -> None:
+    plan = planned(
+        node("one", publisher("a")),
+        node("two", subscription("a")),
+        node("three", subscription("a")),
+    )
+    verdict = judged(plan, change_report(PUB, "/a", matched=3), drop_node("/three"))
+    peer = [each for each in verdict.findings if each.rule == "graph.unknown-peer"]
+    assert [each.outcome for each in verdict.flows] == [Outcome.VIOLATED] * 2
+    without = without_findings(verdict, peer, plan.policy)
+    assert [each.outcome for each in without.flows] == [Outcome.OK, Outcome.VIOLATED]
+    assert without.verdict is Outcome.VIOLATED
+    nothing = without_findings(verdict, verdict.findings, plan.policy)
+    assert (nothing.verdict, nothing.findings, nothing.blocking) == (Outcome.OK, (), False)
+    assert {each.outcome for each in nothing.flows} == {Outcome.OK}
 
 
 def test_undeclared_endpoints_of_nodes_that_may_have_such_are_listed_and_no_others() -> None:

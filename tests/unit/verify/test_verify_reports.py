@@ -26,7 +26,7 @@ from lifecycle.plan.build import build_plan
 from lifecycle.plan.model import Plan
 from lifecycle.verify.observation import NodeConfiguration
 from lifecycle.verify.outcome import Outcome
-from lifecycle.verify.report import render_text, to_json, to_junit, to_sarif
+from lifecycle.verify.report import render_text, to_github, to_json, to_junit, to_sarif
 from lifecycle.verify.rules import RULES
 from lifecycle.verify.verdict import (
     NOT_JUDGED,
@@ -693,3 +693,21 @@ def test_sarif_blames_the_end_of_a_run_only_where_no_finding_is_an_error():
     assert run["invocations"][0]["executionSuccessful"] is True
     (run,) = json.loads(to_sarif(replace(WRITTEN, run=None)))["runs"]
     assert "invocations" not in run
+
+
+@pytest.mark.parametrize("strict", [False, True])
+def test_a_verdict_on_github_is_its_text_and_an_annotation_for_each_finding(*, strict: bool):
+    verdict = after(both(drop_node("/robot/camera"), drop_node("/viewer")))
+    first, *others = verdict.findings
+    assert others
+    verdict = replace(verdict, findings=(replace(first, outcome=Outcome.UNVERIFIABLE), *others))
+    outcomes = [each.outcome for each in verdict.findings]
+    text = render_text(verdict)
+    found = to_github(verdict, strict=strict)
+    assert found.startswith(text)
+    lines = found.removeprefix(text).splitlines()
+    assert len(lines) == len(outcomes)
+    for line, outcome in zip(lines, outcomes, strict=True):
+        is_error = strict or outcome is Outcome.VIOLATED
+        assert line.startswith("::error " if is_error else "::warning ")
+        assert "file=" in line

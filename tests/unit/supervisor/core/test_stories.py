@@ -20,7 +20,7 @@ from lifecycle.manifest.model import (
     RunKind,
     Supervision,
 )
-from lifecycle.plan.model import Plan
+from lifecycle.plan.model import ExpectedParameter, ModeParameters, Plan
 from lifecycle.supervisor.control.protocol import ControlRequest
 from lifecycle.supervisor.core import inputs
 from lifecycle.supervisor.core.state import Level, Options, new_run
@@ -30,7 +30,9 @@ from lifecycle.supervisor.run.events import (
     ManifestApplied,
     Restarted,
     SystemReached,
+    VerdictChanged,
 )
+from lifecycle.verify.verdict import Stage
 from tests.builders import HERE, plan_of, planned_node
 from tests.unit.supervisor.core.playbook import Play
 from tests.unit.supervisor.core.world import verdict
@@ -468,3 +470,70 @@ def test_a_node_that_was_deactivated_for_a_violation_stays_so_until_it_is_resume
     assert play.levels == "4 3"
     play.order(ControlRequest.RESUME)
     assert play.levels == "4 4"
+
+
+# What is no node's
+
+
+@pytest.mark.parametrize(
+    ("finds", "keep_going", "ends"), [(False, True, True), (True, False, True), (True, True, False)]
+)
+def test_a_server_that_dies_ends_the_run_unless_nodes_only_found_each_other_by_it(
+    finds: bool, keep_going: bool, ends: bool
+) -> None:
+    play = Play(CHAIN, keep_going=keep_going)
+    play.give(inputs.Broken(subject="the server", message="pid 7 died", finds=finds))
+    play.wait(5.0)
+    (failed,) = (each for each in play.events if isinstance(each, Failure))
+    assert (failed.subject, failed.message) == ("the server", "pid 7 died")
+    assert (failed.rule, failed.ends_run) == ("run.process-died", ends)
+    assert play.run.is_over == ends
+    if ends:
+        assert play.code == ExitCode.BRING_UP_FAILED
+    assert play.run.broken == finds
+
+
+def test_a_server_that_dies_while_the_run_ends_is_passed_over() -> None:
+    play = Play(CHAIN, ways={"viewer shutdown": "hang"})
+    play.down()
+    before = list(play.events)
+    play.give(inputs.Broken(subject="the server", message="pid 7 died", finds=True))
+    assert not any(isinstance(each, Failure) for each in play.events[len(before) :])
+
+
+def test_what_is_found_beside_all_looks_ends_the_run_and_is_said() -> None:
+    play = Play(CHAIN, ways={"camera connect": "hang"})
+    found = verdict(INTRUDER)
+    play.give(inputs.Refused(verdict=found))
+    (said,) = (each for each in play.events if isinstance(each, VerdictChanged))
+    assert (said.verdict, said.stage) == (found, Stage.CONNECTED)
+    play.wait(30.0)
+    assert play.code == ExitCode.VIOLATED
+
+
+def test_a_mode_whose_parameters_a_node_refuses_is_left_again_with_the_node_s_reason() -> None:
+    modes = Mode(name="day", at=HERE), Mode(name="night", at=HERE)
+    rates = [
+        ModeParameters(
+            mode=mode.name,
+            parameters=(ExpectedParameter(name="rate", type="integer", value=value, at=HERE),),
+        )
+        for mode, value in zip(modes, (10, 5), strict=True)
+    ]
+    camera = replace(planned_node("camera"), mode_parameters=tuple(rates))
+    play = Play(replace(plan_of(camera), modes=modes), ways={"give camera": "rate is read-only"})
+    play.order(ControlRequest.MODE, mode="night")
+    play.wait(5.0)
+    code, error = play.answers[0]
+    assert code == ExitCode.BRING_UP_FAILED
+    assert "cannot enter mode 'night': rate is read-only" in error
+    assert play.run.mode == "day"
+
+
+def test_a_bring_up_that_takes_too_long_names_the_node_that_it_waits_for_and_its_process() -> None:
+    play = Play(CHAIN, ways={"camera configure": "hang"}, timeout_s=3.0)
+    play.wait(4.0)
+    (failed,) = (each for each in play.events if isinstance(each, Failure))
+    assert (failed.subject, failed.process) == ("/camera", "camera")
+    play.wait(30.0)
+    assert play.code == ExitCode.BRING_UP_FAILED

@@ -1,0 +1,330 @@
+"""Make the nodes of the user's classes and functions, each as one planned node.
+
+Owns: `Adoption`, which gives the nodes that a class or function constructs the names, parameters,
+remaps and participants of the plan; `Participants`, which nodes of a process share one; and what a
+class must be to be hosted.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import inspect
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from rclpy.context import Context
+from rclpy.node import Node
+
+from lifecycle.errors import BringUpError, LifecycleError
+from lifecycle.manifest.model import EndpointKind
+from lifecycle.middleware.discovery.environment import reach
+from lifecycle.middleware.discovery.prober import Prober
+from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
+from lifecycle.middleware.fastdds.settings import discovery_by_profile
+from lifecycle.middleware.rcl.graph_queries import OVER_DDS
+from lifecycle.middleware.rcl.hidden_node import made_participant
+from lifecycle.middleware.rcl.rclpy_nodes import follow_nodes, is_rclpy_managed
+from lifecycle.node.author import parameters
+from lifecycle.node.author.managed import Managed
+from lifecycle.node.author.node import LifecycleNode
+from lifecycle.node.author.spec import (
+    Construction,
+    Mode,
+    constructing,
+    load_nodes,
+    ros_arguments,
+)
+from lifecycle.node.host.foreign import ForeignNode
+from lifecycle.plan.model import PlannedNode
+
+if TYPE_CHECKING:
+    from lifecycle.node.host.loop import NodeLoop
+
+Hosted = Managed | ForeignNode
+"""What a host knows of one of its nodes."""
+
+
+class Participants:
+    """Contexts, and with them participants, for nodes that may share one and nodes that must not.
+
+    Nodes of equal transports, datagram size and connection URLs share. The first ones get the
+    process's default context, which is what code that names none uses.
+
+    Args:
+        default: that context.
+        joins: others run already. They answer a new participant once, before it listens, and would
+            announce themselves again within a second: they are asked to as soon as it listens.
+    """
+
+    def __init__(self, default: Context, *, joins: bool = False) -> None:
+        self._default = default
+        self._joins = joins
+        self._made: dict[ParticipantSettings, Context] = {}
+        self._probers: list[Prober] = []
+
+    @contextlib.contextmanager
+    def carrying(self, settings: ParticipantSettings) -> Iterator[Context]:
+        """Yield the context that a node is to be constructed on, inside the block.
+
+        Raises:
+            LifecycleError: its participant cannot be made as planned.
+        """
+        context = self._made.get(settings)
+        if context is not None:
+            yield context
+            return
+        context = self._default
+        is_new = bool(self._made)  # a user's module may have made the default context's
+        if is_new:
+            context = Context()
+            with discovery_by_profile(settings):
+                context.init(args=[], domain_id=self._default.get_domain_id())
+        with made_participant(context, settings, is_new=is_new):
+            if self._joins and OVER_DDS:
+                asked = reach(self._default.get_domain_id(), settings.urls, os.environ)
+                self._probers.append(Prober(asked))
+                self._probers[-1].ask(counted=False)
+            yield context
+        self._made[settings] = context
+
+
+class Adoption:
+    """Makes nodes of the user's classes and functions, each as one planned node.
+
+    Args:
+        context: of the process: its first nodes are constructed on it.
+        loop: runs the callbacks of nodes that are not ours.
+        supervisor: name of the system whose gate holds the nodes; empty for none.
+        joins: the rest of its system runs already.
+        mode: what drives the nodes; None leaves that to their own code.
+        use_global_arguments: nodes take remaps from the process's own --ros-args.
+
+    Attributes:
+        made: what stands for each node, by its key in the plan.
+    """
+
+    def __init__(
+        self,
+        context: Context,
+        loop: NodeLoop,
+        *,
+        supervisor: str = "",
+        joins: bool = False,
+        mode: Mode | None = Mode.MANUAL,
+        use_global_arguments: bool = False,
+    ) -> None:
+        self._participants = Participants(context, joins=joins)
+        self._loop = loop
+        self._supervisor = supervisor
+        self._mode = mode
+        self._use_global_arguments = use_global_arguments
+        self._waiting: list[PlannedNode] = []
+        self._current: PlannedNode | None = None
+        self._taken: PlannedNode | None = None
+        self._constructed: dict[str, Node] = {}
+        self._foreign: dict[int, ForeignNode] = {}
+        self.made: dict[str, Hosted] = {}
+        self.unfollow = follow_nodes(self)
+        """Ends that nodes of this process are taken for those of the plan."""
+
+    def make(
+        self, planned: PlannedNode, group: Sequence[PlannedNode], what: Callable[..., Any]
+    ) -> tuple[Hosted, ...]:
+        """Construct a planned node, and those of its group that the same call makes.
+
+        Args:
+            planned: the node that is to be made.
+            group: all that `what` may make, `planned` among them.
+            what: the class or function.
+
+        Raises:
+            LifecycleError: something else was made. What the class or function raises passes.
+        """
+        self._waiting = [each for each in group if each.key not in self.made]
+        self._current = planned
+        try:
+            with constructing(self):
+                returned = what(**keywords(planned, what))
+        finally:
+            self._waiting, self._current = [], None
+        self._check(planned, what, returned)
+        made: list[Hosted] = []
+        for key, node in self._constructed.items():
+            foreign = self._foreign.get(id(node))
+            if foreign is not None:
+                foreign.constructed()
+            made.append(foreign or node.lifecycle)
+            self.made[key] = made[-1]
+        self._constructed.clear()
+        return tuple(made)
+
+    def make_unplanned(self, what: Callable[..., Any]) -> Managed:
+        """Construct a LifecycleNode that has no plan."""
+        with self._participants.carrying(ParticipantSettings()) as context:
+            construction = Construction(
+                spec=None,
+                mode=self._mode,
+                context=context,
+                use_global_arguments=self._use_global_arguments,
+            )
+            with constructing(construction):
+                made: Managed = what().lifecycle
+                return made
+
+    def _check(self, planned: PlannedNode, what: Callable[..., Any], returned: object) -> None:
+        reference = planned.run.python
+        nodes = [each for each in _each(returned) if isinstance(each, Node)]
+        if planned.key not in self._constructed:
+            names = ", ".join(each.get_fully_qualified_name() for each in nodes) or repr(returned)
+            raise BringUpError(
+                f"cannot use {reference!r}: it made {names}, and no node for {planned.full_name}",
+                hint="return the node, or a list of nodes; the host spins them",
+            )
+        known = {id(each.node) for each in self.made.values()}
+        known.update(map(id, self._constructed.values()))
+        for each in nodes:
+            if id(each) not in known:
+                name = each.get_fully_qualified_name()
+                raise BringUpError(
+                    f"cannot host {name}, which {reference!r} returns: no node is declared for it "
+                    f"beside {planned.full_name}",
+                    hint=f"add a node of that name with the same `run:` and `process: "
+                    f"{planned.process}`",
+                )
+        if not isinstance(what, type) and not nodes:
+            raise BringUpError(
+                f"cannot use {reference!r}: it returns {returned!r} and must return its nodes",
+                hint="it must neither spin nor destroy them: the host does",
+            )
+
+    # What constructors ask: LifecycleNode's by author/spec.py, all others by middleware's hooks.
+
+    def take(self, name: str, namespace: str | None) -> Construction | None:
+        """Return the construction of a LifecycleNode that is about to be made."""
+        planned = self._taken = self._take(name, namespace)
+        if planned is None:
+            return None
+        return Construction(
+            spec=planned,
+            mode=self._mode,
+            use_global_arguments=self._use_global_arguments,
+            # Of a plain node no states are driven.
+            supervisor=self._supervisor if planned.managed else "",
+        )
+
+    @contextlib.contextmanager
+    def constructing(
+        self, node: Node, name: str, options: dict[str, Any]
+    ) -> Iterator[tuple[str, dict[str, Any]]]:
+        """Have rclpy construct a node as planned; one that is not planned is not touched."""
+        ours = isinstance(node, LifecycleNode)
+        planned = self._taken if ours else self._take(name, options.get("namespace"))
+        self._taken = None
+        if planned is None:
+            yield name, options
+            return
+        refuse_unmanaged(planned, type(node))
+        if not ours:
+            name, options = planned.name, self._options(planned, options)
+            parameters.give_empty_arrays(node, planned)
+        with self._participants.carrying(ParticipantSettings.of(planned)) as context:
+            yield name, {**options, "context": context}
+        if not (ours and planned.managed):
+            self._foreign[id(node)] = ForeignNode(
+                node, planned, supervisor=self._supervisor, loop=self._loop
+            )
+        self._constructed[planned.key] = node
+
+    def make_endpoint(self, node: Node, kind: EndpointKind, arguments: Mapping[str, Any]) -> Any:
+        """Make an endpoint that is planned otherwise than rclpy would make it; else None."""
+        foreign = self._foreign.get(id(node))
+        return None if foreign is None else foreign.make(kind, arguments)
+
+    def endpoint_made(self, node: Node, kind: EndpointKind, entity: Any) -> None:
+        """An endpoint of a node exists now."""
+        if foreign := self._foreign.get(id(node)):
+            foreign.made(kind, entity)
+
+    def endpoint_removed(self, node: Node, entity: Any) -> None:
+        """An endpoint of a node is about to be destroyed."""
+        if foreign := self._foreign.get(id(node)):
+            foreign.removed(entity)
+
+    def node_removed(self, node: Node) -> None:
+        """A node is about to be destroyed."""
+        if foreign := self._foreign.pop(id(node), None):
+            foreign.close()
+
+    def _take(self, name: str, namespace: str | None) -> PlannedNode | None:
+        """Choose whose construction this is: by name among the group, else the one asked for."""
+        full = f"/{(namespace or '').strip('/')}/{name}".replace("//", "/")
+        chosen = (
+            next((each for each in self._waiting if each.full_name == full), None)
+            or next((each for each in self._waiting if each.name == name), None)
+            or next((each for each in self._waiting if each is self._current), None)
+        )
+        if chosen is not None:
+            self._waiting.remove(chosen)
+        return chosen
+
+    def _options(self, planned: PlannedNode, options: dict[str, Any]) -> dict[str, Any]:
+        given = options.get("parameter_overrides") or ()
+        return {
+            **options,
+            "namespace": planned.namespace,
+            "cli_args": [*ros_arguments(planned), *(options.get("cli_args") or ())],
+            "parameter_overrides": [*given, *parameters.overrides(planned)],
+            "use_global_arguments": self._use_global_arguments,
+        }
+
+
+def maker_of(planned: PlannedNode, folders: tuple[str, ...]) -> Callable[..., Any]:
+    """Import the class or function of one planned node.
+
+    Raises:
+        LifecycleError: it cannot be used as planned. What its module raises passes.
+    """
+    found = load_nodes(planned.run.python, folders)
+    if isinstance(found, type):
+        refuse_unmanaged(planned, found)
+    return found
+
+
+def refuse_unmanaged(planned: PlannedNode, node_class: type) -> None:
+    """Raise unless a class can be what the plan says.
+
+    Raises:
+        LifecycleError: it is to be managed, and knows nothing of that.
+    """
+    known = issubclass(node_class, LifecycleNode) or is_rclpy_managed(node_class)
+    if planned.managed and not known:
+        raise LifecycleError(
+            f"cannot manage {planned.full_name}: {planned.run.python!r} makes a plain node, a "
+            f"{node_class.__name__}",
+            hint="say `managed: false`, or subclass lifecycle.LifecycleNode",
+        )
+
+
+def keywords(planned: PlannedNode, what: Callable[..., Any]) -> dict[str, Any]:
+    """Return what a class or function is called with; one that needs a `node_name` gets it."""
+    keywords = {
+        name: list(value) if isinstance(value, tuple) else value
+        for name, value in planned.run.arguments
+    }
+    if _needs(what, "node_name"):
+        keywords.setdefault("node_name", planned.name)
+    return keywords
+
+
+def _needs(what: Callable[..., Any], name: str) -> bool:
+    """Return whether what is called so has a parameter of this name without a default."""
+    wanted = inspect.signature(what).parameters.get(name)
+    named = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+    return wanted is not None and wanted.default is wanted.empty and wanted.kind in named
+
+
+def _each(returned: object) -> Iterable[object]:
+    if isinstance(returned, (list, tuple, set, frozenset)):
+        return returned
+    return (returned,)
