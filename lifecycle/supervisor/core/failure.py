@@ -464,8 +464,8 @@ def exit_code_of(run: Run) -> ExitCode:
     return ExitCode.INTERRUPTED if run.hurry and code is ExitCode.OK else code
 
 
-def fail_late(run: Run, limit_s: float) -> list[Event]:
-    """Fail a bring-up, or an order, that takes too long: say what every node was doing."""
+def fail_late(run: Run, limit_s: float, why: str) -> list[Event]:
+    """Fail a bring-up, or an order, that takes too long: say what nodes were doing, or why."""
     busy = [
         each
         for each in run.nodes.values()
@@ -473,7 +473,7 @@ def fail_late(run: Run, limit_s: float) -> list[Event]:
     ]
     culprit = busy[0] if busy else None
     subject = run.plan.system if culprit is None else culprit.name
-    text = f"cannot bring up {run.plan.system!r} within {limit_s:.3g} s: {unfinished(run)}"
+    text = f"cannot bring up {run.plan.system!r} within {limit_s:.3g} s: {unfinished(run) or why}"
     text += next(filter(None, (_unnamed(run, each) for each in run.nodes.values())), "")
     for node in busy:
         node.stuck = bool(node.process)

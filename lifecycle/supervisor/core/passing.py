@@ -36,7 +36,7 @@ def _arrive(run: Run) -> list[Event]:
         return []
     coming = run.held_s is None and not all(run.is_past(each.due_s) for each in run.nodes.values())
     if run.is_changing or run.switch is not None or coming or not advance.is_at_gate(run):
-        return _late(run, failure.unfinished(run)) if run.is_past(passage.until_s) else []
+        return _late(run, "nothing was started") if run.is_past(passage.until_s) else []
     left_s = passage.until_s - run.now_s
     fresh_s = run.options.timeout_s if run.held_s is not None else min(left_s, run.options.gate_s)
     if run.change is None:
@@ -113,7 +113,8 @@ def _late(run: Run, why: str) -> list[Event]:
     """Give up what was to be at the gate, or through it, by now."""
     change = run.change
     if change is None or change.back:
-        return failure.fail_late(run, run.options.timeout_s)
+        return failure.fail_late(run, run.options.timeout_s, why)
+    why = failure.unfinished(run) or why
     text = f"cannot bring up {run.plan.system!r} within {change.timeout_s:.3g} s: {why}"
     return go_back(run, text, ExitCode.BRING_UP_FAILED)
 
@@ -167,7 +168,7 @@ def _go_on(run: Run, passage: Passage) -> list[Event]:
     if run.is_past(gate.refuses_at_s(run, until_s)):
         return _became_another(run) if done and passage.sent else _refused(run, again=True)
     if run.is_past(max(passage.until_s, passage.begun_s + run.options.timeout_s)):
-        return failure.fail_late(run, run.options.timeout_s)
+        return failure.fail_late(run, run.options.timeout_s, "its gate was not passed")
     return []
 
 

@@ -23,6 +23,7 @@ from lifecycle.manifest.model import (
 from lifecycle.plan.model import ExpectedParameter, ModeParameters, Plan
 from lifecycle.supervisor.control.protocol import ControlRequest
 from lifecycle.supervisor.core import inputs
+from lifecycle.supervisor.core.reduce import take
 from lifecycle.supervisor.core.state import Level, Options, new_run
 from lifecycle.supervisor.run.events import (
     Failure,
@@ -152,6 +153,13 @@ def test_networks_that_cannot_be_programmed_end_the_run_before_anything_is_activ
     assert not any(each.endswith(" activate") for each in play.said())
     assert [each.rule for each in play.run.ending.failures] == ["run.not-programmed"]
     assert play.code == 6
+
+
+def test_a_deadline_that_passed_before_anything_was_started_says_so() -> None:
+    run = new_run(CHAIN, Options(timeout_s=2.0))
+    take(run, 0.0, inputs.Tick())
+    take(run, 9.0, inputs.Tick())
+    assert run.failures[0].message.endswith("within 2 s: nothing was started")
 
 
 def test_all_that_fails_within_a_moment_is_named() -> None:
