@@ -48,7 +48,7 @@ _LEFT_OUT = ("__pycache__", "site-packages", "test", "idlelib", "tkinter", "ensu
 def _run(
     *command: str | Path,
     environment: dict[str, str] | None = None,
-    timeout_s: int = 100,
+    timeout_s: int = 300,
     codes: tuple[int, ...] = (0,),
 ) -> str:
     result = subprocess.run(
