@@ -193,9 +193,6 @@ def advance(run: Run) -> list[effects.Effect]:
     run.outbox = []
     if run.adopting and run.ending is None:
         return found
-    if run.order is not None and run.ready is None and run.ending is None:
-        run.ready = False
-        found.append(effects.Prepare())
     for process in run.processes.values():
         found += _process(run, process)
     for node in run.nodes.values():

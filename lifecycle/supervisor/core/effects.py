@@ -63,10 +63,6 @@ class Give(msgspec.Struct, frozen=True, kw_only=True):
     values: GivenParameters | None = None
 
 
-class Prepare(msgspec.Struct, frozen=True, kw_only=True):
-    """Make sure that processes can be started; `Ready`."""
-
-
 class Answer(msgspec.Struct, frozen=True, kw_only=True):
     """Answer an order."""
 
@@ -81,4 +77,4 @@ class Wake(msgspec.Struct, frozen=True, kw_only=True):
     at_s: float
 
 
-Effect = Spawn | Signal | Sweep | Ask | Look | Program | Give | Prepare | Answer | Wake
+Effect = Spawn | Signal | Sweep | Ask | Look | Program | Give | Answer | Wake

@@ -209,13 +209,13 @@ def fail(run: Run, failure: Failure, end: Exited | None = None) -> list[Event]:
         return [goes_on(failure)]
     if not run.failures:
         run.fails_s = run.now_s + ALSO_S
-    is_said = any(
-        each.rule == failure.rule and each.subject == failure.subject for each in run.failures
-    )
-    died = failure.rule == PROCESS_DIED.id and any(
-        each.process and each.process == failure.process for each in run.failures
-    )
-    if not is_said and not died:  # one that says why it cannot go on, and ends, has failed once
+    # One that says why it cannot go on, and ends, has failed once.
+    dead = failure.process if failure.rule == PROCESS_DIED.id else ""
+    if not any(
+        (each.rule, each.subject) == (failure.rule, failure.subject)
+        or (dead and each.process == dead)
+        for each in run.failures
+    ):
         run.failures.append(failure)
     return []
 

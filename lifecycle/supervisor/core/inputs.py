@@ -143,12 +143,6 @@ class Given(msgspec.Struct, frozen=True, kw_only=True):
     error: str = ""
 
 
-class Ready(msgspec.Struct, frozen=True, kw_only=True):
-    """Processes can be started, or cannot."""
-
-    error: str = ""
-
-
 class Ordered(msgspec.Struct, frozen=True, kw_only=True):
     """Somebody ordered something; what does not fit the manifest was refused before."""
 
@@ -211,5 +205,5 @@ class Broken(msgspec.Struct, frozen=True, kw_only=True):
 
 Input = (
     Tick | Spawned | Exited | Swept | Replied | Saw | Changed | Verified | Programmed | Given
-    | Ready | Ordered | Stop | Silent | Adopted | Refused | Broken
+    | Ordered | Stop | Silent | Adopted | Refused | Broken
 )  # fmt: skip

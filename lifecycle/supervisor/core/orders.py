@@ -30,7 +30,8 @@ FITS = {
 }
 """In which phases an order can begin, and what is said in any other."""
 
-_STARTS = (ControlRequest.RESTART, ControlRequest.APPLY)
+STARTS = (ControlRequest.RESTART, ControlRequest.APPLY)
+"""Orders that start processes."""
 
 
 def settled_phase(run: Run) -> str:
@@ -58,7 +59,7 @@ def _unfit(run: Run, order: Order) -> str:
     if order.first is not None and order.first is not run.first:
         what = _cannot(order, run.plan.system)
         return f"{what}: another manifest was applied meanwhile; ask again"
-    if order.ask in _STARTS and run.broken:
+    if order.ask in STARTS and run.broken:
         what = _cannot(order, order.node or run.plan.system)
         return (
             f"{what}: the discovery server has died, and without it nobody who comes again is "
@@ -131,7 +132,7 @@ def settle_orders(run: Run) -> list[Event]:
     if run.pauses and _is_done(run):
         run.pauses = False
         events.append(reached(run, "paused"))
-    if run.order is not None and run.ready and _is_done(run):
+    if run.order is not None and _is_done(run):
         run.answer(ExitCode.OK)
     while run.order is None and run.orders and _is_free(run):
         order = run.orders.popleft()
@@ -139,9 +140,7 @@ def settle_orders(run: Run) -> list[Event]:
             run.outbox = [*run.outbox, (order.id, ExitCode.USAGE, why)]
             continue
         run.order = order
-        if order.ask not in _STARTS:
-            run.ready = True
-            events += begin(run)
+        events += _begin(run, order)
     return events
 
 
@@ -155,10 +154,8 @@ def _is_done(run: Run) -> bool:
     return _is_free(run) and run.opening is None
 
 
-def begin(run: Run) -> list[Event]:
+def _begin(run: Run, order: Order) -> list[Event]:
     """Note an order in the state, by which it is carried out."""
-    order = run.order
-    assert order is not None
     if order.ask is ControlRequest.APPLY:
         return apply(run, order)
     run.passage = None

@@ -314,18 +314,6 @@ def _given(run: Run, given: inputs.Given) -> list[Event]:
     return []
 
 
-def _ready(run: Run, given: inputs.Ready) -> list[Event]:
-    if run.order is None or run.ready is not False:
-        return []
-    if given.error:
-        what = run.order.node or run.plan.system
-        text = f"cannot {run.order.ask.value} {what!r}: {given.error}; everything stays as it is"
-        run.answer(ExitCode.BRING_UP_FAILED, text)
-        return []
-    run.ready = True
-    return orders.begin(run)
-
-
 def _stop(run: Run, given: inputs.Stop) -> list[Event]:
     if run.ending is None:
         return failure.stop(run, given.reason, ExitCode(given.code))
@@ -360,7 +348,6 @@ _HANDLERS: dict[type, Callable[[Run, Any], list[Event]]] = {
     inputs.Verified: _verified,
     inputs.Programmed: passing.programmed,
     inputs.Given: _given,
-    inputs.Ready: _ready,
     inputs.Ordered: lambda run, given: orders.take_order(run, given.order),
     inputs.Stop: _stop,
     inputs.Silent: _silent,

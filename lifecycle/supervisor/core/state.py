@@ -482,7 +482,6 @@ class Run(msgspec.Struct, kw_only=True):
         furthest: "connected", "verified" or "active", as far as it came; empty before.
         held_s: since when it is held; None before it was up.
         pauses: it is to be said that it is paused, once nothing is active.
-        ready: None: it has still to be known whether processes can be started; False: it is asked.
         failures: that end the run, as soon as what is in a step has failed, too, or not.
         fails_s: then it ends all the same.
         deaths: of processes that died while they were taken down, or that the run went on without.
@@ -520,7 +519,6 @@ class Run(msgspec.Struct, kw_only=True):
     passage: Passage | None = None
     orders: deque[Order] = msgspec.field(default_factory=deque)
     order: Order | None = None
-    ready: bool | None = None
     switch: Switch | None = None
     change: Change | None = None
     failures: list[Failure] = []
@@ -638,7 +636,7 @@ class Run(msgspec.Struct, kw_only=True):
         if self.order is not None:
             code, error = self.undone or (code, error)
             self.outbox = [*self.outbox, (self.order.id, code, error)]
-        self.order, self.ready, self.undone = None, None, None
+        self.order, self.undone = None, None
 
     def fails_now(self, *failures: Failure) -> None:
         """End at once for what failed, whatever is to be kept going."""

@@ -36,7 +36,7 @@ from lifecycle.supervisor.control.status import process_state, system_status
 from lifecycle.supervisor.core import advance, effects, gate, inputs
 from lifecycle.supervisor.core import state as core
 from lifecycle.supervisor.core.change import change_to, changed_nodes
-from lifecycle.supervisor.core.orders import refused_at_once
+from lifecycle.supervisor.core.orders import STARTS, refused_at_once
 from lifecycle.supervisor.core.reduce import take
 from lifecycle.supervisor.health.answering import Answering
 from lifecycle.supervisor.health.liveliness import Cause
@@ -156,7 +156,6 @@ class Supervisor:
             effects.Sweep: self._processes.sweep,
             effects.Look: self._looks.look,
             effects.Program: self._program,
-            effects.Prepare: self._prepare,
             effects.Answer: self._answer,
             effects.Wake: self._wake_at,
         }
@@ -227,11 +226,19 @@ class Supervisor:
         if order.ask is ControlRequest.APPLY and order.plan is not None:
             what = change_to(run, order.plan)
             change = changed_nodes(what, run.first, order.plan, run.revision)
-        order = replace(order, id=len(self._answers), first=run.first)
+        order = replace(order, first=run.first)
+        code, why = refused_at_once(run, order)
         if change is not None and order.dry_run:
-            code, why = refused_at_once(run, order)
             differs = ExitCode.VIOLATED if change.differences else ExitCode.OK
             return Answer(exit_code=code if why else differs, error=why, change=change)
+        if order.ask in STARTS and not why:
+            try:
+                await self.means.fork_server.ready()
+            except BringUpError as error:
+                why = f"{error.message}; everything stays as it is"
+                text = f"cannot {order.ask.value} {order.node or run.plan.system!r}: {why}"
+                return Answer(exit_code=ExitCode.BRING_UP_FAILED, error=text)
+        order = replace(order, id=len(self._answers))
         answer = self._answers[order.id] = self._loop.create_future()
         self.give(inputs.Ordered(order=order))
         done: Answer = await asyncio.shield(answer)
@@ -436,14 +443,6 @@ class Supervisor:
         except StepFailedError as failed:
             error = failed.message
         self.give(inputs.Programmed(number=effect.number, error=error))
-
-    async def _prepare(self, _: effects.Prepare) -> None:
-        error = ""
-        try:
-            await self.means.fork_server.ready()
-        except BringUpError as failed:
-            error = failed.message
-        self.give(inputs.Ready(error=error))
 
     async def _adopt(self) -> None:
         """Take what runs already as it is found, before anything is started."""

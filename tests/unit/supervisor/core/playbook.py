@@ -144,7 +144,6 @@ class Play:
             effects.Look: lambda: inputs.Verified(mark=effect.mark, verdict=self.found),
             effects.Program: lambda: inputs.Programmed(number=effect.number, error=way),
             effects.Give: lambda: inputs.Given(node=effect.node, error=way),
-            effects.Prepare: lambda: inputs.Ready(error=way),
         }[type(effect)]()
 
 

@@ -83,9 +83,8 @@ MUTANTS = [
     ("up", "failure.py", "max(node.due_s, due_s)", "NEVER_S"),
     ("violations", "gate.py", "LASTS_S = 1.0", "LASTS_S = 60.0"),
     ("violations", "failure.py", "_outcome(run, run.judged.counted)", '_outcome(run, "")'),
-    ("answers", "state.py", "        self.order, self.ready, self.undone =", "        _ ="),
+    ("answers", "state.py", "        self.order, self.undone =", "        _ ="),
     ("answers", "failure.py", "    run.answer(ExitCode.BRING_UP_FAILED, answer)\n", ""),
-    ("answers", "reduce.py", "        run.answer(ExitCode.BRING_UP_FAILED, text)", "        pass"),
 ]
 """The promise that is broken, the module, what it has, and what the mutant has instead."""
 

@@ -268,8 +268,6 @@ class World:
         elif kind == "Give":
             error = "refused" if not self.calm and r.random() < 0.2 else ""
             self.give(inputs.Given(node=effect.node, error=error))
-        elif kind == "Prepare":
-            self.give(inputs.Ready(error="busy" if not self.calm and r.random() < 0.1 else ""))
 
     def answer_step(self, effect: Any) -> None:
         node = self.run.nodes.get(effect.node)
