@@ -20,7 +20,7 @@ import os
 import threading
 import traceback
 import weakref
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -388,16 +388,14 @@ class Found:
             self._changed()
         return placement
 
-    def beside(self, declared: Collection[Any] = ()) -> tuple[Endpoint, ...]:
-        """Return those of which the rclpy object belongs to no declared endpoint."""
-        known = {id(each) for each in declared}
+    @property
+    def endpoints(self) -> tuple[Endpoint, ...]:
+        """Those that exist."""
         found = []
         for key, (kind, placement) in tuple(self._made.items()):
-            if key in known:
-                continue
             try:
                 found.append(found_endpoint(kind, placement, self._at))
-            except InvalidHandle:
+            except InvalidHandle:  # noqa: PERF203
                 self._made.pop(key, None)  # destroyed behind its node's back
         return tuple(found)
 

@@ -165,7 +165,8 @@ def create_subscription(
         resolved = node.resolve_topic_name(topic)
         raise _not_feasible("subscription", resolved, unique, abi.refusal(), hint)
     if unique is UniqueRequirement.NOT_REQUIRED or not abi.is_known():
-        return node.create_subscription(type_, topic, callback, profile, **options)
+        # Not by its class, which may do more with what its own code makes.
+        return Node.create_subscription(node, type_, topic, callback, profile, **options)
     listed = private(node, "_subscriptions", f"make a flow of its own for {topic!r}")
     group = options.get("callback_group") or node.default_callback_group
     raw = options.get("raw", False)
@@ -206,7 +207,7 @@ def create_publisher(
         hint = "give the publisher its own participant, or ask for optionally_required"
         resolved = node.resolve_topic_name(topic)
         raise _not_feasible("publisher", resolved, unique, reason, hint)
-    return node.create_publisher(type_, topic, to_rclpy(qos), **options)
+    return Node.create_publisher(node, type_, topic, to_rclpy(qos), **options)
 
 
 def _not_feasible(

@@ -209,12 +209,11 @@ class Managed:
     def get_configuration(self) -> NodeConfiguration:
         """Return this node's identity and its endpoints as they are."""
         # Whatever the policy: what a node says of itself is known before discovery shows it.
-        found = self.found.beside(self.data_layer.entities)
         return configuration.collect(
             self.node,
             self.spec,
             self.reported,
-            endpoints=(*self.data_layer.endpoints.values(), *found),
+            endpoints=(*self.data_layer.endpoints.values(), *self.found.endpoints),
             connections=self.data_layer.connections,
             health=self._health.report,
         )

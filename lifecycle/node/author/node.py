@@ -48,7 +48,7 @@ from lifecycle.node.connections.connections import Connection, connections_of
 from lifecycle.node.endpoints.endpoint import EndpointOptions, Placement, interface_name
 from lifecycle.node.endpoints.making import resolve_name
 from lifecycle.node.endpoints.publisher import DeclaredPublisher
-from lifecycle.node.lifecycle.gate import GatedPublisher, GatedTimer, NodeGate
+from lifecycle.node.lifecycle.gate import GatedPublisher, GatedSubscription, GatedTimer, NodeGate
 from lifecycle.node.lifecycle.machine import NodeState
 from lifecycle.plan.model import PlannedEndpoint
 from lifecycle.verify.outcome import ConnectionReport
@@ -577,7 +577,8 @@ class LifecycleNode(Node):  # type: ignore[misc]  # rclpy is not typed
         is_clock = isinstance(getattr(callback, "__self__", None), TimeSource)
         if self._gate is not None and not is_clock:
             self._found(EndpointKind.SUBSCRIPTION, subscription)
-            self._gate.add_subscription(subscription, self.lifecycle.turns.call_soon)
+            gated = GatedSubscription(subscription, self.lifecycle.turns.call_soon)
+            self._gate.add(subscription, gated)
         return subscription
 
     def create_timer(

@@ -249,11 +249,6 @@ class DataLayer:
             )
         return entity
 
-    @property
-    def entities(self) -> tuple[Any, ...]:
-        """Every rclpy object of a declared endpoint."""
-        return tuple(each.entity for each in self._placements)
-
     def _find(self, kind: EndpointKind, name: str) -> Endpoint:
         endpoint = self.endpoints.get((kind, name))
         if endpoint is not None:
@@ -510,12 +505,6 @@ class DataLayer:
 
     # Single endpoints.
 
-    @property
-    def _placements(self) -> tuple[Placement, ...]:
-        placements = [each.placement for each in self.endpoints.values()]
-        placements += [old for _, old in self._handovers.values()]
-        return tuple(each for each in placements if each is not None)
-
     def _map(self, endpoint: Endpoint, connection: Connection) -> None:
         """Map an endpoint that is mapped nowhere; raises LifecycleError."""
         endpoint.placement = self._place(endpoint, connection)
@@ -613,7 +602,8 @@ class DataLayer:
 
     def _tidy(self) -> None:
         """Unmake participants of single flows that carry nothing any more."""
-        used = [each.connection for each in self._placements]
+        used = [each.connection for each in self.endpoints.values()]
+        used += [old.connection for _, old in self._handovers.values()]
         for connection in self.connections.unnamed:
             if connection not in used:
                 self.connections.close(connection)

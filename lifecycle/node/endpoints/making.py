@@ -1,7 +1,8 @@
 """Make and destroy the rclpy entity of a declared endpoint on a connection.
 
-Owns: which factory makes which kind, with which QoS, callback group and gate. It keeps nothing but
-the goals of action servers: what exists where is data_layer.py's.
+Owns: which factory of rclpy makes which kind, with which QoS, callback group and gate; those of our
+own node are for what its author's code makes. It keeps nothing but the goals of action servers:
+what exists where is data_layer.py's.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from lifecycle.middleware.rcl.qos import to_rclpy
 from lifecycle.node.actions import Goals, resolve_action_name
 from lifecycle.node.author.blocking import refuse_to_block, refuse_to_deadlock
 from lifecycle.node.endpoints.endpoint import CLIENTS, Endpoint, wire_name
+from lifecycle.node.lifecycle.gate import GatedSubscription
 from lifecycle.node.lifecycle.steps import positional_count
 
 if TYPE_CHECKING:
@@ -120,11 +122,9 @@ class Maker:
         }
         if connection.participant is not None:
             return connection.participant.create_publisher(endpoint.interface, name, qos, **options)
-        entity = create_publisher(
+        return create_publisher(
             self._node, endpoint.interface, name, qos, unique=endpoint.planned.unique, **options
         )
-        self._gate.release(entity)  # the handle is the gate
-        return entity
 
     def _subscription(self, endpoint: Endpoint, connection: Connection, name: str) -> Any:
         options = endpoint.options
@@ -141,7 +141,7 @@ class Maker:
             event_callbacks=options.event_callbacks,
             raw=options.raw,
         )
-        self._gate.add_subscription(entity, self._turns.call_soon)
+        self._gate.add(entity, GatedSubscription(entity, self._turns.call_soon))
         return entity
 
     def _served(self, endpoint: Endpoint, connection: Connection, name: str) -> Any:
@@ -169,15 +169,14 @@ class Maker:
         assert endpoint.handler is not None
         handler = _answering(endpoint.handler)
         options = {"callback_group": self._group(endpoint), **_qos(endpoint)}
-        service = node.create_service(endpoint.interface, name, handler, **options)
+        service = Node.create_service(node, endpoint.interface, name, handler, **options)
         self._survive_late_answers(service, endpoint.name)
         return service
 
     def _client(self, endpoint: Endpoint, node: Node, *, name: str) -> Any:
         options = {"callback_group": self._group(endpoint), **_qos(endpoint)}
-        client = node.create_client(endpoint.interface, name, **options)
-        if node is not self._node:  # the node's own factory has done it
-            refuse_to_deadlock(client)
+        client = Node.create_client(node, endpoint.interface, name, **options)
+        refuse_to_deadlock(client)
         return client
 
     def _action_server(self, endpoint: Endpoint, node: Node, *, name: str) -> Any:

@@ -365,7 +365,7 @@ class ForeignNode:
         """Return its identity and its endpoints as they are."""
         declared = {(each.kind, each.resolved): each for each in self.spec.endpoints}
         endpoints: list[Endpoint] = []
-        for each in self._found.beside():
+        for each in self._found.endpoints:
             each.fault = self._faults.get(id(each.entity), "")
             planned = declared.pop((each.kind, each.planned.resolved), None)
             if planned is not None:

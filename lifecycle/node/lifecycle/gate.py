@@ -58,17 +58,6 @@ class NodeGate:
         """Put `worker` in charge of `entity`; it is closed first: its last messages pass."""
         self._workers[id(entity)] = worker
 
-    def add_subscription(self, subscription: Subscription, later: Later) -> None:
-        """Gate a subscription, unless its creation already did."""
-        if id(subscription) not in self._entities:
-            self.add(subscription, GatedSubscription(subscription, later))
-
-    def release(self, entity: object) -> None:
-        """Ungate an entity: something else gates it."""
-        gated = self._entities.pop(id(entity), None)
-        if gated is not None:
-            gated.open()
-
     def remove(self, entity: object) -> None:
         """Forget an entity that is being destroyed."""
         self._entities.pop(id(entity), None)
