@@ -382,7 +382,7 @@ _TOO_DEEP = f"cannot read values nested deeper than {MAX_DEPTH} levels"
 
 
 def _collection(
-    data: tuple[Value, ...] | Mapping[str, Value], mark: _Mark, inside: list[_Node]
+    data: tuple[Value, ...] | dict[str, Value], mark: _Mark, inside: list[_Node]
 ) -> _Node:
     return _Node(
         Value(data=data, line=mark[0], column=mark[1]),
