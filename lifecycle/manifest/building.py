@@ -19,6 +19,7 @@ from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.interface import Findings, build_inline, scalar_tuple
 from lifecycle.manifest.model import (
     BY_DEFAULT,
+    PROCESS_KEYS,
     After,
     Condition,
     ConnectionDeclaration,
@@ -270,10 +271,10 @@ def _run(node: Cursor, base: Path, found: Findings) -> Run:
         _refuse(cursor, ("ros_args",), "a Python class: our host gives it no command line", found)
     elif "component" in cursor:
         kind = RunKind.ATTACH
-        _refuse(cursor, _OF_A_PROCESS, "a component: its container's process has that", found)
+        _refuse(cursor, PROCESS_KEYS, "a component: its container's process has that", found)
     elif "attach" in cursor:
         kind = RunKind.ATTACH
-        _refuse(cursor, _OF_A_PROCESS, "an attached node", found)
+        _refuse(cursor, PROCESS_KEYS, "an attached node", found)
     if "component" not in cursor:
         _refuse(cursor, ("extra_arguments",), "what is no component", found)
     _check_python_keys(cursor, kind, found)
@@ -307,12 +308,6 @@ def _resources(run: Cursor, found: Findings) -> Resources | None:
 def _values(run: Cursor, key: str, found: Findings) -> tuple[tuple[str, ParameterValue], ...]:
     values = ((name, _parameter(name, each, found)) for name, each in run.entries(key))
     return tuple((name, value) for name, value in values if value is not None)
-
-
-_OF_A_PROCESS = (
-    *("environment", "working_directory", "ros_args", "prefix", "output"),
-    *("no_new_privileges", "limits", "resources"),
-)
 
 
 def _refuse(run: Cursor, names: tuple[str, ...], what: str, found: Findings) -> None:

@@ -76,6 +76,20 @@ class Diagnostic(msgspec.Struct, frozen=True, kw_only=True):
         return f"{place}{word}{path}{self.message}" + (f"; {self.hint}" if self.hint else "")
 
 
+def in_order(found: Iterable[Diagnostic], files: Iterable[str]) -> tuple[Diagnostic, ...]:
+    """Return findings once each, by file, then by position.
+
+    Args:
+        found: findings, also of other files than `files`: those come last.
+        files: as they were read.
+    """
+    unique = list(dict.fromkeys(found))
+    read = dict.fromkeys([*files, *(each.at.file for each in unique)])
+    rank = {file: index for index, file in enumerate(read)}
+    unique.sort(key=lambda each: (rank[each.at.file], each.at.line, each.at.column))
+    return tuple(unique)
+
+
 class ManifestError(LifecycleError):
     """A manifest that cannot be used; carries every diagnostic, errors and warnings."""
 

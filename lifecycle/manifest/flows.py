@@ -383,12 +383,12 @@ class FlowNeeds:
     def _max_message_size(self, node: Node, need: FlowNeed) -> int | None:
         if need.max_message_size is not None or need.kind is not EndpointKind.PUBLISHER:
             return need.max_message_size
-        for endpoint in node.interface.endpoints:
-            if (endpoint.kind, endpoint.name) == (need.kind, need.name):
-                if endpoint.type not in self._sizes:
-                    self._sizes[endpoint.type] = bounded_size(endpoint.type, self._prefixes)
-                return self._sizes[endpoint.type]
-        return None
+        endpoint = node.interface.find(need.kind, need.name)
+        if endpoint is None:
+            return None
+        if endpoint.type not in self._sizes:
+            self._sizes[endpoint.type] = bounded_size(endpoint.type, self._prefixes)
+        return self._sizes[endpoint.type]
 
     def _by_participant(self, need: FlowNeed) -> bool:
         """Whether the need is met by what its participant may use, with no connection at all.

@@ -11,7 +11,7 @@ Touches the file system; needs no ROS.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
 
@@ -28,7 +28,13 @@ from lifecycle.manifest.building import (
     section,
 )
 from lifecycle.manifest.checks import check
-from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position, Severity
+from lifecycle.manifest.diagnostics import (
+    Diagnostic,
+    ManifestError,
+    Position,
+    Severity,
+    in_order,
+)
 from lifecycle.manifest.interface import Findings
 from lifecycle.manifest.model import (
     Discovery,
@@ -130,17 +136,18 @@ def build_manifest(
     found: Findings,
     machine: str = THIS_HOST,
 ) -> Manifest:
-    """Build what one document declares, its includes not yet joined.
+    """Build what one document or group declares, its includes and groups not yet joined.
 
     Args:
-        root: a document that fits the schema.
+        root: a document that fits the schema, or a group of one.
         path: as the user wrote it.
         arguments: resolved values by name.
         base: folder that its relative paths start from.
         environment: for AMENT_PREFIX_PATH, where interfaces by reference are searched.
         found: findings are appended here.
-        machine: of nodes that name none.
+        machine: of nodes that name none, where the group names none either.
     """
+    machine = root.text("machine", machine)
     nodes = tuple(
         build_node(key, cursor, base=base, machine=machine, environment=environment, found=found)
         for key, cursor in root.entries("nodes")
@@ -236,7 +243,7 @@ def load(
     found = loading.found
 
     def every() -> tuple[Diagnostic, ...]:
-        return _sorted(found, loading.files)
+        return in_order(found, loading.files)
 
     if manifest is None or _has_errors(found):
         raise ManifestError(every())
@@ -287,7 +294,7 @@ def declared_arguments(path: str | Path) -> tuple[ArgumentDeclaration, ...]:
     document = read_document(path, shown=os.fspath(path))
     wrong = [each for place, each in validate(document) if place[:1] == ("arguments",)]
     if wrong:
-        raise ManifestError(_sorted(wrong, [document.file]))
+        raise ManifestError(in_order(wrong, [document.file]))
     return tuple(
         ArgumentDeclaration(
             name=name,
@@ -484,29 +491,22 @@ class _Loading:
     def _group(self, reading: _Reading, outer: Manifest, entry: Cursor, shared: Shared) -> Manifest:
         place = (*entry.document.place, *entry.place)
         root = Cursor.root(Document(file=entry.document.file, root=entry.value, place=place))
-        nodes = tuple(
-            build_node(
-                key,
-                cursor,
-                base=reading.origin.path.parent,
-                machine=root.text("machine", shared.machine),
-                environment=self._environment,
-                found=self.found,
-            )
-            for key, cursor in root.entries("nodes")
-        )
-        inner = Manifest(
-            path=outer.path, system="", nodes=nodes, machines=_machines(root, nodes, self.found)
-        )
-        own = root.text("prefix")
-        inner = self._contents(
-            reading,
+        inner = build_manifest(
             root,
-            inner,
-            shared=shared,
+            path=outer.path,
+            arguments=(),
+            base=reading.origin.path.parent,
+            environment=self._environment,
+            found=self.found,
+            machine=shared.machine,
         )
-        inner = include.move(inner, prefix=own, namespace=root.text("namespace"))
-        return include.join(outer, inner, entry.at, self.found, what="group")
+        inner = self._contents(reading, root, inner, shared=shared)
+        return self._joined(outer, inner, entry, "group")
+
+    def _joined(self, outer: Manifest, inner: Manifest, entry: Cursor, what: str) -> Manifest:
+        prefix, namespace = entry.text("prefix"), entry.text("namespace")
+        inner = include.move(inner, prefix=prefix, namespace=namespace)
+        return include.join(outer, inner, entry.at, self.found, what=what)
 
     def _include(
         self,
@@ -525,18 +525,8 @@ class _Loading:
                 self.found.append(error("manifest.include", entry.at, message))
             return outer
         given = {name: each.value.text for name, each in entry.entries("arguments")}
-        own = entry.text("prefix")
-        inner = self.read(
-            origin,
-            given,
-            chain,
-            entry=entry,
-            shared=shared,
-        )
-        if inner is None:
-            return outer
-        inner = include.move(inner, prefix=own, namespace=entry.text("namespace"))
-        return include.join(outer, inner, entry.at, self.found)
+        inner = self.read(origin, given, chain, entry=entry, shared=shared)
+        return outer if inner is None else self._joined(outer, inner, entry, "include")
 
     def _check_suffix(self, document: Document) -> None:
         if not document.file.endswith(SUFFIX):
@@ -583,15 +573,6 @@ def _keys_of(group: Value) -> Iterator[str]:
         items = data[key].data if key in data else ()
         for each in items if isinstance(items, tuple) else ():
             yield from _keys_of(each)
-
-
-def _sorted(found: Sequence[Diagnostic], read: Iterable[str]) -> tuple[Diagnostic, ...]:
-    """Return findings without repetitions, by file in the order of reading, then by position."""
-    unique = list(dict.fromkeys(found))
-    files = list(dict.fromkeys([*read, *(each.at.file for each in unique)]))
-    return tuple(
-        sorted(unique, key=lambda each: (files.index(each.at.file), each.at.line, each.at.column))
-    )
 
 
 def _has_errors(found: Iterable[Diagnostic]) -> bool:

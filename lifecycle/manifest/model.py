@@ -304,7 +304,33 @@ class Resources(ResourceLimits, frozen=True, kw_only=True):
         return hash(self.properties())
 
 
-class Run(msgspec.Struct, frozen=True, kw_only=True):
+class ProcessKeys(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What is asked of the process of a node, as it is written: all nodes in it ask for the same.
+
+    Attributes:
+        ros_args: ROS arguments of a command: 'auto' appends those that 'name', 'namespace',
+            'remap', 'parameters' and 'log_level' ask for; 'none' never appends any.
+        output: Where what the process prints goes: to the terminal, to its log file, or both.
+        no_new_privileges: Whether the process and what it starts can gain no privileges by running
+            a program, as NoNewPrivileges= of systemd.exec(5).
+        limits: Limits of what the process may use, by setrlimit(2); what is left out is as for the
+            supervisor.
+    """
+
+    ros_args: RosArguments = RosArguments.AUTO
+    output: Output = Output.BOTH
+    no_new_privileges: bool = False
+    limits: Limits | None = None
+
+
+PROCESS_KEYS = (
+    *("environment", "working_directory", "prefix", "resources"),
+    *ProcessKeys.__struct_fields__,
+)
+"""Keys of `run` that are of the process, whatever runs in it."""
+
+
+class Run(ProcessKeys, frozen=True, kw_only=True):
     """How to start a node. Exactly one of the forms is set, as `kind` says.
 
     Attributes:
@@ -318,12 +344,7 @@ class Run(msgspec.Struct, frozen=True, kw_only=True):
         component: `package/Plugin` that `container` loads; the node's kind is ATTACH then.
         container: full name of the container's node.
         extra_arguments: (name, value) of the request that loads the component (LoadNode.srv).
-        ros_args: of a COMMAND.
         prefix: words before the command line of the process.
-        output: where goes what the process prints.
-        no_new_privileges: the process, and what it starts, can gain none by execve(2), as
-            NoNewPrivileges= of systemd.exec(5).
-        limits: None for those of the supervisor.
         resources: None for no limits.
     """
 
@@ -340,11 +361,7 @@ class Run(msgspec.Struct, frozen=True, kw_only=True):
     component: str = ""
     container: str = ""
     extra_arguments: tuple[tuple[str, ParameterValue], ...] = ()
-    ros_args: RosArguments = RosArguments.AUTO
     prefix: tuple[str, ...] = ()
-    output: Output = Output.BOTH
-    no_new_privileges: bool = False
-    limits: Limits | None = None
     resources: Resources | None = None
 
 
@@ -513,6 +530,10 @@ class Interface(msgspec.Struct, frozen=True, kw_only=True):
     parameters: tuple[ParameterDeclaration, ...] = ()
     source: str = ""
     has_all_parameters: bool = False
+
+    def find(self, kind: EndpointKind, name: str) -> Endpoint | None:
+        """Return the endpoint of a kind by its declared name; None if there is none."""
+        return next((e for e in self.endpoints if e.kind is kind and e.name == name), None)
 
 
 class Quantity(msgspec.Struct, frozen=True, kw_only=True):

@@ -21,15 +21,13 @@ from lifecycle.manifest.model import (
     Dscp,
     EndpointPolicy,
     Executor,
-    Limits,
     LinkKeys,
     NetworkKeys,
     NodeKey,
-    Output,
     Policy,
+    ProcessKeys,
     PublisherFlow,
     ResourceLimits,
-    RosArguments,
     Special,
     SubscriptionFlow,
     Supervision,
@@ -192,7 +190,7 @@ class Mode(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     parameters: dict[NodeKey, dict[str, ParameterTree]] = field(default_factory=dict)
 
 
-class Run(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Run(ProcessKeys, frozen=True, kw_only=True):
     """How the node comes to run; exactly one way.
 
     Attributes:
@@ -211,15 +209,8 @@ class Run(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             others start.
         extra_arguments: Extra arguments of the request that loads 'component' (LoadNode.srv), as
             'use_intra_process_comms' of rclcpp_components.
-        ros_args: ROS arguments of a command: 'auto' appends those that 'name', 'namespace',
-            'remap', 'parameters' and 'log_level' ask for; 'none' never appends any.
         prefix: What comes before the process's command line, as for gdb, nice, taskset and perf;
             one text is split as a shell does.
-        output: Where what the process prints goes: to the terminal, to its log file, or both.
-        no_new_privileges: Whether the process and what it starts can gain no privileges by running
-            a program, as NoNewPrivileges= of systemd.exec(5).
-        limits: Limits of what the process may use, by setrlimit(2); what is left out is as for the
-            supervisor.
         resources: What the process and all that it starts may use together, as
             systemd.resource-control(5); set by systemd where that runs, else unverifiable.
     """
@@ -285,7 +276,6 @@ class Run(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     ) = None
     container: Annotated[Text, Meta(examples=["container", "/robot/container"])] | None = None
     extra_arguments: Annotated[dict[str, Values], Meta(min_length=1)] | None = None
-    ros_args: RosArguments = RosArguments.AUTO
     prefix: (
         Annotated[
             Text | Annotated[tuple[Scalar, ...], Meta(min_length=1)],
@@ -293,9 +283,6 @@ class Run(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         ]
         | None
     ) = None
-    output: Output = Output.BOTH
-    no_new_privileges: bool = False
-    limits: Limits | None = None
     resources: ResourceLimits | None = None
 
     def __post_init__(self) -> None:

@@ -20,7 +20,7 @@ from lifecycle.manifest.checks import (
     transport,
 )
 from lifecycle.manifest.checks.system import DeclaredSystem
-from lifecycle.manifest.diagnostics import Diagnostic
+from lifecycle.manifest.diagnostics import Diagnostic, in_order
 from lifecycle.manifest.model import Manifest
 from lifecycle.manifest.parameter_files import ParameterFiles
 
@@ -57,8 +57,4 @@ def check(
         environment=os.environ if environment is None else environment,
         files=files or ParameterFiles(manifest.path),
     )
-    found = [finding for each in CHECKS for finding in each(system)]
-    order = dict.fromkeys((manifest.path, *(each.at.file for each in found)))
-    rank = {file: index for index, file in enumerate(order)}
-    found.sort(key=lambda each: (rank[each.at.file], each.at.line, each.at.column))
-    return tuple(dict.fromkeys(found))
+    return in_order((finding for each in CHECKS for finding in each(system)), [manifest.path])

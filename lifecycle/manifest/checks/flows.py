@@ -104,14 +104,8 @@ def _marking(node: Node, each: ResolvedNeed) -> Iterator[Diagnostic]:
 
 def _is_best_effort(node: Node, need: FlowNeed) -> bool:
     """Whether a reader sends no ACKNACK: a BEST_EFFORT one never does (DDSI-RTPS §8.4.11)."""
-    qos = next(
-        (
-            each.qos
-            for each in node.interface.endpoints
-            if (each.kind, each.name) == (need.kind, need.name)
-        ),
-        None,
-    )
+    endpoint = node.interface.find(need.kind, need.name)
+    qos = None if endpoint is None else endpoint.qos
     return qos is not None and qos.reliability is Reliability.BEST_EFFORT
 
 

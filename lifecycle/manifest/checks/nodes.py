@@ -18,6 +18,7 @@ from lifecycle.errors import did_you_mean
 from lifecycle.manifest.checks.system import DeclaredSystem
 from lifecycle.manifest.diagnostics import Diagnostic, Position
 from lifecycle.manifest.model import (
+    PROCESS_KEYS,
     SUPERVISION_KEYS,
     After,
     Condition,
@@ -25,7 +26,6 @@ from lifecycle.manifest.model import (
     DiscoveryMode,
     DiscoveryRange,
     EndpointKind,
-    Executor,
     Machine,
     Node,
     Reaction,
@@ -93,8 +93,11 @@ def check_processes(system: DeclaredSystem) -> Iterator[Diagnostic]:
             yield from _apart(node, other, at)
 
 
-def _executor(run: Run) -> tuple[Executor, int]:
-    return run.executor, run.threads
+def _of_process(run: Run, key: str) -> object:
+    """Return what a node asks of its process, to be compared with what another asks of it."""
+    if key == "executor":
+        return run.executor, run.threads
+    return dict(run.environment) if key == "environment" else getattr(run, key)
 
 
 def _apart(node: Node, other: Node, at: Position) -> Iterator[Diagnostic]:
@@ -111,22 +114,9 @@ def _apart(node: Node, other: Node, at: Position) -> Iterator[Diagnostic]:
         hint = "a process that is one command has it at each of its nodes"
         yield error("check.process-run", at, message, hint)
         return
-    different = [
-        name
-        for name, mine, its in (
-            ("environment", dict(one.environment), dict(two.environment)),
-            ("working_directory", one.working_directory, two.working_directory),
-            ("prefix", one.prefix, two.prefix),
-            ("output", one.output, two.output),
-            ("ros_args", one.ros_args, two.ros_args),
-            ("no_new_privileges", one.no_new_privileges, two.no_new_privileges),
-            ("limits", one.limits, two.limits),
-            ("resources", one.resources, two.resources),
-            ("executor", _executor(one), _executor(two)),
-        )
-        if mine != its
-    ]
-    for name in different:
+    for name in (*PROCESS_KEYS, "executor"):
+        if _of_process(one, name) == _of_process(two, name):
+            continue
         message = f"{together}: a process has one {name}, these nodes ask for two"
         yield error("check.process-environment", at, message, f"give both the same 'run.{name}'")
     for key in SUPERVISION_KEYS:

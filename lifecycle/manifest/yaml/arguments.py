@@ -185,7 +185,7 @@ class _Substitution:
                 data[key] = self.value(each, inside)
         return replace(value, data=self._known(data, place))
 
-    def _known(self, entries: Mapping[str, Value], place: Place) -> Mapping[str, Value]:
+    def _known(self, entries: dict[str, Value], place: Place) -> dict[str, Value]:
         """Return the entries of a mapping whose values do not depend on programs."""
         if not self.open:
             return entries

@@ -55,18 +55,31 @@ class Value(msgspec.Struct, frozen=True, kw_only=True):
         quoted: the scalar was in quotes or was a block scalar: it is a string whatever it holds.
     """
 
-    data: Scalar | tuple[Value, ...] | Mapping[str, Value]
+    data: Scalar | tuple[Value, ...] | dict[str, Value]
     line: int
     column: int
     key: tuple[int, int] | None = None
     text: str = ""
     quoted: bool = False
 
+    def inside(self, place: Place) -> Value | None:
+        """Return the value at a place inside this one; None where there is none."""
+        value: Value | None = self
+        for step in place:
+            data = None if value is None else value.data
+            if isinstance(data, dict) and isinstance(step, str):
+                value = data.get(step)
+            elif isinstance(data, tuple) and isinstance(step, int):
+                value = data[step] if 0 <= step < len(data) else None
+            else:
+                return None
+        return value
+
     def plain(self, *, null: Any = None) -> Any:
         """Return the value without positions, as `Plain`; `null` is put for each null."""
         if isinstance(self.data, tuple):
             return [each.plain(null=null) for each in self.data]
-        if isinstance(self.data, Mapping):
+        if isinstance(self.data, dict):
             return {key: each.plain(null=null) for key, each in self.data.items()}
         return null if self.data is None else self.data
 
@@ -86,17 +99,7 @@ class Document(msgspec.Struct, frozen=True, kw_only=True):
 
     def find(self, place: Place) -> Value | None:
         """Return the value at a place relative to `root`; None where there is none."""
-        value = self.root
-        for step in place:
-            child: Value | None = None
-            if isinstance(value.data, Mapping) and isinstance(step, str):
-                child = value.data.get(step)
-            elif isinstance(value.data, tuple) and isinstance(step, int):
-                child = value.data[step] if 0 <= step < len(value.data) else None
-            if child is None:
-                return None
-            value = child
-        return value
+        return self.root.inside(place)
 
     def plain(self, place: Place) -> Any:
         """Return the value at a place without positions; an empty mapping where there is none."""
@@ -105,14 +108,11 @@ class Document(msgspec.Struct, frozen=True, kw_only=True):
 
     def at(self, place: Place = ()) -> Position:
         """Return the position of the value at `place`, or of the nearest value around it."""
-        value = self._nearest(place)
-        return self._position(value.line, value.column, place)
+        return self.position(self._nearest(place), place)
 
     def key_at(self, place: Place) -> Position:
         """Return the position of the key at `place`; of the value for items of a sequence."""
-        value = self._nearest(place)
-        line, column = value.key or (value.line, value.column)
-        return self._position(line, column, place)
+        return self.key_position(self._nearest(place), place)
 
     def _nearest(self, place: Place) -> Value:
         for length in range(len(place), 0, -1):
@@ -121,7 +121,14 @@ class Document(msgspec.Struct, frozen=True, kw_only=True):
                 return value
         return self.root
 
-    def _position(self, line: int, column: int, place: Place) -> Position:
+    def position(self, value: Value, place: Place) -> Position:
+        """Return the position of a value that is at `place`."""
+        spelled = spell_place((*self.place, *place))
+        return Position(file=self.file, line=value.line, column=value.column, path=spelled)
+
+    def key_position(self, value: Value, place: Place) -> Position:
+        """Return the position of the key of a value that is at `place`."""
+        line, column = value.key or (value.line, value.column)
         spelled = spell_place((*self.place, *place))
         return Position(file=self.file, line=line, column=column, path=spelled)
 
@@ -162,36 +169,39 @@ class Cursor(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def at(self) -> Position:
         """Position of the value."""
-        return self.document.at(self.place)
+        return self.document.position(self.value, self.place)
 
     @property
     def key_at(self) -> Position:
         """Position of the key of the value."""
-        return self.document.key_at(self.place)
+        return self.document.key_position(self.value, self.place)
 
     @property
     def scalar(self) -> Scalar:
         """The value of a scalar."""
-        assert not isinstance(self.value.data, (tuple, Mapping))
+        assert not isinstance(self.value.data, (tuple, dict))
         return self.value.data
 
     def __contains__(self, key: str) -> bool:
-        return isinstance(self.value.data, Mapping) and key in self.value.data
+        return isinstance(self.value.data, dict) and key in self.value.data
 
     def get(self, *keys: str) -> Cursor | None:
         """Return the cursor on a value below this mapping; None where a key is missing."""
-        place: Place = (*self.place, *keys)
-        value = self.document.find(place)
-        return None if value is None else Cursor(document=self.document, place=place, value=value)
+        value = self.value.inside(keys)
+        return None if value is None else self.below(value, *keys)
+
+    def below(self, value: Value, *steps: str | int) -> Cursor:
+        """Return the cursor on a value that is some steps inside this one."""
+        return Cursor(document=self.document, place=(*self.place, *steps), value=value)
 
     def entries(self, *keys: str) -> Iterator[tuple[str, Cursor]]:
         """Return the entries of a mapping below this one, in order; none where it is missing."""
         cursor = self.get(*keys)
         if cursor is None:
             return
-        assert isinstance(cursor.value.data, Mapping)
+        assert isinstance(cursor.value.data, dict)
         for key, value in cursor.value.data.items():
-            yield key, Cursor(document=self.document, place=(*cursor.place, key), value=value)
+            yield key, cursor.below(value, key)
 
     def items(self, *keys: str) -> Iterator[Cursor]:
         """Return the items of a sequence below this mapping; none where it is missing."""
@@ -200,13 +210,13 @@ class Cursor(msgspec.Struct, frozen=True, kw_only=True):
             return
         assert isinstance(cursor.value.data, tuple)
         for index, value in enumerate(cursor.value.data):
-            yield Cursor(document=self.document, place=(*cursor.place, index), value=value)
+            yield cursor.below(value, index)
 
     def children(self) -> Iterator[tuple[str, Cursor]]:
         """Return what is directly inside, by key or index; nothing inside a scalar."""
         if isinstance(self.value.data, tuple):
             yield from ((str(index), each) for index, each in enumerate(self.items()))
-        elif isinstance(self.value.data, Mapping):
+        elif isinstance(self.value.data, dict):
             yield from self.entries()
 
     def text(self, key: str, default: str = "") -> str:
@@ -224,7 +234,7 @@ class Cursor(msgspec.Struct, frozen=True, kw_only=True):
         """
         known: type = type_
         for name, hint in _hints(known).items():
-            value = None if name in computed else self.document.find((*self.place, name))
+            value = None if name in computed else self.value.inside((name,))
             if value is not None:
                 computed[name] = _converted(value, hint)
         return type_(**computed)

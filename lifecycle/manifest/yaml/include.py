@@ -153,9 +153,7 @@ def _moved_topic(link: Link, old: dict[str, Node], new: dict[str, Node]) -> str:
     return link.topic
 
 
-def join(
-    outer: Manifest, inner: Manifest, at: Position, found: Findings, *, what: str = "include"
-) -> Manifest:
+def join(outer: Manifest, inner: Manifest, at: Position, found: Findings, *, what: str) -> Manifest:
     """Add an included manifest to the one that includes it.
 
     The discovery, network, data layer and policy of the including one hold.

@@ -157,26 +157,12 @@ MAX_FINDINGS = 200
 _SHOWN_DEPTH = 8  # steps of a document path in a message that ends the reading
 
 
-class _Frame(msgspec.Struct):
-    """A collection that is still open."""
+class _Node(msgspec.Struct, frozen=True):
+    """A value, how many values it and all inside it are, and how deep these go."""
 
-    place: Place
-    line: int
-    column: int
-    anchor: str | None
-    mapping: dict[str, Value] | None  # None for a sequence
-    items: list[Value]
-    key: str | None = None
-    key_mark: tuple[int, int] = (1, 1)
-    skip: bool = False  # the key was refused: its value is read and dropped
-    values: int = 1  # with everything inside, aliases expanded
-    height: int = 1
-
-
-class _Anchored(msgspec.Struct, frozen=True):
     value: Value
-    values: int
-    height: int
+    values: int = 1
+    height: int = 0
 
 
 def events(text: str, *, file: str) -> Iterator[yaml.Event]:
@@ -213,228 +199,196 @@ def compose(text: str, *, file: str) -> tuple[Document, tuple[Diagnostic, ...]]:
         ManifestError: not YAML, over a limit, or more or less than one document; with what was
             found up to there.
     """
-    return _Composer(file).run(text)
+    return _Composer(text, file).run()
+
+
+_Mark = tuple[int, int]
+"""Line and column, from 1."""
+
+
+def _mark(event: yaml.Event) -> _Mark:
+    start = event.start_mark
+    return (start.line + 1, start.column + 1) if start else (1, 1)
 
 
 class _Composer:
-    """Builds values bottom-up from events; holds the open collections on a stack."""
+    """Builds values from events; `MAX_DEPTH` bounds how deep it calls itself."""
 
-    def __init__(self, file: str) -> None:
+    def __init__(self, text: str, file: str) -> None:
         self._file = file
-        self._stack: list[_Frame] = []
-        self._anchors: dict[str, _Anchored | None] = {}  # None while still open
+        self._events = self._parse(text)
+        self._anchors: dict[str, _Node | None] = {}  # None while still open
         self._found: list[Diagnostic] = []
         self._values = 0
         self._aliases = 0
-        self._root: Value | None = None
 
-    def run(self, text: str) -> tuple[Document, tuple[Diagnostic, ...]]:
-        import yaml
-
-        for event in self._events(text):
-            start = event.start_mark
-            mark = (start.line + 1, start.column + 1) if start else (1, 1)
-            if isinstance(event, yaml.DocumentStartEvent) and self._root is not None:
-                self._stop(
-                    mark, "cannot read more than one document in a file", "remove this '---'"
-                )
-            elif isinstance(event, yaml.AliasEvent):
-                self._alias(event.anchor, mark)
-            elif isinstance(event, (yaml.MappingStartEvent, yaml.SequenceStartEvent)):
-                self._open(event, mark, mapping=isinstance(event, yaml.MappingStartEvent))
-            elif isinstance(event, (yaml.MappingEndEvent, yaml.SequenceEndEvent)):
-                self._close()
-            elif isinstance(event, yaml.ScalarEvent):
-                self._scalar(event, mark)
-        if self._root is None:
-            self._stop((1, 1), EMPTY, "start with 'manifest_version: 1'")
-        return Document(file=self._file, root=self._root), tuple(self._found)
-
-    def _events(self, text: str) -> Iterator[yaml.Event]:
+    def _parse(self, text: str) -> Iterator[yaml.Event]:
         try:
             yield from events(text, file=self._file)
         except ManifestError as problem:
             raise ManifestError([*self._found, *problem.diagnostics]) from problem
 
-    # -- events
+    def run(self) -> tuple[Document, tuple[Diagnostic, ...]]:
+        import yaml
 
-    def _open(
-        self, event: yaml.CollectionStartEvent, mark: tuple[int, int], *, mapping: bool
-    ) -> None:
-        self._refuse_tag(event.tag, mark)
-        if self._wants_key():
-            self._stop(
-                mark, f"cannot use a {'mapping' if mapping else 'list'} as a key", "use a string"
-            )
-        if len(self._stack) >= MAX_DEPTH:
-            self._stop(mark, f"cannot read values nested deeper than {MAX_DEPTH} levels")
-        self._count(1, mark)
-        self._reserve(event.anchor)
-        frame = _Frame(
-            place=self._next_place(),
-            line=mark[0],
-            column=mark[1],
-            anchor=event.anchor,
-            mapping={} if mapping else None,
-            items=[],
-        )
-        self._stack.append(frame)
+        root = None
+        for event in self._events:
+            if isinstance(event, yaml.DocumentStartEvent) and root is not None:
+                message = "cannot read more than one document in a file"
+                self._stop(_mark(event), (), message, "remove this '---'")
+            elif isinstance(event, yaml.NodeEvent):
+                root = self._node(event, ()).value
+        if root is None:
+            self._stop((1, 1), (), EMPTY, "start with 'manifest_version: 1'")
+        return Document(file=self._file, root=root), tuple(self._found)
 
-    def _close(self) -> None:
-        frame = self._stack.pop()
-        data: tuple[Value, ...] | Mapping[str, Value] = (
-            tuple(frame.items) if frame.mapping is None else frame.mapping
-        )
-        value = Value(data=data, line=frame.line, column=frame.column)
-        self._finish(value, frame.anchor, frame.values, frame.height)
+    def _node(self, event: yaml.Event, place: Place) -> _Node:
+        """Return what begins with an event; its place has a step for each collection around it."""
+        import yaml
 
-    def _scalar(self, event: yaml.ScalarEvent, mark: tuple[int, int]) -> None:
-        self._refuse_tag(event.tag, mark)
-        self._count(1, mark)
-        self._reserve(event.anchor)
+        mark = _mark(event)
+        if isinstance(event, yaml.AliasEvent):
+            return self._alias(event.anchor, mark, place)
+        if isinstance(event, yaml.ScalarEvent):
+            node = _Node(self._scalar(event, place))
+        else:
+            assert isinstance(event, yaml.CollectionStartEvent)
+            self._refuse_tag(event.tag, mark, place)
+            if len(place) >= MAX_DEPTH:
+                self._stop(mark, place, _TOO_DEEP)
+            self._begin(event, place)
+            is_mapping = isinstance(event, yaml.MappingStartEvent)
+            node = self._mapping(mark, place) if is_mapping else self._sequence(mark, place)
+        if event.anchor is not None:
+            self._anchors[event.anchor] = node
+        return node
+
+    def _begin(self, event: yaml.NodeEvent, place: Place) -> None:
+        self._count(1, _mark(event), place)
+        if event.anchor is not None:
+            self._anchors[event.anchor] = None
+
+    def _sequence(self, mark: _Mark, place: Place) -> _Node:
+        import yaml
+
+        inside: list[_Node] = []
+        while not isinstance(event := next(self._events), yaml.SequenceEndEvent):
+            inside.append(self._node(event, (*place, len(inside))))
+        return _collection(tuple(each.value for each in inside), mark, inside)
+
+    def _mapping(self, mark: _Mark, place: Place) -> _Node:
+        import yaml
+
+        data: dict[str, Value] = {}
+        inside: list[_Node] = []
+        while not isinstance(event := next(self._events), yaml.MappingEndEvent):
+            key, is_kept = self._key(event, data, place)
+            inside.append(self._node(next(self._events), (*place, key)))
+            if is_kept:
+                data[key] = replace(inside[-1].value, key=_mark(event))
+        return _collection(data, mark, inside)
+
+    def _scalar(self, event: yaml.ScalarEvent, place: Place) -> Value:
+        mark = _mark(event)
+        self._refuse_tag(event.tag, mark, place)
+        self._begin(event, place)
         if _UNFIT.search(event.value):
-            message = f"cannot use {_cut(event.value)}: it holds a NUL or half a character"
-            self._note("yaml.character", mark, message, "remove the escape")
+            message = f"cannot use {quote(event.value)}: it holds a NUL or half a character"
+            self._note("yaml.character", mark, place, message, "remove the escape")
         # libyaml has "" for a plain scalar, PyYAML None; '!' makes a string (YAML 1.2.2 §6.9.1).
         quoted = bool(event.style) or event.tag == "!"
         data: Scalar = event.value
         if not quoted:
             try:
                 data = resolve(event.value)
-                check_finite(data, self._next_place())
+                check_finite(data, place)
             except ValueError as problem:
-                self._note("yaml.number", mark, f"cannot use {_cut(event.value)}: {problem}")
-        if self._wants_key():
-            self._key(data, event, mark)
-            return
-        value = Value(data=data, line=mark[0], column=mark[1], text=event.value, quoted=quoted)
-        self._finish(value, event.anchor, 1, 0)
+                message = f"cannot use {quote(event.value)}: {problem}"
+                self._note("yaml.number", mark, place, message)
+        return Value(data=data, line=mark[0], column=mark[1], text=event.value, quoted=quoted)
 
-    def _alias(self, anchor: str | None, mark: tuple[int, int]) -> None:
-        if self._wants_key():
-            self._stop(mark, f"cannot use the alias '*{anchor}' as a key", "write the key out")
+    def _alias(self, anchor: str | None, mark: _Mark, place: Place) -> _Node:
         self._aliases += 1
         if self._aliases > MAX_ALIASES:
-            self._stop(mark, f"cannot read more than {MAX_ALIASES} aliases")
+            self._stop(mark, place, f"cannot read more than {MAX_ALIASES} aliases")
         if anchor is None or anchor not in self._anchors:
-            self._stop(mark, f"cannot find the anchor '&{anchor}' above this alias")
+            self._stop(mark, place, f"cannot find the anchor '&{anchor}' above this alias")
         anchored = self._anchors[anchor]
         if anchored is None:
-            self._stop(mark, f"cannot use the alias '*{anchor}' inside its own anchor")
-        self._count(anchored.values, mark)
-        if len(self._stack) + anchored.height > MAX_DEPTH:
-            self._stop(mark, f"cannot read values nested deeper than {MAX_DEPTH} levels")
-        value = replace(anchored.value, line=mark[0], column=mark[1])
-        self._finish(value, None, anchored.values, anchored.height)
+            self._stop(mark, place, f"cannot use the alias '*{anchor}' inside its own anchor")
+        self._count(anchored.values, mark, place)
+        if len(place) + anchored.height > MAX_DEPTH:
+            self._stop(mark, place, _TOO_DEEP)
+        return replace(anchored, value=replace(anchored.value, line=mark[0], column=mark[1]))
 
-    def _key(self, data: Scalar, event: yaml.ScalarEvent, mark: tuple[int, int]) -> None:
-        frame = self._stack[-1]
-        assert frame.mapping is not None
-        frame.key, frame.key_mark, frame.skip = event.value, mark, True
-        if event.value == "<<" and not event.style:
-            self._note(
-                "yaml.merge-key",
-                mark,
-                "cannot use the merge key '<<': YAML 1.2 has none",
-                "write the keys out, or use an alias for a whole value",
-            )
-        elif not isinstance(data, str):
-            hint = f'write "{event.value}"' if event.value else "write the key before the colon"
-            self._note("yaml.key", mark, f"cannot use {_cut(event.value)} as a key", hint)
-        elif event.value in frame.mapping:
-            first = frame.mapping[event.value].key
-            assert first is not None
-            self._note(
-                "yaml.duplicate-key",
-                mark,
-                f"cannot use the key {_cut(event.value)} twice",
-                f"remove one; the first stands at {self._file}:{first[0]}:{first[1]}",
-                (*frame.place, event.value),
-            )
+    def _key(self, event: yaml.Event, known: Mapping[str, Value], place: Place) -> tuple[str, bool]:
+        """Return a key of the mapping at a place, and whether its value is kept."""
+        import yaml
+
+        mark = _mark(event)
+        if isinstance(event, yaml.AliasEvent):
+            message = f"cannot use the alias '*{event.anchor}' as a key"
+            self._stop(mark, place, message, "write the key out")
+        if isinstance(event, yaml.CollectionStartEvent):
+            self._refuse_tag(event.tag, mark, place)
+            what = "mapping" if isinstance(event, yaml.MappingStartEvent) else "list"
+            self._stop(mark, place, f"cannot use a {what} as a key", "use a string")
+        assert isinstance(event, yaml.ScalarEvent)
+        key, value = event.value, self._scalar(event, place)
+        if key == "<<" and not event.style:
+            message = "cannot use the merge key '<<': YAML 1.2 has none"
+            hint = "write the keys out, or use an alias for a whole value"
+            self._note("yaml.merge-key", mark, (*place, key), message, hint)
+        elif not isinstance(value.data, str):
+            hint = f'write "{key}"' if key else "write the key before the colon"
+            self._note("yaml.key", mark, (*place, key), f"cannot use {quote(key)} as a key", hint)
+        elif key in known:
+            line, column = known[key].key or mark
+            message = f"cannot use the key {quote(key)} twice"
+            hint = f"remove one; the first stands at {self._file}:{line}:{column}"
+            self._note("yaml.duplicate-key", mark, (*place, key), message, hint)
         else:
-            frame.skip = False
+            return key, True
+        return key, False
 
-    # -- the stack
-
-    def _finish(self, value: Value, anchor: str | None, values: int, height: int) -> None:
-        """Put a complete value where it belongs."""
-        if anchor is not None:
-            self._anchors[anchor] = _Anchored(value, values, height)
-        if not self._stack:
-            self._root = value
-            return
-        frame = self._stack[-1]
-        frame.values += values
-        frame.height = max(frame.height, height + 1)
-        if frame.mapping is None:
-            frame.items.append(value)
-            return
-        assert frame.key is not None
-        if not frame.skip:
-            frame.mapping[frame.key] = replace(value, key=frame.key_mark)
-        frame.key = None
-
-    def _wants_key(self) -> bool:
-        return (
-            bool(self._stack)
-            and self._stack[-1].mapping is not None
-            and self._stack[-1].key is None
-        )
-
-    def _next_place(self) -> Place:
-        if not self._stack:
-            return ()
-        frame = self._stack[-1]
-        if frame.mapping is None:
-            return (*frame.place, len(frame.items))
-        return frame.place if frame.key is None else (*frame.place, frame.key)
-
-    def _reserve(self, anchor: str | None) -> None:
-        if anchor is not None:
-            self._anchors[anchor] = None
-
-    def _count(self, values: int, mark: tuple[int, int]) -> None:
+    def _count(self, values: int, mark: _Mark, place: Place) -> None:
         self._values += values
         if self._values > MAX_VALUES:
-            self._stop(mark, f"cannot read more than {MAX_VALUES} values, aliases expanded")
+            self._stop(mark, place, f"cannot read more than {MAX_VALUES} values, aliases expanded")
 
-    # -- findings
-
-    def _refuse_tag(self, tag: str | None, mark: tuple[int, int]) -> None:
+    def _refuse_tag(self, tag: str | None, mark: _Mark, place: Place) -> None:
         if tag is not None and tag != "!":
             spelled = tag.replace("tag:yaml.org,2002:", "!!")
-            self._note(
-                "yaml.tag",
-                mark,
-                f"cannot use the tag {_cut(spelled)}: a manifest is data only",
-                "remove the tag; quotes make a string",
-            )
+            message = f"cannot use the tag {quote(spelled)}: a manifest is data only"
+            self._note("yaml.tag", mark, place, message, "remove the tag; quotes make a string")
 
-    def _position(self, mark: tuple[int, int], place: Place | None = None) -> Position:
-        where = self._next_place() if place is None else place
-        return Position(file=self._file, line=mark[0], column=mark[1], path=spell_place(where))
+    def _position(self, mark: _Mark, place: Place) -> Position:
+        return Position(file=self._file, line=mark[0], column=mark[1], path=spell_place(place))
 
-    def _note(
-        self,
-        rule: str,
-        mark: tuple[int, int],
-        message: str,
-        hint: str = "",
-        place: Place | None = None,
-    ) -> None:
+    def _note(self, rule: str, mark: _Mark, place: Place, message: str, hint: str = "") -> None:
         """Record a finding and go on, unless there are too many."""
         if len(self._found) == MAX_FINDINGS:
-            self._stop(mark, f"cannot list more than {MAX_FINDINGS} findings", "fix these first")
+            what = f"cannot list more than {MAX_FINDINGS} findings"
+            self._stop(mark, place, what, "fix these first")
         self._found.append(error(rule, self._position(mark, place), message, hint))
 
-    def _stop(self, mark: tuple[int, int], message: str, hint: str = "") -> NoReturn:
+    def _stop(self, mark: _Mark, place: Place, message: str, hint: str = "") -> NoReturn:
         """Give up at once, with everything found so far."""
-        at = self._position(mark, self._next_place()[:_SHOWN_DEPTH])
+        at = self._position(mark, place[:_SHOWN_DEPTH])
         raise ManifestError([*self._found, error("yaml.limit", at, message, hint)])
 
 
-def _cut(text: str) -> str:
-    return quote(text)
+_TOO_DEEP = f"cannot read values nested deeper than {MAX_DEPTH} levels"
+
+
+def _collection(
+    data: tuple[Value, ...] | dict[str, Value], mark: _Mark, inside: list[_Node]
+) -> _Node:
+    return _Node(
+        Value(data=data, line=mark[0], column=mark[1]),
+        values=1 + sum(each.values for each in inside),
+        height=1 + max((each.height for each in inside), default=0),
+    )
 
 
 def _explain(why: str, text: str, line: int, column: int) -> tuple[str, str]:
