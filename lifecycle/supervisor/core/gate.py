@@ -18,7 +18,7 @@ from lifecycle.verify.judge import not_ok, with_findings, with_only
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import rule
 from lifecycle.verify.rules.catalogue import Heals
-from lifecycle.verify.rules.nodes import UNATTRIBUTED_ENDPOINT
+from lifecycle.verify.rules.nodes import UNATTRIBUTED_ENDPOINT, UNDECLARED_NODE
 from lifecycle.verify.rules.state import ACTIVATED_AT_CLOSED_GATE, MISSING_REPORT
 from lifecycle.verify.verdict import Finding, FindingKey, Verdict
 
@@ -205,14 +205,17 @@ def see_violations(run: Run) -> None:
     judged = run.judged
     if judged.verdict is None:
         return
-    if not run.is_watched or run.asked is not None or run.change is not None:
-        judged.violated = {}  # what an order brings about is judged at its gate
+    if not run.is_watched:
+        judged.violated = {}
         return
+    is_ordered = run.asked is not None or run.change is not None
     names = run.away | run.left | judged.away
     verdict = of_those_there(run, without(run, judged.verdict, names))
     found = {each.key: each for each in verdict.findings if each.outcome is Outcome.VIOLATED}
+    if is_ordered:  # what an order brings about is judged at its gate; a stranger it does not bring
+        found = {key: each for key, each in found.items() if _is_strangers(run, each)}
     keys = [*found]
-    if verdict.verdict is Outcome.VIOLATED and not found:
+    if verdict.verdict is Outcome.VIOLATED and not found and not is_ordered:
         keys = [("", verdict.verdict.value, "", None)]
     judged.violated = {key: judged.violated.get(key, run.now_s) for key in keys}
     lasting = [key for key, at_s in judged.violated.items() if lasts_until(run, at_s + LASTS_S)]
@@ -225,6 +228,14 @@ def see_violations(run: Run) -> None:
         if key in lasting or (passes and len(judged.passed) < _MOST):
             name = _named(key)
             judged.passed[name] = judged.passed.get(name, False) or key in lasting
+
+
+def _is_strangers(run: Run, finding: Finding) -> bool:
+    """Return whether it is of a node that no manifest has, neither that in force nor another."""
+    change = run.change
+    plans = (run.plan, *(() if change is None else (change.before, change.plan)))
+    known = {each.full_name for plan in plans for each in plan.nodes}
+    return finding.rule == UNDECLARED_NODE.id and known.isdisjoint(finding.nodes)
 
 
 def passed(judged: Judged) -> str:

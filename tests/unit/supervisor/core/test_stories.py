@@ -537,3 +537,18 @@ def test_a_bring_up_that_takes_too_long_names_the_node_that_it_waits_for_and_its
     assert (failed.subject, failed.process) == ("/camera", "camera")
     play.wait(30.0)
     assert play.code == ExitCode.BRING_UP_FAILED
+
+
+def test_a_stranger_that_stays_while_an_order_is_carried_out_is_in_the_exit_code() -> None:
+    play = Play(CHAIN, ways={"viewer deactivate": "hang"}, hold_s=9.0)
+    play.order(ControlRequest.RESTART, node="/viewer")
+    play.see(INTRUDER)
+    play.wait(1.5)
+    play.see()
+    play.ways.clear()
+    (held,) = play.held
+    play.give(inputs.Replied(node="viewer", number=held.number, level=Level.CONNECTED))
+    play.wait(2.0)
+    assert play.levels == "4 4"
+    play.wait(30.0)
+    assert play.code == ExitCode.VIOLATED

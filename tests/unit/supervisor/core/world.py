@@ -173,7 +173,8 @@ class World:
     # The loop
 
     def give(self, what: Any) -> None:
-        self.mark += type(what).__name__ in ("Exited", "Replied", "Saw", "Changed", "Silent")
+        self.mark += type(what).__name__ in ("Exited", "Replied", "Saw", "Changed")
+        self.mark += type(what).__name__ == "Silent" and what.node in self.run.nodes
         self.events = self.core.take(self.run, self.now_s, what)
         effects = self.core.advance.advance(self.run)
         self.wake_s = float("inf")
