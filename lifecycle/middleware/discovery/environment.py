@@ -21,7 +21,7 @@ from lifecycle.middleware.fastdds.profiles import (
     DefaultProfile,
     default_profile,
 )
-from lifecycle.middleware.fastdds.sockets import open_sockets
+from lifecycle.middleware.fastdds.sockets import open_sockets, udp_sockets
 from lifecycle.middleware.fastdds.url_profile import (
     DISCOVERY_GROUP,
     UrlTransport,
@@ -215,6 +215,31 @@ def is_served(urls: Sequence[ConnectionUrl], environment: Mapping[str, str]) -> 
     profile = None if urls else _users_profile(environment)
     protocols = () if profile is None else profile.element.iter("discoveryProtocol")
     return any((each.text or "").strip() not in ("", "SIMPLE", "NONE") for each in protocols)
+
+
+def missing_port(
+    domain_id: int, urls: Sequence[ConnectionUrl], environment: Mapping[str, str]
+) -> int | None:
+    """Return the UDP port of the multicast by which participants find each other, if it is missing.
+
+    Fast DDS shares that port with other participants. If another kind of socket has it, no
+    participant of this host receives announcements, and none of them finds another; Fast DDS 2.14
+    says nothing.
+
+    Args:
+        domain_id: of a participant of this process.
+        urls: its own.
+        environment: as for `reach`.
+
+    Returns:
+        None if this process has it, or participants look for each other elsewhere, too.
+    """
+    if urls or chosen_otherwise(environment) or _range(environment) != "SUBNET":
+        return None
+    port = participant_ports(domain_id, 0).discovery_multicast
+    if _static_peers(environment) or any(each.port == port for each in open_sockets()):
+        return None
+    return port if any(each.port == port for each in udp_sockets()) else None
 
 
 def chosen_otherwise(environment: Mapping[str, str]) -> bool:

@@ -19,11 +19,12 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
-from lifecycle.errors import ExitCode
+from lifecycle.errors import ExitCode, MiddlewareError
 from lifecycle.manifest.model import Authority, DataLayerSource, EndpointPolicy, RunKind
 from lifecycle.middleware.discovery.environment import (
     all_by_multicast,
     discovery_peers,
+    missing_port,
     peers_environment,
 )
 from lifecycle.middleware.fastdds.profiles import (
@@ -363,7 +364,21 @@ async def _observer_participant(
                 f"try {number + 1} of {OBSERVER_TRIES - 1}"
             )
         )
-    if unasked_s := observer_participant.discovery.settling.unasked_s:
+    # Nodes elsewhere would be found: they answer to ports of ours.
+    discovery = observer_participant.discovery
+    port = None
+    if local_processes(plan, options.machine):
+        port = missing_port(discovery.domain_id, discovery.urls, os.environ)
+    if port is not None:
+        observer_participant.prepare_to_leave()
+        observer_participant.destroy()
+        raise MiddlewareError(
+            f"cannot discover nodes of this host in domain {plan.domain_id}: UDP port {port}, by "
+            "which all participants find each other, is taken by something else",
+            hint=f"`ss -lunp 'sport = :{port}'` says by what; end it, or choose another domain: "
+            "`lifecycle ports` says which are safe",
+        )
+    if unasked_s := discovery.settling.unasked_s:
         emit(
             Notice(
                 message=f"who is there is seen within {unasked_s:g} s, before which the gate stays "
