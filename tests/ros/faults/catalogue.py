@@ -434,7 +434,7 @@ FLOWS = (
         exit_code=ExitCode.VIOLATED,
         rule="flow.unverifiable",
         subject="/chatter",
-        message="cannot be proven: /listener does not report",
+        message="is not proven: /listener does not report",
     ),
     Fault(
         name="nobody measures the rate that the manifest declares and the gate is strict",
