@@ -294,7 +294,7 @@ def _match_node(
                 planned=planned,
                 observed=observed,
                 report=report,
-                end=_end(node, planned, observed, report, beyond=beyond),
+                end=_end(node, planned, observed, report),
                 unseen=unseen,
                 beyond=beyond,
             )
@@ -444,8 +444,6 @@ def _end(
     planned: PlannedEndpoint,
     observed: ObservedEndpoint | None,
     report: EndpointReport | None,
-    *,
-    beyond: bool,
 ) -> SeenEndpoint:
     """Return a declared endpoint with all that is known of it."""
     shown = observed.qos if observed else None
@@ -458,10 +456,11 @@ def _end(
         node=node.full_name,
         name=planned.resolved,
         type=observed.type if observed else planned.type,
-        qos=planned.qos if beyond else actual_qos(shown, report.qos if report else None),
+        qos=actual_qos(shown, report.qos if report else None),
         report=report,
         planned=planned,
         type_hash=type_hash,
+        observed=observed is not None or report is not None,
     )
 
 
@@ -485,7 +484,7 @@ def _seen(
     """Collect publishers and subscriptions with all that is known of them."""
     topical = [each for each in actual if each.planned.kind.is_topic]
     # Not visible here, but the endpoints that match them count them.
-    found = [each.end for each in topical if each.beyond]
+    found = [each.end for each in topical if each.beyond and each.observed is None]
     declared = {id(each.observed): each.end for each in topical if each.observed is not None}
     found += [
         declared.get(id(each)) or _not_declared(each)

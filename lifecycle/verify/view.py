@@ -53,6 +53,7 @@ class SeenEndpoint(msgspec.Struct, frozen=True, kw_only=True):
         type_hash: as `ObservedEndpoint` has it; as its node reports it where discovery does not.
         expected: it is one that the system has for good, so that whatever can match it must; a
             tool's may be matched or not.
+        observed: discovery or its node shows it; else it is known from its declaration alone.
     """
 
     kind: EndpointKind
@@ -64,6 +65,7 @@ class SeenEndpoint(msgspec.Struct, frozen=True, kw_only=True):
     planned: PlannedEndpoint | None = None
     type_hash: str | None = None
     expected: bool = True
+    observed: bool = True
 
 
 class Actual(msgspec.Struct, frozen=True, kw_only=True):
@@ -72,8 +74,7 @@ class Actual(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         observed: what discovery shows; None if it does not show the endpoint.
         report: what the node itself says; None if it says nothing of it.
-        end: what others can match with: as discovery shows it, else as its node says; as declared
-            where both are out of reach.
+        end: what others can match with: as discovery shows it, else as its node says.
         unseen: discovery cannot be expected to show it to this observer; `observed` is what its
             node says then.
         beyond: its whole node is out of this observer's reach, and so is its report.

@@ -20,7 +20,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from lifecycle.manifest.model import EndpointKind, EndpointPolicy
 from lifecycle.manifest.names import DIAGNOSTICS_TOPIC
-from lifecycle.manifest.qos import UNKNOWN_QOS, Certainty, incompatibilities
+from lifecycle.manifest.qos import Certainty, incompatibilities
 from lifecycle.verify.observation import ObservedEndpoint
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules.catalogue import About, Heals, Rule
@@ -88,11 +88,16 @@ _NO_ENDS: _Ends = ([], [])
 
 
 def obstacle(publisher: SeenEndpoint, subscription: SeenEndpoint) -> str:
-    """Return why two ends cannot match at all (DDS 1.4 §2.2.2.5, §2.2.3); empty if they can."""
+    """Return why two ends cannot match at all (DDS 1.4 §2.2.2.5, §2.2.3); empty if they can.
+
+    QoS that nobody observed is no reason: what an end only declares excludes it from no count.
+    """
     if publisher.type != subscription.type:
         return f"the types differ, {publisher.type} and {subscription.type}"
-    offered, requested = publisher.qos or UNKNOWN_QOS, subscription.qos or UNKNOWN_QOS
-    if any(each.severity is Certainty.CERTAIN for each in incompatibilities(offered, requested)):
+    if publisher.qos is None or subscription.qos is None:
+        return ""
+    found = incompatibilities(publisher.qos, subscription.qos)
+    if any(each.severity is Certainty.CERTAIN for each in found):
         return "the QoS is incompatible"
     return ""
 

@@ -174,9 +174,15 @@ def spell(profile: QosProfile, policy: str) -> str:
 
 
 def _pairs(view: View, ends: list[SeenEndpoint]) -> Iterator[Finding]:
-    """Every publisher against every subscription of a topic, at least one of them ours."""
-    publishers = [each for each in ends if each.kind is EndpointKind.PUBLISHER]
-    subscriptions = [each for each in ends if each.kind is not EndpointKind.PUBLISHER]
+    """Every publisher against every subscription of a topic, at least one of them ours.
+
+    Of an end that nobody observed there is no QoS to compare: its node is named as out of reach,
+    and its flows are proven by those that count whom they are matched with.
+    """
+    publishers = [each for each in ends if each.kind is EndpointKind.PUBLISHER and each.observed]
+    subscriptions = [
+        each for each in ends if each.kind is not EndpointKind.PUBLISHER and each.observed
+    ]
     done: set[tuple[str, str, str, str, str]] = set()
     for publisher in publishers:
         for subscription in subscriptions:

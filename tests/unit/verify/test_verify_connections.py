@@ -14,9 +14,11 @@ from lifecycle.manifest.model import (
     EndpointKind,
     EndpointPolicy,
     Machine,
+    Policy,
     Run,
     RunKind,
 )
+from lifecycle.manifest.qos import Durability, History, Liveliness, QosProfile, Reliability
 from lifecycle.plan.model import ParticipantConnections, Plan, PlannedNode, PlannedParticipant
 from lifecycle.verify.observation import Observation
 from lifecycle.verify.outcome import ConnectionReport, Outcome
@@ -318,6 +320,29 @@ BEYOND = replace(
         replace(each, connections=ParticipantConnections(urls=("shm://",))) for each in PLAN.nodes
     ),
 )
+OPEN = Policy(undeclared_nodes=EndpointPolicy.OPEN)
+RELIABLE = QosProfile(
+    history=History.KEEP_LAST,
+    depth=5,
+    reliability=Reliability.RELIABLE,
+    durability=Durability.VOLATILE,
+    liveliness=Liveliness.AUTOMATIC,
+)
+
+
+def with_qos(plan: Plan, **declared: QosProfile) -> Plan:
+    """The plan, in which the first endpoint of each of these nodes declares a profile."""
+    return replace(
+        plan,
+        nodes=tuple(
+            replace(each, endpoints=(replace(each.endpoints[0], qos=declared[each.key]),))
+            if each.key in declared
+            else each
+            for each in plan.nodes
+        ),
+    )
+
+
 NOTHING_OF_THE_CAMERA = both(HIDDEN, drop_node("/camera"), drop_report("/camera"))
 
 
@@ -331,6 +356,51 @@ def test_a_node_beyond_reach_is_unverifiable_and_its_flow_proven_by_who_hears_it
         ("graph.missing-node", "unverifiable", "/camera"),
         ("graph.unmatched-flow", "violated", FLOW),
     ]
+
+
+@pytest.mark.parametrize(
+    ("edit", "expected"),
+    [
+        # Neither end counts whom it is matched with.
+        (
+            drop_report("/viewer"),
+            ("flow.unreported", "unverifiable", FLOW),
+        ),
+        # One match, and two publishers that may be it: what the camera only declares excludes none.
+        (
+            add_endpoint(PUB, "/other", "/video", qos=RELIABLE),
+            ("graph.unmatched-flow", "unverifiable", FLOW),
+        ),
+    ],
+)
+def test_qos_that_nobody_observed_proves_no_flow(
+    edit: Edit, expected: tuple[str, str, str]
+) -> None:
+    plan = replace(BEYOND, policy=OPEN)
+    plan = with_qos(plan, camera=RELIABLE, viewer=RELIABLE)
+    here = frozenset({"operator"})
+    assert expected in findings(both(NOTHING_OF_THE_CAMERA, edit), plan, machines=here)
+    # As declared the camera could not match: that is not seen, and so it is not left out either.
+    plan = with_qos(plan, camera=replace(RELIABLE, reliability=Reliability.BEST_EFFORT))
+    assert expected in findings(both(NOTHING_OF_THE_CAMERA, edit), plan, machines=here)
+
+
+def test_of_a_node_beyond_reach_its_own_report_counts_and_not_what_it_declares() -> None:
+    plan = with_qos(BEYOND, camera=RELIABLE, viewer=RELIABLE)
+    here = frozenset({"operator"})
+    shown = both(HIDDEN, drop_node("/camera"))
+    out_of_reach = ("graph.missing-node", "unverifiable", "/camera")
+    assert findings(shown, plan, machines=here) == [out_of_reach]
+    otherwise = change_report(
+        PUB, "/video", qos=replace(RELIABLE, reliability=Reliability.BEST_EFFORT)
+    )
+    found = findings(both(shown, otherwise), plan, machines=here)
+    assert ("graph.qos-differs", "violated", "/video") in found
+    assert ("graph.qos-incompatible", "violated", FLOW) in found
+    unknown = change_report(PUB, "/video", qos=None)
+    assert ("graph.qos-unverifiable", "unverifiable", "/camera") in findings(
+        both(shown, unknown), plan, machines=here
+    )
 
 
 def test_a_node_of_our_own_machine_is_never_beyond_reach() -> None:
