@@ -52,7 +52,7 @@ from lifecycle.node.endpoints.endpoint import (
     found_endpoint,
 )
 from lifecycle.plan.model import PlannedNode
-from lifecycle.plan.negotiation.data_layer import PARADIGMS, SERIALIZATIONS
+from lifecycle.plan.negotiation.parties import PARADIGMS, SERIALIZATIONS
 from lifecycle.verify.observation import (
     EndpointReport,
     HealthReport,

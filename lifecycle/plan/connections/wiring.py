@@ -14,7 +14,7 @@ topics `negotiate` finds the like; what is negotiated while the system runs is j
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import msgspec
 from msgspec.structs import replace
@@ -59,16 +59,13 @@ from lifecycle.plan.model import (
     StaticEndpoint,
     StaticParticipant,
 )
-from lifecycle.plan.negotiation.data_layer import (
+from lifecycle.plan.negotiation.media import carried
+from lifecycle.plan.negotiation.negotiate import negotiate
+from lifecycle.plan.negotiation.parties import (
     DataLayerGraph,
     NegotiatedConnection,
     NegotiatedFlow,
     Party,
-)
-from lifecycle.plan.negotiation.media import carried
-from lifecycle.plan.negotiation.negotiate import negotiate
-from lifecycle.plan.negotiation.parties import (
-    endpoint_of,
     make_terms,
     party_of_node,
     place_negotiated,
@@ -81,41 +78,31 @@ _End = tuple[PlannedNode, PlannedEndpoint]
 
 def infeasible(
     nodes: Sequence[PlannedNode], parties: Mapping[str, Party], *, negotiated: bool
-) -> tuple[Diagnostic, ...]:
-    """Return what participants are asked for and cannot do.
+) -> Iterator[Diagnostic]:
+    """Yield what participants are asked for and cannot do.
 
     Args:
         nodes: with all connections that are planned.
         parties: the nodes as negotiation sees them, by key.
         negotiated: topics are where they will be; else only those on declared connections are.
     """
-
-    def carriers(node: PlannedNode, each: PlannedEndpoint) -> tuple[str, ...]:
-        """Return by what an endpoint is reached; nothing where that is not known."""
-        return endpoint_of(node, each).by or parties[node.key].own
-
-    found = [*_services(nodes, parties, carriers)]
+    placed = {
+        node.key: replace(parties[node.key], participants=node.participants) for node in nodes
+    }
+    yield from _services(nodes, placed)
     for node in nodes:
+        party = placed[node.key]
         for each in node.endpoints:
-            if negotiated or _on_connection(node, each):
-                found += _without_udp(node, each, carriers(node, each))
-    return tuple(found)
-
-
-_By = Callable[[PlannedNode, PlannedEndpoint], tuple[str, ...]]
-
-
-def _on_connection(node: PlannedNode, each: PlannedEndpoint) -> bool:
-    return any(one.name == each.participant and one.connection for one in node.participants)
+            on = party.participant_of(each)
+            if negotiated or (on is not None and on.connection):
+                yield from _without_udp(node, each, party.transports_at(each))
 
 
 def _at(node: PlannedNode, each: PlannedEndpoint) -> Position:
     return each.at or node.at
 
 
-def _services(
-    nodes: Sequence[PlannedNode], parties: Mapping[str, Party], carriers: _By
-) -> Iterator[Diagnostic]:
+def _services(nodes: Sequence[PlannedNode], parties: Mapping[str, Party]) -> Iterator[Diagnostic]:
     servers: dict[tuple[EndpointKind, str], list[_End]] = {}
     for node in nodes:
         for each in node.endpoints:
@@ -125,8 +112,9 @@ def _services(
             if each.kind.is_topic or each.kind.offers:
                 continue
             for other, server in servers.get((each.kind.other_end, each.resolved), ()):
-                mine, theirs = carriers(node, each), carriers(other, server)
-                near = parties[node.key].host == parties[other.key].host
+                party, serving = parties[node.key], parties[other.key]
+                mine, theirs = party.transports_at(each), serving.transports_at(server)
+                near = party.host == serving.host
                 if not mine or not theirs or carried(mine, theirs, same_host=near):
                     continue
                 message = (
@@ -352,7 +340,7 @@ def _unconnectable(
     for problem in graph.problems:
         link = links.get((problem.topic, problem.publisher, problem.subscription))
         at = link or endpoints.get((problem.publisher, problem.topic)) or start
-        yield error("plan.unconnectable", at, problem.message, problem.hint)
+        yield error("plan.unconnectable", at, problem.problem, problem.hint)
 
 
 def _with_medium(flow: PlannedFlow, found: Sequence[NegotiatedFlow]) -> PlannedFlow:

@@ -26,13 +26,12 @@ from lifecycle.plan.connections.hosts import (
     peers_by,
     ports_of,
 )
-from lifecycle.plan.model import PlanError
-from lifecycle.plan.negotiation.data_layer import (
+from lifecycle.plan.model import PlanError, PlannedEndpoint
+from lifecycle.plan.negotiation.parties import (
     DataLayerGraph,
     End,
     NegotiatedConnection,
     Party,
-    PartyEndpoint,
     Terms,
 )
 
@@ -53,9 +52,20 @@ class Moved(msgspec.Struct, frozen=True, kw_only=True):
 
     end: End
     party: Party
-    endpoint: PartyEndpoint
+    endpoint: PlannedEndpoint
     transports: tuple[str, ...]
     partners: frozenset[End]
+
+    @property
+    def label(self) -> str:
+        """How `map_to` knows it, `publishers/video`."""
+        return self.endpoint.kind.spell(self.endpoint.name)
+
+    @property
+    def alone(self) -> str:
+        """Its label if it shares its participant with no other; else empty."""
+        alone = self.endpoint.kind is EndpointKind.PUBLISHER and self.endpoint.unique.asks
+        return self.label if alone else ""
 
 
 class _Draft(msgspec.Struct, frozen=True, kw_only=True):
@@ -115,7 +125,7 @@ def connections_of(
             node=draft.party.key,
             name=draft.name,
             urls=old[draft.key].urls if draft.key in kept else urls,
-            map=tuple(sorted(each.endpoint.label for each in draft.members)),
+            map=tuple(sorted(each.label for each in draft.members)),
             reason=f"{', '.join(dict.fromkeys(each.endpoint.resolved for each in draft.members))} "
             f"by {' and '.join(draft.media)}",
         )
@@ -130,8 +140,7 @@ def _drafts(moved: Sequence[Moved]) -> list[_Draft]:
     """
     groups: dict[tuple[str, tuple[str, ...], str, str], list[Moved]] = {}
     for each in moved:
-        alone = each.endpoint.label if each.endpoint.alone else ""
-        place = (each.party.key, each.transports, each.endpoint.group, alone)
+        place = (each.party.key, each.transports, each.endpoint.participant, each.alone)
         groups.setdefault(place, []).append(each)
     drafts = []
     taken: dict[str, set[str]] = {}
@@ -142,7 +151,7 @@ def _drafts(moved: Sequence[Moved]) -> list[_Draft]:
         words += [
             _NOT_WORD.sub("_", each).strip("_") for each in (draft.topic, group, alone) if each
         ]
-        names = taken.setdefault(key, set(party.connections))
+        names = taken.setdefault(key, {each.connection for each in party.participants})
         name = free_name("_".join(words), names)
         names.add(name)
         drafts.append(replace(draft, name=name))

@@ -21,13 +21,14 @@ Owns: `carried`, what Fast DDS does with two participants, and `choose`, these r
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 
 import msgspec
 
 from lifecycle.manifest.model import EndpointKind, FlowTransport
 from lifecycle.network.medium import CONNECTABLE, Medium, is_fragmented, max_unfragmented
-from lifecycle.plan.negotiation.data_layer import End, Party, PartyEndpoint
+from lifecycle.plan.model import PlannedEndpoint
+from lifecycle.plan.negotiation.parties import End, NegotiatedFlow, Party
 
 
 class Pair(msgspec.Struct, frozen=True, kw_only=True):
@@ -38,9 +39,9 @@ class Pair(msgspec.Struct, frozen=True, kw_only=True):
     """
 
     publisher: Party
-    writer: PartyEndpoint
+    writer: PlannedEndpoint
     subscription: Party
-    reader: PartyEndpoint
+    reader: PlannedEndpoint
     link: FlowTransport = FlowTransport.ANY
 
     @property
@@ -65,47 +66,53 @@ class Pair(msgspec.Struct, frozen=True, kw_only=True):
     def present(self) -> list[Medium]:
         """By what the data go if neither end leaves its participant, see `carried`."""
         return carried(
-            self.writer.by or self.publisher.own,
-            self.reader.by or self.subscription.own,
+            self.publisher.transports_at(self.writer),
+            self.subscription.transports_at(self.reader),
             same_host=self.same_host,
         )
 
     @property
-    def lossy(self) -> bool | None:
-        """Whether the data bear an unreliable transport: either end can deny it."""
-        said = (self.writer.lossy, self.reader.lossy)
-        return False if False in said else True if True in said else None
+    def common(self) -> set[str]:
+        """Media that both ends can have."""
+        both = {*_able(self.publisher)} & {*_able(self.subscription)}
+        if not self.same_host:
+            hosts = {self.publisher.host, self.subscription.host} - {""}
+            versions = {6 if ":" in each else 4 for each in hosts}
+            both -= {each for each in Medium if each.stays_on_host or versions - {each.ip_version}}
+        return both
 
     @property
-    def subject(self) -> str:
-        """Spell it for a message."""
-        return f"{self.writer.resolved!r} from {self.publisher.key!r} to {self.subscription.key!r}"
+    def wish(self) -> tuple[FlowTransport, str]:
+        """What is asked for, and who asks: a link, else the publisher, else the subscription."""
+        for wish, who in (
+            (self.link, "a link says so"),
+            (self.writer.transport, "the publisher asks for it"),
+            (self.reader.transport, "the subscription asks for it"),
+        ):
+            if wish is not FlowTransport.ANY:
+                return wish, who
+        return FlowTransport.ANY, ""
 
+    def by(self, medium: str, reason: str) -> NegotiatedFlow:
+        """Return the flow between the two by this medium."""
+        return NegotiatedFlow(
+            topic=self.writer.resolved,
+            publisher=self.publisher.key,
+            subscription=self.subscription.key,
+            medium=medium,
+            reason=reason,
+        )
 
-class Choice(msgspec.Struct, frozen=True, kw_only=True):
-    """What a pair gets.
-
-    Attributes:
-        medium: as `PlannedFlow.medium`; empty if not known, or with a problem.
-        reason: one phrase for people.
-        problem: why nothing can carry it; starts with "cannot".
-        hint: what may help.
-    """
-
-    medium: str = ""
-    reason: str = ""
-    problem: str = ""
-    hint: str = ""
-
-    @property
-    def inside(self) -> bool:
-        """Whether it is handed over inside a process."""
-        return self.medium == Medium.INTRAPROCESS
-
-    @property
-    def by_group(self) -> bool:
-        """Whether one datagram of it goes to a group."""
-        return self.medium == Medium.UDPM
+    def problem(self, how: str, why: str, hint: str = "") -> NegotiatedFlow:
+        """Return that nothing carries the flow `how` it was asked for, ` by tcpv4`, and why."""
+        one, other = self.publisher.key, self.subscription.key
+        return NegotiatedFlow(
+            topic=self.writer.resolved,
+            publisher=one,
+            subscription=other,
+            problem=f"cannot carry {self.writer.resolved!r} from {one!r} to {other!r}{how}: {why}",
+            hint=hint,
+        )
 
 
 MEETING = Medium.SHM
@@ -166,21 +173,9 @@ def _unicast(transports: Collection[str], *, same_host: bool) -> set[Medium]:
     }
 
 
-def wish_of(pair: Pair) -> tuple[FlowTransport, str]:
-    """Return what is asked for and who asks: a link, else the publisher, else the subscription."""
-    for wish, who in (
-        (pair.link, "a link says so"),
-        (pair.writer.transport, "the publisher asks for it"),
-        (pair.reader.transport, "the subscription asks for it"),
-    ):
-        if wish is not FlowTransport.ANY:
-            return wish, who
-    return FlowTransport.ANY, ""
-
-
 def choose(
     pair: Pair, *, by_multicast: bool, listeners: int, max_datagram_bytes: int | None
-) -> Choice:
+) -> NegotiatedFlow:
     """Return what carries a pair.
 
     Args:
@@ -191,29 +186,32 @@ def choose(
     """
     unable = _common_ground(pair)
     if unable:
-        return Choice(problem=unable)
-    wish, who = wish_of(pair)
+        return pair.problem("", unable)
+    wish, who = pair.wish
     if pair.same_process:
         if wish in (FlowTransport.ANY, FlowTransport.SHM, FlowTransport.MULTICAST):
-            return Choice(medium=Medium.INTRAPROCESS, reason="same process")
-        return Choice(
-            problem=f"cannot carry {pair.subject} by {wish.value}: both are in process "
-            f"{pair.publisher.process!r}, and inside a process no transport is used",
-            hint="give one of the two another 'process:'",
+            return pair.by(Medium.INTRAPROCESS, "same process")
+        return pair.problem(
+            f" by {wish.value}",
+            f"both are in process {pair.publisher.process!r}, and inside a process no transport is "
+            "used",
+            "give one of the two another 'process:'",
         )
-    if not (pair.publisher.own and pair.subscription.own) and wish is FlowTransport.ANY:
-        return Choice(reason="its RMW chooses")
-    choice = (
-        _unasked(pair, by_multicast, listeners, max_datagram_bytes)
-        if wish is FlowTransport.ANY
-        else _asked(pair, wish, who, by_multicast=by_multicast)
-    )
+    if wish is not FlowTransport.ANY:
+        choice = _asked(pair, wish, who, by_multicast=by_multicast)
+    elif not (pair.publisher.own and pair.subscription.own):
+        return pair.by("", "its RMW chooses")
+    elif pair.same_host:
+        choice = _near(pair, listeners)
+    else:
+        choice = _far(pair, by_multicast=by_multicast, max_datagram_bytes=max_datagram_bytes)
     other = pair.reader.transport
     if pair.link is FlowTransport.ANY and choice.medium and not other.accepts(choice.medium):
-        return Choice(
-            problem=f"cannot carry {pair.subject}: the publisher asks for "
-            f"{pair.writer.transport.value}, the subscription for {other.value}",
-            hint="ask for the same at both ends, or let a link decide with 'transport:'",
+        return pair.problem(
+            "",
+            f"the publisher asks for {pair.writer.transport.value}, the subscription for "
+            f"{other.value}",
+            "ask for the same at both ends, or let a link decide with 'transport:'",
         )
     return choice
 
@@ -221,29 +219,29 @@ def choose(
 def _common_ground(pair: Pair) -> str:
     """Return why the two cannot communicate whatever carries it; empty if they can."""
     one, other = pair.publisher, pair.subscription
-    for word, mine, theirs in (
-        ("wire format", one.serializations, other.serializations),
-        ("communication paradigm", one.paradigms, other.paradigms),
+    for word, mine, theirs, needed in (
+        ("wire format", one.serializations, other.serializations, {*one.serializations}),
+        ("communication paradigm", one.paradigms, other.paradigms, {"publish-subscribe"}),
     ):
-        common = {*mine} & {*theirs}
-        if not common or (word == "communication paradigm" and "publish-subscribe" not in common):
+        if not {*mine} & {*theirs} & needed:
             return (
-                f"cannot carry {pair.subject}: no {word} is common; {one.key!r} has "
-                f"{_list(mine)}; {other.key!r} has {_list(theirs)}"
+                f"no {word} is common; {one.key!r} has {_list(mine)}; {other.key!r} has"
+                f" {_list(theirs)}"
             )
     return ""
 
 
-def _list(words: Collection[str]) -> str:
+def _list(words: Iterable[str]) -> str:
     return ", ".join(words) or "none"
 
 
-def _none_common(pair: Pair, what: str) -> Choice:
+def _none_common(pair: Pair, how: str = "") -> NegotiatedFlow:
     one, other = pair.publisher, pair.subscription
-    return Choice(
-        problem=f"cannot carry {pair.subject}{what}: {one.key!r} can be connected by "
-        f"{_list(_able(one))}; {other.key!r} by {_list(_able(other))}",
-        hint="" if pair.same_host else "they are on different hosts, where shared memory is none",
+    return pair.problem(
+        how,
+        f"{one.key!r} can be connected by {_list(_able(one))}; {other.key!r} by "
+        f"{_list(_able(other))}",
+        "" if pair.same_host else "they are on different hosts, where shared memory is none",
     )
 
 
@@ -251,89 +249,78 @@ def _able(party: Party) -> tuple[str, ...]:
     return party.transports if party.connectable else party.own
 
 
-def _common(pair: Pair) -> set[str]:
-    """Return media that both ends can have."""
-    common = {*_able(pair.publisher)} & {*_able(pair.subscription)}
-    if not pair.same_host:
-        hosts = {pair.publisher.host, pair.subscription.host} - {""}
-        versions = {6 if ":" in each else 4 for each in hosts}
-        common -= {each for each in Medium if each.stays_on_host or versions - {each.ip_version}}
-    return common
-
-
-def _asked(pair: Pair, wish: FlowTransport, who: str, *, by_multicast: bool) -> Choice:
-    common = _common(pair)
+def _asked(pair: Pair, wish: FlowTransport, who: str, *, by_multicast: bool) -> NegotiatedFlow:
     if wish is FlowTransport.NETWORK:
         present = pair.present
-        if len(present) == 1 and present[0] in wish.media:
-            return Choice(medium=present[0], reason=who)
-        order = _ip_order(pair)
-        medium = next((each for each in order if each in common), "")
-        return (
-            Choice(medium=medium, reason=who) if medium else _none_common(pair, " by the network")
-        )
+        there = present[0] if len(present) == 1 and present[0] in wish.media else ""
+        medium = there or _first_ip(pair)
+        return pair.by(medium, who) if medium else _none_common(pair, " by the network")
     if wish is FlowTransport.MULTICAST and not pair.same_host:
         wish, who = FlowTransport.TCPV4, "multicast stays on its host"
     (medium,) = wish.media
-    if medium not in common:
+    if medium not in pair.common:
         return _none_common(pair, f" by {wish.value}, as {who}")
     if by_multicast and not pair.same_host and medium is Medium.UDPV4:
-        return Choice(
-            problem=f"cannot carry {pair.subject} by udpv4: the publisher sends by multicast with "
-            "TTL 0 on its own host, and one participant has one TTL for UDP",
-            hint="let it go by tcpv4",
+        return pair.problem(
+            " by udpv4",
+            "the publisher sends by multicast with TTL 0 on its own host, and one participant has "
+            "one TTL for UDP",
+            "let it go by tcpv4",
         )
-    return Choice(medium=medium, reason=who)
+    return pair.by(medium, who)
 
 
-def _ip_order(pair: Pair) -> tuple[str, ...]:
+def _first_ip(pair: Pair) -> str:
+    """Return the first IP transport that both can have: UDP before TCP; empty for none."""
     ipv6 = ":" in pair.publisher.host or ":" in pair.subscription.host
-    ip = (each for each in CONNECTABLE if each.is_network and not each.is_group)
-    return tuple(sorted(ip, key=lambda each: (each.is_tcp, (each.ip_version == 6) is not ipv6)))
+    common = pair.common
+    ip = [each for each in CONNECTABLE if each.is_network and not each.is_group and each in common]
+    return min(ip, key=lambda each: (each.is_tcp, (each.ip_version == 6) is not ipv6), default="")
 
 
-def _unasked(
-    pair: Pair, by_multicast: bool, listeners: int, max_datagram_bytes: int | None
-) -> Choice:
+def _default(pair: Pair) -> str:
+    """Return what carries the pair anyway; empty if that is nothing, or arrives twice."""
     present = pair.present
-    default = present[0] if len(present) == 1 else ""
-    if pair.same_host:
-        return _near(pair, default, listeners)
-    common = _common(pair)
-    tcp = _why_tcp(pair, by_multicast=by_multicast, max_datagram_bytes=max_datagram_bytes)
-    if tcp and Medium.TCPV4 in {*common, default}:
-        return Choice(medium=Medium.TCPV4, reason=tcp)
-    if by_multicast:
-        return _none_common(pair, " by tcpv4, as multicast stays on its host")
-    medium = default or next((each for each in _ip_order(pair) if each in common), "")
-    if not medium:
-        return _none_common(pair, "")
-    usual = medium in (default, Medium.UDPV4)
-    return Choice(
-        medium=medium, reason="other host" if usual else "other host, and no UDP over IPv4 between"
-    )
+    return present[0] if len(present) == 1 else ""
 
 
-def _near(pair: Pair, default: str, listeners: int) -> Choice:
+def _near(pair: Pair, listeners: int) -> NegotiatedFlow:
     """Choose on one host: what is there anyway, shared memory, one datagram for all, unicast."""
-    common = _common(pair)
+    default, common = _default(pair), pair.common
     if default or Medium.SHM in common:
-        return Choice(medium=default or Medium.SHM, reason="same host")
+        return pair.by(default or Medium.SHM, "same host")
     if listeners > 1 and Medium.UDPM in common:
         reason = f"{listeners} processes of the host listen, and not by shared memory"
-        return Choice(medium=Medium.UDPM, reason=reason)
-    medium = next((each for each in _ip_order(pair) if each in common), "")
+        return pair.by(Medium.UDPM, reason)
+    medium = _first_ip(pair)
     if medium:
-        return Choice(medium=medium, reason="same host, and no common shared memory")
-    return _none_common(pair, "")
+        return pair.by(medium, "same host, and no common shared memory")
+    return _none_common(pair)
 
 
-def _why_tcp(pair: Pair, *, by_multicast: bool, max_datagram_bytes: int | None) -> str:
-    """Return why a pair of two hosts should use TCP; empty if it need not."""
+def _far(pair: Pair, *, by_multicast: bool, max_datagram_bytes: int | None) -> NegotiatedFlow:
+    """Choose between hosts: TCP where UDP would not do, what is there anyway, UDP, TCP."""
+    default = _default(pair)
+    tcp = "multicast stays on its host" if by_multicast else _too_large(pair, max_datagram_bytes)
+    if tcp and Medium.TCPV4 in {*pair.common, default}:
+        return pair.by(Medium.TCPV4, tcp)
     if by_multicast:
-        return "multicast stays on its host"
-    size = pair.writer.size_bytes
+        return _none_common(pair, " by tcpv4, as multicast stays on its host")
+    medium = default or _first_ip(pair)
+    if not medium:
+        return _none_common(pair)
+    usual = medium in (default, Medium.UDPV4)
+    return pair.by(medium, "other host" if usual else "other host, and no UDP over IPv4 between")
+
+
+def _too_large(pair: Pair, max_datagram_bytes: int | None) -> str:
+    """Return why data may not be lost, and would be if one fragment was; empty if they may.
+
+    Either end can deny that the data bear an unreliable transport.
+    """
+    size = pair.writer.max_message_size
     limit = max_datagram_bytes or max_unfragmented(ipv6=":" in pair.publisher.host)
-    if pair.lossy is False and size is not None and is_fragmented(size, limit):
+    denied = False in (pair.writer.lossy, pair.reader.lossy)
+    if denied and size is not None and is_fragmented(size, limit):
         return f"not lossy, and {size} bytes are more than one datagram"
     return ""

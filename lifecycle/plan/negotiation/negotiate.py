@@ -11,30 +11,13 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from lifecycle.manifest.model import EndpointKind, FlowTransport
 from lifecycle.network.medium import CONNECTABLE, UDP_UNICAST, Medium, medium_of
+from lifecycle.plan.model import PlannedEndpoint
 from lifecycle.plan.negotiation.connecting import Moved, connections_of
-from lifecycle.plan.negotiation.data_layer import (
-    DataLayerGraph,
-    End,
-    NegotiatedFlow,
-    NegotiationProblem,
-    Party,
-    PartyEndpoint,
-    Terms,
-)
-from lifecycle.plan.negotiation.media import (
-    MEETING,
-    Choice,
-    Pair,
-    carried,
-    choose,
-    discover,
-    wish_of,
-)
+from lifecycle.plan.negotiation.media import MEETING, Pair, carried, choose, discover
+from lifecycle.plan.negotiation.parties import DataLayerGraph, End, NegotiatedFlow, Party, Terms
 
 Wishes = Mapping[tuple[str, str, str], FlowTransport]
 """What links demand: (topic, key of the publishing party, key of the subscribing one)."""
-
-_Chosen = tuple[Pair, Choice]
 
 
 def negotiate(
@@ -58,39 +41,22 @@ def negotiate(
             and URLs, so that little is made anew.
     """
     pairs = tuple(_pairs(sorted(parties, key=lambda each: each.key), wishes))
-    choices = _choices(pairs, terms)
-    problems = [
-        _problem(pair, each.problem, each.hint)
-        for pair, each in zip(pairs, choices, strict=True)
-        if each.problem
-    ]
-    chosen = [each for each in zip(pairs, choices, strict=True) if each[1].medium]
-    left_open = [
-        each
-        for each in zip(pairs, choices, strict=True)
-        if not each[1].medium and not each[1].problem
-    ]
-    carriers = _Carriers(chosen, fixed=terms.fixed, served=terms.server is not None)
-    chosen = carriers.settle(problems)
-    flows = {
-        NegotiatedFlow(
-            topic=pair.writer.resolved,
-            publisher=pair.publisher.key,
-            subscription=pair.subscription.key,
-            medium=choice.medium,
-            reason=choice.reason,
-        )
-        for pair, choice in (*chosen, *left_open)
-    }
+    chosen = _choices(pairs, terms)
+    carriers = _Carriers(
+        [(pair, flow) for pair, flow in zip(pairs, chosen, strict=True) if flow.medium], terms
+    )
+    flows, problems = carriers.settle()
+    flows += [each for each in chosen if not each.medium and not each.problem]
+    problems += [each for each in chosen if each.problem]
     return DataLayerGraph(
-        flows=tuple(sorted(flows)),
+        flows=tuple(sorted(set(flows))),
         connections=connections_of(tuple(carriers.moved()), parties, terms, before=before),
         problems=tuple(sorted(problems)),
     )
 
 
 def _pairs(parties: Sequence[Party], wishes: Wishes) -> Iterator[Pair]:
-    readers: dict[str, list[tuple[Party, PartyEndpoint]]] = {}
+    readers: dict[str, list[tuple[Party, PlannedEndpoint]]] = {}
     for party in parties:
         for each in _sorted(party, EndpointKind.SUBSCRIPTION):
             readers.setdefault(each.resolved, []).append((party, each))
@@ -106,19 +72,19 @@ def _pairs(parties: Sequence[Party], wishes: Wishes) -> Iterator[Pair]:
                 )
 
 
-def _sorted(party: Party, kind: EndpointKind) -> list[PartyEndpoint]:
+def _sorted(party: Party, kind: EndpointKind) -> list[PlannedEndpoint]:
     found = [each for each in party.endpoints if each.kind is kind]
     return sorted(found, key=lambda each: (each.resolved, each.name))
 
 
-def _choices(pairs: Sequence[Pair], terms: Terms) -> list[Choice]:
+def _choices(pairs: Sequence[Pair], terms: Terms) -> list[NegotiatedFlow]:
     """Choose on each host first: whether a publisher uses a group decides what others can have."""
     listeners: dict[End, set[str]] = {}
     for pair in pairs:
         if pair.same_host and not pair.same_process:
             listeners.setdefault(pair.ends[0], set()).add(pair.subscription.process)
     by_group: set[End] = set()
-    found: dict[int, Choice] = {}
+    found: dict[int, NegotiatedFlow] = {}
     for near in (True, False):
         for index, pair in enumerate(pairs):
             if pair.same_host is not near:
@@ -135,18 +101,10 @@ def _choices(pairs: Sequence[Pair], terms: Terms) -> list[Choice]:
     return [found[index] for index in range(len(pairs))]
 
 
-def _problem(pair: Pair, message: str, hint: str = "") -> NegotiationProblem:
-    return NegotiationProblem(
-        topic=pair.writer.resolved,
-        publisher=pair.publisher.key,
-        subscription=pair.subscription.key,
-        message=message,
-        hint=hint,
-    )
-
-
 _INTRODUCING = tuple(each for each in CONNECTABLE if each.is_network and not each.is_group)
 """By what a connection beside shared memory can be discovered."""
+
+_ONE_TRANSPORT = "ask for one transport for all that these two endpoints talk to"
 
 
 class _Carriers:
@@ -157,59 +115,59 @@ class _Carriers:
 
     Args:
         chosen: pairs with the medium of each.
-        fixed: every port is planned.
-        served: a discovery server introduces participants to each other.
+        terms: what the system gives.
     """
 
-    def __init__(self, chosen: Sequence[_Chosen], *, fixed: bool, served: bool) -> None:
-        self._fixed = fixed
-        self._served = served
-        self._chosen = list(chosen)
+    def __init__(self, chosen: Sequence[tuple[Pair, NegotiatedFlow]], terms: Terms) -> None:
+        self._fixed = terms.fixed
+        self._served = terms.server is not None
+        self._chosen = chosen
         self._moved: dict[End, set[str]] = {}
-        self._parties: dict[End, tuple[Party, PartyEndpoint]] = {}
+        self._sides: dict[End, tuple[Party, PlannedEndpoint]] = {}
         self._needs: dict[End, set[str]] = {}
-        for pair, choice in chosen:
+        for pair, flow in chosen:
             # A topic has a group of its own.
-            token = f"{choice.medium}@{pair.writer.resolved}" if choice.by_group else choice.medium
+            token = f"{flow.medium}@{flow.topic}" if flow.by_group else flow.medium
             sides = ((pair.publisher, pair.writer), (pair.subscription, pair.reader))
             for end, side in zip(pair.ends, sides, strict=True):
-                self._parties[end] = side
-                self._needs.setdefault(end, set()).update(() if choice.inside else (token,))
+                self._sides[end] = side
+                self._needs.setdefault(end, set()).update(() if flow.inside else (token,))
 
-    def settle(self, problems: list[NegotiationProblem]) -> list[_Chosen]:
-        """Move endpoints until every pair has its medium; return what the pairs have then."""
+    def settle(self) -> tuple[list[NegotiatedFlow], list[NegotiatedFlow]]:
+        """Move endpoints until every pair has its medium; return flows, and what has it not."""
         stuck: set[int] = set()
         changed = True
         while changed:
             changed = False
-            for index, (pair, choice) in enumerate(self._chosen):
-                if index in stuck or self._holds(pair, choice):
+            for index, (pair, flow) in enumerate(self._chosen):
+                if index in stuck or self._holds(pair, flow):
                     continue
-                if self._move(pair, choice):
+                if self._move(pair, flow):
                     changed = True
                 else:
                     stuck.add(index)
+        flows, problems = [], []
         # A pair that was stuck, or held, may not be so any more after others have moved.
-        for index, (pair, choice) in enumerate(self._chosen):
+        for index, (pair, flow) in enumerate(self._chosen):
+            flows.append(flow)
             if not self._moved and index not in stuck:
                 continue  # it held, and nothing has changed since
             impossible = any(map(self._is_impossible, pair.ends))
-            if self._holds(pair, choice) and not impossible:
+            if self._holds(pair, flow) and not impossible:
                 continue
             ours = pair.publisher.connectable and pair.subscription.connectable
-            if wish_of(pair)[0] is FlowTransport.NETWORK and not ours:
+            if pair.wish[0] is FlowTransport.NETWORK and not ours:
                 # `lifecycle check` has warned; from outside it may have been seen to.
-                self._chosen[index] = pair, Choice(reason="its participant is not ours")
+                flows[-1] = pair.by("", "its participant is not ours")
             elif impossible:
-                message = (
-                    f"cannot carry {pair.subject} by {choice.medium}: an end of it also needs "
-                    "another of shared memory and UDP, and beside fixed ports Fast DDS does "
-                    "not listen to shared memory"
+                why = (
+                    "an end of it also needs another of shared memory and UDP, and beside fixed "
+                    "ports Fast DDS does not listen to shared memory"
                 )
-                problems.append(_problem(pair, message, _ONE_TRANSPORT))
+                problems.append(pair.problem(f" by {flow.medium}", why, _ONE_TRANSPORT))
             else:
-                problems.append(self._conflict(pair, choice))
-        return self._chosen
+                problems.append(self._conflict(pair, flow))
+        return flows, problems
 
     def moved(self) -> Iterator[Moved]:
         """Yield the endpoints that have moved, with those whom each connection must find."""
@@ -218,7 +176,7 @@ class _Carriers:
             for end, other in (pair.ends, pair.ends[::-1]):
                 partners.setdefault(end, set()).add(other)
         for end in sorted(self._moved, key=lambda each: (each[0], each[1].value, each[2])):
-            party, endpoint = self._parties[end]
+            party, endpoint = self._sides[end]
             yield Moved(
                 end=end,
                 party=party,
@@ -234,32 +192,32 @@ class _Carriers:
         return self._fixed and in_memory and bool({*UDP_UNICAST} & found)
 
     def _transports(self, end: End) -> set[str]:
-        party, endpoint = self._parties[end]
-        return self._moved.get(end) or {*(endpoint.by or party.own)}
+        party, endpoint = self._sides[end]
+        return self._moved.get(end) or {*party.transports_at(endpoint)}
 
     def _present(self, pair: Pair) -> list[Medium]:
         writer, reader = map(self._transports, pair.ends)
         return carried(writer, reader, same_host=pair.same_host)
 
-    def _holds(self, pair: Pair, choice: Choice) -> bool:
+    def _holds(self, pair: Pair, flow: NegotiatedFlow) -> bool:
         present = self._present(pair)
         # Inside a process it is enough that the participants find each other.
-        if choice.inside:
+        if flow.inside:
             return bool(present)
         meet = self._served or not pair.same_host or discover(*map(self._transports, pair.ends))
-        return present == [choice.medium] and meet
+        return present == [flow.medium] and meet
 
-    def _move(self, pair: Pair, choice: Choice) -> bool:
-        if self._present(pair) == [choice.medium] and self._introduce(pair):
+    def _move(self, pair: Pair, flow: NegotiatedFlow) -> bool:
+        if self._present(pair) == [flow.medium] and self._introduce(pair):
             return True
         for end in pair.ends:
             if end in self._moved:
-                if choice.inside and MEETING not in self._moved[end]:
+                if flow.inside and MEETING not in self._moved[end]:
                     self._moved[end].add(MEETING)
                     return True
                 continue
-            party, endpoint = self._parties[end]
-            if party.connectable and not endpoint.fixed and self._needs[end]:
+            party, endpoint = self._sides[end]
+            if party.may_move(endpoint) and self._needs[end]:
                 # A group on loopback also receives by unicast.
                 groups = {medium_of(each) for each in self._needs[end]}
                 unicast = {each.unicast for each in groups if each.is_group}
@@ -277,23 +235,19 @@ class _Carriers:
                 return True
         return False
 
-    def _conflict(self, pair: Pair, choice: Choice) -> NegotiationProblem:
+    def _conflict(self, pair: Pair, flow: NegotiatedFlow) -> NegotiatedFlow:
         present = self._present(pair)
         one, other = (", ".join(sorted(self._transports(end))) or "none" for end in pair.ends)
         happens = "it would not arrive"
-        if present == [choice.medium]:
+        if present == [flow.medium]:
             happens = "they would not discover each other"
         elif present:
             twice = ", twice" if len(present) > 1 else ""
             happens = f"it would go by {' and '.join(present)}{twice}"
-        wish, who = wish_of(pair)
+        wish, who = pair.wish
         asked = f", as {who}" if wish is not FlowTransport.ANY else ""
-        return _problem(
-            pair,
-            f"cannot carry {pair.subject} by {choice.medium}{asked}: the publisher's participant "
-            f"has {one}, the subscription's {other}, so {happens}",
+        return pair.problem(
+            f" by {flow.medium}{asked}",
+            f"the publisher's participant has {one}, the subscription's {other}, so {happens}",
             _ONE_TRANSPORT,
         )
-
-
-_ONE_TRANSPORT = "ask for one transport for all that these two endpoints talk to"

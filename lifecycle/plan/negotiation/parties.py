@@ -1,8 +1,9 @@
-"""Nodes of a plan as parties of a negotiation, the terms of the system, and the result in the plan.
+"""The parties of a negotiation, the terms of their system, and the data layer graph that results.
 
-Owns: `party_of_node`, `place_negotiated` and the wishes that links make; `terms_of` and `Terms` of
-a plan in the making: ports that are taken, groups, observers. It is used before anything runs and
-while it does. Pure.
+Owns: `Party`, `Terms`, `DataLayerGraph`; `party_of_node` and `terms_of`, which make them of a plan;
+`place_negotiated`, which gives a planned node what was negotiated for it. Negotiation is used
+before anything runs, and while it does. The rules are in `media`, and `negotiate` applies them.
+Pure.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 
+import msgspec
 from msgspec.structs import replace
 
 from lifecycle.manifest.model import (
@@ -29,10 +31,11 @@ from lifecycle.network.medium import (
     RMW_DEFAULT,
     RMW_DISCOVERY,
     TRANSPORTS_VARIABLE,
+    Medium,
 )
 from lifecycle.network.ports import DG, domain_base
 from lifecycle.plan.connections.control import is_fixed, participant_name
-from lifecycle.plan.connections.hosts import Hosts, contacts_of, ports_of
+from lifecycle.plan.connections.hosts import Contact, Hosts, contacts_of, ports_of
 from lifecycle.plan.model import (
     ParticipantConnections,
     Plan,
@@ -42,12 +45,146 @@ from lifecycle.plan.model import (
     PlannedParticipant,
     PlannedServer,
 )
-from lifecycle.plan.negotiation.data_layer import (
-    NegotiatedConnection,
-    Party,
-    PartyEndpoint,
-    Terms,
-)
+
+PARADIGMS = ("publish-subscribe", "request-response")
+"""Topics; services, and actions, which consist of both."""
+
+SERIALIZATIONS = ("cdr",)
+"""OMG's Common Data Representation, the one wire format of ROS 2's DDS and zenoh RMWs."""
+
+End = tuple[str, EndpointKind, str]
+"""An endpoint that takes part: key of its party, kind, declared name."""
+
+
+class Party(msgspec.Struct, frozen=True, kw_only=True):
+    """One node, as negotiation sees it. Its endpoints are on the participant that they name.
+
+    Attributes:
+        key: manifest key; the full name of a node that no manifest declares.
+        host: its host, see `lifecycle.plan.connections.hosts`; parties of equal hosts share memory.
+        process: unique on the host.
+        transports: all that it can be connected by.
+        own: transports of its own participant; empty if not known.
+        connectable: `connect_to` is there to be called.
+        endpoints: its publishers and subscriptions; one that no interface declares has its resolved
+            name.
+        participants: those beside its own. What is on a connection of theirs stays there; else
+            those that share one may share a connection, and no others.
+        contacts: where its own participant is reached.
+    """
+
+    key: str
+    host: str
+    process: str
+    transports: tuple[str, ...] = CONNECTABLE
+    own: tuple[str, ...] = RMW_DEFAULT
+    connectable: bool = True
+    serializations: tuple[str, ...] = SERIALIZATIONS
+    paradigms: tuple[str, ...] = PARADIGMS
+    endpoints: tuple[PlannedEndpoint, ...] = ()
+    participants: tuple[PlannedParticipant, ...] = ()
+    contacts: tuple[Contact, ...] = ()
+
+    def participant_of(self, endpoint: PlannedEndpoint) -> PlannedParticipant | None:
+        """Return the participant beside the party's own that an endpoint is on; None for its own.
+
+        Of two that share a name the first is meant.
+        """
+        return next((each for each in self.participants if each.name == endpoint.participant), None)
+
+    def transports_at(self, endpoint: PlannedEndpoint) -> tuple[str, ...]:
+        """Return by what an endpoint is reached where it is; nothing where that is not known."""
+        on = self.participant_of(endpoint)
+        if on is None:
+            return self.own
+        return transports_of(on.connections.urls) or on.transports or RMW_DEFAULT
+
+    def may_move(self, endpoint: PlannedEndpoint) -> bool:
+        """Whether an endpoint may be mapped onto another connection."""
+        on = self.participant_of(endpoint)
+        return self.connectable and (on is None or not on.connection)
+
+
+class Terms(msgspec.Struct, frozen=True, kw_only=True):
+    """What a system's data layer is made under.
+
+    Attributes:
+        fixed: every port is planned, and nothing is found by multicast.
+        server: the discovery server that every connection must know; None without.
+        server_medium: it listens on TCPV4 or UDPV4.
+        first_port: first of the ports given out, per host.
+        taken: by host, ports that are not given out.
+        multicast_group: first of the groups given out.
+        max_datagram_bytes: UDP payload that the path carries unfragmented; None assumes Ethernet.
+        observers: where the supervisors' observers are reached: every connection looks for them.
+    """
+
+    fixed: bool = False
+    server: Peer | None = None
+    server_medium: Medium = DEFAULT_TCP
+    first_port: int = 7910
+    taken: tuple[tuple[str, tuple[int, ...]], ...] = ()
+    multicast_group: str = "239.255.1.1"
+    max_datagram_bytes: int | None = None
+    observers: tuple[Contact, ...] = ()
+
+
+class NegotiatedFlow(msgspec.Struct, frozen=True, kw_only=True, order=True):
+    """What carries one topic from one node to another, or why nothing does.
+
+    Attributes:
+        publisher: key of the publishing party.
+        subscription: key of the subscribing party.
+        medium: as `PlannedFlow.medium`; empty where the RMW decides and it is not known, and where
+            nothing carries it.
+        reason: one phrase for people.
+        problem: why it cannot be carried, a sentence; empty if it can.
+        hint: what may help.
+    """
+
+    topic: str
+    publisher: str
+    subscription: str
+    medium: str = ""
+    reason: str = ""
+    problem: str = ""
+    hint: str = ""
+
+    @property
+    def inside(self) -> bool:
+        """Whether it is handed over inside a process."""
+        return self.medium == Medium.INTRAPROCESS
+
+    @property
+    def by_group(self) -> bool:
+        """Whether one datagram of it goes to a group."""
+        return self.medium == Medium.UDPM
+
+
+class NegotiatedConnection(msgspec.Struct, frozen=True, kw_only=True):
+    """One connection that a node must have because its own participant does not do it.
+
+    Attributes:
+        node: key of the party.
+        name: unique in the node.
+        urls: the arguments of `connect_to`.
+        map: the endpoints that it carries, `publishers/video`, sorted.
+        reason: one phrase for people.
+    """
+
+    node: str
+    name: str
+    urls: tuple[str, ...]
+    map: tuple[str, ...]
+    reason: str
+
+
+class DataLayerGraph(msgspec.Struct, frozen=True, kw_only=True):
+    """Everything that was negotiated; sorted throughout. `problems` are what nothing carries."""
+
+    flows: tuple[NegotiatedFlow, ...] = ()
+    connections: tuple[NegotiatedConnection, ...] = ()
+    problems: tuple[NegotiatedFlow, ...] = ()
 
 
 def transports_of(urls: Iterable[str]) -> tuple[str, ...]:
@@ -90,14 +227,13 @@ def party_of_node(
     own = transports_of(node.connections.urls) or node.transports or _by_variable(node, variables)
     return Party(
         key=node.key,
-        full_name=node.full_name,
         host=host,
         process=node.process,
         transports=CONNECTABLE if ours else own if known else (),
         own=own if known else (),
         connectable=ours,
-        endpoints=tuple(endpoint_of(node, each) for each in node.endpoints if each.kind.is_topic),
-        connections=tuple(each.connection for each in node.participants if each.connection),
+        endpoints=tuple(each for each in node.endpoints if each.kind.is_topic),
+        participants=node.participants,
         contacts=contacts_of(host, node.connections.urls),
     )
 
@@ -109,30 +245,6 @@ def _by_variable(node: PlannedNode, variables: Mapping[str, str]) -> tuple[str, 
         environment = {**variables, **environment}
     word = environment.get(TRANSPORTS_VARIABLE, "").partition("?")[0]
     return BUILTIN_TRANSPORTS.get(word or "DEFAULT", ())
-
-
-def endpoint_of(node: PlannedNode, each: PlannedEndpoint) -> PartyEndpoint:
-    """Return an endpoint as the manifest declares it, on the participant that the plan puts it."""
-    carrier = next((one for one in node.participants if one.name == each.participant), None)
-    by: tuple[str, ...] = ()
-    if carrier is not None:
-        by = transports_of(carrier.connections.urls) or carrier.transports or RMW_DEFAULT
-    publishes = each.kind is EndpointKind.PUBLISHER
-    return PartyEndpoint(
-        kind=each.kind,
-        name=each.name,
-        resolved=each.resolved,
-        type=each.type,
-        qos=each.qos,
-        by=by,
-        fixed=carrier is not None and bool(carrier.connection),
-        alone=publishes and each.unique.asks,
-        # Who shares a participant already may share a connection; who does not may not.
-        group=each.participant if carrier and not carrier.connection else "",
-        transport=each.transport,
-        lossy=each.lossy,
-        size_bytes=each.max_message_size,
-    )
 
 
 def place_negotiated(node: PlannedNode, connections: Sequence[NegotiatedConnection]) -> PlannedNode:

@@ -17,9 +17,11 @@ from collections.abc import Collection, Iterator, Mapping
 import msgspec
 from msgspec.structs import replace
 
-from lifecycle.manifest.model import Authority, DataLayerSource, EndpointKind, EndpointPolicy
+from lifecycle.manifest.diagnostics import Position
+from lifecycle.manifest.model import Authority, DataLayerSource, EndpointPolicy
 from lifecycle.network.connection_url import parse
 from lifecycle.network.medium import CONNECTABLE, FAST_DDS, RMW_DEFAULT
+from lifecycle.plan.connections.control import participant_name
 from lifecycle.plan.connections.hosts import contacts_of, ports_of
 from lifecycle.plan.connections.wiring import with_graph
 from lifecycle.plan.model import (
@@ -28,16 +30,13 @@ from lifecycle.plan.model import (
     PlannedEndpoint,
     PlannedFlow,
     PlannedNode,
-)
-from lifecycle.plan.negotiation.data_layer import (
-    DataLayerGraph,
-    NegotiatedConnection,
-    Party,
-    PartyEndpoint,
+    PlannedParticipant,
 )
 from lifecycle.plan.negotiation.negotiate import negotiate
 from lifecycle.plan.negotiation.parties import (
-    endpoint_of,
+    DataLayerGraph,
+    NegotiatedConnection,
+    Party,
     hosts_of,
     party_of_node,
     terms_of,
@@ -50,7 +49,6 @@ from lifecycle.supervisor.connections.desired_state import (
     planned_instructions,
 )
 from lifecycle.verify.observation import EndpointReport, NodeConfiguration, Observation
-from lifecycle.verify.outcome import ConnectionReport
 from lifecycle.verify.verdict import Finding
 
 
@@ -79,15 +77,20 @@ def party_of(
     if own is not None and own.urls:
         own_urls = own.urls
     default = (planned.transports if planned else ()) or RMW_DEFAULT
-    others = [
-        each for each in configuration.connections if each.name and each.name not in {*negotiated}
-    ]
-    taken = {each.name for each in others}
-    if planned is not None:
-        taken |= {each.connection for each in planned.participants if each.connection}
+    base = configuration.name.rpartition("/")[2]
+    there = tuple(
+        PlannedParticipant(
+            name=participant_name(base, each.name),
+            dscp=None,
+            reason="",
+            connection=each.name,
+            connections=ParticipantConnections(urls=each.urls),
+        )
+        for each in configuration.connections
+        if each.name and each.name not in {*negotiated}
+    )
     return Party(
         key=planned.key if planned else configuration.name,
-        full_name=configuration.name,
         host=host,
         process=str(configuration.identity.process_id),
         transports=(configuration.transports or CONNECTABLE) if known else (),
@@ -96,19 +99,20 @@ def party_of(
         serializations=configuration.serializations,
         paradigms=configuration.paradigms,
         endpoints=tuple(
-            _endpoint(each, planned, others)
+            _endpoint(each, planned, {one.connection: one.name for one in there})
             for each in configuration.endpoints
             if each.kind.is_topic
         ),
-        connections=tuple(sorted(taken)),
+        participants=(*there, *(planned.participants if planned else ())),
         contacts=contacts_of(host, own_urls),
     )
 
 
 def _endpoint(
-    report: EndpointReport, planned: PlannedNode | None, others: Collection[ConnectionReport]
-) -> PartyEndpoint:
-    declared = next(
+    report: EndpointReport, planned: PlannedNode | None, there: Mapping[str, str]
+) -> PlannedEndpoint:
+    """Return an endpoint where its node reports it; `there`: participants, by connection."""
+    endpoint = next(
         (
             each
             for each in (planned.endpoints if planned else ())
@@ -116,29 +120,33 @@ def _endpoint(
         ),
         None,
     )
-    carrier = next((each for each in others if each.name == report.connection), None)
-    if declared is not None and planned is not None:
-        endpoint = endpoint_of(planned, declared)
-        endpoint = replace(
-            endpoint,
-            resolved=report.resolved or endpoint.resolved,
-            lossy=report.lossy if endpoint.lossy is None else endpoint.lossy,
-            size_bytes=report.size_bytes if endpoint.size_bytes is None else endpoint.size_bytes,
-        )
-    else:
-        endpoint = PartyEndpoint(
-            kind=report.kind,
-            name=report.name or report.resolved,
-            resolved=report.resolved,
-            type=report.type,
-            qos=report.qos,
-            alone=report.kind is EndpointKind.PUBLISHER and report.unique.asks,
-            lossy=report.lossy,
-            size_bytes=report.size_bytes,
-        )
-    if carrier is None:
-        return endpoint
-    return replace(endpoint, by=transports_of(carrier.urls) or RMW_DEFAULT, fixed=True)
+    if endpoint is None:
+        endpoint = replace(_made_in_code(report, _NOWHERE), unique=report.unique)
+    size = endpoint.max_message_size
+    return replace(
+        endpoint,
+        resolved=report.resolved or endpoint.resolved,
+        lossy=report.lossy if endpoint.lossy is None else endpoint.lossy,
+        max_message_size=report.size_bytes if size is None else size,
+        participant=there.get(report.connection, endpoint.participant),
+    )
+
+
+_NOWHERE = Position(file="", line=1, column=1)
+
+
+def _made_in_code(report: EndpointReport, at: Position) -> PlannedEndpoint:
+    """Return an endpoint that no interface declares, as its node reports it."""
+    return PlannedEndpoint(
+        kind=report.kind,
+        name=report.name or report.resolved,
+        resolved=report.resolved,
+        type=report.type,
+        qos=report.qos,
+        lossy=report.lossy,
+        max_message_size=report.size_bytes,
+        at=at,
+    )
 
 
 _RMW = "RMW_IMPLEMENTATION"
@@ -199,7 +207,7 @@ class NegotiatedSource:
         # What concerns an undeclared node is left out: the system does without it.
         keys = {each.key for each in self._plan.nodes}
         self.problems = tuple(
-            f"{each.message}; {each.hint}" if each.hint else each.message
+            f"{each.problem}; {each.hint}" if each.hint else each.problem
             for each in graph.problems
             if {each.publisher, each.subscription} <= keys
         )
@@ -285,16 +293,7 @@ def _with_made(node: PlannedNode, configuration: NodeConfiguration) -> PlannedNo
     declared = {(each.kind, each.name) for each in node.endpoints}
     resolved = {(each.kind, each.resolved) for each in node.endpoints}
     made = tuple(
-        PlannedEndpoint(
-            kind=each.kind,
-            name=each.name or each.resolved,
-            resolved=each.resolved,
-            type=each.type,
-            qos=each.qos,
-            lossy=each.lossy,
-            max_message_size=each.size_bytes,
-            at=node.at,
-        )
+        _made_in_code(each, node.at)
         for each in configuration.endpoints
         if (each.kind, each.name) not in declared
         and (each.name or (each.kind, each.resolved) not in resolved)

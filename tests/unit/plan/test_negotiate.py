@@ -12,35 +12,50 @@ from msgspec.structs import replace
 from lifecycle.manifest.model import EndpointKind, FlowTransport
 from lifecycle.network.connection_url import Peer, parse
 from lifecycle.network.medium import CONNECTABLE, RMW_DEFAULT
+from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.plan.connections.hosts import Contact
-from lifecycle.plan.negotiation.data_layer import DataLayerGraph, Party, PartyEndpoint, Terms
+from lifecycle.plan.model import ParticipantConnections, PlannedEndpoint, PlannedParticipant
 from lifecycle.plan.negotiation.negotiate import negotiate
-from lifecycle.plan.negotiation.parties import transports_of
+from lifecycle.plan.negotiation.parties import DataLayerGraph, Party, Terms, transports_of
+from tests.builders import at
 
 STRING = "std_msgs/msg/String"
 HERE, THERE = "10.77.0.1", "10.77.0.2"
 Wish = FlowTransport
 
 
-def pub(topic: str = "/t", **rest: object) -> PartyEndpoint:
-    """One publisher."""
-    return PartyEndpoint(
-        kind=EndpointKind.PUBLISHER, name=topic[1:], resolved=topic, type=STRING, **rest
+def _end(kind: EndpointKind, topic: str, **rest: object) -> PlannedEndpoint:
+    return PlannedEndpoint(
+        kind=kind, name=topic[1:], resolved=topic, type=STRING, qos=None, at=at(9), **rest
     )
 
 
-def sub(topic: str = "/t", **rest: object) -> PartyEndpoint:
+def pub(topic: str = "/t", *, alone: bool = False, **rest: object) -> PlannedEndpoint:
+    """One publisher; `alone`: it needs a flow of its own."""
+    unique = UniqueRequirement.STRICTLY_REQUIRED if alone else UniqueRequirement.NOT_REQUIRED
+    return _end(EndpointKind.PUBLISHER, topic, unique=unique, **rest)
+
+
+def sub(topic: str = "/t", **rest: object) -> PlannedEndpoint:
     """One subscription."""
-    return PartyEndpoint(
-        kind=EndpointKind.SUBSCRIPTION, name=topic[1:], resolved=topic, type=STRING, **rest
+    return _end(EndpointKind.SUBSCRIPTION, topic, **rest)
+
+
+def extra(name: str, connection: str = "", *urls: str) -> PlannedParticipant:
+    """One participant beside a node's own; what is on a connection stays there."""
+    return PlannedParticipant(
+        name=name,
+        dscp=None,
+        reason="",
+        connection=connection,
+        connections=ParticipantConnections(urls=urls),
     )
 
 
-def party(key: str, *endpoints: PartyEndpoint, host: str = HERE, **rest: object) -> Party:
+def party(key: str, *endpoints: PlannedEndpoint, host: str = HERE, **rest: object) -> Party:
     """One node in a process of its own."""
     return Party(
         key=key,
-        full_name=f"/{key}",
         host=host,
         process=str(rest.pop("process", key)),
         endpoints=endpoints,
@@ -160,7 +175,7 @@ MADE = {
     ),
     "what must arrive and is large goes by TCP to other hosts": (
         [
-            party("p", pub(lossy=False, size_bytes=40_000)),
+            party("p", pub(lossy=False, max_message_size=40_000)),
             party("near", sub()),
             party("far", sub(), host=THERE),
         ],
@@ -171,7 +186,7 @@ MADE = {
     ),
     "a subscription can deny that its data bear loss": (
         [
-            party("p", pub(lossy=True, size_bytes=40_000)),
+            party("p", pub(lossy=True, max_message_size=40_000)),
             party("far", sub(lossy=False), host=THERE),
         ],
         {},
@@ -200,7 +215,10 @@ MADE = {
         },
     ),
     "shared memory alone is joined by shared memory alone": (
-        [party("p", pub(by=("shm",), fixed=True)), party("s", sub())],
+        [
+            party("p", pub(participant="net"), participants=(extra("net", "net", "shm://"),)),
+            party("s", sub()),
+        ],
         {},
         Terms(),
         {"s": ("shm", "same host")},
@@ -252,7 +270,7 @@ def test_each_pair_is_carried_by_what_was_asked_for_or_is_there(case: str):
     ("lossy", "size"), [(None, 40_000), (True, 40_000), (False, 1000), (False, None)]
 )
 def test_otherwise_udp_does_for_other_hosts(lossy: bool | None, size: int | None):
-    parties = [party("p", pub(lossy=lossy, size_bytes=size)), party("far", sub(), host=THERE)]
+    parties = [party("p", pub(lossy=lossy, max_message_size=size)), party("far", sub(), host=THERE)]
     assert media(negotiate(parties, {}, Terms())) == {"far": ("udpv4", "other host")}
 
 
@@ -298,7 +316,12 @@ REFUSED = {
         ),
     ),
     "shared memory wins against what one link asks for": (
-        [party("p", pub()), party("q", pub()), party("s", sub(fixed=True)), party("r", sub())],
+        [
+            party("p", pub()),
+            party("q", pub()),
+            party("s", sub(participant="net"), participants=(extra("net", "net"),)),
+            party("r", sub()),
+        ],
         {TO_S: Wish.TCPV4},
         (
             "cannot carry '/t' from 'p' to 's' by tcpv4, as a link says so: the publisher's "
@@ -313,7 +336,7 @@ REFUSED = {
 def test_a_pair_that_nothing_can_carry_is_one_problem(case: str):
     parties, wishes, text = REFUSED[case]
     (only,) = negotiate(parties, wishes, Terms()).problems
-    assert f"{only.message}; {only.hint}".removesuffix("; ") == text
+    assert f"{only.problem}; {only.hint}".removesuffix("; ") == text
 
 
 def test_publishers_that_are_told_apart_stay_apart():
@@ -322,10 +345,11 @@ def test_publishers_that_are_told_apart_stay_apart():
         [
             party(
                 "p",
-                pub("/a", transport=wish, alone=True, group="_p_flow_0"),
-                pub("/b", transport=wish, group="_p_flow_1"),
-                pub("/c", transport=wish, group="_p_flow_1"),
+                pub("/a", transport=wish, alone=True, participant="_p_flow_0"),
+                pub("/b", transport=wish, participant="_p_flow_1"),
+                pub("/c", transport=wish, participant="_p_flow_1"),
                 pub("/d", transport=wish),
+                participants=(extra("_p_flow_0"), extra("_p_flow_1")),
             ),
             party("s", *(sub(topic) for topic in ("/a", "/b", "/c", "/d"))),
         ],
@@ -353,15 +377,15 @@ def test_a_new_subscriber_changes_nothing_for_those_that_are_there():
     assert new.urls == (f"tcpv4://{THERE}:7911?peer={HERE}:7910",)
 
 
-def _endpoints(draw: random.Random) -> tuple[PartyEndpoint, ...]:
+def _endpoints(draw: random.Random) -> tuple[PlannedEndpoint, ...]:
     ends = [(make, topic) for make in (pub, sub) for topic in ("/a", "/b")]
     return tuple(
         make(
             topic,
             transport=draw.choice([*FlowTransport, *[FlowTransport.ANY] * 7]),
             lossy=draw.choice((None, None, True, False)),
-            size_bytes=draw.choice((None, 100, 100_000)),
-            alone=make is pub and draw.random() < 0.2,
+            max_message_size=draw.choice((None, 100, 100_000)),
+            **({"alone": draw.random() < 0.2} if make is pub else {}),
         )
         for make, topic in draw.sample(ends, draw.randint(0, 3))
     )

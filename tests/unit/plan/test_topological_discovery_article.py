@@ -29,9 +29,14 @@ from lifecycle.network.medium import Medium
 from lifecycle.node.host.control import Operation
 from lifecycle.plan.build import build_plan
 from lifecycle.plan.model import Plan
-from lifecycle.plan.negotiation.data_layer import DataLayerGraph
 from lifecycle.plan.negotiation.negotiate import negotiate
-from lifecycle.plan.negotiation.parties import hosts_of, party_of_node, terms_of, wishes_of
+from lifecycle.plan.negotiation.parties import (
+    DataLayerGraph,
+    hosts_of,
+    party_of_node,
+    terms_of,
+    wishes_of,
+)
 from lifecycle.supervisor.connections.desired_state import Instructions, planned_instructions, steps
 from lifecycle.supervisor.connections.negotiation import NegotiatedSource, party_of
 from lifecycle.verify.observation import Identity, NodeConfiguration
@@ -315,7 +320,7 @@ def test_what_transports_do_you_support_is_answered_and_decides():
     ]
     wish = ("/t", "/p", "/s")
     (problem,) = negotiate(parties, {wish: FlowTransport.UDPV6}, terms_of(plan)).problems
-    assert problem.message == (
+    assert problem.problem == (
         "cannot carry '/t' from '/p' to '/s' by udpv6, as a link says so: '/p' can be connected "
         "by shm, tcpv4, udpm, udpv4, udpv6; '/s' by tcpv4"
     )

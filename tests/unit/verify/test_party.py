@@ -5,14 +5,20 @@ from __future__ import annotations
 import pytest
 from msgspec.structs import replace
 
+from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import EndpointKind, FlowTransport
 from lifecycle.manifest.qos import QosProfile
 from lifecycle.network.connection_url import Peer
 from lifecycle.network.medium import CONNECTABLE, RMW_DEFAULT
 from lifecycle.network.nfe import UniqueRequirement
 from lifecycle.plan.connections.hosts import Contact
-from lifecycle.plan.model import ParticipantConnections, PlannedNode, PlannedParticipant
-from lifecycle.plan.negotiation.data_layer import Party, PartyEndpoint
+from lifecycle.plan.model import (
+    ParticipantConnections,
+    PlannedEndpoint,
+    PlannedNode,
+    PlannedParticipant,
+)
+from lifecycle.plan.negotiation.parties import Party
 from lifecycle.supervisor.connections.negotiation import party_of
 from lifecycle.verify.observation import NodeConfiguration
 from lifecycle.verify.outcome import ConnectionReport
@@ -22,7 +28,6 @@ PUB, SUB = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION
 STRING = "std_msgs/msg/String"
 URL = "tcpv4://10.0.0.1:5100"
 STRICTLY, OPTIONALLY = UniqueRequirement.STRICTLY_REQUIRED, UniqueRequirement.OPTIONALLY_REQUIRED
-DEFAULT, NOT = UniqueRequirement.SYSTEM_DEFAULT, UniqueRequirement.NOT_REQUIRED
 
 VIDEO = reported(
     PUB, "video", qos=QosProfile(depth=3), unique=STRICTLY, lossy=True, size_bytes=70_000
@@ -42,7 +47,7 @@ def camera(**changes: object) -> NodeConfiguration:
 
 def own_endpoint(
     configuration: NodeConfiguration, of: PlannedNode | None = None, **rest: object
-) -> PartyEndpoint:
+) -> PlannedEndpoint:
     (endpoint,) = party_of(configuration, "h", planned=of, **rest).endpoints
     return endpoint
 
@@ -54,7 +59,6 @@ def video(**changes: object) -> NodeConfiguration:
 def test_a_node_that_no_manifest_declares_takes_part_with_all_that_it_says():
     assert party_of(CAMERA, "10.0.0.1") == Party(
         key="/camera",
-        full_name="/camera",
         host="10.0.0.1",
         process="42",
         transports=("udpv4", "tcpv4"),
@@ -63,15 +67,16 @@ def test_a_node_that_no_manifest_declares_takes_part_with_all_that_it_says():
         serializations=("cdr",),
         paradigms=("publish-subscribe",),
         endpoints=(
-            PartyEndpoint(
+            PlannedEndpoint(
                 kind=PUB,
                 name="video",
                 resolved="/video",
                 type=STRING,
                 qos=QosProfile(depth=3),
-                alone=True,
+                unique=STRICTLY,
                 lossy=True,
-                size_bytes=70_000,
+                max_message_size=70_000,
+                at=Position(file="", line=1, column=1),
             ),
         ),
     )
@@ -84,21 +89,6 @@ def test_a_node_that_names_no_transports_can_be_connected_by_all():
 def test_a_node_of_an_rmw_that_we_cannot_connect_has_no_transports_at_all():
     party = party_of(camera(rmw="rmw_cyclonedds_cpp"), "h")
     assert (party.transports, party.own, party.connectable) == ((), (), False)
-
-
-@pytest.mark.parametrize(
-    ("kind", "unique", "alone"),
-    [
-        (PUB, STRICTLY, True),
-        (PUB, OPTIONALLY, True),
-        (PUB, DEFAULT, False),
-        (PUB, NOT, False),
-        (SUB, STRICTLY, False),
-        (SUB, NOT, False),
-    ],
-)
-def test_only_a_publisher_that_asks_for_a_flow_of_its_own_is_alone(kind, unique, alone):
-    assert own_endpoint(video(kind=kind, unique=unique)).alone is alone
 
 
 # --- what the own participant was connected to
@@ -150,20 +140,10 @@ def test_planned_urls_of_the_own_participant_hold_until_the_node_reports_its_own
 
 def test_a_declared_node_takes_part_under_its_key_and_with_what_is_declared_of_its_endpoints():
     party = party_of(CAMERA, "h", planned=with_endpoint(transport=FlowTransport.NETWORK))
-    assert (party.key, party.full_name) == ("cam", "/camera")
-    assert party.endpoints == (
-        PartyEndpoint(
-            kind=PUB,
-            name="video",
-            resolved="/video",
-            type=STRING,
-            qos=QosProfile(depth=7),
-            alone=True,
-            transport=FlowTransport.NETWORK,
-            lossy=True,
-            size_bytes=70_000,
-        ),
-    )
+    (video,) = party.endpoints
+    assert (party.key, video.name, video.qos) == ("cam", "video", QosProfile(depth=7))
+    assert (video.unique, video.transport) == (OPTIONALLY, FlowTransport.NETWORK)
+    assert (video.lossy, video.max_message_size) == (True, 70_000)
 
 
 @pytest.mark.parametrize(
@@ -189,18 +169,25 @@ BARE = ConnectionReport(name="bare")
 MAPPED = replace(VIDEO, connection="net", mapped=True)
 
 
+def connections(party: Party) -> set[str]:
+    """Names of connections that are taken."""
+    return {each.connection for each in party.participants} - {""}
+
+
 def test_connections_that_somebody_else_made_are_taken_and_what_is_on_them_stays():
     seen = camera(connections=(OWN, BARE, NET), endpoints=(MAPPED,))
-    assert party_of(seen, "h").connections == ("bare", "net")
-    found = own_endpoint(seen)
-    assert (found.by, found.fixed, found.name) == (("tcpv4",), True, "video")
+    party = party_of(seen, "h")
+    assert connections(party) == {"bare", "net"}
+    (video,) = party.endpoints
+    assert (party.transports_at(video), party.may_move(video)) == (("tcpv4",), False)
 
 
 def test_what_a_negotiation_made_before_it_may_unmake():
     seen = camera(connections=(NET, BARE), endpoints=(MAPPED,))
-    assert party_of(seen, "h", negotiated={"net"}).connections == ("bare",)
-    found = own_endpoint(seen, negotiated={"net"})
-    assert (found.by, found.fixed) == ((), False)
+    party = party_of(seen, "h", negotiated={"net"})
+    assert connections(party) == {"bare"}
+    (video,) = party.endpoints
+    assert (party.transports_at(video), party.may_move(video)) == (party.own, True)
 
 
 def test_names_of_planned_connections_are_taken_beside_those_that_exist():
@@ -209,4 +196,4 @@ def test_names_of_planned_connections_are_taken_beside_those_that_exist():
         for name in ("late", "")
     )
     party = party_of(camera(connections=(NET,)), "h", planned=declared(participants=carriers))
-    assert party.connections == ("late", "net")
+    assert connections(party) == {"late", "net"}
