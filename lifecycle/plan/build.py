@@ -20,7 +20,7 @@ from msgspec.structs import replace
 
 from lifecycle.errors import UsageError
 from lifecycle.manifest.diagnostics import Diagnostic, ManifestError, Position
-from lifecycle.manifest.flows import FlowNeeds, ParticipantGroup, ResolvedNeed
+from lifecycle.manifest.flows import FlowNeeds, ResolvedNeed
 from lifecycle.manifest.installed_types import installed_hash, search_prefixes
 from lifecycle.manifest.model import (
     Discovery,
@@ -47,7 +47,7 @@ from lifecycle.manifest.yaml.document import error, warning
 from lifecycle.manifest.yaml.source import read_bytes
 from lifecycle.network.medium import DEFAULT_RMW
 from lifecycle.network.ports import MAX_DOMAIN_ID, domain_of
-from lifecycle.plan.connections.wiring import WiredSystem, place_declared, variables_of, wire
+from lifecycle.plan.connections.wiring import WiredSystem, variables_of, wire
 from lifecycle.plan.model import (
     HeldBy,
     Plan,
@@ -61,7 +61,7 @@ from lifecycle.plan.model import (
     in_mode,
 )
 from lifecycle.plan.parameters import NodeParameters, portable
-from lifecycle.plan.participants import command_line, place_flows
+from lifecycle.plan.participants import command_line, place
 
 
 def dependency_levels(nodes: Sequence[Node]) -> tuple[tuple[str, ...], ...]:
@@ -468,9 +468,8 @@ def _planned_node(
     )
     # Only a node in our own host can be given more participants; what others start keeps its own.
     ours = node.run.kind is RunKind.PYTHON
-    groups: tuple[ParticipantGroup, ...] = needs.groups(node) if ours else ()
-    endpoints, connected, groups = place_declared(node.name, endpoints, node.connections, groups)
-    endpoints, participants = place_flows(node.name, endpoints, groups)
+    groups = needs.groups(node) if ours else ()
+    endpoints, participants = place(node.name, endpoints, node.connections, groups)
     expected = parameters.expected(node)
     given = tuple((name, portable(value)) for name, value in node.parameters)
     return PlannedNode(
@@ -487,7 +486,7 @@ def _planned_node(
         has_all_parameters=node.interface.has_all_parameters
         and node.endpoints is EndpointPolicy.DECLARED,
         unread_parameter_files=parameters.unread(node),
-        participants=(*connected, *participants),
+        participants=participants,
         endpoint_policy=node.endpoints,
         transports=needs.node_transports(node) if ours else (),
         files=tuple(

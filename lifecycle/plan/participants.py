@@ -1,10 +1,10 @@
-"""Extra DDS participants for endpoints that need a unique network flow or a DSCP of their own.
+"""Extra DDS participants for declared connections, and for flows that are unique or marked.
 
-Owns: naming and describing the participants that `manifest/flows.py` groups endpoints into, and
-the command lines of processes. On Fast DDS a publisher sends from the sender sockets of its
-participant, so only one of its own makes it unique, and only all publishers of one
-participant together can carry a DSCP. From the same sockets subscriptions send their
-acknowledgements. Pure.
+Owns: naming and describing the participants that `connections:` declares, and those that
+`manifest/flows.py` groups endpoints into; the command lines of processes. On Fast DDS a publisher
+sends from the sender sockets of its participant, so only one of its own makes it unique, and only
+all publishers of one participant together can carry a DSCP. From the same sockets subscriptions
+send their acknowledgements. Pure.
 """
 
 from __future__ import annotations
@@ -20,50 +20,95 @@ from msgspec.structs import replace
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.flows import ParticipantGroup
 from lifecycle.manifest.installed_types import search_prefixes
-from lifecycle.manifest.model import Node, ParameterValue, RosArguments, Run
+from lifecycle.manifest.model import (
+    ConnectionDeclaration,
+    Node,
+    ParameterValue,
+    RosArguments,
+    Run,
+)
 from lifecycle.network.dscp import describe
-from lifecycle.plan.model import PlanError, PlannedEndpoint, PlannedParticipant
+from lifecycle.plan.connections.control import participant_name
+from lifecycle.plan.model import (
+    ParticipantConnections,
+    PlanError,
+    PlannedEndpoint,
+    PlannedParticipant,
+)
+from lifecycle.printable import count
 
 
-def place_flows(
-    node_name: str, endpoints: Sequence[PlannedEndpoint], groups: Sequence[ParticipantGroup]
+def place(
+    node_name: str,
+    endpoints: Sequence[PlannedEndpoint],
+    connections: Sequence[ConnectionDeclaration],
+    groups: Sequence[ParticipantGroup],
 ) -> tuple[tuple[PlannedEndpoint, ...], tuple[PlannedParticipant, ...]]:
-    """Make a participant of each group; leave all endpoints that are in none alone.
+    """Put endpoints on the connections that are declared for them, the others on what flows need.
 
-    Names count from 0 in the order in which the interface first needs them, so they are the same in
-    every run.
+    Names of the latter count from 0 in the order in which the interface first needs them, so they
+    are the same in every run. What is in no connection and no group is left alone.
 
     Args:
         node_name: the node's base name.
         endpoints: all of the node's endpoints, in the interface's order.
-        groups: endpoints that share, as `FlowNeeds.groups` makes them.
+        connections: that the manifest declares for the node.
+        groups: endpoints that share a participant, as `FlowNeeds.groups` makes them.
 
     Returns:
-        The endpoints with `participant` filled in, and the participants by index.
+        The endpoints with `participant` filled in, and the participants, connections first.
     """
-    names = {
-        (group.kind, name): f"_{node_name}_flow_{index}"
-        for index, group in enumerate(groups)
-        for name in group.names
+    places = {
+        entry: participant_name(node_name, connection.name)
+        for connection in connections
+        for entry in connection.map
     }
+    participants = [_connection(node_name, connection, groups) for connection in connections]
+    for group in groups:
+        names = tuple(name for name in group.names if (group.kind, name) not in places)
+        if names:
+            index = len(participants) - len(connections)
+            flow = _flow(f"_{node_name}_flow_{index}", replace(group, names=names))
+            places |= {(group.kind, name): flow.name for name in names}
+            participants.append(flow)
     placed = tuple(
-        replace(each, participant=names[each.kind, each.name])
-        if (each.kind, each.name) in names
-        else each
-        for each in endpoints
+        replace(each, participant=places.get((each.kind, each.name), "")) for each in endpoints
     )
-    participants = tuple(
-        PlannedParticipant(
-            name=names[group.kind, group.names[0]],
-            dscp=group.dscp,
-            reason=_reason(group),
-            transports=group.transports,
-            max_datagram_bytes=group.max_datagram_bytes,
-            non_blocking_send=group.non_blocking_send,
-        )
+    return placed, tuple(participants)
+
+
+def _connection(
+    node_name: str, connection: ConnectionDeclaration, groups: Sequence[ParticipantGroup]
+) -> PlannedParticipant:
+    """Return the participant of a connection, with what the flows of its endpoints ask for."""
+    needs = [
+        group
         for group in groups
+        if {*connection.map} & {(group.kind, name) for name in group.names}
+    ]
+    marks = [url.dscp for url in connection.urls] + [group.dscp for group in needs]
+    sizes = [group.max_datagram_bytes for group in needs]
+    return PlannedParticipant(
+        name=participant_name(node_name, connection.name),
+        dscp=next((each for each in marks if each is not None), None),
+        reason=f"connection {connection.name} for {count(len(connection.map), 'endpoint')}",
+        max_datagram_bytes=min((each for each in sizes if each is not None), default=None),
+        non_blocking_send=any(group.non_blocking_send for group in needs),
+        connection=connection.name,
+        connections=ParticipantConnections(urls=tuple(str(url) for url in connection.urls)),
+        declared=True,
     )
-    return placed, participants
+
+
+def _flow(name: str, group: ParticipantGroup) -> PlannedParticipant:
+    return PlannedParticipant(
+        name=name,
+        dscp=group.dscp,
+        reason=_reason(group),
+        transports=group.transports,
+        max_datagram_bytes=group.max_datagram_bytes,
+        non_blocking_send=group.non_blocking_send,
+    )
 
 
 def _reason(group: ParticipantGroup) -> str:

@@ -25,11 +25,12 @@ from lifecycle.manifest.yaml.document import error, warning
 from lifecycle.plan.model import PlanError
 from lifecycle.plan.participants import find_executable
 from lifecycle.plan.python_source import (
-    Handler,
+    ClassKind,
     NodeClass,
     NotThereError,
     Sources,
     UnknownError,
+    Use,
 )
 
 RULE = "program.missing"
@@ -43,6 +44,7 @@ _WORDS = {
     EndpointKind.SERVICE_SERVER: ("service server", "@on_service"),
     EndpointKind.ACTION_SERVER: ("action server", "@on_action"),
 }
+_OF_RCLPY = (ClassKind.MANAGED, ClassKind.PLAIN)
 _PYTHON = re.compile(r"python(3(\.\d+)?)?")
 
 
@@ -183,7 +185,7 @@ def _python(node: Node, read: _Read, *, authority: Authority, ours: bool) -> Ite
     except UnknownError as problem:
         yield UnresolvedProgram(at=at, subject=subject, reason=problem.message)
         return
-    if found.is_node is False:
+    if found.kind is ClassKind.NO_NODE:
         yield error(
             RULE,
             at,
@@ -192,7 +194,7 @@ def _python(node: Node, read: _Read, *, authority: Authority, ours: bool) -> Ite
         )
         return
     yield from _called(node, found, at)
-    if found.is_managed is not None and not found.is_ours and found.is_node:
+    if found.kind in _OF_RCLPY:
         yield from _immovable(node, found, at, authority)
     yield from _without_health(node, found)
     yield from _interface(node, found, at, subject)
@@ -200,19 +202,20 @@ def _python(node: Node, read: _Read, *, authority: Authority, ours: bool) -> Ite
 
 def _interface(node: Node, found: NodeClass, at: Position, subject: str) -> Iterator[_Found]:
     """Compare what a class handles and asks for with what the node declares."""
-    problems = [*_pairs(node, found, at)] if found.is_ours else []
-    accesses = [*_undeclared(node, found, at)] if found.is_ours else []
+    ours = found.kind is ClassKind.OURS
+    problems = [*_pairs(node, found, at)] if ours else []
+    asks = [*_undeclared(node, found, at)] if ours else []
     if found.unknown:
-        of = "handlers" if found.is_ours else "node class"
+        of = "handlers" if ours else "node class"
         yield UnresolvedProgram(at=at, subject=f"{of} of {subject}", reason=found.unknown)
         # What is there is there, whatever else may be.
         problems = [each for each in problems if each.message.startswith("cannot use")]
-    if found.declares and (problems or accesses):
+    if found.declares and (problems or asks):
         first = f"; {problems[0].message}" if problems else ""
         reason = f"its code declares endpoints itself{first}"
         yield UnresolvedProgram(at=at, subject=f"endpoints of {subject}", reason=reason)
         return
-    yield from (*problems, *accesses)
+    yield from (*problems, *asks)
 
 
 def _folders(node: Node) -> tuple[str, ...]:
@@ -233,7 +236,7 @@ def _called(node: Node, found: NodeClass, at: Position) -> Iterator[Diagnostic]:
             "does",
             "name the node's class, or a function that returns nodes without spinning them",
         )
-    if node.managed and found.is_managed is False and found.is_node:
+    if node.managed and found.kind is ClassKind.PLAIN:
         yield error(
             RULE,
             at,
@@ -291,10 +294,10 @@ def _immovable(
 
 def _without_health(node: Node, found: NodeClass) -> Iterator[Diagnostic]:
     """Yield that a node is to be asked for its health whose class has nothing to ask."""
-    if node.health is None or not node.health.check or not node.managed or not found.is_node:
+    if node.health is None or not node.health.check or not node.managed:
         return
     what = f"{found.name} ({found.file or 'rclpy'})"
-    if not found.is_ours and found.is_managed is not None:
+    if found.kind in _OF_RCLPY:
         yield error(
             NO_HEALTH,
             node.where("health"),
@@ -302,7 +305,7 @@ def _without_health(node: Node, found: NodeClass) -> Iterator[Diagnostic]:
             "lifecycle.LifecycleNode",
             "derive it from lifecycle.LifecycleNode, or write 'health: {diagnostics: NAME}'",
         )
-    elif found.is_ours and not found.has_health and not found.unknown:
+    elif found.kind is ClassKind.OURS and not found.has_health and not found.unknown:
         yield error(
             NO_HEALTH,
             node.where("health"),
@@ -358,15 +361,16 @@ def _names(folder: Path) -> tuple[str, ...]:
 def _pairs(node: Node, found: NodeClass, at: Position) -> Iterator[Diagnostic]:
     """Yield what `node.author.handlers.match` would refuse when the node is configured."""
     wanted = {(e.kind, e.name): e for e in node.interface.endpoints if e.kind in _WORDS}
-    taken: dict[tuple[EndpointKind, str, bool], Handler] = {}
+    taken: dict[tuple[EndpointKind, str, bool], Use] = {}
     for each in found.handlers:
-        noun, _ = _WORDS[each.kind]
+        noun, decorator = _WORDS[each.kind]
+        decorator = "@on_goal" if each.decides else decorator
         if (each.kind, each.name) not in wanted:
             declared = [name for kind, name in wanted if kind is each.kind]
             yield error(
                 UNHANDLED,
                 at,
-                f"cannot use handler {each.method} ({each.place}): {each.decorator}({each.name!r}) "
+                f"cannot use handler {each.text} ({each.place}): {decorator}({each.name!r}) "
                 f"names no {noun} that {node.key!r} declares",
                 _declared(each.name, declared),
             )
@@ -374,8 +378,8 @@ def _pairs(node: Node, found: NodeClass, at: Position) -> Iterator[Diagnostic]:
             yield error(
                 UNHANDLED,
                 at,
-                f"cannot use two handlers of {noun} {each.name!r}: {first.method} ({first.place}) "
-                f"and {each.method} ({each.place})",
+                f"cannot use two handlers of {noun} {each.name!r}: {first.text} ({first.place}) "
+                f"and {each.text} ({each.place})",
             )
         taken.setdefault((each.kind, each.name, each.decides), each)
     for (kind, name), endpoint in wanted.items():
@@ -390,7 +394,7 @@ def _pairs(node: Node, found: NodeClass, at: Position) -> Iterator[Diagnostic]:
 
 
 def _undeclared(node: Node, found: NodeClass, at: Position) -> Iterator[Diagnostic]:
-    for each in dict.fromkeys(found.accesses):
+    for each in dict.fromkeys(found.asks):
         declared = [e.name for e in node.interface.endpoints if e.kind is each.kind]
         if each.name not in declared:
             yield warning(

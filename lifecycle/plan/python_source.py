@@ -1,4 +1,4 @@
-"""Read Python node classes from their source: file, bases, handlers, endpoints; imports nothing.
+"""Read Python node classes from their source: bases, handlers, constructor; imports nothing.
 
 Owns: `Sources`, which finds the file of `module:Class` and reads the class there and its bases,
 through plain imports. It ends in two other ways: `NotThereError`, what Python itself would refuse,
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import ast
 import builtins
+import enum
 import importlib.machinery
 import importlib.util
 import re
@@ -24,7 +25,8 @@ from lifecycle.manifest.model import EndpointKind
 
 _MOST_BYTES = 4 * 2**20
 _MOST_IMPORTS = 20
-_DYNAMIC = ("import *", "__getattr__", "globals()", "vars()", "exec(", "sys.modules")
+_DYNAMIC = re.compile(r"import \*|__getattr__|globals\(\)|vars\(\)|exec\(|sys\.modules")
+"""What makes names of a module that its statements do not show."""
 
 _HANDLERS = {
     "on_message": EndpointKind.SUBSCRIPTION,
@@ -42,9 +44,6 @@ _DECLARES = {
     *("declare_publisher", "declare_subscription", "declare_service", "declare_client"),
     *("declare_action", "declare_action_client"),
 }
-_OURS = "lifecycle.LifecycleNode"
-_THEIRS = "rclpy.lifecycle.Node"
-_PLAIN = "rclpy.node.Node"
 _OF_HOST = {"rclpy.init", "rclpy.spin", "rclpy.shutdown", "init", "spin", "shutdown"}
 """What a script's `main` calls, and a host does itself."""
 
@@ -57,45 +56,46 @@ class UnknownError(LifecycleError):
     """Only running it can show that; the message is the reason, half a sentence."""
 
 
-class Handler(msgspec.Struct, frozen=True, kw_only=True):
-    """A decorated method.
+class ClassKind(enum.Enum):
+    """What kind of node a class is."""
+
+    OURS = "lifecycle.LifecycleNode"
+    MANAGED = "rclpy.lifecycle.Node"
+    PLAIN = "rclpy.node.Node"
+    FUNCTION = "function"  # which nodes it returns is known once it has
+    NO_NODE = "no node"
+    UNKNOWN = "unknown"  # one of its bases cannot be found
+
+
+_NODES = (ClassKind.OURS, ClassKind.MANAGED, ClassKind.PLAIN)
+
+
+class Use(msgspec.Struct, frozen=True, kw_only=True):
+    """A handler of an endpoint, or where code asks for one by a literal name.
 
     Attributes:
-        method: `Class.method`.
-        decorator: `@on_message`.
-        decides: on an action's goals, instead of executing them.
+        text: `Class.method`, or `self.publisher('chatter')`.
         place: `file:line`.
+        decides: a handler that decides on an action's goals, instead of executing them.
     """
-
-    kind: EndpointKind
-    name: str
-    method: str
-    decorator: str
-    decides: bool
-    place: str
-
-
-class Access(msgspec.Struct, frozen=True, kw_only=True):
-    """An endpoint that code asks for by a literal name: `self.publisher("chatter")`."""
 
     kind: EndpointKind
     name: str
     text: str
     place: str
+    decides: bool = False
 
 
 class NodeClass(msgspec.Struct, frozen=True, kw_only=True):
-    """What the source of a class shows.
+    """What the source of a class, or of a function that returns nodes, shows.
 
     Attributes:
-        is_node: it is a node class, or a function; None if one of its bases cannot be found.
-        is_ours: it is a LifecycleNode of this package.
-        is_managed: it is that or one of rclpy.lifecycle; None of a function, whose nodes are known
-            once it has returned.
-        takes: keyword arguments of its constructor, or of the function; None where any is taken,
-            or nothing is known.
+        takes: keyword arguments that it is called with; None where any is taken, or nothing is
+            known.
         needs: those of them without a default.
         spins: where a function calls what its host has done or does, `rclpy.spin (nodes.py:7)`.
+        handlers: its decorated methods.
+        asks: the endpoints that its code asks for.
         unknown: why more may belong to it than is known; empty if nothing does.
         declares: its code declares endpoints itself.
         has_health: it, or a base of it, has a `health` method of its own.
@@ -103,14 +103,12 @@ class NodeClass(msgspec.Struct, frozen=True, kw_only=True):
 
     name: str
     file: str
-    is_node: bool | None
-    is_ours: bool
-    is_managed: bool | None = None
+    kind: ClassKind
     takes: tuple[str, ...] | None = None
     needs: tuple[str, ...] = ()
     spins: str = ""
-    handlers: tuple[Handler, ...] = ()
-    accesses: tuple[Access, ...] = ()
+    handlers: tuple[Use, ...] = ()
+    asks: tuple[Use, ...] = ()
     unknown: str = ""
     declares: bool = False
     has_health: bool = False
@@ -125,6 +123,11 @@ class _Module(msgspec.Struct):
     text: str
     bound: dict[str, list[ast.stmt]]
 
+    def only(self, name: str) -> ast.stmt | None:
+        """Return the one statement that binds a name; None if there is none, or several do."""
+        bound = self.bound.get(name, [])
+        return bound[0] if len(bound) == 1 else None
+
 
 _Function = (ast.FunctionDef, ast.AsyncFunctionDef)
 _AnyFunction = ast.FunctionDef | ast.AsyncFunctionDef
@@ -136,13 +139,9 @@ class _Definition(msgspec.Struct, frozen=True):
     module: _Module
     node: ast.ClassDef | _AnyFunction
 
-    @property
-    def body(self) -> list[ast.stmt]:
-        return self.node.body
-
-    @property
-    def file(self) -> str:
-        return _shown(self.module.file)
+    def place(self, node: ast.stmt | ast.expr) -> str:
+        """Return where a part of it is, `file:line`."""
+        return f"{_shown(self.module.file)}:{node.lineno}"
 
 
 class Sources:
@@ -166,61 +165,50 @@ class Sources:
         """
         found = self._named(self._module(module), name, 0)
         if isinstance(found, str):
-            is_node = found in (_OURS, _THEIRS, _PLAIN)
-            return NodeClass(
-                name=name,
-                file="",
-                is_node=is_node or None,
-                is_ours=found == _OURS,
-                is_managed=found != _PLAIN if is_node else None,
-            )
+            kinds = {each.value: each for each in _NODES}
+            return NodeClass(name=name, file="", kind=kinds.get(found, ClassKind.UNKNOWN))
         if isinstance(found.node, ast.ClassDef):
-            return self._described(found, found.node)
-        takes, needs = _arguments(found.node, of_method=False)
+            return self._described(found)
+        takes, needs = _arguments(found.node.args)
         return NodeClass(
             name=name,
-            file=found.file,
-            is_node=True,
-            is_ours=False,
+            file=_shown(found.module.file),
+            kind=ClassKind.FUNCTION,
             takes=takes,
             needs=needs,
             spins=_spins(found),
         )
 
-    def _described(self, value: _Definition, node: ast.ClassDef) -> NodeClass:
+    def _described(self, value: _Definition) -> NodeClass:
         line, known, unknown = self._line(value)
+        body = [(each, statement) for each in line for statement in each.node.body]
+        methods = [(each, method) for each, method in body if isinstance(method, _Function)]
         takes: tuple[str, ...] | None = None
         needs: tuple[str, ...] = ()
-        found: dict[str, list[Handler]] = {}
-        accesses: list[Access] = []
-        body = [(each, statement) for each in line for statement in each.body]
-        methods = [(each, method) for each, method in body if isinstance(method, _Function)]
         constructor = next((each for _, each in methods if each.name == "__init__"), None)
         if constructor and not unknown:
-            takes, needs = _arguments(constructor, of_method=True)
+            takes, needs = _arguments(constructor.args, but_first=True)
+        kind = next((each for each in _NODES if each.value in known), ClassKind.NO_NODE)
+        if unknown and kind in (ClassKind.PLAIN, ClassKind.NO_NODE):
+            kind = ClassKind.UNKNOWN
+        handlers: dict[str, list[Use]] = {}  # a method hides those of its name in the bases
         for each, method in methods:
             marks, why = self._marks(each, method)
-            if method.name in _ACCESS:
-                why = why or f"{each.node.name}.{method.name} replaces that of LifecycleNode"
             unknown = unknown or why
             if marks:
-                found.setdefault(method.name, marks)
-            accesses += _accesses(each, method)
+                handlers.setdefault(method.name, marks)
         for each, statement in body:
             if _makes_methods(statement):
                 why = f"methods of {each.node.name} are made in line {statement.lineno}"
                 unknown = unknown or why
-        is_ours = _OURS in known
         return NodeClass(
-            name=node.name,
-            file=value.file,
-            is_node=True if known & {_OURS, _THEIRS, _PLAIN} else None if unknown else False,
-            is_ours=is_ours,
-            is_managed=True if known & {_OURS, _THEIRS} else None if unknown else False,
+            name=value.node.name,
+            file=_shown(value.module.file),
+            kind=kind,
             takes=takes,
             needs=needs,
-            handlers=tuple(each for marks in found.values() for each in marks),
-            accesses=tuple(accesses),
+            handlers=tuple(each for marks in handlers.values() for each in marks),
+            asks=tuple(use for each, method in methods for use in _asks(each, method)),
             unknown=unknown,
             declares=any(
                 isinstance(each, ast.Attribute) and each.attr in _DECLARES
@@ -246,7 +234,7 @@ class Sources:
             above: list[_Definition] = []
             for base in each.node.bases:
                 try:
-                    found = self._followed(self._dotted(each.module, base), 0)
+                    found = self._followed(_dotted(each.module, base), 0)
                 except (NotThereError, UnknownError) as problem:
                     unknown = unknown or f"its base {ast.unparse(base)} is not known: {problem}"
                     continue
@@ -257,35 +245,31 @@ class Sources:
             left = above + left
         return line, known, unknown
 
-    def _marks(self, of: _Definition, function: _AnyFunction) -> tuple[list[Handler], str]:
+    def _marks(self, of: _Definition, function: _AnyFunction) -> tuple[list[Use], str]:
         """Return the handlers that a method is, and why there may be more."""
-        marks: list[Handler] = []
-        unknown = ""
+        marks: list[Use] = []
+        text = f"{of.node.name}.{function.name}"
+        unknown = f"{text} replaces that of LifecycleNode" if function.name in _ACCESS else ""
         for decorator in function.decorator_list:
             called = decorator.func if isinstance(decorator, ast.Call) else decorator
             shown = ast.unparse(called)
-            if shown.rpartition(".")[2] in _HARMLESS:
-                continue
-            dotted = self._dotted(of.module, called)
-            if dotted.startswith("builtins."):
+            dotted = _dotted(of.module, called)
+            if shown.rpartition(".")[2] in _HARMLESS or dotted.startswith("builtins."):
                 continue
             word = _known(dotted).removeprefix("lifecycle.")
             name = _literal(of.module, decorator) if word in _HANDLERS else None
             if name is None:
-                unknown = unknown or f"{of.node.name}.{function.name} is decorated with @{shown}"
+                unknown = unknown or f"{text} is decorated with @{shown}"
                 continue
-            handler = Handler(
+            handler = Use(
                 kind=_HANDLERS[word],
                 name=name,
-                method=f"{of.node.name}.{function.name}",
-                decorator=f"@{word}",
+                text=text,
+                place=of.place(function),
                 decides=word == "on_goal",
-                place=f"{of.file}:{function.lineno}",
             )
             marks.insert(0, handler)  # the decorator next to the function marks it first
         return marks, unknown
-
-    # Names
 
     def _named(self, module: _Module, name: str, depth: int) -> _Definition | str:
         """Return what a name at the top of a module stands for; text for what need not be read.
@@ -294,20 +278,18 @@ class Sources:
             NotThereError: nothing in the module is called so.
             UnknownError: that cannot be decided.
         """
-        bound = module.bound.get(name, [])
-        only = bound[0] if len(bound) == 1 else None
+        only = module.only(name)
         if isinstance(only, ast.ImportFrom):
-            return self._followed(self._dotted(module, ast.Name(name)), depth + 1)
-        if isinstance(only, ast.ClassDef):
-            return _Definition(module, only)
-        if isinstance(only, _Function) and not only.decorator_list:
+            return self._followed(_dotted(module, ast.Name(name)), depth + 1)
+        if isinstance(only, ast.ClassDef) or (
+            isinstance(only, _Function) and not only.decorator_list
+        ):
             return _Definition(module, only)
         file = _shown(module.file)
         if re.search(rf"\b{re.escape(name)}\b", module.text):
             raise UnknownError(f"{name} is made by running {file}")
-        for word in _DYNAMIC:
-            if word in module.text:
-                raise UnknownError(f"{module.name} uses {word} ({file})")
+        if dynamic := _DYNAMIC.search(module.text):
+            raise UnknownError(f"{module.name} uses {dynamic.group()} ({file})")
         classes = [
             each
             for each, (first, *_) in module.bound.items()
@@ -327,22 +309,6 @@ class Sources:
         if not module or depth > _MOST_IMPORTS:
             raise UnknownError("it has to be evaluated")
         return self._named(self._module(module), name, depth)
-
-    def _dotted(self, module: _Module, expression: ast.expr) -> str:
-        """Return the full name of what an expression names; empty if it is not a plain name."""
-        if isinstance(expression, ast.Subscript):
-            return self._dotted(module, expression.value)
-        if isinstance(expression, ast.Attribute):
-            outer = self._dotted(module, expression.value)
-            return outer and f"{outer}.{expression.attr}"
-        name = expression.id if isinstance(expression, ast.Name) else ""
-        bound = module.bound.get(name, [])
-        if not bound and hasattr(builtins, name):
-            return f"builtins.{name}"
-        found = {_imported(module, each, name) or f"{module.name}.{name}" for each in bound}
-        return found.pop() if len(found) == 1 else ""
-
-    # Modules
 
     def _module(self, name: str) -> _Module:
         if name not in self._modules:
@@ -425,6 +391,21 @@ def _bound_by(alias: ast.alias) -> str:
     return alias.asname or alias.name.partition(".")[0]
 
 
+def _dotted(module: _Module, expression: ast.expr) -> str:
+    """Return the full name of what an expression names; empty if it is not a plain name."""
+    if isinstance(expression, ast.Subscript):
+        return _dotted(module, expression.value)
+    if isinstance(expression, ast.Attribute):
+        outer = _dotted(module, expression.value)
+        return outer and f"{outer}.{expression.attr}"
+    name = expression.id if isinstance(expression, ast.Name) else ""
+    bound = module.bound.get(name, [])
+    if not bound and hasattr(builtins, name):
+        return f"builtins.{name}"
+    found = {_imported(module, each, name) or f"{module.name}.{name}" for each in bound}
+    return found.pop() if len(found) == 1 else ""
+
+
 def _imported(module: _Module, statement: ast.stmt, name: str) -> str:
     """Return the full name of what an import binds to a name; empty if it is no import of it."""
     if not isinstance(statement, (ast.Import, ast.ImportFrom)):
@@ -441,25 +422,26 @@ def _known(dotted: str) -> str:
     """Return the public name of what need not be read; empty of everything else."""
     module, _, name = dotted.rpartition(".")
     room = module.partition(".")[0]
-    if room == "lifecycle" and (name == "LifecycleNode" or name in _HANDLERS or name == "on_timer"):
+    if room == "lifecycle" and name in {"LifecycleNode", "on_timer", *_HANDLERS}:
         return f"lifecycle.{name}"
     if room == "rclpy" and (
         name in {"LifecycleNode", "LifecycleNodeMixin"} or "lifecycle" in module
     ):
-        return _THEIRS
+        return ClassKind.MANAGED.value
     if room == "rclpy" and name == "Node":
-        return _PLAIN
+        return ClassKind.PLAIN.value
     return dotted if module in {"builtins", "typing", "abc", "enum", "typing_extensions"} else ""
 
 
-# Classes and functions
-
-
 def _arguments(
-    function: _AnyFunction, *, of_method: bool
+    given: ast.arguments, *, but_first: bool = False
 ) -> tuple[tuple[str, ...] | None, tuple[str, ...]]:
-    """Return the keywords that a function takes, None for any, and those that it needs."""
-    given = function.args
+    """Return the keywords that a function takes, None for any, and those that it needs.
+
+    Args:
+        given: its arguments.
+        but_first: it is a method: the first one is not given.
+    """
     positional = [each.arg for each in (*given.posonlyargs, *given.args)]
     needs = positional[: len(positional) - len(given.defaults)]
     needs += [
@@ -467,18 +449,15 @@ def _arguments(
         for each, default in zip(given.kwonlyargs, given.kw_defaults, strict=True)
         if default is None
     ]
-    takes = [each.arg for each in (*given.args, *given.kwonlyargs)]
-    own = positional[0] if of_method and positional else None
-    return (
-        None if given.kwarg else tuple(each for each in takes if each != own),
-        tuple(each for each in needs if each != own),
-    )
+    own = positional[:1] if but_first else []
+    takes = tuple(each.arg for each in (*given.args, *given.kwonlyargs) if each.arg not in own)
+    return None if given.kwarg else takes, tuple(each for each in needs if each not in own)
 
 
 def _spins(function: _Definition) -> str:
     for node in ast.walk(function.node):
         if isinstance(node, ast.Call) and ast.unparse(node.func) in _OF_HOST:
-            return f"{ast.unparse(node.func)} ({function.file}:{node.lineno})"
+            return f"{ast.unparse(node.func)} ({function.place(node)})"
     return ""
 
 
@@ -493,29 +472,27 @@ def _makes_methods(statement: ast.stmt) -> bool:
 
 def _literal(module: _Module, decorator: ast.expr) -> str | None:
     """Return the name that a decorator is given: a string, or a constant of the module."""
-    if not isinstance(decorator, ast.Call):
-        return None
-    given = [*decorator.args, *(each.value for each in decorator.keywords)]
-    value = given[0] if len(given) == 1 else None
-    if isinstance(value, ast.Name):
-        bound = module.bound.get(value.id, [])
-        value = bound[0].value if len(bound) == 1 and isinstance(bound[0], ast.Assign) else None
-    return value.value if isinstance(value, ast.Constant) and isinstance(value.value, str) else None
+    match decorator:
+        case (
+            ast.Call(args=[value], keywords=[])
+            | ast.Call(args=[], keywords=[ast.keyword(value=value)])
+        ):
+            if isinstance(value, ast.Name) and isinstance(of := module.only(value.id), ast.Assign):
+                value = of.value
+            if isinstance(value, ast.Constant) and isinstance(value.value, str):
+                return value.value
+    return None
 
 
-def _accesses(of: _Definition, function: _AnyFunction) -> Iterator[Access]:
+def _asks(of: _Definition, function: _AnyFunction) -> Iterator[Use]:
     for node in ast.walk(function):
         match node:
             case ast.Call(
                 func=ast.Attribute(value=ast.Name(id="self"), attr=attr),
                 args=[ast.Constant(value=str(name))],
             ) if attr in _ACCESS:
-                yield Access(
-                    kind=_ACCESS[attr],
-                    name=name,
-                    text=ast.unparse(node)[:80],
-                    place=f"{of.file}:{node.lineno}",
-                )
+                text = ast.unparse(node)[:80]
+                yield Use(kind=_ACCESS[attr], name=name, text=text, place=of.place(node))
 
 
 def _shown(file: Path) -> str:

@@ -12,6 +12,7 @@ fixed, not shared memory beside UDP. Pure.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import TypeVar
 
 import msgspec
 from msgspec.structs import replace
@@ -130,7 +131,7 @@ def connect_control(
             slots[slot] = (host, pool.take(host, kind.ports) if planned else ())
     urls = dict.fromkeys(slots, str(ConnectionUrl(transport=kind)))
     if planned:
-        urls = _urls(slots, kind, server, hosts)
+        urls = meshed(slots, kind, hosts, server=server)
 
     def connected(slot: _Slot) -> ParticipantConnections:
         told = server is not None and slot[0] == "observer"
@@ -172,40 +173,43 @@ def _server(discovery: Discovery, hosts: Hosts, pool: PortPool, *, tcp: bool) ->
     )
 
 
-def _urls(
-    slots: Mapping[_Slot, tuple[str, tuple[int, ...]]],
+_Key = TypeVar("_Key")
+
+
+def meshed(
+    ports: Mapping[_Key, tuple[str, tuple[int, ...]]],
     kind: Medium,
-    server: PlannedServer | None,
     hosts: Hosts,
-) -> dict[_Slot, str]:
-    """Spell each participant's URL."""
+    *,
+    server: PlannedServer | None = None,
+) -> dict[_Key, str]:
+    """Return the URLs of participants that find each other at fixed ports.
+
+    Args:
+        ports: of each participant its host, and its ports as `fixed_url` takes them.
+        kind: what all of them are connected by.
+        hosts: of the system.
+        server: by which they find each other; None for each looking for all others.
+
+    Raises:
+        PlanError: a host has no address.
+    """
     v6 = kind.ip_version == 6
     alone = {
-        key: fixed_url(kind, hosts.address(host, ipv6=v6), ports)
-        for key, (host, ports) in slots.items()
+        key: fixed_url(kind, hosts.address(host, ipv6=v6), taken)
+        for key, (host, taken) in ports.items()
     }
     if server is not None:
         at = (Peer(address=server.address, port=server.port),)
         return {key: str(replace(url, server=at, multicast=True)) for key, url in alone.items()}
-    contacts = {key: contacts_of(slots[key][0], (str(url),))[0] for key, url in alone.items()}
-    order = {key: index for index, key in enumerate(alone)}
-
-    def looks_for(key: _Slot, other: _Slot) -> bool:
+    contacts = [contacts_of(ports[key][0], (str(url),))[0].peer for key, url in alone.items()]
+    found = {}
+    for index, (key, url) in enumerate(alone.items()):
         # Two ends that dial each other refuse both connections (Fast DDS 2.14). Observers are
         # first, so that they are there when dialled.
-        return order[other] < order[key] if kind.is_tcp else other != key
-
-    return {
-        key: str(
-            replace(
-                url,
-                peers=tuple(
-                    sorted(each.peer for other, each in contacts.items() if looks_for(key, other))
-                ),
-            )
-        )
-        for key, url in alone.items()
-    }
+        later = [] if kind.is_tcp else contacts[index + 1 :]
+        found[key] = str(replace(url, peers=tuple(sorted([*contacts[:index], *later]))))
+    return found
 
 
 def with_tcp(control: Control, hosts: Hosts) -> dict[str, ParticipantConnections]:

@@ -2,8 +2,7 @@
 
 Owns: `wire`, in this order: ports that are written down are kept free, own participants and
 observers are connected, endpoints are negotiated for, observers are extended to see the result.
-Placing a node's endpoints on the connections that `connections:` declares for it, with what
-`flows:` asks of them. Static endpoint discovery (Fast DDS STATIC EDP): the connection `data` that
+Static endpoint discovery (Fast DDS STATIC EDP): the connection `data` that
 carries a node's topics in that mode, and the table of all endpoints: DDS names, ids that are unique
 in the system, and rmw_fastrtps's own topic `ros_discovery_info` of each participant. Pure.
 
@@ -20,9 +19,7 @@ import msgspec
 from msgspec.structs import replace
 
 from lifecycle.manifest.diagnostics import Diagnostic, Position
-from lifecycle.manifest.flows import ParticipantGroup
 from lifecycle.manifest.model import (
-    ConnectionDeclaration,
     DataLayerSource,
     Discovery,
     DiscoveryMode,
@@ -40,10 +37,11 @@ from lifecycle.plan.connections.control import (
     connect_control,
     connect_observers,
     is_fixed,
+    meshed,
     participant_name,
     with_tcp,
 )
-from lifecycle.plan.connections.hosts import Hosts, PortPool, contacts_of, fixed_url
+from lifecycle.plan.connections.hosts import Hosts, PortPool
 from lifecycle.plan.model import (
     GRAPH_TOPIC,
     GRAPH_TYPE,
@@ -351,68 +349,6 @@ def _with_medium(flow: PlannedFlow, found: Sequence[NegotiatedFlow]) -> PlannedF
     return replace(flow, medium=" and ".join(media), medium_reason=", ".join(reasons))
 
 
-def place_declared(
-    node_name: str,
-    endpoints: Sequence[PlannedEndpoint],
-    declared: Sequence[ConnectionDeclaration],
-    groups: Sequence[ParticipantGroup],
-) -> tuple[
-    tuple[PlannedEndpoint, ...], tuple[PlannedParticipant, ...], tuple[ParticipantGroup, ...]
-]:
-    """Place endpoints on declared connections.
-
-    Args:
-        node_name: the node's base name.
-        endpoints: all of the node's endpoints.
-        declared: its connections.
-        groups: endpoints that must share, or not share, a participant.
-
-    Returns:
-        The endpoints with `participant` filled in where a connection carries them, a participant
-        for each connection, and the groups without the endpoints that are placed now.
-    """
-    places = {
-        entry: participant_name(node_name, connection.name)
-        for connection in declared
-        for entry in connection.map
-    }
-    placed = tuple(
-        replace(each, participant=places[each.kind, each.name])
-        if (each.kind, each.name) in places
-        else each
-        for each in endpoints
-    )
-    left = tuple(
-        replace(group, names=remaining)
-        for group in groups
-        if (remaining := tuple(name for name in group.names if (group.kind, name) not in places))
-    )
-    return placed, tuple(_participant(node_name, each, groups) for each in declared), left
-
-
-def _participant(
-    node_name: str, connection: ConnectionDeclaration, groups: Sequence[ParticipantGroup]
-) -> PlannedParticipant:
-    needs = [
-        group
-        for group in groups
-        if {*connection.map} & {(group.kind, name) for name in group.names}
-    ]
-    marks = [url.dscp for url in connection.urls] + [group.dscp for group in needs]
-    sizes = [group.max_datagram_bytes for group in needs]
-    count = len(connection.map)
-    return PlannedParticipant(
-        name=participant_name(node_name, connection.name),
-        dscp=next((each for each in marks if each is not None), None),
-        reason=f"connection {connection.name} for {count} endpoint{'' if count == 1 else 's'}",
-        max_datagram_bytes=min((each for each in sizes if each is not None), default=None),
-        non_blocking_send=any(group.non_blocking_send for group in needs),
-        connection=connection.name,
-        connections=ParticipantConnections(urls=tuple(str(url) for url in connection.urls)),
-        declared=True,
-    )
-
-
 DATA = "data"
 """Name of the connection that carries a node's topics."""
 
@@ -435,19 +371,14 @@ def place_static(
         for each in node.participants
         if _is_static(each)
     }
-    bare = {
-        key: fixed_url(kind, hosts.address(host), taken) for key, (host, taken) in ports.items()
-    }
-    contacts = {key: contacts_of(ports[key][0], (str(url),))[0] for key, url in bare.items()}
+    urls = meshed(ports, kind, hosts)
     table = tuple(_table(placed))
 
     def connected(node: PlannedNode, each: PlannedParticipant) -> PlannedParticipant:
-        own = (node.key, each.name)
-        if own not in bare:
+        if (node.key, each.name) not in urls:
             return each
-        peers = tuple(sorted(contact.peer for key, contact in contacts.items() if key != own))
         connections = ParticipantConnections(
-            urls=(str(replace(bare[own], peers=peers)),),
+            urls=(urls[node.key, each.name],),
             static_name=_enclave(node, each),
             static_participants=table,
         )
