@@ -150,16 +150,6 @@ class NegotiatedFlow(msgspec.Struct, frozen=True, kw_only=True, order=True):
     problem: str = ""
     hint: str = ""
 
-    @property
-    def inside(self) -> bool:
-        """Whether it is handed over inside a process."""
-        return self.medium == Medium.INTRAPROCESS
-
-    @property
-    def by_group(self) -> bool:
-        """Whether one datagram of it goes to a group."""
-        return self.medium == Medium.UDPM
-
 
 class NegotiatedConnection(msgspec.Struct, frozen=True, kw_only=True):
     """One connection that a node must have because its own participant does not do it.
