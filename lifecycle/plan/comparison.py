@@ -22,35 +22,25 @@ import msgspec
 from lifecycle.codec import from_json, to_json, to_plain
 from lifecycle.manifest.diagnostics import Position
 from lifecycle.manifest.model import OnViolation, RunKind
-from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedNode
+from lifecycle.plan.model import Plan, PlannedEndpoint, PlannedFile, PlannedNode
 from lifecycle.plan.secrets import shown, without_secrets
 
 _VALUE_CHARACTERS = 80
 
-_DECLARED = {
-    "endpoint_policy": "endpoints",
-    "enforce_dscp": "enforce",
-    "has_all_parameters": "interface.parameters",
-    "default": "default_value",
-}
-"""Fields that the manifest calls otherwise."""
+_NODE = (
+    *("name", "namespace", "machine", "managed", "timeouts", "log_level", "state", "may_end"),
+    *("health", "process"),
+)
+"""Fields of a node that are in its document as they are; what is planned from them is in none."""
+
+_FLOW = (
+    *("unique", "dscp", "transport", "lossy", "five_qi", "max_delay_ms", "loss", "rate_hz"),
+    "max_message_size",
+)
+"""Fields of an endpoint that say what it asks of its flow; none asks anything by default."""
 
 _RUN_SPELLED = (
     *("kind", "environment", "working_directory", "arguments", "executor", "extra_arguments"),
-)
-
-_NODE_DERIVED = (
-    # What the planner, the authority or a restart makes of the rest, and what `_node` adds itself.
-    *("key", "at", "run", "endpoints", "declared_parameters", "parameters", "parameter_files"),
-    *("remap", "participants", "after", "transports", "max_datagram_bytes", "connections"),
-    *("authority", "events", "membership", "files", "held_by"),
-    *("mode_parameters", "expected_parameters", "unread_parameter_files"),
-    *("supervision", "on_violation"),
-)
-_ENDPOINT_DERIVED = (
-    *("kind", "name", "resolved", "type", "qos", "participant", "at"),
-    *("dscp_reason", "five_qi_reason", "max_message_size_reason"),
-    *("qos_defaults", "quantities", "type_hash"),
 )
 
 
@@ -105,9 +95,9 @@ def _document(plan: Plan) -> _Tree:
     document: dict[str, object] = {
         "system": plan.system,
         "machines": {each.name: {"address": each.address} for each in plan.machines},
-        "discovery": _fields(plan.discovery),
-        "network": _fields(plan.network),
-        "data_layer": _fields(plan.data_layer),
+        "discovery": to_plain(plan.discovery),
+        "network": to_plain(plan.network),
+        "data_layer": to_plain(plan.data_layer),
         "policy": {**_fields(plan.policy), "ros_interface": plan.policy.access.value},
         "on_violation": _consequences(plan.on_violation),
         "modes": {
@@ -121,11 +111,8 @@ def _document(plan: Plan) -> _Tree:
         },
         "links": {
             f"{flow.topic} from {flow.publisher} to {flow.subscription}": {
-                **_fields(
-                    flow,
-                    *("topic", "publisher", "subscription", "linked", "medium", "medium_reason"),
-                    "quantities",
-                ),
+                name: to_plain(getattr(flow, name))
+                for name in ("unique", "max_delay_ms", "transport")
             }
             for flow in plan.flows
             if flow.linked
@@ -138,24 +125,16 @@ def _document(plan: Plan) -> _Tree:
 
 
 def _node(node: PlannedNode) -> _Tree:
-    run = _fields(node.run, *_RUN_SPELLED)
-    run = {name: value for name, value in run.items() if value} or {node.run.kind.value: True}
-    if node.run.kind is RunKind.PYTHON:
-        run["arguments"] = {name: to_plain(value) for name, value in node.run.arguments}
-        run["executor"] = node.run.executor.value
-    if node.run.extra_arguments:
-        run["extra_arguments"] = {name: to_plain(value) for name, value in node.run.extra_arguments}
     written = {each.place: each for each in node.files}
-    folder = written.get("run.working_directory")
-    run["working_directory"] = folder.written if folder else node.run.working_directory or None
-    run["environment"] = dict(node.run.environment)
     files = [written.get(f"parameter_files.{index}") for index in range(len(node.parameter_files))]
     return {
-        **_fields(node, *_NODE_DERIVED),
+        **{name: to_plain(getattr(node, name)) for name in _NODE},
         **_fields(node.supervision),
+        "endpoints": node.endpoint_policy.value,
+        "interface.parameters": node.has_all_parameters,
         "on_violation": _consequences(node.on_violation),
-        "run": run,
-        "parameters": {name: to_plain(value) for name, value in node.parameters},
+        "run": _run(node, written.get("run.working_directory")),
+        "parameters": _plain(node.parameters),
         "parameter_files": [
             {"path": each.written, "contents": each.digest} if each else {"path": path}
             for path, each in zip(node.parameter_files, files, strict=True)
@@ -179,19 +158,35 @@ def _node(node: PlannedNode) -> _Tree:
     }
 
 
+def _run(node: PlannedNode, folder: PlannedFile | None) -> _Tree:
+    run = {name: value for name, value in _fields(node.run, *_RUN_SPELLED).items() if value}
+    run = run or {node.run.kind.value: True}
+    if node.run.kind is RunKind.PYTHON:
+        run["arguments"] = _plain(node.run.arguments)
+        run["executor"] = node.run.executor.value
+    if node.run.extra_arguments:
+        run["extra_arguments"] = _plain(node.run.extra_arguments)
+    run["working_directory"] = folder.written if folder else node.run.working_directory or None
+    run["environment"] = dict(node.run.environment)
+    return run
+
+
+def _plain(values: Iterable[tuple[str, object]]) -> _Tree:
+    return {name: to_plain(value) for name, value in values}
+
+
 def _consequences(said: OnViolation) -> _Tree:
     return {each.rule: f"{each.what.value} {each.mode}".rstrip() for each in said}
 
 
 def _interface(node: PlannedNode) -> _Tree:
-    found: dict[str, dict[str, object]] = {
-        "parameters": {
-            each.name: _fields(each, "name", "description", "at")
-            for each in node.declared_parameters
-        }
-    }
+    found: dict[str, dict[str, object]] = {"parameters": {}}
+    for parameter in node.declared_parameters:
+        declared = _fields(parameter, "name", "description", "at")
+        declared["default_value"] = declared.pop("default")
+        found["parameters"][parameter.name] = declared
     for each in node.endpoints:
-        declared: dict[str, object] = {"type": each.type}
+        declared = {"type": each.type}
         if each.qos is not None:
             declared["qos"] = _fields(each.qos, *each.qos_defaults)
         found.setdefault(each.kind.value, {})[each.name] = declared
@@ -202,33 +197,33 @@ def _flows(node: PlannedNode) -> _Tree:
     """Return what each endpoint asks of its flow, without what it does not ask."""
     found: dict[str, dict[str, object]] = {}
     waiting = {each.name for each in node.participants if each.non_blocking_send}
-    defaults = {field.name: field.default for field in msgspec.structs.fields(PlannedEndpoint)}
     for each in node.endpoints:
-        skipped = list(_ENDPOINT_DERIVED)
-        asked: dict[str, object] = {}
+        asked = {
+            name: to_plain(getattr(each, name))
+            for name in _FLOW
+            if getattr(each, name) != _NOT_ASKED[name]
+        }
         if each.five_qi_reason:  # proposed from sizes, which are known where types are installed
-            skipped += ["five_qi", "dscp"]
+            asked.pop("dscp", None)
             asked["five_qi"] = "auto"
         if each.max_message_size_reason:
-            skipped.append("max_message_size")
-        asked |= {
-            _DECLARED.get(name, name): to_plain(getattr(each, name))
-            for name, default in defaults.items()
-            if name not in skipped and getattr(each, name) != default
-        }
+            asked.pop("max_message_size", None)
+        if not each.enforce_dscp:
+            asked["enforce"] = False
         if each.participant in waiting:
             asked["non_blocking_send"] = True
         found.setdefault(each.kind.value, {})[each.name] = asked
     return found
 
 
+_NOT_ASKED = {each.name: each.default for each in msgspec.structs.fields(PlannedEndpoint)}
+
+
 def _fields(value: object, *without: str) -> dict[str, object]:
-    """Return the fields of a Struct by the names that the manifest has for them."""
+    """Return the fields of a Struct by name."""
     plain = to_plain(value)
     assert isinstance(plain, dict)
-    return {
-        _DECLARED.get(name, name): plain[name] for name in map(str, plain) if name not in without
-    }
+    return {name: each for name, each in plain.items() if name not in without}
 
 
 def _compared(path: _Path, old: object, new: object) -> Iterator[tuple[_Path, str, str]]:
