@@ -163,7 +163,7 @@ def _guarded(node: Node) -> Finding:
     what = "it is being deactivated"
     if given_up:
         what = f"it was deactivated {GUARD_TRIES} times; {ACTIVATES_ITSELF}"
-    return ACTIVATED_AT_CLOSED_GATE.on_node(
+    return ACTIVATED_AT_CLOSED_GATE.on(
         node.planned,
         outcome=Outcome.VIOLATED,
         expected="inactive",

@@ -54,7 +54,7 @@ def ran_before(
     if not older:
         return ()
     return (
-        DUPLICATE_NODE.on_node(
+        DUPLICATE_NODE.on(
             node.planned,
             outcome=Outcome.VIOLATED,
             expected="1 node of this name",
@@ -107,7 +107,7 @@ async def adopt(
 
 
 def _runs_twice(node: NodeRun, count: int) -> Finding:
-    return DUPLICATE_NODE.on_node(
+    return DUPLICATE_NODE.on(
         node.planned,
         outcome=Outcome.VIOLATED,
         expected="1 node of this name",

@@ -115,9 +115,9 @@ class Rule(msgspec.Struct, frozen=True, kw_only=True):
             ends=ends,
         )
 
-    def on_endpoint(
+    def on(
         self,
-        actual: Actual,
+        what: PlannedNode | Actual,
         *,
         expected: str,
         observed: str,
@@ -125,38 +125,17 @@ class Rule(msgspec.Struct, frozen=True, kw_only=True):
         outcome: Outcome | None = None,
         hint: str = "",
     ) -> Finding:
-        """Make a finding on a declared endpoint, at its declaration; as `finding`."""
-        planned = actual.planned
+        """Make a finding on a declared node or endpoint, at its declaration; as `finding`."""
+        node = what if isinstance(what, PlannedNode) else what.node
+        planned = None if isinstance(what, PlannedNode) else what.planned
         return self.finding(
-            subject=planned.resolved,
+            subject=node.full_name if planned is None else planned.resolved,
             expected=expected,
             observed=observed,
             message=message,
             outcome=outcome,
-            at=planned.at,
-            node=actual.node.full_name,
-            endpoint=planned.kind,
-            hint=hint,
-        )
-
-    def on_node(
-        self,
-        node: PlannedNode,
-        *,
-        expected: str,
-        observed: str,
-        message: str,
-        outcome: Outcome | None = None,
-        hint: str = "",
-    ) -> Finding:
-        """Make a finding on a declared node, at its declaration; as `finding`."""
-        return self.finding(
-            subject=node.full_name,
-            expected=expected,
-            observed=observed,
-            message=message,
-            outcome=outcome,
-            at=node.at,
+            at=node.at if planned is None else planned.at,
             node=node.full_name,
+            endpoint=None if planned is None else planned.kind,
             hint=hint,
         )

@@ -90,7 +90,7 @@ def _connection(
     if configuration is None:
         if facts.is_ours:
             return  # that it does not report is said
-        yield MISSING.on_node(
+        yield MISSING.on(
             node,
             outcome=Outcome.UNVERIFIABLE,
             expected=f"connection {name}",
@@ -101,7 +101,7 @@ def _connection(
         return
     report = next((each for each in configuration.connections if each.name == name), None)
     if report is None:
-        yield MISSING.on_node(
+        yield MISSING.on(
             node,
             outcome=Outcome.VIOLATED,
             expected=f"connection {name}",
@@ -110,7 +110,7 @@ def _connection(
             f" it has {_listed(configuration.connections)}",
         )
     elif report.error:
-        yield FAILED.on_node(
+        yield FAILED.on(
             node,
             expected=f"connection {name}",
             observed=report.error,
@@ -127,7 +127,7 @@ def _urls(
     if _as_planned(report.urls, planned.urls, first_port=first_port):
         return
     what = f"connection {report.name!r}" if report.name else "the own participant"
-    yield DIFFERS.on_node(
+    yield DIFFERS.on(
         node,
         expected=", ".join(planned.urls),
         observed=", ".join(report.urls) or "no URL",
@@ -144,7 +144,7 @@ def _mapping(actual: Actual) -> Iterator[Finding]:
     if report.connection == wanted:
         return
     node, planned = actual.node, actual.planned
-    yield WRONG_MAPPING.on_endpoint(
+    yield WRONG_MAPPING.on(
         actual,
         expected=_spell(wanted),
         observed=_spell(report.connection),

@@ -92,7 +92,7 @@ def _declared(actual: Actual, *, absent: bool) -> Iterator[Finding]:
     node, planned = actual.node, actual.planned
     word = planned.kind.noun
     if actual.report is not None and actual.report.error:
-        yield ENDPOINT_ERROR.on_endpoint(
+        yield ENDPOINT_ERROR.on(
             actual,
             expected=f"{word} of {node.full_name}",
             observed=actual.report.error,
@@ -100,7 +100,7 @@ def _declared(actual: Actual, *, absent: bool) -> Iterator[Finding]:
             f" {actual.report.error}",
         )
     elif actual.observed is None and not absent and not (actual.unseen and actual.report is None):
-        yield MISSING_ENDPOINT.on_endpoint(
+        yield MISSING_ENDPOINT.on(
             actual,
             expected=f"{word} of {node.full_name}",
             observed=f"no such {word}",
@@ -109,7 +109,7 @@ def _declared(actual: Actual, *, absent: bool) -> Iterator[Finding]:
         )
     seen = actual.observed or actual.report
     if seen is not None and seen.type != planned.type:
-        yield TYPE_MISMATCH.on_endpoint(
+        yield TYPE_MISMATCH.on(
             actual,
             expected=planned.type,
             observed=seen.type or "no type",
@@ -147,7 +147,7 @@ def _unseen(
         if more <= 0 or view.plan.policy.undeclared_nodes is EndpointPolicy.OPEN:
             return
         reason = f"it is matched with {report.matched}, of which {known} are known here"
-    yield UNSEEN_ENDPOINT.on_endpoint(
+    yield UNSEEN_ENDPOINT.on(
         actual,
         expected=f"{word} of {node.full_name}",
         observed="not shown by discovery",
@@ -199,7 +199,7 @@ def _wrong_part(view: View, endpoint: ObservedEndpoint) -> Finding | None:
             continue
         expected = part_type(endpoint.name, planned.type)
         if endpoint.type != expected:
-            return TYPE_MISMATCH.on_endpoint(
+            return TYPE_MISMATCH.on(
                 actual,
                 expected=expected,
                 observed=endpoint.type or "no type",

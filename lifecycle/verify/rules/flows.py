@@ -137,7 +137,7 @@ def _broken(actual: Actual) -> Iterator[Finding]:
     if planned.kind is not EndpointKind.SUBSCRIPTION or report is None or report.error:
         return
     if report.nfes == ():
-        yield BROKEN_ENDPOINT.on_endpoint(
+        yield BROKEN_ENDPOINT.on(
             actual,
             expected="at least one network flow endpoint",
             observed="none",
@@ -156,7 +156,7 @@ def _strict(actual: Actual, uniqueness: Uniqueness) -> Iterator[Finding]:
     where = f"the {word} of {planned.resolved} in {actual.node.full_name}"
     unique = uniqueness.is_unique(actual)
     if unique is None:
-        yield UNVERIFIABLE.on_endpoint(
+        yield UNVERIFIABLE.on(
             actual,
             expected=f"unique {word}",
             observed="network flow endpoints not reported",
@@ -165,7 +165,7 @@ def _strict(actual: Actual, uniqueness: Uniqueness) -> Iterator[Finding]:
         )
     elif unique is False:
         shared = ", ".join(dict.fromkeys(map(_spell, uniqueness.nfes((actual,)))))
-        yield NOT_UNIQUE.on_endpoint(
+        yield NOT_UNIQUE.on(
             actual,
             expected=f"unique {word}",
             observed=f"shares {shared}",
@@ -342,7 +342,7 @@ def check_dscp(view: View) -> Iterator[Finding]:
         where = f"the {planned.kind.noun} of {planned.resolved} in {node.full_name}"
         read = report.dscp if report else None
         if read is None:
-            yield DSCP_UNVERIFIABLE.on_endpoint(
+            yield DSCP_UNVERIFIABLE.on(
                 actual,
                 expected=describe(wanted),
                 observed="not read back",
@@ -350,7 +350,7 @@ def check_dscp(view: View) -> Iterator[Finding]:
             )
         elif read != wanted:
             waived = "" if planned.enforce_dscp else "; the manifest does not enforce it"
-            yield DSCP_NOT_APPLIED.on_endpoint(
+            yield DSCP_NOT_APPLIED.on(
                 actual,
                 outcome=Outcome.VIOLATED if planned.enforce_dscp else Outcome.UNVERIFIABLE,
                 expected=describe(wanted),

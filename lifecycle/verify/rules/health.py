@@ -74,7 +74,7 @@ def _judge(view: View, facts: NodeFacts) -> Iterator[Finding]:
     # One that has the method reports what it returned, or that it has not returned, at once.
     lacks = report is not None and report.connected and report.health is None
     if node.health.check and lacks:
-        yield NOT_ASKED.on_node(
+        yield NOT_ASKED.on(
             node,
             expected="a method 'health'",
             observed="none",
@@ -96,7 +96,7 @@ def _judge(view: View, facts: NodeFacts) -> Iterator[Finding]:
         None if facts.observed is None else facts.observed.health,
     )
     if health.ok is False:
-        yield UNHEALTHY.on_node(
+        yield UNHEALTHY.on(
             node,
             outcome=Outcome.VIOLATED,
             expected=_HEALTHY,
@@ -104,7 +104,7 @@ def _judge(view: View, facts: NodeFacts) -> Iterator[Finding]:
             message=f"node {node.full_name} is not healthy: {health.message}",
         )
     elif health.ok is None:
-        yield UNHEALTHY.on_node(
+        yield UNHEALTHY.on(
             node,
             outcome=Outcome.UNVERIFIABLE,
             expected=_HEALTHY,
@@ -119,7 +119,7 @@ def _faults(facts: NodeFacts) -> Iterator[Finding]:
     for each in () if report is None or facts.absent else report.endpoints:
         if each.fault:
             wrong = f"{each.kind.noun} {each.name!r}: {each.fault}"
-            yield UNHEALTHY.on_node(
+            yield UNHEALTHY.on(
                 node,
                 outcome=Outcome.VIOLATED,
                 expected=_HEALTHY,

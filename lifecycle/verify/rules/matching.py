@@ -176,7 +176,7 @@ def _unknown_peers(view: View, topics: Mapping[str, _Ends]) -> Iterator[Finding]
         place = (other, actual.planned.resolved)
         if place in NOISE_TOPICS or report.matched <= possible + unseen[place]:
             continue
-        yield UNKNOWN_PEER.on_endpoint(
+        yield UNKNOWN_PEER.on(
             actual,
             expected=f"at most {possible} {other.noun}{'s' * (possible != 1)}, as in the graph",
             observed=f"matched {report.matched}",

@@ -69,7 +69,7 @@ def _missing(view: View, others: Mapping[str, list[str]]) -> Iterator[Finding]:
         if name in view.observed:
             continue
         if name in view.over:
-            yield ENDED_NODE.on_node(
+            yield ENDED_NODE.on(
                 node,
                 expected="node in the graph, or ended by itself",
                 observed=view.over[name] or "no such node",
@@ -94,7 +94,7 @@ def _missing(view: View, others: Mapping[str, list[str]]) -> Iterator[Finding]:
         beyond = is_beyond(node, view.machines)
         if beyond:
             hint = f"the supervisor of machine {node.machine!r} verifies it"
-        yield MISSING_NODE.on_node(
+        yield MISSING_NODE.on(
             node,
             outcome=Outcome.UNVERIFIABLE if beyond else Outcome.VIOLATED,
             expected="node in the graph",

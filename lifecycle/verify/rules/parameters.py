@@ -198,7 +198,7 @@ def _undeclared(node: PlannedNode, known: Mapping[str, ParameterReport]) -> Iter
         if name not in declared and not is_implicit(name) and each.type
     )
     if names:
-        yield UNDECLARED.on_node(
+        yield UNDECLARED.on(
             node,
             expected="no such parameter",
             observed=", ".join(f"{name} ({known[name].type})" for name in names[:_NAMED]),
@@ -231,7 +231,7 @@ def _finding(
 def _unknown(node: PlannedNode, why: str) -> Finding:
     names = [each.name for each in node.expected_parameters]
     what = _listed(names) if names else "that there are no parameters"
-    return UNVERIFIABLE.on_node(
+    return UNVERIFIABLE.on(
         node,
         expected=", ".join(names) or "no parameters",
         observed="unknown",

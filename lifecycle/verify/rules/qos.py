@@ -96,7 +96,7 @@ def _against_declaration(actual: Actual, unknown: _Unknown) -> Iterator[Finding]
     word = planned.kind.noun
     where = f"the {word} of {planned.resolved} in {node.full_name}"
     for policy, want, have in differing:
-        yield QOS_DIFFERS.on_endpoint(
+        yield QOS_DIFFERS.on(
             actual,
             expected=f"{policy} {want}",
             observed=f"{policy} {have}",

@@ -84,14 +84,14 @@ def _judge(view: View, facts: NodeFacts) -> Iterator[Finding]:
             wrong = ["inactive, disconnected"]
     expected = " or ".join([expected, *sorted(allowed - {wanted})])
     if wrong:
-        yield WRONG_STATE.on_node(
+        yield WRONG_STATE.on(
             node,
             expected=expected,
             observed=wrong[0],
             message=f"node {name} is {wrong[0]} and must be {expected}",
         )
     elif observed is not None and observed.managed is False and not _reports_state(facts):
-        yield WRONG_STATE.on_node(
+        yield WRONG_STATE.on(
             node,
             expected=f"managed node, {expected}",
             observed="not a managed node",
@@ -99,7 +99,7 @@ def _judge(view: View, facts: NodeFacts) -> Iterator[Finding]:
             hint="make it a managed node, or declare it `managed: false`",
         )
     elif not states:
-        yield STATE_UNVERIFIABLE.on_node(
+        yield STATE_UNVERIFIABLE.on(
             node,
             expected=expected,
             observed="unknown",
@@ -151,7 +151,7 @@ def _judge_report(facts: NodeFacts) -> Iterator[Finding]:
     if not facts.is_ours or facts.absent:
         return
     if facts.configuration is None:
-        yield MISSING_REPORT.on_node(
+        yield MISSING_REPORT.on(
             facts.node,
             expected="node configuration",
             observed="no report",
@@ -163,7 +163,7 @@ def _judge_report(facts: NodeFacts) -> Iterator[Finding]:
             continue
         planned = actual.planned
         word = planned.kind.noun
-        yield INCOMPLETE_REPORT.on_endpoint(
+        yield INCOMPLETE_REPORT.on(
             actual,
             expected=f"{word} in the report of {name}",
             observed="not mentioned",
