@@ -47,7 +47,7 @@ from lifecycle.manifest.yaml.document import error, warning
 from lifecycle.manifest.yaml.source import read_bytes
 from lifecycle.network.medium import DEFAULT_RMW
 from lifecycle.network.ports import MAX_DOMAIN_ID, domain_of
-from lifecycle.plan.connections.wiring import WiredSystem, variables_of, wire
+from lifecycle.plan.connections.wiring import variables_of, wire
 from lifecycle.plan.model import (
     HeldBy,
     Plan,
@@ -209,30 +209,22 @@ def build_plan(
     if domain_id is not None:
         discovery = msgspec.structs.replace(manifest.discovery, domain_id=domain_id)
         manifest = replace(manifest, discovery=discovery)
-    domain_id = effective_domain(manifest.discovery, variables)
     discovery_range = effective_range(manifest.discovery, variables)
-    rmw = variables.get("RMW_IMPLEMENTATION", "") or DEFAULT_RMW
     parameters = NodeParameters(ParameterFiles(manifest.path), manifest.modes)
-    wired = _wired(manifest, variables, parameters, domain_id=domain_id, rmw=rmw)
-    plan = Plan(
-        **{**declared(SystemDeclaration, manifest), "modes": tuple(map(_portable, manifest.modes))},
-        manifest_path=manifest.path,
-        domain_id=domain_id,
+    plan = _wired(manifest, variables, parameters)
+    processes = planned_processes(
+        manifest.nodes,
+        domain_id=plan.domain_id,
         discovery_range=discovery_range,
-        processes=planned_processes(
-            manifest.nodes,
-            domain_id=domain_id,
-            discovery_range=discovery_range,
-            environment=variables,
-            connecting=variables_of(manifest.discovery, wired.server),
-            shared_memory=manifest.discovery.transport.in_memory,
-        ),
-        nodes=wired.nodes,
-        flows=wired.flows,
+        environment=variables,
+        connecting=variables_of(manifest.discovery, plan.server),
+        shared_memory=manifest.discovery.transport.in_memory,
+    )
+    plan = replace(
+        plan,
+        discovery_range=discovery_range,
+        processes=processes,
         levels=dependency_levels(manifest.nodes),
-        rmw=rmw,
-        server=wired.server,
-        observers=wired.observers,
     )
     return in_mode(plan, plan.modes[0].name) if plan.modes else plan
 
@@ -336,14 +328,11 @@ def check_plan(
         files: parameter files of its nodes that were read already.
     """
     variables = os.environ if environment is None else environment
-    try:
-        domain_id = effective_domain(manifest.discovery, variables)
-    except UsageError:
-        return ()  # the environment's fault, reported where it is used
     parameters = NodeParameters(files or ParameterFiles(manifest.path), manifest.modes)
     try:
-        rmw = variables.get("RMW_IMPLEMENTATION", "") or DEFAULT_RMW
-        _wired(manifest, variables, parameters, domain_id=domain_id, rmw=rmw)
+        _wired(manifest, variables, parameters)
+    except UsageError:
+        return ()  # the environment's fault, reported where it is used
     except PlanError as problem:
         at = problem.at or Position(file=manifest.path, line=1, column=1)
         alone = error("plan.impossible", at, problem.message, problem.hint)
@@ -381,15 +370,9 @@ def _without_clock(manifest: Manifest, parameters: NodeParameters) -> Iterator[D
 _NAMED = 4
 
 
-def _wired(
-    manifest: Manifest,
-    variables: Mapping[str, str],
-    parameters: NodeParameters,
-    *,
-    domain_id: int,
-    rmw: str,
-) -> WiredSystem:
-    """Plan nodes, flows and how they are connected."""
+def _wired(manifest: Manifest, variables: Mapping[str, str], parameters: NodeParameters) -> Plan:
+    """Plan nodes, flows and how they are connected, but no processes and no order yet."""
+    domain_id = effective_domain(manifest.discovery, variables)
     prefixes = search_prefixes(variables)
     needs = FlowNeeds(manifest, prefixes)
     hash_of = functools.cache(functools.partial(installed_hash, prefixes=prefixes))
@@ -397,16 +380,18 @@ def _wired(
     nodes = tuple(
         _planned_node(node, needs, parameters, hash_of, digest_of) for node in manifest.nodes
     )
-    return wire(
-        manifest,
-        nodes,
-        planned_flows(nodes, manifest.links),
+    plan = Plan(
+        **{**declared(SystemDeclaration, manifest), "modes": tuple(map(_portable, manifest.modes))},
+        manifest_path=manifest.path,
         domain_id=domain_id,
-        rmws={
-            node.key: dict(node.run.environment).get("RMW_IMPLEMENTATION", "") or rmw
-            for node in manifest.nodes
-        },
+        discovery_range=DiscoveryRange.SYSTEM_DEFAULT,
+        processes=(),
+        nodes=nodes,
+        flows=planned_flows(nodes, manifest.links),
+        levels=(),
+        rmw=variables.get("RMW_IMPLEMENTATION", "") or DEFAULT_RMW,
     )
+    return wire(plan, manifest.links)
 
 
 def effective_domain(discovery: Discovery, environment: Mapping[str, str]) -> int:

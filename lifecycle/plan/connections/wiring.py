@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 
-import msgspec
 from msgspec.structs import replace
 
 from lifecycle.manifest.diagnostics import Diagnostic, Position
@@ -25,7 +24,7 @@ from lifecycle.manifest.model import (
     DiscoveryMode,
     EndpointKind,
     FlowTransport,
-    Manifest,
+    Link,
     RunKind,
 )
 from lifecycle.manifest.qos import Durability, Reliability
@@ -64,9 +63,10 @@ from lifecycle.plan.negotiation.parties import (
     NegotiatedConnection,
     NegotiatedFlow,
     Party,
-    make_terms,
     party_of_node,
     place_negotiated,
+    rmw_of,
+    terms_of,
     wishes_of,
     written_ports,
 )
@@ -149,49 +149,25 @@ def _without_udp(
         yield error("plan.unique-without-udp", _at(node, each), message, hint)
 
 
-class WiredSystem(msgspec.Struct, frozen=True, kw_only=True):
-    """Nodes and flows with their data layer.
-
-    Attributes:
-        observers: (machine, connections), see `Plan.observers`.
-    """
-
-    nodes: tuple[PlannedNode, ...]
-    flows: tuple[PlannedFlow, ...]
-    server: PlannedServer | None
-    observers: tuple[tuple[str, ParticipantConnections], ...]
-
-
-def wire(
-    manifest: Manifest,
-    nodes: Sequence[PlannedNode],
-    flows: Sequence[PlannedFlow],
-    *,
-    domain_id: int,
-    rmws: Mapping[str, str],
-) -> WiredSystem:
+def wire(plan: Plan, links: Sequence[Link]) -> Plan:
     """Connect everything.
 
     Args:
-        manifest: valid.
-        nodes: with their declared connections and the extra participants that flows need.
-        flows: of these nodes.
-        domain_id: 0–232.
-        rmws: RMW identifier of each node, by key.
+        plan: its nodes have their declared connections and the extra participants that flows need.
+        links: of its manifest.
 
     Raises:
         PlanError: a pair cannot be connected, a participant cannot do what is asked of it, or there
             are not enough ports.
     """
-    discovery, data_layer = manifest.discovery, manifest.data_layer
-    machines = [node.machine for node in nodes]
+    discovery, data_layer = plan.discovery, plan.data_layer
+    machines = [node.machine for node in plan.nodes]
     if discovery.mode is DiscoveryMode.SERVER:
-        first = next((each.name for each in manifest.machines), "")
+        first = next((each.name for each in plan.machines), "")
         machines.append(discovery.server_machine or first)
-    hosts = Hosts.of(manifest.machines, machines)
-    taken = written_ports(nodes, hosts, discovery, domain_id=domain_id)
-    pool = PortPool(discovery.first_port, taken)
-    nodes, control = connect_control(nodes, discovery, hosts, pool)
+    hosts = Hosts.of(plan.machines, machines)
+    pool = PortPool(discovery.first_port, written_ports(plan, hosts))
+    nodes, control = connect_control(plan.nodes, discovery, hosts, pool)
     if discovery.mode is DiscoveryMode.STATIC_ENDPOINTS:
         nodes = place_static(nodes, hosts, pool)
     # A node that can join at any time must announce it where others work out connections from it.
@@ -207,61 +183,43 @@ def wire(
         )
         for node in nodes
     )
+    plan = replace(
+        plan,
+        nodes=nodes,
+        server=control.server,
+        observers=_by_machine(with_tcp(control, hosts), hosts),
+    )
     variables = dict(variables_of(discovery, control.server))
     parties = {
-        node.key: party_of_node(node, hosts, rmw=rmws[node.key], variables=variables)
+        node.key: party_of_node(node, hosts, rmw=rmw_of(node, plan), variables=variables)
         for node in nodes
     }
     static = data_layer.source is DataLayerSource.STATIC
     found: list[Diagnostic] = []
     if static:
-        terms = make_terms(
-            discovery,
-            data_layer,
-            nodes,
-            hosts,
-            observers=with_tcp(control, hosts),
-            server=control.server,
-            domain_id=domain_id,
-            max_datagram_bytes=manifest.network.max_datagram_bytes,
-        )
-        graph = negotiate(tuple(parties.values()), wishes_of(flows), terms)
-        found += _unconnectable(graph, nodes, manifest)
-        nodes, flows = _with_graph(nodes, flows, graph)
-    found += infeasible(nodes, parties, negotiated=static)
+        graph = negotiate(tuple(parties.values()), wishes_of(plan.flows), terms_of(plan))
+        found += _unconnectable(graph, plan, links)
+        plan = with_graph(plan, graph)
+    found += infeasible(plan.nodes, parties, negotiated=static)
     if found:
         raise PlanError.of(tuple(found))
     observers = connect_observers(
-        nodes,
+        plan.nodes,
         hosts,
         control,
         fixed=is_fixed(discovery),
-        may_use_tcp=not static and _may_use_tcp(nodes, flows),
+        may_use_tcp=not static and _may_use_tcp(plan),
     )
-    return WiredSystem(
-        nodes=tuple(nodes),
-        flows=tuple(flows),
-        server=control.server,
-        observers=tuple(_by_machine(observers, hosts)),
-    )
+    return replace(plan, observers=_by_machine(observers, hosts))
 
 
 def with_graph(plan: Plan, graph: DataLayerGraph) -> Plan:
-    """Return a plan as it must be seen once a data layer graph is made.
+    """Return a plan with the connections and media that a data layer graph gives it.
 
     Args:
-        plan: without negotiated connections, as `build_plan` returns it where the data layer graph
-            is made from node configurations.
+        plan: without negotiated connections.
         graph: what was negotiated; what it gives to nodes that the plan does not know is left out.
     """
-    nodes, flows = _with_graph(plan.nodes, plan.flows, graph)
-    return replace(plan, nodes=nodes, flows=flows)
-
-
-def _with_graph(
-    nodes: Sequence[PlannedNode], flows: Sequence[PlannedFlow], graph: DataLayerGraph
-) -> tuple[tuple[PlannedNode, ...], tuple[PlannedFlow, ...]]:
-    """Return nodes with the connections, and flows with the media, that a graph gives them."""
     connections: dict[str, list[NegotiatedConnection]] = {}
     for each in graph.connections:
         connections.setdefault(each.node, []).append(each)
@@ -269,11 +227,12 @@ def _with_graph(
     for flow in graph.flows:
         place = (flow.topic, flow.publisher, flow.subscription)
         negotiated.setdefault(place, []).append(flow)
-    return (
-        tuple(place_negotiated(node, connections.get(node.key, ())) for node in nodes),
-        tuple(
+    return replace(
+        plan,
+        nodes=tuple(place_negotiated(node, connections.get(node.key, ())) for node in plan.nodes),
+        flows=tuple(
             _with_medium(flow, negotiated.get((flow.topic, flow.publisher, flow.subscription), ()))
-            for flow in flows
+            for flow in plan.flows
         ),
     )
 
@@ -302,7 +261,7 @@ def variables_of(discovery: Discovery, server: PlannedServer | None) -> tuple[tu
 
 def _by_machine(
     observers: Mapping[str, ParticipantConnections], hosts: Hosts
-) -> list[tuple[str, ParticipantConnections]]:
+) -> tuple[tuple[str, ParticipantConnections], ...]:
     """Return observers by machine; by no name where there is one host or none has a name."""
     found = []
     for host, each in observers.items():
@@ -310,33 +269,34 @@ def _by_machine(
         if not hosts.several or not names:
             found.append(("", each))
         found += [(name, each) for name in names]
-    return found
+    return tuple(found)
 
 
-def _may_use_tcp(nodes: Sequence[PlannedNode], flows: Sequence[PlannedFlow]) -> bool:
+def _may_use_tcp(plan: Plan) -> bool:
     """Whether anything declares that TCP may be negotiated while the system runs."""
-    wishes = {each.transport.medium for each in flows}
-    wishes |= {each.transport.medium for node in nodes for each in node.endpoints}
-    reliable = any(each.lossy is False for node in nodes for each in node.endpoints)
+    endpoints = [each for node in plan.nodes for each in node.endpoints]
+    wishes = {each.transport.medium for each in plan.flows}
+    wishes |= {each.transport.medium for each in endpoints}
+    reliable = any(each.lossy is False for each in endpoints)
     return reliable or any(each and (each.is_tcp or each.is_group) for each in wishes)
 
 
 def _unconnectable(
-    graph: DataLayerGraph, nodes: Sequence[PlannedNode], manifest: Manifest
+    graph: DataLayerGraph, plan: Plan, links: Sequence[Link]
 ) -> Iterator[Diagnostic]:
     """Yield what cannot be connected, at the link or else the publisher that asks."""
-    start = Position(file=manifest.path, line=1, column=1)
-    links: dict[tuple[str, str, str], Position] = {}
-    for each in manifest.links:
+    start = Position(file=plan.manifest_path, line=1, column=1)
+    asked: dict[tuple[str, str, str], Position] = {}
+    for each in links:
         if each.transport is not FlowTransport.ANY:
-            links.setdefault((each.topic, each.from_node, each.to_node), each.at)
+            asked.setdefault((each.topic, each.from_node, each.to_node), each.at)
     endpoints: dict[tuple[str, str], Position] = {}
-    for node in nodes:
+    for node in plan.nodes:
         for endpoint in node.endpoints:
             if endpoint.kind is EndpointKind.PUBLISHER:
                 endpoints.setdefault((node.key, endpoint.resolved), _at(node, endpoint))
     for problem in graph.problems:
-        link = links.get((problem.topic, problem.publisher, problem.subscription))
+        link = asked.get((problem.topic, problem.publisher, problem.subscription))
         at = link or endpoints.get((problem.publisher, problem.topic)) or start
         yield error("plan.unconnectable", at, problem.problem, problem.hint)
 

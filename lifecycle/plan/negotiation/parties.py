@@ -15,8 +15,6 @@ import msgspec
 from msgspec.structs import replace
 
 from lifecycle.manifest.model import (
-    DataLayer,
-    Discovery,
     DiscoveryMode,
     EndpointKind,
     FlowTransport,
@@ -43,7 +41,6 @@ from lifecycle.plan.model import (
     PlannedFlow,
     PlannedNode,
     PlannedParticipant,
-    PlannedServer,
 )
 
 PARADIGMS = ("publish-subscribe", "request-response")
@@ -289,72 +286,40 @@ def hosts_of(plan: Plan) -> Hosts:
     return Hosts.of(plan.machines, machines)
 
 
+def rmw_of(node: PlannedNode, plan: Plan) -> str:
+    """Return the RMW identifier that a node of a plan runs with."""
+    return dict(node.run.environment).get("RMW_IMPLEMENTATION", "") or plan.rmw
+
+
 def terms_of(plan: Plan) -> Terms:
-    """Return what the nodes of a running plan can negotiate under."""
-    hosts = hosts_of(plan)
+    """Return what the nodes of a plan can negotiate under, whatever they have negotiated so far."""
+    hosts, server = hosts_of(plan), plan.server
     observers = {hosts.host(machine): each for machine, each in plan.observers}
-    return make_terms(
-        plan.discovery,
-        plan.data_layer,
-        plan.nodes,
-        hosts,
-        observers=observers,
-        server=plan.server,
-        domain_id=plan.domain_id,
-        max_datagram_bytes=plan.network.max_datagram_bytes,
-    )
-
-
-def make_terms(
-    discovery: Discovery,
-    data_layer: DataLayer,
-    nodes: Sequence[PlannedNode],
-    hosts: Hosts,
-    *,
-    observers: Mapping[str, ParticipantConnections],
-    server: PlannedServer | None,
-    domain_id: int,
-    max_datagram_bytes: int | None,
-) -> Terms:
-    """Return the terms of a plan's parts.
-
-    Args:
-        discovery: as declared.
-        data_layer: as declared.
-        nodes: with the connections that they have whatever is negotiated.
-        hosts: of the system.
-        observers: by host, how its supervisor's own participant is connected.
-        server: the discovery server; None without.
-        domain_id: 0–232.
-        max_datagram_bytes: UDP payload that the path carries unfragmented; None assumes Ethernet.
-    """
-    taken = written_ports(nodes, hosts, discovery, domain_id=domain_id)
+    taken = written_ports(plan, hosts)
     for host, each in observers.items():
         taken.setdefault(host, set()).update(ports_of(parse(text) for text in each.urls))
     if server is not None:
         taken.setdefault(hosts.host(server.machine), set()).add(server.port)
     return Terms(
-        fixed=is_fixed(discovery),
+        fixed=is_fixed(plan.discovery),
         server=None if server is None else Peer(address=server.address, port=server.port),
         server_medium=DEFAULT_TCP if server is None or server.tcp else RMW_DISCOVERY,
-        first_port=discovery.first_port,
+        first_port=plan.discovery.first_port,
         taken=tuple((host, tuple(sorted(ports))) for host, ports in sorted(taken.items())),
-        multicast_group=data_layer.multicast_group,
-        max_datagram_bytes=max_datagram_bytes,
+        multicast_group=plan.data_layer.multicast_group,
+        max_datagram_bytes=plan.network.max_datagram_bytes,
         observers=tuple(
             contact for host, each in observers.items() for contact in contacts_of(host, each.urls)
         ),
     )
 
 
-def written_ports(
-    nodes: Sequence[PlannedNode], hosts: Hosts, discovery: Discovery, *, domain_id: int
-) -> dict[str, set[int]]:
+def written_ports(plan: Plan, hosts: Hosts) -> dict[str, set[int]]:
     """Return the ports of each host that URLs name, and those that a domain uses by itself."""
-    base = domain_base(domain_id)
-    domain = set(range(base, base + DG)) if discovery.mode is DiscoveryMode.DYNAMIC else set()
-    taken: dict[str, set[int]] = {host: set(domain) for host in hosts.used}
-    for node in nodes:
+    base = domain_base(plan.domain_id)
+    dynamic = plan.discovery.mode is DiscoveryMode.DYNAMIC
+    taken = {host: set(range(base, base + DG)) if dynamic else set() for host in hosts.used}
+    for node in plan.nodes:
         ports = taken.setdefault(hosts.host(node.machine), set())
         ports.update(ports_of(parse(text) for text in urls_of(node)))
     return taken
