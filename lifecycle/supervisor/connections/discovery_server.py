@@ -98,7 +98,7 @@ async def begin(system: System, spawner: ForkServer, *, ours: bool) -> None:
 
 
 async def end(system: System, hurry: asyncio.Event) -> None:
-    """End it, if it is ours; nothing of the system may need it any more."""
+    """End it, if it is ours; nothing of the system may need it any more. Again is harmless."""
     server = system.server
     if server is None or server.child is None:
         return
@@ -113,6 +113,7 @@ async def end(system: System, hurry: asyncio.Event) -> None:
     await server.release()
     if server.ended.done():
         _say(system, ProcessState.EXITED)
+    system.server = None
 
 
 def _say(system: System, state: ProcessState) -> None:

@@ -16,14 +16,13 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lifecycle.errors import LifecycleError
+from lifecycle.errors import BringUpError, LifecycleError
 from lifecycle.graph.loop import set_within
 from lifecycle.plan.model import Plan
 from lifecycle.run_directory import LEDGER_NAME, RunDirectory
 from lifecycle.supervisor.run.events import Emitter, Event, Notice, VerdictChanged
-from lifecycle.supervisor.run.failure import StepFailedError, Worker, ended
+from lifecycle.supervisor.run.failure import Worker, ended
 from lifecycle.supervisor.run.options import UpOptions
-from lifecycle.verify.rules.run import NOT_PROGRAMMED
 from lifecycle.verify.verdict import FlowReport, Verdict
 
 if TYPE_CHECKING:
@@ -85,7 +84,7 @@ class Networks:
             timeout_s: what is left for it; None for the patience with each request.
 
         Raises:
-            StepFailedError: a network could not be programmed, or not in time; what was made all
+            BringUpError: a network could not be programmed, or not in time; what was made all
                 the same is removed by `close`.
         """
         if self._programmer is None:
@@ -95,11 +94,7 @@ class Networks:
         try:
             await self._program(self._programmer, timeout_s)
         except LifecycleError as error:
-            raise StepFailedError(
-                f"cannot program networks for {self._system!r}: {error}",
-                rule=NOT_PROGRAMMED,
-                subject=self._system,
-            ) from error
+            raise BringUpError(f"cannot program networks for {self._system!r}: {error}") from error
         self._begun = True
         self._take(verdict)  # from now on renewed in time
 

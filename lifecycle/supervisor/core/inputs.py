@@ -9,6 +9,7 @@ import msgspec
 
 from lifecycle.manifest.model import Condition
 from lifecycle.plan.model import Plan
+from lifecycle.supervisor.run.events import Failure
 from lifecycle.verify.verdict import Verdict
 
 if TYPE_CHECKING:
@@ -197,9 +198,7 @@ class Broken(msgspec.Struct, frozen=True, kw_only=True):
             may go on.
     """
 
-    subject: str
-    message: str
-    rule: str = "run.process-died"
+    failure: Failure
     finds: bool = False
 
 

@@ -322,13 +322,12 @@ def _stop(run: Run, given: inputs.Stop) -> list[Event]:
 
 
 def _broken(run: Run, given: inputs.Broken) -> list[Event]:
-    found = Failure(rule=given.rule, subject=given.subject, message=given.message)
     run.broken = run.broken or given.finds
     if run.ending is not None:
         return []
     if given.finds:
-        return failure.fail(run, found)
-    run.fails_now(found)
+        return failure.fail(run, given.failure)
+    run.fails_now(given.failure)
     return []
 
 

@@ -70,11 +70,6 @@ class ControlDriver:
         self._channel = channel
         self._node = node
 
-    async def start(self) -> NodeCondition:
-        """Wait for the host's "ready"."""
-        await self._channel.ready()
-        return NodeCondition(state=UNCONFIGURED)
-
     async def perform(self, operation: Operation, permit: Permit | None = None) -> NodeCondition:
         """Send the operation and wait for the reply.
 

@@ -24,32 +24,25 @@ from lifecycle.verify.verdict import NOT_JUDGED, Finding, RunEnd, Verdict
 
 
 class StepFailedError(BringUpError):
-    """A step of bring-up failed, or a process ended that was not asked to.
+    """A step of bring-up failed that is no request to a node.
 
-    Attributes:
+    Args:
+        message: a whole sentence.
         rule: the `run.*` rule that it breaks.
-        subject: fully qualified node name, or the process where no node is to blame.
+        subject: fully qualified node name, or what else is to blame.
         process: name of the process concerned; empty if there is none of ours.
         log: the file with all that its process wrote; empty if there is none.
+
+    Attributes:
+        failure: all of it.
     """
 
     def __init__(
         self, message: str, *, rule: Rule, subject: str, process: str = "", log: str = ""
     ) -> None:
         super().__init__(message)
-        self.rule = rule
-        self.subject = subject
-        self.process = process
-        self.log = log
-
-    def event(self) -> Failure:
-        """Return the failure as listeners get it."""
-        return Failure(
-            rule=self.rule.id,
-            subject=self.subject,
-            message=self.message,
-            process=self.process,
-            log=self.log,
+        self.failure = Failure(
+            rule=rule.id, subject=subject, message=message, process=process, log=log
         )
 
 

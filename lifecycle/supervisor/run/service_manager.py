@@ -34,33 +34,28 @@ is restarted; the service manager's is for a supervisor that hangs."""
 
 
 class ServiceManager:
-    """Reports one run to the service manager that has started this process.
+    """Reports one run to the service manager that has started this process, if one has.
 
     Args:
-        address: of its socket, NOTIFY_SOCKET; a leading `@` is an abstract one; empty for none.
-        watchdog_s: seconds within which it wants a sign of life; None for never.
+        environment: NOTIFY_SOCKET names its socket, a leading `@` an abstract one; WATCHDOG_USEC
+            the microseconds within which it wants a sign of life, of the process WATCHDOG_PID.
     """
 
-    def __init__(self, address: str, watchdog_s: float | None = None) -> None:
-        self._address = f"\0{address[1:]}" if address.startswith("@") else address
-        self._watchdog_s = watchdog_s
-        self._timer: asyncio.TimerHandle | None = None
-        self._starting = True
-        self._active = False
-        self._system = ""
-
-    @classmethod
-    def of(cls, environment: Mapping[str, str]) -> ServiceManager:
-        """Return the one that an environment names; one that sends nothing where there is none."""
+    def __init__(self, environment: Mapping[str, str]) -> None:
         address = environment.get("NOTIFY_SOCKET", "")
-        if not address.startswith(("/", "@")):
-            return cls("")
+        self._address = address if address.startswith(("/", "@")) else ""
+        if address.startswith("@"):
+            self._address = f"\0{address[1:]}"
+        self._watchdog_s: float | None = None
         with contextlib.suppress(ValueError):
             pid = int(environment.get("WATCHDOG_PID", "") or os.getpid())
             limit_us = int(environment.get("WATCHDOG_USEC", ""))
             if pid == os.getpid() and limit_us > 0:
-                return cls(address, limit_us / 1e6)
-        return cls(address)
+                self._watchdog_s = limit_us / 1e6
+        self._timer: asyncio.TimerHandle | None = None
+        self._starting = True
+        self._active = False
+        self._system = ""
 
     def on_event(self, event: Event) -> None:
         """Report what an event means for the service."""

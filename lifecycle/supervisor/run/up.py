@@ -139,7 +139,7 @@ def up(
     """
     guarded = _Guarded(listener)
     processes = local_processes(plan, options.machine)
-    service = ServiceManager.of(os.environ)
+    service = ServiceManager(os.environ)
     emit = Emitter()
     emit.listen(guarded)
     emit.listen(service.on_event)
@@ -200,10 +200,10 @@ def up(
                 leaving.push_async_callback(supervisor.leave)
                 on_start(supervisor.status)
                 return await supervisor.run()
-            except StepFailedError as failure:
-                emit(failed := failure.event())
+            except StepFailedError as error:
+                emit(failed := error.failure)
                 reason = f"failed: {failed.subject} ({failed.rule})"
-                return ended_early(reason, failure.exit_code, failed)
+                return ended_early(reason, error.exit_code, failed)
             finally:
                 await discovery_server.end(system, asyncio.Event())
                 await fork_server.close()
@@ -354,7 +354,6 @@ async def _observer_participant(
             )
         if number + 1 == OBSERVER_TRIES or observer_participant.discovery.reaches_servers():
             break
-        observer_participant.prepare_to_leave()
         observer_participant.destroy()
         connections = moved_observer(plan, planned, number)
         emit(
@@ -370,7 +369,6 @@ async def _observer_participant(
     if local_processes(plan, options.machine):
         port = missing_port(discovery.domain_id, discovery.urls, os.environ)
     if port is not None:
-        observer_participant.prepare_to_leave()
         observer_participant.destroy()
         raise MiddlewareError(
             f"cannot discover nodes of this host in domain {plan.domain_id}: UDP port {port}, by "

@@ -47,6 +47,7 @@ from lifecycle.supervisor.nodes.system import NodeRun, System
 from lifecycle.supervisor.processes.orphans import reap_adopted
 from lifecycle.supervisor.run.events import (
     Event,
+    Failure,
     LogLine,
     Notice,
     ProcessChanged,
@@ -62,6 +63,7 @@ from lifecycle.supervisor.shell.looks import Looks
 from lifecycle.supervisor.shell.processes import Processes
 from lifecycle.supervisor.shell.requests import Requests
 from lifecycle.verify.judge import with_findings
+from lifecycle.verify.rules.run import PROCESS_DIED
 from lifecycle.verify.verdict import NOT_JUDGED, Verdict
 
 if TYPE_CHECKING:
@@ -440,7 +442,7 @@ class Supervisor:
         try:
             left_s = max(gate.LEAST_S, until_s - self.now_s())
             await self.means.networks.begin(effect.verdict, left_s)
-        except StepFailedError as failed:
+        except BringUpError as failed:
             error = failed.message
         self.give(inputs.Programmed(number=effect.number, error=error))
 
@@ -449,9 +451,7 @@ class Supervisor:
         try:
             plan, findings = await adopt(self.system, self.means.participant)
         except StepFailedError as failed:
-            self.give(
-                inputs.Broken(subject=failed.subject, message=failed.message, rule=failed.rule.id)
-            )
+            self.give(inputs.Broken(failure=failed.failure))
             return
         if findings:
             verdict = with_findings(NOT_JUDGED, findings, self.system.plan.policy)
@@ -461,12 +461,14 @@ class Supervisor:
 
     async def _watch_fork_server(self) -> None:
         text = await asyncio.shield(self.means.fork_server.died)
-        self.give(inputs.Broken(subject="fork server", message=f"cannot go on: {text}"))
+        text = f"cannot go on: {text}"
+        failed = Failure(rule=PROCESS_DIED.id, subject="fork server", message=text)
+        self.give(inputs.Broken(failure=failed))
 
     async def _watch_discovery_server(self) -> None:
         if (server := self.system.server) is not None:
             found = discovery_server.death(server, await asyncio.shield(server.ended))
-            self.give(inputs.Broken(subject=found.subject, message=found.message, finds=True))
+            self.give(inputs.Broken(failure=found, finds=True))
 
     # From begin to end
 

@@ -18,6 +18,7 @@ from pathlib import Path
 
 import pytest
 
+from lifecycle.errors import BringUpError
 from lifecycle.programming.http import Api, Patience
 from lifecycle.programming.programmer import Programmer
 from lifecycle.programming.target import (
@@ -30,7 +31,6 @@ from lifecycle.programming.target import (
 )
 from lifecycle.supervisor.connections.networks import Networks
 from lifecycle.supervisor.run.events import Emitter, Notice
-from lifecycle.supervisor.run.failure import StepFailedError
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.verdict import Verdict
 from tests.unit.programming.flow_samples import plan, report
@@ -450,9 +450,9 @@ _ENDLESS = Patience(attempts=1000, first_s=0.05, total_s=600)
     ids=["drips", "fails", "asks to wait"],
 )
 def test_a_bring_up_waits_for_no_server_past_its_deadline(behave: Behave, tmp_path: Path) -> None:
-    async def run() -> StepFailedError:
+    async def run() -> BringUpError:
         networks = Networks("s", tmp_path, Emitter(), _programmer(tmp_path, server, _ENDLESS))
-        with pytest.raises(StepFailedError) as caught:
+        with pytest.raises(BringUpError) as caught:
             await networks.begin(_VERDICT, 0.5)
         hurry = asyncio.Event()
         hurry.set()

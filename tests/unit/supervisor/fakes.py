@@ -19,6 +19,7 @@ from typing import Any, TypeVar
 from msgspec.structs import replace
 
 from lifecycle.codec import from_json, to_json
+from lifecycle.errors import BringUpError
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.node.host.control import Command, Event, HostSpec, Operation
 from lifecycle.plan.model import Plan, PlannedProcess
@@ -148,10 +149,10 @@ _FIRST_PID = 5_000_000
 
 
 class FakeProcess:
-    """A host that lives in the loop; see FakeSpawner for what it can be told to do."""
+    """A host that lives in the loop; see FakeForkServer for what it can be told to do."""
 
     def __init__(
-        self, spawner: FakeSpawner, process: ManagedProcess, stdout: int, control: int | None
+        self, spawner: FakeForkServer, process: ManagedProcess, stdout: int, control: int | None
     ) -> None:
         self.pid = spawner.next_pid()
         self.exited: asyncio.Future[ProcessExit] = asyncio.get_running_loop().create_future()
@@ -271,7 +272,7 @@ class FakeProcess:
             self._spawner.came(self._name, *nodes)
         if command is not None:
             answer = replace(answer, configuration=self._carry_out(command, answer))
-        if self._spawner.reports_changes and answer.configuration is not None:
+        if answer.configuration is not None:
             told = replace(answer, kind="configuration", id=0, ok=True, error="")
             writer.write(to_json(told) + b"\n")
         writer.write(to_json(answer) + b"\n")
@@ -281,7 +282,7 @@ class FakeProcess:
         return self._spawner.carry_out(command, answer.state, connected=answer.connected)
 
 
-class FakeSpawner:
+class FakeForkServer:
     """Starts fake hosts.
 
     Attributes:
@@ -291,9 +292,10 @@ class FakeSpawner:
         unhosted: by process, nodes that cannot be constructed and why, reported 0.1 s apart.
         starves: by process, for how much of the time its threads wait for a processor, added up.
         ends_at: processes that do not end by themselves, and the signal that ends them.
+        cannot_start: why it cannot start processes; empty while it can.
+        lingers_s: seconds for which discovery shows the nodes of a process that has ended.
         processes: by name.
         interfaces: what a node reports, by full name; steps of wiring change it.
-        tells: hosts tell unasked what nodes report whenever that changes, as ours do.
         nodes: full names of the nodes that are in the graph, by process.
         changed: called whenever the graph looks otherwise.
     """
@@ -305,18 +307,21 @@ class FakeSpawner:
         self.unhosted: dict[str, dict[str, str]] = {}
         self.starves: dict[str, float] = {}
         self.ends_at: dict[str, int] = {}
+        self.cannot_start = ""
+        self.lingers_s = 0.0
         self.strays: tuple[int, ...] = ()
         self.processes: dict[str, FakeProcess] = {}
         self.interfaces: dict[str, NodeConfiguration] = {}
-        self.reports_changes = False
         self.nodes: dict[str, tuple[str, ...]] = {}
         self.changed: Callable[[], None] = lambda: None
-        self._pid = _FIRST_PID
+        self.died: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+        self.waited_for: tuple[int, ...] = ()
+        self.pid = _FIRST_PID
 
     def next_pid(self) -> int:
         """One that no process can have."""
-        self._pid += 1
-        return self._pid
+        self.pid += 1
+        return self.pid
 
     def begin(self, nodes: list[str]) -> None:
         """Construct nodes anew."""
@@ -332,9 +337,13 @@ class FakeSpawner:
             self.changed()
 
     def gone(self, process: str) -> None:
-        """Show the nodes of a process in the graph no more."""
-        if self.nodes.pop(process, ()):
-            self.changed()
+        """Show the nodes of a process in the graph no more, a moment later."""
+
+        def gone() -> None:
+            if self.nodes.pop(process, ()):
+                self.changed()
+
+        asyncio.get_running_loop().call_later(self.lingers_s, gone)
 
     def carry_out(
         self, command: Command, state: str, *, connected: bool
@@ -357,7 +366,8 @@ class FakeSpawner:
         return interface
 
     async def ready(self) -> None:
-        """Always."""
+        if self.cannot_start:
+            raise BringUpError(self.cannot_start)
 
     async def spawn(
         self, process: ManagedProcess, streams: Sequence[int], control: int | None
@@ -365,15 +375,17 @@ class FakeSpawner:
         child = self.processes[process.name] = FakeProcess(self, process, streams[0], control)
         return child
 
-    def belonging(self, processes: Mapping[int, str]) -> frozenset[int]:
+    def family(self) -> frozenset[int]:
         """They have started nothing."""
+        return frozenset()
+
+    def belonging(self, processes: Mapping[int, str]) -> frozenset[int]:
         del processes
         return frozenset()
 
     async def end_left(
         self, ended: Mapping[int, str], known: Collection[int] = ()
     ) -> tuple[int, ...]:
-        """Nothing is left."""
         del ended, known
         return ()
 
@@ -410,7 +422,7 @@ class World:
     def __init__(
         self, plan: Plan, directory: Path, processes: Iterable[PlannedProcess] | None = None
     ) -> None:
-        self.spawner = FakeSpawner()
+        self.spawner = FakeForkServer()
         self.events: list[SupervisorEvent] = []
         self.emit = Emitter()
         self.emit.listen(self.events.append)

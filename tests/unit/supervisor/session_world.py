@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 from msgspec.structs import replace
 
 from lifecycle.codec import from_json, to_json
-from lifecycle.errors import MiddlewareError
+from lifecycle.errors import BringUpError, MiddlewareError
 from lifecycle.manifest.model import Condition, RunKind
 from lifecycle.node.host.control import Operation
 from lifecycle.plan.model import ParticipantConnections, Plan, PlannedNode
@@ -54,56 +54,20 @@ from lifecycle.supervisor.run.events import (
     SystemReached,
     VerdictChanged,
 )
-from lifecycle.supervisor.run.failure import StepFailedError
 from lifecycle.supervisor.run.journal import Journal, journal_files, read_run
 from lifecycle.supervisor.run.options import UpOptions, UpResult
 from lifecycle.supervisor.run.records import Records
 from lifecycle.supervisor.run.signals import Ending
 from lifecycle.supervisor.shell.supervisor import Means, Supervisor
 from lifecycle.verify.observation import NodeConfiguration, Observation, ObservedNode
-from lifecycle.verify.rules import rule
 from lifecycle.verify.verdict import Verdict
 from tests.builders import plan_of, planned_node
-from tests.unit.supervisor.fakes import FakeSpawner, interface_of
+from tests.unit.supervisor.fakes import FakeForkServer, interface_of
 
 E = TypeVar("E", bound=Event)
 
 SHUTDOWN_S = 30.0
 """However a node or a process resists, a system of the size of these is down within so long."""
-
-
-class FakeForkServer(FakeSpawner):
-    """A fork server whose children are coroutines.
-
-    Attributes:
-        cannot_start: why it cannot start processes; empty while it can.
-        lingers_s: seconds for which discovery shows the nodes of a process that has ended.
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.reports_changes = True
-        self.cannot_start = ""
-        self.lingers_s = 0.0
-        self.died: asyncio.Future[str] = asyncio.get_running_loop().create_future()
-
-    def gone(self, process: str) -> None:
-        asyncio.get_running_loop().call_later(self.lingers_s, super().gone, process)
-
-    @property
-    def pid(self) -> int:
-        return self._pid
-
-    @property
-    def waited_for(self) -> tuple[int, ...]:
-        return ()
-
-    def family(self) -> frozenset[int]:
-        return frozenset()
-
-    async def ready(self) -> None:
-        if self.cannot_start:
-            raise StepFailedError(self.cannot_start, rule=rule("run.start-failed"), subject="robot")
 
 
 class _Connection:
@@ -384,7 +348,7 @@ class FakeNetworks(Networks):
         self._log.append(f"networks programmed ({verdict.verdict.value})")
         await asyncio.sleep(self.takes_s)
         if self.fails:
-            raise StepFailedError(self.fails, rule=rule("run.not-programmed"), subject="robot")
+            raise BringUpError(self.fails)
 
     async def close(self, hurry: asyncio.Event) -> None:
         del hurry
@@ -422,55 +386,48 @@ class _Story(list[str]):
 _DETAIL = ("[process]", "[node]", "[request]", "[joined]", "[left]", "[log]")
 
 
+def _applied(event: ManifestApplied) -> str:
+    what = {
+        "added": event.added,
+        "removed": event.removed,
+        "restarted": event.restarted,
+        "parameters of": event.parameters,
+    }
+    said = "".join(f", {word} {' '.join(names)}" for word, names in what.items() if names)
+    return f"{event.stage} revision {event.revision}{said}"
+
+
+def _judged(event: VerdictChanged) -> str:
+    found = ", ".join(f"{each.rule} {each.subject}" for each in event.verdict.findings)
+    return f"{event.stage.value} {event.verdict.verdict.value} {found}"
+
+
+_SAID: dict[type, Callable[[Any], str]] = {
+    ProcessChanged: lambda of: f"{of.process} {of.state.value} ({of.detail})",
+    NodeChanged: lambda of: f"{of.node} {of.reach.value} ({of.state})",
+    RequestSent: lambda of: f"{of.node} {of.operation.value}",
+    VerdictChanged: _judged,
+    GateOpened: lambda of: f"{of.outcome}: {', '.join(of.nodes)}",
+    SystemReached: lambda of: f"{of.reached} at {of.elapsed_s:.1f} s",
+    Failure: lambda of: f"{of.rule} {of.subject}{'' if of.ends_run else ', and the run goes on'}",
+    Notice: lambda of: of.message,
+    Stopped: lambda of: f"{of.exit_code}",
+    NodeJoined: lambda of: of.node,
+    NodeLeft: lambda of: of.node,
+    RestartScheduled: lambda of: f"{of.process} in {of.in_s:.1f} s",
+    Restarted: lambda of: f"{of.process} ({of.restarts})",
+    GaveUp: lambda of: f"{of.process} ({len(of.history)} failures)",
+    ModeEntered: lambda of: f"{of.mode} without {' '.join(of.inactive)}".removesuffix(" without "),
+    ManifestApplied: _applied,
+    ConsequenceTaken: lambda of: f"{of.action} {' '.join(of.nodes)} for {of.rule}",
+}
+
+
 def _line(event: Event, now_s: float) -> str:
-    if isinstance(event, ProcessChanged):
-        detail = f" ({event.detail})" if event.detail else ""
-        return f"[process] {event.process} {event.state.value}{detail}"
-    if isinstance(event, NodeChanged):
-        state = f" ({event.state})" if event.state else ""
-        return f"[node] {event.node} {event.reach.value}{state}"
-    if isinstance(event, RequestSent):
-        return f"[request] {event.node} {event.operation.value}"
-    if isinstance(event, VerdictChanged):
-        found = ", ".join(f"{each.rule} {each.subject}" for each in event.verdict.findings)
-        return f"[verdict] {event.stage.value} {event.verdict.verdict.value} {found}".rstrip()
-    if isinstance(event, GateOpened):
-        return f"[gate] {event.outcome}: {', '.join(event.nodes)}"
-    if isinstance(event, SystemReached):
-        return f"[system] {event.reached} at {event.elapsed_s:.1f} s"
-    if isinstance(event, Failure):
-        goes_on = "" if event.ends_run else ", and the run goes on"
-        return f"[failure] {event.rule} {event.subject}{goes_on}"
-    if isinstance(event, Notice):
-        return f"[notice] {event.message}"
     if isinstance(event, Stopping):
         return f"[stopping] at {now_s:.1f} s: {event.reason}"
-    if isinstance(event, Stopped):
-        return f"[stopped] {event.exit_code}"
-    if isinstance(event, NodeJoined):
-        return f"[joined] {event.node}"
-    if isinstance(event, NodeLeft):
-        return f"[left] {event.node}"
-    if isinstance(event, RestartScheduled):
-        return f"[backoff] {event.process} in {event.in_s:.1f} s"
-    if isinstance(event, Restarted):
-        return f"[restarted] {event.process} ({event.restarts})"
-    if isinstance(event, GaveUp):
-        return f"[gave_up] {event.process} ({len(event.history)} failures)"
-    if isinstance(event, ModeEntered):
-        return f"[mode] {event.mode} without {' '.join(event.inactive)}".removesuffix(" without ")
-    if isinstance(event, ManifestApplied):
-        what = {
-            "added": event.added,
-            "removed": event.removed,
-            "restarted": event.restarted,
-            "parameters of": event.parameters,
-        }
-        said = "".join(f", {word} {' '.join(names)}" for word, names in what.items() if names)
-        return f"[apply] {event.stage} revision {event.revision}{said}"
-    if isinstance(event, ConsequenceTaken):
-        return f"[consequence] {event.action} {' '.join(event.nodes)} for {event.rule}"
-    return f"[{event.kind}]"
+    said = _SAID.get(type(event), lambda _: "")(event)
+    return f"[{event.kind}] {said}".removesuffix(" ()").rstrip()
 
 
 class SessionWorld:

@@ -43,7 +43,7 @@ def _received(manager: socket.socket) -> list[list[str]]:
 def test_a_system_is_ready_when_it_is_active_and_not_before(
     manager: socket.socket, tmp_path: Path
 ) -> None:
-    service = ServiceManager.of({"NOTIFY_SOCKET": str(tmp_path / "notify")})
+    service = ServiceManager({"NOTIFY_SOCKET": str(tmp_path / "notify")})
     service.on_event(
         RunStarted(
             system="arm",
@@ -76,7 +76,7 @@ def test_the_watchdog_is_served_in_half_of_its_time_from_the_loop(
     manager: socket.socket, tmp_path: Path
 ) -> None:
     environment = {"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "40000"}
-    service = ServiceManager.of({**environment, "WATCHDOG_PID": str(os.getpid())})
+    service = ServiceManager({**environment, "WATCHDOG_PID": str(os.getpid())})
 
     service.on_event(SystemReached(reached="active", elapsed_s=2.0))
     _received(manager)
@@ -90,7 +90,7 @@ def test_the_watchdog_is_served_in_half_of_its_time_from_the_loop(
         assert _received(manager) == []
 
     asyncio.run(main())
-    other = ServiceManager.of({**environment, "WATCHDOG_PID": "1"})
+    other = ServiceManager({**environment, "WATCHDOG_PID": "1"})
     asyncio.run(_watched(other))
     assert ["WATCHDOG=1"] not in _received(manager)
 
@@ -99,7 +99,7 @@ def test_a_bring_up_that_goes_on_has_more_time_until_it_is_active(
     manager: socket.socket, tmp_path: Path
 ) -> None:
     """What is restarted during bring-up has its time anew; a fixed limit would cut that off."""
-    service = ServiceManager.of({"NOTIFY_SOCKET": str(tmp_path / "notify")})
+    service = ServiceManager({"NOTIFY_SOCKET": str(tmp_path / "notify")})
     asyncio.run(_watched(service))
     assert _received(manager) == [["EXTEND_TIMEOUT_USEC=20000000"]]
     service.on_event(SystemReached(reached="active", elapsed_s=2.0))
@@ -117,5 +117,5 @@ def test_without_a_service_manager_nothing_is_sent_and_a_deaf_one_stops_nothing(
 ) -> None:
     gone = {"NOTIFY_SOCKET": str(tmp_path / "gone"), "WATCHDOG_USEC": "x"}
     for environment in ({}, {"NOTIFY_SOCKET": "relative"}, gone):
-        service = ServiceManager.of(environment)
+        service = ServiceManager(environment)
         service.on_event(SystemReached(reached="active", elapsed_s=2.0))

@@ -15,10 +15,11 @@ from lifecycle.plan.model import ParticipantConnections, Plan, PlannedServer
 from lifecycle.supervisor.connections import discovery_server
 from lifecycle.supervisor.nodes.system import System
 from lifecycle.supervisor.processes.process import ManagedProcess, ProcessExit
+from lifecycle.supervisor.run.events import Event
 from lifecycle.supervisor.run.failure import StepFailedError
 from lifecycle.supervisor.run.options import observer_connections, onlooker_connections
 from tests.builders import plan_of, planned_node
-from tests.unit.supervisor.fakes import FakeProcess, FakeSpawner, World
+from tests.unit.supervisor.fakes import FakeForkServer, FakeProcess, World
 
 REAL_TIME = True
 PREFIX = "44.53.00.5f.45.50.52.4f.53.49.4d.41"
@@ -44,12 +45,12 @@ def served(port: int, machine: str = "") -> Plan:
     return replace(plan_of(planned_node("a")), server=server)
 
 
-def world(plan: Plan, directory: Path) -> tuple[System, FakeSpawner]:
+def world(plan: Plan, directory: Path) -> tuple[System, FakeForkServer]:
     made = World(plan, directory)
     return made.system, made.spawner
 
 
-class _EndsAtOnce(FakeSpawner):
+class _EndsAtOnce(FakeForkServer):
     async def spawn(
         self, process: ManagedProcess, streams: Sequence[int], control: int | None
     ) -> FakeProcess:
@@ -78,8 +79,12 @@ async def test_one_that_ends_at_once_says_how(tmp_path: Path, nobody: int) -> No
     system, _ = world(served(nobody), tmp_path)
     with pytest.raises(StepFailedError) as caught:
         await discovery_server.begin(system, _EndsAtOnce(), ours=True)
-    await discovery_server.end(system, asyncio.Event())
-    assert (caught.value.rule.id, caught.value.subject) == (
+    said: list[Event] = []
+    system.emit.listen(said.append)
+    for _ in range(2):
+        await discovery_server.end(system, asyncio.Event())
+    assert [each.kind for each in said] == ["process"]
+    assert (caught.value.failure.rule, caught.value.failure.subject) == (
         "run.start-failed",
         "discovery_server",
     )
@@ -96,7 +101,7 @@ async def test_the_server_of_another_machine_is_waited_for_with_a_deadline(
     system, spawner = world(served(nobody, "base"), tmp_path)
     with pytest.raises(StepFailedError) as caught:
         await discovery_server.begin(system, spawner, ours=False)
-    assert caught.value.rule.id == "run.deadline"
+    assert caught.value.failure.rule == "run.deadline"
     assert caught.value.message == (
         "cannot reach the discovery server of machine 'base', whose supervisor starts it, at "
         f"tcp 127.0.0.1:{nobody}: nobody listened for 0.1 s"

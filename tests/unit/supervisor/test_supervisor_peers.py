@@ -6,6 +6,7 @@ import asyncio
 import logging
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -48,50 +49,37 @@ def two_machines(system: str = "robot", *, log_level: str = "") -> Plan:
     )
 
 
-class FakeWatch:
-    """Watches one topic; what comes of it is said by the test."""
-
-    def __init__(
-        self,
-        air: FakeAir,
-        topic: str,
-        on_liveliness: Callable[[bool], None],
-        on_left: Callable[[], None],
-        on_notice: Callable[[Mapping[str, str]], None],
-    ) -> None:
-        self.alive, self.left, self.silent = on_liveliness, on_left, on_notice
-        self._air = air
-        self._topic = topic
-
-    def destroy(self) -> None:
-        del self._air.watched[self._topic]
-
-
 class FakeAir:
     """Carries nothing, and remembers what was announced and watched."""
 
     def __init__(self) -> None:
-        self.watched: dict[str, FakeWatch] = {}
+        self.watched: dict[str, SimpleNamespace] = {}
         self.announced: dict[str, list[Mapping[str, str]]] = {}
         self.plans: list[str] = []
         self.arrives: Callable[[str], None] | None = None
         self.done: list[str] = []
 
-    def announce_alive(self, topic: str) -> Any:
+    def announce_alive(self, topic: str) -> SimpleNamespace:
         said = self.announced.setdefault(topic, [])
+        return SimpleNamespace(
+            notify=lambda silent: said.append(dict(silent)), destroy=lambda: None
+        )
 
-        class Announcement:
-            def notify(self, silent: Mapping[str, str]) -> None:
-                said.append(dict(silent))
-
-            def destroy(self) -> None:
-                """Nothing to destroy."""
-
-        return Announcement()
-
-    def watch_alive(self, topic: str, **callbacks: Any) -> FakeWatch:
-        watch = self.watched[topic] = FakeWatch(self, topic, **callbacks)
-        return watch
+    def watch_alive(
+        self,
+        topic: str,
+        *,
+        on_liveliness: Callable[[bool], None],
+        on_left: Callable[[], None],
+        on_notice: Callable[[Mapping[str, str]], None],
+    ) -> SimpleNamespace:
+        self.watched[topic] = SimpleNamespace(
+            alive=on_liveliness,
+            left=on_left,
+            silent=on_notice,
+            destroy=lambda: self.watched.pop(topic),
+        )
+        return self.watched[topic]
 
     def plan_notices(self, on_notice: Callable[[str], None]) -> FakeAir:
         self.arrives = on_notice
@@ -125,7 +113,7 @@ class Robot(World):
         self.peers.open()
 
     @property
-    def desk(self) -> FakeWatch:
+    def desk(self) -> SimpleNamespace:
         return self.air.watched[DESK]
 
     def said(self) -> list[tuple[str, bool | str]]:

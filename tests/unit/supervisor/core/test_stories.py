@@ -475,6 +475,9 @@ def test_a_node_that_was_deactivated_for_a_violation_stays_so_until_it_is_resume
 # What is no node's
 
 
+SERVER_DIED = Failure(rule="run.process-died", subject="the server", message="pid 7 died")
+
+
 @pytest.mark.parametrize(
     ("finds", "keep_going", "ends"), [(False, True, True), (True, False, True), (True, True, False)]
 )
@@ -482,7 +485,7 @@ def test_a_server_that_dies_ends_the_run_unless_nodes_only_found_each_other_by_i
     finds: bool, keep_going: bool, ends: bool
 ) -> None:
     play = Play(CHAIN, keep_going=keep_going)
-    play.give(inputs.Broken(subject="the server", message="pid 7 died", finds=finds))
+    play.give(inputs.Broken(failure=SERVER_DIED, finds=finds))
     play.wait(5.0)
     (failed,) = (each for each in play.events if isinstance(each, Failure))
     assert (failed.subject, failed.message) == ("the server", "pid 7 died")
@@ -497,7 +500,7 @@ def test_a_server_that_dies_while_the_run_ends_is_passed_over() -> None:
     play = Play(CHAIN, ways={"viewer shutdown": "hang"})
     play.down()
     before = list(play.events)
-    play.give(inputs.Broken(subject="the server", message="pid 7 died", finds=True))
+    play.give(inputs.Broken(failure=SERVER_DIED, finds=True))
     assert not any(isinstance(each, Failure) for each in play.events[len(before) :])
 
 
