@@ -62,11 +62,14 @@ class Judgement(msgspec.Struct, frozen=True, kw_only=True):
         kept: None while the sample cannot decide.
         observed: `delay p99 0.6 ms`; empty while nothing is known.
         allowed: `≤ 5 ms`.
+        decides_in_s: about how long it takes yet until a sample can decide; None if it can, or
+            where that is not known.
     """
 
     kept: bool | None
     observed: str
     allowed: str
+    decides_in_s: float | None = None
 
 
 def judge(bound: Bound, sample: Sample, *, publishes_s: float | None = None) -> Judgement:
@@ -96,7 +99,12 @@ def _delay(bound: Bound, delays: Delays) -> Judgement:
     observed = (
         "" if found is None else f"{bound.kind.value} {percentile(bound.quantile)} {ms(found)}"
     )
-    return Judgement(kept=kept, observed=observed, allowed=_limit("≤", ">", kept, ms(bound.most)))
+    return Judgement(
+        kept=kept,
+        observed=observed,
+        allowed=_limit("≤", ">", kept, ms(bound.most)),
+        decides_in_s=max(0.0, DELAY_S - delays.seconds) if kept is None else None,
+    )
 
 
 def _rate(bound: Bound, sample: Sample, publishes_s: float | None) -> Judgement:
@@ -115,9 +123,12 @@ def _rate(bound: Bound, sample: Sample, publishes_s: float | None) -> Judgement:
     else:
         slack = f" - {bound.slack:.0%}" if bound.slack else ""
         allowed = _limit("≥", "<", not low, f"{bound.least:g} Hz{slack}")
-    observed = f"{seen.rate_hz:.1f} Hz" if seen.seconds else ""
+    left_s = max(needed_s - seen.seconds, REPORTED_S) + (needed_s if new else 0.0)
     return Judgement(
-        kept=not (low or high) if decided else None, observed=observed, allowed=allowed
+        kept=not (low or high) if decided else None,
+        observed=f"{seen.rate_hz:.1f} Hz" if seen.seconds else "",
+        allowed=allowed,
+        decides_in_s=None if decided else left_s,
     )
 
 
@@ -130,9 +141,12 @@ def _loss(bound: Bound, sample: Sample) -> Judgement:
         kept = False  # whatever else arrives
     elif seen.published >= needed:
         kept = True
-    observed = lost(seen.lost, seen.published) if seen.published else ""
+    left = needed - seen.published
     return Judgement(
-        kept=kept, observed=observed, allowed=_limit("≤", ">", kept, f"{bound.most:.6g}")
+        kept=kept,
+        observed=lost(seen.lost, seen.published) if seen.published else "",
+        allowed=_limit("≤", ">", kept, f"{bound.most:.6g}"),
+        decides_in_s=left / seen.rate_hz if kept is None and seen.messages else None,
     )
 
 
@@ -146,6 +160,7 @@ def _silence(bound: Bound, sample: Sample, publishes_s: float | None) -> Judgeme
         kept=kept,
         observed=f"silent for {silent_s:.1f} s",
         allowed=_limit("≤", ">", kept, f"{bound.most:g} s"),
+        decides_in_s=max(0.0, bound.most - silent_s) if kept is None else None,
     )
 
 

@@ -92,3 +92,19 @@ class Sample(msgspec.Struct, frozen=True, kw_only=True):
             if past.seconds >= seconds and past.published >= published:
                 return past
         return Slot.of(found)
+
+
+class Measured(msgspec.Struct, frozen=True, kw_only=True):
+    """What a node has counted.
+
+    Attributes:
+        active_s: for how long its data have been let through, seconds.
+        samples: of its subscriptions, each after its fully qualified topic.
+    """
+
+    active_s: float
+    samples: tuple[tuple[str, Sample], ...] = ()
+
+    def of(self, topic: str) -> Sample | None:
+        """Return what the subscription of a topic has counted; None without one."""
+        return next((sample for name, sample in self.samples if name == topic), None)

@@ -32,6 +32,7 @@ from lifecycle import codec
 from lifecycle.errors import MiddlewareError
 from lifecycle.manifest.model import EndpointKind
 from lifecycle.manifest.qos import QosProfile
+from lifecycle.measure.sample import Measured
 from lifecycle.middleware.fastdds.nfe import SHARED_MEMORY, get_network_flow_endpoints, senders_of
 from lifecycle.middleware.process.control import machine_id
 from lifecycle.middleware.process.hosted import vouch_for
@@ -101,14 +102,15 @@ _DIGITS = 16
 def checksum(configuration: NodeConfiguration) -> str:
     """Return 16 hex digits that change exactly when a reader must read the document again.
 
-    State, matches and what follows from them (whether a connection is established) change
-    all the time and are reported by events, so they do not count.
+    State, matches, what follows from them (whether a connection is established) and what is
+    measured change all the time and are reported by events, so they do not count.
     """
     stable = replace(
         configuration,
         state="",
         connected=False,
         checksum="",
+        measured=None,
         endpoints=tuple(
             replace(each, matched=None, server_matched=None) for each in configuration.endpoints
         ),
@@ -202,6 +204,7 @@ def collect(
     endpoints: tuple[EndpointReport, ...],
     connections: tuple[ConnectionReport, ...],
     health: HealthReport | None = None,
+    measured: Measured | None = None,
 ) -> NodeConfiguration:
     """Return the configuration of `node` as it is now.
 
@@ -212,6 +215,7 @@ def collect(
         endpoints: what they are now.
         connections: what they are now, the node's own participant first.
         health: what it says of itself; None if it says nothing.
+        measured: what its subscriptions have counted; None while it is not active.
     """
     name, prefix = node.get_fully_qualified_name(), _gid_prefix(node)
     vouch_for(prefix)  # before it is answered with
@@ -232,6 +236,7 @@ def collect(
         connections=connections,
         parameters=parameters.reports(node),
         health=health,
+        measured=measured,
     )
     return replace(configuration, checksum=checksum(configuration))
 

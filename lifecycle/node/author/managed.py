@@ -22,6 +22,7 @@ from rclpy.timer import Timer
 
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import EndpointKind, Health
+from lifecycle.measure.sample import Measured
 from lifecycle.node import configuration
 from lifecycle.node.author import parameters
 from lifecycle.node.author.declaring import DeclaredInCode
@@ -306,7 +307,12 @@ class Managed:
             endpoints=configuration.endpoint_reports(self._node, self.data_layer, undeclared),
             connections=configuration.connection_reports(self.spec, self.data_layer),
             health=self._health.report,
+            measured=self.gate.measured(),
         )
+
+    def measured(self) -> Measured | None:
+        """Return what has arrived since it was activated; None while it is not. Any thread."""
+        return self.gate.measured()
 
     # What the rows of the machine's table run.
 

@@ -34,6 +34,7 @@ from rclpy.time_source import TimeSource
 
 from lifecycle.errors import BringUpError, LifecycleError
 from lifecycle.manifest.model import EndpointKind
+from lifecycle.measure.sample import Measured
 from lifecycle.middleware.fastdds.nfe import create_subscription
 from lifecycle.middleware.rcl.graph_changes import ServerWatch
 from lifecycle.middleware.rcl.rclpy_nodes import (
@@ -52,7 +53,7 @@ from lifecycle.node.configuration import ConfigurationChanges
 from lifecycle.node.connections.connections import Connection, Connections
 from lifecycle.node.connections.data_layer import NodeDataLayer, serve_interface
 from lifecycle.node.endpoints.mapping import MatchWatch
-from lifecycle.node.lifecycle.gate import GatedPublisher, NodeGate
+from lifecycle.node.lifecycle.gate import CountedSubscription, GatedPublisher, NodeGate
 from lifecycle.node.lifecycle.machine import RefusedError
 from lifecycle.node.lifecycle.steps import SUCCESS, CallbackOutcome, Result
 from lifecycle.plan.model import PlannedEndpoint, PlannedNode
@@ -263,6 +264,8 @@ class ForeignNode:
             return  # /clock belongs to rclpy
         if kind is EndpointKind.PUBLISHER:
             self._gate.add(entity, HeldPublisher(entity, self._node.get_logger().warning))
+        elif kind is EndpointKind.SUBSCRIPTION:
+            self._gate.add(entity, CountedSubscription(entity))
         touch = self.configuration_changes.touch
         if kind.is_topic:
             # In the host's executor: the node's own need not run.
@@ -401,7 +404,12 @@ class ForeignNode:
             connected=reported.connected,
             endpoints=endpoints,
             connections=connections,
+            measured=self._gate.measured(),
         )
+
+    def measured(self) -> Measured | None:
+        """Return what has arrived since it was let through; None while it is held. Any thread."""
+        return self._gate.measured()
 
     @property
     def is_marked(self) -> bool:

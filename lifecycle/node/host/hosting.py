@@ -28,6 +28,7 @@ from rclpy.signals import SignalHandlerOptions
 from lifecycle import codec
 from lifecycle.errors import LifecycleError
 from lifecycle.manifest.model import Executor
+from lifecycle.measure.sample import SLOT_S
 from lifecycle.middleware.discovery.tcp import send_again_soon
 from lifecycle.middleware.fastdds.participant_profile import ParticipantSettings
 from lifecycle.middleware.fastdds.settings import discovery_by_profile
@@ -390,12 +391,22 @@ class Host:
         self._channel.write(Event(kind="ready"))
         if any(hosted.is_marked for hosted in self._nodes.values()):
             threading.Thread(target=self._watch_marks, name="marks", daemon=True).start()
+        if self._spec.measures:
+            threading.Thread(target=self._report_measured, name="measured", daemon=True).start()
 
     def _watch_marks(self) -> None:
         """Read the marks of the sockets again and again, whatever the node's callbacks do."""
         while not self._left.wait(_MARKS_S):
             for hosted in tuple(self._nodes.values()):
                 self._commands.marks.look(hosted)
+
+    def _report_measured(self) -> None:
+        """Report again and again what active nodes have counted, whatever their callbacks do."""
+        while not self._left.wait(SLOT_S):
+            for name, hosted in tuple(self._nodes.items()):
+                measured = hosted.measured()
+                if measured is not None:
+                    self._channel.write(Event(kind="measured", node=name, measured=measured))
 
     def _report_state(self, hosted: Hosted) -> None:
         state = hosted.reported

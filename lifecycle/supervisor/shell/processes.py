@@ -79,6 +79,7 @@ class Processes:
                 nodes=tuple(node.planned for node in nodes),
                 folders=manifest_folders(node.planned for node in nodes),
                 log=process.log.shown,
+                measures=bool(system.plan.bounds),
             )
             channel = ControlChannel(spec, system.on_host_event, hung)
         try:
