@@ -24,6 +24,7 @@ from lifecycle.supervisor.core.state import (
     Run,
     Step,
 )
+from lifecycle.verify.rules.measured import PROBATION_S
 from lifecycle.verify.verdict import Stage
 
 SIGINT, SIGTERM, SIGKILL = 2, 15, 9
@@ -486,8 +487,10 @@ def wakes_at_s(run: Run) -> float:
             times.append(gate.refuses_at_s(run, run.waits_s + run.options.timeout_s))
         if run.change is not None:
             times.append(run.change.until_s)
-        if run.held_s is not None and run.options.hold_s is not None:
-            over_s = run.held_s + run.options.hold_s
+        if run.held_s is not None and run.decided_s is None:
+            times.append(run.held_s + PROBATION_S)
+        if run.decided_s is not None and run.options.hold_s is not None:
+            over_s = run.decided_s + run.options.hold_s
             times += [over_s, over_s + NOTICE_S, over_s + GLANCE_S]
     return min((each for each in times if each > now_s), default=NEVER_S)
 
@@ -507,6 +510,7 @@ def phase_of(run: Run) -> str:
         (coming, "restarting" if up else "connecting"),
         (run.attempt is not None, "verifying"),
         (run.paused, "paused"),
+        (_is_whole(run) and gate.is_measuring(run), "measuring"),
         (_is_whole(run), "active"),
     )
     return next((name for holds, name in found if holds), "held")

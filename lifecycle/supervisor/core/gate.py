@@ -15,10 +15,11 @@ from lifecycle.errors import ExitCode
 from lifecycle.supervisor.core.inputs import Verified
 from lifecycle.supervisor.core.state import NEVER_S, Judged, Level, Node, Run
 from lifecycle.supervisor.run.events import Event, VerdictChanged
-from lifecycle.verify.judge import not_ok, with_findings, with_only
+from lifecycle.verify.judge import apart_from_numbers, not_ok, with_findings, with_only
 from lifecycle.verify.outcome import Outcome
 from lifecycle.verify.rules import rule
 from lifecycle.verify.rules.catalogue import Heals
+from lifecycle.verify.rules.measured import PROBATION_S
 from lifecycle.verify.rules.nodes import UNATTRIBUTED_ENDPOINT
 from lifecycle.verify.rules.state import ACTIVATED_AT_CLOSED_GATE, MISSING_REPORT
 from lifecycle.verify.verdict import Finding, FindingKey, Stage, Verdict
@@ -153,7 +154,10 @@ def take_verdict(run: Run, given: Verified, away: Collection[str], stage: Stage)
     found = frozenset((each.rule, each.subject) for each in verdict.findings)
     if found != judged.found or judged.verdict is None:
         judged.found, judged.since_s = found, run.now_s
-    is_new, judged.verdict = verdict != judged.verdict, verdict
+    is_new = judged.verdict is None or (
+        apart_from_numbers(verdict) != apart_from_numbers(judged.verdict)
+    )
+    judged.verdict = verdict
     see_violations(run, away)
     return [VerdictChanged(stage=stage, verdict=verdict)] if is_new else []
 
@@ -233,6 +237,25 @@ def see_violations(run: Run, away: Collection[str]) -> None:
         if key in lasting or (passes and len(judged.passed) < _MOST):
             name = _named(key)
             judged.passed[name] = judged.passed.get(name, False) or key in lasting
+
+
+def has_probation(run: Run) -> bool:
+    """Return whether the manifest declares numbers of data that are to flow."""
+    return run.options.until is Level.ACTIVE and bool(run.plan.bounds)
+
+
+def is_measuring(run: Run) -> bool:
+    """Return whether a declared number of a system that is held is decided before long.
+
+    That is its probation: PROBATION_S from when it was brought up, at most.
+    """
+    if run.held_s is None or run.decided_s is not None or not has_probation(run):
+        return False
+    left_s = run.held_s + PROBATION_S - run.now_s
+    if left_s <= 0:
+        return False
+    verdict, judged = run.judged.verdict, run.judged
+    return verdict is None or judged.mark < run.probation or verdict.is_measuring(left_s)
 
 
 def counts_at_s(judged: Judged, now_s: float) -> float:

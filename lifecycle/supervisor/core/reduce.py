@@ -455,20 +455,37 @@ def _hold(run: Run) -> list[Event]:
     if run.held_s is None:
         if run.attempt is None and run.passage is None and not run.failures and run.furthest:
             run.held_s = run.now_s
+            if not gate.has_probation(run):
+                run.decided_s = run.held_s
+            else:
+                run.changed()  # a look that began before it was up measures nothing
+                run.probation = run.mark
         return []
+    said: list[Event] = []
+    if run.decided_s is None:
+        if gate.is_measuring(run):
+            return []
+        run.decided_s, said = run.now_s, _measured(run)
     hold_s = run.options.hold_s
-    if hold_s is None or run.now_s < run.held_s + hold_s or run.order is not None or run.failures:
-        return []
-    over_s = run.held_s + hold_s
+    over_s = run.decided_s + (hold_s or 0.0)
+    if hold_s is None or run.now_s < over_s or run.order is not None or run.failures:
+        return said
     waits = not gate.is_latest(run) and any(
         each.level is Level.ACTIVE for each in run.nodes.values()
     )
     if run.now_s < over_s + advance.NOTICE_S and failure.only_elsewhere(run):
-        return []  # who runs these may be about to say that it ends, too
+        return said  # who runs these may be about to say that it ends, too
     if run.options.until < Level.ACTIVE and not run.options.verifies:
         waits = not (gate.allows(run) and gate.is_latest(run))
     waits = waits and run.now_s < over_s + advance.GLANCE_S
-    return [] if waits else failure.end_done(run)
+    return said if waits else [*said, *failure.end_done(run)]
+
+
+def _measured(run: Run) -> list[Event]:
+    """Say what was measured of each flow of which a number is declared."""
+    verdict = run.judged.verdict
+    flows = () if verdict is None else verdict.measured
+    return [Notice(message=f"measured: {each.describe()}") for each in flows if each.bounds]
 
 
 def _returned(run: Run) -> list[Event]:

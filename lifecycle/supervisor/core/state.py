@@ -484,6 +484,9 @@ class Run(msgspec.Struct, kw_only=True):
         waits_s: since when nodes wait at the gate that nobody asked for; `said`: it was said.
         furthest: "connected", "verified" or "active", as far as it came; empty before.
         held_s: since when it is held; None before it was up.
+        decided_s: since when what is declared of its data is decided, as far as it can be before
+            long; None before.
+        probation: the mark from which on looks measure.
         pauses: it is to be said that it is paused, once nothing is active.
         ready: None: it has still to be known whether processes can be started; False: it is asked.
         failures: that end the run, as soon as what is in a step has failed, too, or not.
@@ -517,6 +520,8 @@ class Run(msgspec.Struct, kw_only=True):
     said: bool = False
     furthest: str = ""
     held_s: float | None = None
+    decided_s: float | None = None
+    probation: int = 0
     paused: bool = False
     pauses: bool = False
     attempt: Attempt | None = None

@@ -23,6 +23,7 @@ from msgspec.structs import replace
 
 from lifecycle.graph.loop import set_within
 from lifecycle.manifest.model import Condition
+from lifecycle.measure.sample import SLOT_S
 from lifecycle.plan.model import Plan, PlannedNode
 from lifecycle.plan.restart import moving_nodes
 from lifecycle.supervisor.control.protocol import ProcessState
@@ -57,6 +58,9 @@ asked again: after this long, then twice as long each time, ..."""
 
 ASK_AGAIN_AT_MOST_S = 0.5
 """... up to this."""
+
+MEASURED_S = 1.0
+"""What has arrived is compared with what is declared so often; in the probation twice as often."""
 
 REMOTE_S = 0.2
 """A remote node is asked again so long after, because the event that it connected may be missed:
@@ -150,6 +154,8 @@ class Looks:
             )
             waits = again_s is not None
             waits_s += [again_s] if again_s is not None else []
+            if run.plan.bounds and stage is Stage.ACTIVE:
+                waits_s.append(MEASURED_S if run.decided_s is not None else SLOT_S)
         self._latest = verdict
         if not gate.closes(found, strict=run.options.strict) and stage is Stage.CONNECTED:
             unsaid_s = judge.unsaid_s(found)
